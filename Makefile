@@ -85,7 +85,7 @@ golden: $(VENV)/.ready  ## rewrite the golden files; read the diff before commit
 	@git status --short tests
 
 wheel: $(VENV)/.ready  ## build dist/*.whl
-	@$(BIN)/python -c 'from powderdsl.web.site import write_modules; write_modules()'
+	@$(BIN)/python -c 'from powderdsl.web.site import write_made; write_made()'
 	@$(BIN)/python -m build --wheel --no-isolation
 	@ls -l dist/*.whl
 

@@ -28,16 +28,15 @@ OWN_SHAPES = 12
 
 
 def offered_worlds(ruleset: Ruleset, names: Sequence[str]) -> tuple[list[dict[str, Any]], str]:
-    """Worlds with `name`, `about` and what `world_data` has; and the name of the one that shows the rules best.
+    """Worlds with `name`, `about` and what `world_data` has; and the name of the world that shows the rules best.
 
-    `names` is what `load` takes: tasks belong to their rules alone, an added pack gets a world with its elements.
+    `names` is what `load` takes: an added pack gets a world with its elements.
     """
-    found = [*_scenes(ruleset), *_tasks(ruleset, tuple(names))]
-    scenes = [one for one in found if not one["name"].startswith("task ")]
+    found = [*_scenes(ruleset)]
+    shown = found[-1]["name"] if found else "shapes"
     found.append(
         _named("shapes", "Random shapes of all elements.", ruleset, strew(ruleset, (SIDE, SIDE), 1, 0)[0])
     )
-    shown = scenes[-1]["name"] if scenes else "shapes"
     if not unchanging_ids(ruleset):
         ids = np.array([element.id for element in ruleset.elements], np.uint8)
         noise = ids[np.random.default_rng(0).integers(0, len(ids), (SIDE, SIDE))]
@@ -64,14 +63,16 @@ def _scenes(ruleset: Ruleset) -> Iterator[dict[str, Any]]:
         yield _named(scene.name, scene.about or "", ruleset, start.ids, fields)
 
 
-def _tasks(ruleset: Ruleset, names: tuple[str, ...]) -> Iterator[dict[str, Any]]:
-    """The first world of each task's first split."""
+def task_worlds() -> dict[str, list[dict[str, Any]]]:
+    """The first world of each shipped task's first split, by the rules of the tasks."""
     kind = PlainArrays()
+    found: dict[str, list[dict[str, Any]]] = {}
     for name in shipped_tasks():
         task = load_task(name)
-        if task.rules == names and task.ruleset.palette == ruleset.palette:
-            made = StartWorlds(task, task.splits[0].name, kind).make(np.array([0], np.int64))
-            yield _named(f"task {name}", task.about, ruleset, np.asarray(made.ids)[0])
+        made = StartWorlds(task, task.splits[0].name, kind).make(np.array([0], np.int64))
+        world = _named(f"task {name}", task.about, task.ruleset, np.asarray(made.ids)[0])
+        found.setdefault("+".join(task.rules), []).append(world)
+    return found
 
 
 def _own(ruleset: Ruleset) -> dict[str, Any]:

@@ -25,15 +25,15 @@ TYPES = {
 
 
 class SiteServer(ThreadingHTTPServer):
-    """Serves one site. Files that take long to make are made once at a time."""
+    """Serves one site. Files that take long to make are made once, and do not hold others up."""
 
     daemon_threads = True
 
     def __init__(self, site: Site, port: int = 0):
         super().__init__((ADDRESS, port), _Handler)
         self.site = site
-        self.making = threading.Lock()
         self.made: dict[str, bytes] = {}
+        self.making: dict[str, threading.Lock] = {}
 
     @property
     def address(self) -> str:
@@ -41,14 +41,13 @@ class SiteServer(ThreadingHTTPServer):
 
     def content(self, path: str) -> bytes | None:
         """A file of the site. Files of the page are read again each time, so that an edit shows."""
-        if path in self.made:
-            return self.made[path]
-        with self.making:
+        if not path.startswith(("rules/", "catalog.json", "python.zip", "tasks.json")):
+            return self.site.read(path)
+        if path not in self.site.files:
+            return None
+        with self.making.setdefault(path, threading.Lock()):
             if path not in self.made:
-                data = self.site.read(path)
-                if data is None or not path.startswith(("rules/", "catalog.json", "python.zip")):
-                    return data
-                self.made[path] = data
+                self.made[path] = self.site.files[path]()
         return self.made[path]
 
 

@@ -6,24 +6,25 @@ import base64
 import hashlib
 import io
 import json
+import re
+import shutil
 import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from powderdsl.compiler import load, read, shipped, shipped_tests, split_names
 from powderdsl.diagnostics import Reporter
-from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.state import fits
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.standalone import standalone_module
 from powderdsl.system.memo import Memo
 from powderdsl.system.user_cache import cache_folder
 from powderdsl.system.writing import replacing
-from powderdsl.web.offered_worlds import offered_worlds
+from powderdsl.web.offered_worlds import offered_worlds, task_worlds
 from powderdsl.worlds.raster import Size
 from powderdsl.worlds.strewn import frame_element
 
@@ -32,8 +33,8 @@ PAGE = HERE / "page"
 PARTS = HERE / "parts"
 """What `make web` fetches from npm: Pyodide and CodeMirror, with their licenses. Git ignores the folder."""
 
-MODULES = HERE / "modules"
-"""Modules of all shipped rules: `make wheel` compiles them, so that the first world of an installed page needs no wait."""
+MADE = HERE / "made"
+"""Files about shipped rules, which `make wheel` compiles, so that the page of an installed wheel opens at once."""
 
 SIZES = (64, 128, 256, 512)
 LIBRARIES = ("click", "lark", "pyyaml")
@@ -66,21 +67,84 @@ class Entry:
         return [word for name in self.names for word in split_names(name)[1]]
 
 
-def entries() -> list[Entry]:
-    """The shipped rules that stand by themselves, then the example packs on top of a ruleset."""
+def shipped_entries() -> list[Entry]:
+    """The shipped rules that stand by themselves, those with the most elements first, then each example pack on top."""
     found = [Entry(name, (name,)) for name in shipped_tests()]
     found.sort(key=lambda one: -len(one.ruleset.elements))
-    largest = found[0]
-    examples = [
-        Entry(path.stem, (*largest.names, str(path))) for path in sorted(examples_folder().glob("*.yaml"))
-    ]
-    return found + examples
+    return found + [_example(path.stem, found[0].key) for path in sorted(examples_folder().glob("*.yaml"))]
+
+
+def _example(stem: str, rules: str) -> Entry:
+    return Entry(stem, (rules, str(examples_folder() / f"{stem}.yaml")))
 
 
 def examples_folder() -> Path:
     """The example packs: inside the installed package, or in the repository."""
     inside = shipped("examples")
     return inside if HERE.parent / "data" in inside.parents else HERE.parents[1] / "docs" / "examples"
+
+
+Make = Callable[[], bytes]
+
+
+def shipped_files() -> dict[str, Make]:
+    """What makes each file about shipped rules: the catalog, start worlds of tasks, sheets and modules."""
+    rows = _shipped_rows()
+    found: dict[str, Make] = {"tasks.json": partial(kept, "tasks.json", lambda: _dump(task_worlds()))}
+    memo = Memo()
+    for row in rows:
+        key = row["key"]
+        entry = _example(key, rows[0]["key"]) if row["example"] else Entry(key, (key,))
+        for path, make in _files_of(entry, [tuple(size) for size in row["sizes"]], memo).items():
+            found[path] = partial(kept, path, make)
+    return found
+
+
+def _shipped_rows() -> list[dict[str, Any]]:
+    def make() -> bytes:
+        found = shipped_entries()
+        return _dump([_row(one) | {"example": len(one.names) > 1} for one in found])
+
+    rows: list[dict[str, Any]] = json.loads(kept("shipped.json", make))
+    return rows
+
+
+def _row(entry: Entry, *more: Size) -> dict[str, Any]:
+    """A row of the catalog: sizes are those for which there is a module, `more` of them first."""
+    sizes = dict.fromkeys([*more, *((side, side) for side in SIZES)])
+    return {
+        "key": entry.key,
+        "about": _about(entry),
+        "sizes": [size for size in sizes if fits(entry.ruleset, size)],
+    }
+
+
+def _files_of(
+    entry: Entry, sizes: list[Size], memo: Memo, world: dict[str, Any] | None = None
+) -> dict[str, Make]:
+    """The files about some rules: a sheet, and a module for each size."""
+    found: dict[str, Make] = {f"rules/{entry.key}.json": lambda: _dump(_sheet(entry, world))}
+    for size in sizes:
+        module = partial(lambda one: standalone_module(entry.ruleset, one, memo), size)
+        found[f"rules/{entry.key}-{size[0]}x{size[1]}.wasm"] = module
+    return found
+
+
+def _sheet(entry: Entry, world: dict[str, Any] | None) -> dict[str, Any]:
+    ruleset = entry.ruleset
+    worlds, shown = offered_worlds(ruleset, entry.names)
+    if world is not None:
+        worlds, shown = [world, *worlds], world["name"]
+    return {
+        "key": entry.key,
+        "title": ruleset.name,
+        "about": _about(entry),
+        "files": entry.files(),
+        "off": entry.left_out(),
+        "frame": frame_element(ruleset, ruleset.elements[0].id),
+        "worlds": worlds,
+        "shown": shown,
+    }
 
 
 class Site:
@@ -93,41 +157,49 @@ class Site:
         self.first, self.world = first, world
 
     @cached_property
-    def entries(self) -> dict[str, Entry]:
-        known = entries()
-        if self.first is not None:
-            known = [self.first] + [one for one in known if one.key != self.first.key]
-        return {one.key: one for one in known}
+    def rows(self) -> list[dict[str, Any]]:
+        """The rows of the catalog; the page opens the first one."""
+        rows = [{name: row[name] for name in ("key", "about", "sizes")} for row in _shipped_rows()]
+        if self.first is None:
+            return rows
+        known = [row for row in rows if row["key"] == self.first.key]
+        shape = () if self.world is None else ((self.world["rows"], self.world["columns"]),)
+        own = known[0] if known and self._is_shipped else _row(self.first, *shape)
+        return [own, *(row for row in rows if row not in known)]
+
+    @property
+    def _is_shipped(self) -> bool:
+        """Whether the first rules are the shipped ones of their name, as they are."""
+        first = self.first
+        return first is not None and first.names == (first.key,) and not first.params and self.world is None
 
     @cached_property
-    def files(self) -> dict[str, Callable[[], bytes]]:
+    def files(self) -> dict[str, Make]:
         """What makes each file, by its path in the site."""
-        found: dict[str, Callable[[], bytes]] = {}
+        found: dict[str, Make] = {}
         for folder, below in ((PAGE, ""), (PARTS, "parts/")):
             for path in sorted(folder.rglob("*")):
                 if path.is_file():
                     found[below + path.relative_to(folder).as_posix()] = path.read_bytes
-        found["index.html"] = index_page
-        found["catalog.json"] = self._catalog
-        found["python.zip"] = python_archive
-        for key, entry in self.entries.items():
-            found[f"rules/{key}.json"] = _json(self._rules, entry)
-            for size in self.sizes(entry):
-                found[f"rules/{key}-{size[0]}x{size[1]}.wasm"] = _code(entry, size)
-        return found
+        found["index.html"], found["python.zip"] = index_page, python_archive
+        found |= shipped_files()
+        if self.first is not None and not self._is_shipped:
+            own = [
+                path
+                for path in found
+                if re.fullmatch(rf"rules/{self.first.key}(-\d+x\d+\.wasm|\.json)", path)
+            ]
+            found = {path: make for path, make in found.items() if path not in own}
+            found |= _files_of(
+                self.first, [tuple(size) for size in self.rows[0]["sizes"]], Memo(), self.world
+            )
+        return found | {"catalog.json": lambda: _dump({"format": 1, "rules": self.rows})}
 
-    def sizes(self, entry: Entry) -> list[Size]:
-        """The sizes of worlds for which the site has a module, the user's world first."""
-        sizes: list[Size] = [(side, side) for side in SIZES]
-        if entry is self.first and self.world is not None:
-            sizes.insert(0, (self.world["rows"], self.world["columns"]))
-        return [size for size in dict.fromkeys(sizes) if fits(entry.ruleset, size)]
-
+    @property
     def start(self) -> str:
         """The module that the page loads first."""
-        entry = next(iter(self.entries.values()))
-        rows, columns = self.sizes(entry)[0]
-        return f"rules/{entry.key}-{rows}x{columns}.wasm"
+        (rows, columns), key = self.rows[0]["sizes"][0], self.rows[0]["key"]
+        return f"rules/{key}-{rows}x{columns}.wasm"
 
     def read(self, path: str) -> bytes | None:
         """A file, or None if the site has no such file."""
@@ -142,30 +214,6 @@ class Site:
             with replacing(target) as temporary:
                 temporary.write_bytes(make())
         return len(self.files)
-
-    def _catalog(self) -> bytes:
-        listed = [
-            {"key": key, "about": _about(entry), "sizes": self.sizes(entry)}
-            for key, entry in self.entries.items()
-        ]
-        return _dump({"format": 1, "rules": listed})
-
-    def _rules(self, entry: Entry) -> dict[str, Any]:
-        ruleset = entry.ruleset
-        ground = ruleset.elements[0].id
-        worlds, shown = offered_worlds(ruleset, entry.names)
-        if entry is self.first and self.world is not None:
-            worlds, shown = [self.world, *worlds], self.world["name"]
-        return {
-            "key": entry.key,
-            "title": ruleset.name,
-            "about": _about(entry),
-            "files": entry.files(),
-            "off": entry.left_out(),
-            "frame": frame_element(ruleset, ground),
-            "worlds": worlds,
-            "shown": shown,
-        }
 
 
 def index_page() -> bytes:
@@ -187,56 +235,51 @@ def _dump(value: Any) -> bytes:
     return json.dumps(value, ensure_ascii=False, separators=(",", ":")).encode()
 
 
-def _json(make: Callable[[Entry], Any], entry: Entry) -> Callable[[], bytes]:
-    return lambda: _dump(make(entry))
-
-
-def _code(entry: Entry, size: Size) -> Callable[[], bytes]:
-    return lambda: cached_module(entry.ruleset, size)
-
-
-def cached_module(ruleset: Ruleset, size: Size) -> bytes:
-    """The module of a world: that of the installation or of the user's cache, if the same code has made it."""
-    name = _file_name(ruleset, size)
-    if (made := MODULES / name).is_file():
-        return made.read_bytes()
+def kept(name: str, make: Make) -> bytes:
+    """A file about shipped rules: that of the installation or of the user's cache, if the same code has made it."""
+    if _made_by() == code_version() and (MADE / name).is_file():
+        return (MADE / name).read_bytes()
     try:
-        path = cache_folder("play") / name
+        folder = cache_folder("play")
+        path = folder / f"{code_version()}-{name.replace('/', '-')}"
         if path.is_file():
             return path.read_bytes()
     except OSError:
-        return standalone_module(ruleset, size)
-    code = standalone_module(ruleset, size)
+        return make()
+    for old in folder.iterdir():
+        if not old.name.startswith(code_version()):
+            old.unlink(missing_ok=True)
+    data = make()
     with replacing(path) as temporary:
-        temporary.write_bytes(code)
-    return code
+        temporary.write_bytes(data)
+    return data
 
 
-def write_modules() -> None:
-    """Compile all shipped rules into the folder MODULES, and remove what other code has made."""
-    for path in MODULES.glob("*.wasm"):
-        path.unlink()
-    MODULES.mkdir(exist_ok=True)
-    memo = Memo()
-    for entry in entries():
-        for size in ((side, side) for side in SIZES):
-            if fits(entry.ruleset, size):
-                (MODULES / _file_name(entry.ruleset, size)).write_bytes(
-                    standalone_module(entry.ruleset, size, memo)
-                )
+def _made_by() -> str:
+    version = MADE / "version.txt"
+    return version.read_text(encoding="utf-8") if version.is_file() else ""
 
 
-def _file_name(ruleset: Ruleset, size: Size) -> str:
-    """A name that only the same code gives to the same rules."""
-    key = f"{code_version()} {fingerprint(ruleset)} {ruleset.name} {size}"
-    return f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.wasm"
+def write_made() -> None:
+    """Make all files about shipped rules, in the folder MADE."""
+    shutil.rmtree(MADE, ignore_errors=True)
+    found = shipped_files() | {"shipped.json": lambda: _dump(_shipped_rows())}
+    for name, make in found.items():
+        (MADE / name).parent.mkdir(parents=True, exist_ok=True)
+        (MADE / name).write_bytes(make())
+    (MADE / "version.txt").write_text(code_version(), encoding="utf-8")
 
 
 @cache
 def code_version() -> str:
-    """A number that changes with any module of powderdsl."""
+    """A number that changes with any module of powderdsl, and with the rules, tasks and examples that it has."""
     found = hashlib.sha256()
-    for path in sorted(HERE.parent.rglob("*.py")):
+    texts = [
+        path
+        for folder in (shipped("rules"), shipped("tasks"), examples_folder())
+        for path in folder.rglob("*.yaml")
+    ]
+    for path in sorted({*HERE.parent.rglob("*.py"), *HERE.parent.rglob("*.lark")}) + sorted(texts):
         found.update(path.read_bytes())
     return found.hexdigest()[:16]
 

@@ -104,7 +104,18 @@ def test_a_downloaded_world_continues_on_the_command_line(seen: dict[str, Any], 
 def test_pictures(seen: dict[str, Any], scripts: Path) -> None:
     """The page draws as `powderdsl render` does; its animation ends with the same picture, in fewer colors."""
     folder: Path = seen["folder"]
-    succeed(scripts / "powderdsl", "render", "later.npz", "--rules", "powderworld", "--scale", "8", "--out", "later.png", cwd=folder)
+    succeed(
+        scripts / "powderdsl",
+        "render",
+        "later.npz",
+        "--rules",
+        "powderworld",
+        "--scale",
+        "8",
+        "--out",
+        "later.png",
+        cwd=folder,
+    )
     with Image.open(folder / "world.png") as picture, Image.open(folder / "later.png") as wanted:
         pixels = np.asarray(picture.convert("RGB")).astype(int)
         assert np.array_equal(pixels, np.asarray(wanted.convert("RGB")))

@@ -133,7 +133,9 @@ def test_scripts_insert_no_html() -> None:
 
 def test_a_folder_for_any_web_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(site_module, "SIZES", (64,))
-    monkeypatch.setattr(site_module, "entries", lambda: [Entry("life", ("life",))])
+    monkeypatch.setattr(site_module, "shipped_entries", lambda: [Entry("life", ("life",))])
+    monkeypatch.setattr(site_module, "code_version", lambda: "of a test")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     count = Site().write(tmp_path / "site")
     written = {
         path.relative_to(tmp_path / "site").as_posix()

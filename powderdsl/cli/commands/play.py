@@ -81,7 +81,7 @@ def _serve(site: Site, port: int, opens: bool) -> None:
     except OSError as error:
         raise BadInput(f"port {port} cannot be used: {error.strerror}; choose another --port") from None
     click.echo("compiling the first world", err=True)
-    for path in ("catalog.json", site.start()):
+    for path in ("catalog.json", site.start):
         server.content(path)
     click.echo(f"{server.address}  (Ctrl+C ends it)")
     if opens:

@@ -109,6 +109,16 @@ function fillWorlds(chosen) {
   fill($("world"), [...names, ["random", "random shapes"], ["empty", "empty"]], chosen ?? "random");
 }
 
+/** Worlds of tasks, which come after the first world runs. @param {Record<string, any[]>} found  by rules */
+async function addWorlds(found) {
+  for (const [key, worlds] of Object.entries(found)) {
+    if (!app.catalog.rules.some((one) => one.key === key)) continue;
+    const sheet = await sheetOf(key);
+    sheet.worlds.push(...worlds);
+    if (app.rules === sheet) fillWorlds($("world").value);
+  }
+}
+
 function fill(select, rows, chosen) {
   select.replaceChildren(...rows.map(([value, label]) => make("option", { value }, label)));
   select.value = chosen;
@@ -568,6 +578,7 @@ async function begin() {
   await import("./panels.js");
   await import("./rules.js");
   await Promise.all([import("./exchange.js"), import("./checks.js")]);
+  await addWorlds(await (await get("tasks.json")).json());
 }
 
 app.surface = surface;

@@ -22,13 +22,21 @@ function lab([r, g, b]) {
   ];
 }
 
-const seen = (color) => SIGHTS.map((sight) => lab(sight(channels(color).map((c) => linear(c / 255)))));
-const distance = (a, b) => Math.min(...a.map((one, i) => Math.hypot(...one.map((v, k) => v - b[i][k]))));
+const far = (a, b) => Math.hypot(...a.map((value, i) => value - b[i]));
 
+/** A color as people see it: with all cones, then without some. */
+function looks(color) {
+  const light = channels(color).map((c) => linear(c / 255));
+  return { color, whole: lab(light), partial: SIGHTS.map((sight) => lab(sight(light))) };
+}
+const apart = (a, b) => Math.min(...a.partial.map((one, i) => far(one, b.partial[i])));
+
+const ENOUGH = 0.1;
+const LEVELS = [0, 51, 102, 153, 204, 255];
 const CANDIDATES = [];
-for (const r of [0, 64, 128, 192, 255])
-  for (const g of [0, 64, 128, 192, 255])
-    for (const b of [0, 64, 128, 192, 255])
+for (const r of LEVELS)
+  for (const g of LEVELS)
+    for (const b of LEVELS)
       CANDIDATES.push(`#${[r, g, b].map((c) => c.toString(16).padStart(2, "0")).join("")}`);
 
 /**
@@ -38,13 +46,13 @@ for (const r of [0, 64, 128, 192, 255])
 export function blindColors(elements) {
   const found = new Map();
   const used = [];
-  const options = CANDIDATES.map((color) => ({ color, look: seen(color) }));
+  const options = CANDIDATES.map(looks);
   for (const { id, color } of elements) {
-    const own = seen(color);
-    const all = [{ color, look: own }, ...options];
-    const score = ({ look }) => Math.min(0.16, ...used.map((one) => distance(look, one))) * 6 - distance(look, own);
-    const best = all.reduce((a, b) => (score(b) > score(a) ? b : a));
-    used.push(best.look);
+    const own = looks(color);
+    // A difference of ENOUGH is seen at once; more of it is worth no change of the color.
+    const score = (one) => 5 * Math.min(ENOUGH, ...used.map((other) => apart(one, other))) - far(one.whole, own.whole);
+    const best = [own, ...options].reduce((a, b) => (score(b) > score(a) ? b : a));
+    used.push(best);
     found.set(id, best.color);
   }
   return found;
