@@ -158,10 +158,12 @@ class Session:
         from powderdsl.simulation.tracing.text import trace_text
         from powderdsl.simulation.tracing.trace import trace
 
-        reporter = Reporter()
-        rules = set_params(self._rules(), params, reporter)
-        reporter.raise_if_errors()
-        sim = ArraySimulator(rules, memo=self.memo) if params else self._simulator()
+        reporter, sim = Reporter(), self._simulator()
+        usual = {one.name: float(one.default) for one in self._rules().params}
+        if changed := {name: value for name, value in params.items() if value != usual.get(name)}:
+            rules = set_params(self._rules(), changed, reporter)
+            reporter.raise_if_errors()
+            sim = ArraySimulator(rules, memo=self.memo)
         return trace_text(trace(self._world(world, sim), int(row), int(column), 1)).replace(
             f"{self.folder}/", ""
         )

@@ -142,3 +142,14 @@ def test_strangers_reach_nothing(seen: dict[str, Any]) -> None:
 def test_layout(seen: dict[str, Any]) -> None:
     assert seen["gallery"] >= 12
     assert not seen["tooWide"]
+
+
+@pytest.mark.campaign
+def test_damaged_packs_links_and_files_give_messages(address: str, tmp_path: Path) -> None:
+    found = json.loads(succeed(str(shutil.which("node")), HERE / "hostile.mjs", address, "200", cwd=tmp_path))
+    assert (found["packs"], found["links"], found["files"]) == (100, 50, 50)
+    assert found["refused"] > 50
+    assert (found["silent"], found["dead"], found["problems"]) == ([], [], [])
+    assert found["compiles"]
+    assert found["stopped"] == ["stopped after 10 seconds", True]
+    assert found["memory"][-1] <= 2 * found["memory"][1]

@@ -109,6 +109,15 @@ function fillWorlds(chosen) {
   fill($("world"), [...names, ["random", "random shapes"], ["empty", "empty"]], chosen ?? "random");
 }
 
+/** Opens other rules, unless the user wants to keep edits. */
+export function chooseRules(key) {
+  if (app.edits?.edited && !confirm("Open other rules, and lose your edits of these?")) {
+    $("rules").value = app.rules.key;
+    return;
+  }
+  openRules(key, { size: $("size").value }).catch(failed);
+}
+
 /** Worlds of tasks, which come after the first world runs. @param {Record<string, any[]>} found  by rules */
 async function addWorlds(found) {
   for (const [key, worlds] of Object.entries(found)) {
@@ -545,7 +554,7 @@ function attach() {
   $("seed").onchange = startWorld;
   $("world").onchange = startWorld;
   $("size").onchange = resize;
-  $("rules").onchange = () => openRules($("rules").value, { size: $("size").value }).catch(failed);
+  $("rules").onchange = () => chooseRules($("rules").value);
   $("tint").onchange = refresh;
   $("blind").onchange = () => {
     newPainter();

@@ -106,8 +106,8 @@ app.explain = async ([row, column]) => {
       return;
     }
     const { parameters, values } = app.engine;
-    const other = Object.fromEntries(parameters.flatMap((one, i) => (values[i] === one.value ? [] : [[one.name, values[i]]])));
-    const text = await rules.compiler.call("trace", writeWorld(before), row, column, other);
+    const set = Object.fromEntries(parameters.map((one, i) => [one.name, values[i]]));
+    const text = await rules.compiler.call("trace", writeWorld(before), row, column, set);
     const head = changed ? `It last changed in step ${step}.` : `It has not changed lately; this is step ${step}.`;
     why.replaceChildren(make("p", {}, head), make("pre", { class: "report" }, text));
   } catch (error) {

@@ -33,7 +33,7 @@ export async function link() {
     key: app.rules.key,
     files: changedFiles(),
     off: [...rules.off],
-    parameters: changedParameters(),
+    parameters: Object.fromEntries(app.engine.parameters.map((one, i) => [one.name, app.engine.values[i]])),
     world: app.engine.snapshot(),
   };
   return location.href.split("#")[0] + (await toFragment(shared));

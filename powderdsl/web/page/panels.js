@@ -1,6 +1,6 @@
 // Parameters as sliders, and the gallery of live pictures.
 
-import { app, make, openRules, shippedModule, sheetOf, size } from "./app.js";
+import { app, chooseRules, make, shippedModule, sheetOf } from "./app.js";
 import { Engine } from "./engine.js";
 import { Painter } from "./view.js";
 import { readWorld } from "./worlds.js";
@@ -43,7 +43,7 @@ async function showGallery() {
     cards = [];
     const shown = app.catalog.rules.map((one) => {
       const canvas = make("canvas", { width: 64, height: 64 });
-      const open = () => openRules(one.key, { size: size().join("x") });
+      const open = () => chooseRules(one.key);
       const attributes = { type: "button", class: "card", onclick: open };
       cards.push({ key: one.key, sizes: one.sizes, canvas, engine: null, painter: null });
       return make("button", attributes, canvas, make("strong", {}, one.key), make("small", {}, one.about));

@@ -1,0 +1,100 @@
+// Damaged packs, links and files: each gives a message, and the page keeps working: node hostile.mjs ADDRESS [COUNT]
+import { launch, openPage } from "./browser.mjs";
+
+const [address, number = "200"] = process.argv.slice(2);
+const count = Number(number);
+const browser = await launch();
+const { page, problems } = await openPage(browser, address);
+await page.waitForFunction(() => powderdsl.compilerReady && powderdsl.linkOpened, null, { timeout: 60000 });
+
+let state = 12345;
+const below = (n) => {
+  state = (Math.imul(state, 1664525) + 1013904223) >>> 0;
+  return Math.floor((state / 2 ** 32) * n);
+};
+const PIECES = ["\t", ": ", "- ", "[", "}", "'", '"', "&a", "*a", "!!x", "\u0000", "\ud800", "->", " if ", "9".repeat(40), "<b>", "?", "\n", "pack: x\n", "%"];
+
+/** A text with one to four damages: a piece cut out, doubled, or put in. */
+function damaged(text, pieces = PIECES) {
+  let found = text;
+  for (let n = 1 + below(4); n > 0; n--) {
+    const at = below(found.length + 1);
+    const length = 1 + below(12);
+    const kind = below(3);
+    const middle = kind === 0 ? "" : kind === 1 ? found.slice(at, at + 2 * length) : pieces[below(pieces.length)];
+    found = found.slice(0, at) + middle + found.slice(kind === 2 ? at : at + length);
+  }
+  return found;
+}
+
+const alive = () =>
+  page.evaluate(async () => {
+    const before = powderdsl.frames;
+    await new Promise((resolve) => setTimeout(resolve, 120));
+    return powderdsl.frames > before;
+  });
+const seen = { packs: 0, refused: 0, links: 0, files: 0, silent: [], dead: [], memory: [] };
+
+const text = await page.evaluate(() => powderdsl.edits.files["fire.yaml"]);
+for (let n = 0; n < count / 2; n++) {
+  const broken = damaged(text);
+  const found = await page.evaluate(async (pack) => {
+    const { edits } = powderdsl;
+    try {
+      const { ok, diagnostics } = await edits.compiler.check({ ...edits.files, "fire.yaml": pack }, []);
+      return { ok, messages: diagnostics.filter((one) => one.severity === "error" && one.text).length };
+    } catch (error) {
+      return { ok: false, messages: String(error.message).length };
+    }
+  }, broken);
+  seen.packs++;
+  if (!found.ok) seen.refused++;
+  if (!found.ok && !found.messages) seen.silent.push(broken);
+  if (n % 10 === 0 && !(await alive())) seen.dead.push(broken);
+  if (n % 10 === 0) seen.memory.push(await page.evaluate(() => Math.round(performance.memory.usedJSHeapSize / 2 ** 20)));
+}
+
+await page.locator("#share").click();
+await page.waitForFunction(() => location.hash.length > 10);
+const link = await page.evaluate(() => location.hash);
+const LETTERS = ["A", "_", "-", "=", "%", "é", "AAAA", "<"];
+for (let n = 0; n < count / 4; n++) {
+  const broken = `#w=${damaged(link.slice(3), LETTERS)}`;
+  const said = await page.evaluate(async (fragment) => {
+    const status = document.getElementById("status");
+    status.textContent = "";
+    location.hash = fragment;
+    for (let i = 0; i < 100 && !/damaged|version|link/.test(status.textContent); i++)
+      await new Promise((resolve) => setTimeout(resolve, 30));
+    return status.textContent;
+  }, broken);
+  seen.links++;
+  if (!said) seen.silent.push(broken);
+  if (n % 10 === 0 && !(await alive())) seen.dead.push(broken);
+}
+
+for (let n = 0; n < count / 4; n++) {
+  const size = below(300);
+  const buffer = Buffer.from(Array.from({ length: size }, () => below(256)));
+  const head = n % 2 ? Buffer.from("PK\u0003\u0004") : Buffer.alloc(0);
+  await page.evaluate(() => (document.getElementById("status").textContent = ""));
+  await page.locator("#file").setInputFiles({ name: "world.npz", mimeType: "", buffer: Buffer.concat([head, buffer]) });
+  await page.waitForFunction(() => document.getElementById("status").textContent, null, { timeout: 30000 });
+  seen.files++;
+}
+if (!(await alive())) seen.dead.push("files");
+seen.compiles = await page.evaluate(async () => {
+  const { edits } = powderdsl;
+  return (await edits.compiler.check(edits.files, [])).ok;
+});
+// A compilation that runs away is stopped with its worker, and another one starts.
+seen.stopped = await page.evaluate(async () => {
+  const { edits } = powderdsl;
+  const waiting = edits.compiler.call("invariants").catch((error) => error.message);
+  edits.compiler.restart("stopped after 10 seconds");
+  const said = await waiting;
+  return [said, (await edits.compiler.check(edits.files, [])).ok];
+});
+seen.problems = problems;
+console.log(JSON.stringify(seen));
+await browser.close();
