@@ -145,6 +145,8 @@ await page.waitForFunction(() => powderdsl?.linkOpened && powderdsl.compilerRead
 await page.waitForFunction(() => document.getElementById("problems").textContent.includes("No mistakes"));
 await page.waitForFunction(() => powderdsl.engine.clock()[2] > 60n);
 await page.locator("#run").click();
+await page.keyboard.press("w");
+await drag(page, [0.2, 0.3], [0.8, 0.35]); // moving cells are tinted
 await saved(page, "save-world", "world.npz");
 for (let i = 0; i < 20; i++) await page.locator("#step").click();
 seen.continued = await hashes(page, "wind.velocity");

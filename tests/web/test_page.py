@@ -116,6 +116,8 @@ def test_pictures(seen: dict[str, Any], scripts: Path) -> None:
         "later.png",
         cwd=folder,
     )
+    with np.load(folder / "later.npz") as later:
+        assert (np.abs(later["slot_velocity"]) > 0.1).sum() > 100
     with Image.open(folder / "world.png") as picture, Image.open(folder / "later.png") as wanted:
         pixels = np.asarray(picture.convert("RGB")).astype(int)
         assert np.array_equal(pixels, np.asarray(wanted.convert("RGB")))

@@ -293,14 +293,17 @@ function showCell([row, column]) {
   }
   const at = row * engine.columns + column;
   const words = [`(${row}, ${column})`, engine.byId.get(engine.ids()[at])?.name ?? ""];
+  const all = [...words];
   engine.fields.forEach((field, number) => {
     const values = engine.field(number);
-    const found = [];
-    for (let c = 0; c < field.components; c++) found.push(shown(field, values[c * engine.cells + at]));
-    if (field.kind !== "flag" || values[at]) words.push(`${field.name} ${found.join(", ")}`);
+    const found = Array.from({ length: field.components }, (_, c) => values[c * engine.cells + at]);
+    const word = `${field.name} ${found.map((value) => shown(field, value)).join(", ")}`;
+    all.push(word);
+    // The line has room for what is unusual; the tooltip has everything.
+    if (found.some((value) => value !== 0 && !(field.kind === "element" && value === engine.ground))) words.push(word);
   });
   $("hover").textContent = words.join("  ·  ");
-  $("hover").title = words.join("\n");
+  $("hover").title = all.join("\n");
 }
 
 const DIRECTIONS = ["up", "up right", "right", "down right", "down", "down left", "left", "up left"];

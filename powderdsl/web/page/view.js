@@ -21,6 +21,8 @@ export class Painter {
     this.engine = engine;
     this.image = new ImageData(engine.columns, engine.rows);
     this.pixels = new Int32Array(this.image.data.buffer);
+    /** The channels; unlike those of an ImageData, they are rounded down. */
+    this.bytes = new Uint8Array(this.image.data.buffer);
     this.table = new Int32Array(256);
     this.ramps = [];
     for (const { id, color, ramp } of engine.elements) {
@@ -63,21 +65,18 @@ export class Painter {
   }
 
   _tint(values) {
-    const { pixels, engine } = this;
-    const { cells } = engine;
-    const data = this.image.data;
+    const { bytes } = this;
+    const { cells } = this.engine;
     for (let i = 0; i < cells; i++) {
       const [down, right] = [values[i], values[cells + i]];
       if (down === 0 && right === 0) continue;
       const speed = fround(Math.sqrt(down * down + right * right));
       const weight = Math.min(fround(speed / 2), MAX_TINT);
-      if (weight < 0.001) continue;
       for (let c = 0; c < 3; c++) {
-        const old = data[4 * i + c];
-        data[4 * i + c] = fround(fround(old + fround((MOTION[c] - old) * weight)) + 0.5);
+        const old = bytes[4 * i + c];
+        bytes[4 * i + c] = fround(fround(old + fround((MOTION[c] - old) * weight)) + 0.5);
       }
     }
-    return pixels;
   }
 }
 
