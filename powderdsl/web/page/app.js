@@ -96,7 +96,12 @@ export async function openRules(key, { world, size: wanted = "64x64", run = true
   $("rules").value = key;
   fill($("size"), listed.sizes.map((one) => [one.join("x"), one.join("×")]), shape);
   fillWorlds(world ?? sheet.shown);
-  use(await Engine.start(module));
+  const engine = await Engine.start(module);
+  // An added pack is opened to paint with its elements.
+  const own = engine.elements.find((one) => one.qualified.startsWith(`${key}.`));
+  if (own) app.element = own.qualified;
+  app.keepParameters = false;
+  use(engine);
   startWorld();
   setRunning(run);
   say(sheet.about || sheet.title);
