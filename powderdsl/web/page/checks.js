@@ -1,11 +1,13 @@
 // What the compiler knows about the rules: the ledger, invariants, tests; and why a cell changed.
 
-import { app, make, say, setRunning, showPanel } from "./app.js";
+import { $, make, say } from "./dom.js";
 import { Engine } from "./engine.js";
 import { rules } from "./rules.js";
+import { setRunning } from "./stage.js";
+import { app } from "./state.js";
+import { showPanel } from "./tabs.js";
 import { writeWorld } from "./worlds.js";
 
-const $ = (id) => document.getElementById(id);
 const packOf = (file) => file.replace(/\.ya?ml$/, "");
 
 const why = make("div");

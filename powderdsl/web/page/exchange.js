@@ -1,13 +1,15 @@
 // Files and links: what leaves the page, and what comes back in.
 
-import { app, make, openRules, openWorld, refresh, say } from "./app.js";
+import { $, say } from "./dom.js";
 import { Recorder, download, png } from "./media.js";
-import { addFile, applyRules, editor, openFiles, rules } from "./rules.js";
+import { openRules, openWorld } from "./opening.js";
+import { addFile, applyRules, openFiles, rules } from "./rules.js";
 import { fromFragment, toFragment } from "./share.js";
+import { refresh } from "./stage.js";
+import { app } from "./state.js";
 import { readWorld, text, writeWorld } from "./worlds.js";
 
 const MAX_FILE = 32 << 20;
-const $ = (id) => document.getElementById(id);
 const recorder = new Recorder();
 app.drawn = (image) => recorder.add(image);
 app.recorder = recorder;

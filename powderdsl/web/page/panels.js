@@ -1,11 +1,12 @@
 // Parameters as sliders, and the gallery of live pictures.
 
-import { app, chooseRules, make, shippedModule, sheetOf } from "./app.js";
+import { $, make } from "./dom.js";
 import { Engine } from "./engine.js";
+import { chooseRules, sheetOf, shippedModule } from "./opening.js";
+import { app } from "./state.js";
 import { Painter } from "./view.js";
 import { readWorld } from "./worlds.js";
 
-const $ = (id) => document.getElementById(id);
 const LIVE_EVERY = 100; // ms between two steps of a picture
 
 function showParameters(engine) {

@@ -1,12 +1,13 @@
 // The rules that people edit: files as tabs, checks while they type, and changes that the running world takes over.
 
-import { app, make, refresh, say, use } from "./app.js";
 import { Compiler } from "./compiler.js";
+import { $, make, say } from "./dom.js";
 import { Editor } from "./editor.js";
 import { Engine } from "./engine.js";
+import { refresh, use } from "./stage.js";
+import { app } from "./state.js";
 
 const PAUSE = 120; // ms without a key before a check
-const $ = (id) => document.getElementById(id);
 const packOf = (file) => file.replace(/\.ya?ml$/, "");
 
 export const rules = (app.edits = {
