@@ -52,7 +52,7 @@ class Session:
         packs: list[str] = []
         try:
             packs = self._packs(names)
-            ruleset, remarks = load_with_diagnostics(*names, memo=self.memo)
+            ruleset, remarks = load_with_diagnostics(*names)
         except CompileError as error:
             return {"ok": False, "diagnostics": self._data(error.diagnostics), "packs": packs}
         self.ruleset = ruleset
@@ -79,14 +79,14 @@ class Session:
         tops = [str(self.folder / name) for name in rulesets if Path(name).stem not in based]
         known: set[str] = set()
         with suppress(CompileError):  # too many mistakes: reported when the rules are loaded
-            known = {pack.source.name for pack in read(tops, Reporter(), self.memo)[0]} if tops else known
+            known = {pack.source.name for pack in read(tops, Reporter())[0]} if tops else known
         beside = [str(self.folder / name) for name in files if name not in rulesets]
         names = tops + [name for name in beside if name not in known]
         return [*names[:-1], "-".join([names[-1], *off])]
 
     def _packs(self, names: list[str]) -> list[str]:
         """The files of packs that take part."""
-        packs, _ = read(names, Reporter(), self.memo)
+        packs, _ = read(names, Reporter())
         return [Path(pack.source.name).name for pack in packs]
 
     def _data(self, found: tuple[Diagnostic, ...]) -> list[dict[str, Any]]:
