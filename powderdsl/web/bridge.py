@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import base64
+import io
 import json
 import re
 import tempfile
+import zipfile
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from powderdsl.arrays import np
-from powderdsl.compiler import load_with_diagnostics, read
+from powderdsl.compiler import load_with_diagnostics, read, shipped
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter
 from powderdsl.diagnostics.render import diagnostic_data, render_text
 from powderdsl.model.builtins import FUNCTIONS, RESERVED
@@ -37,6 +39,15 @@ class BadRequest(ValueError):
     """The page, or a link that it was given, asks for something that the session cannot do."""
 
 
+@dataclass(frozen=True)
+class Named:
+    """Rule files by name, those of them that the rules are named by, and packs that are left out."""
+
+    files: Mapping[str, str]
+    words: list[str]
+    off: list[str]
+
+
 class Session:
     """Rule files in a folder of their own, and the last rules that had no mistakes."""
 
@@ -44,22 +55,26 @@ class Session:
         self.folder = folder
         self.memo = Memo()
         self.ruleset: Ruleset | None = None
+        self.good = Named({}, [], [])
+        """What was read for these rules."""
         self._made: Any = None
 
     def check(self, files: Mapping[str, str], off: list[str]) -> dict[str, Any]:
         """Load the files without the packs in `off`. Rules with mistakes leave the ones before in place."""
-        names = self._write(files, off)
+        named = self._write(files, off)
+        names = [str(self.folder / word) for word in named.words]
+        names[-1] = "-".join([names[-1], *off])
         packs: list[str] = []
         try:
             packs = self._packs(names)
             ruleset, remarks = load_with_diagnostics(*names)
         except CompileError as error:
             return {"ok": False, "diagnostics": self._data(error.diagnostics), "packs": packs}
-        self.ruleset = ruleset
+        self.ruleset, self.good = ruleset, named
         return {"ok": True, "diagnostics": self._data(remarks), "packs": packs, "words": _words(ruleset)}
 
-    def _write(self, files: Mapping[str, str], off: list[str]) -> list[str]:
-        """Write the files, and name them as `load` takes them: rulesets, packs beside them, packs left out."""
+    def _write(self, files: Mapping[str, str], off: list[str]) -> Named:
+        """Write the files, and name them as `load` takes them: rulesets, and packs beside them."""
         if not 0 < len(files) <= MAX_FILES or sum(map(len, files.values())) > MAX_TEXT:
             raise BadRequest(f"1 to {MAX_FILES} files with at most {MAX_TEXT:,} characters together")
         for name in files:
@@ -72,17 +87,18 @@ class Session:
                 path.unlink()
         for name, text in files.items():
             (self.folder / name).write_text(text, encoding="utf-8", errors="replace", newline="")
-        rulesets = [name for name, text in files.items() if re.search(r"^ruleset:", text, re.MULTILINE)]
+        rulesets = [name for name, text in files.items() if _is_ruleset(text)]
         based = {
             base for name in rulesets for base in re.findall(r"^extends: *(\w+)", files[name], re.MULTILINE)
         }
-        tops = [str(self.folder / name) for name in rulesets if Path(name).stem not in based]
+        tops = [name for name in rulesets if Path(name).stem not in based] or rulesets
         known: set[str] = set()
         with suppress(CompileError):  # too many mistakes: reported when the rules are loaded
-            known = {pack.source.name for pack in read(tops, Reporter())[0]} if tops else known
-        beside = [str(self.folder / name) for name in files if name not in rulesets]
-        names = tops + [name for name in beside if name not in known]
-        return [*names[:-1], "-".join([names[-1], *off])]
+            packs = read([str(self.folder / name) for name in tops], Reporter())[0] if tops else []
+            known = {Path(pack.source.name).name for pack in packs}
+        return Named(
+            dict(files), tops + [name for name in files if name not in known.union(rulesets)], list(off)
+        )
 
     def _packs(self, names: list[str]) -> list[str]:
         """The files of packs that take part."""
@@ -101,6 +117,33 @@ class Session:
         if self.ruleset is None:
             raise BadRequest("no rules without mistakes have been loaded")
         return self.ruleset
+
+    def command(self) -> dict[str, Any]:
+        """What the command line needs for the last good rules: `rules` as `run` takes them, and `files` to save.
+
+        Files that are not shipped as they are have to be saved; with a member of a ruleset, which is looked for beside
+        it, the ruleset too.
+        """
+        words, off = self.good.words, self.good.off
+        own = {name for name, text in self.good.files.items() if not _is_shipped(name, text)}
+        if own.difference(words):
+            own.update(name for name, text in self.good.files.items() if _is_ruleset(text))
+        named = [word if word in own else Path(word).stem for word in words]
+        return {
+            "rules": "-".join(["+".join(named), *off]),
+            "files": [name for name in self.good.files if name in own],
+        }
+
+    def save_rules(self) -> bytes:
+        """The files that `command` names: one as it is, several in a zip."""
+        files = self.command()["files"]
+        if len(files) == 1:
+            return self.good.files[files[0]].encode()
+        out = io.BytesIO()
+        with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name in files:
+                archive.writestr(name, self.good.files[name])
+        return out.getvalue()
 
     def ledger(self) -> str:
         """What rules create, destroy and conserve, as `check --ledger` prints it."""
@@ -230,6 +273,15 @@ class Session:
         )
 
 
+def _is_ruleset(text: str) -> bool:
+    return re.search(r"^ruleset:", text, re.MULTILINE) is not None
+
+
+def _is_shipped(name: str, text: str) -> bool:
+    path = shipped("rules") / name
+    return path.is_file() and path.read_text(encoding="utf-8") == text
+
+
 def _words(ruleset: Ruleset) -> dict[str, list[str]]:
     """What the editor completes, by kind."""
     return {
@@ -257,6 +309,8 @@ def session() -> Session:
 CALLS: Mapping[str, Callable[..., Any]] = {
     "check": Session.check,
     "compile": Session.compile,
+    "command": Session.command,
+    "save_rules": Session.save_rules,
     "ledger": Session.ledger,
     "invariants": Session.invariants,
     "tests": Session.tests,

@@ -182,6 +182,7 @@ class Site:
                 if path.is_file():
                     found[below + path.relative_to(folder).as_posix()] = path.read_bytes
         found["index.html"], found["python.zip"] = index_page, python_archive
+        found["licenses.txt"] = licenses
         found |= shipped_files()
         if self.first is not None and not self._is_shipped:
             own = [
@@ -282,6 +283,19 @@ def code_version() -> str:
     for path in sorted({*HERE.parent.rglob("*.py"), *HERE.parent.rglob("*.lark")}) + sorted(texts):
         found.update(path.read_bytes())
     return found.hexdigest()[:16]
+
+
+def licenses() -> bytes:
+    """The licenses of powderdsl, of the packages beside it in Pyodide, and of the parts from npm."""
+    found = []
+    for library in ("powderdsl", *LIBRARIES):
+        about = metadata.distribution(library)
+        files = [file for file in about.files or () if "licenses" in file.parts]
+        texts = [Path(str(file.locate())).read_text(encoding="utf-8") for file in files]
+        found.append("\n\n".join([f"{about.name} {about.version}", *texts]))
+    for path in sorted((PARTS / "licenses").glob("*.txt")):
+        found.append(f"{path.stem}\n\n{path.read_text(encoding='utf-8')}")
+    return f"\n\n{'-' * 80}\n\n".join(found).encode()
 
 
 ABSENT = (

@@ -59,12 +59,17 @@ async function drag(page, from, to) {
   await page.mouse.up();
 }
 
-async function saved(page, id, name) {
+async function downloaded(page, name, action) {
   const waiting = page.waitForEvent("download");
-  await page.locator("#save summary").click();
-  await page.locator(`#${id}`).click();
+  await action();
   await (await waiting).saveAs(join(folder, name));
 }
+
+const saved = (page, id, name) =>
+  downloaded(page, name, async () => {
+    await page.locator("#save summary").click();
+    await page.locator(`#${id}`).click();
+  });
 
 const seen = {};
 const { page, problems } = await visit(address);
@@ -128,11 +133,23 @@ await until(page, "applyTook");
 seen.own = await page.locator("#elements button", { hasText: "mine" }).count();
 await page.locator("#run").click();
 
+// Save the world and its rules: the status line says how they continue.
+await saved(page, "save-world", "own/world.npz");
+await page.locator("#status code").waitFor();
+seen.command = await page.locator("#status code").textContent();
+await downloaded(page, "own/rules.zip", () => page.locator("#status button", { hasText: "rules.zip" }).click());
+await page.locator("#save summary").click();
+await page.waitForFunction(() => document.getElementById("save-rules").textContent.includes("(.zip)"));
+seen.entries = await page.locator("#save div").innerText();
+await page.keyboard.press("Escape");
+
 // A link opens the same world, with the same rules.
 await page.locator("#share").click();
 await page.waitForFunction(() => location.hash.length > 10);
 seen.link = page.url().length;
 const here = await hashes(page, "wind.velocity");
+for (let i = 0; i < 5; i++) await page.locator("#step").click();
+seen.ownContinued = await hashes(page, "wind.velocity");
 const second = await visit(page.url());
 seen.sameFromLink = JSON.stringify(await hashes(second.page, "wind.velocity")) === JSON.stringify(here);
 seen.ownFromLink = await second.page.locator("#elements button", { hasText: "mine" }).count();
@@ -152,6 +169,7 @@ for (let i = 0; i < 20; i++) await page.locator("#step").click();
 seen.continued = await hashes(page, "wind.velocity");
 await saved(page, "save-png", "world.png");
 await saved(page, "save-gif", "world.gif");
+await saved(page, "save-webm", "world.webm");
 
 // Why a cell changed, and what is known about the rules.
 await page.keyboard.press("t");

@@ -41,5 +41,20 @@ for (const [name, file] of [["pyodide", null], ...Object.entries(EDITOR)]) {
   const license = ["LICENSE", "LICENSE.md"].map((one) => join(folder, one)).find((one) => existsSync(one));
   if (license) cpSync(license, join(parts, "licenses", `${flat}.txt`));
 }
+
+// The packages of Pyodide come without the texts of their licenses.
+const { version } = JSON.parse(readFileSync(join(modules, "pyodide", "package.json"), "utf8"));
+const { python } = JSON.parse(readFileSync(join(modules, "pyodide", "pyodide-lock.json"), "utf8")).info;
+const NOTES = {
+  pyodide: `Pyodide ${version}, Copyright Pyodide contributors and Mozilla. Unchanged files of its npm package.
+Its source is at https://github.com/pyodide/pyodide/tree/${version}, under this license:`,
+  python: `Python ${python}, which is a part of Pyodide: its interpreter and its standard library.
+What else it contains is listed, with licenses, at https://docs.python.org/${python.split(".", 2).join(".")}/license.html.`,
+};
+for (const [name, note] of Object.entries(NOTES)) {
+  const license = readFileSync(join(here, "licenses", `${name}.txt`), "utf8");
+  writeFileSync(join(parts, "licenses", `${name}.txt`), `${note}\n\n${license}`);
+}
+versions.splice(1, 0, `python ${python}, PSF-2.0`);
 for (const file of PYODIDE) cpSync(join(modules, "pyodide", file), join(parts, "pyodide", file));
 writeFileSync(join(parts, "licenses", "README.txt"), `${versions.join("\n")}\n`);

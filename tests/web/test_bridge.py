@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import base64
+import io
 import json
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +72,61 @@ def test_packs_are_left_out(session: bridge.Session) -> None:
     assert session.ruleset is not None
     assert session.ruleset.packs == powderdsl.load("powderworld-acid-wind").packs
     assert not call("check", files("powderworld"), ["core"])["result"]["ok"]
+
+
+MINE = 'pack: mine\nneeds: core\nelements:\n  mine: {density: 4, gravity: yes, color: "#E0559A"}\n'
+
+EDITS: list[tuple[tuple[str, ...], dict[str, str], list[str], str, list[str]]] = [
+    (("powderworld",), {}, [], "powderworld", []),
+    (("life",), {}, [], "life", []),
+    (("powderworld",), {}, ["acid"], "powderworld-acid", []),
+    (("powderworld",), {"mine.yaml": MINE}, ["acid"], "powderworld+mine.yaml-acid", ["mine.yaml"]),
+    (
+        ("powderworld", "docs/examples/salt.yaml"),
+        {"sand.yaml": "# edited\n", "mine.yaml": MINE},
+        [],
+        "powderworld.yaml+salt.yaml+mine.yaml",
+        ["powderworld.yaml", "sand.yaml", "salt.yaml", "mine.yaml"],
+    ),
+    (("core", "sand"), {"sand.yaml": "# edited\n"}, [], "core+sand.yaml", ["sand.yaml"]),
+]
+
+
+@pytest.mark.parametrize(("names", "edits", "off", "rules", "saved"), EDITS)
+def test_the_command_line_reads_the_same_rules(
+    session: bridge.Session,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    names: tuple[str, ...],
+    edits: dict[str, str],
+    off: list[str],
+    rules: str,
+    saved: list[str],
+) -> None:
+    given = files(*names)
+    given |= {name: text + given.get(name, "") for name, text in edits.items()}
+    assert call("check", given, off)["result"]["ok"]
+    good = session.ruleset
+    assert good is not None
+    call("check", given | {"core.yaml": "["}, off)  # the last good rules are saved
+    found = call("command")["result"]
+    assert (found["rules"], sorted(found["files"])) == (rules, sorted(saved))
+    monkeypatch.chdir(tmp_path)
+    data = call("save_rules")
+    if len(saved) == 1:
+        Path(saved[0]).write_bytes(data)
+    else:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            assert sorted(archive.namelist()) == sorted(saved)
+            archive.extractall()
+    wanted = powderdsl.load(found["rules"])
+    assert (wanted.name, wanted.palette, wanted.passes) == (good.name, good.palette, good.passes)
+
+
+def test_rulesets_that_extend_each_other_are_a_mistake(session: bridge.Session) -> None:
+    circle = {"a.yaml": "ruleset: a\nextends: b\n", "b.yaml": "ruleset: b\nextends: a\n"}
+    found = call("check", circle, [])["result"]
+    assert {one["code"] for one in found["diagnostics"]} == {"PD314"}
 
 
 def test_worlds_are_saved_and_opened(session: bridge.Session, tmp_path: Path) -> None:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import imageio_ffmpeg
 import numpy as np
 import pytest
 from PIL import Image
@@ -62,6 +64,16 @@ def seen(address: str, tmp_path_factory: pytest.TempPathFactory) -> dict[str, An
     return found | {"folder": folder}
 
 
+def hashes(path: Path) -> dict[str, int]:
+    """What `hashes` of page.mjs finds, of a saved world."""
+    with np.load(path) as world:
+        return {
+            "ids": fnv(world["slot_element"].tobytes()),
+            "field": fnv(world["slot_velocity"].tobytes()),
+            "step": int(world["step"][0]),
+        }
+
+
 def test_painted_sand_falls_and_edits_can_be_undone(seen: dict[str, Any]) -> None:
     assert seen["painted"] > 60
     assert seen["lyingBefore"] == 0 < seen["lyingAfter"]
@@ -92,13 +104,21 @@ def test_a_downloaded_world_continues_on_the_command_line(seen: dict[str, Any], 
     folder: Path = seen["folder"]
     arguments = ("powderworld", "--world", "world.npz", "--steps", "20", "--out", "later.npz")
     succeed(scripts / "powderdsl", "run", *arguments, cwd=folder)
-    with np.load(folder / "later.npz") as later:
-        found = {
-            "ids": fnv(later["slot_element"].tobytes()),
-            "field": fnv(later["slot_velocity"].tobytes()),
-            "step": int(later["step"][0]),
-        }
-    assert found == seen["continued"]
+    assert hashes(folder / "later.npz") == seen["continued"]
+
+
+def test_a_world_of_edited_rules_continues_as_the_status_line_says(
+    seen: dict[str, Any], scripts: Path
+) -> None:
+    folder: Path = seen["folder"] / "own"
+    assert seen["command"] == "powderdsl run powderworld.yaml+mine.yaml --world world.npz"
+    with zipfile.ZipFile(folder / "rules.zip") as archive:
+        assert set(archive.namelist()) == {"powderworld.yaml", "sand.yaml", "mine.yaml"}
+        archive.extractall(folder)
+    program, *arguments = seen["command"].split()
+    succeed(scripts / program, *arguments, "--steps", "5", "--out", "later.npz", cwd=folder)
+    assert hashes(folder / "later.npz") == seen["ownContinued"]
+    assert "All 3 edited rule files (.zip)" in seen["entries"]
 
 
 def test_pictures(seen: dict[str, Any], scripts: Path) -> None:
@@ -127,6 +147,14 @@ def test_pictures(seen: dict[str, Any], scripts: Path) -> None:
         film.seek(film.n_frames - 1)  # type: ignore[attr-defined]
         last = np.asarray(film.convert("RGB")).astype(int)
     assert np.abs(last - pixels[::2, ::2]).max() <= 24  # 15 bits a pixel, and 256 colors
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(folder / "world.webm")]
+    raw = subprocess.run(
+        [*command, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"], capture_output=True, check=True
+    )
+    video = np.frombuffer(raw.stdout, np.uint8).reshape(-1, 512, 512, 3)
+    assert len(video) == film.n_frames  # type: ignore[attr-defined]
+    assert f"Duration: 00:00:{len(video) / 20:05.2f}".encode() in raw.stderr
+    assert np.abs(video[-1].astype(int) - pixels).mean() < 6
 
 
 def test_reports(seen: dict[str, Any]) -> None:

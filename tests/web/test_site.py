@@ -169,6 +169,17 @@ def test_the_archive_for_pyodide_is_the_compiler() -> None:
     assert site_module.python_archive() == site_module.python_archive.__wrapped__()
 
 
+def test_the_licenses_of_all_parts_are_there(site: Site) -> None:
+    text = (site.read("licenses.txt") or b"").decode()
+    for owner in ("The powderdsl authors", "Pallets", "Erez Shinan", "Kirill Simonov"):
+        assert owner in text
+    assert text.count("\n" + "-" * 80 + "\n") == 3 + len(list(site_module.PARTS.glob("licenses/*.txt")))
+    if site_module.PARTS.is_dir():
+        listed = (site_module.PARTS / "licenses" / "README.txt").read_text().splitlines()
+        for name in (line.split()[0].removeprefix("@").replace("/", "-") for line in listed):
+            assert (site_module.PARTS / "licenses" / f"{name}.txt").stat().st_size > 500, name
+
+
 def test_without_its_parts_the_command_says_what_to_do(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

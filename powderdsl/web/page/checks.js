@@ -1,6 +1,6 @@
 // What the compiler knows about the rules: the ledger, invariants, tests; and why a cell changed.
 
-import { $, make, say } from "./dom.js";
+import { $, make, report, say } from "./dom.js";
 import { Engine } from "./engine.js";
 import { rules } from "./rules.js";
 import { setRunning } from "./stage.js";
@@ -29,7 +29,7 @@ const button = (label, action) => {
   return found;
 };
 const showLedger = button("Show the ledger", async () => {
-  ledger.replaceChildren(make("pre", { class: "report" }, await rules.compiler.call("ledger")));
+  ledger.replaceChildren(report(await rules.compiler.call("ledger")));
 });
 const MARKS = { proven: "✓", tried: "✓", tested: "✓", broken: "✗", differs: "≠" };
 const WORDS = { proven: "proven", tried: "holds in all worlds tried", broken: "broken", differs: "differs with added packs" };
@@ -41,7 +41,7 @@ const tryInvariants = button("Check the invariants", async () => {
     ...found.map(({ text, status, note, owner }) => {
       const mark = make("span", { class: status === "broken" ? "bad" : "good" }, `${MARKS[status] ?? "?"} `);
       const head = make("summary", {}, mark, text, make("span", { class: "soft" }, ` (${owner}): ${WORDS[status] ?? status}`));
-      return make("details", { class: "result", open: status === "broken" }, head, make("pre", { class: "report" }, note || "no world breaks it"));
+      return make("details", { class: "result", open: status === "broken" }, head, report(note || "no world breaks it"));
     }),
   );
   if (!found.length) invariants.replaceChildren(make("p", { class: "soft" }, "These rules state no invariants."));
@@ -74,7 +74,7 @@ function picture(lines, legend) {
     }),
   );
   canvas.style.width = `${rows[0].length * 18}px`;
-  return make("div", {}, canvas, make("pre", { class: "report" }, lines.join("\n")));
+  return make("div", {}, canvas, report(lines.join("\n")));
 }
 
 $("checks").replaceChildren(
@@ -111,7 +111,7 @@ app.explain = async ([row, column]) => {
     const set = Object.fromEntries(parameters.map((one, i) => [one.name, values[i]]));
     const text = await rules.compiler.call("trace", writeWorld(before), row, column, set);
     const head = changed ? `It last changed in step ${step}.` : `It has not changed lately; this is step ${step}.`;
-    why.replaceChildren(make("p", {}, head), make("pre", { class: "report" }, text));
+    why.replaceChildren(make("p", {}, head), report(text));
   } catch (error) {
     why.replaceChildren(make("p", { class: "bad" }, String(error.message ?? error)));
   }

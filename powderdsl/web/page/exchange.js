@@ -1,12 +1,13 @@
 // Files and links: what leaves the page, and what comes back in.
 
-import { $, say } from "./dom.js";
-import { Recorder, download, png } from "./media.js";
+import { $, commandLine, failed, make, say } from "./dom.js";
+import { Recorder, download, gif, png } from "./media.js";
 import { openRules, openWorld } from "./opening.js";
 import { addFile, applyRules, openFiles, rules } from "./rules.js";
 import { fromFragment, toFragment } from "./share.js";
 import { refresh } from "./stage.js";
 import { app } from "./state.js";
+import { missing, webm } from "./video.js";
 import { readWorld, text, writeWorld } from "./worlds.js";
 
 const MAX_FILE = 32 << 20;
@@ -85,10 +86,41 @@ export async function openLink(fragment) {
 async function saveWorld() {
   say("Writing the world…");
   const data = await rules.compiler.call("save", writeWorld(app.engine.snapshot()));
+  const { rules: named, files } = await rules.compiler.call("command");
   download(new Blob([data]), "world.npz");
   const settings = Object.entries(changedParameters()).map(([name, value]) => ` --set ${name}=${value}`);
-  const named = rules.edited ? "RULES" : app.rules.title;
-  say(`Continue it with: powderdsl run ${named} --world world.npz${settings.join("")}`);
+  const command = commandLine(`powderdsl run ${named} --world world.npz${settings.join("")}`);
+  if (!files.length) {
+    say("world.npz is saved. This continues it: ", false, command);
+    return;
+  }
+  const button = make("button", { type: "button", class: "small" }, files.length > 1 ? "Save rules.zip" : `Save ${files[0]}`);
+  button.onclick = () => saveRules().catch(failed);
+  const then = files.length > 1 ? " beside it, and unpack that. Then this continues the world: " : " beside it. Then this continues the world: ";
+  say("world.npz is saved. Its rules are not shipped: ", false, button, then, command);
+}
+
+/** Saves what the command line needs beside the shipped rules: one file, or several in a zip. */
+async function saveRules() {
+  const { files } = await rules.compiler.call("command");
+  download(new Blob([await rules.compiler.call("save_rules")]), files.length > 1 ? "rules.zip" : files[0]);
+}
+
+/** Says what the entries of the menu save now. */
+async function showEntries() {
+  $("save-pack").textContent = `Rule file (${rules.shown})`;
+  $("save-rules").hidden = true;
+  if (!rules.edited) return;
+  const { files } = await rules.compiler.call("command");
+  $("save-rules").hidden = files.length === 0 || (files.length === 1 && files[0] === rules.shown);
+  $("save-rules").textContent = files.length === 1 ? `Edited rule file (${files[0]})` : `All ${files.length} edited rule files (.zip)`;
+}
+
+/** Animations take a while: their progress is shown. */
+async function saveFilm(make, name) {
+  const film = await make(recorder, (part) => say(`Writing ${name}: ${Math.round(100 * part)} %`));
+  download(film, name);
+  say(`${name} is saved.`);
 }
 
 async function openFile(file) {
@@ -107,7 +139,6 @@ async function openFile(file) {
   say(`${file.name}: ${world.rows}×${world.columns} cells, step ${world.clock[2]}`);
 }
 
-const failed = (error) => say(String(error.message ?? error), true);
 const on = (id, action) =>
   $(id).addEventListener("click", () => {
     $("save").open = false;
@@ -117,10 +148,14 @@ const on = (id, action) =>
 on("share", share);
 on("save-world", saveWorld);
 on("save-pack", () => download(new Blob([rules.files[rules.shown]], { type: "text/yaml" }), rules.shown));
+on("save-rules", saveRules);
 on("save-png", async () => download(await png($("canvas")), "world.png"));
-on("save-gif", () => {
-  if (recorder.frames.length < 2) throw new Error("Run the world first: there are no frames yet.");
-  download(recorder.gif(), "world.gif");
+on("save-gif", () => saveFilm(gif, "world.gif"));
+on("save-webm", () => saveFilm(webm, "world.webm"));
+$("save").addEventListener("toggle", () => $("save").open && showEntries().catch(failed));
+missing().then((reason) => {
+  $("save-webm").disabled = $("no-video").textContent = reason;
+  $("no-video").hidden = !reason;
 });
 on("open", () => $("file").click());
 $("file").onchange = () => {

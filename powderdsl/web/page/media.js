@@ -1,4 +1,4 @@
-// Pictures and animations of the world: PNG by the browser, GIF written here.
+// Pictures and animations of the world: PNG by the browser, GIF written here, videos in video.js.
 
 const MOST_FRAMES = 120;
 const BUDGET = 32 << 20; // bytes of frames that are kept
@@ -32,11 +32,29 @@ export class Recorder {
     if (this.frames.length > most) this.frames.shift();
   }
 
-  /** @returns {Blob} an animation of all frames, each pixel of the world as `factor`×`factor` */
-  gif(factor = Math.max(1, Math.floor(256 / Math.max(this.rows, this.columns)))) {
-    return new Blob(gif(this.frames, this.rows, this.columns, factor, EVERY / 10), { type: "image/gif" });
+  /** The frames that are there now; `every` is the ms between them. */
+  kept() {
+    const { rows, columns, frames } = this;
+    if (frames.length < 2) throw new Error("Run the world first: there are no frames yet.");
+    return { rows, columns, frames: [...frames], every: EVERY };
   }
 }
+
+const wide = (five) => (five << 3) | (five >> 2);
+
+/** A frame as a picture. @param {Uint16Array} frame @returns {ImageData} */
+export function picture(frame, rows, columns) {
+  const found = new ImageData(columns, rows);
+  const pixels = new Uint32Array(found.data.buffer);
+  for (let i = 0; i < frame.length; i++) {
+    const color = frame[i];
+    pixels[i] = (255 << 24) | (wide(color & 31) << 16) | (wide((color >> 5) & 31) << 8) | wide(color >> 10);
+  }
+  return found;
+}
+
+/** Lets the page draw a frame of its own. */
+export const pause = () => new Promise((resolve) => setTimeout(resolve));
 
 /** The most frequent colors, at most 256, and a table from each 15-bit color to the nearest of them. */
 function paletteOf(frames) {
@@ -56,11 +74,17 @@ function paletteOf(frames) {
       if (far < best) [best, table[color]] = [far, i];
     });
   }
-  return { colors: palette.map((color) => parts(color).map((c) => (c << 3) | (c >> 2))), table };
+  return { colors: palette.map((color) => parts(color).map(wide)), table };
 }
 
-/** GIF89a: a header, one palette, and the frames, each compressed by LZW. @returns {Uint8Array[]} */
-function gif(frames, rows, columns, factor, delay) {
+/**
+ * GIF89a: a header, one palette, and the frames, each compressed by LZW.
+ * @param {Recorder} recorder @param {(part: number) => void} progress  told from 0 to 1
+ * @returns {Promise<Blob>} an animation of all frames that are kept
+ */
+export async function gif(recorder, progress = () => {}) {
+  const { frames, rows, columns, every } = recorder.kept();
+  const factor = Math.max(1, Math.floor(256 / Math.max(rows, columns)));
   const { colors, table } = paletteOf(frames);
   const [width, height] = [columns * factor, rows * factor];
   const two = (n) => [n & 255, n >> 8];
@@ -73,17 +97,19 @@ function gif(frames, rows, columns, factor, delay) {
     Uint8Array.from([0x21, 0xff, 11, ...ascii("NETSCAPE2.0"), 3, 1, 0, 0, 0]),
   ];
   const pixels = new Uint8Array(width * height);
-  for (const frame of frames) {
+  for (const [i, frame] of frames.entries()) {
     for (let y = 0, to = 0; y < height; y++) {
       const row = Math.floor(y / factor) * columns;
       for (let x = 0; x < width; x++) pixels[to++] = table[frame[row + Math.floor(x / factor)]];
     }
-    found.push(Uint8Array.from([0x21, 0xf9, 4, 0, ...two(delay), 0, 0]));
+    found.push(Uint8Array.from([0x21, 0xf9, 4, 0, ...two(every / 10), 0, 0]));
     found.push(Uint8Array.from([0x2c, 0, 0, 0, 0, ...two(width), ...two(height), 0, 8]));
     found.push(compressed(pixels), Uint8Array.of(0));
+    progress(i / frames.length);
+    await pause();
   }
   found.push(Uint8Array.of(0x3b));
-  return found;
+  return new Blob(found, { type: "image/gif" });
 }
 
 /** LZW as GIF has it, for 8-bit symbols, in blocks of at most 255 bytes, each with its length before it. */
