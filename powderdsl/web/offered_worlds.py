@@ -20,9 +20,6 @@ from powderdsl.worlds.strewn import random_shape, strew
 SIDE = 64
 """Rows and columns of worlds that have no size of their own."""
 
-MANY = 5
-"""Rules with this many elements, all of which change, grow patterns out of noise."""
-
 OWN_SHAPES = 12
 """Shapes of an added pack's own elements."""
 
@@ -41,7 +38,6 @@ def offered_worlds(ruleset: Ruleset, names: Sequence[str]) -> tuple[list[dict[st
         ids = np.array([element.id for element in ruleset.elements], np.uint8)
         noise = ids[np.random.default_rng(0).integers(0, len(ids), (SIDE, SIDE))]
         found.append(_named("noise", "Every cell at random.", ruleset, noise))
-        shown = "noise" if len(ids) >= MANY else shown
     if len(names) > 1:
         found.append(_own(ruleset))
         shown = found[-1]["name"]

@@ -11,8 +11,9 @@ from PIL import Image
 import powderdsl as package
 from powderdsl.analysis.reactions import unchanging_ids
 from powderdsl.cli.start_worlds import start_drawn
-from powderdsl.compiler import shipped_rules
+from powderdsl.compiler import shipped_rules, shipped_tests
 from powderdsl.diagnostics import CompileError
+from powderdsl.worlds.raster import Paint
 from powderdsl.worlds.scene import shipped_scenes
 from powderdsl.worlds.strewn import strew
 from tests.cli.commands import PACK, powderdsl
@@ -182,12 +183,52 @@ def test_worlds_come_from_drawings_pictures_and_scenes():
     ]
 
 
-def test_every_shipped_scene_is_a_start_world():
-    rules = package.load("powderworld")
-    for scene in shipped_scenes():
-        drawn = start_drawn(rules, scene.name, None, 2, None)
-        ids = drawn.ids if drawn else None
-        assert ids.shape == (2, *scene.size)
+def test_shipped_rules_and_scenes_belong_together():
+    """Each shipped scene is a start world of some shipped rules, and all of them have one."""
+    scenes = {scene.name: scene for scene in shipped_scenes()}
+    drawn = set()
+    for name in shipped_tests():
+        rules = package.load(name)
+        names = {element.name for element in rules.elements}
+        own = [one for one in scenes.values() if one.fill in names and _painted(one) <= names]
+        assert own, f"{name} has no scene"
+        for scene in own:
+            assert start_drawn(rules, scene.name, None, 2, None).ids.shape == (2, *scene.size)
+        drawn |= {scene.name for scene in own}
+    assert drawn == set(scenes)
+
+
+def _painted(scene):
+    return {one.element for one in scene.paints if isinstance(one, Paint)}
+
+
+@pytest.mark.parametrize(
+    ("rules", "scene", "steps", "period"),
+    [
+        ("life", "glider-gun", 300, 30),
+        ("wireworld", "clocks-and-gates", 400, 120),
+        ("cyclic", "spirals", 200, 6),
+        ("brians_brain", "spaceships", 0, 64),
+    ],
+)
+def test_designed_automata_repeat(rules, scene, steps, period):
+    """The eater survives, gates do not disturb clocks, spirals turn, ships come back."""
+    sim = package.compile(rules)
+    world = sim.step(sim.world(start_drawn(sim.ruleset, scene, None, 1, None).ids), steps)
+    later = sim.step(world, period)
+    assert np.array_equal(world.ids, later.ids)
+    assert not np.array_equal(world.ids, sim.step(world, period // 2).ids)
+
+
+def test_four_ants_draw_one_pattern():
+    sim = package.compile("langtons_ant")
+    drawn = start_drawn(sim.ruleset, "four-ants", None, 1, None)
+    world = sim.world(drawn.ids)
+    for name, field in drawn.fields.items():
+        world = sim.paint(world, where=field.where, **{name: field.values})
+    ids = sim.step(world, 500).ids[0]
+    assert np.array_equal(np.rot90(ids), ids)
+    assert (ids == 1).sum() > 200
 
 
 @pytest.mark.parametrize(

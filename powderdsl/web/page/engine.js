@@ -193,15 +193,24 @@ export function* runs(mask, columns) {
 
 /** A snapshot with every cell as `factor`×`factor` cells. @param {Snapshot} from @returns {Snapshot} */
 export function enlarged(from, factor) {
-  if (factor === 1) return from;
-  const [rows, columns] = [from.rows * factor, from.columns * factor];
+  return grown(from, factor, factor, (at) => Math.floor(at / factor));
+}
+
+/** Copies of a snapshot, `down` below each other and `right` beside each other. @param {Snapshot} from @returns {Snapshot} */
+export function tiled(from, down, right) {
+  return grown(from, down, right, (at, side) => at % side);
+}
+
+/** `source` says from which row or column, of so many, one comes. */
+function grown(from, down, right, source) {
+  const [rows, columns] = [from.rows * down, from.columns * right];
   const grow = (values, components) => {
     const found = new values.constructor(rows * columns * components);
     let to = 0;
     for (let c = 0; c < components; c++)
       for (let y = 0; y < rows; y++) {
-        const row = (c * from.rows + Math.floor(y / factor)) * from.columns;
-        for (let x = 0; x < columns; x++) found[to++] = values[row + Math.floor(x / factor)];
+        const row = (c * from.rows + source(y, from.rows)) * from.columns;
+        for (let x = 0; x < columns; x++) found[to++] = values[row + source(x, from.columns)];
       }
     return found;
   };

@@ -1,7 +1,7 @@
 // Rules and worlds of the site: fetches, opens and resizes them.
 
 import { $, failed, fill, get, say } from "./dom.js";
-import { Engine, enlarged, framed, scatter } from "./engine.js";
+import { Engine, enlarged, framed, scatter, tiled } from "./engine.js";
 import { clearChart } from "./readings.js";
 import { refresh, setRunning, use } from "./stage.js";
 import { app } from "./state.js";
@@ -87,8 +87,7 @@ export function startWorld() {
   const listed = app.rules.worlds.find((one) => one.name === name);
   if (listed) {
     const world = readWorld(listed);
-    const factor = Math.floor(Math.min(engine.rows / world.rows, engine.columns / world.columns));
-    engine.restore(factor > 1 ? enlarged(world, factor) : world);
+    engine.restore(filling(world, engine));
     if (!world.clock.some(Boolean)) engine.reseed(seed);
   } else if (name === "empty") {
     engine.begin(framed(new Uint8Array(engine.cells).fill(engine.ground), engine, app.rules.frame), seed);
@@ -100,6 +99,14 @@ export function startWorld() {
   app.checkpoints = [];
   clearChart();
   refresh();
+}
+
+/** A start world that fills a larger one: patterns of cellular automata are repeated, where things move they grow. */
+function filling(world, { rows, columns }) {
+  const [down, right] = [Math.floor(rows / world.rows), Math.floor(columns / world.columns)];
+  const factor = Math.min(down, right);
+  if (factor < 1 || down * right === 1) return world;
+  return app.rules.frame === null ? tiled(world, down, right) : enlarged(world, factor);
 }
 
 /** Continues with a world from elsewhere, which `reset` returns to. @param {import("./engine.js").Snapshot} world */
