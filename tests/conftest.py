@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests import wheels
+
 # Before torch is imported anywhere: tests run in several processes; small tensors gain nothing from threads.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -35,6 +37,20 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if long:
         config.hook.pytest_deselected(items=[one for one in items if one in long])
         items[:] = [one for one in items if one not in long]
+
+
+@pytest.fixture(scope="session")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A wheel of the repository as it is now, built once for all processes of a run."""
+    (built,) = wheels.once(tmp_path_factory, "wheel", wheels.build_wheel).glob("*.whl")
+    return built
+
+
+@pytest.fixture(scope="session")
+def scripts(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The scripts of a fresh environment with the wheel in it. Nothing is installed there later."""
+    home = wheels.once(tmp_path_factory, "environment", lambda folder: wheels.install_wheel(wheel, folder))
+    return wheels.scripts_of(home)
 
 
 @pytest.fixture

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
+import shutil
 import subprocess
 import sys
 import sysconfig
+from collections.abc import Callable
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -26,6 +31,20 @@ def succeed(*command: str | Path, cwd: Path) -> str:
     return done.stdout
 
 
+def once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
+    """A folder that one process of a test run fills, and all processes of the run read."""
+    base = factory.getbasetemp()
+    home = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
+    with open(f"{home}.lock", "w", encoding="utf-8") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (home / "done").exists():
+            shutil.rmtree(home, ignore_errors=True)
+            home.mkdir()
+            make(home)
+            (home / "done").touch()
+    return home
+
+
 def build_wheel(folder: Path) -> Path:
     """Build the wheel in an empty folder, without the network."""
     succeed(sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", folder, ROOT, cwd=folder)
@@ -33,8 +52,8 @@ def build_wheel(folder: Path) -> Path:
     return built
 
 
-def install_wheel(wheel: Path, home: Path) -> Path:
-    """The scripts of a fresh environment with the wheel in it. Third parties come from this environment."""
+def install_wheel(wheel: Path, home: Path) -> None:
+    """Make a fresh environment with the wheel in it. Third parties come from this environment."""
     succeed(sys.executable, "-m", "venv", "--without-pip", home, cwd=home)
     places = sysconfig.get_paths(scheme="venv", vars={"base": str(home), "platbase": str(home)})
     # A path in a .pth file is searched last, and .pth files in it, such as an editable one's, are not read.
@@ -42,4 +61,7 @@ def install_wheel(wheel: Path, home: Path) -> Path:
     python = Path(places["scripts"], "python")
     pip = (sys.executable, "-m", "pip", "--python", python, "install", "--no-deps", "--no-index", wheel)
     succeed(*pip, cwd=home)
-    return Path(places["scripts"])
+
+
+def scripts_of(home: Path) -> Path:
+    return Path(sysconfig.get_path("scripts", scheme="venv", vars={"base": str(home)}))

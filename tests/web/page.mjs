@@ -7,12 +7,10 @@ const [address, folder] = process.argv.slice(2);
 const browser = await launch();
 const requests = new Set();
 
-/** The page as people find it, once its compiler has checked the rules. */
-async function visit(url) {
-  const found = await openPage(browser, url);
-  await found.page.waitForFunction(() => powderdsl.compilerReady && powderdsl.linkOpened, null, { timeout: 60000 });
-  return found;
-}
+const ready = (page) =>
+  page.waitForFunction(() => powderdsl.compilerReady && powderdsl.linkOpened, null, { timeout: 60000 });
+const passed = (page, from, steps) =>
+  page.waitForFunction((until) => powderdsl.engine.clock()[2] >= BigInt(until), from + steps);
 
 /** A hash (FNV-1a) of the ids and of a field of the world, and its step. */
 const hashes = (page, field) =>
@@ -32,6 +30,12 @@ const count = (page, name) =>
   }, name);
 const text = (page, id) => page.locator(`#${id}`).textContent();
 const step = (page) => page.evaluate(() => Number(powderdsl.engine.clock()[2]));
+const said = (page, id, pattern) =>
+  page.waitForFunction(
+    ([name, source]) => new RegExp(source).test(document.getElementById(name).textContent),
+    [id, pattern.source],
+    { timeout: 60000 },
+  );
 
 /** Replaces a text in the editor. */
 async function edit(page, from, to) {
@@ -71,15 +75,18 @@ const saved = (page, id, name) =>
     await page.locator(`#${id}`).click();
   });
 
-const seen = {};
-const { page, problems } = await visit(address);
+const seen = { seconds: {} };
+const begun = performance.now();
+const lap = (name) => (seen.seconds[name] = Math.round((performance.now() - begun) / 100) / 10);
+const { page, problems } = await openPage(browser, address);
 page.on("request", (one) => requests.add(new URL(one.url()).origin));
+page.on("dialog", (one) => one.accept());
 seen.firstWorld = await page.evaluate(() => powderdsl.firstWorld);
-seen.compilerReady = await page.evaluate(() => powderdsl.compilerReady);
-await page.screenshot({ path: join(folder, "page.png") });
+lap("first world");
 
-// Paint sand and see it fall; undo.
+// While the compiler loads: paint sand and see it fall; undo; drag wind.
 await page.locator("#run").click();
+await page.locator("#speed").fill("8");
 await page.locator("#world").selectOption("empty");
 const clean = await hashes(page, "wind.velocity");
 await page.locator("#elements button", { hasText: "sand" }).click();
@@ -98,12 +105,10 @@ seen.undone = undone.ids === clean.ids && undone.step === clean.step;
 await page.locator("#redo").click();
 seen.redone = await count(page, "sand");
 await page.locator("#run").click();
-await page.waitForFunction(() => powderdsl.engine.clock()[2] > 100n);
+await passed(page, 0, 100);
 await page.locator("#run").click();
 seen.lyingAfter = await low();
 seen.fallen = await count(page, "sand");
-
-// Drag wind.
 await page.keyboard.press("w");
 await drag(page, [0.2, 0.5], [0.8, 0.5]);
 seen.wind = await page.evaluate(() => {
@@ -111,14 +116,19 @@ seen.wind = await page.evaluate(() => {
   return Math.max(...engine.field(engine.motion).subarray(engine.cells));
 });
 await page.keyboard.press("b");
+lap("painted");
 
 // Break a rule, see where and why; fix it, and see the world continue.
+await ready(page);
+seen.compilerReady = await page.evaluate(() => powderdsl.compilerReady);
+await said(page, "problems", /No mistakes/);
+lap("compiler");
 const before = await hashes(page, "wind.velocity");
 await edit(page, "density: 4", "densit: 4");
 seen.keystrokeToDiagnostics = await until(page, "checkTook");
 seen.problem = await text(page, "problems");
 await page.locator("#run").click();
-await page.waitForFunction((from) => powderdsl.engine.clock()[2] > BigInt(from + 5), before.step);
+await passed(page, before.step, 6);
 await page.screenshot({ path: join(folder, "broken.png") });
 seen.ranWhileBroken = (await step(page)) - before.step;
 await edit(page, "densit: 4", "density: 2");
@@ -132,6 +142,14 @@ await page.locator("#packs button", { hasText: "+ pack" }).click();
 await until(page, "applyTook");
 seen.own = await page.locator("#elements button", { hasText: "mine" }).count();
 await page.locator("#run").click();
+lap("edited");
+
+// A link opens the same world, with the same rules, while this page goes on.
+await page.locator("#share").click();
+await page.waitForFunction(() => location.hash.length > 10);
+seen.link = page.url().length;
+const here = await hashes(page, "wind.velocity");
+const second = await openPage(browser, page.url());
 
 // Save the world and its rules: the status line says how they continue.
 await saved(page, "save-world", "own/world.npz");
@@ -142,49 +160,49 @@ await page.locator("#save summary").click();
 await page.waitForFunction(() => document.getElementById("save-rules").textContent.includes("(.zip)"));
 seen.entries = await page.locator("#save div").innerText();
 await page.keyboard.press("Escape");
-
-// A link opens the same world, with the same rules.
-await page.locator("#share").click();
-await page.waitForFunction(() => location.hash.length > 10);
-seen.link = page.url().length;
-const here = await hashes(page, "wind.velocity");
 for (let i = 0; i < 5; i++) await page.locator("#step").click();
 seen.ownContinued = await hashes(page, "wind.velocity");
-const second = await visit(page.url());
-seen.sameFromLink = JSON.stringify(await hashes(second.page, "wind.velocity")) === JSON.stringify(here);
-seen.ownFromLink = await second.page.locator("#elements button", { hasText: "mine" }).count();
-await second.page.close();
 
-// A world continues on the command line.
-await page.goto(address);
-await page.reload();
-await page.waitForFunction(() => powderdsl?.linkOpened && powderdsl.compilerReady, null, { timeout: 60000 });
-await page.waitForFunction(() => document.getElementById("problems").textContent.includes("No mistakes"));
-await page.waitForFunction(() => powderdsl.engine.clock()[2] > 60n);
+// The shipped rules again: a world continues on the command line.
+await page.locator("#rules").selectOption("powderworld");
+await page.waitForFunction(() => !powderdsl.edits.edited && powderdsl.running);
+await passed(page, 0, 200);
+await page.screenshot({ path: join(folder, "page.png") });
+await page.evaluate(() => powderdsl.recorder.clear());
+await passed(page, await step(page), 240);
 await page.locator("#run").click();
 await page.keyboard.press("w");
 await drag(page, [0.2, 0.3], [0.8, 0.35]); // moving cells are tinted
+await said(page, "problems", /No mistakes/);
 await saved(page, "save-world", "world.npz");
-for (let i = 0; i < 20; i++) await page.locator("#step").click();
+for (let i = 0; i < 20; i++) await page.keyboard.press(".");
 seen.continued = await hashes(page, "wind.velocity");
 await saved(page, "save-png", "world.png");
 await saved(page, "save-gif", "world.gif");
 await saved(page, "save-webm", "world.webm");
+lap("saved");
 
 // Why a cell changed, and what is known about the rules.
 await page.keyboard.press("t");
 const box = await page.locator("#canvas").boundingBox();
 await page.mouse.click(box.x + box.width * 0.25, box.y + box.height * 0.8);
-await page.waitForFunction(() => /of powderworld/.test(document.getElementById("checks").textContent), null, { timeout: 60000 });
+await said(page, "checks", /of powderworld/);
 await page.locator("#checks button", { hasText: "ledger" }).click();
-await page.waitForFunction(() => /ledger of/.test(document.getElementById("checks").textContent), null, { timeout: 60000 });
+await said(page, "checks", /ledger of/);
 seen.checks = await text(page, "checks");
 await page.screenshot({ path: join(folder, "checks.png") });
+lap("explained");
+
+await ready(second.page);
+seen.sameFromLink = JSON.stringify(await hashes(second.page, "wind.velocity")) === JSON.stringify(here);
+seen.ownFromLink = await second.page.locator("#elements button", { hasText: "mine" }).count();
+await second.page.close();
+lap("link");
 
 // A stranger's link: damaged, or with HTML in it.
 for (const bad of ["#w=AAAA", "#w=%3Cscript%3E", `#w=${"A".repeat(5000)}`]) {
   await page.evaluate((hash) => (location.hash = hash), bad);
-  await page.waitForFunction(() => /damaged|version/.test(document.getElementById("status").textContent));
+  await said(page, "status", /damaged|version/);
 }
 await page.locator("[data-panel=rules-panel]").click();
 await edit(page, "about: A powder that falls and piles up.", 'about: "<img src=x onerror=alert(1)>" \nnot <b>rules</b>');
@@ -200,7 +218,8 @@ await page.setViewportSize({ width: 360, height: 740 });
 seen.tooWide = await page.evaluate(() => document.documentElement.scrollWidth > innerWidth);
 await page.screenshot({ path: join(folder, "narrow.png") });
 
-seen.problems = problems;
+lap("end");
+seen.problems = [...problems, ...second.problems];
 seen.origins = [...requests].filter((one) => one !== new URL(address).origin && one !== "null");
 console.log(JSON.stringify(seen, null, 1));
 await browser.close();

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import zipfile
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from PIL import Image
 
 from powderdsl.web.site import PARTS
 from tests.wasm.standalone_world import chromium, fnv
-from tests.wheels import build_wheel, install_wheel, succeed
+from tests.wheels import once, succeed
 
 HERE = Path(__file__).parent
 
@@ -33,19 +34,10 @@ def needed() -> str:
     return "" if chromium() else "the page is tested in Chromium: apt install chromium-headless-shell"
 
 
-@pytest.fixture(scope="module")
-def scripts(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    if words := needed():
-        pytest.skip(words)
-    wheel = build_wheel(tmp_path_factory.mktemp("wheel"))
-    assert wheel.stat().st_size <= 20 << 20
-    return install_wheel(wheel, tmp_path_factory.mktemp("environment"))
-
-
-@pytest.fixture(scope="module")
-def address(scripts: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+@contextmanager
+def played(scripts: Path, folder: Path) -> Iterator[str]:
+    """The address of a page that the installed command serves."""
     command = [scripts / "powderdsl", "play", "--no-open"]
-    folder = tmp_path_factory.mktemp("elsewhere")
     with subprocess.Popen(
         command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     ) as server:
@@ -57,10 +49,19 @@ def address(scripts: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator
 
 
 @pytest.fixture(scope="module")
-def seen(address: str, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    folder = tmp_path_factory.mktemp("seen")
-    node = str(shutil.which("node"))
-    found: dict[str, Any] = json.loads(succeed(node, HERE / "page.mjs", address, folder, cwd=folder))
+def seen(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What page.mjs saw, which runs once for all processes of a run."""
+    if words := needed():
+        pytest.skip(words)
+    scripts = request.getfixturevalue("scripts")
+
+    def use(folder: Path) -> None:
+        with played(scripts, folder) as address:
+            text = succeed(str(shutil.which("node")), HERE / "page.mjs", address, folder, cwd=folder)
+        (folder / "seen.json").write_text(text, encoding="utf-8")
+
+    folder = once(tmp_path_factory, "page", use)
+    found: dict[str, Any] = json.loads((folder / "seen.json").read_text(encoding="utf-8"))
     return found | {"folder": folder}
 
 
@@ -175,8 +176,12 @@ def test_layout(seen: dict[str, Any]) -> None:
 
 
 @pytest.mark.campaign
-def test_damaged_packs_links_and_files_give_messages(address: str, tmp_path: Path) -> None:
-    found = json.loads(succeed(str(shutil.which("node")), HERE / "hostile.mjs", address, "200", cwd=tmp_path))
+def test_damaged_packs_links_and_files_give_messages(scripts: Path, tmp_path: Path) -> None:
+    if words := needed():
+        pytest.skip(words)
+    with played(scripts, tmp_path) as address:
+        text = succeed(str(shutil.which("node")), HERE / "hostile.mjs", address, "200", cwd=tmp_path)
+    found = json.loads(text)
     assert (found["packs"], found["links"], found["files"]) == (100, 50, 50)
     assert found["refused"] > 50
     assert (found["silent"], found["dead"], found["problems"]) == ([], [], [])

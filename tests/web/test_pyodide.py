@@ -13,7 +13,7 @@ import pytest
 import powderdsl
 from tests.wasm.jobs import hashes
 from tests.web.packages import PACKAGES, needed_in_pyodide, write_packages
-from tests.wheels import build_wheel, succeed
+from tests.wheels import succeed
 
 HERE = Path(__file__).parent
 
@@ -28,11 +28,6 @@ passes:
 """
 
 pytestmark = pytest.mark.wheel
-
-
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build_wheel(tmp_path_factory.mktemp("wheel"))
 
 
 def test_metadata_asks_only_for_pure_packages(wheel: Path) -> None:

@@ -153,6 +153,14 @@ on("save-png", async () => download(await png($("canvas")), "world.png"));
 on("save-gif", () => saveFilm(gif, "world.gif"));
 on("save-webm", () => saveFilm(webm, "world.webm"));
 $("save").addEventListener("toggle", () => $("save").open && showEntries().catch(failed));
+addEventListener("pointerdown", ({ target }) => {
+  if (!$("save").contains(target)) $("save").open = false;
+});
+addEventListener("keydown", ({ key }) => {
+  if (key !== "Escape" || !$("save").open) return;
+  $("save").open = false;
+  $("save").querySelector("summary").focus();
+});
 missing().then((reason) => {
   $("save-webm").disabled = $("no-video").textContent = reason;
   $("no-video").hidden = !reason;

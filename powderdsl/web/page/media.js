@@ -13,12 +13,18 @@ export class Recorder {
   clear() {
     /** @type {Uint16Array[]} */ this.frames = [];
     this.last = -Infinity;
+    /** The picture that is shown, if it came too soon after the last frame. @type {ImageData | null} */ this.skipped = null;
   }
 
   /** @param {ImageData} image */
   add(image, now = performance.now()) {
-    if (now - this.last < EVERY) return;
+    this.skipped = now - this.last < EVERY ? image : null;
+    if (this.skipped) return;
     this.last = now;
+    this._keep(image);
+  }
+
+  _keep(image) {
     if (this.rows !== image.height || this.columns !== image.width) this.frames = [];
     [this.rows, this.columns] = [image.height, image.width];
     const pixels = new Uint32Array(image.data.buffer);
@@ -34,6 +40,9 @@ export class Recorder {
 
   /** The frames that are there now; `every` is the ms between them. */
   kept() {
+    // An animation ends with the picture that is shown.
+    if (this.skipped) this._keep(this.skipped);
+    this.skipped = null;
     const { rows, columns, frames } = this;
     if (frames.length < 2) throw new Error("Run the world first: there are no frames yet.");
     return { rows, columns, frames: [...frames], every: EVERY };
