@@ -116,6 +116,24 @@ seen.wind = await page.evaluate(() => {
   return Math.max(...engine.field(engine.motion).subarray(engine.cells));
 });
 await page.keyboard.press("b");
+
+// The same with the keyboard alone.
+const focused = () => page.evaluate(() => document.activeElement.textContent);
+await page.locator("[data-tool=brush]").focus();
+seen.keyboard = [];
+for (const one of ["ArrowRight", "Home"]) {
+  await page.keyboard.press(one);
+  seen.keyboard.push(await focused(), await page.evaluate(() => powderdsl.tool));
+}
+await page.locator("#elements [tabindex='0']").focus();
+await page.keyboard.press("ArrowRight");
+seen.keyboard.push(await focused(), await page.evaluate(() => powderdsl.element));
+await page.locator("#canvas").focus();
+const dry = await count(page, "water");
+for (const one of ["Shift+ArrowUp", "Shift+ArrowUp", "Enter"]) await page.keyboard.press(one);
+seen.keyboard.push((await count(page, "water")) > dry);
+await page.keyboard.press("Control+z");
+seen.keyboard.push((await count(page, "water")) === dry);
 lap("painted");
 
 // Break a rule, see where and why; fix it, and see the world continue.

@@ -81,6 +81,7 @@ def test_painted_sand_falls_and_edits_can_be_undone(seen: dict[str, Any]) -> Non
     assert seen["fallen"] == seen["painted"] == seen["redone"]
     assert seen["undone"]
     assert seen["wind"] > 1
+    assert seen["keyboard"] == ["Erase", "erase", "Paint", "brush", "water", "water.water", True, True]
 
 
 def test_broken_rules_are_explained_while_the_world_runs(seen: dict[str, Any]) -> None:

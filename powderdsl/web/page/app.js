@@ -4,7 +4,7 @@ import { $, failed, fill, get } from "./dom.js";
 import { addWorlds, chooseRules, openRules, resize, startWorld } from "./opening.js";
 import { layout, newPainter, refresh, setRunning } from "./stage.js";
 import { app } from "./state.js";
-import { showPanel } from "./tabs.js";
+import { arrows, showPanel } from "./tabs.js";
 import {
   SPEEDS,
   choose,
@@ -72,6 +72,7 @@ function attach() {
   };
   for (const one of document.querySelectorAll("[data-tool]")) one.onclick = () => setTool(one.dataset.tool);
   for (const one of document.querySelectorAll("[data-panel]")) one.onclick = () => showPanel(one.dataset.panel);
+  for (const id of ["tool", "elements", "tabs"]) arrows($(id));
   document.addEventListener("keydown", key);
   new ResizeObserver(() => app.engine && layout()).observe($("frame"));
 }

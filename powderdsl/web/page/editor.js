@@ -135,7 +135,7 @@ export class Editor {
         syntaxHighlighting(STYLE),
         coloring,
         THEME,
-        EditorView.contentAttributes.of({ "aria-label": "Rules" }),
+        EditorView.contentAttributes.of({ "aria-label": "Rules. Escape, then Tab leaves the editor." }),
         // Escape, then Tab leaves the editor: CodeMirror's own way out for keyboards.
         keymap.of([...completionKeymap, ...searchKeymap, ...historyKeymap, ...defaultKeymap, indentWithTab]),
         EditorView.updateListener.of((update) => {
@@ -149,6 +149,12 @@ export class Editor {
   open(files) {
     this.states = new Map(Object.entries(files).map(([name, text]) => [name, this._state(text)]));
     this.name = "";
+  }
+
+  /** Another file, or another text of one. */
+  add(name, text) {
+    if (name === this.name) this.name = "";
+    this.states.set(name, this._state(text));
   }
 
   show(name) {

@@ -6,6 +6,7 @@ import { Editor } from "./editor.js";
 import { Engine } from "./engine.js";
 import { refresh, use } from "./stage.js";
 import { app } from "./state.js";
+import { choose } from "./tools.js";
 
 const PAUSE = 120; // ms without a key before a check
 const packOf = (file) => file.replace(/\.ya?ml$/, "");
@@ -80,17 +81,23 @@ function toggle(pack) {
   showTabs();
 }
 
-const NEW = (name, id) => `pack: ${name}
+/** A pack with an element that falls, where the rules have gravity. */
+const NEW = (name) => `pack: ${name}
 about: An element of my own.
-needs: core
-elements:
-  ${name}: {id: ${id}, density: 4, gravity: yes, color: "#E0559A", glyph: m, tags: powder}
+${"core.yaml" in rules.files ? "needs: core\n" : ""}elements:
+  ${name}:
+    color: "#E0559A"
+${"core.yaml" in rules.files ? FALLING : ""}`;
+
+const FALLING = `    density: 4
+    gravity: yes
+    tags: powder
 `;
 
 /** Adds a file, and shows it. */
 export function addFile(name, text) {
   rules.files[name] = text;
-  editor.open(rules.files);
+  editor.add(name, text);
   edited();
   show(name);
 }
@@ -99,9 +106,7 @@ function addPack() {
   const names = new Set(Object.keys(rules.files));
   const number = [1, 2, 3, 4, 5, 6, 7, 8, 9].find((n) => !names.has(`mine${n > 1 ? n : ""}.yaml`)) ?? 1;
   const name = `mine${number > 1 ? number : ""}`;
-  const ids = new Set(app.engine.elements.map((one) => one.id));
-  const id = Array.from({ length: 200 }, (_, i) => i + 30).find((one) => !ids.has(one));
-  addFile(`${name}.yaml`, NEW(name, id));
+  addFile(`${name}.yaml`, NEW(name));
 }
 
 let waiting = null;
@@ -175,9 +180,11 @@ async function compiled(rows, columns) {
 
 function continueUnder(engine) {
   const before = app.engine.snapshot();
+  const known = new Set(app.engine.elements.map((one) => one.qualified));
   const start = app.start;
   app.keepParameters = true;
   use(engine);
+  choose(engine.elements.find((one) => !known.has(one.qualified))); // a new element waits to be painted
   app.start = start;
   const lost = engine.restore(before);
   refresh();
@@ -198,7 +205,9 @@ function showProblems(ok) {
       editor.goTo(span.start.line, span.start.column);
     };
     const text = one.text.replace(/\n *= more: .*$/, "");
-    return make("div", { class: `problem ${one.severity}`, onclick: go }, make("pre", {}, text));
+    const keys = ({ key }) => key === "Enter" && go();
+    const attributes = { class: `problem ${one.severity}`, tabindex: "0", onclick: go, onkeydown: keys };
+    return make("div", { ...attributes, title: "Enter or a click goes to the place" }, make("pre", {}, text));
   });
   if (listed.length > shown.length) shown.push(make("p", { class: "soft" }, `and ${listed.length - shown.length} more`));
   if (!ok && rules.edited) shown.push(make("p", { class: "soft" }, "The last good rules keep running."));

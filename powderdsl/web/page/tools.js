@@ -4,6 +4,7 @@ import { $, fill, make, say } from "./dom.js";
 import { clearChart, leaveCell, showCell } from "./readings.js";
 import { redraw, refresh, setRunning, step } from "./stage.js";
 import { app } from "./state.js";
+import { markStop } from "./tabs.js";
 import { Surface, region, stroke } from "./view.js";
 
 export const SPEEDS = [1, 2, 5, 10, 20, 30, 60, 120, 240, 480];
@@ -138,7 +139,9 @@ export function choose(element) {
   if (!element) return;
   app.element = element.qualified;
   if (!["brush", "fill"].includes(app.tool)) setTool("brush");
-  showElements();
+  for (const one of $("elements").children)
+    one.setAttribute("aria-checked", String(one.dataset.element === app.element));
+  markStop($("elements"));
 }
 
 export function showElements() {
@@ -147,10 +150,17 @@ export function showElements() {
     swatch.style.background = app.colors.get(one.id);
     const checked = one.qualified === app.element;
     const title = i < 9 ? `${one.qualified} (${i + 1})` : one.qualified;
-    const attributes = { type: "button", role: "radio", "aria-checked": String(checked), title };
+    const attributes = {
+      type: "button",
+      role: "radio",
+      "aria-checked": String(checked),
+      "data-element": one.qualified,
+      title,
+    };
     return make("button", { ...attributes, onclick: () => choose(one) }, swatch, make("span", {}, one.name));
   });
   $("elements").replaceChildren(...buttons);
+  markStop($("elements"));
 }
 
 function showFields() {
@@ -174,6 +184,7 @@ export function setTool(tool) {
   app.tool = tool;
   for (const one of document.querySelectorAll("[data-tool]"))
     one.setAttribute("aria-checked", String(one === button));
+  markStop($("tool"));
   $("field-row").hidden = tool !== "field";
   $("canvas").style.cursor = tool === "look" ? "help" : "crosshair";
 }

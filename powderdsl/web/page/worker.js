@@ -11,6 +11,7 @@ async function boot() {
     loadPyodide({ indexURL: new URL("parts/pyodide/", here).href }),
     fetch(new URL("python.zip", here)).then((answer) => answer.arrayBuffer()),
   ]);
+  globalThis.python = python; // for measurements of its memory
   stage("unpacking");
   const site = python.runPython("import site; site.getsitepackages()[0]");
   python.unpackArchive(new Uint8Array(archive), "zip", { extractDir: site });
