@@ -63,7 +63,7 @@ class Session:
         """Load the files without the packs in `off`. Rules with mistakes leave the ones before in place."""
         named = self._write(files, off)
         names = [str(self.folder / word) for word in named.words]
-        names[-1] = "-".join([names[-1], *off])
+        names[-1] = "-".join([names[-1], *named.off])
         packs: list[str] = []
         try:
             packs = self._packs(names)
@@ -96,9 +96,13 @@ class Session:
         with suppress(CompileError):  # too many mistakes: reported when the rules are loaded
             packs = read([str(self.folder / name) for name in tops], Reporter())[0] if tops else []
             known = {Path(pack.source.name).name for pack in packs}
-        return Named(
-            dict(files), tops + [name for name in files if name not in known.union(rulesets)], list(off)
-        )
+        beside = [name for name in files if name not in known.union(rulesets)]
+        unread = {Path(name).stem for name in beside}.intersection(off)
+        words = tops + [name for name in beside if Path(name).stem not in unread]
+        if not words:
+            raise BadRequest("every pack is off")
+        taken = {name: text for name, text in files.items() if Path(name).stem not in unread}
+        return Named(taken, words, [name for name in off if name not in unread])
 
     def _packs(self, names: list[str]) -> list[str]:
         """The files of packs that take part."""

@@ -87,14 +87,31 @@ seen.compiles = await page.evaluate(async () => {
   const { edits } = powderdsl;
   return (await edits.compiler.check(edits.files, [])).ok;
 });
-// A compilation that runs away is stopped with its worker, and another one starts.
-seen.stopped = await page.evaluate(async () => {
-  const { edits } = powderdsl;
-  const waiting = edits.compiler.call("invariants").catch((error) => error.message);
-  edits.compiler.restart("stopped after 10 seconds");
-  const said = await waiting;
-  return [said, (await edits.compiler.check(edits.files, [])).ok];
-});
+// A compilation that runs away is stopped with its worker; the world runs on, and so does the compiler without that pack.
+const ELEMENTS = 60;
+const rulesOf = (pass) =>
+  Array.from({ length: 100 }, (_, i) => {
+    const [from, to, first, second] = [i, 7 * i + 1, 3 * i, 5 * i + 2].map((n) => `e${n % ELEMENTS}`);
+    return `      - ${from} -> ${to} if count(${first} in wide) > ${i % 5} and count(${second}) in (${pass % 7}, ${(pass % 5) + 3})`;
+  });
+const slow = [
+  "pack: slow",
+  "kernels:",
+  `  wide: {rows: [${Array.from({ length: 5 }, (_, row) => (row === 2 ? '"1 1 0 1 1"' : '"1 1 1 1 1"')).join(", ")}]}`,
+  "elements:",
+  ...Array.from({ length: ELEMENTS }, (_, i) => `  e${i}: {color: "#${(1000 * i).toString(16).padStart(6, "0")}"}`),
+  "passes:",
+  ...Array.from({ length: 24 }, (_, pass) => [`  pass${pass}:`, "    do:", ...rulesOf(pass)]).flat(),
+];
+const began = Date.now();
+await page.locator("#file").setInputFiles({ name: "slow.yaml", mimeType: "", buffer: Buffer.from(slow.join("\n")) });
+const stopped = () => /stopped after 10 seconds/.test(document.getElementById("problems").textContent);
+await page.waitForFunction(stopped, null, { timeout: 90000 });
+const seconds = (Date.now() - began) / 1000;
+const running = await alive();
+await page.locator("#packs input").last().click();
+await page.waitForFunction(() => powderdsl.edits.applyTook !== null, null, { timeout: 60000 });
+seen.stopped = { seconds, running, after: await page.locator("#status").textContent() };
 seen.problems = problems;
 console.log(JSON.stringify(seen));
 await browser.close();

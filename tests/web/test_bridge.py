@@ -88,6 +88,7 @@ EDITS: list[tuple[tuple[str, ...], dict[str, str], list[str], str, list[str]]] =
         "powderworld.yaml+salt.yaml+mine.yaml",
         ["powderworld.yaml", "sand.yaml", "salt.yaml", "mine.yaml"],
     ),
+    (("powderworld",), {"snow.yaml": MINE}, ["snow", "acid"], "powderworld-acid", []),
     (("core", "sand"), {"sand.yaml": "# edited\n"}, [], "core+sand.yaml", ["sand.yaml"]),
 ]
 
@@ -121,6 +122,12 @@ def test_the_command_line_reads_the_same_rules(
             archive.extractall()
     wanted = powderdsl.load(found["rules"])
     assert (wanted.name, wanted.palette, wanted.passes) == (good.name, good.palette, good.passes)
+
+
+def test_a_pack_that_is_off_may_be_anything(session: bridge.Session) -> None:
+    given = files("life") | {"mine.yaml": "pack: [", "other.yaml": "x" * 10_000}
+    assert call("check", given, ["mine", "other"])["result"]["ok"]
+    assert call("check", given, ["mine", "other", "life"]) == {"error": "every pack is off"}
 
 
 def test_rulesets_that_extend_each_other_are_a_mistake(session: bridge.Session) -> None:

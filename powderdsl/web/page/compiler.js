@@ -1,6 +1,8 @@
 // The front of the worker that compiles: requests with numbers, a time limit, and a fresh worker after a failure.
 
 const LIMIT = 10_000; // ms
+/** For the first request to a fresh worker: rules that were good before, but slow machines load the compiler slowly. */
+const COLD_LIMIT = 60_000;
 
 export class CompileFailure extends Error {}
 
@@ -35,6 +37,7 @@ export class Compiler {
     }
     if (stage !== "ready") return;
     this.ready = true;
+    this.warm = false;
     for (const { message } of this.open.values()) this.worker.postMessage(message);
     const [first] = this.open.keys();
     if (first) this._watch(first);
@@ -45,6 +48,7 @@ export class Compiler {
     if (!request) return;
     clearTimeout(request.timer);
     this.open.delete(id);
+    this.warm = true;
     // Requests are answered in order: the time of the next one begins now.
     const [following] = this.open.keys();
     if (following) this._watch(following);
@@ -56,7 +60,9 @@ export class Compiler {
   _watch(id) {
     const request = this.open.get(id);
     clearTimeout(request.timer);
-    request.timer = setTimeout(() => this.restart("stopped after 10 seconds"), request.limit);
+    const limit = this.warm ? request.limit : COLD_LIMIT;
+    const reason = `The compiler was stopped after ${limit / 1000} seconds.`;
+    request.timer = setTimeout(() => this.restart(reason), limit);
   }
 
   /** Ends the worker with all that it does, and starts another. */
