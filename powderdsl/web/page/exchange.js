@@ -61,7 +61,7 @@ export async function openLink(fragment) {
   const listed = app.catalog.rules.find((one) => one.key === shared.key);
   if (!listed) throw new Error(`The link uses the rules ${shared.key}, which this page does not have.`);
   const size = `${world.rows}x${world.columns}`;
-  await openRules(shared.key, { size, run: false });
+  if (!(await openRules(shared.key, { size, run: false }))) return false;
   const own = files === null && String(off) === String(app.rules.off);
   if (!own || !listed.sizes.some((one) => one.join("x") === size)) {
     say("Compiling the rules of the link…");

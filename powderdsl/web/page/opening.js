@@ -32,27 +32,32 @@ const moduleOf = (rows, columns) =>
 
 export const size = () => $("size").value.split("x").map(Number);
 
-/** Opens rules of the site. */
+let openings = 0;
+
+/** Opens rules of the site. Resolves to whether they are open. */
 export async function openRules(key, { world, size: wanted = "64x64", run = true } = {}) {
   say(`Loading ${key}…`);
+  const mine = ++openings;
   const listed = app.catalog.rules.find((one) => one.key === key);
   const shape = listed.sizes.some((one) => one.join("x") === wanted) ? wanted : listed.sizes[0].join("x");
   const [sheet, module] = await Promise.all([sheetOf(key), shippedModule(key, ...shape.split("x"))]);
+  const engine = await Engine.start(module);
+  if (mine !== openings) return false; // others were chosen meanwhile
+  // Packs are opened to paint with their own elements, the first of which is the ground in rules of one pack.
+  const own = engine.elements.find((one) => one.qualified.startsWith(`${key}.`) && one.id !== engine.ground);
+  if (own) app.element = own.qualified;
   app.rules = sheet;
   app.compiled = null;
   $("rules").value = key;
   fill($("size"), listed.sizes.map((one) => [one.join("x"), one.join("×")]), shape);
   fillWorlds(world ?? sheet.shown);
-  const engine = await Engine.start(module);
-  // An added pack is opened to paint with its elements.
-  const own = engine.elements.find((one) => one.qualified.startsWith(`${key}.`));
-  if (own) app.element = own.qualified;
   app.keepParameters = false;
   use(engine);
   startWorld();
   setRunning(run);
   say(sheet.about || sheet.title);
   for (const one of app.onRules) one(sheet);
+  return true;
 }
 
 function fillWorlds(chosen) {
