@@ -56,10 +56,10 @@ web: tests/web/node_modules  ## fetch Pyodide and the editor, for `powderdsl pla
 	@node tests/web/parts.mjs
 
 test: $(VENV)/.ready  ## run the tests (ARGS=... for pytest, JOBS=0 for one process)
-	@$(BIN)/python -m pytest --numprocesses $(JOBS) --maxprocesses 4 $(ARGS)
+	@$(BIN)/python -m pytest --numprocesses $(JOBS) --maxprocesses 4 --dist worksteal $(ARGS)
 
 test-all: $(VENV)/.ready  ## run the tests and all campaigns: long searches for mistakes (hours)
-	@$(BIN)/python -m pytest --campaigns --numprocesses $(JOBS) --maxprocesses 4 --durations 20 $(ARGS)
+	@$(BIN)/python -m pytest --campaigns --numprocesses $(JOBS) --maxprocesses 4 --dist worksteal --durations 20 $(ARGS)
 
 check: lint types test  ## lint, types and test
 

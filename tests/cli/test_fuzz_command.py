@@ -14,7 +14,7 @@ from powderdsl.simulation.simulator import Simulator
 from powderdsl.targets.cpp.build import Building
 from powderdsl.testing.generators.cases import load_text
 from powderdsl.testing.generators.rulemaker import random_ruleset_text
-from tests.cli.commands import command_line, environment_with, powderdsl, process
+from tests.cli.commands import command_line, environment_with, powderdsl
 from tests.compilers import skip_without_compiler
 from tests.fuzz import COMPARED, STARTS_AT_ONCE, differential
 from tests.fuzz.case_files import read_case, write_case
@@ -32,14 +32,14 @@ def listed(names: tuple[str, ...]) -> str:
 def test_a_run_reports_saves_its_state_and_goes_on(tmp_path: Path) -> None:
     options = ("fuzz", "--jobs", 1, "--worlds", 2, "--steps", 1, "--save", tmp_path / "found")
     options += ("--backends", "torch,wasm")
-    first = process(*options, "--seeds", "0..2")
-    assert first.returncode == 0, first.stderr
+    first = powderdsl(*options, "--seeds", "0..2")
+    assert first.exit_code == 0, first.stderr
     assert "2 rulesets" in first.stdout
     assert "torch and wasm against the reference" in first.stdout
     assert "no differences found" in first.stdout
     assert "bit planes" in first.stdout
-    second = process(*options, "--seeds", "0..3", "--resume")
-    assert second.returncode == 0, second.stderr
+    second = powderdsl(*options, "--seeds", "0..3", "--resume")
+    assert second.exit_code == 0, second.stderr
     assert json.loads((tmp_path / "found" / "state.json").read_text())["next"] == 3
     assert "3 rulesets" in second.stdout
     other = powderdsl(*options[:-1], "torch", "--resume")
@@ -51,11 +51,11 @@ def test_a_run_reports_saves_its_state_and_goes_on(tmp_path: Path) -> None:
 def test_every_target_is_compared_unless_some_are_named(tmp_path: Path) -> None:
     skip_without_compiler()
     given = ("fuzz", "--jobs", 1, "--worlds", 1, "--steps", 1, "--seeds", "0..1", "--save", tmp_path)
-    every = process(*given)
-    assert every.returncode == 0, every.stderr
+    every = powderdsl(*given)
+    assert every.exit_code == 0, every.stderr
     assert f": {listed(COMPARED)} against the reference" in every.stdout
-    some = process(*given, "--backends", "reference,cuda-emulated")
-    assert some.returncode == 0, some.stderr
+    some = powderdsl(*given, "--backends", "reference,cuda-emulated")
+    assert some.exit_code == 0, some.stderr
     assert ": cuda-emulated against the reference" in some.stdout
 
 
@@ -124,8 +124,8 @@ def test_bad_options(options: tuple[str, ...], words: str) -> None:
 
 @pytest.mark.slow
 def test_damaged_files(tmp_path: Path) -> None:
-    result = process("fuzz", "--front-end", "--seeds", "0..30", "--jobs", 1, "--save", tmp_path)
-    assert result.returncode == 0, result.stdout
+    result = powderdsl("fuzz", "--front-end", "--seeds", "0..30", "--jobs", 1, "--save", tmp_path)
+    assert result.exit_code == 0, result.stdout
     assert "30 inputs" in result.stdout
     assert "no problems found" in result.stdout
 

@@ -390,7 +390,7 @@ def _results(folder: Path) -> None:
 
 
 def make_valid(folder: Path, run: Callable[..., None]) -> None:
-    """A folder with a valid file of each kind. `run` runs a command there, in a process of its own."""
+    """A folder with a valid file of each kind. `run` runs a command there."""
     folder.mkdir()
     (folder / "grit.yaml").write_text(GRIT, encoding="utf-8")
     (folder / "pair.yaml").write_text("ruleset: pair\nabout: Two packs.\npacks: [core, grit]\nslots: 32\n")

@@ -10,11 +10,13 @@ import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from contextlib import chdir
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.cli.commands import powderdsl
 from tests.hostile.damage_kinds import KINDS, Kind, make_valid
 
 SECONDS, MEGABYTES = 5.0, 300.0
@@ -24,18 +26,17 @@ SMOKE = 2
 RAW = re.compile(rb"[\x00-\x08\x0b-\x1f\x7f]|\xc2[\x80-\x9f]|\xe2\x80[\xaa-\xae]|\xe2\x81[\xa6-\xa9]")
 
 
-def process(*words: str, cwd: Path) -> None:
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "XDG_CACHE_HOME": str(cwd / "own")}
-    command = [sys.executable, "-m", "powderdsl", *words]
-    run = subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, check=False)
-    assert run.returncode == 0, run.stderr
+def run_there(folder: Path, *words: str) -> None:
+    with chdir(folder):
+        run = powderdsl(*words, XDG_CACHE_HOME=str(folder / "own"))
+    assert run.exit_code == 0, run.stderr
 
 
 @pytest.fixture(scope="module")
 def valid(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a valid file of each kind."""
     folder = tmp_path_factory.mktemp("valid") / "files"
-    make_valid(folder, lambda *words: process(*words, cwd=folder))
+    make_valid(folder, lambda *words: run_there(folder, *words))
     return folder
 
 

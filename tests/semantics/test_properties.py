@@ -84,7 +84,9 @@ def test_a_world_is_the_same_alone_and_in_a_batch(backend: str, seeds: range) ->
 @pytest.mark.parametrize(("backend", "seeds"), CASES)
 def test_steps_add_up_and_leave_their_argument_alone(backend: str, seeds: range) -> None:
     for number, simulator in enumerate(simulators(ANYTHING, seeds, backend)):
-        world = random_world(simulator, number, (2, 4, 33))
+        world = random_world(
+            simulator, number, (2, 4, 34)
+        )  # the width of the test above: modules are made once
         before = {name: value.clone() for name, value in world.state.items()}
         one_by_one = world
         for _ in range(3):
@@ -240,17 +242,24 @@ def _seen(expr: Expr) -> Any:
 # Conservation
 
 
-def test_swaps_conserve_what_cells_hold() -> None:
-    """Swaps move an element with all its fields: the multiset of whole cells stays the same, in any shape."""
+@pytest.mark.parametrize("backend", ["torch", "wasm"])
+def test_swaps_conserve_what_cells_hold(backend: str) -> None:
+    """Swaps move an element with all its fields: the multiset of whole cells stays the same, in any shape.
+
+    Each width is a module of its own on `wasm`: there each ruleset has one shape, and seeds 1 and 9, which have
+    thousands of movements, are left to `torch`.
+    """
     moved = 0
-    for number, simulator in enumerate(simulators(SWAPS, range(60))):
+    shapes = ((2, 5, 9), (1, 1, 33), (2, 31, 1), (1, 2, 2))
+    seeds = range(60) if backend == "torch" else range(20, 60)
+    for number, simulator in enumerate(simulators(SWAPS, seeds, backend)):
         carried = [slot.name for slot in slots(simulator.ruleset) if slot.travels and not slot.resets]
-        for shape in ((2, 5, 9), (1, 1, 33), (2, 31, 1), (1, 2, 2)):
+        for shape in shapes if backend == "torch" else (shapes[number % 3],):
             world = random_world(simulator, number, shape)
             after = simulator.step(world, 2)
             assert cells(world, carried) == cells(after, carried)
             moved += not torch.equal(world.ids, after.ids)
-    assert moved >= 60
+    assert moved >= (60 if backend == "torch" else 10)
 
 
 def cells(world: World, names: list[str]) -> list[list[tuple[float, ...]]]:

@@ -242,7 +242,7 @@ def test_known_keys_are_those_of_real_evaluations(tmp_path: Path, monkeypatch: p
         "--batch",
         12,
         "--backend",
-        "torch",
+        "wasm",
         "--steps",
         12,
     )
@@ -255,9 +255,9 @@ def test_known_keys_are_those_of_real_evaluations(tmp_path: Path, monkeypatch: p
     assert {keys for keys in known if keys[-1] != "success"} <= real <= known
 
     quick = ("--width", 4, "--batch", 4, "--buffer", 8, "--refresh", 2, "--states", 8, "--iterations", 1)
-    trained = powderdsl("wm", "train", "--run", "model", *quick, "--backend", "torch")
+    trained = powderdsl("wm", "train", "--run", "model", *quick, "--backend", "wasm")
     assert trained.exit_code == 0, trained.output
-    tested = powderdsl("wm", "eval", "model", "--split", "held_out", "--worlds", 1, "--backend", "torch")
+    tested = powderdsl("wm", "eval", "model", "--split", "held_out", "--worlds", 1, "--backend", "wasm")
     assert tested.exit_code == 0, tested.output
     real = {any_name(keys) for keys in numbers(json.loads(Path("model/evaluation.json").read_text()))}
     known = set(numbers(values_of_world_model()))

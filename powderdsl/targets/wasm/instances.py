@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from threading import RLock
 from typing import Any
 
@@ -28,6 +28,12 @@ Like = Mapping[str, tuple[Any, tuple[int, ...]]]
 """The dtype and shape of each array of a state."""
 
 
+def digest_of(planes: Program) -> Hashable:
+    """A value that is equal for two programs only if their modules are the same."""
+    passes = tuple(structure(one, places=False) for one in planes.passes)
+    return planes.slots, planes.params, planes.streams, passes
+
+
 class Loaded:
     """A module for grids of one width, ready to be instantiated, and its numbers."""
 
@@ -38,6 +44,7 @@ class Loaded:
         program: Program,
         planes: Program,
         width: int,
+        digest: Hashable,
         *,
         apart: bool,
         memo: Memo | None = None,
@@ -46,9 +53,7 @@ class Loaded:
             made = wasm_module(planes, width, apart=apart, memo=memo)
             return host.compile(made.code), made.layout
 
-        passes = tuple(structure(one, places=False) for one in planes.passes)
-        key = host, planes.slots, planes.params, planes.streams, passes, width, apart
-        self.module, self.layout = _MODULES.of(key, "", make)
+        self.module, self.layout = _MODULES.of((host, digest, width, apart), "", make)
         self.host, self.kind, self.pieces = host, kind, pieces(program)
         self.passes = tuple(one.name for one in planes.passes)
         self._instances: dict[tuple[int, bool], Instance] = {}

@@ -9,7 +9,7 @@ from powderdsl.system.memo import Memo
 from powderdsl.targets.array_kind import Array, ArrayKind
 from powderdsl.targets.job import Job, shape_of
 from powderdsl.targets.wasm.host import this_host
-from powderdsl.targets.wasm.instances import Loaded, WasmState
+from powderdsl.targets.wasm.instances import Loaded, WasmState, digest_of
 
 
 class WasmProgram:
@@ -25,6 +25,7 @@ class WasmProgram:
     def __init__(self, program: Program, planes: Program, kind: ArrayKind, memo: Memo | None = None):
         self._program, self._planes, self._kind = program, planes, kind
         self._memo = Memo() if memo is None else memo  # the schedules are the same for all widths
+        self._digest = digest_of(planes)
         self._host = this_host()
         self._modules: dict[tuple[int, bool], Loaded] = {}
 
@@ -33,7 +34,14 @@ class WasmProgram:
         key = (width, apart)
         if key not in self._modules:
             self._modules[key] = Loaded(
-                self._host, self._kind, self._program, self._planes, width, apart=apart, memo=self._memo
+                self._host,
+                self._kind,
+                self._program,
+                self._planes,
+                width,
+                self._digest,
+                apart=apart,
+                memo=self._memo,
             )
         return self._modules[key]
 
