@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import subprocess
 import threading
 from collections.abc import Callable
@@ -23,6 +24,7 @@ from powderdsl.experiments.studies.run import Outcome, StudyRun
 from powderdsl.experiments.studies.study import Point, StudyStep
 from tests.cli.commands import ROOT, command_line, environment_with, powderdsl
 from tests.cli.endless import TASK
+from tests.tiers import tiered
 
 STUDY = """
 study: patience
@@ -414,7 +416,9 @@ def test_a_step_waits_for_what_a_killed_study_has_started(
 
 
 @pytest.mark.slow
-def test_two_processes_and_collect_give_the_table_of_one(tmp_path: Path) -> None:
+@pytest.mark.parametrize("runs", tiered(["of the two", "its own"], ["of the two"]))
+def test_two_processes_and_collect_give_the_table_of_one(runs: str, tmp_path: Path) -> None:
+    """The one has finished runs of the two in its folder, or trains and evaluates itself."""
     (tmp_path / "dig.yaml").write_text(TASK, encoding="utf-8")
     text = STUDY.replace("[100, 200, 300]", "[12, 24]").replace("small: [none, some]", "small: [none]")
     text = text.replace("seeds: 2", "seeds: 1").replace("on: sand-pushing", "on: dig.yaml")
@@ -433,6 +437,11 @@ def test_two_processes_and_collect_give_the_table_of_one(tmp_path: Path) -> None
     parts = [begin("study.yaml", "--shard", f"{number}/2", "--out", f"part{number}") for number in (1, 2)]
     assert [one.wait(timeout=240) for one in parts] == [0, 0]
     assert begin("collect", "part1", "part2", "--out", "all").wait(timeout=60) == 0
+    if runs == "of the two":
+        for number in (2, 1):
+            shutil.copytree(tmp_path / f"part{number}", tmp_path / "whole", dirs_exist_ok=True)
+        for name in RESULTS:
+            (tmp_path / "whole" / name).unlink(missing_ok=True)
     assert begin("study.yaml", "--out", "whole").wait(timeout=240) == 0
     for name in RESULTS:
         assert (tmp_path / "all" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
