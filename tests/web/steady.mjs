@@ -1,11 +1,12 @@
 // Uses the page at random for some minutes and measures its memory: node steady.mjs ADDRESS [MINUTES] [SEED]
-// Prints a line for each minute; fails if a measure of the last third is more than 10 % above that of the second.
+// Prints a line for each minute, measured with the same rules and panel; fails if the median of a measure grows from the
+// second to the last third.
 import { readFileSync } from "node:fs";
 import { launch, openPage } from "./browser.mjs";
 
 const [address, minutes = "5", seed = "1"] = process.argv.slice(2);
-const GROWTH = 1.1;
-const BOUND = ["heap", "nodes", "listeners", "python"]; // the others hold what the page keeps on purpose, up to a limit
+/** How much may be added. Python's memory grows by a fifth at once; the others hold what the page keeps up to a limit. */
+const GROWTH = { heap: 0.1, nodes: 0.1, listeners: 0.1, python: 0.25 };
 const browser = await launch();
 const { page, problems } = await openPage(browser, address);
 page.on("dialog", (one) => one.accept());
@@ -107,6 +108,10 @@ const round = (value) => Math.round(value * 10) / 10;
 
 /** MiB, and counts of nodes and listeners. `resident` is what the page's processes take of the machine. */
 async function measure() {
+  await choose("rules", "powderworld");
+  await showRules();
+  await page.waitForFunction(() => !powderdsl.edits.edited && /No mistakes/.test(document.getElementById("problems").textContent), null, { timeout: 90000 });
+  await choose("size", "64x64");
   await client.send("HeapProfiler.collectGarbage");
   const { metrics } = await client.send("Performance.getMetrics");
   const of = (name) => metrics.find((one) => one.name === name).value;
@@ -143,9 +148,9 @@ for (let minute = 1; minute <= Number(minutes); minute++) {
   console.log(JSON.stringify({ minute, actions: done, ...seen.at(-1) }));
 }
 const third = Math.max(1, Math.floor(seen.length / 3));
-const highest = (part, name) => Math.max(...part.map((one) => one[name]));
-const grown = BOUND.filter(
-  (name) => highest(seen.slice(-third), name) > GROWTH * highest(seen.slice(-2 * third, -third), name),
+const median = (part, name) => part.map((one) => one[name]).sort((a, b) => a - b)[part.length >> 1];
+const grown = Object.keys(GROWTH).filter(
+  (name) => median(seen.slice(-third), name) > (1 + GROWTH[name]) * median(seen.slice(-2 * third, -third), name),
 );
 const before = await page.evaluate(() => powderdsl.frames);
 await page.waitForTimeout(500);
