@@ -19,7 +19,13 @@ const below = (n) => {
   return Math.floor((state / 2 ** 32) * n);
 };
 const pick = (list) => list[below(list.length)];
-const settled = () => page.waitForFunction(() => powderdsl.edits.applyTook !== null, null, { timeout: 60000 });
+const checked = () => page.waitForFunction(() => powderdsl.edits.checkTook !== null, null, { timeout: 60000 });
+const settled = () =>
+  page.waitForFunction(
+    () => powderdsl.edits.applyTook !== null || (powderdsl.edits.checkTook !== null && document.querySelector(".problem.error, .problem[class=problem]")),
+    null,
+    { timeout: 60000 },
+  );
 const options = (id) => page.locator(`#${id} option`).evaluateAll((found) => found.map((one) => one.value));
 const choose = async (id, wanted) => page.locator(`#${id}`).selectOption(wanted ?? pick(await options(id)));
 const click = (id) => page.locator(`#${id}`).click();
@@ -50,7 +56,7 @@ async function edit() {
       view.dispatch({ changes: change });
       return true;
     }, mistake);
-  if (below(3) === 0 && (await change("heavy"))) await page.waitForFunction(() => powderdsl.edits.checkTook !== null);
+  if (below(3) === 0 && (await change("heavy"))) await checked();
   if (await change(String(1 + below(5)))) await settled();
 }
 
@@ -66,7 +72,7 @@ const ACTIONS = [
     const box = page.locator("#packs input").last();
     for (let n = 0; n < 2; n++) {
       await box.click();
-      await page.waitForFunction(() => powderdsl.edits.checkTook !== null);
+      await checked();
     }
   },
   () => click("run"),

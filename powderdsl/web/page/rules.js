@@ -141,6 +141,7 @@ async function checkAll() {
       found = await checkNow(applying);
     } catch (error) {
       found = undefined;
+      rules.checkTook = performance.now() - rules.changedAt;
       say(String(error.message ?? error), true);
       showProblem(String(error.message ?? error));
     }
