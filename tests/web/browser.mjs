@@ -19,8 +19,10 @@ export async function launch() {
   return chromium.launch({ executablePath: executable(), args: ["--no-sandbox", "--disable-gpu"] });
 }
 
-export async function openPage(browser, address, options = {}) {
+/** `before` is run in the page before its own scripts. */
+export async function openPage(browser, address, { before, ...options } = {}) {
   const page = await browser.newPage({ viewport: { width: 1440, height: 900 }, ...options });
+  if (before) await page.addInitScript(before);
   const problems = [];
   page.on("console", (message) => {
     if (["error", "warning"].includes(message.type())) problems.push(message.text());

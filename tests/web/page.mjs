@@ -167,7 +167,7 @@ await page.locator("#share").click();
 await page.waitForFunction(() => location.hash.length > 10);
 seen.link = page.url().length;
 const here = await hashes(page, "wind.velocity");
-const second = await openPage(browser, page.url());
+const second = await openPage(browser, page.url(), { before: () => delete globalThis.VideoEncoder });
 
 // Save the world and its rules: the status line says how they continue.
 await saved(page, "save-world", "own/world.npz");
@@ -214,6 +214,8 @@ lap("explained");
 await ready(second.page);
 seen.sameFromLink = JSON.stringify(await hashes(second.page, "wind.velocity")) === JSON.stringify(here);
 seen.ownFromLink = await second.page.locator("#elements button", { hasText: "mine" }).count();
+await second.page.locator("#save summary").click();
+seen.noVideo = [await second.page.locator("#save-webm").isDisabled(), await text(second.page, "no-video")];
 await second.page.close();
 lap("link");
 

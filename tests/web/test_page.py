@@ -121,6 +121,7 @@ def test_a_world_of_edited_rules_continues_as_the_status_line_says(
     succeed(scripts / program, *arguments, "--steps", "5", "--out", "later.npz", cwd=folder)
     assert hashes(folder / "later.npz") == seen["ownContinued"]
     assert "All 3 edited rule files (.zip)" in seen["entries"]
+    assert seen["noVideo"] == [True, "This browser has no encoder for VP8 or VP9 videos."]
 
 
 def test_pictures(seen: dict[str, Any], scripts: Path) -> None:
