@@ -53,7 +53,8 @@ class Session:
 
     def __init__(self, folder: Path):
         self.folder = folder
-        self.memo = Memo()
+        self.memo = Memo(versions=2, things=250)
+        """Of one ruleset with some 60 passes: a page has less memory than a machine."""
         self.ruleset: Ruleset | None = None
         self.good = Named({}, [], [])
         """What was read for these rules."""
