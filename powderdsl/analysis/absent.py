@@ -134,7 +134,8 @@ class Lacking:
     def may_make(self, rule: Rule) -> bool:
         """Whether the rule may bring about an element that the world lacks."""
         if not isinstance(rule, Transform):
-            return isinstance(rule, Move) and rule.leaving.value in self.gone and self.may(rule)
+            left = rule.leaving if isinstance(rule, Move) else None
+            return left is not None and left.value in self.gone and self.may(rule)
         made = member(self.rewrite(rule.target), tuple(self.gone))
         there = replace(rule, mask=self.rewrite(rule.mask))
         return bool(self.ids) and self.asked.may(there, (made, HERE))

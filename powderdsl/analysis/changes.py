@@ -83,11 +83,12 @@ class Asked:
         earlier swap or move that is wanted may itself be dropped, so that says nothing.
         """
         policy = self.moment.policy
-        if policy == "prove" or isinstance(rule, Assign):
+        if policy in ("prove", "overwrite") or isinstance(rule, Assign):
             return []
         found: list[Condition] = []
         cells = footprint(rule)
-        if not isinstance(rule, Transform):  # pairs of one rule that share a cell: none of them happens
+        rows = isinstance(rule, Transform) or (isinstance(rule, Move) and rule.leaving is None)
+        if not rows:  # pairs of one rule that share a cell: none of them happens
             assert rule.mask is not None
             dy, dx = rule.offset
             found += [(negation(rule.mask), rule.offset), (negation(rule.mask), (-dy, -dx))]
@@ -162,7 +163,15 @@ def _look_at(rule: Rule, asked: Asked, found: Found) -> None:
             found.moves |= {
                 a for a in _left(asked, found.moves) if asked.may(rule, is_(a), is_not(a, rule.offset))
             }
+        case Move(leaving=None):
+            found.moves |= {a for a in _left(asked, found.moves) if _pushed(rule, a, asked)}
+            found.moves |= {
+                a for a in _left(asked, found.moves) if asked.may(rule, is_(a), is_not(a, rule.offset))
+            }
+            targets = overwritten(rule, asked)  # of a row one is lost, and one is there twice
+            found.pairs |= {(x, y) for x in targets for y in targets if x != y}
         case Move():
+            assert rule.leaving is not None
             left = rule.leaving.value
             found.moves |= {a for a in _left(asked, found.moves) if _pushed(rule, a, asked)}
             found.moves |= {a for a in _left(asked, found.moves) if a != left and asked.may(rule, is_(a))}
@@ -211,11 +220,13 @@ def _chains(asked: Asked) -> Iterator[tuple[Move, Pairs]]:
     Of such a row the first leaves its element behind and the last overwrites one: these need not be of one rule.
     """
     moves = [rule for rule in asked.moment.rules if isinstance(rule, Move)]
-    if asked.moment.policy != "prove" or len({rule.leaving.value for rule in moves}) < 2:
+    kinds = {rule.offset if rule.leaving is None else rule.leaving.value for rule in moves}
+    if asked.moment.policy not in ("prove", "overwrite") or len(kinds) < 2:
         return
     live = [rule for rule in moves if asked.may(rule)]
-    left = {int(rule.leaving.value) for rule in live}
     lost = {number for rule in live for number in overwritten(rule, asked)}
+    left = {int(rule.leaving.value) for rule in live if rule.leaving is not None}
+    left |= {number for rule in live if rule.leaving is None for number in overwritten(rule, asked)}
     pairs = {(before, after) for before in lost for after in left if before != after}
     for rule in live:
         yield rule, pairs

@@ -14,6 +14,7 @@ from powderdsl.model.types import (
     Expr,
     Local,
     Moment,
+    Move,
     Never,
     Offset,
     Ruleset,
@@ -111,7 +112,7 @@ def _moment(moment: Moment, seen: int, lets: Mapping[str, int]) -> int:
     claims = [rule for rule in moment.rules if not isinstance(rule, Assign)]
     masks = {id(rule): _sight(rule.mask, seen, lets) for rule in moment.rules if rule.mask is not None}
     reaches = [_length(rule.offset) for rule in claims if not isinstance(rule, Transform)]
-    if moment.policy != "prove" and claims:
+    if moment.policy in ("drop_both", "first_wins") and claims:
         # A rule must know where the others claim cells; earlier rules decide one after the other.
         rounds = len(claims) if moment.policy == "first_wins" and reaches else 1
         widest = max(masks[id(rule)] for rule in claims)
@@ -126,9 +127,10 @@ def _moment(moment: Moment, seen: int, lets: Mapping[str, int]) -> int:
                 continue
             case Transform():
                 found.append(max(mask, _sight(rule.target, seen, lets)))
-            case Swap():
+            case Swap() | Move(leaving=None):
                 found.append(_length(rule.offset) + max(mask, seen))
             case _:
+                assert rule.leaving is not None
                 found.append(_length(rule.offset) + max(mask, seen, _sight(rule.leaving, seen, lets)))
         for effect in rule.effects:
             found.append(_length(effect.offset) + max(mask, _sight(effect.value, seen, lets)))

@@ -79,7 +79,10 @@ class AddedPacks:
         """The tags among some words that packs outside a scope give an element, else such values, else the element itself."""
         composition = self.composition
         named = composition.element_decls[element]
-        entries = [(pack, entry) for pack, name, entry in composition.entries() if name == element]
+        packs = {pack.name.text for pack in composition.packs}
+        entries = [
+            (pack, entry) for pack, name, entry in composition.entries() if name == element and pack in packs
+        ]
         tags = [("tag", pack, tag) for pack, entry in entries for tag in entry.tags]
         values = [("value", pack, key) for pack, entry in entries for key, _ in entry.values]
         for several in (tags, values):

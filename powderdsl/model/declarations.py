@@ -56,12 +56,13 @@ class ElementDecl:
 
 @dataclass(frozen=True)
 class AlsoDecl:
-    """Tags, values and a ramp that a pack adds to an element of another pack."""
+    """Tags, values, a color and a ramp that a pack adds to an element of another pack, or a ruleset to one of its packs'."""
 
     name: Scalar
     tags: tuple[Scalar, ...] = ()
     values: tuple[Pair, ...] = ()
     ramp: RampDecl | None = None
+    color: str | None = None
 
 
 @dataclass(frozen=True)
@@ -123,6 +124,7 @@ class PassDecl:
     after: tuple[Scalar, ...] = ()
     before: tuple[Scalar, ...] = ()
     scratch: tuple[TypedDecl, ...] = ()
+    override: bool = False
 
 
 @dataclass(frozen=True)
@@ -151,6 +153,7 @@ class PackDecl:
     source: Source
     about: str = ""
     needs: tuple[Scalar, ...] = ()
+    provides: tuple[Scalar, ...] = ()
     conflicts: tuple[Scalar, ...] = ()
     tags: tuple[TagDecl, ...] = ()
     properties: tuple[TypedDecl, ...] = ()
@@ -199,6 +202,7 @@ class RulesetDecl:
     matrix: tuple[Scalar, ...] = ()
     params: tuple[Pair, ...] = ()
     invariants: tuple[Syntax, ...] = ()
+    also: tuple[AlsoDecl, ...] = ()
     rename: tuple[tuple[Scalar, Scalar], ...] = ()
     """Qualified names, and the names by which these definitions are known here."""
     left_out: tuple[PackDecl, ...] = ()

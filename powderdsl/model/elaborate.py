@@ -299,7 +299,14 @@ class Elaborator:
         who, place, leaving = syntax.children[:3]
         offset = self._neighbor(place, scope)
         mask = self._mask([self.typer.condition(who, scope)], syntax, scope)
-        left = self.typer.element(self.typer.evaluate(leaving, scope), leaving.span)
+        behind = self.typer.evaluate(leaving, scope)
+        if isinstance(behind, Place):
+            if behind.offset != offset:
+                fix = f"write `leaving {place.span.text}`, or name an element"
+                message, label = "what is left behind is what was there", "another place than the target"
+                raise self.typer.fail("PD405", message, leaving.span, label, fix)
+            return [Move(mask, offset, None, self._effects(syntax, scope), syntax.span)]
+        left = self.typer.element(behind, leaving.span)
         if left.op != "const":
             raise self.typer.fail("PD405", "what is left behind must be one element", leaving.span, "name it")
         return [Move(mask, offset, left, self._effects(syntax, scope), syntax.span)]

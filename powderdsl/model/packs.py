@@ -84,6 +84,8 @@ class _PackReader(Reader):
         params = self.pairs(values.pop("params", None), "a mapping from parameters to values")
         values["params"] = tuple((key, line) for key, node in params if (line := self.line(node)))
         values["rename"] = tuple(self.renamed(values.pop("rename", None)))
+        also = self.pairs(values.pop("also", None), "a mapping from elements to tags")
+        values["also"] = tuple(self.also(key, node) for key, node in also)
         return RulesetDecl(name, self.source, **values)
 
     def renamed(self, node: Node | None) -> Iterator[tuple[Scalar, Scalar]]:
@@ -218,7 +220,9 @@ class _PackReader(Reader):
         if not isinstance(node, Mapping):
             return AlsoDecl(key, self.words(node))
         entries = self.mapping(node, "also", f"`{key.text}`")
-        return AlsoDecl(key, **self.with_ramp(key, entries, self.values(entries, "also")))
+        values = self.values(entries, "also")
+        values["color"] = self.color(values, "color")
+        return AlsoDecl(key, **self.with_ramp(key, entries, values))
 
     def with_ramp(self, element: Scalar, entries: Entries, values: dict[str, Any]) -> dict[str, Any]:
         """The values with the ramp that `color_by` describes; without one if something is wrong with it."""
@@ -256,6 +260,7 @@ class _PackReader(Reader):
             values.get("after", ()),
             values.get("before", ()),
             tuple(TypedDecl(name, type=self.line(value)) for name, value in scratch),
+            values.get("override", False),
         )
 
     def block(self, entries: Entries, values: dict[str, Any], node: Node) -> Block:

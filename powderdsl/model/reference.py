@@ -314,8 +314,11 @@ def run_moment(moment: Moment, at: Context, table: Mapping[str, Slot]) -> State:
         mask = masks[id(rule)]
         if isinstance(rule, Transform):
             _become(evaluate(rule.target, at), mask, state, at, table)
-        elif isinstance(rule, Move):
+        elif isinstance(rule, Move) and rule.leaving is not None:
             _become(evaluate(rule.leaving, at), mask, state, at, table)
+        elif isinstance(rule, Move):
+            for name in (name for name, slot in table.items() if slot.travels):
+                state[name] = _where(mask, look(before[name], rule.offset), state[name])
     for rule in claims:
         if isinstance(rule, (Swap, Move)):
             mask, source = masks[id(rule)], back(rule.offset)
@@ -337,7 +340,7 @@ def run_moment(moment: Moment, at: Context, table: Mapping[str, Slot]) -> State:
 def masks_of(moment: Moment, at: Context) -> dict[int, Array]:
     """Where each rule of a substep happens, bool [B, H, W] by `id`. `at.lets` has the substep's lets."""
     masks = {id(rule): evaluate(rule.mask, at) for rule in moment.rules if rule.mask is not None}
-    if moment.policy != "prove":
+    if moment.policy in ("drop_both", "first_wins"):
         claims = [rule for rule in moment.rules if not isinstance(rule, Assign)]
         _settle_claims(moment.policy, claims, masks)
     return masks
@@ -396,7 +399,8 @@ def _settle_claims(policy: str, claims: list[Any], masks: dict[int, Array]) -> N
     taken = np.zeros_like(next(iter(wanted.values()))) if wanted else None
     for rule in claims:
         mask = wanted[id(rule)]
-        if isinstance(rule, (Swap, Move)):  # pairs of one rule that share a cell have no order: none happens
+        if isinstance(rule, Swap) or (isinstance(rule, Move) and rule.leaving is not None):
+            # Pairs of one rule that share a cell have no order: none happens. Those that trade places move in rows.
             mask = mask & ~(look(mask, rule.offset) | look(mask, back(rule.offset)))
         if policy == "drop_both":
             for other in claims:

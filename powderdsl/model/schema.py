@@ -43,8 +43,8 @@ _BLOCK = {
     ),
     "conflicts": Key(
         "word",
-        "`drop_both` or `first_wins`: what happens when rules claim one cell",
-        options=("drop_both", "first_wins"),
+        "`drop_both`, `first_wins` or `overwrite`: what happens when rules claim one cell",
+        options=("drop_both", "first_wins", "overwrite"),
     ),
 }
 
@@ -53,6 +53,7 @@ KEYS: dict[str, dict[str, Key]] = {
         "pack": Key("word", "the pack's name", True),
         "about": Key("text", "what it is, in a sentence"),
         "needs": Key("words", "packs that must be loaded too"),
+        "provides": Key("words", "packs that it stands in for, where others need them"),
         "conflicts": Key("words", "packs that must not be loaded too"),
         "tags": Key("mapping", "tags that other packs give to their elements, with a sentence each"),
         "properties": Key("mapping", "numbers that every element has"),
@@ -82,6 +83,7 @@ KEYS: dict[str, dict[str, Key]] = {
         "matrix": Key("words", "the channels of `World.matrix()`"),
         "rename": Key("mapping", "other names for what packs define: `pack.word: name`"),
         "params": Key("mapping", "other values for the packs' parameters"),
+        "also": Key("mapping", "other tags, values and colors for elements of its packs"),
         "invariants": Key("statements", "what is true of every world, a statement a line"),
     },
     "property": {
@@ -128,6 +130,7 @@ KEYS: dict[str, dict[str, Key]] = {
     },
     "also": {
         "tags": Key("words", "tags to add"),
+        "color": Key("word", 'another color, quoted: "#RRGGBB"'),
         "color_by": Key("mapping", "how its color follows a field"),
     },
     "color_by": {
@@ -140,6 +143,7 @@ KEYS: dict[str, dict[str, Key]] = {
         "about": Key("text", "what it does, in a sentence"),
         "after": Key("words", "passes that come before it"),
         "before": Key("words", "passes that come after it"),
+        "override": Key("flag", "yes: replaces a pass of another pack, in its place"),
         "scratch": Key("mapping", "fields of this pass alone, which start at their default: a kind each"),
         **_BLOCK,
     },

@@ -215,7 +215,7 @@ class _Printer:
             case Swap():
                 text = f"swap {show_offset(rule.offset)}{self.condition('if', rule.mask)}"
             case Move():
-                leaving = self.expr(rule.leaving)
+                leaving = show_offset(rule.offset) if rule.leaving is None else self.expr(rule.leaving)
                 text = f"move {show_offset(rule.offset)} leaving {leaving}{self.condition('if', rule.mask)}"
             case Assign():
                 return self.assignment(rule) + self.condition("where", rule.mask)

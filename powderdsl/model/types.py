@@ -219,11 +219,14 @@ class Swap:
 
 @dataclass(frozen=True)
 class Move:
-    """Cells of the mask move what they hold to the neighbor `offset` away and leave a fresh element behind."""
+    """Cells of the mask move what they hold to the neighbor `offset` away and leave a fresh element behind.
+
+    `leaving` is None for cells that leave behind what that neighbor held: they trade places, also in rows.
+    """
 
     mask: Expr
     offset: Offset
-    leaving: Expr
+    leaving: Expr | None
     effects: tuple[Assign, ...]
     span: Span = field(compare=False, repr=False)
 
@@ -246,7 +249,7 @@ class Moment:
 
     Writes land in this order: assignments, then transforms, swaps and moves, then effects.
     `policy` says what happens to rules that claim one cell: ``prove`` (shown to be impossible), ``drop_both``,
-    ``first_wins``.
+    ``first_wins``, ``overwrite`` (nothing is dropped: later rules overwrite what earlier ones wrote).
     """
 
     lets: tuple[Let, ...]

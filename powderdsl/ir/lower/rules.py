@@ -187,7 +187,7 @@ class _PassLowering:
         at = self.inputs()
         masks = {id(rule): node(rule.mask, at) for rule in moment.rules if rule.mask is not None}
         movers: list[Mover] = [rule for rule in moment.rules if not isinstance(rule, Assign)]
-        if moment.policy != "prove":
+        if moment.policy in ("drop_both", "first_wins"):
             self._apply_policy(moment.policy, movers, masks)
         writes = [(rule, masks[id(rule)]) for rule in moment.rules if isinstance(rule, Assign)]
         effects = [(effect, masks[id(rule)]) for rule in movers for effect in rule.effects]
@@ -222,17 +222,23 @@ class _PassLowering:
         """Transforms and what moves leave behind first, then arrivals, all from the world before."""
         build = self.build
         before = dict(self.state)
+        travelling = [name for slot in self.slots.values() if slot.travels for name in slot_names(slot)]
         for rule in movers:
             if isinstance(rule, Swap):
                 continue
-            fresh = node(rule.target if isinstance(rule, Transform) else rule.leaving, at)
-            for name, value in self._fresh(fresh).items():
+            target = rule.target if isinstance(rule, Transform) else rule.leaving
+            left = (
+                {name: build.shift(before[name], rule.offset) for name in travelling}
+                if target is None and isinstance(rule, Move)
+                else self._fresh(node(target, at))  # type: ignore[arg-type]  # only moves may have none
+            )
+            for name, value in left.items():
                 self.state[name] = build.select(masks[id(rule)], value, self.state[name])
         for rule in movers:
             if isinstance(rule, Transform):
                 continue
             op = "swap" if isinstance(rule, Swap) else "arrive"
-            for name in (name for slot in self.slots.values() if slot.travels for name in slot_names(slot)):
+            for name in travelling:
                 mask, rest = masks[id(rule)], self.state[name]
                 self.state[name] = build.derive(op, before[name], mask, rest, attr=rule.offset)
 
@@ -273,7 +279,7 @@ class _PassLowering:
         taken = build.flag(False)
         for rule in movers:
             mask = wanted[id(rule)]
-            if not isinstance(rule, Transform):
+            if isinstance(rule, Swap) or (isinstance(rule, Move) and rule.leaving is not None):
                 dy, dx = rule.offset
                 chained = build.or_(build.shift(mask, (dy, dx)), build.shift(mask, (-dy, -dx)))
                 mask = build.and_(mask, build.not_(chained))

@@ -6,8 +6,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 from powderdsl.model.composition.names import Names
-from powderdsl.model.declarations import PackDecl, RulesetDecl
+from powderdsl.model.declarations import AlsoDecl, PackDecl, RulesetDecl
 from powderdsl.syntax.ast import Syntax
+from powderdsl.syntax.yaml_tree import Scalar
 
 
 class ClaimScopes:
@@ -56,6 +57,20 @@ def names_left_out(ruleset: RulesetDecl | None) -> frozenset[str]:
     """The names defined by packs that a ruleset leaves out: its own lines may use them as if they ended in `?`."""
     left_out = ruleset.left_out if ruleset else ()
     return frozenset(decl.name.text for pack in left_out for decl in pack.definitions)
+
+
+def with_waiting(also: AlsoDecl, names: frozenset[str]) -> AlsoDecl:
+    """What a ruleset adds to an element, with a `?` behind some names."""
+
+    def waiting(scalar: Scalar) -> Scalar:
+        return replace(scalar, text=f"{scalar.text}?") if scalar.text in names else scalar
+
+    return replace(
+        also,
+        name=waiting(also.name),
+        tags=tuple(map(waiting, also.tags)),
+        values=tuple((waiting(key), value) for key, value in also.values),
+    )
 
 
 def with_optional(syntax: Syntax, names: frozenset[str]) -> Syntax:

@@ -13,8 +13,15 @@ from typing import Any, TypeVar
 
 from powderdsl.diagnostics import Label, Reporter, Span
 from powderdsl.model.builtins import RESERVED
-from powderdsl.model.composition.claim_scopes import ClaimScopes, title_of
-from powderdsl.model.composition.names import NameBook, Named, Names, needed_first, report_unknown
+from powderdsl.model.composition.claim_scopes import ClaimScopes, names_left_out, title_of, with_waiting
+from powderdsl.model.composition.names import (
+    NameBook,
+    Named,
+    Names,
+    needed_first,
+    report_unknown,
+    with_stand_ins,
+)
 from powderdsl.model.composition.palette import Claim, Palette, composed_ids, recorded_ids, report_ids
 from powderdsl.model.composition.pass_order import order_passes
 from powderdsl.model.declarations import (
@@ -32,6 +39,7 @@ from powderdsl.model.declarations import (
 )
 from powderdsl.model.types import Element
 from powderdsl.syntax.parse import reserved_words
+from powderdsl.syntax.yaml_tree import Scalar
 
 T = TypeVar("T", bound=Definition)
 
@@ -91,15 +99,23 @@ class Composition:
         return self.ruleset.lineage if self.ruleset else ()
 
     def entries(self) -> Iterator[tuple[str, str, ElementDecl | AlsoDecl]]:
-        """The entries of all elements: the pack, the element's global name (as written if absent), the entry.
+        """The entries of all elements: the pack or ruleset, the element's global name (as written if absent), the entry.
 
-        In rising precedence: the elements' own entries, then those under `also`, each pack after those that it needs.
+        In rising precedence: the elements' own entries, then those under `also`, each pack after those that it needs. A
+        ruleset comes after its packs, and packs that are added to it come last.
         """
         for name, named in self.element_decls.items():
             yield named.pack, name, named.decl
-        for pack in needed_first(self.packs):
-            for also in pack.also:
-                yield pack.name.text, self.element(also.name.word, pack.name.text) or also.name.word, also
+        members = {name for one in self.lineage for name in one.members}
+        ordered = needed_first(self.packs)
+        gone = names_left_out(self.ruleset) - self.names.owners.keys()
+        of_rulesets = [
+            (one.name.text, with_waiting(also, gone)) for one in self.lineage for also in one.also
+        ]
+        of_packs = [(pack.name.text, also) for pack in ordered for also in pack.also]
+        own = [entry for entry in of_packs if entry[0] in members]
+        for giver, also in (*own, *of_rulesets, *(entry for entry in of_packs if entry[0] not in members)):
+            yield giver, self.element(also.name.word, giver) or also.name.word, also
 
     def glyphs_alone(self, packs: Sequence[str]) -> dict[str, str]:
         """The glyphs of elements, by global name, as they are where only some packs are loaded."""
@@ -129,15 +145,14 @@ def compose(
 
     `palette` has ids that were recorded earlier.
     """
+    packs = with_stand_ins(packs)
     _check_needs(packs, reporter)
     reporter.raise_if_errors()  # every name of a missing pack would be reported too
     renames = ruleset.renames if ruleset else ()
     book = NameBook(packs, renames, reporter, RESERVED | reserved_words() | {"elements"})
     passes_book = NameBook(packs, renames, reporter)
 
-    def table(
-        kind: str, decls_of: Callable[[PackDecl], Sequence[T]], book: NameBook = book
-    ) -> dict[str, Named[T]]:
+    def table(kind: str, decls_of: Callable[[PackDecl], Sequence[T]]) -> dict[str, Named[T]]:
         """The declarations of a kind by global name."""
         found = [book.define(decl, kind, pack.name.text) for pack in packs for decl in decls_of(pack)]
         return {named.name: named for named in found if named}
@@ -155,7 +170,7 @@ def compose(
     streams = table("stream", lambda pack: pack.streams)
     kernels = table("kernel", lambda pack: pack.kernels)
     sets = table("set", lambda pack: pack.sets)
-    passes = table("pass", lambda pack: pack.passes, passes_book)
+    passes = _passes(packs, passes_book, reporter)
     params = [Named(p.name.text, decl, f"{p.name.text}.{decl.name.text}") for p in packs for decl in p.params]
     for param in params:
         book.check_word(param.decl.name, "parameter")
@@ -184,7 +199,7 @@ def compose(
         groups=tuple(tuple(pack.name.text for pack in group) for group in groups),
         reserved=tuple(ids[claim.name] for claim in claims if claim.name in ids and not claim.is_loaded),
     )
-    return replace(composition, tags=_tags(composition, reporter))
+    return replace(composition, tags=_tags(composition, reporter), elements=_colored(composition))
 
 
 def _slots(
@@ -222,7 +237,7 @@ def _check_needs(packs: Sequence[PackDecl], reporter: Reporter) -> None:
         for need in pack.needs:
             if need.text not in loaded:
                 missing.setdefault(need.text, {})[pack.name.text] = need.span
-        for other in pack.conflicts:
+        for other in (*pack.conflicts, *pack.provides):
             if other.text in loaded:
                 message = f"packs `{pack.name.text}` and `{other.text}` cannot be loaded together"
                 secondary = [Label(loaded[other.text].name.span, "loaded too")]
@@ -254,16 +269,13 @@ def _versions(
     found: dict[str, list[Named[ElementDecl]]] = {}
     for pack in packs:
         for decl in pack.elements:
-            known = book.override(decl.name.text, pack.name.text) if decl.override else None
+            known = book.override(decl.name.text, pack.name.text, "element") if decl.override else None
             if known is not None:
                 _check_same_id(decl, found[known], reporter)
                 found[known].insert(0, Named(pack.name.text, decl, known))
                 continue
             if decl.override:
-                reporter.error(
-                    "PD301", f"`{decl.name.text}` overrides nothing", decl.name.span, "no pack before this one defines it",
-                    helps=["remove `override`, or load the other pack first"],
-                )  # fmt: skip
+                _report_no_base(decl.name, reporter)
             if named := book.define(decl, "element", pack.name.text):
                 found[named.name] = [named]
     if not found:
@@ -271,6 +283,31 @@ def _versions(
             "PD109", "no element is defined", packs[0].name.span if packs else None, "a world needs elements",
             helps=["define `elements:`, or load `core` too"],
         )  # fmt: skip
+    return found
+
+
+def _report_no_base(name: Scalar, reporter: Reporter) -> None:
+    reporter.error(
+        "PD301", f"`{name.text}` overrides nothing", name.span, "no pack before this one defines it",
+        helps=["remove `override`, or load the other pack first"],
+    )  # fmt: skip
+
+
+def _passes(packs: Sequence[PackDecl], book: NameBook, reporter: Reporter) -> dict[str, Named[PassDecl]]:
+    """The passes by global name. One that overrides another has its name, and its place in the order."""
+    found: dict[str, Named[PassDecl]] = {}
+    for pack in packs:
+        for decl in pack.passes:
+            known = book.override(decl.name.text, pack.name.text, "pass") if decl.override else None
+            if known is not None:
+                old = found[known].decl
+                decl = replace(decl, after=(*old.after, *decl.after), before=(*old.before, *decl.before))
+                found[known] = Named(pack.name.text, decl, known, "pass")
+                continue
+            if decl.override:
+                _report_no_base(decl.name, reporter)
+            if named := book.define(decl, "pass", pack.name.text):
+                found[named.name] = named
     return found
 
 
@@ -382,6 +419,19 @@ def _glyphs(elements: Sequence[Named[ElementDecl]]) -> dict[str, str]:
         taken.add(glyph)
         glyphs[named.name] = glyph
     return glyphs
+
+
+def _colored(composition: Composition) -> dict[str, Element]:
+    """The elements, with the colors that `also` gives them."""
+    colors = {
+        name: entry.color
+        for _, name, entry in composition.entries()
+        if isinstance(entry, AlsoDecl) and entry.color is not None
+    }
+    return {
+        name: replace(element, color=colors.get(name, element.color))
+        for name, element in composition.elements.items()
+    }
 
 
 def _tags(composition: Composition, reporter: Reporter) -> dict[str, frozenset[int]]:

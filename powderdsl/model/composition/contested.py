@@ -51,9 +51,15 @@ def report_replaced(
     composition: Composition,
     reporter: Reporter,
 ) -> None:
-    """Report that a pack replaces what another one gives an element: a note if it needs that pack, else a warning."""
+    """Report that a pack replaces what another one gives an element: a note if it needs that pack, else a warning.
+
+    What a ruleset gives replaces that of its packs without a word; a pack that is added to it may replace it.
+    """
     (before, old), (after, new) = lost, held
-    if before in composition.names.needs[after]:
+    needs = composition.names.needs
+    if after not in needs:  # a ruleset knows what its packs say
+        return
+    if before not in needs or before in needs[after]:
         reporter.report(
             "PD317", f"`{after}` replaces the `{what}` of `{element}`", new, "this value is used",
             secondary=[Label(old, f"the one that `{before}` gives")],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
 from powderdsl.diagnostics import Label, Reporter, Span, suggest
@@ -64,6 +64,22 @@ def needs_of(packs: Sequence[PackDecl]) -> dict[str, frozenset[str]]:
                 waiting.extend(direct.get(name, ()))
         closed[pack] = frozenset(found)
     return closed
+
+
+def with_stand_ins(packs: Sequence[PackDecl]) -> list[PackDecl]:
+    """The packs, in whose `needs` stand the packs that provide what is needed where that is not loaded itself."""
+    loaded = {pack.name.text for pack in packs}
+    provider = {
+        other.text: pack.name.text for pack in packs for other in pack.provides if other.text not in loaded
+    }
+    return [
+        replace(
+            pack, needs=tuple(replace(one, text=provider.get(one.text, one.text)) for one in pack.needs)
+        )
+        if any(one.text in provider for one in pack.needs)
+        else pack
+        for pack in packs
+    ]
 
 
 def in_order(names: Iterable[str], after: Mapping[str, Collection[str]]) -> tuple[list[str], list[str]]:
@@ -135,6 +151,7 @@ class NameBook:
         self.reporter = reporter
         self.packs = [pack.name.text for pack in packs]
         self.needs = needs_of(packs)
+        self.provided = {pack.name.text: [other.text for other in pack.provides] for pack in packs}
         self.reserved = reserved
         self.rename = {old.text: new for old, new in rename}
         self.renamed: set[str] = set()
@@ -144,7 +161,7 @@ class NameBook:
         self._known: dict[str, Named[Any]] = {}
         """By global name."""
         self._overridden: dict[tuple[str, str], str] = {}
-        """By pack and word: the global name of the element that the pack overrides."""
+        """By pack and word: the global name of the element or pass that the pack overrides."""
 
     def check_word(self, scalar: Scalar, kind: str) -> bool:
         """Whether a word may name something; reports one that belongs to the language."""
@@ -187,12 +204,12 @@ class NameBook:
         self._known[name] = found
         return found
 
-    def override(self, word: str, pack: str) -> str | None:
-        """The global name of the element that a pack overrides, which is also known by the pack's name from now on.
+    def override(self, word: str, pack: str, kind: str) -> str | None:
+        """The global name of the element or pass that a pack overrides, which is also known by the pack's name from now on.
 
         It is one of a pack before this one; what the pack knows comes first.
         """
-        written = [one for one in self._words.get(word, ()) if one.kind == "element"]
+        written = [one for one in self._words.get(word, ()) if one.kind == kind]
         near = [one for one in written if one.pack in self.needs[pack]]
         known = next(iter(near or written), None)
         if known is None:
@@ -210,11 +227,14 @@ class NameBook:
                 if near:
                     meanings[pack, word] = near[0]
         owners = {name: (one.pack, one.decl.name.text) for name, one in self._known.items()}
-        defined = {owner: name for name, owner in owners.items()}
-        return Names(owners, meanings, defined | self._overridden, self.needs)
+        defined = {owner: name for name, owner in owners.items()} | self._overridden
+        stands_in = {
+            (other, word): name for (pack, word), name in defined.items() for other in self.provided.get(pack, ())
+        }
+        return Names(owners, meanings, stands_in | defined, self.needs)
 
     def _report_twice(self, scalar: Scalar, kind: str, pack: str, other: Named[Any]) -> None:
-        override = "; to replace an element say `override: yes`" if kind == "element" else ""
+        override = f"; to replace {a(kind)} say `override: yes`" if kind in ("element", "pass") else ""
         self.reporter.error(
             "PD302", f"{'pass ' if kind == 'pass' else ''}`{scalar.text}` is defined twice", scalar.span,
             f"{a(kind)} of {pack}", secondary=[Label(other.span, f"{a(other.kind)} of {other.pack}")],

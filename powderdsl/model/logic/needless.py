@@ -342,6 +342,8 @@ def _arrives(
         return may(rule.mask, ELEMENT_HERE)
     if any(may(mask, what) for mask, what in _brought(moment)):
         return True
+    if isinstance(rule, Move) and rule.leaving is None and write.offset == HERE:
+        return may(rule.mask, _left(rule))
     if isinstance(rule, Move) and write.offset == HERE:
         return False  # what leaves is gone, and nothing brings one
     return may(rule.mask, look(ELEMENT_HERE, write.offset))
@@ -357,7 +359,12 @@ def _brought(moment: Moment) -> Iterator[tuple[Expr, Expr]]:
             yield rule.mask, look(ELEMENT_HERE, rule.offset)
         elif isinstance(rule, Move):
             yield rule.mask, ELEMENT_HERE
-            yield rule.mask, rule.leaving
+            yield rule.mask, _left(rule)
+
+
+def _left(rule: Move) -> Expr:
+    """The element that a move leaves behind."""
+    return look(ELEMENT_HERE, rule.offset) if rule.leaving is None else rule.leaving
 
 
 # What could not be decided

@@ -125,10 +125,32 @@ class Search:
         self._chosen: Assignment = {}
         self._domains: dict[Key, list[Any]] = {}
         self._opened: dict[str, tuple[Expr, int]] = {}
+        self._named: dict[tuple[str, Offset], bool] = {}
+        """Lets that the conditions ask for by name, by place, and whether they must hold."""
+        self._contradicts = False
 
     def require(self, condition: Expr, at: Offset = (0, 0)) -> None:
         """Add a condition; conjunctions are split, lets of this substep are looked through."""
+        self._note(condition, at, holds=True)
         self._split(self._resolve(condition)[0], at)
+
+    def _note(self, condition: Expr, at: Offset, *, holds: bool) -> None:
+        """Notice a let that must hold at a place where another condition says that it does not."""
+        match condition.op:
+            case "and" if holds:
+                for arg in condition.args:
+                    self._note(arg, at, holds=True)
+            case "or" if not holds:
+                for arg in condition.args:
+                    self._note(arg, at, holds=False)
+            case "not":
+                self._note(condition.args[0], at, holds=not holds)
+            case "look":
+                self._note(condition.args[0], _plus(at, condition.value), holds=holds)
+            case "let":
+                self.facts.budget.spend(1)
+                known = self._named.setdefault((str(condition.value), at), holds)
+                self._contradicts |= known != holds
 
     def _split(self, condition: Expr, at: Offset) -> None:
         if condition.op == "and":
@@ -173,6 +195,8 @@ class Search:
 
     def possible(self) -> bool:
         """False if no assignment satisfies all conditions."""
+        if self._contradicts:
+            return False
         joint = self._narrow()
         if joint is None:
             return False

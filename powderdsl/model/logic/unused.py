@@ -129,7 +129,9 @@ def produced_ids(passes: tuple[Pass, ...], facts: Facts) -> frozenset[int]:
     found: set[int] = set()
     for _, moment, _ in substeps(passes):
         for rule in moment.rules:
-            if isinstance(rule, (Transform, Move)):
-                target = rule.target if isinstance(rule, Transform) else rule.leaving
+            target = (
+                rule.target if isinstance(rule, Transform) else rule.leaving if isinstance(rule, Move) else None
+            )
+            if target is not None:
                 found |= {target.value} if target.op == "const" else set(facts.ids)
     return frozenset(found)

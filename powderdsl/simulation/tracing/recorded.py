@@ -203,6 +203,13 @@ class _Replay:
                 how, target = (
                     ("become", model.target) if isinstance(model, Transform) else ("leave", model.leaving)
                 )
+                if target is None and isinstance(model, Move):
+                    source = substep.near(cell, model.offset)
+                    content = _after_assignments(substep, source)
+                    for name in self.travelling:
+                        yield self.put(name, content[name], "arrive", rule, cell, source)
+                    continue
+                assert target is not None
                 identity = int(value_at(target, substep.at, cell))
                 for name in self.travelling:
                     yield self.put(name, _fresh(substep, name, identity), how, rule, cell)
