@@ -104,6 +104,15 @@ FUNCTIONS: dict[str, Function] = {
     "abs": Function("abs(A)", "a number without its sign", (1, 1)),
     "clamp": Function("clamp(A, LOW, HIGH)", "a number kept between two bounds", (3, 3)),
     "opposite": Function("opposite(PLACE)", "the neighbor, or the direction, the other way", (1, 1)),
+    "clockwise": Function(
+        "clockwise(PLACE)", "the neighbor, or the direction, a quarter turn to the right", (1, 1)
+    ),
+    "counterclockwise": Function(
+        "counterclockwise(PLACE)", "the neighbor, or the direction, a quarter turn to the left", (1, 1)
+    ),
+    "pick": Function("pick(DRAW, A, B, …)", "one of the values, each as likely as the others", (3, 17)),
+    "sin": Function("sin(A)", "the sine of an angle in radians", (1, 1)),
+    "cos": Function("cos(A)", "the cosine of an angle in radians", (1, 1)),
 }
 
 COORDINATES = ("row", "column", "step")

@@ -41,8 +41,13 @@ def _abs_bounds(node: Expr, a: Bounds) -> Bounds:
     return (0 if a[0] <= 0 <= a[1] else min(abs(a[0]), abs(a[1]))), max(abs(a[0]), abs(a[1]))
 
 
-def _opposite_bounds(node: Expr, a: Bounds) -> Bounds:
-    return ((a[0] + 4) % 8,) * 2 if a[0] == a[1] else (0, 7)
+def _turned(about: str, eighths: int) -> Operation:
+    """An operation that turns a direction clockwise."""
+
+    def bounds(node: Expr, a: Bounds) -> Bounds:
+        return ((a[0] + eighths) % 8,) * 2 if a[0] == a[1] else (0, 7)
+
+    return Operation(about, evaluate=lambda node, a: (a + eighths) % 8, bounds=bounds)
 
 
 OPS: dict[str, Operation] = {
@@ -96,10 +101,11 @@ OPS: dict[str, Operation] = {
     ),
     "choose": Operation("condition, value if it holds, value otherwise", bounds=_chosen_bounds),
     "octant": Operation("the direction a vec2 points to"),
-    "opposite": Operation(
-        "the direction the other way", evaluate=lambda node, a: (a + 4) % 8, bounds=_opposite_bounds
-    ),
+    "opposite": _turned("the direction the other way", 4),
+    "clockwise": _turned("the direction a quarter turn to the right", 2),
     "length": Operation("√(y² + x²) in float32"),
+    "sin": Operation("the sine of a float32, see `model.reference`"),
+    "cos": Operation("the cosine of a float32"),
     "row_part": Operation("the first component of a vec2"),
     "column_part": Operation("the second component of a vec2"),
     "vector": Operation("a vec2 from its two components"),

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
-from math import ceil, floor
+from math import ceil, floor, pi
 from typing import Any
 
 from powderdsl.ir.build import Builder
@@ -19,6 +19,16 @@ Pair = tuple[Node, Node]
 
 NEAR, FAR = 0.92387953251128674, 0.38268343236508977
 """cos(π/8) and cos(3π/8), where octants end."""
+
+HALF_PI = (1.5703125, 0.0004837512969970703125, 7.549789954891609e-08)
+"""π/2 in three parts, the first two of few bits."""
+
+SINE = (-1 / 6, 1 / 120, -1 / 5040, 1 / 362880)
+COSINE = (1 / 24, -1 / 720, 1 / 40320, -1 / 3628800)
+"""The series of sine and cosine from x³ and x⁴ on."""
+
+ROUNDER = 12582912.0
+"""1.5 · 2²³, which rounds what is added to it to an integer."""
 
 
 @dataclass
@@ -317,8 +327,54 @@ def _octant(expr: Expr, at: Inputs) -> Node:
     return result
 
 
-def _opposite(expr: Expr, at: Inputs) -> Node:
-    return at.build.mod(at.build.derive("add", node(expr.args[0], at), at.build.integer(4)), 8)
+def _turned(eighths: int) -> Callable[[Expr, Inputs], Node]:
+    return lambda expr, at: at.build.mod(
+        at.build.derive("add", node(expr.args[0], at), at.build.integer(eighths)), 8
+    )
+
+
+def _wave(expr: Expr, at: Inputs) -> Node:
+    """A sine or cosine: π/2 is taken off in three parts, then follows a series. See `model.reference` for each step."""
+    build, x = at.build, node(expr.args[0], at)
+
+    def real(value: float) -> Node:
+        return build.real(_float32(value))
+
+    def add(a: Node, b: Node) -> Node:
+        return build.derive("add", a, b)
+
+    def sub(a: Node, b: Node) -> Node:
+        return build.derive("sub", a, b)
+
+    def mul(a: Node, b: Node) -> Node:
+        return build.derive("mul", a, b)
+
+    def rounded(value: Node) -> Node:
+        return sub(add(value, real(ROUNDER)), real(ROUNDER))
+
+    def series(coefficients: tuple[float, ...]) -> Node:
+        *others, total = map(real, coefficients)
+        for coefficient in reversed(others):
+            total = add(coefficient, mul(z, total))
+        return total
+
+    def between(low: float, high: float) -> Node:
+        return build.and_(build.compare("lt", real(low), turn), build.compare("lt", turn, real(high)))
+
+    q = rounded(mul(x, real(2 / pi)))
+    coarse, middle, fine = (mul(q, real(part)) for part in HALF_PI)
+    near = sub(x, coarse)
+    rest = sub(near, middle)
+    small = sub(sub(sub(near, rest), middle), fine)
+    turn = sub(q, mul(real(4.0), rounded(sub(mul(q, real(0.25)), real(0.375)))))
+    z = mul(rest, rest)
+    rising = add(rest, add(small, mul(rest, mul(z, series(SINE)))))
+    level = sub(real(1.0), add(mul(real(0.5), z), sub(mul(rest, small), mul(mul(z, z), series(COSINE)))))
+    odd = build.or_(between(0.5, 1.5), build.compare("lt", real(2.5), turn))
+    is_cosine = expr.op == "cos"
+    down = between(0.5, 2.5) if is_cosine else build.compare("lt", real(1.5), turn)
+    value = build.select(odd, rising, level) if is_cosine else build.select(odd, level, rising)
+    return build.select(down, build.derive("neg", value), value)
 
 
 def _vector(expr: Expr, at: Inputs) -> Pair:
@@ -358,7 +414,10 @@ _LOWER: dict[str, Callable[[Expr, Inputs], Node | Pair]] = {
     "sum": _sum,
     "choose": _choose,
     "octant": _octant,
-    "opposite": _opposite,
+    "opposite": _turned(4),
+    "clockwise": _turned(2),
+    "sin": _wave,
+    "cos": _wave,
     "length": lambda e, at: _length(pair(e.args[0], at), at.build),
     "row_part": lambda e, at: pair(e.args[0], at)[0],
     "column_part": lambda e, at: pair(e.args[0], at)[1],

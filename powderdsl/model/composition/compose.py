@@ -109,9 +109,7 @@ class Composition:
         members = {name for one in self.lineage for name in one.members}
         ordered = needed_first(self.packs)
         gone = names_left_out(self.ruleset) - self.names.owners.keys()
-        of_rulesets = [
-            (one.name.text, with_waiting(also, gone)) for one in self.lineage for also in one.also
-        ]
+        of_rulesets = [(one.name.text, with_waiting(also, gone)) for one in self.lineage for also in one.also]
         of_packs = [(pack.name.text, also) for pack in ordered for also in pack.also]
         own = [entry for entry in of_packs if entry[0] in members]
         for giver, also in (*own, *of_rulesets, *(entry for entry in of_packs if entry[0] not in members)):

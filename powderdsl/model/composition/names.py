@@ -73,9 +73,7 @@ def with_stand_ins(packs: Sequence[PackDecl]) -> list[PackDecl]:
         other.text: pack.name.text for pack in packs for other in pack.provides if other.text not in loaded
     }
     return [
-        replace(
-            pack, needs=tuple(replace(one, text=provider.get(one.text, one.text)) for one in pack.needs)
-        )
+        replace(pack, needs=tuple(replace(one, text=provider.get(one.text, one.text)) for one in pack.needs))
         if any(one.text in provider for one in pack.needs)
         else pack
         for pack in packs
@@ -229,7 +227,9 @@ class NameBook:
         owners = {name: (one.pack, one.decl.name.text) for name, one in self._known.items()}
         defined = {owner: name for name, owner in owners.items()} | self._overridden
         stands_in = {
-            (other, word): name for (pack, word), name in defined.items() for other in self.provided.get(pack, ())
+            (other, word): name
+            for (pack, word), name in defined.items()
+            for other in self.provided.get(pack, ())
         }
         return Names(owners, meanings, stands_in | defined, self.needs)
 

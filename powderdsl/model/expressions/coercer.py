@@ -17,6 +17,7 @@ from powderdsl.model.expressions.operands import (
     Number,
     Operand,
     Place,
+    PlaceChoice,
     Poisoned,
     SetOf,
     Unresolved,
@@ -39,6 +40,7 @@ _KINDS = {
 }
 _OPERANDS: dict[type, str] = {
     Place: "a place",
+    PlaceChoice: "a choice of places",
     Number: "a number",
     Bounds: "a range",
     Items: "a list",
@@ -128,6 +130,9 @@ class Coercer:
                 return operand
             case Place():
                 return look(ELEMENT_HERE, operand.offset, span)
+            case PlaceChoice():
+                places = (self.element(operand.yes, span), self.element(operand.no, span))
+                return Expr("choose", ELEMENT, (operand.condition, *places), span=span)
             case SetOf() if operand.name is not None:
                 return Expr("const", ELEMENT, value=operand.ids[0], span=span)
             case SetOf():
@@ -143,7 +148,7 @@ class Coercer:
                 return operand
             case SetOf(_, None):
                 return self.flag(operand, span)
-            case SetOf() | Place() | Absent():
+            case SetOf() | Place() | PlaceChoice() | Absent():
                 return self.element(operand, span)
         raise self.wrong(operand, "a value", span)
 
@@ -231,6 +236,9 @@ class Coercer:
             if operand.offset in OCTANTS:
                 return Expr("const", DIRECTION, value=OCTANTS.index(operand.offset), span=span)
             raise self.fail("PD401", "not a direction", span, "directions are the eight neighbors")
+        if isinstance(operand, PlaceChoice):
+            ways = (self.direction(operand.yes, span), self.direction(operand.no, span))
+            return Expr("choose", DIRECTION, (operand.condition, *ways), span=span)
         if isinstance(operand, Expr) and operand.kind == DIRECTION:
             return operand
         if isinstance(operand, Absent):

@@ -8,10 +8,18 @@ from typing import TYPE_CHECKING
 
 from powderdsl.diagnostics import Span, suggest
 from powderdsl.model.builtins import FUNCTIONS, KERNEL_SHAPES, KERNELS, MAX_RADIUS, shaped_kernel
-from powderdsl.model.expressions.operands import Number, Operand, Place, Scope, Value, disjunction
-from powderdsl.model.expressions.operators import extreme, is_integer, kind_name, on_integers
+from powderdsl.model.expressions.operands import (
+    Number,
+    Operand,
+    Place,
+    PlaceChoice,
+    Scope,
+    Value,
+    disjunction,
+)
+from powderdsl.model.expressions.operators import choose, compare, extreme, is_integer, kind_name, on_integers
 from powderdsl.model.expressions.symbols import ELSEWHERE
-from powderdsl.model.types import DIRECTION, FLAG, REAL, VEC2, Expr, Kernel, Kind, integer
+from powderdsl.model.types import DIRECTION, DRAW, FLAG, REAL, VEC2, Expr, Kernel, Kind, integer
 from powderdsl.syntax.ast import Syntax
 
 if TYPE_CHECKING:
@@ -139,15 +147,58 @@ def _vector(typer: Typer, syntax: Syntax, scope: Scope) -> Expr:
     return Expr("vector", VEC2, parts, span=syntax.span)
 
 
-def _opposite(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
-    operand = typer.evaluate(syntax.children[0], scope)
-    if isinstance(operand, Expr) and operand.kind == DIRECTION:
-        return Expr("opposite", DIRECTION, (operand,), span=syntax.span)
-    dy, dx = typer.place(operand, syntax.children[0].span).offset
-    return Place((-dy, -dx))
+def _turned(quarters: int) -> Call:
+    """A function that turns a neighbor or a direction clockwise; a mirrored copy of a rule turns it the other way."""
+
+    def check(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
+        operand = typer.evaluate(syntax.children[0], scope)
+        if isinstance(operand, PlaceChoice):
+            operand = typer.direction(operand, syntax.children[0].span)
+        (a, b), (c, d) = scope.orientation
+        turns = quarters * (a * d - b * c) % 4
+        if isinstance(operand, Expr) and operand.kind == DIRECTION:
+            result = operand
+            for op in ("clockwise",) * (turns % 2) + ("opposite",) * (turns // 2):
+                result = Expr(op, DIRECTION, (result,), span=syntax.span)
+            return result
+        dy, dx = typer.place(operand, syntax.children[0].span).offset
+        for _ in range(turns):
+            dy, dx = dx, -dy
+        return Place((dy, dx))
+
+    return check
+
+
+# Draws
+
+
+def _pick(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
+    """One of several values by a draw, as choices between them."""
+    first, *children = syntax.children
+    draw = typer.evaluate(first, scope)
+    if not isinstance(draw, Expr) or draw.kind != DRAW:
+        fix = "such as `pick(movement, left, right)`: a stream's draw comes first"
+        raise typer.wrong(draw, "a random draw", first.span, fix)
+    operands = [(typer.evaluate(child, scope), child.span) for child in children]
+    result, place = operands[-1]
+    for number in range(len(operands) - 1, 0, -1):
+        limit = Number(Fraction(number, len(operands)))
+        below = compare(typer, "<", (draw, first.span), (limit, first.span), syntax.span)
+        result = choose(typer, below, operands[number - 1], (result, place), syntax.span)
+    return result
 
 
 # Numbers
+
+
+def _of_number(op: str) -> Call:
+    """A function of one float."""
+
+    def check(typer: Typer, syntax: Syntax, scope: Scope) -> Expr:
+        (child,) = syntax.children
+        return Expr(op, REAL, (typer.real(typer.evaluate(child, scope), child.span),), span=syntax.span)
+
+    return check
 
 
 def _extreme(typer: Typer, syntax: Syntax, scope: Scope) -> Value:
@@ -195,5 +246,10 @@ CALLS: dict[str, Call] = {
     "max": _extreme,
     "abs": _abs,
     "clamp": _clamp,
-    "opposite": _opposite,
+    "opposite": _turned(2),
+    "clockwise": _turned(1),
+    "counterclockwise": _turned(3),
+    "pick": _pick,
+    "sin": _of_number("sin"),
+    "cos": _of_number("cos"),
 }

@@ -31,6 +31,15 @@ class Place:
 
 
 @dataclass(frozen=True)
+class PlaceChoice:
+    """One place where the condition holds, the other one elsewhere. As a value it is an element, or a direction."""
+
+    condition: Expr
+    yes: Place | PlaceChoice
+    no: Place | PlaceChoice
+
+
+@dataclass(frozen=True)
 class Number:
     """An exact constant."""
 
@@ -64,7 +73,7 @@ class Broken:
     """A name whose definition has been reported: using it is not a second mistake."""
 
 
-Operand = Expr | SetOf | Place | Number | Bounds | Items | Kernel | Absent | Broken
+Operand = Expr | SetOf | Place | PlaceChoice | Number | Bounds | Items | Kernel | Absent | Broken
 Value = Expr | Number
 """Operands that arithmetic and comparisons work on."""
 

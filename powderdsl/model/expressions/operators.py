@@ -22,6 +22,7 @@ from powderdsl.model.expressions.operands import (
     Number,
     Operand,
     Place,
+    PlaceChoice,
     Poisoned,
     Scope,
     SetOf,
@@ -191,7 +192,23 @@ def holds(typer: Typer, left: Operand, right: Operand, syntax: Syntax) -> Expr:
             return TRUE if left == right else FALSE
         case SetOf(), SetOf() if left.name is not None:
             return TRUE if left.ids[0] in right.ids else FALSE
-        case Expr(), Place():
+        case PlaceChoice(), Place() | PlaceChoice():
+            return compare(
+                typer,
+                "==",
+                (typer.direction(left, first), span),
+                (typer.direction(right, second), span),
+                span,
+            )
+        case Place(), PlaceChoice():
+            return compare(
+                typer,
+                "==",
+                (typer.direction(left, first), span),
+                (typer.direction(right, second), span),
+                span,
+            )
+        case Expr(), Place() | PlaceChoice():
             return compare(typer, "==", (left, span), (typer.direction(right, second), span), span)
         case _, Expr() if right.kind == DIRECTION:
             return compare(typer, "==", (typer.direction(left, first), span), (right, span), span)
@@ -386,8 +403,10 @@ def _coordinate_quotient(typer: Typer, syntax: Syntax, modulus: int, scope: Scop
 
 def choose(
     typer: Typer, condition: Expr, yes: tuple[Operand, Span], no: tuple[Operand, Span], span: Span
-) -> Expr:
-    """`a if c else b`, both of one kind; integers join their ranges."""
+) -> Expr | PlaceChoice:
+    """`a if c else b`, both of one kind; integers join their ranges. What it is of places depends on its use."""
+    if isinstance(yes[0], (Place, PlaceChoice)) and isinstance(no[0], (Place, PlaceChoice)):
+        return PlaceChoice(condition, yes[0], no[0])
     a, b = typer.value(*yes), typer.value(*no)
     kinds = {kind_name(value) or "number" for value in (a, b)}
     if is_integer(a) and is_integer(b):

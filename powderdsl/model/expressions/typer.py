@@ -23,6 +23,7 @@ from powderdsl.model.expressions.operands import (
     Number,
     Operand,
     Place,
+    PlaceChoice,
     Poisoned,
     Scope,
     SetOf,
@@ -341,7 +342,7 @@ class Typer(Coercer):
         headings = any(kind_name(operand) == "direction" for operand in operands)
         values: list[tuple[Value, Span]] = [
             (self.direction(operand, child.span), child.span)
-            if headings and isinstance(operand, Place)
+            if headings and isinstance(operand, (Place, PlaceChoice))
             else (self.value(operand, child.span), child.span)
             for operand, child in zip(operands, syntax.children, strict=True)
         ]

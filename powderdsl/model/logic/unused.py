@@ -130,7 +130,11 @@ def produced_ids(passes: tuple[Pass, ...], facts: Facts) -> frozenset[int]:
     for _, moment, _ in substeps(passes):
         for rule in moment.rules:
             target = (
-                rule.target if isinstance(rule, Transform) else rule.leaving if isinstance(rule, Move) else None
+                rule.target
+                if isinstance(rule, Transform)
+                else rule.leaving
+                if isinstance(rule, Move)
+                else None
             )
             if target is not None:
                 found |= {target.value} if target.op == "const" else set(facts.ids)

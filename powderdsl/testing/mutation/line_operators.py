@@ -248,7 +248,7 @@ def _call(node: Syntax, names: Names) -> Iterator[Change]:
     inner = node.children[0].span.text if node.children else ""
     if name in ("abs", "clamp"):
         yield _change("arithmetic", node, f"({inner})")
-    if name == "opposite":
+    if name in ("opposite", "clockwise", "counterclockwise"):
         yield _change("neighbor", node, inner)
     for shape in KERNEL_SHAPES if name in KERNEL_SHAPES else ():
         if shape != name:
