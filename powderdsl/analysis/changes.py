@@ -87,8 +87,8 @@ class Asked:
             return []
         found: list[Condition] = []
         cells = footprint(rule)
-        rows = isinstance(rule, Transform) or (isinstance(rule, Move) and rule.leaving is None)
-        if not rows:  # pairs of one rule that share a cell: none of them happens
+        if isinstance(rule, Swap) or (isinstance(rule, Move) and rule.leaving is not None):
+            # pairs of one rule that share a cell: none of them happens
             assert rule.mask is not None
             dy, dx = rule.offset
             found += [(negation(rule.mask), rule.offset), (negation(rule.mask), (-dy, -dx))]

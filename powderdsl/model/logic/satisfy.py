@@ -15,6 +15,7 @@ from fractions import Fraction
 from functools import cached_property
 from typing import Any, NamedTuple, TypeVar
 
+from powderdsl.model.logic.literals import contradict
 from powderdsl.model.operations import OPS, Bounds
 from powderdsl.model.types import Assign, Expr, Moment, Offset, Pass, Property, Rule
 
@@ -30,7 +31,6 @@ Conditions = Sequence[tuple[Expr, Offset]]
 MAX_DOMAIN = 256
 MAX_LET = 150
 """Nodes of a let's value that are looked through; a larger one is taken for free."""
-
 
 BUDGET = 500_000
 """Nodes evaluated in a group of questions: half a second. The largest shipped ruleset needs a twentieth of it."""
@@ -125,32 +125,10 @@ class Search:
         self._chosen: Assignment = {}
         self._domains: dict[Key, list[Any]] = {}
         self._opened: dict[str, tuple[Expr, int]] = {}
-        self._named: dict[tuple[str, Offset], bool] = {}
-        """Lets that the conditions ask for by name, by place, and whether they must hold."""
-        self._contradicts = False
 
     def require(self, condition: Expr, at: Offset = (0, 0)) -> None:
         """Add a condition; conjunctions are split, lets of this substep are looked through."""
-        self._note(condition, at, holds=True)
         self._split(self._resolve(condition)[0], at)
-
-    def _note(self, condition: Expr, at: Offset, *, holds: bool) -> None:
-        """Notice a let that must hold at a place where another condition says that it does not."""
-        match condition.op:
-            case "and" if holds:
-                for arg in condition.args:
-                    self._note(arg, at, holds=True)
-            case "or" if not holds:
-                for arg in condition.args:
-                    self._note(arg, at, holds=False)
-            case "not":
-                self._note(condition.args[0], at, holds=not holds)
-            case "look":
-                self._note(condition.args[0], _plus(at, condition.value), holds=holds)
-            case "let":
-                self.facts.budget.spend(1)
-                known = self._named.setdefault((str(condition.value), at), holds)
-                self._contradicts |= known != holds
 
     def _split(self, condition: Expr, at: Offset) -> None:
         if condition.op == "and":
@@ -195,8 +173,6 @@ class Search:
 
     def possible(self) -> bool:
         """False if no assignment satisfies all conditions."""
-        if self._contradicts:
-            return False
         joint = self._narrow()
         if joint is None:
             return False
@@ -484,6 +460,8 @@ def _ask(
 
 def decide(facts: Facts, conditions: Conditions, lets: Lets | None = None) -> bool | None:
     """Whether the conditions may hold together; None if that takes too much work. False is a proof."""
+    if contradict(conditions):
+        return False
     return _ask(facts, conditions, lets, Search.possible)
 
 

@@ -1,0 +1,245 @@
+"""The second Powderworld against recorded steps of its engine: every pass alone, and whole steps.
+
+A recording holds steps of the engine of 2023 as it ran: the state before, the random numbers, the state after each of
+its 18 passes, and where a defect of the engine shows in the result of a pass. Each pass runs alone from the recorded
+state before it, all steps of one file as one batch of worlds:
+
+* `powderworld2` conserves what the engine loses: the same in all cells but those where a defect shows, and after
+  a whole step in all worlds where none does;
+* `powderworld2_defects` has the defects too: the same in all cells.
+
+Ids, gravity, density and `fell` must be equal, what creatures keep within 1e-4, velocity within 1e-3. The engine's
+three custom numbers are fields of their own here: see `fields_of`. A gravity of 2, which only sums of a defect have,
+counts as none: such cells never fall.
+
+The recordings in tests/data/second are a few steps of each file, chosen so that every event of the full files is among
+them (tests/data/make_recordings.py). To check against full recordings, or others of the same kind:
+
+    POWDERDSL_SECOND_RECORDINGS=FOLDER pytest tests/semantics/test_second_recordings.py
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import powderdsl
+from powderdsl.model.state import slots
+from powderdsl.model.types import Ruleset
+
+DATA = Path(__file__).parents[1] / "data" / "second"
+STREAMS = ("movement", "interact", "element")
+PASSES = (
+    "stone", "mole", "gravity", "piling", "lemming", "flow", "melt", "freeze", "fire",
+    "plant", "lava", "acid", "cloner", "fish", "bird", "kangaroo", "snake", "wind",
+)  # fmt: skip
+RULESETS = ("powderworld2", "powderworld2_defects")
+FLOWING = ("empty", "water", "gas", "lava", "acid", "kangaroo", "lemming")
+CLOSE = {"velocity": 1e-3, "flying": 1e-4, "leap": 1e-4, "energy": 1e-4}
+"""How far floats may be from the recorded ones."""
+COVERED = {
+    "mole": 10, "gravity": 10, "piling": 10, "lemming": 10, "flow": 10, "melt": 2, "freeze": 2, "fire": 10, "plant": 5,
+    "lava": 5, "acid": 5, "cloner": 5, "fish": 5, "snake": 10, "wind": 10,
+}  # fmt: skip
+"""How many ids each pass must change in the recordings of the tests."""
+
+State = dict[str, np.ndarray]
+"""A recorded state: ``ids`` [n, H, W], ``velocity`` [n, 2, H, W], and the engine's other numbers."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """n recorded steps: `states[k]` is the state after k passes; `defect` is bool [18, n, H, W]."""
+
+    elements: tuple[str, ...]
+    passes: tuple[str, ...]
+    random: dict[str, np.ndarray]
+    states: tuple[State, ...]
+    defect: np.ndarray
+
+
+def recording_paths() -> list[Path]:
+    """The recordings to test against; FileNotFoundError when there are none."""
+    folder = Path(os.environ.get("POWDERDSL_SECOND_RECORDINGS") or DATA)
+    paths = []
+    for path in sorted(folder.glob("*.npz")):
+        with np.load(path, allow_pickle=False) as archive:
+            if "before_custom1" in archive.files:
+                paths.append(path)
+    if not paths:
+        raise FileNotFoundError(f"no recordings in {folder}")
+    return paths
+
+
+@cache
+def read_recording(path: Path) -> Recording:
+    with np.load(path, allow_pickle=False) as archive:
+        arrays = {name: archive[name] for name in archive.files}
+    names = [name.removeprefix("before_") for name in arrays if name.startswith("before_")]
+    before = {name: arrays[f"before_{name}"] for name in names}
+    passes = tuple(arrays["passes"].tolist())
+    after = [{name: arrays[f"after_{name}"][k] for name in names} for k in range(len(passes))]
+    draws = (arrays["random"].astype(np.float32) + np.float32(0.5)) / np.float32(256)
+    random = dict(zip(STREAMS, draws, strict=True))
+    return Recording(tuple(arrays["elements"].tolist()), passes, random, (before, *after), arrays["defect"])
+
+
+@dataclass(frozen=True)
+class Runner:
+    """The compiled rules on one backend, taking and giving recorded states."""
+
+    backend: str
+    ruleset: Ruleset
+    simulator: Any
+
+    def run(self, state: State, random: State, passes: tuple[str, ...]) -> Any:
+        """The world after one step that runs only `passes`."""
+        world = self.simulator.world(self.given(state["ids"]))
+        fields = {slot.name: slot for slot in slots(self.ruleset)}
+        found = {name: value for name, value in self.fields_of(state).items() if name in fields}
+        for name, value in found.items():
+            prop = self.ruleset.property(name)
+            if prop is not None:  # cells of other elements have the value of their element, and no other
+                usual = np.array([float(number) for number in prop.values])[state["ids"]]
+                own = np.isin(state["ids"], sorted(prop.stored))
+                found[name] = np.where(own, value, usual).astype(fields[name].dtype)
+        world = self.simulator.replace(world, **{name: self.given(value) for name, value in found.items()})
+        draws = {stream: self.given(draw) for stream, draw in random.items()}
+        return self.simulator.step(world, random=draws, passes=list(passes))
+
+    def fields_of(self, state: State) -> State:
+        """The fields that stand for a recorded state's numbers."""
+        ids, first, second = state["ids"], state["custom1"], state["custom2"]
+
+        def only(values: np.ndarray, *names: str) -> np.ndarray:
+            numbers = [self.ruleset.element(name).id for name in names]  # type: ignore[union-attr]  # all are there
+            return np.where(np.isin(ids, numbers), values, 0)
+
+        found = {
+            "gravity": (state["gravity"] == 1).astype(np.uint8),
+            "momentum": only(first, *FLOWING).astype(np.int8),
+            "fell": state["custom3"].astype(np.int8),
+            "velocity": state["velocity"].astype(np.float32),
+            "clone": only(first, "cloner").astype(np.uint8),
+            "digging": 2 * only(first, "mole").astype(np.uint8),  # quarters of a turn as eighths
+            "crawling": 2 * only(first, "snake").astype(np.uint8),
+            "energy": only(second, "snake").astype(np.float32),
+            "leap": only(second, "kangaroo").astype(np.float32),
+            "flying": np.stack([only(first, "bird"), only(second, "bird")], 1).astype(np.float32),
+        }
+        return found | ({"density": state["density"].astype(np.int8)} if "density" in state else {})
+
+    def given(self, array: np.ndarray) -> Any:
+        """The array as the backend's own type."""
+        if self.backend == "reference":
+            return array
+        import torch
+
+        return torch.from_numpy(array.copy())
+
+    def differing(self, world: Any, recorded: State) -> dict[str, np.ndarray]:
+        """Where a world differs from a recorded state, bool [n, H, W], by field. The same without a field: no entry."""
+        found = {"ids": np.asarray(world.ids) != recorded["ids"]}
+        for name, value in self.fields_of(recorded).items():
+            if name not in world.state:
+                continue
+            ours = np.asarray(world[name]).astype(np.float64)
+            other = ~(np.abs(ours - value) <= CLOSE.get(name, 0))  # NaN is not close
+            found[name] = other.any(axis=1) if other.ndim == 4 else other
+        return {name: mask for name, mask in found.items() if mask.any()}
+
+
+@cache
+def compiled(name: str, backend: str) -> Runner:
+    ruleset = powderdsl.load(name)
+    return Runner(backend, ruleset, powderdsl.compile(ruleset, backend=backend))
+
+
+@pytest.fixture(
+    params=[(name, backend) for name in RULESETS for backend in ("reference", "wasm")], ids="-".join
+)
+def runner(request: pytest.FixtureRequest) -> Runner:
+    return compiled(*request.param)
+
+
+@pytest.fixture(params=recording_paths(), ids=lambda path: path.stem)
+def recording(request: pytest.FixtureRequest) -> Recording:
+    return read_recording(request.param)
+
+
+def where_first(mask: np.ndarray) -> str:
+    """How many cells a mask [n, H, W] has, and the first few of them, for a message."""
+    cells = [tuple(cell) for cell in np.argwhere(mask)[:5].tolist()]
+    return f"{np.count_nonzero(mask)} of {mask.size} cells, the first (world, row, column): {cells}"
+
+
+def assert_none(differing: dict[str, np.ndarray], but: np.ndarray) -> None:
+    """Fail if a field differs somewhere, cells [n, H, W] or worlds [n, 1, 1] left out."""
+    found = {name: mask & ~but for name, mask in differing.items()}
+    assert not any(mask.any() for mask in found.values()), {
+        name: where_first(mask) for name, mask in found.items() if mask.any()
+    }
+
+
+def test_names_and_order_are_the_engines(runner: Runner, recording: Recording) -> None:
+    assert tuple(runner.simulator.elements) == recording.elements
+    assert tuple(runner.simulator.passes) == recording.passes == PASSES
+
+
+@pytest.mark.parametrize("alone", PASSES)
+def test_single_pass(runner: Runner, recording: Recording, alone: str) -> None:
+    k = PASSES.index(alone)
+    world = runner.run(recording.states[k], recording.random, (alone,))
+    conserving = runner.ruleset.name == "powderworld2"
+    but = recording.defect[k] if conserving else np.zeros_like(recording.defect[k])
+    before = recording.states[k]
+    if conserving and "density" in before:  # sums that a defect left behind are no cells of these rules
+        usual = np.array([float(number) for number in runner.ruleset.property("density").values])  # type: ignore[union-attr]
+        sums = (before["gravity"] > 1) | (before["density"] != usual[before["ids"]])
+        but = but | sums.any(axis=(-2, -1), keepdims=True)
+    assert_none(runner.differing(world, recording.states[k + 1]), but)
+
+
+def test_whole_step(runner: Runner, recording: Recording) -> None:
+    world = runner.run(recording.states[0], recording.random, PASSES)
+    worlds = recording.defect.any(axis=(0, -2, -1))[:, None, None]
+    before = recording.states[0]
+    worlds = worlds | (before["gravity"] > 1).any(axis=(-2, -1), keepdims=True)
+    but = worlds if runner.ruleset.name == "powderworld2" else np.zeros_like(worlds)
+    assert_none(runner.differing(world, recording.states[-1]), but)
+
+
+def test_defects_are_told_apart() -> None:
+    """Where the recordings mark a defect, the conserving rules do something else somewhere."""
+    runner = compiled("powderworld2", "reference")
+    for name in ("piling", "mole"):
+        k, marked = PASSES.index(name), []
+        for recording in map(read_recording, recording_paths()):
+            world = runner.run(recording.states[k], recording.random, (name,))
+            for mask in runner.differing(world, recording.states[k + 1]).values():
+                marked.append(np.count_nonzero(mask & recording.defect[k]))
+        assert sum(marked) > 0, name
+
+
+@pytest.mark.skipif("POWDERDSL_SECOND_RECORDINGS" in os.environ, reason="says what tests/data holds")
+def test_small_recordings_show_everything() -> None:
+    """The recordings kept here hold every element, gusts, and something for each pass to do."""
+    recordings = [read_recording(path) for path in recording_paths()]
+    assert len(recordings) == 6
+    present = {element for one in recordings for element in np.unique(one.states[0]["ids"]).tolist()}
+    assert present == set(range(21))
+    assert any(np.abs(one.states[0]["velocity"]).max() > 10 for one in recordings)
+
+    def changed(k: int, field: str) -> int:
+        return sum(np.count_nonzero(one.states[k][field] != one.states[k + 1][field]) for one in recordings)
+
+    assert {name for name, least in COVERED.items() if changed(PASSES.index(name), "ids") < least} == set()
+    assert changed(PASSES.index("stone"), "gravity") >= 10
+    assert changed(PASSES.index("bird"), "custom1") >= 10
+    assert changed(PASSES.index("kangaroo"), "custom2") >= 10
