@@ -137,7 +137,7 @@ def find_changes(ruleset: Ruleset, facts: Facts) -> list[Found]:
         for rule in moment.rules:
             line = rule_line(rule, pass_)
             _look_at(rule, asked, found.setdefault(line, Found(line)))
-        for rule, pairs in _chains(asked):
+        for rule, pairs in (*_chains(asked), *_overwritten(asked)):
             found[rule_line(rule, pass_)].pairs |= pairs
     return list(found.values())
 
@@ -221,7 +221,7 @@ def _chains(asked: Asked) -> Iterator[tuple[Move, Pairs]]:
     """
     moves = [rule for rule in asked.moment.rules if isinstance(rule, Move)]
     kinds = {rule.offset if rule.leaving is None else rule.leaving.value for rule in moves}
-    if asked.moment.policy not in ("prove", "overwrite") or len(kinds) < 2:
+    if asked.moment.policy != "prove" or len(kinds) < 2:
         return
     live = [rule for rule in moves if asked.may(rule)]
     lost = {number for rule in live for number in overwritten(rule, asked)}
@@ -230,3 +230,23 @@ def _chains(asked: Asked) -> Iterator[tuple[Move, Pairs]]:
     pairs = {(before, after) for before in lost for after in left if before != after}
     for rule in live:
         yield rule, pairs
+
+
+def _overwritten(asked: Asked) -> list[tuple[Rule, Pairs]]:
+    """Effects of rules that overwrite each other: in a cell that several claim anything of theirs may be lost or stay."""
+    if asked.moment.policy != "overwrite":
+        return []
+    live = [rule for rule in asked.moment.rules if not isinstance(rule, Assign) and asked.may(rule)]
+    if not any(isinstance(rule, (Swap, Move)) for rule in live):
+        return []
+    there = {
+        number
+        for rule in live
+        for at in footprint(rule)
+        for number in asked.facts.ids
+        if asked.may(rule, is_(number, at))
+    }
+    made = {after for rule in live if isinstance(rule, Transform) for _, after in becomes(rule, asked, set())}
+    made |= {int(rule.leaving.value) for rule in live if isinstance(rule, Move) and rule.leaving is not None}
+    pairs = {(before, after) for before in there for after in there | made if before != after}
+    return [(rule, pairs) for rule in live]

@@ -8,18 +8,21 @@ from typing import TypeVar
 
 from powderdsl.analysis.changes import HERE, Asked, RuleLine, footprint, is_not, possible, rule_line
 from powderdsl.model.logic.satisfy import Facts
-from powderdsl.model.types import Assign, Expr, Offset, Pass, Rule, Ruleset, Transform
+from powderdsl.model.types import Assign, Expr, Move, Offset, Pass, Rule, Ruleset, Transform
 
 T = TypeVar("T")
 
 OUTCOMES = {
     "first wins": "both claim a cell at once: the first one happens",
     "both dropped": "both claim a cell at once: neither happens",
+    "overwritten": "both claim a cell at once: the later one overwrites the other",
     "last writes": "both write a field of a cell at once: the last one has the final word",
     "cut off": "both change a number of a cell at once: at the bounds of its range the order matters",
     "first in turn": "both may want to turn a cell into something: the one that runs first does",
 }
 """Outcomes for two rules that meet, in words."""
+
+_BY_POLICY = {"first_wins": "first wins", "drop_both": "both dropped", "overwrite": "overwritten"}
 
 MAX_LINES = 64
 """Lines that transform cells, up to which every two of different substeps are compared."""
@@ -60,11 +63,13 @@ def _claims(asked: Asked, pass_: Pass, known: dict[Overlap, None]) -> Iterator[O
         return
     # Rules that are always dropped meet others too: only the conditions count here.
     movers = [rule for rule in asked.moment.rules if not isinstance(rule, Assign)]
-    outcome = "first wins" if asked.moment.policy == "first_wins" else "both dropped"
+    outcome = _BY_POLICY[asked.moment.policy]
     for i, second in enumerate(movers):
         for first in movers[: i + 1]:
             one = first is second
-            what = "both dropped" if one else outcome
+            if one and _in_rows(first):
+                continue
+            what = "both dropped" if one and outcome != "overwritten" else outcome
             overlap = Overlap(what, rule_line(first, pass_), rule_line(second, pass_))
             same = what == "first wins" and _alike(first, second)
             if overlap in known or same:
@@ -74,6 +79,11 @@ def _claims(asked: Asked, pass_: Pass, known: dict[Overlap, None]) -> Iterator[O
             )
             if any(_meet(first.mask, second.mask, at, asked) for at in shifts if not (one and at == HERE)):
                 yield overlap
+
+
+def _in_rows(rule: Rule) -> bool:
+    """Whether cells of one rule that share a place move in rows."""
+    return isinstance(rule, Move) and rule.leaving is None
 
 
 def _alike(first: Rule, second: Rule) -> bool:

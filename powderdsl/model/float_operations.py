@@ -71,7 +71,7 @@ def wave(x: Array, *, cosine: bool) -> Array:
     level = whole - (np.float32(0.5) * z + (rest * small - higher))
     odd = ((turn > np.float32(0.5)) & (turn < np.float32(1.5))) | (turn > np.float32(2.5))
     down = (turn > np.float32(0.5)) & (turn < np.float32(2.5)) if cosine else turn > np.float32(1.5)
-    value = np.where(odd != cosine, level, rising)
+    value = np.where(~odd if cosine else odd, level, rising)
     return np.where(down, -value, value)
 
 

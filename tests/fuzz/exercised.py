@@ -36,6 +36,7 @@ NOT_RUN = {
     "pack": {
         "about",
         "needs",
+        "provides",
         "conflicts",
         "also",
         "tests",
@@ -43,7 +44,8 @@ NOT_RUN = {
         "side_multiple",
     },  # how packs meet is decided before the IR
     "element": {"glyph", "about", "override", "color_by"},
-    **{context: {"about"} for context in ("property", "field", "stream", "param", "pass")},
+    **{context: {"about"} for context in ("property", "field", "stream", "param")},
+    "pass": {"about", "override"},
 }
 """Keys that say nothing about what a step does."""
 
@@ -92,7 +94,7 @@ def expected() -> dict[str, frozenset[str]]:
         - OF_INVARIANTS,
         "words": frozenset([*DIRECTIONS, *DIRECTION_SETS, *KERNELS, *FUNCTIONS, *COORDINATES]),
         "rules": frozenset(
-            ["Transform", "Swap", "Move", "Assign", "prove", "drop_both", "first_wins", ":=", "+=", "-=", "mirror", "rotations", "all"]
+            ["Transform", "Swap", "Move", "Assign", "prove", "drop_both", "first_wins", "overwrite", ":=", "+=", "-=", "mirror", "rotations", "all"]
         ),
         "fields and properties": frozenset(
             [f"field {kind}" for kind in ("int", *KIND_WORDS) if kind != "chance"]

@@ -62,13 +62,14 @@ def seeded_ruleset(seed: int) -> Ruleset | None:
 
 def compositions() -> list[str]:
     """Everything shipped, as it can be loaded: rulesets, and packs with what they need."""
-    found = []
-    for name in shipped_rules():
+
+    def with_needs(name: str) -> list[str]:
         text = (shipped("rules") / f"{name}.yaml").read_text(encoding="utf-8")
         needs = next((line for line in text.splitlines() if line.startswith("needs:")), "")
         words = needs.removeprefix("needs:").replace("[", " ").replace("]", " ").replace(",", " ").split()
-        found.append("+".join([*words, name]))
-    return found
+        return [*(one for word in words for one in with_needs(word)), name]
+
+    return ["+".join(dict.fromkeys(with_needs(name))) for name in shipped_rules()]
 
 
 @pytest.mark.parametrize("name", compositions())

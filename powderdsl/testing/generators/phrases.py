@@ -362,7 +362,8 @@ class Phrases(Names):
 
     def _real_unary(self, depth: int) -> Number:
         value = self.real(depth)
-        return Number(self.pick(f"abs({value})", f"(-{value})"), fixed=value.fixed)
+        text = self.pick(f"abs({value})", f"(-{value})", f"sin({value})", f"cos({value})")
+        return Number(text, fixed=value.fixed and text[0] not in "sc")
 
     def _real_extreme(self, depth: int) -> Number:
         a, b = self.real(depth), self._number(2, depth)
@@ -441,12 +442,16 @@ class Phrases(Names):
     def direction(self, depth: int) -> str:
         if self.choices.maybe(50):
             return self.runtime_direction(depth)
+        if self.words.streams and self.choices.maybe(20):
+            sides = [self.pick(*SIDES) for _ in range(self.choices.integer(2, 4))]
+            return f"pick({self.choices.pick(list(self.words.streams))}, {', '.join(sides)})"
         return self.pick(*SIDES, *self.local("side"))
 
     def runtime_direction(self, depth: int) -> str:
         """A direction that depends on the world."""
         if depth > 0 and self.choices.maybe(20):
-            return f"opposite({self.runtime_direction(depth - 1)})"
+            turn = self.pick("opposite", "clockwise", "counterclockwise")
+            return f"{turn}({self.runtime_direction(depth - 1)})"
         name = self._named("direction")
         if name is None or (depth > 0 and self.choices.maybe(30)):
             return f"octant({self.vector(depth - 1)})"

@@ -94,7 +94,7 @@ class PassMaker:
         choices = self.choices
         tree: dict[str, Tree] = {}
         if policy is None and choices.maybe(40):
-            policy = choices.pick(["drop_both", "first_wins"])
+            policy = choices.pick(["drop_both", "first_wins", "overwrite"])
             tree["conflicts"] = policy
         if not symmetric and self.manner.symmetry and choices.maybe(15):
             symmetric = True
@@ -243,8 +243,9 @@ class PassMaker:
         return head + self._tail(phrases)
 
     def _move(self, phrases: Phrases) -> str:
-        leaving = self.choices.pick([*self.words.elements, *phrases.local("one")])
-        return f"{self._subject(phrases)} moves {self._mover_place(phrases)} leaving {leaving}{self._tail(phrases)}"
+        place = self._mover_place(phrases)
+        leaving = self.choices.pick([*self.words.elements, *phrases.local("one"), place])
+        return f"{self._subject(phrases)} moves {place} leaving {leaving}{self._tail(phrases)}"
 
     def _assign(self, phrases: Phrases) -> str | None:
         update = self._update(phrases, effect=False)
@@ -331,7 +332,8 @@ class PassMaker:
         choices = self.choices
         one, two, three = choices.some(self.words.elements, 3, 3)
         place = self._mover_place(phrases)
-        verb = choices.pick([f"swaps {place}", f"moves {place} leaving {choices.pick(self.words.elements)}"])
+        left = choices.pick([*self.words.elements, place])
+        verb = choices.pick([f"swaps {place}", f"moves {place} leaving {left}"])
         condition = f"{place} is {three} and {phrases.flag(2)}"
         mover = f"{two} {verb} if {condition}{self._chance(phrases)}{self._effects(phrases)}"
         rules: list[str | None] = [f"{one} -> {phrases.element(1)}{self._tail(phrases)}", mover]

@@ -23,7 +23,7 @@ Path = tuple[tuple[Container, int], ...]
 
 OPTIONS = {
     "symmetry": ("side", ("mirror", "rotations", "all")),
-    "conflicts": ("conflicts", ("drop_both", "first_wins")),
+    "conflicts": ("conflicts", ("drop_both", "first_wins", "overwrite")),
 }
 """Keys of a block with a word as their value: the kind of mistake, and the words."""
 
