@@ -52,18 +52,17 @@ def length(v: Array) -> Array:
 
 
 def wave(x: Array, *, cosine: bool) -> Array:
-    """The sine or cosine of angles in radians, within 2⁻²³ for those up to 1000.
+    """The sine or cosine of angles in radians, within 2⁻²² for those up to 1000.
 
-    x is the q-th multiple of π/2 plus a rest, in two parts of which the second is far smaller. Both follow from the
-    series of the rest.
+    x is the q-th multiple of π/2 plus a rest, and what rounding took off the rest. Both waves follow from its series.
     """
     sine, cosine_of = ([np.float32(number) for number in row] for row in SERIES)
     rounder, whole = np.float32(ROUNDER), np.float32(1)
     q = (x * np.float32(2 / math.pi) + rounder) - rounder
     coarse, middle, fine = (q * np.float32(part) for part in HALF_PI)
-    near = x - coarse
-    rest = near - middle
-    small = ((near - rest) - middle) - fine
+    near = (x - coarse) - middle  # exact
+    rest = near - fine
+    small = (near - rest) - fine
     turn = q - np.float32(4) * ((q * np.float32(0.25) - np.float32(0.375) + rounder) - rounder)
     z = rest * rest
     rising = rest + (small + rest * (z * (sine[0] + z * (sine[1] + z * (sine[2] + z * sine[3])))))

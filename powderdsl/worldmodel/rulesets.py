@@ -15,6 +15,7 @@ from torch import Tensor
 from powderdsl.compiler import read, starting_backend
 from powderdsl.diagnostics import CompileError, Reporter, suggest
 from powderdsl.model.check import check
+from powderdsl.model.composition.names import with_stand_ins
 from powderdsl.model.composition.palette import Palette
 from powderdsl.model.declarations import ElementDecl, PackDecl
 from powderdsl.model.parameter_values import set_params
@@ -155,7 +156,7 @@ class RulesetSource:
         """The packs that are left out, drawn one at a time; packs that others need stay."""
         if not self.variety.leave_out:
             return ()
-        needed = {name.text for pack in self.packs for name in pack.needs}
+        needed = {name.text for pack in with_stand_ins(self.packs) for name in pack.needs}
         loose = [pack.name.text for pack in self.packs if pack.name.text not in needed]
         return tuple(name for name in loose if next(draws) < self.variety.leave_out)
 

@@ -363,9 +363,9 @@ def _wave(expr: Expr, at: Inputs) -> Node:
 
     q = rounded(mul(x, real(2 / pi)))
     coarse, middle, fine = (mul(q, real(part)) for part in HALF_PI)
-    near = sub(x, coarse)
-    rest = sub(near, middle)
-    small = sub(sub(sub(near, rest), middle), fine)
+    near = sub(sub(x, coarse), middle)
+    rest = sub(near, fine)
+    small = sub(sub(near, rest), fine)
     turn = sub(q, mul(real(4.0), rounded(sub(mul(q, real(0.25)), real(0.375)))))
     z = mul(rest, rest)
     rising = add(rest, add(small, mul(rest, mul(z, series(SINE)))))

@@ -230,15 +230,20 @@ def _check_renamed(ruleset: RulesetDecl | None, renamed: AbstractSet[str], repor
 def _check_needs(packs: Sequence[PackDecl], reporter: Reporter) -> None:
     """Report packs that cannot be loaded together, and packs that are needed and not loaded."""
     loaded = {pack.name.text: pack for pack in packs}
+    stands_in: dict[str, PackDecl] = {}
     missing: dict[str, dict[str, Span]] = {}
     for pack in packs:
         for need in pack.needs:
             if need.text not in loaded:
                 missing.setdefault(need.text, {})[pack.name.text] = need.span
         for other in (*pack.conflicts, *pack.provides):
-            if other.text in loaded:
-                message = f"packs `{pack.name.text}` and `{other.text}` cannot be loaded together"
-                secondary = [Label(loaded[other.text].name.span, "loaded too")]
+            rival = loaded.get(other.text)
+            if other in pack.provides:
+                rival = rival or stands_in.get(other.text)
+                stands_in.setdefault(other.text, pack)
+            if rival is not None:
+                message = f"packs `{pack.name.text}` and `{rival.name.text}` cannot be loaded together"
+                secondary = [Label(rival.name.span, "loaded too")]
                 helps = ["leave one of them out"]
                 reporter.error(
                     "PD306", message, other.span, "declared here", secondary=secondary, helps=helps
