@@ -257,7 +257,7 @@ class _FileChanges:
                     if other != value.text:
                         yield self._replaced(operator, value, other)
                 yield from self._lost(operator, entry)
-            elif key.text == "do" or key.text.startswith(("for ", "repeat ")):
+            elif is_action(key):
                 if key.text != "do":
                     yield from self._line(key, "header", names)
                 yield Change("rule", without_action(self.source, entry))
@@ -356,8 +356,24 @@ def without_action(source: Source, path: Path) -> tuple[Edit, ...]:
     assert isinstance(block, Mapping)
     then = next((key for key, _ in block.entries if key.text == "then"), None)
     if then is None:
-        return (removed(source, path[:-1]),)
+        return _without_block(source, path[:-1])
     return (removed(source, path), Edit(then.span.start, then.span.end, "do"))
+
+
+def _without_block(source: Source, path: Path) -> tuple[Edit, ...]:
+    """The block at the end of a path cut out; with its action where it is all that the action does."""
+    container, number = path[-1]
+    if isinstance(container, Sequence) and len(container.items) == 1:
+        return _without_block(source, path[:-1])
+    inside = isinstance(container, Mapping) and len(path) > 2  # a pass or block, not the list of all passes
+    if inside and is_action(container.entries[number][0]):  # type: ignore[union-attr]  # a mapping
+        return without_action(source, path)
+    return (removed(source, path),)
+
+
+def is_action(key: Scalar) -> bool:
+    """Whether a key of a pass or block is what it does."""
+    return key.text == "do" or key.text.startswith(("for ", "repeat "))
 
 
 def inserted(path: Path, entry: str) -> Edit:

@@ -237,12 +237,24 @@ def _exchanged(operator: str, parent: Syntax, first: Syntax, second: Syntax) -> 
     return Change(operator, (Edit(a, b, text[c:d]), Edit(c, d, text[a:b])))
 
 
+_LOOSER_THAN_IN = ("compare", "is_", "is_not", "in_", "not_in", "not_", "and_", "or_")
+"""Kinds of conditions that stand in parentheses before `in`."""
+
+
 def _call(node: Syntax, names: Names) -> Iterator[Change]:
     name = node.text.split()[0]
     start = node.span.start
     if name in ("count", "sum") and not any(_names_kernel(part, node, names) for part in node.children):
+        last, end = node.children[-1], node.span.end - 1
+        opened = last.span.start if last.kind in _LOOSER_THAN_IN and last.span.text[:1] != "(" else None
         for kernel in ("ring", "cross"):
-            yield Change("kernel", (Edit(node.span.end - 1, node.span.end - 1, f" in {kernel}"),))
+            more = f"{')' if opened is not None else ''} in {kernel}"
+            edits = (
+                (Edit(end, end, more),)
+                if opened is None
+                else (Edit(opened, opened, "("), Edit(end, end, more))
+            )
+            yield Change("kernel", edits)
     if name in ("min", "max"):
         yield Change("arithmetic", (Edit(start, start + 3, "max" if name == "min" else "min"),))
     inner = node.children[0].span.text if node.children else ""
