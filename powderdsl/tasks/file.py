@@ -171,7 +171,11 @@ class _TaskReader:
         assert name is not None
         assert agent is not None
         about = self.reader.text(self.entries, "about")
-        return Task(name.text, about, self.ruleset, size, knobs, agent, goal, splits, expert, self.rules)
+        family = self.reader.scalar(self.entries, "family")
+        word = family.text if family else ""
+        return Task(
+            name.text, about, self.ruleset, size, knobs, agent, goal, splits, expert, self.rules, word
+        )
 
     def node(self, key: str) -> yaml_tree.Node | None:
         return self.entries[key][1] if key in self.entries else None

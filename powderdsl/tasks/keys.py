@@ -15,6 +15,7 @@ TASK_KEYS: dict[str, dict[str, Key]] = {
     "task": {
         "task": Key("word", "the task's name", True),
         "about": Key("text", "what is to be done, in a sentence"),
+        "family": Key("word", "what tasks of its kind have in common, such as `build` or `herd`"),
         "rules": Key(
             "word", "the rules of its worlds: a shipped ruleset, packs joined by `+`, or a file", True
         ),

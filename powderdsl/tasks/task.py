@@ -261,6 +261,8 @@ class Task:
     expert: Expert | None = field(default=None, metadata=UNMEANING)
     rules: tuple[str, ...] = field(default=(), compare=False, repr=False)
     """The rules that were loaded, as `compiler.load` takes them."""
+    family: str = field(default="", metadata=UNMEANING)
+    """A word for tasks of one kind; empty if the file has none."""
 
     def with_shaped_reward(self) -> Task:
         """The same task with its `shaped` reward: worlds, actions and ends stay. Raises ValueError if it has none."""
