@@ -183,14 +183,16 @@ def scene_statements() -> str:
     return "```text\n" + "".join(f"{line}\n" for line in (*STATEMENTS.values(), SETTING)) + "```\n"
 
 
-def tasks() -> str:
-    """The tasks that come with powderdsl: what may be placed, how often, and their knobs."""
+def tasks(families: bool = False) -> str:
+    """The tasks that come with powderdsl, in families or not: what may be placed, how often, and their knobs."""
     from powderdsl.tasks.shipped import load_task, shipped_tasks
     from powderdsl.tasks.task import BLOW, NO_CHANGE
 
+    loaded = sorted(((name, load_task(name)) for name in shipped_tasks()), key=lambda one: one[1].family)
     rows = []
-    for name in shipped_tasks():
-        task = load_task(name)
+    for name, task in loaded:
+        if bool(task.family) != families:
+            continue
         names = {element.id: element.name for element in task.ruleset.elements}
         every = set(names) <= set(task.agent.choices)
         words = ["any"] if every else [names[one] for one in task.agent.choices if one >= 0]
@@ -198,8 +200,10 @@ def tasks() -> str:
         words += ["nothing"] if NO_CHANGE in task.agent.choices else []
         knobs = ", ".join(f"`{knob.name}`" for knob in task.knobs)
         splits = ", ".join(f"`{split.name}`" for split in task.splits)
-        rows.append((f"`{name}`", task.about, ", ".join(words), str(task.agent.actions), knobs, splits))
-    return table(("task", "what is to be done", "with", "actions", "knobs", "splits"), rows)
+        last = task.family if families else splits
+        rows.append((f"`{name}`", task.about, ", ".join(words), str(task.agent.actions), knobs, last))
+    head = "family" if families else "splits"
+    return table(("task", "what is to be done", "with", "actions", "knobs", head), rows)
 
 
 def stages() -> str:
@@ -290,6 +294,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "shipped": shipped,
     "scene statements": scene_statements,
     "tasks": tasks,
+    "task families": partial(tasks, families=True),
     "stages": stages,
     "planner": planner,
     "commands": commands,
