@@ -9,6 +9,7 @@ import json
 import re
 import shutil
 import zipfile
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache, cached_property, partial
@@ -68,10 +69,21 @@ class Entry:
 
 
 def shipped_entries() -> list[Entry]:
-    """The shipped rules that stand by themselves, those with the most elements first, then each example pack on top."""
-    found = [Entry(name, (name,)) for name in shipped_tests()]
-    found.sort(key=lambda one: -len(one.ruleset.elements))
+    """The shipped rules that stand by themselves, then each example pack on top of the first ones.
+
+    Those that most tasks use come first, then those with the most elements. Variants of others, which extend them, are
+    left out.
+    """
+    tasks = "\n".join(path.read_text(encoding="utf-8") for path in sorted(shipped("tasks").glob("*.yaml")))
+    used = Counter(re.findall(r"^rules: *(\S+)", tasks, re.MULTILINE))
+    found = [Entry(name, (name,)) for name in shipped_tests() if not _extends(name)]
+    found.sort(key=lambda one: (-used[one.key], -len(one.ruleset.elements)))
     return found + [_example(path.stem, found[0].key) for path in sorted(examples_folder().glob("*.yaml"))]
+
+
+def _extends(name: str) -> bool:
+    _, ruleset = read([name], Reporter())
+    return ruleset is not None and ruleset.extends is not None
 
 
 def _example(stem: str, rules: str) -> Entry:
