@@ -39,6 +39,8 @@ class Kernels:
     step: Tensor
     flags: frozenset[str] = frozenset()
     """Parameters that are flags."""
+    snap: float = SNAP
+    """Smaller magnitudes of float slots become zero at the end of a pass."""
     keys: Tensor = field(init=False)
     _draws: dict[tuple[str, int], Tensor] = field(default_factory=dict)
     _masks: dict[tuple[int, int], Tensor] = field(default_factory=dict)
@@ -146,19 +148,23 @@ class Kernels:
         found = torch.div(numerator, torch.where(b == 0, torch.ones_like(b), b), rounding_mode="floor")
         return torch.where(b == 0, torch.zeros_like(found), found)
 
-    @staticmethod
-    def settle(x: Tensor, low: float, high: float) -> Tensor:
-        """No NaN, within bounds, nothing smaller than SNAP."""
+    def settle(self, x: Tensor, low: float, high: float) -> Tensor:
+        """No NaN, within bounds, nothing smaller than `snap`."""
         zero = torch.zeros((), dtype=x.dtype, device=x.device)
         x = torch.where(x == x, x, zero).clamp(low, high)
-        return torch.where(x.abs() < SNAP, zero, x)
+        return torch.where(x.abs() < self.snap, zero, x)
 
 
 class TorchProgram:
-    """A program whose passes are generated torch functions."""
+    """A program whose passes are generated torch functions.
 
-    def __init__(self, program: Program, device: torch.device):
+    Args:
+        snap: another threshold than SNAP for what becomes zero, to follow engines that keep every magnitude.
+    """
+
+    def __init__(self, program: Program, device: torch.device, snap: float = SNAP):
         self.program = program
+        self._snap = snap
         self.device = device
         self._slots = {slot.name: slot for slot in program.slots}
         self._pieces = pieces(program)
@@ -176,7 +182,7 @@ class TorchProgram:
         batch, height, width = job.state["element"].shape
         kernels = Kernels(
             (batch, height, width), self.device, job.params, self._streams, job.draws,
-            base_keys(seed, index), self._idents, start,
+            base_keys(seed, index), self._idents, start, snap=self._snap,
         )  # fmt: skip
         planes = self._unpack(job.state)
         with torch.no_grad():
