@@ -1,0 +1,282 @@
+"""Many episodes of a level, step by step: stages, invalid actions, goals and success. Environments are faces of this."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from powderdsl.ogbench.draws import (
+    FIRST_ELEMENT,
+    FIRST_TASK,
+    FIRST_X,
+    FIRST_Y,
+    RANDOMNESS,
+    REPLACED,
+    CounterDraws,
+    Draws,
+    LegacyDraws,
+)
+from powderdsl.ogbench.levels import GoalTask, Level, read_task
+from powderdsl.ogbench.program import LevelProgram
+from powderdsl.simulation.simulator import World
+
+Numbers = NDArray[np.int64]
+
+MODES = ("task", "data_collection")
+"""``task``: goals, rewards, and a first painted block. ``data_collection``: the worlds alone."""
+
+GOALS = 0xFFFFFFFF
+"""The index of worlds in which goals are played; episodes have the indices 0, 1, …"""
+
+MAX_GOALS = 1 << 13
+"""Goals that are kept."""
+
+
+@dataclass(frozen=True, eq=False)
+class Goal:
+    """A world to reach: ids uint8 [H, W] and picture uint8 [H, W, 3]."""
+
+    ids: Tensor
+    picture: Tensor
+
+
+class Episodes:
+    """A batch of episodes of one level. Environment i has the seed `seeds`[i], and its first episode the number 0.
+
+    Args:
+        program: from the same level; one made `as_ogbench` if `randomness` is ``ogbench``.
+        seeds: int64 [B], of 0 or more.
+        randomness: one of RANDOMNESS, or other draws. mode: one of MODES.
+    """
+
+    def __init__(
+        self,
+        program: LevelProgram,
+        seeds: Sequence[int] | Numbers,
+        *,
+        randomness: str | Draws = "counter",
+        mode: str = "task",
+    ):
+        if mode not in MODES:
+            raise ValueError(f"mode is one of {', '.join(MODES)}; found {mode!r}")
+        self.program, self.level, self.mode = program, program.level, mode
+        self.seeds = np.array(seeds, dtype=np.int64)
+        self.count = count = len(self.seeds)
+        self._draws = self._made(randomness)
+        side, device = self.level.side, program.device
+        self.episode = np.full(count, -1, dtype=np.int64)
+        """The number of each environment's episode."""
+        self.stage = np.zeros(count, dtype=np.int64)
+        """What the next action chooses: 0 the element, 1 x, 2 y."""
+        self.elapsed = np.zeros(count, dtype=np.int64)
+        """Environment steps of each episode."""
+        self.errors = np.zeros(count, dtype=np.int64)
+        """Cells of the goal without a match in the world."""
+        self.tolerance = np.zeros(count, dtype=np.int64)
+        self.task_number = np.zeros(count, dtype=np.int64)
+        """The task of each episode, from 1; 0 if it was given from outside."""
+        self._chosen = np.zeros((count, 3), dtype=np.int64)
+        self.world: World | None = None
+        self._shown = torch.zeros(count, side, side, 6, dtype=torch.uint8, device=device)
+        self.goal_ids = torch.zeros(count, side, side, dtype=torch.uint8, device=device)
+        self.goal_pictures = torch.zeros(count, side, side, 3, dtype=torch.uint8, device=device)
+        self._goals: dict[tuple[int, GoalTask], Goal] = {}
+        self._columns = torch.arange(side, device=device)
+
+    def _made(self, randomness: str | Draws) -> Draws:
+        if not isinstance(randomness, str):
+            return randomness
+        if randomness not in RANDOMNESS:
+            raise ValueError(f"randomness is one of {', '.join(RANDOMNESS)}; found {randomness!r}")
+        if randomness == "counter":
+            return CounterDraws(self.seeds)
+        return LegacyDraws(self.seeds, len(self.program.streams), self.level.side)
+
+    def seed(self, which: Numbers, seeds: Numbers) -> None:
+        """Give environments new seeds, int64 [n]; their next episode has the number 0."""
+        self.seeds[which], self.episode[which] = seeds, -1
+        if isinstance(self._draws, LegacyDraws):
+            self._draws.seed(which, seeds)
+
+    # Beginning
+
+    def begin(self, which: Numbers, tasks: Sequence[int | GoalTask | None]) -> None:
+        """Begin the next episodes of environments `which`, int64 [n]; the first call begins all.
+
+        Args:
+            tasks: for each the number of a task, from 1, a task, or None to draw one.
+        """
+        self.episode[which] += 1
+        self.stage[which], self.elapsed[which] = 0, 0
+        if self.mode == "task":
+            found = [self._task(int(one), task) for one, task in zip(which, tasks, strict=True)]
+            self._set_goals(which, found)
+        fresh = self.program.start(self.seeds[which], self.episode[which])
+        if self.mode == "task":
+            first = [
+                self._drawn(which, what, self.level.choices(stage))
+                for stage, what in enumerate((FIRST_ELEMENT, FIRST_X, FIRST_Y))
+            ]
+            fresh = self.program.act(fresh, np.stack(first, 1), self._draws.planes(which))
+        self._put(which, fresh)
+        self._show_frames()
+
+    def _task(self, which: int, task: int | GoalTask | None) -> GoalTask:
+        if isinstance(task, GoalTask):
+            self.task_number[which] = 0
+            return task
+        if task is None:
+            task = 1 + int(self._drawn(np.array([which]), FIRST_TASK, len(self.level.tasks))[0])
+        self.task_number[which] = task
+        return self.level.tasks[task - 1]
+
+    def _drawn(self, which: Numbers, what: str, count: int) -> Numbers:
+        return self._draws.integers(which, what, self.episode[which], self.elapsed[which], count)
+
+    def _set_goals(self, which: Numbers, tasks: Sequence[GoalTask]) -> None:
+        keys = [(int(seed), task) for seed, task in zip(self.seeds[which], tasks, strict=True)]
+        known = self._goals if self._draws.fixes_goals else {}
+        missing = [at for at, key in enumerate(keys) if key not in known]
+        made = self.play_goals(which[missing], [tasks[at] for at in missing])
+        new = dict(zip(missing, made, strict=True))
+        goals = [new[at] if at in new else known[key] for at, key in enumerate(keys)]
+        if self._draws.fixes_goals:
+            if len(known) > MAX_GOALS:
+                known.clear()
+            known.update((keys[at], goal) for at, goal in new.items())
+        places = torch.from_numpy(which).to(self.program.device)
+        self.goal_ids[places] = torch.stack([goal.ids for goal in goals])
+        self.goal_pictures[places] = torch.stack([goal.picture for goal in goals])
+        self.tolerance[which] = [task.tolerance for task in tasks]
+
+    def play_goals(self, which: Numbers, tasks: Sequence[GoalTask]) -> list[Goal]:
+        """The goals that tasks lead to, one for each of environments `which`, int64 [n]: their actions from the start."""
+        if not len(which):
+            return []
+        lists = [self.level.numbers(task) for task in tasks]
+        order = sorted(range(len(lists)), key=lambda at: -len(lists[at]))  # the longest lists stay to the end
+        world = self.program.start(self.seeds[which][order], np.full(len(which), GOALS, dtype=np.int64))
+        found: dict[int, Goal] = {}
+        active = len(order)
+        for time in range(len(lists[order[0]]) + 1):
+            left = sum(len(one) > time for one in lists)
+            if left < active:
+                ids, pictures = world.ids, self.program.pictures(world)
+                for place in range(left, active):
+                    found[order[place]] = Goal(ids[place].clone(), pictures[place])
+                if not left:
+                    break
+                world, active = world.select(slice(0, left)), left
+            painted = np.array([lists[at][time] for at in order[:active]], dtype=np.int64)
+            world = self.program.act(world, painted, self._draws.planes(which[order[:active]]))
+        return [found[at] for at in range(len(order))]
+
+    # Stepping
+
+    def step(self, actions: Numbers, active: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
+        """One environment step of the episodes where `active`, bool [B], is set (None: of all).
+
+        Args:
+            actions: int64 [B]. One that is not valid at its stage is replaced by a random valid one.
+
+        Returns:
+            success, bool [B]: whether the worlds match their goals now.
+        """
+        which = np.arange(self.count) if active is None else np.flatnonzero(active)
+        if not len(which):
+            return self.success
+        stages = self.stage[which]
+        choices = np.where(stages == 0, self.level.choices(0), self.level.choices(1))
+        given = actions[which]
+        invalid = (given < 0) | (given >= choices)
+        if invalid.any():
+            given = given.copy()
+            for stage in range(3):
+                bad = np.flatnonzero(invalid & (stages == stage))
+                if len(bad):
+                    given[bad] = self._drawn(which[bad], REPLACED, self.level.choices(stage))
+        self._chosen[which, stages] = given
+        self.stage[which] = (stages + 1) % 3
+        self.elapsed[which] += 1
+        painting = which[stages == 2]
+        if len(painting):
+            part = self._world
+            if len(painting) < self.count:
+                part = part.select(torch.from_numpy(painting).to(self.program.device))
+            planes = self._draws.planes(painting)
+            self._put(painting, self.program.act(part, self._chosen[painting], planes))
+        self._show_frames()
+        return self.success
+
+    @property
+    def success(self) -> NDArray[np.bool_]:
+        """Whether the worlds match their goals: bool [B]."""
+        return (self.errors < self.tolerance) & (self.mode == "task")
+
+    @property
+    def _world(self) -> World:
+        assert self.world is not None
+        return self.world
+
+    def _put(self, which: Numbers, part: World) -> None:
+        """Take up new states of the worlds `which`: what they show, and their errors."""
+        pictures, ids = self.program.pictures(part), part.ids
+        if len(which) == self.count:
+            self.world, goals = part, self.goal_ids
+            self._shown[..., :3] = pictures
+        else:
+            places = torch.from_numpy(which).to(self.program.device)
+            self.world, goals = self.program.put(self._world, places, part), self.goal_ids[places]
+            self._shown[places, :, :, :3] = pictures
+        if self.mode == "task":
+            self.errors[which] = self.program.errors(ids, goals)
+
+    def _show_frames(self) -> None:
+        """Write channels 3 to 5: what has been chosen of the action that is being given."""
+        level, device = self.level, self.program.device
+        stage, element, x = (
+            torch.from_numpy(one).to(device) for one in (self.stage, self._chosen[:, 0], self._chosen[:, 1])
+        )
+        first = (x * level.grid)[:, None]
+        inside = (self._columns >= first) & (self._columns < first + level.brush)
+        lit = (stage == 1)[:, None] | ((stage == 2)[:, None] & inside)
+        frame = lit[:, :, None] * self.program.paints[element][:, None]
+        self._shown[..., 3:] = frame[:, None]
+
+    # Showing
+
+    def observations(self) -> Tensor:
+        """uint8 [B, H, W, 6]: the worlds' pictures, then the action frames. It is never overwritten."""
+        return self._shown.clone()
+
+    def goals(self) -> Tensor:
+        """The goals as observations: uint8 [B, H, W, 6]."""
+        return torch.cat([self.goal_pictures, torch.zeros_like(self.goal_pictures)], -1)
+
+
+def task_of(level: Level, options: Mapping[str, Any]) -> int | GoalTask | None:
+    """The task that options of `reset` name: a number from 1, a task of one's own, or None.
+
+    Raises:
+        TypeError, ValueError: they name none that the level has.
+    """
+    number, info = options.get("task_id"), options.get("task_info")
+    if info is not None:
+        if number is not None:
+            raise ValueError("give `task_id` or `task_info`, not both")
+        task = read_task(info)
+        level.numbers(task)
+        return task
+    if number is None:
+        return None
+    if not hasattr(number, "__index__") or isinstance(number, bool):
+        raise TypeError(f"task_id must be an integer, found {number!r}")
+    if not 1 <= number <= len(level.tasks):
+        raise ValueError(f"task_id must lie in 1..{len(level.tasks)}, found {number}")
+    return int(number)
