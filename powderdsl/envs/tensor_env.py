@@ -106,7 +106,7 @@ class TensorEnv:
         self.num_envs, self.worlds = num_envs, worlds
         self.simulator = self.program.simulator
         self.device = self.simulator.device
-        self.autoreset_mode = _mode(autoreset_mode)
+        self.autoreset_mode = mode_of(autoreset_mode)
         self.observation = observation_of(observation, self.simulator, self.task.size)
         self.action_form = action_form(actions, self.task.agent, self.device)
         self.single_action_space, self.action_nvec = self.action_form.space, self.action_form.nvec
@@ -389,7 +389,7 @@ def check_cells(num_envs: int, size: tuple[int, int]) -> None:
         raise ValueError(f"num_envs must be an integer from 1 to {most:,} here, found {num_envs:,}")
 
 
-def _mode(value: AutoresetMode | str) -> AutoresetMode:
+def mode_of(value: AutoresetMode | str) -> AutoresetMode:
     """A mode of Gymnasium's, or the one of a name, which may be written in any case."""
     if isinstance(value, AutoresetMode):
         return value

@@ -1,0 +1,51 @@
+"""OGBench's Powderworld on powderdsl: the same environments and data sets, many worlds at once.
+
+`make_env_and_datasets` takes the place of `ogbench.make_env_and_datasets`. Importing this registers
+``powderworld-easy-v0``, ``powderworld-medium-v0`` and ``powderworld-hard-v0`` with Gymnasium, unless OGBench itself has;
+``powderdsl/powderworld-easy-v0`` and so on are always ours.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+
+from powderdsl.ogbench.levels import find_level, shipped_levels
+
+if TYPE_CHECKING:
+    from powderdsl.ogbench.datasets import load_dataset, make_env_and_datasets
+    from powderdsl.ogbench.env import PowderworldEnv
+    from powderdsl.ogbench.vector import PowderworldVectorEnv
+
+__all__ = ["PowderworldEnv", "PowderworldVectorEnv", "load_dataset", "make_env_and_datasets"]
+
+_HOMES = {
+    "PowderworldEnv": "env",
+    "PowderworldVectorEnv": "vector",
+    "load_dataset": "datasets",
+    "make_env_and_datasets": "datasets",
+}
+
+
+def _register() -> None:
+    for name in shipped_levels():
+        for env_id in (f"powderdsl/powderworld-{name}-v0", f"powderworld-{name}-v0"):
+            if env_id not in gymnasium.registry:
+                gymnasium.register(
+                    env_id,
+                    entry_point="powderdsl.ogbench.env:PowderworldEnv",
+                    vector_entry_point="powderdsl.ogbench.vector:PowderworldVectorEnv",
+                    max_episode_steps=find_level(name).steps,
+                    kwargs={"level": name},
+                )
+
+
+_register()
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'powderdsl.ogbench' has no attribute {name!r}")
+    return getattr(import_module(f"powderdsl.ogbench.{_HOMES[name]}"), name)

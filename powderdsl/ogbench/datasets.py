@@ -1,0 +1,149 @@
+"""OGBench's data sets: files of flat rows, and the environments that they belong to."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from powderdsl.diagnostics import suggest
+from powderdsl.ogbench.levels import shipped_levels
+from powderdsl.system.archives import BadArchive, open_archive
+
+DEFAULT_DATASET_DIR = "~/.ogbench/data"
+"""Where OGBench keeps its data sets, and where they are looked for."""
+
+FAMILY, VERSION = "powderworld", "v0"
+
+ROWS = ("observations", "actions", "terminals")
+"""The arrays of a file; rows of all episodes, one after the other."""
+
+Dataset = dict[str, NDArray[Any]]
+
+
+def split_name(name: str) -> tuple[str, str]:
+    """The level and the kind of data of ``powderworld-easy-play-v0``. Raises ValueError for other names."""
+    parts = name.split("-")
+    levels = shipped_levels()
+    if len(parts) == 4 and parts[0] == FAMILY and parts[1] in levels and parts[2] and parts[3] == VERSION:
+        return parts[1], parts[2]
+    known = [f"{FAMILY}-{level}-play-{VERSION}" for level in levels]
+    raise ValueError("; ".join([f"no data set named {name!r}", *suggest(name, known, "data sets")]))
+
+
+def make_env_and_datasets(
+    dataset_name: str,
+    dataset_dir: str | Path = DEFAULT_DATASET_DIR,
+    dataset_path: str | Path | None = None,
+    compact_dataset: bool = False,
+    env_only: bool = False,
+    dataset_only: bool = False,
+    cur_env: Any = None,
+    add_info: bool = False,
+    **env_kwargs: Any,
+) -> Any:
+    """An environment, and the data set of a name: what `ogbench.make_env_and_datasets` returns. Nothing is downloaded.
+
+    Args:
+        dataset_name: ``powderworld-easy-play-v0``, also ``medium`` and ``hard``.
+        dataset_dir: the folder of ``NAME.npz`` and ``NAME-val.npz``, which `powderdsl ogbench` writes.
+        dataset_path: the first of these files, wherever it is; the other one lies beside it.
+        compact_dataset: False: transitions with ``next_observations``. True: all rows, and ``valids``.
+        env_only, dataset_only: leave out the other.
+        cur_env, add_info: taken for compatibility; these environments have nothing to add.
+        env_kwargs: those of `PowderworldEnv`, and `max_episode_steps`.
+
+    Returns:
+        (environment, training data, validation data); or the environment alone, or the data alone, as a pair. Data are
+        arrays by name, see `load_dataset`: observations uint8, actions int32, the others float32.
+
+    Raises:
+        ValueError: an unknown name, or a file that is not such a data set. FileNotFoundError: there is no such file.
+    """
+    level, _ = split_name(dataset_name)
+    if env_only and dataset_only:
+        raise ValueError("env_only and dataset_only leave nothing to return")
+    env = None
+    if not dataset_only:
+        spec = gymnasium.spec(f"powderdsl/{FAMILY}-{level}-{VERSION}")
+        env = gymnasium.make(spec, **env_kwargs)
+    if env_only:
+        return env
+    train = Path(dataset_dir).expanduser() / f"{dataset_name}.npz"
+    if dataset_path is not None:
+        train = Path(dataset_path).expanduser()
+    found = []
+    for path in (train, train.with_name(f"{train.stem}-val.npz")):
+        if not path.is_file():
+            raise FileNotFoundError(
+                f"{path} does not exist, and nothing is downloaded. To collect it: "
+                f"powderdsl ogbench --level {level} --out {path.parent}"
+            )
+        found.append(load_dataset(path, np.uint8, np.int32, compact_dataset=compact_dataset))
+    return (found[0], found[1]) if dataset_only else (env, found[0], found[1])
+
+
+def load_dataset(
+    dataset_path: str | Path,
+    ob_dtype: Any = np.float32,
+    action_dtype: Any = np.float32,
+    compact_dataset: bool = False,
+    add_info: bool = False,
+) -> Dataset:
+    """A file of episodes one after the other, whose last row is marked in `terminals`, as arrays by name.
+
+    Args:
+        compact_dataset: False: the last row of each episode, whose action leads nowhere, is only the last row of
+            ``next_observations``; ``terminals`` is 1 on the last transition of each. True: all rows stay; ``valids`` is 0
+            on the last rows, and ``terminals`` is 1 there and on the rows before.
+        add_info: taken for compatibility.
+
+    Returns:
+        ``observations`` and, unless compact, ``next_observations``, of `ob_dtype` [N, H, W, C]; ``actions``, of
+        `action_dtype` [N]; ``terminals`` and, if compact, ``valids``, float32 [N].
+
+    Raises:
+        ValueError: the file is not such a data set; the text says why. OSError: it cannot be read.
+    """
+    path = Path(dataset_path)
+    try:
+        with open_archive(path) as archive:
+            heads = archive.headers
+            for name in ROWS:
+                if name not in heads:
+                    raise BadArchive(f"`{name}` is missing")
+                if heads[name].letter not in "biuf" or not heads[name].shape:
+                    raise BadArchive(f"`{name}` is not an array of numbers")
+            counts = {name: heads[name].shape[0] for name in ROWS}
+            if len(set(counts.values())) != 1:
+                raise BadArchive(f"its arrays have different numbers of rows: {counts}")
+        # NumPy reads into memory that may be written to, as learners expect; what it reads has been checked above.
+        with np.load(path, allow_pickle=False) as file:
+            observations, actions, ends = (file[name] for name in ROWS)
+    except BadArchive as error:
+        raise ValueError(f"{path} is not a data set of OGBench's: {error}") from None
+    last = ends.astype(bool)
+    if not len(last) or not last[-1] or last[0] or (last[1:] & last[:-1]).any():
+        raise ValueError(
+            f"{path} is not a data set of OGBench's: `terminals` does not end episodes of at least two rows"
+        )
+    before = np.append(last[1:], False)
+    observations = observations.astype(ob_dtype, copy=False)
+    actions = actions.astype(action_dtype, copy=False)
+    if compact_dataset:
+        return {
+            "observations": observations,
+            "actions": actions,
+            "terminals": (last | before).astype(np.float32),
+            "valids": (~last).astype(np.float32),
+        }
+    rows = np.flatnonzero(~last)
+    return {
+        "observations": observations[rows],
+        "actions": actions[rows],
+        "terminals": before[rows].astype(np.float32),
+        "next_observations": observations[rows + 1],
+    }
