@@ -38,6 +38,7 @@ _LEARNING = (
     "datasets",
     "rl",
     "worldmodel",
+    "ogbench",
 )
 
 LAYERS: dict[str, tuple[str, ...]] = {
@@ -124,6 +125,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "datasets": (*_SCREEN, *_LEARNING[:6]),
     "rl": (*_SCREEN, *_LEARNING[:7]),
     "worldmodel": (*_SCREEN, *_LEARNING[:7]),
+    "ogbench": (*_SCREEN, "experiments.runs", "tasks", "tasks.episodes", "envs"),
     # Calls commands, in processes of their own.
     "experiments.studies": (*_FRONT, "compiler", "experiments.runs", "experiments.bench"),
     "web.worlds": _FRONT,
@@ -179,6 +181,11 @@ _TORCH = (
     "experiments.runs",
     "worldmodel",
     "rl",
+    "ogbench.program",
+    "ogbench.episodes",
+    "ogbench.env",
+    "ogbench.vector",
+    "ogbench.collect",
 )
 THIRD_PARTIES: dict[str, Home] = {
     "yaml": Home(_TEXT, _TEXT),
@@ -195,7 +202,7 @@ THIRD_PARTIES: dict[str, Home] = {
         ),
         _TORCH,
     ),
-    "gymnasium": Home(("envs", "rl", "datasets.minari"), ("envs", "rl")),
+    "gymnasium": Home(("envs", "rl", "datasets.minari", "ogbench"), ("envs", "rl", "ogbench")),
     "minari": Home(("datasets.minari",), ()),
     "h5py": Home(("datasets.minari",), ()),
     "stable_baselines3": Home(("envs", "rl"), ("envs", "rl")),

@@ -25,6 +25,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "test": ("test", "Run the tests of packs and check their invariants."),
     "trace": ("trace", "Explain a cell: which rule wrote it, and what the rule read."),
     "record": ("record", "Record episodes of a task: data for offline learning and world models."),
+    "ogbench": ("ogbench", "Collect the data sets of OGBench's Powderworld."),
     "bench": ("bench", "Measure how fast rules run, on each backend, batch and size."),
     "train": ("train", "Train an agent on a task, or resume an interrupted run."),
     "evaluate": ("evaluate", "Compare an agent with a random policy and with doing nothing."),

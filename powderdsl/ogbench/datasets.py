@@ -80,7 +80,7 @@ def make_env_and_datasets(
         if not path.is_file():
             raise FileNotFoundError(
                 f"{path} does not exist, and nothing is downloaded. To collect it: "
-                f"powderdsl ogbench --level {level} --out {path.parent}"
+                f"powderdsl ogbench {level} --out {path.parent}"
             )
         found.append(load_dataset(path, np.uint8, np.int32, compact_dataset=compact_dataset))
     return (found[0], found[1]) if dataset_only else (env, found[0], found[1])

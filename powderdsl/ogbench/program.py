@@ -25,9 +25,6 @@ Numbers = NDArray[np.int64]
 CLOCK = ("seed", "index", "step")
 """Tensors of `World` that draws depend on."""
 
-STILL = 1e-10
-"""Cells of less motion, in parts of the full tint, keep every bit of their color."""
-
 
 class _WithoutSnap(Simulator):
     """On torch, keeping every magnitude of float fields."""
@@ -87,10 +84,11 @@ class LevelProgram:
         colors = np.zeros((256, 3), dtype=np.float32)
         found = palette(ruleset.elements)
         colors[: len(found)] = found
-        self._colors = torch.from_numpy(colors / np.float32(255)).to(self.device)
-        tint = np.array(level.tint.color, dtype=np.float32) / np.float32(255)
-        self._tint = torch.from_numpy(tint).to(self.device)
-        self._rest = _bytes(self._colors)
+        shares = torch.from_numpy(colors / np.float32(255)).to(self.device)
+        self._colors = shares.T.contiguous()
+        """float32 [3, 256], in 0..1."""
+        self._tint = [float(np.float32(part) / np.float32(255)) for part in level.tint.color]
+        self._rest = (shares * 255).to(torch.uint8)
         self.paints = self._rest[torch.from_numpy(self.ids).to(self.device)]
         """The colors of what agents paint: uint8 [n, 3]."""
 
@@ -156,12 +154,17 @@ class LevelProgram:
     def pictures(self, world: World) -> Tensor:
         """uint8 [B, H, W, 3]: the elements' colors, moving cells tinted. Every bit is what single precision gives."""
         ids, tint = world.ids.int(), self.level.tint
-        found = self._rest[ids]
-        row, column = world[tint.field].unbind(1)
-        weight = torch.sqrt(row * row + column * column) / tint.full
-        moving = weight > STILL
-        share = weight[moving].clamp(max=tint.most)[:, None]
-        found[moving] = _bytes((1 - share) * self._colors[ids[moving]] + share * self._tint)
+        motion = world[tint.field]
+        if not bool(motion.any()):
+            return self._rest[ids]
+        row, column = motion.unbind(1)
+        share = (row * row).add_(column * column).sqrt_().div_(tint.full).clamp_(max=tint.most)
+        rest, cells = 1 - share, ids.flatten()
+        found = torch.empty(*ids.shape, 3, dtype=torch.uint8, device=self.device)
+        for channel in range(3):  # whole planes: a pixel's three colors are too short a row for vectors
+            color = self._colors[channel].index_select(0, cells).view(ids.shape)
+            color.mul_(rest).add_(share * self._tint[channel])
+            found[..., channel] = color.mul_(255)
         return found
 
     def errors(self, ids: Tensor, goals: Tensor) -> Numbers:
@@ -172,11 +175,6 @@ class LevelProgram:
                 matched |= ids.roll(by, axis) == goals
         found: Numbers = (~matched).sum((1, 2)).cpu().numpy()
         return found
-
-
-def _bytes(colors: Tensor) -> Tensor:
-    """Colors in 0..1 as bytes, cut off."""
-    return (colors.clamp(0, 1) * 255).to(torch.uint8)
 
 
 def _number(ruleset: Ruleset, name: str) -> int:

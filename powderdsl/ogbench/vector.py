@@ -171,7 +171,9 @@ class PowderworldVectorEnv(VectorEnv[Any, Any, Any]):
             if ended.any():
                 info["final_obs"] = objects(self._observations()[ended], ended)
                 info["_final_obs"] = ended.copy()
-                info["final_info"] = {name: np.copy(value) for name, value in info.items() if "obs" not in name}
+                info["final_info"] = {
+                    name: np.copy(value) for name, value in info.items() if "obs" not in name
+                }
                 info["_final_info"] = ended.copy()
         else:
             self._over = ended

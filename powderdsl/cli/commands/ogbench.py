@@ -1,0 +1,67 @@
+"""`powderdsl ogbench`: collect OGBench's data sets of Powderworld."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+import click
+
+from powderdsl.cli import options as opt
+from powderdsl.cli.commands.record import require_gymnasium
+from powderdsl.cli.exits import OK, user_values
+from powderdsl.cli.output import counted, progress
+
+
+@click.command("ogbench")
+@click.argument("level", metavar="LEVEL")
+@opt.path("--out", "FOLDER", "Folder of the files.", required=True)
+@opt.integer("--episodes", 1, 1 << 30, "Training episodes.  [default: as many as OGBench has]")
+@opt.integer("--validation", 1, 1 << 30, "Validation episodes.  [default: a tenth]")
+@opt.integer("--seed", 0, (1 << 61) - 1, "Seed of the episodes.", 0)
+@opt.integer("--threads", 1, 1024, "CPU threads.", 1)
+@opt.backend("auto")
+@opt.device
+def command(
+    level: str,
+    out: Path,
+    episodes: int | None,
+    validation: int | None,
+    seed: int,
+    threads: int,
+    backend: str,
+    device: str,
+) -> int:
+    """Collect the data set of LEVEL, easy, medium or hard: scripted play, in OGBench's files.
+
+    The files depend only on the options. After an interruption, the same command continues.
+
+    \b
+        powderdsl ogbench easy --out data
+        powderdsl ogbench hard --out data --episodes 100
+    """
+    require_gymnasium()
+    from powderdsl.ogbench.levels import find_level
+
+    with user_values():
+        found = find_level(level)
+    from powderdsl.ogbench.collect import collect
+    from powderdsl.ogbench.program import LevelProgram
+
+    try:
+        with user_values(), progress(found.name, episodes or found.episodes, lines=True) as show:
+            files = collect(
+                LevelProgram(found, backend=backend, device=device, threads=threads),
+                out,
+                episodes=episodes,
+                validation=validation,
+                seed=seed,
+                progress=lambda done, total: show(done, "episodes"),
+            )
+    except KeyboardInterrupt:
+        click.echo(f"stopped: the same command continues in {shlex.quote(str(out))}", err=True)
+        raise
+    size = sum(path.stat().st_size for path in files)
+    names = ", ".join(path.name for path in files)
+    click.echo(f"{out}: {names}, {counted(len(files), 'file')}, {size / 1e6:,.1f} MB", err=True)
+    return OK

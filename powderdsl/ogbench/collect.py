@@ -1,0 +1,257 @@
+"""Collecting data sets of scripted play, in OGBench's files. Options alone decide every byte of them.
+
+Episodes are played in parts, whose worlds are kept in files beside the data set until it is complete: what was
+interrupted continues there.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import zipfile
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from powderdsl.experiments.runs.folder import held
+from powderdsl.model.fingerprint import fingerprint
+from powderdsl.ogbench.datasets import FAMILY, VERSION
+from powderdsl.ogbench.levels import Level
+from powderdsl.ogbench.play import VALIDATION, play
+from powderdsl.ogbench.program import LevelProgram
+from powderdsl.system.archives import BadArchive, open_archive
+from powderdsl.system.reading import read_json
+from powderdsl.system.writing import failure, replacing, write_text
+
+Array = NDArray[Any]
+Frames = NDArray[np.uint8]
+Progress = Callable[[float, int], None]
+"""Called with the number of episodes that are done, unfinished ones as fractions, and the number of all."""
+
+PART = 64
+"""Episodes of a part."""
+
+WRITTEN = 8
+"""Episodes whose rows are in memory at once."""
+
+COMPRESSION = 1
+"""zlib's level: 6, its default, takes three times as long and saves little."""
+
+PLAYED = 0.6
+"""The share of an episode's work that is done once it has been played; the rest is compressing."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What decides the bytes of one file: `count` episodes of `rows` rows from the number `first`."""
+
+    level: str
+    rules: str
+    seed: int
+    first: int
+    count: int
+    rows: int
+
+    @property
+    def painted(self) -> int:
+        """Whole actions of an episode: worlds change so often."""
+        return (self.rows - 1) // 3
+
+
+def collect(
+    program: LevelProgram,
+    folder: str | Path,
+    *,
+    episodes: int | None = None,
+    validation: int | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> list[Path]:
+    """Write ``powderworld-LEVEL-play-v0.npz`` and ``…-val.npz`` to a folder; what is there already is not made again.
+
+    Args:
+        episodes, validation: how many; the level's numbers by default, and a tenth if only `episodes` is given.
+        seed: decides the actions of each episode, and with them its worlds.
+
+    Returns:
+        the files.
+
+    Raises:
+        CompileError: PD613 if something cannot be written, PD622 if another process writes there. ValueError: other data
+        of the same name is there.
+    """
+    level, place = program.level, Path(folder)
+    train = level.episodes if episodes is None else episodes
+    few = validation
+    if few is None:
+        few = level.validation if episodes is None else -(-train // 10)
+    rules = fingerprint(program.simulator.ruleset)
+    name = f"{FAMILY}-{level.name}-play-{VERSION}"
+    recipes = {
+        place / f"{name}.npz": Recipe(level.name, rules, seed, 0, train, level.episode_steps),
+        place / f"{name}-val.npz": Recipe(level.name, rules, seed, VALIDATION, few, level.episode_steps),
+    }
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise failure("PD613", f"cannot write {place}", notes=(error.strerror or str(error),)) from None
+    done = 0.0
+
+    def report(more: float) -> None:
+        nonlocal done
+        done += more
+        if progress is not None:
+            progress(done, train + few)
+
+    with held(place):
+        for path, recipe in recipes.items():
+            _write(program, path, recipe, report)
+    return list(recipes)
+
+
+def _write(program: LevelProgram, path: Path, recipe: Recipe, report: Callable[[float], None]) -> None:
+    about, parts = path.with_suffix(".json"), path.with_suffix(".parts")
+    found = read_json(about)
+    if found is not None and found != asdict(recipe):
+        given = asdict(recipe)
+        changed = next((key for key in given if found.get(key) != given[key]), "form")
+        changed = {"count": "number of episodes", "rows": "number of rows"}.get(changed, changed)
+        raise ValueError(
+            f"{path} was collected with another {changed}: choose another folder, or remove it and {about.name}"
+        )
+    if path.exists():
+        if found is None:
+            raise ValueError(f"{path} is there already, and {about.name} is not: choose another folder")
+        report(recipe.count)
+        return
+    try:
+        parts.mkdir(exist_ok=True)
+    except OSError as error:
+        raise failure("PD613", f"cannot write {parts}", notes=(error.strerror or str(error),)) from None
+    write_text(about, json.dumps(asdict(recipe), indent=2) + "\n")
+    for first in range(0, recipe.count, PART):
+        file, count = parts / f"{first:09}.npz", min(PART, recipe.count - first)
+        if _read_part(file, recipe, program.level, count) is None:
+            frames = _played(program, recipe, first, count)
+            with (
+                replacing(file) as temporary,
+                _archive(temporary) as archive,
+                archive.open("frames.npy", "w", force_zip64=True) as member,
+            ):
+                _write_header(member, frames.dtype, frames.shape)
+                for one in frames:
+                    member.write(one.tobytes())
+        report(PLAYED * count)
+    with replacing(path) as temporary, _archive(temporary) as archive:
+        _write_arrays(archive, program, parts, recipe, report)
+    shutil.rmtree(parts, ignore_errors=True)
+
+
+def _write_arrays(
+    archive: zipfile.ZipFile,
+    program: LevelProgram,
+    parts: Path,
+    recipe: Recipe,
+    report: Callable[[float], None],
+) -> None:
+    level, rows = program.level, recipe.count * recipe.rows
+    shape = (rows, level.side, level.side, 6)
+    with archive.open("observations.npy", "w", force_zip64=True) as member:
+        _write_header(member, np.dtype(np.uint8), shape)
+        for first in range(0, recipe.count, PART):
+            count = min(PART, recipe.count - first)
+            frames = _read_part(parts / f"{first:09}.npz", recipe, level, count)
+            if frames is None:
+                raise failure("PD613", f"cannot write the data set: {parts} was changed meanwhile")
+            actions = _actions(level, recipe, first, count)
+            for at in range(0, count, WRITTEN):
+                some = slice(at, min(at + WRITTEN, count))
+                member.write(rows_of(program, frames[some], actions[some], recipe.rows).tobytes())
+                report((1 - PLAYED) * (some.stop - some.start))
+    with archive.open("actions.npy", "w") as member:
+        _write_header(member, np.dtype(np.int32), (rows,))
+        for first in range(0, recipe.count, PART):
+            actions = _actions(level, recipe, first, min(PART, recipe.count - first))
+            flat = actions.reshape(len(actions), -1)[:, : recipe.rows]
+            member.write(flat.astype(np.int32).tobytes())
+    terminals = np.zeros((recipe.count, recipe.rows), dtype=np.int32)
+    terminals[:, -1] = 1
+    with archive.open("terminals.npy", "w") as member:
+        _write_header(member, terminals.dtype, (rows,))
+        member.write(terminals.tobytes())
+
+
+def _archive(path: Path) -> zipfile.ZipFile:
+    return zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=COMPRESSION)
+
+
+def _write_header(member: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
+    values = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(member, values)
+
+
+def _actions(level: Level, recipe: Recipe, first: int, count: int) -> NDArray[np.int16]:
+    """The whole actions of some episodes of a file: int16 [count, n, 3]; the last may be cut off in its rows."""
+    numbers = np.arange(recipe.first + first, recipe.first + first + count)
+    return play(level, recipe.seed, numbers, -(-recipe.rows // 3))
+
+
+def _played(program: LevelProgram, recipe: Recipe, first: int, count: int) -> Frames:
+    """The worlds' pictures at the start and after each whole action: uint8 [count, painted + 1, H, W, 3]."""
+    actions = _actions(program.level, recipe, first, count).astype(np.int64)
+    side = program.level.side
+    frames = np.empty((count, recipe.painted + 1, side, side, 3), dtype=np.uint8)
+    for number, pictures in enumerate(worlds(program, recipe, first, actions)):
+        frames[:, number] = pictures
+    return frames
+
+
+def worlds(program: LevelProgram, recipe: Recipe, first: int, actions: NDArray[np.int64]) -> Iterator[Frames]:
+    """The pictures of a batch's worlds at the start and after each whole action: uint8 [B, H, W, 3]."""
+    count = len(actions)
+    seeds = np.full(count, recipe.seed, dtype=np.int64)
+    world = program.start(seeds, np.arange(recipe.first + first, recipe.first + first + count))
+    yield program.pictures(world).cpu().numpy()
+    for number in range(recipe.painted):
+        world = program.act(world, actions[:, number])
+        yield program.pictures(world).cpu().numpy()
+
+
+def rows_of(program: LevelProgram, frames: Frames, actions: NDArray[np.int16], rows: int) -> Frames:
+    """Observations before each action of episodes: uint8 [n, rows, H, W, 6]."""
+    level = program.level
+    found = np.zeros((len(frames), rows, level.side, level.side, 6), dtype=np.uint8)
+    paints: Array = program.paints.cpu().numpy()
+    chosen = paints[actions[:, :, 0]]
+    first = actions[:, :, 1, None].astype(np.int64) * level.grid
+    columns = np.tile(np.arange(level.side), level.side)
+    inside = (columns >= first) & (columns < first + level.brush)
+    pixels = found.reshape(len(frames), rows, -1, 6)
+    pictures = frames.reshape(len(frames), frames.shape[1], -1, 3)
+    for stage in range(3):
+        at = pixels[:, stage::3]
+        count = at.shape[1]
+        for channel in range(3):  # one at a time: a pixel's three colors are too short a row to copy
+            at[..., channel] = pictures[:, :count, :, channel]
+            if stage == 1:
+                at[..., 3 + channel] = chosen[:, :count, None, channel]
+            elif stage == 2:
+                at[..., 3 + channel] = inside[:, :count] * chosen[:, :count, None, channel]
+    return found
+
+
+def _read_part(file: Path, recipe: Recipe, level: Level, count: int) -> Frames | None:
+    """The frames of a part; None if the file is missing or damaged."""
+    shape = (count, recipe.painted + 1, level.side, level.side, 3)
+    try:
+        with open_archive(file) as archive:
+            head = archive.headers.get("frames")
+            if head is None or head.shape != shape or head.dtype != "uint8":
+                return None
+            return np.asarray(archive.read("frames"))
+    except (OSError, BadArchive):
+        return None
