@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -29,13 +30,15 @@ MAX_SEED = (1 << 62) - 1
 def made_program(
     level: str | Path | Level | LevelProgram, randomness: str | Draws, backend: str, device: str, threads: int
 ) -> LevelProgram:
-    """The program of a level, or the same one."""
+    """The program of a level; environments of one process share it."""
     if isinstance(level, LevelProgram):
         return level
-    as_ogbench = randomness != "counter"
-    return LevelProgram(
-        find_level(level), backend=backend, device=device, threads=threads, as_ogbench=as_ogbench
-    )
+    return _program(find_level(level), randomness != "counter", backend, str(device), threads)
+
+
+@lru_cache(maxsize=16)
+def _program(level: Level, as_ogbench: bool, backend: str, device: str, threads: int) -> LevelProgram:
+    return LevelProgram(level, backend=backend, device=device, threads=threads, as_ogbench=as_ogbench)
 
 
 def spaces_of(level: Level) -> tuple[Box, Discrete[Any]]:

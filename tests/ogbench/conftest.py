@@ -1,0 +1,22 @@
+"""Levels, compiled once for all tests of OGBench's environments."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from powderdsl.ogbench.env import made_program
+from powderdsl.ogbench.program import LevelProgram
+
+
+@pytest.fixture(scope="session")
+def easy(torch: Any) -> LevelProgram:
+    """The easy level on the backend `wasm`."""
+    return made_program("easy", "counter", "wasm", "cpu", 1)
+
+
+@pytest.fixture(scope="session")
+def hard(torch: Any) -> LevelProgram:
+    """The hard level on the backend `wasm`."""
+    return made_program("hard", "counter", "wasm", "cpu", 1)
