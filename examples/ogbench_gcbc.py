@@ -91,7 +91,9 @@ def chooser(policy: nn.Module, temperature: float, seed: int) -> Policy:
     return act
 
 
-def train(policy: nn.Module, args: argparse.Namespace, data: Pairs, held_out: Pairs) -> list[dict[str, float]]:
+def train(
+    policy: nn.Module, args: argparse.Namespace, data: Pairs, held_out: Pairs
+) -> list[dict[str, float]]:
     """Fit the policy. Returns the learning curve, one row for each evaluation."""
     optimizer = torch.optim.Adam(policy.parameters(), args.lr)
     random, begun = np.random.default_rng(args.seed), time.perf_counter()
