@@ -131,6 +131,9 @@ def main(argv: list[str] | None = None) -> dict[str, float]:
     parser.add_argument("--ahead", type=float, default=20, help="painted blocks to a goal, on average")
     parser.add_argument("--temperature", type=float, default=0.3)
     parser.add_argument("--episodes", type=int, default=20, help="evaluation episodes of each task")
+    parser.add_argument(
+        "--steps", type=int, help="steps of an evaluation episode; the level's, 500, by default"
+    )
     parser.add_argument("--every", type=int, default=500)
     parser.add_argument("--backend", default="auto")
     parser.add_argument("--seed", type=int, default=0)
@@ -152,7 +155,13 @@ def main(argv: list[str] | None = None) -> dict[str, float]:
 
     # The same episodes as `env` plays, all at once.
     count = args.episodes * len(level.tasks)
-    batch = PowderworldVectorEnv(level.name, count, autoreset_mode="same_step", backend=args.backend)
+    batch = PowderworldVectorEnv(
+        level.name,
+        count,
+        max_episode_steps=args.steps,
+        autoreset_mode="same_step",
+        backend=args.backend,
+    )
     random = np.random.default_rng(args.seed)
     found = {
         "random": successes(batch, lambda observed, goals: random.integers(actions, size=len(observed))),
