@@ -226,16 +226,15 @@ class Episodes:
 
     def _put(self, which: Numbers, part: World) -> None:
         """Take up new states of the worlds `which`: what they show, and their errors."""
-        pictures, ids = self.program.pictures(part), part.ids
         if len(which) == self.count:
             self.world, goals = part, self.goal_ids
-            self._shown[..., :3] = pictures
+            self.program.pictures(part, self._shown[..., :3])
         else:
             places = torch.from_numpy(which).to(self.program.device)
+            self._shown[places, :, :, :3] = self.program.pictures(part)
             self.world, goals = self.program.put(self._world, places, part), self.goal_ids[places]
-            self._shown[places, :, :, :3] = pictures
         if self.mode == "task":
-            self.errors[which] = self.program.errors(ids, goals)
+            self.errors[which] = self.program.errors(part.ids, goals)
 
     def _show_frames(self) -> None:
         """Write channels 3 to 5: what has been chosen of the action that is being given."""
@@ -246,8 +245,9 @@ class Episodes:
         first = (x * level.grid)[:, None]
         inside = (self._columns >= first) & (self._columns < first + level.brush)
         lit = (stage == 1)[:, None] | ((stage == 2)[:, None] & inside)
-        frame = lit[:, :, None] * self.program.paints[element][:, None]
-        self._shown[..., 3:] = frame[:, None]
+        color = self.program.paints[element]
+        for channel in range(3):  # one at a time: as in `LevelProgram.pictures`
+            self._shown[..., 3 + channel] = (lit * color[:, channel, None])[:, None]
 
     # Showing
 

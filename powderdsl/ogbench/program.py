@@ -88,8 +88,8 @@ class LevelProgram:
         self._colors = shares.T.contiguous()
         """float32 [3, 256], in 0..1."""
         self._tint = [float(np.float32(part) / np.float32(255)) for part in level.tint.color]
-        self._rest = (shares * 255).to(torch.uint8)
-        self.paints = self._rest[torch.from_numpy(self.ids).to(self.device)]
+        self._rest = (self._colors * 255).to(torch.uint8)
+        self.paints = self._rest.T[torch.from_numpy(self.ids).to(self.device)]
         """The colors of what agents paint: uint8 [n, 3]."""
 
     def start(self, seeds: Numbers, indices: Numbers) -> World:
@@ -151,21 +151,28 @@ class LevelProgram:
         clock = (getattr(world, one).index_copy(0, places, getattr(part, one)) for one in CLOCK)
         return World(self.simulator, new, *clock)
 
-    def pictures(self, world: World) -> Tensor:
-        """uint8 [B, H, W, 3]: the elements' colors, moving cells tinted. Every bit is what single precision gives."""
+    def pictures(self, world: World, out: Tensor | None = None) -> Tensor:
+        """uint8 [B, H, W, 3]: the elements' colors, moving cells tinted. Every bit is what single precision gives.
+
+        `out`: written to and returned, instead of a new tensor.
+        """
         ids, tint = world.ids.int(), self.level.tint
-        motion = world[tint.field]
+        cells, motion = ids.flatten(), world[tint.field]
+        if out is None:
+            out = torch.empty(*ids.shape, 3, dtype=torch.uint8, device=self.device)
+        # One color of all cells after the other: a pixel's three are too short a row for vectors.
         if not bool(motion.any()):
-            return self._rest[ids]
+            for channel in range(3):
+                out[..., channel] = self._rest[channel].index_select(0, cells).view(ids.shape)
+            return out
         row, column = motion.unbind(1)
         share = (row * row).add_(column * column).sqrt_().div_(tint.full).clamp_(max=tint.most)
-        rest, cells = 1 - share, ids.flatten()
-        found = torch.empty(*ids.shape, 3, dtype=torch.uint8, device=self.device)
-        for channel in range(3):  # whole planes: a pixel's three colors are too short a row for vectors
+        rest = 1 - share
+        for channel in range(3):
             color = self._colors[channel].index_select(0, cells).view(ids.shape)
             color.mul_(rest).add_(share * self._tint[channel])
-            found[..., channel] = color.mul_(255)
-        return found
+            out[..., channel] = color.mul_(255)
+        return out
 
     def errors(self, ids: Tensor, goals: Tensor) -> Numbers:
         """Cells of goals, uint8 [B, H, W], whose element is neither there in `ids` nor beside it: int64 [B]."""

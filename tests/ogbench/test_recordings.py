@@ -12,10 +12,8 @@ import numpy as np
 import pytest
 
 from powderdsl.ogbench.draws import LegacyDraws
-from powderdsl.ogbench.env import PowderworldEnv
+from powderdsl.ogbench.env import PowderworldEnv, made_program
 from powderdsl.ogbench.episodes import Episodes
-from powderdsl.ogbench.levels import find_level
-from powderdsl.ogbench.program import LevelProgram
 
 EXCERPTS = Path(__file__).resolve().parents[1] / "data" / "second" / "ogbench"
 WHOLE = "POWDERDSL_RECORDINGS"
@@ -71,7 +69,7 @@ def follow_planes(folder: Path, level: str) -> int:
     """The trace with given planes: ids, fields and pictures. Returns its number of steps."""
     with np.load(folder / "trace_planes.npz") as file:
         recorded = {name.removeprefix(f"{level}_"): file[name] for name in file if name.startswith(level)}
-    program = LevelProgram(find_level(level), as_ogbench=True)
+    program = made_program(level, "ogbench", "torch", "cpu", 1)
     episodes = Episodes(program, [0], randomness=Planes(recorded["random"]), mode="data_collection")
     episodes.begin(np.zeros(1, dtype=np.int64), [None])
     steps = len(recorded["random"])
@@ -106,7 +104,7 @@ def follow_goal(folder: Path, level: str, number: int) -> None:
         counts, ids, errors = (
             file[f"{kind}_{level}_task{number}"] for kind in ("counts", "goal_ids", "cross_error")
         )
-    program = LevelProgram(find_level(level), as_ogbench=True)
+    program = made_program(level, "ogbench", "torch", "cpu", 1)
     known = [program.simulator.ruleset.element(name) for name in names]
     seeds = np.arange(len(ids))
     draws = LegacyDraws(seeds, len(program.streams), program.level.side)
