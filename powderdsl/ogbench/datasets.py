@@ -52,7 +52,7 @@ def make_env_and_datasets(
         dataset_dir: the folder of ``NAME.npz`` and ``NAME-val.npz``, which `powderdsl ogbench` writes.
         dataset_path: the first of these files, wherever it is; the other one lies beside it.
         compact_dataset: False: transitions with ``next_observations``. True: all rows, and ``valids``.
-        env_only, dataset_only: leave out the other.
+        env_only, dataset_only: leave out the other; the first one counts.
         cur_env, add_info: taken for compatibility; these environments have nothing to add.
         env_kwargs: those of `PowderworldEnv`, and `max_episode_steps`.
 
@@ -64,10 +64,8 @@ def make_env_and_datasets(
         ValueError: an unknown name, or a file that is not such a data set. FileNotFoundError: there is no such file.
     """
     level, _ = split_name(dataset_name)
-    if env_only and dataset_only:
-        raise ValueError("env_only and dataset_only leave nothing to return")
     env = None
-    if not dataset_only:
+    if env_only or not dataset_only:
         spec = gymnasium.spec(f"powderdsl/{FAMILY}-{level}-{VERSION}")
         env = gymnasium.make(spec, **env_kwargs)
     if env_only:

@@ -169,7 +169,7 @@ class Episodes:
             if left < active:
                 ids, pictures = world.ids, self.program.pictures(world)
                 for place in range(left, active):
-                    found[order[place]] = Goal(ids[place].clone(), pictures[place])
+                    found[order[place]] = Goal(ids[place].clone(), pictures[place].clone())
                 if not left:
                     break
                 world, active = world.select(slice(0, left)), left

@@ -122,6 +122,39 @@ def follow_goal(folder: Path, level: str, number: int) -> None:
     assert (program.errors(world.ids[list(others)], world.ids[list(goals)]) == errors).all()
 
 
+REPLAYED = {
+    "easy": (180, 372, 246, 474, 282),
+    "medium": (186, 270, 160, 186, 270),
+    "hard": (284, 240, 195, 110, 440),
+}
+"""The environment step at which replaying a goal's actions first succeeds in OGBench: exact at the first level."""
+
+
+def first_successes(episodes: Episodes, number: int) -> np.ndarray:
+    """The environment step of first success in each episode of a task, when its own actions are replayed; -1: never."""
+    every = np.arange(episodes.count)
+    episodes.begin(every, [number] * episodes.count)
+    first = np.full(episodes.count, -1)
+    level = episodes.level
+    for step, action in enumerate(np.array(level.numbers(level.tasks[number - 1])).ravel(), 1):
+        success = episodes.step(np.full(episodes.count, action))
+        first[(first < 0) & success] = step
+    return first
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("randomness", ["counter", "ogbench"])
+@pytest.mark.parametrize("level", LEVELS)
+def test_replayed_goals_succeed_when_ogbenchs_do(torch: Any, level: str, randomness: str) -> None:
+    program = made_program(level, randomness, "wasm", "cpu", 1)
+    count = 5 if randomness == "ogbench" else 32
+    for number, expected in enumerate(REPLAYED[level], 1):
+        episodes = Episodes(program, np.arange(1000, 1000 + count), randomness=randomness)
+        first = first_successes(episodes, number)
+        assert (first < 0).mean() <= 0.25
+        assert abs(np.median(first[first > 0]) - expected) <= (0 if level == "easy" else 16)
+
+
 @pytest.mark.parametrize("level", LEVELS)
 def test_seeded_episodes_are_ogbenchs(torch: Any, level: str) -> None:
     follow_seeded(EXCERPTS, level)
