@@ -115,7 +115,7 @@ def find_level(level: str | Path | Level) -> Level:
         return read_level(Path(level))
     path = FOLDER / f"{level}.json"
     if not path.is_file():
-        helps = suggest(level, [one.stem for one in FOLDER.glob("*.json")], "levels")
+        helps = suggest(level, [one.stem for one in sorted(FOLDER.glob("*.json"))], "levels")
         raise ValueError("; ".join([f"no level {level!r}", *helps]))
     return read_level(path)
 
