@@ -237,8 +237,6 @@ def _overwritten(asked: Asked) -> list[tuple[Rule, Pairs]]:
     if asked.moment.policy != "overwrite":
         return []
     live = [rule for rule in asked.moment.rules if not isinstance(rule, Assign) and asked.may(rule)]
-    if not any(isinstance(rule, (Swap, Move)) for rule in live):
-        return []
     there = {
         number
         for rule in live

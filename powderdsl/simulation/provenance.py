@@ -6,13 +6,25 @@ need no support for it, and ordinary simulators do not change.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from powderdsl.diagnostics import Span
 from powderdsl.model.text import place_of
-from powderdsl.model.types import Assign, Expr, Field, Move, Pass, Rule, Ruleset, Swap, integer
+from powderdsl.model.types import (
+    Assign,
+    Expr,
+    Field,
+    Move,
+    Offset,
+    Pass,
+    Rule,
+    Ruleset,
+    Swap,
+    Transform,
+    integer,
+)
 from powderdsl.simulation.any_arrays import AnySimulator, AnyWorld
 from powderdsl.targets.array_kind import Array
 
@@ -120,16 +132,39 @@ def marked(ruleset: Ruleset) -> Ruleset:
 def _marked_pass(pass_: Pass, numbers: Iterator[NumberedRule]) -> Pass:
     moments = []
     for moment in pass_.moments:
-        rules = tuple(_marked_rule(rule, next(numbers).number) for rule in moment.rules)
+        numbered = [(rule, next(numbers).number) for rule in moment.rules]
+        if moment.policy in ("prove", "overwrite"):
+            rules = (*moment.rules, *_marks_in_order(numbered))
+        else:  # of the cells that rules claim each has one writer
+            rules = tuple(_marked_rule(rule, number) for rule, number in numbered)
         moments.append(replace(moment, rules=rules))
     return replace(pass_, moments=tuple(moments))
+
+
+def _marks_in_order(numbered: Sequence[tuple[Rule, int]]) -> Iterator[Assign]:
+    """Assignments of the numbers of rules that all happen where their conditions hold, in the order of their writes.
+
+    What becomes of cells, or is left behind, is written before anything arrives.
+    """
+    for rule, number in numbered:
+        if isinstance(rule, (Transform, Move)):
+            yield _mark(number, (0, 0), rule.mask, rule)
+    for rule, number in numbered:
+        if isinstance(rule, (Swap, Move)):
+            yield _mark(number, rule.offset, rule.mask, rule)
+        if isinstance(rule, Swap):
+            yield _mark(number, (0, 0), rule.mask, rule)
+
+
+def _mark(number: int, place: Offset, mask: Expr | None, rule: Rule) -> Assign:
+    value = Expr("const", integer(number, number), value=number)
+    return Assign(SLOT, place, ":=", value, mask, rule.span)
 
 
 def _marked_rule(rule: Rule, number: int) -> Rule:
     """The rule with effects that leave its number in every cell whose element it writes."""
     if isinstance(rule, Assign):
         return rule  # assignments never write elements
-    value = Expr("const", integer(number, number), value=number)
     places = [(0, 0)] if not isinstance(rule, (Swap, Move)) else [rule.offset, (0, 0)]
-    marks = tuple(Assign(SLOT, place, ":=", value, None, rule.span) for place in places)
+    marks = tuple(_mark(number, place, None, rule) for place in places)
     return replace(rule, effects=(*rule.effects, *marks))

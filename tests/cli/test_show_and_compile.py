@@ -9,9 +9,9 @@ import pytest
 
 import powderdsl as package
 from powderdsl.analysis.reactions import moved_ids, reactions, unchanging_ids
-from powderdsl.compiler import shipped_rules
 from powderdsl.model.text import print_model, show_number, show_set
 from tests.cli.commands import PACK, ROOT, powderdsl
+from tests.semantics.test_differential import compositions
 
 RULESETS = ("powderworld", "life", "wireworld", "margolus", "forest_fire", "langtons_ant")
 
@@ -101,12 +101,9 @@ def test_what_moves_and_what_stays():
 # Text
 
 
-@pytest.mark.parametrize("name", shipped_rules())
+@pytest.mark.parametrize("name", compositions())
 def test_every_model_has_a_text(name):
-    try:
-        rules = package.load(name)
-    except package.CompileError:  # a pack that needs others
-        rules = package.load("core", "water", name)
+    rules = package.load(name)
     text = print_model(rules)
     assert text == print_model(rules)
     assert text.endswith("\n")

@@ -80,7 +80,7 @@ class Watch:
             id(rule): reference.evaluate(rule.mask, at) for rule in moment.rules if rule.mask is not None
         }
         masks = dict(wanted)
-        if moment.policy != "prove":
+        if moment.policy in ("drop_both", "first_wins"):
             claims = [rule for rule in moment.rules if not isinstance(rule, Assign)]
             reference._settle_claims(moment.policy, claims, masks)
         return wanted, masks
@@ -102,7 +102,7 @@ class Watch:
                 self._changes(line, before[mask], after[mask], np.nonzero(mask)[0])
             else:
                 self._moves(rule, line, mask, before, after)
-                if isinstance(rule, Move):
+                if isinstance(rule, Move) and rule.leaving is not None:
                     self._overwrites(rule, line, moment, masks, before)
         self._expect(bool((explained | (before == after)).all()), f"{pass_.name}: a change without a rule")
         self._write(moment, pass_, masks)
@@ -151,6 +151,7 @@ class Watch:
                 leaves |= masks[id(other)]
         dy, dx = rule.offset
         lost = reference.look(masks[id(rule)], (-dy, -dx)) & ~leaves
+        assert rule.leaving is not None
         fresh = np.full(int(lost.sum()), rule.leaving.value)
         self._changes(line, before[lost], fresh, np.nonzero(lost)[0])
 

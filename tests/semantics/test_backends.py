@@ -5,14 +5,14 @@ from __future__ import annotations
 import pytest
 
 import powderdsl
-from powderdsl.compiler import shipped_rules
+from powderdsl.compiler import shipped_tests
 from powderdsl.model.types import Ruleset
 from powderdsl.testing.generators.cases import load_text
 from tests.compilers import skip_without_compiler
 
 SIZES = [(1, 1), (1, 7), (5, 1), (2, 2), (3, 33), (7, 64), (4, 65), (9, 130)]
-PACKS_ALONE = {"acid", "cloner", "core", "fire", "gas", "lava", "plant", "sand", "stone", "water", "wind"}
-RULESETS = [name for name in shipped_rules() if name not in PACKS_ALONE]
+VARIANTS = {"powderworld2_ogbench", "powderworld2_defects"}
+RULESETS = [name for name in shipped_tests() if name not in VARIANTS]
 
 
 def compiled(rules: Ruleset, backend: str) -> powderdsl.Simulator:

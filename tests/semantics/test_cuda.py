@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import powderdsl
-from powderdsl.compiler import load, lower, shipped_rules
+from powderdsl.compiler import load, lower, shipped_tests
 from powderdsl.diagnostics import CompileError
 from powderdsl.ir.segments import segments
 from powderdsl.model.types import Ruleset
@@ -22,12 +22,12 @@ from powderdsl.testing.generators.rulemaker import random_ruleset_text
 from tests.fuzz.compare import assert_same
 from tests.fuzz.cuda_emulation import EmulatedSimulator
 
-PACKS_ALONE = {"acid", "cloner", "core", "fire", "gas", "lava", "plant", "sand", "stone", "water", "wind"}
-LARGE = "powderworld"
+VARIANTS = {"powderworld2_ogbench", "powderworld2_defects"}
+LARGE = ("powderworld", "powderworld2")
 RULESETS = [
-    pytest.param(name, marks=pytest.mark.slow) if name == LARGE else name
-    for name in shipped_rules()
-    if name not in PACKS_ALONE
+    pytest.param(name, marks=pytest.mark.slow) if name in LARGE else name
+    for name in shipped_tests()
+    if name not in VARIANTS
 ]
 H200 = 232_448
 """Bytes of shared memory that a block may have there."""
@@ -127,7 +127,7 @@ def test_a_missing_barrier_would_be_seen(folder: Path, monkeypatch: pytest.Monke
 
 def test_what_does_not_fit_leaves_the_chip() -> None:
     """Fields first, then planes; a block never takes more shared memory than it may."""
-    ruleset = load(LARGE)
+    ruleset = load(LARGE[0])
     for shared, side in ((H200, 64), (H200, 256), (48 << 10, 64), (1 << 10, 64)):
         (source,) = kernels(ruleset, side, side, shared)
         assert source.shared <= shared
@@ -147,7 +147,7 @@ def test_without_a_gpu_it_is_refused(device: str, torch) -> None:  # type: ignor
 
 @pytest.mark.slow
 @pytest.mark.cuda
-@pytest.mark.parametrize("name", ["margolus", LARGE])
+@pytest.mark.parametrize("name", ["margolus", LARGE[0]])
 def test_kernels_compile_for_a_gpu(name: str, tmp_path: Path) -> None:
     compiler = shutil.which("nvcc")
     if compiler is None:
@@ -180,7 +180,7 @@ def gpu(torch) -> str:  # type: ignore[no-untyped-def]
 
 
 @pytest.mark.cuda
-@pytest.mark.parametrize("name", [name for name in shipped_rules() if name not in PACKS_ALONE])
+@pytest.mark.parametrize("name", [name for name in shipped_tests() if name not in VARIANTS])
 def test_same_worlds_on_a_gpu(name: str, gpu: str) -> None:
     ruleset = load(name)
     simulators = [
@@ -211,7 +211,7 @@ def test_random_rulesets_on_a_gpu(seed: int, gpu: str) -> None:
 @pytest.mark.cuda
 def test_thousands_of_worlds_and_steps_on_a_gpu(gpu: str, torch) -> None:  # type: ignore[no-untyped-def]
     """A thousand steps in one launch, on every multiprocessor; `torch` on the same device is the other side."""
-    ruleset = load(LARGE)
+    ruleset = load(LARGE[0])
     ids = torch.tensor([element.id for element in ruleset.elements])
     start = ids[torch.randint(len(ids), (600, 64, 64), generator=torch.Generator().manual_seed(3))]
     kernel = compile_ruleset(ruleset, backend="cuda", device=gpu)
