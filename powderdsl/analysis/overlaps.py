@@ -102,7 +102,7 @@ def _writes(rules: list[Rule], asked: Asked, pass_: Pass, known: dict[Overlap, N
             outcome = order_matters(a, b)
             if not outcome or first.mask is None or second.mask is None:
                 continue
-            apart = first is not second and asked.moment.policy != "prove"
+            apart = first is not second and asked.moment.policy in ("drop_both", "first_wins")
             if apart and _own_cells(first, a) and _own_cells(second, b):
                 continue  # rules that happen never share a cell
             overlap = Overlap(outcome, rule_line(first, pass_), rule_line(second, pass_), a.field)

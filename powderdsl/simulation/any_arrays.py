@@ -253,7 +253,7 @@ class AnySimulator(Generic[W]):
         if self.kind.sort(array) == "complex":
             raise TypeError(f"{slot.name} takes floats, found {array.dtype}")
         if slot.is_real:
-            return checked_floats(self.kind, array, slot)
+            return checked_floats(self.kind, array, ids, slot, self.ruleset)
         usual = None if self.ruleset.property(slot.name) is None else self.table(slot.name)
         return checked_integers(self.kind, array, ids, slot, usual, self.ruleset)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any
 
 from powderdsl.diagnostics import suggest
@@ -83,8 +83,11 @@ def _rows(shape: tuple[int, ...]) -> Iterator[slice]:
     return (slice(start, start + step) for start in range(0, shape[-2], step))
 
 
-def checked_floats(kind: ArrayKind, array: Array, slot: Slot) -> Array:
-    """Values as a float32 slot holds them, in memory of their own. Raises ValueError."""
+def checked_floats(kind: ArrayKind, array: Array, ids: Array, slot: Slot, ruleset: Ruleset) -> Array:
+    """Values as a float32 slot holds them, in memory of their own. Raises ValueError.
+
+    `ids` are the elements of the cells, of which some may not have the field.
+    """
     xp = kind.xp
     if not bool(xp.isfinite(array).all()):
         raise ValueError(f"{slot.name} has values that are not finite")
@@ -92,7 +95,19 @@ def checked_floats(kind: ArrayKind, array: Array, slot: Slot) -> Array:
     for rows in _rows(floats.shape):
         part = xp.clip(xp.asarray(array[..., rows, :], dtype=xp.float32), slot.kind.lo, slot.kind.hi)
         floats[..., rows, :] = xp.where(xp.abs(part) < SNAP, 0, part)
+        if slot.of is not None:
+            without = ~_holders(kind, slot.of)[kind.as_index(ids[:, rows])]
+            defaults = slot.default if isinstance(slot.default, tuple) else (slot.default,)
+            parts = [floats[:, i, rows, :] for i in range(2)] if slot.planes == 2 else [floats[:, rows, :]]
+            for values, default in zip(parts, defaults, strict=True):
+                if bool(((values != default) & without).any()):
+                    raise _misplaced(slot, slot.of, ruleset)
     return floats
+
+
+def _misplaced(slot: Slot, limited: Collection[int], ruleset: Ruleset) -> ValueError:
+    names = ", ".join(e.name for e in ruleset.elements if e.id in limited)
+    return ValueError(f"{slot.name} can only differ from its default in cells of: {names}")
 
 
 def checked_integers(
@@ -132,6 +147,5 @@ def _integers(
         places = arrays.as_index(ids)
         default = int(slot.default) if usual is None else xp.asarray(usual[places], dtype=xp.int64)
         if bool(((values != default) & ~_holders(arrays, limited)[places]).any()):
-            names = ", ".join(e.name for e in ruleset.elements if e.id in limited)
-            raise ValueError(f"{slot.name} can only differ from its default in cells of: {names}")
+            raise _misplaced(slot, limited, ruleset)
     return values
