@@ -131,6 +131,12 @@ def _shipped_sources() -> Iterator[Source]:
             yield source
 
 
+def shipped_variants() -> set[str]:
+    """The shipped rulesets that extend another one."""
+    found = [read_file(source, Reporter()) for source in _shipped_sources()]
+    return {decl.name.text for decl in found if isinstance(decl, RulesetDecl) and decl.extends is not None}
+
+
 def shipped_tests() -> list[str]:
     """The shipped rules that stand by themselves: rulesets, and packs that need no other and belong to no ruleset."""
     found = [decl for source in _shipped_sources() if (decl := read_file(source, Reporter()))]

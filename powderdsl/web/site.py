@@ -17,7 +17,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from powderdsl.compiler import load, read, shipped, shipped_tests, split_names
+from powderdsl.compiler import load, read, shipped, shipped_tests, shipped_variants, split_names
 from powderdsl.diagnostics import Reporter
 from powderdsl.model.state import fits
 from powderdsl.model.types import Ruleset
@@ -76,14 +76,10 @@ def shipped_entries() -> list[Entry]:
     """
     tasks = "\n".join(path.read_text(encoding="utf-8") for path in sorted(shipped("tasks").glob("*.yaml")))
     used = Counter(re.findall(r"^rules: *(\S+)", tasks, re.MULTILINE))
-    found = [Entry(name, (name,)) for name in shipped_tests() if not _extends(name)]
+    variants = shipped_variants()
+    found = [Entry(name, (name,)) for name in shipped_tests() if name not in variants]
     found.sort(key=lambda one: (-used[one.key], -len(one.ruleset.elements)))
     return found + [_example(path.stem, found[0].key) for path in sorted(examples_folder().glob("*.yaml"))]
-
-
-def _extends(name: str) -> bool:
-    _, ruleset = read([name], Reporter())
-    return ruleset is not None and ruleset.extends is not None
 
 
 def _example(stem: str, rules: str) -> Entry:

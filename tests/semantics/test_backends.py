@@ -5,14 +5,13 @@ from __future__ import annotations
 import pytest
 
 import powderdsl
-from powderdsl.compiler import shipped_tests
+from powderdsl.compiler import shipped_tests, shipped_variants
 from powderdsl.model.types import Ruleset
 from powderdsl.testing.generators.cases import load_text
 from tests.compilers import skip_without_compiler
 
 SIZES = [(1, 1), (1, 7), (5, 1), (2, 2), (3, 33), (7, 64), (4, 65), (9, 130)]
-VARIANTS = {"powderworld2_ogbench", "powderworld2_defects"}
-RULESETS = [name for name in shipped_tests() if name not in VARIANTS]
+RULESETS = sorted(set(shipped_tests()) - shipped_variants())
 
 
 def compiled(rules: Ruleset, backend: str) -> powderdsl.Simulator:

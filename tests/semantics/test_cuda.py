@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import powderdsl
-from powderdsl.compiler import load, lower, shipped_tests
+from powderdsl.compiler import load, lower, shipped_tests, shipped_variants
 from powderdsl.diagnostics import CompileError
 from powderdsl.ir.segments import segments
 from powderdsl.model.types import Ruleset
@@ -22,12 +22,10 @@ from powderdsl.testing.generators.rulemaker import random_ruleset_text
 from tests.fuzz.compare import assert_same
 from tests.fuzz.cuda_emulation import EmulatedSimulator
 
-VARIANTS = {"powderworld2_ogbench", "powderworld2_defects"}
 LARGE = ("powderworld", "powderworld2")
 RULESETS = [
     pytest.param(name, marks=pytest.mark.slow) if name in LARGE else name
-    for name in shipped_tests()
-    if name not in VARIANTS
+    for name in sorted(set(shipped_tests()) - shipped_variants())
 ]
 H200 = 232_448
 """Bytes of shared memory that a block may have there."""
@@ -180,7 +178,7 @@ def gpu(torch) -> str:  # type: ignore[no-untyped-def]
 
 
 @pytest.mark.cuda
-@pytest.mark.parametrize("name", [name for name in shipped_tests() if name not in VARIANTS])
+@pytest.mark.parametrize("name", sorted(set(shipped_tests()) - shipped_variants()))
 def test_same_worlds_on_a_gpu(name: str, gpu: str) -> None:
     ruleset = load(name)
     simulators = [

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from powderdsl.compiler import load, shipped_rules
+from powderdsl.compiler import load, shipped_rules, shipped_variants
 from powderdsl.diagnostics import CompileError
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.simulation.simulator import compile as compile_ruleset
@@ -34,7 +34,7 @@ def complete(name: str) -> bool:
         return False
 
 
-RULESETS = [name for name in shipped_rules() if complete(name)]
+RULESETS = [name for name in shipped_rules() if name not in shipped_variants() and complete(name)]
 
 
 @pytest.mark.slow
