@@ -18,7 +18,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # runs from a checkout that is not installed
 
-from powderdsl.compiler import shipped_tests
+from powderdsl.compiler import shipped_tests, shipped_variants
 
 DOCS = Path(__file__).resolve().parent
 RESULTS = DOCS / "mutation.json"
@@ -32,9 +32,14 @@ EXAMPLES = {
 """Compositions of the examples, and which of their packs are mutated."""
 
 
+UNCOUNTED = {"powderworld2"}
+"""Rules whose mutants have not been counted yet: it takes hours."""
+
+
 def compositions() -> dict[str, tuple[str, ...]]:
     """What is judged: rules, and which of their packs; none for all of them."""
-    return {**dict.fromkeys(shipped_tests(), ()), **EXAMPLES}
+    counted = [name for name in shipped_tests() if name not in shipped_variants() | UNCOUNTED]
+    return {**dict.fromkeys(counted, ()), **EXAMPLES}
 
 
 Counts = dict[str, dict[str, int]]

@@ -83,7 +83,7 @@ class Session:
                 raise BadRequest(f"{name[:80]!r} is not a file name such as pack.yaml")
         if bad := next((name for name in off if not PACK.fullmatch(name)), None):
             raise BadRequest(f"{bad[:80]!r} is not the name of a pack")
-        for path in self.folder.iterdir():
+        for path in sorted(self.folder.iterdir()):
             if path.name not in files:
                 path.unlink()
         for name, text in files.items():

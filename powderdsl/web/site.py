@@ -255,7 +255,7 @@ def kept(name: str, make: Make) -> bytes:
             return path.read_bytes()
     except OSError:
         return make()
-    for old in folder.iterdir():
+    for old in sorted(folder.iterdir()):
         if not old.name.startswith(code_version()):
             old.unlink(missing_ok=True)
     data = make()
@@ -286,7 +286,7 @@ def code_version() -> str:
     texts = [
         path
         for folder in (shipped("rules"), shipped("tasks"), examples_folder())
-        for path in folder.rglob("*.yaml")
+        for path in sorted(folder.rglob("*.yaml"))
     ]
     for path in sorted({*HERE.parent.rglob("*.py"), *HERE.parent.rglob("*.lark")}) + sorted(texts):
         found.update(path.read_bytes())

@@ -67,7 +67,7 @@ passes:
       - any but (empty, bane) -> empty if above is bane with chance 40%
       - bane -> empty if below is not (empty, bane) with chance 20%
 """,
-        (("wall never changes", 9), ("count(cloner) is constant", 9)),
+        (("wall never changes", 9), ("count(cloner) is constant without (mole?, snake?)", 9)),
     ),
     Added(
         "quake",

@@ -34,7 +34,7 @@ from tests.fuzz.compare import find_difference
 ANYTHING = Manner()
 STEADY = Manner(draws=False, borders=False, symmetry=False)
 """Nothing random, nothing that knows where the grid ends."""
-SWAPS = Manner(forms=("swap",))
+SWAPS = Manner(forms=("swap",), overwrites=False)
 
 MOVEMENT = ("stone", "gravity", "piling", "flow", "wind")
 """The passes of powderworld that move elements and make none."""

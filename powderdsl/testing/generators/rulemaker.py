@@ -94,7 +94,7 @@ class PassMaker:
         choices = self.choices
         tree: dict[str, Tree] = {}
         if policy is None and choices.maybe(40):
-            policy = choices.pick(["drop_both", "first_wins", "overwrite"])
+            policy = choices.pick(["drop_both", "first_wins", *["overwrite"] * self.manner.overwrites])
             tree["conflicts"] = policy
         if not symmetric and self.manner.symmetry and choices.maybe(15):
             symmetric = True

@@ -51,6 +51,8 @@ class Manner:
     """Anything that knows where the grid ends: `row`, `column`, `inside`, kernels that do not wrap."""
     reals: bool = True
     symmetry: bool = True
+    overwrites: bool = True
+    """Blocks whose moves may overwrite each other, so that cells get lost or doubled."""
     forms: tuple[str, ...] = ("transform", "swap", "move", "assign", "push")
 
 
