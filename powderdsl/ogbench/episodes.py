@@ -261,7 +261,7 @@ class Episodes:
 
 
 def task_of(level: Level, options: Mapping[str, Any]) -> int | GoalTask | None:
-    """The task that options of `reset` name: a number from 1, a task of one's own, or None.
+    """The task that options of `reset` name: a number from 1, a custom task, or None.
 
     Raises:
         TypeError, ValueError: they name none that the level has.

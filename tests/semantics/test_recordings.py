@@ -36,9 +36,10 @@ import numpy.typing as npt
 import pytest
 
 import powderdsl
+from tests.recordings import draws_of, recording_paths
 
 DATA = Path(__file__).parents[1] / "data"
-STREAMS = ("movement", "interact", "element")
+RECORDINGS = recording_paths("POWDERDSL_RECORDINGS", DATA, "before_ids")
 FIELDS = ("gravity", "momentum", "clone", "velocity")
 PASSES = (
     "stone", "gravity", "piling", "flow", "melt", "freeze", "fire", "plant", "lava", "acid", "cloner", "wind",
@@ -78,19 +79,6 @@ class Recording:
     states: tuple[State, ...]
 
 
-def recording_paths() -> list[Path]:
-    """The recordings to test against; FileNotFoundError when there are none."""
-    folder = Path(os.environ.get("POWDERDSL_RECORDINGS") or DATA)
-    paths = []
-    for path in sorted(folder.glob("*.npz")):
-        with np.load(path, allow_pickle=False) as archive:
-            if "before_ids" in archive.files:
-                paths.append(path)
-    if not paths:
-        raise FileNotFoundError(f"no recordings in {folder}")
-    return paths
-
-
 @cache
 def read_recording(path: Path) -> Recording:
     """Read one recording."""
@@ -99,11 +87,10 @@ def read_recording(path: Path) -> Recording:
     names = ("ids", *FIELDS)
     before = State(*(arrays[f"before_{name}"] for name in names))
     after = [State(*(arrays[f"after_{name}"][k] for name in names)) for k in range(len(arrays["passes"]))]
-    draws = (arrays["random"].astype(np.float32) + np.float32(0.5)) / np.float32(256)
     return Recording(
         elements=tuple(arrays["elements"].tolist()),
         passes=tuple(arrays["passes"].tolist()),
-        random=dict(zip(STREAMS, draws, strict=True)),
+        random=draws_of(arrays["random"]),
         states=(before, *after),
     )
 
@@ -151,7 +138,7 @@ def runner(request: pytest.FixtureRequest) -> Runner:
     return compiled(request.param)
 
 
-@pytest.fixture(params=recording_paths(), ids=lambda path: path.stem)
+@pytest.fixture(params=RECORDINGS, ids=lambda path: path.stem)
 def path(request: pytest.FixtureRequest) -> Path:
     """Each recording's path in turn."""
     chosen: Path = request.param
@@ -267,7 +254,7 @@ def test_quirk_is_rare(runner: Runner) -> None:
     """Momentum differs in under 0.1 % of cells after the wind, all recordings taken together."""
     differ = [
         (wind_alone(runner.backend, path).momentum != read_recording(path).states[-1].momentum).ravel()
-        for path in recording_paths()
+        for path in RECORDINGS
     ]
     assert np.concatenate(differ).mean() < QUIRK_SHARE
 
@@ -275,7 +262,7 @@ def test_quirk_is_rare(runner: Runner) -> None:
 @pytest.mark.skipif("POWDERDSL_RECORDINGS" in os.environ, reason="says what tests/data holds")
 def test_small_recordings_show_everything() -> None:
     """The recordings kept here hold every element, gusts of wind, and something for each pass to do."""
-    recordings = [read_recording(path) for path in recording_paths()]
+    recordings = [read_recording(path) for path in RECORDINGS]
     assert len(recordings) == 4
     present = {element for recording in recordings for element in np.unique(recording.states[0].ids).tolist()}
     assert present == set(range(14))

@@ -32,9 +32,10 @@ import pytest
 import powderdsl
 from powderdsl.model.state import slots
 from powderdsl.model.types import Ruleset
+from tests.recordings import draws_of, recording_paths
 
 DATA = Path(__file__).parents[1] / "data" / "second"
-STREAMS = ("movement", "interact", "element")
+RECORDINGS = recording_paths("POWDERDSL_SECOND_RECORDINGS", DATA, "before_custom1")
 PASSES = (
     "stone", "mole", "gravity", "piling", "lemming", "flow", "melt", "freeze", "fire",
     "plant", "lava", "acid", "cloner", "fish", "bird", "kangaroo", "snake", "wind",
@@ -64,19 +65,6 @@ class Recording:
     defect: np.ndarray
 
 
-def recording_paths() -> list[Path]:
-    """The recordings to test against; FileNotFoundError when there are none."""
-    folder = Path(os.environ.get("POWDERDSL_SECOND_RECORDINGS") or DATA)
-    paths = []
-    for path in sorted(folder.glob("*.npz")):
-        with np.load(path, allow_pickle=False) as archive:
-            if "before_custom1" in archive.files:
-                paths.append(path)
-    if not paths:
-        raise FileNotFoundError(f"no recordings in {folder}")
-    return paths
-
-
 @cache
 def read_recording(path: Path) -> Recording:
     with np.load(path, allow_pickle=False) as archive:
@@ -85,8 +73,7 @@ def read_recording(path: Path) -> Recording:
     before = {name: arrays[f"before_{name}"] for name in names}
     passes = tuple(arrays["passes"].tolist())
     after = [{name: arrays[f"after_{name}"][k] for name in names} for k in range(len(passes))]
-    draws = (arrays["random"].astype(np.float32) + np.float32(0.5)) / np.float32(256)
-    random = dict(zip(STREAMS, draws, strict=True))
+    random = draws_of(arrays["random"])
     return Recording(tuple(arrays["elements"].tolist()), passes, random, (before, *after), arrays["defect"])
 
 
@@ -168,7 +155,7 @@ def runner(request: pytest.FixtureRequest) -> Runner:
     return compiled(*request.param)
 
 
-@pytest.fixture(params=recording_paths(), ids=lambda path: path.stem)
+@pytest.fixture(params=RECORDINGS, ids=lambda path: path.stem)
 def recording(request: pytest.FixtureRequest) -> Recording:
     return read_recording(request.param)
 
@@ -220,7 +207,7 @@ def test_defects_are_told_apart() -> None:
     runner = compiled("powderworld2", "reference")
     for name in ("piling", "mole"):
         k, marked = PASSES.index(name), []
-        for recording in map(read_recording, recording_paths()):
+        for recording in map(read_recording, RECORDINGS):
             world = runner.run(recording.states[k], recording.random, (name,))
             for mask in runner.differing(world, recording.states[k + 1]).values():
                 marked.append(np.count_nonzero(mask & recording.defect[k]))
@@ -230,7 +217,7 @@ def test_defects_are_told_apart() -> None:
 @pytest.mark.skipif("POWDERDSL_SECOND_RECORDINGS" in os.environ, reason="says what tests/data holds")
 def test_small_recordings_show_everything() -> None:
     """The recordings kept here hold every element, gusts, and something for each pass to do."""
-    recordings = [read_recording(path) for path in recording_paths()]
+    recordings = [read_recording(path) for path in RECORDINGS]
     assert len(recordings) == 6
     present = {element for one in recordings for element in np.unique(one.states[0]["ids"]).tolist()}
     assert present == set(range(21))

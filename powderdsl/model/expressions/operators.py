@@ -192,22 +192,9 @@ def holds(typer: Typer, left: Operand, right: Operand, syntax: Syntax) -> Expr:
             return TRUE if left == right else FALSE
         case SetOf(), SetOf() if left.name is not None:
             return TRUE if left.ids[0] in right.ids else FALSE
-        case PlaceChoice(), Place() | PlaceChoice():
-            return compare(
-                typer,
-                "==",
-                (typer.direction(left, first), span),
-                (typer.direction(right, second), span),
-                span,
-            )
-        case Place(), PlaceChoice():
-            return compare(
-                typer,
-                "==",
-                (typer.direction(left, first), span),
-                (typer.direction(right, second), span),
-                span,
-            )
+        case (PlaceChoice(), Place() | PlaceChoice()) | (Place(), PlaceChoice()):
+            one, other = typer.direction(left, first), typer.direction(right, second)
+            return compare(typer, "==", (one, span), (other, span), span)
         case Expr(), Place() | PlaceChoice():
             return compare(typer, "==", (left, span), (typer.direction(right, second), span), span)
         case _, Expr() if right.kind == DIRECTION:
