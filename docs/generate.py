@@ -1,14 +1,17 @@
-"""Tables of README.md and docs/*.md that follow from the package.
+"""Tables and pictures of README.md and docs/*.md that follow from the package.
 
-`python docs/generate.py` writes them, `--check` names the pages that are stale.
+`python docs/generate.py` writes the tables, `--check` names the pages that are stale. `--pictures` draws the pictures.
 
-A table stands between `<!-- generated: NAME -->` and `<!-- end -->`; what is between them is rewritten.
+A table stands between `<!-- generated: NAME -->` and `<!-- end -->`; what is between them is rewritten. A picture
+stands below the command that draws it: `<!-- powderdsl run … --out docs/images/NAME -->`.
 """
 
 from __future__ import annotations
 
 import json
 import re
+import shlex
+import subprocess
 import sys
 import textwrap
 from collections.abc import Callable, Iterable
@@ -47,6 +50,8 @@ from powderdsl.worlds.scene.read import FILE_KEYS, SCENE_KEYS
 from powderdsl.worlds.scene.statements import SETTING, STATEMENTS
 
 DOCS = Path(__file__).resolve().parent
+PAGES = (DOCS.parent / "README.md", *sorted(DOCS.rglob("*.md")))
+DRAWN = re.compile(r"^<!-- powderdsl (.*) --out (docs/images/\S+) -->$", re.MULTILINE)
 MARKED = re.compile(r"(<!-- generated: ([\w ]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 SHAPES = {
@@ -310,12 +315,27 @@ def generated(markdown: str) -> str:
 
 def stale_pages() -> list[Path]:
     """Pages whose tables are not what the package says."""
-    pages = [DOCS.parent / "README.md", *sorted(DOCS.rglob("*.md"))]
-    return [page for page in pages if generated(text := page.read_text("utf-8")) != text]
+    return [page for page in PAGES if generated(text := page.read_text("utf-8")) != text]
+
+
+def pictures() -> dict[str, list[str]]:
+    """The arguments of the command that draws each picture, by the picture's path in the repository."""
+    found = (match for page in PAGES for match in DRAWN.findall(page.read_text("utf-8")))
+    return {path: shlex.split(command) for command, path in found}
+
+
+def draw_pictures() -> None:
+    for path, arguments in pictures().items():
+        print(path)
+        command = [sys.executable, "-m", "powderdsl", *arguments, "--out", path]
+        subprocess.run(command, cwd=DOCS.parent, check=True)
 
 
 def main(arguments: list[str]) -> int:
-    """Write the stale pages, or name them and return 1 under `--check`."""
+    """Write the stale pages, or name them and return 1 under `--check`; under `--pictures`, draw the pictures."""
+    if "--pictures" in arguments:
+        draw_pictures()
+        return 0
     stale = stale_pages()
     for page in stale:
         print(f"{'stale' if '--check' in arguments else 'written'}: {page.relative_to(DOCS.parent)}")

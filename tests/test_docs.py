@@ -309,6 +309,35 @@ def test_a_stale_table_would_be_seen(generate: Any) -> None:
     assert generate.generated(fresh) == fresh
 
 
+PICTURES = sorted({path for page in PAGES for path in re.findall(r"--out (docs/images/\S+) -->", read(page))})
+SHOWN_STEPS = 24
+"""Steps of animations that are compared."""
+
+
+@pytest.mark.parametrize("path", PICTURES)
+def test_pictures_are_what_their_commands_draw(path: str, generate: Any, tmp_path: Path) -> None:
+    """Its first frames, pixel by pixel: `python docs/generate.py --pictures` draws pictures again."""
+    from powderdsl.cli import main
+
+    arguments = list(generate.pictures()[path])
+    at = arguments.index("--steps") + 1
+    shown = min(int(arguments[at]), SHOWN_STEPS)
+    out = tmp_path / "drawn.gif"
+    fewer = [*arguments[:at], str(shown), *arguments[at + 1 :]]
+    result = CliRunner().invoke(main, [*fewer, "--backend", "wasm", "--out", str(out)])
+    assert result.exit_code == 0, result.output
+    drawn, kept = frames_of(out), frames_of(ROOT / path)
+    assert len(drawn) > 2
+    assert drawn == kept[: len(drawn)]
+
+
+def frames_of(path: Path) -> list[bytes]:
+    from PIL import Image, ImageSequence
+
+    with Image.open(path) as image:
+        return [frame.convert("RGB").tobytes() for frame in ImageSequence.Iterator(image)]
+
+
 def test_every_table_of_keys_is_shown(generate: Any) -> None:
     """A new kind of mapping, or a function, cannot stay undocumented."""
     shown = {found for page in PAGES for found in re.findall(r"<!-- generated: ([\w ]+) -->", read(page))}

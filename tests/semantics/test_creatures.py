@@ -1,0 +1,345 @@
+"""The creatures behave as docs/creatures.md says, in the second world and in the first one.
+
+Tests inside the packs say what one step does. Here are whole lives, and which element does what to which creature. Long
+runs are on one backend: that all run worlds alike, cell by cell, is tested elsewhere.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import powderdsl
+from powderdsl.simulation.draw import to_numpy
+from powderdsl.simulation.simulator import Simulator, World
+from powderdsl.worlds.ascii import read_ascii
+from powderdsl.worlds.scene import load_start
+
+PAGE = Path(__file__).parents[2] / "docs" / "creatures.md"
+CREATURES = ("fish", "bird", "kangaroo", "mole", "lemming", "snake", "robot")
+LIGHT = {"empty", "water", "gas", "fire", "acid", "dust"}
+"""What moves out of the way and is no heavier than a fish."""
+
+backends = pytest.mark.parametrize("backend", ["reference", "wasm"])
+both_worlds = pytest.mark.parametrize(
+    ("first", "backend"),
+    [(False, "reference"), (False, "wasm"), (True, "wasm")],
+    ids=["second-reference", "second-wasm", "first-wasm"],
+)
+"""`powderworld2`, or `powderworld` with all seven creatures."""
+
+
+@cache
+def simulator(backend: str, first: bool = False) -> Simulator:
+    rules = "+".join(("powderworld", *CREATURES)) if first else "powderworld2"
+    return powderdsl.compile(powderdsl.load(rules), backend=backend)
+
+
+def drawn(sim: Simulator, art: str, count: int = 1, **fields: float) -> World:
+    """`count` worlds that begin alike. Fields are set in the cells that have creatures."""
+    world = sim.world(np.repeat(read_ascii(art, sim.ruleset.elements)[None], count, 0), seed=5)
+    creatures = np.isin(to_numpy(world.ids), [sim.ruleset.element(name).id for name in CREATURES])
+    return sim.paint(world, where=creatures, **fields) if fields else world
+
+
+def beside(sim: Simulator, glyph: str, copies: int) -> World:
+    """Worlds of a creature and to the right of it each element, in the order of their ids, `copies` of each."""
+    elements = sim.ruleset.elements
+    drawings = [read_ascii(f"####\n#{glyph}{other.glyph}#\n####", elements) for other in elements]
+    return sim.world(np.repeat(np.array(drawings), copies, 0), seed=5)
+
+
+def cells(world: World, name: str) -> NDArray[np.bool_]:
+    return np.asarray(to_numpy(world.ids) == world.sim.ruleset.element(name).id)
+
+
+def count(world: World, name: str) -> list[int]:
+    return [int(number) for number in cells(world, name).sum((1, 2))]
+
+
+def path(world: World, name: str, steps: int) -> NDArray[np.int64]:
+    """Row and column of the only creature of each world, in each step: [steps + 1, B, 2]."""
+    found = []
+    for step in range(steps + 1):
+        places = np.argwhere(cells(world, name))
+        assert places[:, 0].tolist() == list(range(len(world))), f"lost or doubled in step {step}"
+        found.append(places[:, 1:])
+        world = world.sim.step(world)
+    return np.array(found)
+
+
+def assert_chance(hits: int, tries: int, chance: float) -> None:
+    """A count of independent events lies within four standard deviations of its mean."""
+    assert abs(hits - tries * chance) <= 4 * np.sqrt(tries * chance * (1 - chance)), (hits, tries)
+
+
+# --- fish
+
+
+@both_worlds
+def test_fish_swim_in_what_moves_and_is_no_heavier(first: bool, backend: str) -> None:
+    sim = simulator(backend, first)
+    world = beside(sim, "F", 8)
+    entered = np.zeros(len(world), bool)
+    for _ in range(25):
+        world = sim.step(world, passes=["fish"])
+        entered |= cells(world, "fish")[:, 1, 2]
+    names = [element.name for element in sim.ruleset.elements]
+    assert set(count(world, "fish")[: 8 * names.index("fish")]) == {1}
+    assert {
+        name for name, some in zip(names, entered.reshape(-1, 8).any(1), strict=True) if some
+    } == LIGHT | {"fish"}
+
+
+# --- bird
+
+
+@both_worlds
+def test_birds_fly_one_cell_a_step_or_two_and_keep_away_from_walls(first: bool, backend: str) -> None:
+    sim = simulator(backend, first)
+    room = np.zeros((20, 20), np.uint8)
+    room[[0, -1]] = room[:, [0, -1]] = sim.ruleset.element("wall").id
+    room[9, 10] = sim.ruleset.element("bird").id
+    places = path(sim.world(np.repeat(room[None], 8, 0), seed=1), "bird", 14)
+    assert (np.abs(np.diff(places[1:4], axis=0)).max(2) == (2 if first else 1)).all()
+    distance = np.minimum(places, 19 - places).min(2)
+    assert first or distance.min() == 3
+
+
+def test_birds_that_start_in_all_directions_fly_the_same_way_after_a_while() -> None:
+    sim = simulator("wasm")
+    crowd = np.zeros((4, 16, 16), np.uint8)
+    crowd[:, 3::4, 3::4] = sim.ruleset.element("bird").id
+    world = sim.step(sim.world(crowd, seed=3))
+    agreement = []
+    for _ in range(2):
+        heading = (to_numpy(world["flying"]) * cells(world, "bird")[:, None]).sum((2, 3))
+        agreement.append(np.mean(np.hypot(*heading.T) / count(world, "bird")))
+        world = sim.step(world, 24)
+    assert agreement[0] < 0.6
+    assert agreement[1] > 0.85
+
+
+# --- kangaroo
+
+
+@both_worlds
+def test_a_leap_is_nine_pushes(first: bool, backend: str) -> None:
+    sim = simulator(backend, first)
+    world = drawn(sim, "#k#\n#.#\n###", leap=1)
+    velocities = []
+    for _ in range(12):
+        world = sim.step(world, passes=["kangaroo"])
+        velocities.append(float(to_numpy(world["velocity"])[0, 0, 0, 1]))
+    assert velocities == [-4.0 * n for n in (*range(1, 10), 9, 9, 9)]
+
+
+@both_worlds
+def test_kangaroos_leap_ten_cells_high_or_25(first: bool, backend: str) -> None:
+    sim = simulator(backend, first)
+    world = drawn(sim, "\n".join(["#######", *["#.....#"] * 29, "#..k..#", "#######"]), 4, leap=1)
+    height = 30 - path(world, "kangaroo", 26 if first else 19)[..., 0]
+    assert (24 if first else 9) <= height.max(0).min() <= height.max() <= (26 if first else 10)
+    if not first:
+        assert (height[16:] == 0).any(0).mean() > 0.5  # back on the ground
+
+
+def test_kangaroos_leap_over_walls_and_climb_no_steps() -> None:
+    sim = simulator("wasm")
+    room = ["#" * 16, *["#" + "." * 14 + "#"] * 10, *["#........#.....#"] * 3, "#..k.....#.....#", "#" * 16]
+    leaping = drawn(sim, "\n".join(room), 4, leap=1, momentum=-2)
+    assert (path(leaping, "kangaroo", 12)[-1, :, 1] > 9).all()
+    walking = drawn(sim, "########\n#......#\n#.k..w.#\n########", 8)
+    for _ in range(12):
+        walking = sim.step(walking, params={"kangaroo.leaps": 0})
+        assert cells(walking, "kangaroo")[:, 2, 1:5].any(1).all()
+
+
+# --- mole
+
+
+@both_worlds
+def test_moles_eat_what_is_solid_and_push_aside_what_is_not(first: bool, backend: str) -> None:
+    sim = simulator(backend, first)
+    start = beside(sim, "m", 16)
+    world = sim.step(start, 20, passes=["mole"])
+    found: dict[str, set[str]] = {"eaten": set(), "pushed aside": set(), "stops it": set()}
+    for element in sim.ruleset.elements:
+        group = slice(16 * element.id, 16 * element.id + 16)
+        what = "stops it"
+        if (to_numpy(world.ids) != to_numpy(start.ids))[group].any():
+            what = "pushed aside" if all(count(world, element.name)[group]) else "eaten"
+        found[what].add(element.name)
+    assert set(count(world, "mole")) == {1, 2}
+    assert found["pushed aside"] == LIGHT | {"fish"}
+    assert found["stops it"] == {"wall", "mole"}
+
+
+def test_of_what_a_mole_digs_only_the_tunnel_is_missing() -> None:
+    sim = simulator("wasm")
+    world = drawn(sim, "########\n#~~wwww#\n#~mwwww#\n#~~wwww#\n########", 32)
+    water, solid = np.array(count(world, "water")), np.array(count(world, "wood")) + count(world, "empty")
+    world = sim.step(world, 40)
+    assert (np.array(count(world, "water")) == water).all()
+    assert (np.array(count(world, "wood")) + count(world, "empty") == solid).all()
+    assert np.mean(count(world, "empty")) > 2
+
+
+# --- lemming
+
+
+@both_worlds
+def test_a_lemming_turns_around_at_walls_and_nowhere_else(first: bool, backend: str) -> None:
+    sim = simulator(backend, first)
+    column = path(drawn(sim, "#######\n#L....#\n#######", 64), "lemming", 24)[..., 1]
+    step = np.diff(column, axis=0)
+    before, after, at = step[:-1], step[1:], column[1:-1]
+    assert set(np.unique(step)) == {-1, 0, 1}
+    assert (after == before)[(at > 1) & (at < 5)].all()
+    assert {1, 5} <= set(np.unique(column[-8:]))
+    stopped = (before == 0) & ((at == 1) | (at == 5))
+    assert_chance(int((after != 0)[stopped].sum()), int(stopped.sum()), 0.5)
+
+
+@both_worlds
+def test_lemmings_cross_hills_of_steps_and_no_wall_of_two(first: bool, backend: str) -> None:
+    sim = simulator(backend, first)
+    hill = "#########\n#.......#\n#...w...#\n#..www..#\n#Lwwwww.#\n#########"
+    crossed = path(drawn(sim, hill, 32), "lemming", 60 if first else 16)[..., 1].max(0) == 7
+    assert crossed.mean() > 0.8
+    wall = "#######\n#.....#\n#..w..#\n#L.w..#\n#######"
+    assert path(drawn(sim, wall, 32), "lemming", 12)[..., 1].max() == 2
+
+
+# --- snake
+
+
+@both_worlds
+def test_a_snake_with_energy_1_grows_to_eleven_cells_and_travels(first: bool, backend: str) -> None:
+    sim = simulator(backend, first)
+    world = drawn(sim, "\n".join(["#" * 30, "##S" + "." * 26 + "#", "#" * 30]), 2, energy=1)
+    lengths, heads = [], []
+    for _ in range(16):
+        world = sim.step(world)
+        body = cells(world, "snake")[:, 1]
+        lengths.append(body.sum(1).tolist())
+        heads.append((body * np.arange(30)).max(1).tolist())
+    assert lengths == [[n, n] for n in [*range(2, 12), *[11] * 6]]
+    assert heads == [[n, n] for n in range(3, 19)]
+
+
+def test_a_snake_that_is_stuck_gets_shorter_and_is_gone() -> None:
+    sim = simulator("wasm")
+    world = drawn(sim, "#######\n#S....#\n#######", 4, energy=1)
+    lengths = []
+    for _ in range(18):
+        world = sim.step(world)
+        lengths.append(max(count(world, "snake")))
+    assert max(lengths) == 5
+    assert lengths[-1] == 0
+
+
+@both_worlds
+def test_snakes_destroy_everything_but_walls(first: bool, backend: str) -> None:
+    sim = simulator(backend, first)
+    world = sim.step(beside(sim, "S", 2), passes=["snake"])
+    entered = cells(world, "snake")[:, 1, 2].reshape(-1, 2).all(1)
+    assert [element.name for element, yes in zip(sim.ruleset.elements, entered, strict=True) if not yes] == [
+        "wall"
+    ]
+
+
+# --- robot, cloners
+
+
+@both_worlds
+def test_robots_stand_where_they_have_landed(first: bool, backend: str) -> None:
+    sim = simulator(backend, first)
+    world = sim.step(drawn(sim, "#######\n#.r.r.#\n#..w~w#\n#.ww~w#\n#######", 4), 4)
+    landed = cells(world, "robot")
+    assert (np.argwhere(landed)[:, 1:] == [[2, 2], [3, 4]] * 4).all()
+    assert (cells(sim.step(world, 12), "robot") == landed).all()
+
+
+def test_cloners_pour_out_creatures_and_moles_and_snakes_eat_theirs() -> None:
+    sim = simulator("wasm")
+    start = load_start("hatchery", sim.ruleset)
+    world = sim.world(np.repeat(start.ids[None], 2, 0), seed=0)
+    for name, field in start.fields.items():
+        world = sim.paint(world, where=field.where, **{name: field.values})
+    world = sim.step(world, 100)
+    for cage, name in enumerate(CREATURES):
+        inside = to_numpy(world.ids)[:, 1:-1, 7 * cage + 1 : 7 * cage + 7]
+        number, cloner, acid = (sim.ruleset.element(one).id for one in (name, "cloner", "acid"))
+        others = set(np.unique(inside).tolist()) - {0, number, cloner, acid}
+        if name != "snake":  # their acid turns into gas what it touches
+            assert not others, name
+        if name not in ("mole", "snake"):
+            assert (inside == number).sum() > 20, name
+            assert (inside == cloner).sum() == 2, name
+        else:
+            assert (inside == cloner).sum() == 0, name
+
+
+# --- who harms whom
+
+
+def table(heading: str) -> dict[str, list[str]]:
+    """The rows of the first table under a heading of the page, by their first cell."""
+    text = PAGE.read_text(encoding="utf-8").partition(f"\n## {heading}\n")[2].partition("\n## ")[0]
+    rows = [
+        [cell.strip() for cell in line.strip("|").split("|")] for line in re.findall(r"^\|.*\|$", text, re.M)
+    ]
+    return {name: cells for name, *cells in rows[2:]}
+
+
+HARMS = table("Who harms whom")
+
+
+def test_the_table_has_all_creatures() -> None:
+    assert tuple(HARMS) == CREATURES
+
+
+@backends
+def test_creatures_are_harmed_as_the_table_says(backend: str) -> None:
+    sim = simulator(backend)
+    glyphs = [sim.ruleset.element(creature).glyph for creature in CREATURES]
+
+    def left(art: str, name: str, steps: int, copies: int) -> NDArray[np.bool_]:
+        """Where the creature `X` of a drawing still is, [7, copies, H, W], after steps of one pass."""
+        ids = [read_ascii(art.replace("X", glyph), sim.ruleset.elements) for glyph in glyphs]
+        world = sim.step(sim.world(np.repeat(np.array(ids), copies, 0), seed=2), steps, passes=[name])
+        found = [
+            cells(world, creature)[i * copies : (i + 1) * copies] for i, creature in enumerate(CREATURES)
+        ]
+        return np.array(found)
+
+    burns, acid, mole, snake = zip(*HARMS.values(), strict=True)
+    for safe, words in zip(left("####\n#Xf#\n####", "fire", 1, 1000).sum((1, 2, 3)), burns, strict=True):
+        assert_chance(1000 - int(safe), 1000, 0 if words == "no" else int(words.removesuffix(" %")) / 100)
+    stays = left("###\n#a#\n#X#\n###", "acid", 40, 4).any((1, 2, 3))
+    assert ["no" if here else "dissolves" for here in stays] == list(acid)
+    dug = left("####\n#mX#\n####", "mole", 25, 16)
+    seen = np.where(
+        dug.any((2, 3)).all(1), np.where(dug[:, :, 1, 2].all(1), "stops it", "pushed aside"), "eaten"
+    )
+    assert seen.tolist() == list(mole)
+    bitten = left("####\n#SX#\n####", "snake", 1, 2)
+    assert [
+        creature for creature, some in zip(CREATURES, bitten[:, :, 1, 2].any(1), strict=True) if some
+    ] == ["snake"]
+    assert set(snake) == {"eaten"}
+
+
+@both_worlds
+def test_wind_carries_all_of_them(first: bool, backend: str) -> None:
+    sim = simulator(backend, first)
+    for creature in CREATURES:
+        world = drawn(sim, f"####\n#{sim.ruleset.element(creature).glyph}.#\n####", 2)
+        world = sim.paint(world, where=np.ones(world.shape, bool), velocity=(0, 8))
+        assert cells(sim.step(world, passes=["wind"]), creature)[:, 1, 2].all(), creature
