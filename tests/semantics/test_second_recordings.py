@@ -85,8 +85,8 @@ class Runner:
     ruleset: Ruleset
     simulator: Any
 
-    def run(self, state: State, random: State, passes: tuple[str, ...]) -> Any:
-        """The world after one step that runs only `passes`."""
+    def world(self, state: State) -> Any:
+        """A recorded state as worlds."""
         world = self.simulator.world(self.given(state["ids"]))
         fields = {slot.name: slot for slot in slots(self.ruleset)}
         found = {name: value for name, value in self.fields_of(state).items() if name in fields}
@@ -96,9 +96,12 @@ class Runner:
                 usual = np.array([float(number) for number in prop.values])[state["ids"]]
                 own = np.isin(state["ids"], sorted(prop.stored))
                 found[name] = np.where(own, value, usual).astype(fields[name].dtype)
-        world = self.simulator.replace(world, **{name: self.given(value) for name, value in found.items()})
+        return self.simulator.replace(world, **{name: self.given(value) for name, value in found.items()})
+
+    def run(self, state: State, random: State, passes: tuple[str, ...]) -> Any:
+        """The world after one step that runs only `passes`."""
         draws = {stream: self.given(draw) for stream, draw in random.items()}
-        return self.simulator.step(world, random=draws, passes=list(passes))
+        return self.simulator.step(self.world(state), random=draws, passes=list(passes))
 
     def fields_of(self, state: State) -> State:
         """The fields that stand for a recorded state's numbers."""
