@@ -123,14 +123,15 @@ def difference(prop: Property, ruleset: Ruleset, found: Counterexample) -> Diffe
     added = ruleset.added_to(prop.scope)
     owners = pack_of_line(ruleset)
     lines = [span for span in found.culprits if owners.get(span) in added]
-    if not lines and not is_paired(prop.claim):
-        lines = _happened(ruleset, found.sample, found.steps, added)
+    packs = added
+    if not lines:  # only packs that matter: rules of others may have happened too
+        packs = tuple(pack for pack in added[:MOST] if not _still(prop, ruleset, found, pack)) or added
+        if not is_paired(prop.claim):
+            lines = _happened(ruleset, found.sample, found.steps, packs)
     causes = [Cause(owners[span], span, one_line(span), True) for span in lines]
-    causes = causes or list(_elements(found, ruleset, added))
+    causes = causes or list(_elements(found, ruleset, packs))
     if causes:
         return Difference(_in_order(added, causes), tuple(causes))
-    guilty = [pack for pack in added[:MOST] if not _still(prop, ruleset, found, pack)]
-    packs = tuple(guilty) or added
     names = {element.id: element.name for element in ruleset.elements}
     near = frozenset(
         names[number] for ids in (found.before, found.after) for number in np.unique(ids).tolist()
