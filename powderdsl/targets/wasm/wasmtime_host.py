@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import atexit
 import ctypes
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar
+from weakref import WeakSet
 
 import wasmtime
 from wasmtime import _ffi
@@ -16,6 +18,24 @@ from powderdsl.targets.wasm.host import TOO_LARGE, Bytes
 MOST_ARGUMENTS = 16
 GROWTH = 16 << 20
 """Bytes of addresses beyond a memory into which it grows without being moved, where addresses are few."""
+
+
+_OWNED: WeakSet[Any] = WeakSet()
+"""What wasmtime frees with the objects of Python that own it."""
+T = TypeVar("T")
+
+
+def _owned(one: T) -> T:
+    _OWNED.add(one)
+    return one
+
+
+@atexit.register
+def _leave() -> None:
+    """Leave everything to the operating system: wasmtime cannot free it when Python has taken its modules apart."""
+    for one in list(_OWNED):
+        with suppress(ValueError):  # it was freed before
+            one._consume()
 
 
 @dataclass
@@ -39,14 +59,14 @@ class WasmtimeHost:
 
     def compile(self, code: bytes) -> Compiled:
         engine = self._engine
-        return Compiled(code, engine, wasmtime.Module(engine, code))
+        return Compiled(code, engine, _owned(wasmtime.Module(engine, code)))
 
     def instantiate(self, module: Compiled) -> WasmtimeModule:
         try:
             return WasmtimeModule(module.engine, module.module)
         except wasmtime.WasmtimeError:
             self._engine = module.engine = _engine(reserve=False)
-            module.module = wasmtime.Module(module.engine, module.code)
+            module.module = _owned(wasmtime.Module(module.engine, module.code))
         try:
             return WasmtimeModule(module.engine, module.module)
         except wasmtime.WasmtimeError:
@@ -60,16 +80,14 @@ def _engine(*, reserve: bool) -> wasmtime.Engine:
         config.memory_reservation = 0
         config.memory_reservation_for_growth = GROWTH
         config.memory_guard_size = 0
-    engine = wasmtime.Engine(config)
-    atexit.register(engine.close)  # later, when Python has taken wasmtime apart, it would complain
-    return engine
+    return _owned(wasmtime.Engine(config))
 
 
 class WasmtimeModule:
     """An instance in a store of its own."""
 
     def __init__(self, engine: wasmtime.Engine, module: wasmtime.Module):
-        self._store = wasmtime.Store(engine)
+        self._store = _owned(wasmtime.Store(engine))
         exports: dict[str, Any] = dict(
             wasmtime.Instance(self._store, module, []).exports(self._store).items()
         )
