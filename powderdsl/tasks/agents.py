@@ -19,7 +19,6 @@ Entries = dict[str, tuple[yaml_tree.Scalar, yaml_tree.Node]]
 
 MAX_ACTIONS = 1_000_000
 MAX_STEPS = 100_000
-MAX_SPEED = 1_000_000.0
 ACTS = {"blow": BLOW, "nothing": NO_CHANGE}
 """Words of `may:` that are not elements."""
 

@@ -211,61 +211,22 @@ def pixels(path: Path) -> set[tuple[int, ...]]:
 
 
 def test_pictures_of_commands(stove: Path) -> None:
-    ran = run_command(
-        "run",
-        "core+stove.yaml",
-        "--world",
-        "start.txt",
-        "--steps",
-        "3",
-        "--backend",
-        "torch",
-        "--out",
-        "a.png",
-        "--scale",
-        "1",
-    )
-    assert ran.exit_code == 0, ran.output
+    def done(words: str) -> None:
+        ran = run_command(*words.split())
+        assert ran.exit_code == 0, ran.output
+
+    run = "run core+stove.yaml --world start.txt --steps 3 --backend torch --out"
+    done(f"{run} a.png --scale 1")
     hot = tuple(
         floor(a + (b - a) * Fraction(3, 9) + Fraction(1, 2))
         for a, b in zip((48, 48, 48), (255, 48, 0), strict=True)
     )
     assert hot in pixels(Path("a.png"))
-    assert (
-        run_command(
-            "run",
-            "core+stove.yaml",
-            "--world",
-            "start.txt",
-            "--steps",
-            "3",
-            "--backend",
-            "torch",
-            "--out",
-            "a.npz",
-        ).exit_code
-        == 0
-    )
-    drawn = run_command("render", "a.npz", "--rules", "core+stove.yaml", "--out", "b.png", "--scale", "1")
-    assert drawn.exit_code == 0, drawn.output
+    done(f"{run} a.npz")
+    done("render a.npz --rules core+stove.yaml --out b.png --scale 1")
     assert pixels(Path("b.png")) == pixels(Path("a.png"))
-    film = run_command(
-        "run",
-        "core+stove.yaml",
-        "--world",
-        "start.txt",
-        "--steps",
-        "3",
-        "--backend",
-        "torch",
-        "--out",
-        "a.gif",
-        "--scale",
-        "1",
-    )
-    assert film.exit_code == 0, film.output
-    again = run_command("run", "core+stove.yaml", "--world", "b.png", "--steps", "0", "--out", "c.npz")
-    assert again.exit_code == 0, again.output  # a color of a ramp means its element
+    done(f"{run} a.gif --scale 1")
+    done("run core+stove.yaml --world b.png --steps 0 --out c.npz")  # a color of a ramp means its element
     from powderdsl.worlds.store import load_world
 
     sim = powderdsl.compile("core+stove.yaml", backend="reference")

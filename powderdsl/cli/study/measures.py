@@ -22,19 +22,6 @@ EVALUATES: dict[tuple[str, ...], tuple[tuple[str, ...], ...]] = {
 POLICIES = ("trained", "expert", "random", "nothing")
 BASELINES = ("random", "nothing")
 PREDICTORS = ("model", "nothing changes", "most frequent outcome")
-WORLD_MODEL_NUMBERS = (
-    "loss",
-    "accuracy",
-    "changed_accuracy",
-    "change_precision",
-    "change_f1",
-    "ece",
-    "changed_ece",
-    "change_ece",
-    "cells",
-    "changed",
-    "predicted_changed",
-)
 
 
 def check_measure(
@@ -157,7 +144,9 @@ def values_of_agent(
 
 def values_of_world_model() -> Mapping[str, Any]:
     """The numbers that `wm eval` writes."""
-    numbers = dict.fromkeys(WORLD_MODEL_NUMBERS, 0)
+    from powderdsl.worldmodel.scores import MEASURES
+
+    numbers = dict.fromkeys(MEASURES, 0)
     by_predictor = dict.fromkeys(PREDICTORS, numbers)
     return {
         "worlds_each": 0,
