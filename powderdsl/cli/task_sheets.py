@@ -16,7 +16,7 @@ from powderdsl.cli.exits import BadInput
 from powderdsl.cli.options import check_writable
 from powderdsl.cli.output import print_json, table
 from powderdsl.cli.pictures import MAX_SIDE, USUAL_SIDE
-from powderdsl.simulation.draw import OUTLINES, contact_sheet, outline, palette, ramps, rgb, scale
+from powderdsl.simulation.draw import OUTLINES, contact_sheet, outline, scale
 from powderdsl.tasks.shipped import check_split, is_task, load_task
 from powderdsl.tasks.task import BLOW, Agent, Task
 
@@ -133,9 +133,7 @@ def _write_sheet(task: Task, split: str, seeds: int, out: Path) -> None:
 
     program = compile_task(task, split=split, backend="torch")
     episodes = program.start(torch.arange(seeds))
-    start, elements = episodes.world, task.ruleset.elements
-    fields = {ramp.field: start[ramp.field].numpy() for ramp in ramps(elements)}
-    drawn = rgb(start.ids.numpy(), palette(elements), ramps=ramps(elements), fields=fields)
+    drawn = episodes.world.rgb().numpy()
     columns = int(np.ceil(np.sqrt(seeds)))
     longest = max(task.size) * columns
     factor = max(2, min(8, 2 * USUAL_SIDE // longest))

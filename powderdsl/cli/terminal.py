@@ -10,8 +10,8 @@ from types import TracebackType
 from typing import Any, TextIO
 
 from powderdsl.diagnostics.printable import printable, unguarded
-from powderdsl.model.types import Element
-from powderdsl.simulation.draw import palette, ramps, rgb, to_numpy
+from powderdsl.model.types import Element, Field
+from powderdsl.simulation.draw import palette, ramps, rgb, tints, to_numpy
 from powderdsl.worlds.ascii import write_ascii
 
 UPPER_HALF = "▀"
@@ -49,7 +49,7 @@ def render_frame(image: Any) -> str:
 class LiveView:
     """Shows one world after the other in one place; a context manager that leaves the terminal as it was.
 
-        with LiveView(rules.elements) as view:
+        with LiveView(rules.elements, fields=rules.fields) as view:
             view.show(ids, caption="step 12")
 
     Where the output is not a terminal, frames follow one another as plain text. With NO_COLOR set
@@ -57,12 +57,14 @@ class LiveView:
     fit are thinned out.
     """
 
-    def __init__(self, elements: Sequence[Element], stream: TextIO | None = None):
+    def __init__(
+        self, elements: Sequence[Element], stream: TextIO | None = None, *, fields: Sequence[Field] = ()
+    ):
         self.stream: TextIO = unguarded(sys.stdout if stream is None else stream)
         self.elements = elements
         self.in_place = self.stream.isatty() and os.environ.get("TERM") != "dumb"
         self.color = self.in_place and not os.environ.get("NO_COLOR") and _can_encode(self.stream)
-        self._colors, self._ramps = palette(elements), ramps(elements)
+        self._colors, self._ramps, self._tints = palette(elements), ramps(elements), tints(fields)
         self._height = 0
 
     def __enter__(self) -> LiveView:
@@ -77,23 +79,19 @@ class LiveView:
         if self.in_place:
             self._write(_RESET + _SHOW_CURSOR)
 
-    def show(
-        self, ids: Any, motion: Any = None, caption: str = "", fields: Mapping[str, Any] | None = None
-    ) -> None:
-        """Draw ids [H, W], array or tensor, tinted by `motion`, float [2, H, W]; `caption` stands below.
+    def show(self, ids: Any, caption: str = "", fields: Mapping[str, Any] | None = None) -> None:
+        """Draw ids [H, W], array or tensor; `caption` stands below.
 
-        `fields` has the fields that colors follow, [H, W] each, by name.
+        `fields` has the fields that pictures show, [H, W] or of vectors [2, H, W], by name.
         """
         ids = to_numpy(ids)
         shown = {name: to_numpy(value) for name, value in (fields or {}).items()}
-        motion = None if motion is None else to_numpy(motion)
         if self.in_place:
             step = self._thinning(*ids.shape)
             ids = ids[::step, ::step]
-            motion = None if motion is None else motion[:, ::step, ::step]
-            shown = {name: value[::step, ::step] for name, value in shown.items()}
+            shown = {name: value[..., ::step, ::step] for name, value in shown.items()}
         if self.color:
-            text = render_frame(rgb(ids, self._colors, motion, ramps=self._ramps, fields=shown))
+            text = render_frame(rgb(ids, self._colors, ramps=self._ramps, tints=self._tints, fields=shown))
         else:
             text = write_ascii(ids, self.elements).rstrip("\n")
         caption = printable(caption)

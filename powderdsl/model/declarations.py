@@ -27,6 +27,17 @@ class TypedDecl:
     values: tuple[Pair, ...] = ()
     """The values of single elements."""
     about: str = ""
+    tint: TintDecl | None = None
+
+
+@dataclass(frozen=True)
+class TintDecl:
+    """How a field tints cells in pictures, as written."""
+
+    key: Scalar
+    color: str
+    full: int
+    most: Syntax | None
 
 
 @dataclass(frozen=True)

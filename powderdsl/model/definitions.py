@@ -12,12 +12,12 @@ from powderdsl.diagnostics import Label, Span, suggest
 from powderdsl.model.composition.compose import Composition
 from powderdsl.model.composition.contested import given_values
 from powderdsl.model.composition.names import Named, report_unknown
-from powderdsl.model.declarations import KernelDecl, TypedDecl
+from powderdsl.model.declarations import KernelDecl, TintDecl, TypedDecl
 from powderdsl.model.expressions.operands import Broken, Operand, Poisoned, Scope, SetOf, Unresolved
 from powderdsl.model.expressions.symbols import clamped, default_of, not_a_value, number_value, read_kind
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.schema import KEYS
-from powderdsl.model.types import CHANCE, FLAG, Field, Kernel, Kind, Param, Property, Value
+from powderdsl.model.types import CHANCE, FLAG, Field, Kernel, Kind, Param, Property, Tint, Value
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.yaml_tree import Scalar
 
@@ -170,8 +170,20 @@ def _field(named: Named[TypedDecl], typer: Typer) -> Field:
             raise typer.fail("PD401", "`of` needs `at: element`", decl.of.span, label)
     resets = decl.resets is not None
     return Field(
-        named.name, kind, clamped(default, kind), decl.at, resets, of, named.pack, named.span, word=named.word
-    )
+        named.name, kind, clamped(default, kind), decl.at, resets, of, named.pack, named.span,
+        word=named.word, tint=_tint(decl.tint, kind, typer, scope) if decl.tint else None,
+    )  # fmt: skip
+
+
+def _tint(decl: TintDecl, kind: Kind, typer: Typer, scope: Scope) -> Tint:
+    """The tint of a field. Raises Poisoned after reporting that it is not a vector."""
+    if kind.name != "vec2":
+        fix = "cells show numbers and flags with `color_by`, under their element"
+        raise typer.fail(
+            "PD401", f"a field of kind {kind} tints nothing", decl.key.span, "only vectors do", fix
+        )
+    most = typer.constant(decl.most, CHANCE, scope) if decl.most else 1
+    return Tint(decl.color, decl.full, float(most))  # type: ignore[arg-type]  # a chance is a number
 
 
 Given = Mapping[tuple[str, str], tuple[Syntax, str]]

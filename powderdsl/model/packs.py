@@ -21,6 +21,7 @@ from powderdsl.model.declarations import (
     StreamDecl,
     TagDecl,
     TestDecl,
+    TintDecl,
     TypedDecl,
 )
 from powderdsl.model.schema import KEYS, Entries, Reader, first_line
@@ -138,7 +139,20 @@ class _PackReader(Reader):
         return TypedDecl(key, **self.read(node, "property", f"the property `{key.text}`"))
 
     def field(self, key: Scalar, node: Node) -> TypedDecl:
-        return TypedDecl(key, **self.read(node, "field", f"the field `{key.text}`"))
+        entries = self.mapping(node, "field", f"the field `{key.text}`")
+        values = self.values(entries, "field")
+        tint = values.pop("tint", None)
+        return TypedDecl(
+            key, **values, tint=None if tint is None else self.tint(key, entries["tint"][0], tint)
+        )
+
+    def tint(self, field: Scalar, key: Scalar, node: Node) -> TintDecl | None:
+        """A tint; None if something is wrong with it."""
+        found = self.read(node, "tint", f"`tint` of `{field.text}`")
+        color = self.color(found, "to")
+        if color is None or "full" not in found:
+            return None
+        return TintDecl(key, color, found["full"], found.get("most"))
 
     def param(self, key: Scalar, node: Node) -> TypedDecl:
         if isinstance(node, Scalar):

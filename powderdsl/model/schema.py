@@ -99,7 +99,15 @@ KEYS: dict[str, dict[str, Key]] = {
         "default": Key("line", "its value in a fresh cell; that of one element beside it, by its name"),
         "of": Key("line", "the elements that have it; others read the default"),
         "resets": Key("word", "`step`: back to the default when a step starts", options=("step",)),
+        "tint": Key("mapping", "how it tints cells in pictures, if it is a vector"),
         "about": Key("text", "what it is, in a sentence"),
+    },
+    "tint": {
+        "to": Key("word", 'the color that cells are tinted toward, quoted: "#RRGGBB"', True),
+        "full": Key("number", "the length at which a cell would have that color", True, bounds=(1, 1000)),
+        "most": Key(
+            "line", "the most of that color that a cell can have, such as `50%`; all of it by default"
+        ),
     },
     "stream": {
         "bits": Key("number", "resolution of a draw: 16 or 32", bounds=(16, 32)),
@@ -187,7 +195,7 @@ _MEANT = {
 }
 """Keys that people expect, and what they are called here."""
 
-HOMES = ("pack", "pass", "element", "task", "agent", "reward", "split", "color_by")
+HOMES = ("pack", "pass", "element", "task", "agent", "reward", "split", "color_by", "tint")
 """Mappings to which a key may belong that stands in another one."""
 
 NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")

@@ -125,6 +125,12 @@ def show_expr(ruleset: Ruleset, expr: Expr) -> str:
     return _Printer(ruleset).expr(expr)
 
 
+def tint_text(item: Field) -> str:
+    """How it tints cells, after a blank; nothing where it does not."""
+    tint = item.tint
+    return f" tint {tint.color} full {tint.full} most {tint.most:g}" if tint else ""
+
+
 def ramp_text(element: Element) -> str:
     """How its color follows a field, after a blank; nothing where it does not."""
     ramp = element.ramp
@@ -176,7 +182,7 @@ class _Printer:
             f", {element_name(self.ruleset, identity)} {show_value(self.ruleset, item.kind, value)}"
             for identity, value in item.own
         )
-        return f"{item.name} {item.kind} at {item.at}{of} default {default}{own}{resets}"
+        return f"{item.name} {item.kind} at {item.at}{of} default {default}{own}{resets}{tint_text(item)}"
 
     def kernel_lines(self) -> list[str]:
         lines = []

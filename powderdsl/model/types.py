@@ -130,6 +130,15 @@ class Property:
 
 
 @dataclass(frozen=True)
+class Tint:
+    """How a vector field tints cells in pictures: toward `color`, by its length / `full`, and at most by `most`."""
+
+    color: str
+    full: int
+    most: float
+
+
+@dataclass(frozen=True)
 class Field:
     """State of a cell. `at` is ``element`` (travels with it) or ``place``; `of` limits it to some elements.
     `own` are the defaults of single elements, by id, in the order of ids. `word` is as in `Element`."""
@@ -144,6 +153,7 @@ class Field:
     span: Span = field(compare=False, repr=False)
     own: tuple[tuple[int, Any], ...] = ()
     word: str = field(default="", repr=False, metadata=UNMEANING)
+    tint: Tint | None = field(default=None, metadata=UNMEANING)
 
     @property
     def defaults(self) -> tuple[Any, ...]:

@@ -215,10 +215,10 @@ def worlds(program: LevelProgram, recipe: Recipe, first: int, actions: NDArray[n
     count = len(actions)
     seeds = np.full(count, recipe.seed, dtype=np.int64)
     world = program.start(seeds, np.arange(recipe.first + first, recipe.first + first + count))
-    yield program.pictures(world).cpu().numpy()
+    yield world.rgb().cpu().numpy()
     for number in range(recipe.painted):
         world = program.act(world, actions[:, number])
-        yield program.pictures(world).cpu().numpy()
+        yield world.rgb().cpu().numpy()
 
 
 def rows_of(program: LevelProgram, frames: Frames, actions: NDArray[np.int16], rows: int) -> Frames:

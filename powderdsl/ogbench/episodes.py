@@ -167,7 +167,7 @@ class Episodes:
         for time in range(len(lists[order[0]]) + 1):
             left = sum(len(one) > time for one in lists)
             if left < active:
-                ids, pictures = world.ids, self.program.pictures(world)
+                ids, pictures = world.ids, world.rgb()
                 for place in range(left, active):
                     found[order[place]] = Goal(ids[place].clone(), pictures[place].clone())
                 if not left:
@@ -228,10 +228,10 @@ class Episodes:
         """Take up new states of the worlds `which`: what they show, and their errors."""
         if len(which) == self.count:
             self.world, goals = part, self.goal_ids
-            self.program.pictures(part, self._shown[..., :3])
+            self._shown[..., :3] = part.rgb()
         else:
             places = torch.from_numpy(which).to(self.program.device)
-            self._shown[places, :, :, :3] = self.program.pictures(part)
+            self._shown[places, :, :, :3] = part.rgb()
             self.world, goals = self.program.put(self._world, places, part), self.goal_ids[places]
         if self.mode == "task":
             self.errors[which] = self.program.errors(part.ids, goals)
@@ -246,7 +246,7 @@ class Episodes:
         inside = (self._columns >= first) & (self._columns < first + level.brush)
         lit = (stage == 1)[:, None] | ((stage == 2)[:, None] & inside)
         color = self.program.paints[element]
-        for channel in range(3):  # one at a time: as in `LevelProgram.pictures`
+        for channel in range(3):  # one at a time: a pixel's three are too short a row for vectors
             self._shown[..., 3 + channel] = (lit * color[:, channel, None])[:, None]
 
     # Showing

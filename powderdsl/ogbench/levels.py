@@ -37,16 +37,6 @@ class GoalTask:
 
 
 @dataclass(frozen=True)
-class Tint:
-    """Moving cells are tinted: by |field| / `full`, at most `most`, toward `color`."""
-
-    field: str
-    full: float
-    most: float
-    color: tuple[int, int, int]
-
-
-@dataclass(frozen=True)
 class Level:
     """Square worlds of `side` cells, `fill` with a `frame` around it, in which agents paint one of `elements`.
 
@@ -65,7 +55,6 @@ class Level:
     grid: int
     elements: tuple[str, ...]
     steps: int
-    tint: Tint
     episodes: int
     validation: int
     episode_steps: int
@@ -174,12 +163,6 @@ class _Fields:
             raise ValueError(f"`{name}` must lie in {least:,}..{most:,}, found {value:,}")
         return int(value)
 
-    def number(self, name: str, most: float) -> float:
-        value = self._value(name, (int, float), "a number")
-        if not 0 < value <= most:
-            raise ValueError(f"`{name}` must be above 0 and at most {most}, found {value}")
-        return float(value)
-
     def end(self) -> None:
         unknown = sorted(set(self.values) - self.read)
         if unknown:
@@ -189,12 +172,9 @@ class _Fields:
 
 
 def _level(fields: _Fields) -> Level:
-    tint, play = fields.inner("tint"), fields.inner("play")
+    play = fields.inner("play")
     side = fields.integer("side", 4, MAX_SIDE)
     brush = fields.integer("brush", 1, side)
-    color = tint.list("color")
-    if len(color) != 3 or not all(type(part) is int and 0 <= part <= 255 for part in color):
-        raise ValueError(f"`tint.color` must be three integers in 0..255, found {color!r:.80}")
     elements = fields.list("elements")
     if not elements or not all(isinstance(name, str) for name in elements):
         raise ValueError("`elements` must list at least one name")
@@ -210,13 +190,12 @@ def _level(fields: _Fields) -> Level:
         fields.integer("grid", 1, side),
         tuple(elements),
         fields.integer("steps", 1, 1 << 30),
-        Tint(tint.text("field"), tint.number("full", 1e9), tint.number("most", 1), tuple(color)),
         play.integer("episodes", 1, 1 << 30),
         play.integer("validation", 1, 1 << 30),
         play.integer("steps", 2, 1 << 20),
         tuple(tasks),
     )
-    for part in (tint, play, fields):
+    for part in (play, fields):
         part.end()
     for task in level.tasks:
         level.numbers(task)

@@ -65,8 +65,6 @@ class LevelProgram:
         self.streams = tuple(stream.name for stream in ruleset.streams)
         self.ids = np.array([_number(ruleset, name) for name in level.elements], dtype=np.int64)
         """The ids of what agents paint, in the order of actions."""
-        if level.tint.field not in {slot.name for slot in self.simulator.slots if slot.planes == 2}:
-            raise ValueError(f"`tint.field`: {level.tint.field} is not a field of vectors of {level.rules}")
         fill, frame = _number(ruleset, level.fill), _number(ruleset, level.frame)
         start = torch.full((level.side, level.side), fill, dtype=torch.uint8, device=self.device)
         start[0], start[-1], start[:, 0], start[:, -1] = frame, frame, frame, frame
@@ -81,15 +79,7 @@ class LevelProgram:
                 table = value[:1].repeat(256, *[1] * (value.ndim - 1))
                 table[known[0, 0]] = value
                 self._fresh[slot.name] = table
-        colors = np.zeros((256, 3), dtype=np.float32)
-        found = palette(ruleset.elements)
-        colors[: len(found)] = found
-        shares = torch.from_numpy(colors / np.float32(255)).to(self.device)
-        self._colors = shares.T.contiguous()
-        """float32 [3, 256], in 0..1."""
-        self._tint = [float(np.float32(part) / np.float32(255)) for part in level.tint.color]
-        self._rest = (self._colors * 255).to(torch.uint8)
-        self.paints = self._rest.T[torch.from_numpy(self.ids).to(self.device)]
+        self.paints = torch.from_numpy(palette(ruleset.elements)[self.ids]).to(self.device)
         """The colors of what agents paint: uint8 [n, 3]."""
 
     def start(self, seeds: Numbers, indices: Numbers) -> World:
@@ -150,29 +140,6 @@ class LevelProgram:
             new = {name: value.index_copy(0, places, part.state[name]) for name, value in state.items()}
         clock = (getattr(world, one).index_copy(0, places, getattr(part, one)) for one in CLOCK)
         return World(self.simulator, new, *clock)
-
-    def pictures(self, world: World, out: Tensor | None = None) -> Tensor:
-        """uint8 [B, H, W, 3]: the elements' colors, moving cells tinted. Every bit is what single precision gives.
-
-        `out`: written to and returned, instead of a new tensor.
-        """
-        ids, tint = world.ids.int(), self.level.tint
-        cells, motion = ids.flatten(), world[tint.field]
-        if out is None:
-            out = torch.empty(*ids.shape, 3, dtype=torch.uint8, device=self.device)
-        # One color of all cells after the other: a pixel's three are too short a row for vectors.
-        if not bool(motion.any()):
-            for channel in range(3):
-                out[..., channel] = self._rest[channel].index_select(0, cells).view(ids.shape)
-            return out
-        row, column = motion.unbind(1)
-        share = (row * row).add_(column * column).sqrt_().div_(tint.full).clamp_(max=tint.most)
-        rest = 1 - share
-        for channel in range(3):
-            color = self._colors[channel].index_select(0, cells).view(ids.shape)
-            color.mul_(rest).add_(share * self._tint[channel])
-            out[..., channel] = color.mul_(255)
-        return out
 
     def errors(self, ids: Tensor, goals: Tensor) -> Numbers:
         """Cells of goals, uint8 [B, H, W], whose element is neither there in `ids` nor beside it: int64 [B]."""

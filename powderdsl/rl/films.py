@@ -14,7 +14,17 @@ from torch import Tensor
 
 from powderdsl.envs.acting import Policy
 from powderdsl.rl.evaluation import Played, play
-from powderdsl.simulation.draw import OUTLINES, contact_sheet, outline, palette, ramps, rgb, scale
+from powderdsl.simulation.draw import (
+    OUTLINES,
+    contact_sheet,
+    outline,
+    palette,
+    ramps,
+    rgb,
+    scale,
+    shown_fields,
+    tints,
+)
 from powderdsl.simulation.simulator import World
 from powderdsl.tasks.episodes import Episodes, TaskProgram
 from powderdsl.tasks.players import ExpertPlayer
@@ -30,12 +40,11 @@ PAPER = (30, 30, 30)
 
 @dataclass(frozen=True)
 class FilmScene:
-    """All worlds between two steps: `ids` uint8 [B, H, W], `motion` float32 [B, 2, H, W] or None, `fields` [B, H, W]
-    each, those that colors follow; `actions` int64 [B, 5] or None before the first and where nobody acts; `returns`
+    """All worlds between two steps: `ids` uint8 [B, H, W]; `fields` [B, H, W] or of vectors [B, 2, H, W], those that
+    pictures show; `actions` int64 [B, 5] or None before the first and where nobody acts; `returns`
     float64 [B] before them; `over` bool [B]."""
 
     ids: NDArray[np.uint8]
-    motion: NDArray[np.float32] | None
     fields: dict[str, NDArray[Any]]
     actions: Tensor | None
     returns: Tensor
@@ -48,7 +57,7 @@ class FilmRecorder:
     def __init__(self, count: int) -> None:
         self.regions: dict[str, NDArray[np.bool_]] = {}
         self.scenes: list[FilmScene] = []
-        self._pending: list[tuple[Any, Any, Any]] = []
+        self._pending: list[tuple[Any, Any]] = []
         self._returns = torch.zeros(count, dtype=torch.float64)
         self._over = torch.zeros(count, dtype=torch.bool)
 
@@ -60,11 +69,9 @@ class FilmRecorder:
 
     def seen(self, world: World) -> None:
         """The worlds after an action, or a step."""
-        vectors = [item.name for item in world.sim.ruleset.fields if item.kind.name == "vec2"]
-        motion = world[vectors[0]].cpu().numpy().copy() if vectors else None
-        names = {ramp.field for ramp in ramps(world.sim.ruleset.elements)}
-        fields = {name: world[name].cpu().numpy().copy() for name in sorted(names)}
-        self._pending.append((world.ids.cpu().numpy().copy(), motion, fields))
+        names = shown_fields(world.sim.ruleset)
+        fields = {name: world[name].cpu().numpy().copy() for name in names}
+        self._pending.append((world.ids.cpu().numpy().copy(), fields))
 
     def acted(self, actions: Tensor | None, returns: Tensor, over: Tensor) -> None:
         """Assign the worlds seen since the last call to these actions; the last of them shows the new returns."""
@@ -124,10 +131,11 @@ def _tile(
     task: Task, recorder: FilmRecorder, scene: FilmScene, world: int, colors: Any, factor: int, font: Any
 ) -> NDArray[np.uint8]:
     """One world, uint8 [H·factor + LINE, W·factor, 3]."""
-    motion = None if scene.motion is None else scene.motion[world]
     fields = {name: values[world] for name, values in scene.fields.items()}
-    ramped = ramps(task.ruleset.elements)
-    picture = np.array(scale(rgb(scene.ids[world], colors, motion, ramps=ramped, fields=fields), factor))
+    ramped, tinted = ramps(task.ruleset.elements), tints(task.ruleset.fields)
+    picture = np.array(
+        scale(rgb(scene.ids[world], colors, ramps=ramped, tints=tinted, fields=fields), factor)
+    )
     for number, masks in enumerate(recorder.regions.values()):
         outline(picture, masks[world % len(masks)], factor, OUTLINES[number % len(OUTLINES)])
     words = ""

@@ -10,16 +10,10 @@ from functools import lru_cache
 from typing import Any
 
 from powderdsl.arrays import NDArray, np
-from powderdsl.model.types import ColorRamp, Element
+from powderdsl.model.types import ColorRamp, Element, Field, Ruleset
 
 Array = Any
 """A NumPy array or a torch tensor. Torch is imported only once a tensor is given."""
-
-MOTION_COLOR = (200, 100, 100)
-"""The color toward which moving cells are tinted."""
-
-MAX_TINT = 0.5
-"""The weight of the tint at speed 1 and above; slower cells are tinted in proportion."""
 
 OUTLINES = ((255, 0, 160), (0, 160, 255), (255, 160, 0), (0, 200, 80))
 """Colors of regions, in their order in the file; they repeat after the fourth."""
@@ -56,6 +50,61 @@ def ramps(elements: Sequence[Element]) -> tuple[Ramp, ...]:
     return tuple(
         Ramp(number, ramp.field, *_steps(ramp)) for number, ramp in sorted(found, key=lambda one: one[0])
     )
+
+
+@dataclass(frozen=True)
+class CellTint:
+    """Cells are tinted by the vectors of a field: toward `color`, float32 in 0..1, by |v| / `full`, at most by `most`."""
+
+    field: str
+    color: tuple[float, float, float]
+    full: float
+    most: float
+
+
+def tints(fields: Sequence[Field]) -> tuple[CellTint, ...]:
+    """The tints of the fields that have one, in their order."""
+    return tuple(
+        CellTint(one.name, _shares(one.tint.color), float(one.tint.full), float(np.float32(one.tint.most)))
+        for one in fields
+        if one.tint is not None
+    )
+
+
+def _shares(color: str) -> tuple[float, float, float]:
+    red, green, blue = (float(np.float32(part) / np.float32(255)) for part in _components(color))
+    return red, green, blue
+
+
+def tint_cells(image: Array, vectors: Array, tint: CellTint) -> None:
+    """Tint pictures uint8 [..., H, W, 3] in place by vectors float32 [..., 2, H, W], NumPy arrays or tensors.
+
+    Each operation is one of float32, and bytes are cut off, so that all libraries and the page draw the same bytes.
+    """
+    here = not _is_tensor(vectors) or vectors.device.type == "cpu"  # asking a GPU would mean waiting for it
+    if here and not bool((vectors != 0).any()):
+        return
+    row, column = vectors[..., 0, :, :], vectors[..., 1, :, :]
+    share = row * row
+    share += column * column
+    share = share.sqrt() if _is_tensor(share) else np.sqrt(share)
+    share /= tint.full
+    share = share.clip(max=tint.most) if _is_tensor(share) else np.minimum(share, np.float32(tint.most))
+    rest = 1 - share
+    for channel, color in enumerate(tint.color):
+        part = image[..., channel]
+        part = part.float() if _is_tensor(part) else part.astype(np.float32)
+        part /= 255
+        part *= rest
+        part += share * color
+        part *= 255
+        image[..., channel] = part if _is_tensor(part) else part.astype(np.uint8)
+
+
+def shown_fields(ruleset: Ruleset) -> tuple[str, ...]:
+    """The fields that pictures of its worlds show."""
+    followed = {ramp.field for ramp in ramps(ruleset.elements)}
+    return tuple(sorted(followed | {tint.field for tint in tints(ruleset.fields)}))
 
 
 @lru_cache(maxsize=256)
@@ -103,15 +152,15 @@ def _reached(value: np.float32, place: int, whole: int, rises: bool) -> bool:
 def rgb(
     ids: Array,
     colors: Colors,
-    motion: Array | None = None,
     *,
     ramps: Sequence[Ramp] = (),
+    tints: Sequence[CellTint] = (),
     fields: Mapping[str, Array] | None = None,
 ) -> Any:
     """Pictures uint8 [..., H, W, 3] of ids [..., H, W] (any integers), of the same kind, on the same device.
 
-    With `ramps`, cells of their elements have the color of their value in `fields`, arrays [..., H, W] by name.
-    With `motion`, float [..., 2, H, W], cells are tinted toward MOTION_COLOR by clamp(|v|/2, 0, 0.5).
+    With `ramps`, cells of their elements have the color of their value in `fields`, arrays [..., H, W] by name. With
+    `tints`, cells are tinted by vectors in `fields`, float [..., 2, H, W], after that and in order.
     Raises ValueError for ids without a color, fields that are missing and shapes that do not fit, TypeError for ids
     of another type.
     """
@@ -127,13 +176,12 @@ def rgb(
         _check_shape(ramp.field, values, cells.shape)
         ramped = cells == ramp.id
         image[ramped] = ramp.colors[np.searchsorted(ramp.starts, values[ramped], side="right")]
-    if motion is not None:
-        motion = to_numpy(motion).astype(np.float32)
-        _check_shape("motion", motion, (*cells.shape[:-2], 2, *cells.shape[-2:]))
-        speed = np.hypot(*np.moveaxis(motion, -3, 0))
-        weight = np.nan_to_num(np.clip(speed / 2, 0, MAX_TINT))[..., None]
-        tint = np.array(MOTION_COLOR, dtype=np.float32)
-        image = (image + (tint - image) * weight + 0.5).astype(np.uint8)
+    for tint in tints:
+        if tint.field not in (fields or {}):
+            raise ValueError(f"cells are tinted by the field {tint.field}, which is missing")
+        vectors = to_numpy((fields or {})[tint.field]).astype(np.float32)
+        _check_shape(tint.field, vectors, (*cells.shape[:-2], 2, *cells.shape[-2:]))
+        tint_cells(image, vectors, tint)
     if not _is_tensor(ids):
         return image
     import torch

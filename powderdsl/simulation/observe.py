@@ -19,7 +19,7 @@ from powderdsl.ir.lower.rules import ir_type, slot_names
 from powderdsl.ir.ops import component_of
 from powderdsl.model.state import Slot, property_dtype, property_values, slot_name, slots
 from powderdsl.model.types import MatrixChannel, Ruleset
-from powderdsl.simulation.draw import Ramp, palette, ramps
+from powderdsl.simulation.draw import CellTint, Ramp, palette, ramps, tint_cells, tints
 from powderdsl.simulation.state_checks import unknown_slot
 from powderdsl.targets.cpp.program import PackedState, address
 from powderdsl.targets.job import shape_of
@@ -81,11 +81,13 @@ class Observer:
 
     @torch.no_grad()
     def rgb(self, state: State, out: Any = None) -> Tensor:
-        """Pictures uint8 [B, H, W, 3], a pixel a cell, in the elements' colors, which may follow fields."""
+        """Pictures uint8 [B, H, W, 3], a pixel a cell, in the elements' colors, which may follow fields; then tints."""
         out = self._buffer(out, (*shape_of(state), 3), torch.uint8)
         _write_rgb(state, self._palette, out)
         for ramp in self._ramps:
             _write_ramp(state, ramp, out)
+        for tint in self._tints:
+            tint_cells(out, state[tint.field], tint)
         return out
 
     @torch.no_grad()
@@ -199,6 +201,10 @@ class Observer:
             )
             for ramp in found
         )
+
+    @cached_property
+    def _tints(self) -> tuple[CellTint, ...]:
+        return tints(self.ruleset.fields)
 
     def _colors(self, colors: Any, count: int) -> Tensor:
         """Colors uint8 [n, 3] with a fourth byte, and black up to `count` of them."""

@@ -9,7 +9,7 @@ from powderdsl.compiler import lower, parts
 from powderdsl.ir.segments import carry
 from powderdsl.model.state import SNAP, Slot, qualified_slots, size_problem, slots, storage
 from powderdsl.model.state import fits as sides_fit
-from powderdsl.model.types import Param, Ruleset
+from powderdsl.model.types import Param, Ruleset, Tint
 from powderdsl.system.memo import Memo
 from powderdsl.system.writing import failure
 from powderdsl.targets.codec import Piece, pieces
@@ -98,6 +98,10 @@ def _knob(param: Param) -> Knob:
     return Knob(param.name, float(param.default), *_range(param), param.kind.name in ("int", "flag"))
 
 
+def _tint(tint: Tint) -> dict[str, Any]:
+    return {"color": tint.color, "full": tint.full, "most": tint.most}
+
+
 def _about(ruleset: Ruleset, size: tuple[int, int]) -> dict[str, Any]:
     """What a page needs to know, in the order of the numbers that functions take."""
     elements = []
@@ -120,9 +124,11 @@ def _about(ruleset: Ruleset, size: tuple[int, int]) -> dict[str, Any]:
             }
         elements.append(row)
     qualified = qualified_slots(ruleset)
+    tinted = {one.name: one.tint for one in ruleset.fields if one.tint is not None}
     fields = [
         {"name": slot.name, "qualified": qualified.get(slot.name, slot.name), "kind": slot.kind.name}
         | {"type": storage(slot.kind), "components": slot.planes}
+        | ({"tint": _tint(tinted[slot.name])} if slot.name in tinted else {})
         for slot in slots(ruleset)
         if slot.name != "element"
     ]

@@ -265,7 +265,7 @@ def test_damaged_levels_are_refused(tmp_path: Any) -> None:
         ({"colour": 1}, "unknown key `colour`"),
         ({"elements": []}, "at least one"),
         ({"tasks": [{"name": "a", "tolerance": 1, "actions": [["plant", 8, 0]]}]}, "not within"),
-        ({"tint": {**whole["tint"], "color": [1, 2]}}, "three integers"),
+        ({"play": {**whole["play"], "episodes": 0}}, "must lie in"),
     ):
         path.write_text(json.dumps({**whole, **change}))
         with pytest.raises(ValueError, match=error):

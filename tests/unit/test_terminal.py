@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+import powderdsl
 from powderdsl.cli import terminal
 from powderdsl.cli.terminal import LiveView, render_frame
 from powderdsl.simulation.draw import palette, rgb
@@ -130,9 +131,10 @@ def test_motion_tints():
     screens = [Screen(True), Screen(True)]
     motion = np.zeros((2, 2, 2), dtype=np.float32)
     motion[0, 1, 1] = 9
+    fields = powderdsl.load("core+wind").fields
     for screen, field in zip(screens, (motion, torch.tensor(motion)), strict=True):
-        with LiveView(ELEMENTS, screen) as view:
-            view.show(torch.zeros((2, 2), dtype=torch.uint8), field)
+        with LiveView(ELEMENTS, screen, fields=fields) as view:
+            view.show(torch.zeros((2, 2), dtype=torch.uint8), fields={"velocity": field})
     _, colors, _ = replay(screens[0].written)
     empty = tuple(COLORS[0].tolist())
     assert colors[0][0] == (empty, empty)

@@ -163,7 +163,7 @@ def play(start: AnyWorld, plan: Playback) -> AnyWorld:
 
     with ExitStack() as stack:
         if plan.watch:
-            show = _watcher(stack.enter_context(LiveView(ruleset.elements)), plan)
+            show = _watcher(stack.enter_context(LiveView(ruleset.elements, fields=ruleset.fields)), plan)
         else:
             bar = stack.enter_context(progress(ruleset.name, plan.steps))
 
@@ -181,7 +181,7 @@ def play(start: AnyWorld, plan: Playback) -> AnyWorld:
                 pass
     if plan.out is None:
         if not plan.watch:
-            with LiveView(ruleset.elements) as view:
+            with LiveView(ruleset.elements, fields=ruleset.fields) as view:
                 view.show(**first_world(world))
     elif plan.suffix == ".png":
         from powderdsl.simulation.media import write_png

@@ -17,7 +17,7 @@ from powderdsl.model.expressions.operands import ELEMENT_HERE, member
 from powderdsl.model.restrict import restricted
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Never, Ruleset, Symmetric, Total
-from powderdsl.simulation.draw import ramps
+from powderdsl.simulation.draw import shown_fields
 from powderdsl.system.user_cache import cache_folder
 from powderdsl.testing.generators.cases import Start
 from powderdsl.testing.properties.blame import Oracle, culprits, difference, translated
@@ -256,8 +256,8 @@ def as_it_is(claim: Tested, runner: Runs, small: Start, steps: int) -> Counterex
     """A world that breaks a claim, and the rules that did it."""
     cell = breaks(claim, runner, small, steps).cell[0]
     states = runner.states(small, steps)
-    names = {ramp.field for ramp in ramps(runner.ruleset.elements)}
-    before, after = ({name: state[name][0] for name in sorted(names)} for state in (states[0], states[-1]))
+    names = shown_fields(runner.ruleset)
+    before, after = ({name: state[name][0] for name in names} for state in (states[0], states[-1]))
     return Counterexample(
         small,
         steps,

@@ -1,6 +1,7 @@
 // A world that runs in a WebAssembly module: docs/export.md describes the functions of such modules.
 
-/** @typedef {{name: string, qualified: string, kind: string, type: string, components: number}} FieldAbout */
+/** @typedef {{color: string, full: number, most: number}} TintAbout */
+/** @typedef {{name: string, qualified: string, kind: string, type: string, components: number, tint?: TintAbout}} FieldAbout */
 /** @typedef {{field: string, start: string, end: string, low: number, high: number}} RampAbout */
 /** @typedef {{id: number, name: string, qualified: string, color: string, glyph: string, ramp?: RampAbout}} ElementAbout */
 /** @typedef {{name: string, kind: string, value: number, low: number, high: number, about: string}} ParameterAbout */
@@ -35,8 +36,9 @@ export class Engine {
     this.columns = this.about.columns;
     this.cells = this.rows * this.columns;
     this.byId = new Map(this.elements.map((one) => [one.id, one]));
-    /** The vector field that people drag and pictures show: the first one, as `powderdsl render` chooses. */
-    this.motion = this.fields.findIndex((one) => one.kind === "vec2");
+    /** The vector field that people drag: one that pictures show, or the first one. */
+    this.motion = this.fields.findIndex((one) => one.tint);
+    if (this.motion < 0) this.motion = this.fields.findIndex((one) => one.kind === "vec2");
     this.values = this.parameters.map((one) => one.value);
   }
 

@@ -2,8 +2,6 @@
 
 import { generator } from "./engine.js";
 
-const MOTION = [200, 100, 100];
-const MAX_TINT = 0.5;
 const { fround } = Math;
 
 /** @returns {number[]} red, green, blue */
@@ -32,7 +30,7 @@ export class Painter {
     }
   }
 
-  /** @returns {ImageData} the world as it is; with `tint`, cells that move are tinted */
+  /** @returns {ImageData} the world as it is; with `tint`, vectors tint cells */
   draw(tint = true) {
     const { engine, pixels, table } = this;
     const ids = engine.ids();
@@ -42,7 +40,7 @@ export class Painter {
       const cells = engine.ids();
       for (let i = 0; i < cells.length; i++) if (cells[i] === one.id) pixels[i] = this._ramped(one, values[i]);
     }
-    if (tint && engine.motion >= 0) this._tint(engine.field(engine.motion));
+    if (tint) engine.fields.forEach((one, number) => one.tint && this._tint(engine.field(number), one.tint));
     return this.image;
   }
 
@@ -64,17 +62,21 @@ export class Painter {
     return found;
   }
 
-  _tint(values) {
+  /** Each operation is one of float32, as in `tint_cells` of simulation/draw.py. */
+  _tint(values, tint) {
     const { bytes } = this;
     const { cells } = this.engine;
+    const most = fround(tint.most);
+    const shares = channels(tint.color).map((part) => fround(part / 255));
     for (let i = 0; i < cells; i++) {
       const [down, right] = [values[i], values[cells + i]];
       if (down === 0 && right === 0) continue;
-      const speed = fround(Math.sqrt(down * down + right * right));
-      const weight = Math.min(fround(speed / 2), MAX_TINT);
+      const length = fround(Math.sqrt(fround(fround(down * down) + fround(right * right))));
+      const share = Math.min(fround(length / tint.full), most);
+      const rest = fround(1 - share);
       for (let c = 0; c < 3; c++) {
-        const old = bytes[4 * i + c];
-        bytes[4 * i + c] = fround(fround(old + fround((MOTION[c] - old) * weight)) + 0.5);
+        const own = fround(fround(bytes[4 * i + c] / 255) * rest);
+        bytes[4 * i + c] = fround(fround(own + fround(share * shares[c])) * 255);
       }
     }
   }
