@@ -215,12 +215,12 @@ class AutoByWidth(ByWidth[AutoProgram]):
     """Chooses for each width of grids. What it tells is about the width stepped last.
 
     Args:
-        words: what it tells about before the first step, see `known_words`.
+        width: what it tells about before the first step, see `known_width`.
     """
 
-    def __init__(self, make: Callable[[int], AutoProgram], words: int):
+    def __init__(self, make: Callable[[int], AutoProgram], width: int):
         super().__init__(make)
-        self._latest = self.of(words)
+        self._latest = self.of(width)
 
     @property
     def running(self) -> str:

@@ -1,6 +1,6 @@
 """From a checked model to native code: cached code if the same model has been compiled before, else by lowering it.
 
-Each width of grids has a library of its own, or shares one with others (`known_words`). A library is compiled when the
+Each width of grids has a library of its own, or shares one with others (`known_width`). A library is compiled when the
 first grid of its width is stepped, so that nobody waits for code that is not needed.
 
 The cache's key depends on the model, on every source file that turns models into C++, on the compiler, the processor
@@ -35,15 +35,15 @@ Lowered = Callable[[], Program]
 SOURCES = ("compiler.py", "simulation/native_start.py", "model", "analysis", "ir", "schedule", "targets")
 
 
-def start_key(ruleset: Ruleset, words: int | None = None) -> str:
-    """The cache's key for the native code of a ruleset; without `words`, for the code compiled last.
+def start_key(ruleset: Ruleset, width: int | None = None) -> str:
+    """The cache's key for the native code of a ruleset; without `width`, for the code compiled last.
 
     Raises NoCompiler if there is no compiler.
     """
     compiler = find_compiler()
     params = tuple(replace(param, default=0, about="") for param in ruleset.params)
     said = fingerprint(replace(ruleset, params=params))
-    return cache_key(f"{said}{generator()} {words}", compiler, flags_for(compiler, current().level))
+    return cache_key(f"{said}{generator()} {width}", compiler, flags_for(compiler, current().level))
 
 
 @lru_cache(maxsize=1)
@@ -58,25 +58,25 @@ def generator() -> str:
     return found.hexdigest()
 
 
-def latest_words(ruleset: Ruleset) -> int | None:
+def latest_width(ruleset: Ruleset) -> int | None:
     """What the code compiled last is for; None if there is none. Raises NoCompiler if there is no compiler."""
     code = recall(start_key(ruleset))
-    return None if code is None else code.words
+    return None if code is None else code.width
 
 
-def ready_program(ruleset: Ruleset, lowered: Lowered, threads: int, words: int) -> Runnable | None:
+def ready_program(ruleset: Ruleset, lowered: Lowered, threads: int, width: int) -> Runnable | None:
     """A program that was compiled before, or None. Raises NoCompiler if there is no compiler."""
-    code = recall(start_key(ruleset, words))
-    return None if code is None else _recalled(code, lowered, threads, words)
+    code = recall(start_key(ruleset, width))
+    return None if code is None else _recalled(code, lowered, threads, width)
 
 
-def native_program(ruleset: Ruleset, lowered: Lowered, threads: int, words: int) -> Runnable:
+def native_program(ruleset: Ruleset, lowered: Lowered, threads: int, width: int) -> Runnable:
     """A program, from the cache or compiled now; passes that do not fit bit planes run on cells.
 
     Raises:
         NoCompiler: there is no C++ compiler, or it failed.
     """
-    key = start_key(ruleset, words)
+    key = start_key(ruleset, width)
     code = recall(key)
     if code is None:
         with turn(current().place(), key):
@@ -87,25 +87,25 @@ def native_program(ruleset: Ruleset, lowered: Lowered, threads: int, words: int)
                     return mixed_program(
                         found,
                         torch.device("cpu"),
-                        lambda cells, planes: _compiled(cells, planes, threads, words),
+                        lambda cells, planes: _compiled(cells, planes, threads, width),
                     )
-                code = compile_program(found[0].program, found[0].planes, words)
+                code = compile_program(found[0].program, found[0].planes, width)
                 remember(key, code)
                 remember(start_key(ruleset), code)
-    return _recalled(code, lowered, threads, words)
+    return _recalled(code, lowered, threads, width)
 
 
-def _recalled(code: NativeCode, lowered: Lowered, threads: int, words: int) -> Runnable:
+def _recalled(code: NativeCode, lowered: Lowered, threads: int, width: int) -> Runnable:
     """The program of code for a whole ruleset, which is only lowered if its passes are timed."""
 
     def with_clocks() -> NativeCode:
         (segment,) = segments(lowered())
         assert segment.planes is not None
-        return compile_program(segment.program, segment.planes, words, clocks=True)
+        return compile_program(segment.program, segment.planes, width, clocks=True)
 
     return NativeProgram(code, threads, with_clocks)
 
 
-def _compiled(cells: Program, planes: Program, threads: int, words: int) -> Runnable:
-    code = compile_program(cells, planes, words)
-    return NativeProgram(code, threads, lambda: compile_program(cells, planes, words, clocks=True))
+def _compiled(cells: Program, planes: Program, threads: int, width: int) -> Runnable:
+    code = compile_program(cells, planes, width)
+    return NativeProgram(code, threads, lambda: compile_program(cells, planes, width, clocks=True))

@@ -13,7 +13,7 @@ from powderdsl.targets.cpp.chunks import Chunks
 from powderdsl.targets.layout import Layout
 from powderdsl.targets.values import chains_of
 
-SIDE_BY_SIDE = 8
+SIDE_BY_SIDE = 16
 """The masks of a loop begin at a multiple of this many words: the most that a vector has."""
 
 ANY_PASS = 1 << 30
@@ -282,7 +282,7 @@ class _Loop:
     def starts(self) -> Iterator[str]:
         """Pointers to the rows that the loop writes."""
         for out in self.flags:
-            yield f"u64* o{out.var.name} = &lane_word(v{out.var.name}, row * words, lane);"
+            yield f"Word* o{out.var.name} = &lane_word(v{out.var.name}, row * words, lane);"
         for out in self.floats:
             name = out.var.name
             if name in self.waiting:
@@ -345,12 +345,12 @@ class _Loop:
                 if part.op == "load"
             ]
             busy = " || ".join(self.busy(part) for part in parts if part.op == "live") or "false"
-            yield f"u64 some = {busy};" + (f" if (!some) {{ {' '.join(scans)} }}" if scans else "")
+            yield f"Word some = {busy};" + (f" if (!some) {{ {' '.join(scans)} }}" if scans else "")
             yield f"if (!some) {{ {' '.join(self.quiet())} }} else {{"
         yield " ".join([*self.pointers(), *self.starts(), *counts])
-        yield from (f"if (!WORDS) o{out.var.name}[(words - 1) * LANES] = 0;" for out in self.flags)
+        yield from (f"if (!WIDTH) o{out.var.name}[(words - 1) * LANES] = 0;" for out in self.flags)
         words = [
-            f"const u64 {name} = lane_word(v{plane}, row * words + w, lane);"
+            f"const Word {name} = lane_word(v{plane}, row * words + w, lane);"
             for plane, name in values.words.items()
         ]
         yield f"for (int w = 0; w < words; w++) {{ {' '.join(words)}"
@@ -372,7 +372,7 @@ class _Loop:
     # Chains of choices
 
     def laid(self) -> Iterator[str]:
-        """A row of all choices: 64 columns stay in registers while the choices whose masks hold there are applied."""
+        """A row of all choices: the columns of a word stay in registers while the choices whose masks hold there are applied."""
         values, count = self.values, len(self.masks)
         heads = [f"g{number}" for number in range(len(self.chains))]
         bases = [str(chain[-1].args[2].attr) for chain in self.chains]
@@ -389,23 +389,23 @@ class _Loop:
             ]
             lines = " ".join([*values.lines, *changes])
             levels.append(
-                f"{{ const u64 m = masks[{level}]; "
-                f"EACH_REGISTER {{ const u32 bits = m >> (x & 63) & ALL; {lines} }} }}"
+                f"{{ const Word m = masks[{level}]; "
+                f"EACH_REGISTER {{ const u32 bits = m >> (x & (BITS - 1)) & ALL; {lines} }} }}"
             )
         values.lines = []
         values.known = {id(chain[0]): f"{name}[k]" for chain, name in zip(self.chains, heads, strict=True)}
         stores = [f"*(F*)(o{out.var.name} + x) = {values.of(out.value)};" for out in self.floats]
         ends = " ".join([*values.lines, *stores])
         olds = [values.row(base, 0) for base in bases]
-        yield f"const u64* turned = turned_row(c, base + y) + {self.first}; const bool any = any_turned(c, turned, {count});"
+        yield f"const Word* turned = turned_row(c, base + y) + {self.first}; const bool any = any_turned(c, turned, {count});"
         lives = " || ".join(dict.fromkeys(self.alive(base) for base in bases))
         yield f"const bool some = any || {lives};"
         yield " ".join(f"some{name} |= v{name}.live[base + y] = some;" for name in self.lasts)
         gone = " ".join(f"{self.waiting[name].at(name, 0)} = nothing;" for name in self.waits)
         yield f"if (!some) {{ {gone} }} else {{"
         yield " ".join([*self.pointers(), *self.starts()])
-        yield f"for (int w = 0; w < words; w++) {{ const u64* masks = turned + w * c.masks; const u64 which = which_turned(masks, {count});"
-        yield " ".join(f"F {name}[64 / CHUNK];" for name in heads)
+        yield f"for (int w = 0; w < words; w++) {{ const Word* masks = turned + w * c.masks; const u64 which = which_turned(masks, {count});"
+        yield " ".join(f"F {name}[BITS / CHUNK];" for name in heads)
         yield f"EACH_REGISTER {{ {' '.join(f'{name}[k] = load({old}, x);' for name, old in zip(heads, olds, strict=True))} }}"
         for begin in range(0, count, AT_ONCE):
             asked = f"which & {(1 << AT_ONCE) - 1 << begin % 64:#x}ull" if count <= 64 else "which"

@@ -64,7 +64,7 @@ class Chunks(CellValues[str]):
 
     def mask(self, node: Node) -> str:
         """The bits of a chunk in a flag's plane."""
-        return f"(u32)({self.word(node)} >> (x & 63) & ALL)"
+        return f"(u32)({self.word(node)} >> (x & (BITS - 1)) & ALL)"
 
     def node(self, node: Node) -> str:
         attr = node.attr

@@ -19,31 +19,31 @@ from powderdsl.targets.layout import Layout
 
 @dataclass(frozen=True)
 class NativeCode:
-    """A library, the widths it is for (`source.known_words`), its layout, the pieces of each state tensor, and the names
+    """A library, the widths it is for (`source.known_width`), its layout, the pieces of each state tensor, and the names
     of the passes."""
 
     library: Path
-    words: int
+    width: int
     layout: Layout
     pieces: Mapping[str, tuple[Piece, ...]]
     passes: tuple[str, ...]
 
 
-def compile_program(program: Program, planes: Program, words: int, *, clocks: bool = False) -> NativeCode:
+def compile_program(program: Program, planes: Program, width: int, *, clocks: bool = False) -> NativeCode:
     """Write a program as C++ and compile it.
 
     Args:
         program: the numeric program, whose slots are the state's.
         planes: the same program from `ir.bits.lower_bits`.
-        words: the words of a row, see `source.known_words`.
+        width: of grids, see `source.known_width`.
         clocks: measure the time of each pass.
 
     Raises:
         NoCompiler: there is no C++ compiler, or it failed.
     """
-    source, layout, units = native_source(planes, words)
+    source, layout, units = native_source(planes, width)
     library, _ = open_library(f"#define PROFILE\n{source}" if clocks else source, program.name, units)
-    return NativeCode(library, words, layout, pieces(program), tuple(p.name for p in planes.passes))
+    return NativeCode(library, width, layout, pieces(program), tuple(p.name for p in planes.passes))
 
 
 def recall(key: str) -> NativeCode | None:
@@ -83,7 +83,7 @@ def _encode(code: NativeCode) -> dict[str, Any]:
     ]
     return {
         "library": code.library.parent.name,
-        "words": code.words,
+        "width": code.width,
         "layout": tables,
         "pieces": [asdict(piece) for parts in code.pieces.values() for piece in parts],
         "passes": list(code.passes),
@@ -103,7 +103,7 @@ def _decode(kept: dict[str, Any], library: Path) -> NativeCode:
     for row in kept["pieces"]:
         piece = Piece(**row | {"type": Type(**row["type"])})
         found[piece.state] = (*found.get(piece.state, ()), piece)
-    return NativeCode(library, int(kept["words"]), Layout(**tables), found, tuple(kept["passes"]))
+    return NativeCode(library, int(kept["width"]), Layout(**tables), found, tuple(kept["passes"]))
 
 
 def _key(key: Any) -> Any:

@@ -20,13 +20,13 @@ struct Batch {
 constexpr size_t LARGE_PLANE = 32 << 10;  // bytes from which a plane of LANES worlds is too large to be kept near
 // Strips waste no lanes where there are few worlds, and keep less at hand where worlds are large.
 static Grid make_grid(int worlds, int height, int width) {
-  const int words = (width + 63) / 64;
+  const int words = (width + BITS - 1) / BITS;
   const bool large = sizeof(V) * height * words >= LARGE_PLANE;
   const bool reachable = height / LANES >= std::max({1, AROUND_ROWS, BEYOND_ROWS});  // only the next strip is asked
   const bool strips = height % LANES == 0 && reachable && (worlds <= LANES / 2 || large);
   Grid g;
   g.height = strips ? height / LANES : height, g.strips = strips;
-#if !WORDS
+#if !WIDTH
   g.width = width, g.words = words, g.stride = stride_of(width);
 #endif
   return g;
@@ -42,9 +42,9 @@ static bool fixed_flag(const FixedPlane& f, const Grid& g, int lane, int y, int 
 static Context* new_context(const Grid& g) {
   Context* c = new (std::align_val_t(64)) Context();
   c->g = g;
-#if !WORDS
-  c->rest = g.width - 64 * (g.words - 1);
-  c->valid_last = splat(c->rest == 64 ? ~0ull : (1ull << c->rest) - 1);
+#if !WIDTH
+  c->rest = g.width - BITS * (g.words - 1);
+  c->valid_last = splat(FULL >> (BITS - c->rest));
   for (int dx = -HALO; dx <= HALO; dx++) c->turns[dx + HALO] = ((dx % g.width) + g.width) % g.width;
 #endif
   const int whole = g.world_height();
@@ -63,14 +63,14 @@ static Context* new_context(const Grid& g) {
   c->entered = aligned<V>(g.height + 1);
   c->moving = aligned<int>(g.height + 1);
   c->zeros = aligned<float>(g.stride + HALO + CHUNK);
-  c->turned = aligned<u64>((size_t)LANES * g.height * g.words * TURNED);
+  c->turned = aligned<Word>((size_t)LANES * g.height * g.words * TURNED);
   c->waiting = aligned<float>((size_t)WAITING * g.stride + HALO + CHUNK);
   for (int i = 0; i < COINS; i++) c->coins[i] = aligned<V>(g.cells());
   for (const FixedPlane& f : FIXED) {
     V* plane = aligned<V>(g.cells());
     for (int y = 0; y < g.height; y++)
       for (int x = 0; x < g.width; x++)
-        for (int l = 0; l < LANES; l++) plane[y * g.words + x / 64][l] |= (u64)fixed_flag(f, g, l, y, x) << (x % 64);
+        for (int l = 0; l < LANES; l++) plane[y * g.words + x / BITS][l] |= (Word)fixed_flag(f, g, l, y, x) << (x % BITS);
     c->fixed.push_back(plane);
   }
   return c;
@@ -149,14 +149,13 @@ static void begin_step(Context& c, const Clocks& k, int number, long done) {
       u64 step = k.step[world] + done;
       u32 a = key(k.seed[world], k.index[world], step, STREAM_IDENT[s], 0x243F6A88u);
       u32 b = key(k.seed[world], k.index[world], step, STREAM_IDENT[s], 0x85A308D3u);
-      c.k0[s][2 * l] = c.k0[s][2 * l + 1] = a + l * strip * 0x9E3779B1u;  // as draw_plane multiplies
-      c.k1[s][2 * l] = c.k1[s][2 * l + 1] = b;
+      for (int i = HASHES * l; i < HASHES * (l + 1); i++) c.k0[s][i] = a + l * strip * APART, c.k1[s][i] = b;
     }
   std::fill_n(c.tossed, COINS, false);
   for (int i = 0; i < STEP_PLANES; i++)
     for (int l = 0; l < LANES; l++) {
       u64 step = k.step[world_of(c, number, l)] + done;
-      c.step_bits[i][l] = (step % STEP_TABLE[i].a) >> STEP_TABLE[i].b & 1 ? ~0ull : 0;
+      c.step_bits[i][l] = (step % STEP_TABLE[i].a) >> STEP_TABLE[i].b & 1 ? FULL : 0;
     }
 }
 static void run_group(Context& c, Batch& b, int number, long steps, const Clocks& k, const uint8_t* planes, const float* reals) {
@@ -164,7 +163,7 @@ static void run_group(Context& c, Batch& b, int number, long steps, const Clocks
   for (int l = 0; l < (c.g.strips ? 1 : LANES); l++) {
     int world = world_of(c, number, l);
     for (int i = 0; i < PARAM_PLANES; i++) {
-      const u64 bits = planes[(size_t)i * b.worlds + world] ? ~0ull : 0;
+      const Word bits = planes[(size_t)i * b.worlds + world] ? FULL : 0;
       if (c.g.strips) c.param_bits[i] = splat(bits);
       else c.param_bits[i][l] = bits;
     }
@@ -242,17 +241,17 @@ static Pool& pool() {  // never destroyed: its threads may outlive main
   return *p;
 }
 
-// Bit `bit` of up to 64 cells in a row as a word. Eight bytes at a time: a product moves their lowest bits into one byte.
-template <class T> ALWAYS u64 word_of_cells(const T* cell, int count, int bit) {
-  u64 word = 0;
+// Bit `bit` of the cells of a word. Eight bytes at a time: a product moves their lowest bits into one byte.
+template <class T> ALWAYS Word word_of_cells(const T* cell, int count, int bit) {
+  Word word = 0;
   int x = 0;
   if (sizeof(T) == 1)
     for (; x + 8 <= count; x += 8) {
       u64 eight;
       memcpy(&eight, cell + x, 8);
-      word |= ((eight >> bit & 0x0101010101010101ull) * 0x0102040810204080ull >> 56) << x;
+      word |= (Word)((eight >> bit & 0x0101010101010101ull) * 0x0102040810204080ull >> 56) << x;
     }
-  for (; x < count; x++) word |= (u64)((u64)cell[x] >> bit & 1) << x;
+  for (; x < count; x++) word |= (Word)((u64)cell[x] >> bit & 1) << x;
   return word;
 }
 template <class T> static void load_values(Batch& b, int slot, int bits, const T* data) {
@@ -265,11 +264,11 @@ template <class T> static void load_values(Batch& b, int slot, int bits, const T
       bool some = false;
       for (int l = 0; l < std::min(LANES, b.lanes() - (int)n * LANES); l++) {
         const T* cell = data + ((size_t)n * LANES + l) * g.height * g.width;
-        u64* out = (u64*)p->data;
+        Word* out = (Word*)p->data;
         for (int y = 0; y < g.height; y++)
           for (int w = 0; w < g.words; w++) {
-            int count = std::min(64, g.width - 64 * w);
-            u64 word = word_of_cells(cell, count, i);
+            int count = std::min(BITS, g.width - BITS * w);
+            Word word = word_of_cells(cell, count, i);
             cell += count;
             some |= word != 0;
             out[(y * g.words + w) * LANES + l] = word;
@@ -374,13 +373,13 @@ template <class T> static void put_values(Batch& b, int slot, int bits, int coun
       const T* cell = data + begin;
       for (int y = 0; y < b.g.height; y++)
         for (int w = 0; w < b.g.words; w++) {
-          const int many = std::min(64, b.g.width - 64 * w);
-          const u64 word = word_of_cells(cell, many, i);
+          const int many = std::min(BITS, b.g.width - BITS * w);
+          const Word word = word_of_cells(cell, many, i);
           cell += many;
           if (p->zero && !word) continue;  // a plane that holds nothing goes on being skipped
           if (p->zero) memset(p->data, 0, sizeof(V) * b.g.cells());
           p->zero = false;
-          ((u64*)p->data)[((size_t)y * b.g.words + w) * LANES + lane] = word;
+          ((Word*)p->data)[((size_t)y * b.g.words + w) * LANES + lane] = word;
         }
     }
   });
@@ -430,11 +429,11 @@ API void pd_fill(void* batch, int slot, int bits, const int64_t* boxes, const in
       p->zero = false;
       p->around = p->beyond = 0;
       for (int w = 0; w < b.g.words; w++) {
-        const int from = (int)std::max<int64_t>(box[2] - 64 * w, 0), to = (int)std::min<int64_t>(box[3] - 64 * w, 64);
+        const int from = (int)std::max<int64_t>(box[2] - BITS * w, 0), to = (int)std::min<int64_t>(box[3] - BITS * w, BITS);
         if (from >= to) continue;
-        const u64 mask = (to - from == 64 ? ~0ull : (1ull << (to - from)) - 1) << from;
+        const Word mask = FULL >> (BITS - (to - from)) << from;
         for (int y = first; y < last; y++) {
-          u64& word = ((u64*)p->data)[((size_t)y * b.g.words + w) * LANES + lane];
+          Word& word = ((Word*)p->data)[((size_t)y * b.g.words + w) * LANES + lane];
           word = set ? word | mask : word & ~mask;
         }
       }

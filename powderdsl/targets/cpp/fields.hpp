@@ -15,9 +15,9 @@ ALWAYS F inside_columns(F value, int x, int dx, int width) {
 }
 ALWAYS F load(const float* row, int x) { return (F)*(const Fu*)(row + x); }
 // A word of a lane, and all words of one of its rows together.
-ALWAYS u64& lane_word(V* plane, int i, int lane) { return ((u64*)plane)[i * LANES + lane]; }
-ALWAYS u64 row_bits(V* p, int first, int words, int lane) {
-  u64 some = 0;
+ALWAYS Word& lane_word(V* plane, int i, int lane) { return ((Word*)plane)[i * LANES + lane]; }
+ALWAYS Word row_bits(V* p, int first, int words, int lane) {
+  Word some = 0;
   for (int w = 0; w < words; w++) some |= lane_word(p, first + w, lane);
   return some;
 }
@@ -36,22 +36,32 @@ static void close_plane(const Context& c, Plane* p) {  // nothing beyond the wid
   p->zero = !any(some);
 }
 // Masks of choices, lane by lane: [LANES][height][words][c.masks], so that a lane finds the words of all masks side by side.
+#if VECTOR == 64
+ALWAYS V two_of(V a, V which, V b) {  // words of a, then of b, by their numbers
+#if WIDTH == 32
+  return (V)_mm512_permutex2var_epi32((__m512i)a, (__m512i)which, (__m512i)b);
+#else
+  return (V)_mm512_permutex2var_epi64((__m512i)a, (__m512i)which, (__m512i)b);
+#endif
+}
+#endif
 ALWAYS void turn(const V* in, V* out) {  // LANES vectors of LANES words
 #if VECTOR == 64
-  const __m512i low[3] = {
-      _mm512_setr_epi64(0, 8, 2, 10, 4, 12, 6, 14), _mm512_setr_epi64(0, 1, 8, 9, 4, 5, 12, 13), _mm512_setr_epi64(0, 1, 2, 3, 8, 9, 10, 11)};
-  const __m512i high[3] = {
-      _mm512_setr_epi64(1, 9, 3, 11, 5, 13, 7, 15), _mm512_setr_epi64(2, 3, 10, 11, 6, 7, 14, 15), _mm512_setr_epi64(4, 5, 6, 7, 12, 13, 14, 15)};
-  __m512i rows[8];
-  _Pragma("GCC unroll 8") for (int i = 0; i < 8; i++) rows[i] = (__m512i)in[i];
-  _Pragma("GCC unroll 3") for (int s = 0; s < 3; s++)  // pairs of rows, then of pairs, then of fours
-    _Pragma("GCC unroll 8") for (int i = 0; i < 8; i++)
+  V number;
+  for (int l = 0; l < LANES; l++) number[l] = l;
+  V rows[LANES];
+  _Pragma("GCC unroll 16") for (int i = 0; i < LANES; i++) rows[i] = in[i];
+  _Pragma("GCC unroll 4") for (int s = 0; 1 << s < LANES; s++) {  // pairs of rows, then of pairs, and so on
+    const V crossed = number ^ (Word)(1 << s), odd = (V)((number >> s & 1) != 0);
+    const V low = mux(odd, crossed + LANES, number), high = mux(odd, number + LANES, crossed);
+    _Pragma("GCC unroll 16") for (int i = 0; i < LANES; i++)
       if (!(i >> s & 1)) {
-        const __m512i a = rows[i], b = rows[i | 1 << s];
-        rows[i] = _mm512_permutex2var_epi64(a, low[s], b);
-        rows[i | 1 << s] = _mm512_permutex2var_epi64(a, high[s], b);
+        const V a = rows[i], b = rows[i | 1 << s];
+        rows[i] = two_of(a, low, b);
+        rows[i | 1 << s] = two_of(a, high, b);
       }
-  _Pragma("GCC unroll 8") for (int i = 0; i < 8; i++) out[i] = (V)rows[i];
+  }
+  _Pragma("GCC unroll 16") for (int i = 0; i < LANES; i++) out[i] = rows[i];
 #else
   for (int i = 0; i < LANES; i++)
     for (int l = 0; l < LANES; l++) out[l][i] = in[i][l];
@@ -67,21 +77,21 @@ OUTLINE void turn_masks(Context& c, const Plane* const* planes, int count, int p
       for (int l = 0; l < c.lanes; l++) *(V*)(c.turned + ((size_t)l * cells + i) * c.masks + place + from) = out[l];
     }
 }
-ALWAYS const u64* turned_row(const Context& c, int line) { return c.turned + (size_t)line * c.g.words * c.masks; }
-ALWAYS bool any_turned(const Context& c, const u64* masks, int count) {
+ALWAYS const Word* turned_row(const Context& c, int line) { return c.turned + (size_t)line * c.g.words * c.masks; }
+ALWAYS bool any_turned(const Context& c, const Word* masks, int count) {
   V some = splat(0);
   for (int w = 0; w < c.g.words; w++)
     for (int from = 0; from < count; from += LANES) some |= *(const V*)(masks + w * c.masks + from);
   return any(some);
 }
 // Which of up to 64 masks hold anything in a word.
-ALWAYS u64 which_turned(const u64* masks, int count) {
+ALWAYS u64 which_turned(const Word* masks, int count) {
   u64 which = 0;
   for (int from = 0; from < count; from += LANES) which |= (u64)lanes_of(*(const V*)(masks + from)) << (from & 63);
   return which;
 }
 // The chunks of word w, whose values wait in registers.
-#define EACH_REGISTER _Pragma("GCC unroll 16") for (int k = 0, x = 64 * w; k < 64 / CHUNK && (WORDS || x < width); k++, x += CHUNK)
+#define EACH_REGISTER _Pragma("GCC unroll 16") for (int k = 0, x = BITS * w; k < BITS / CHUNK && (WIDTH || x < width); k++, x += CHUNK)
 // The worlds of a group: `rows` of them from line `base` on. Strips are one world. A row that is not there is `nothing`.
 #define EACH_WORLD \
   if (const int rows = c.g.world_height(); true) \
@@ -89,22 +99,22 @@ ALWAYS u64 which_turned(const u64* masks, int count) {
       if (const float* const nothing = c.zeros + HALO; true) \
         if (const int *const lines = c.lines.data() + HALO, base = l * height; true)
 // Chunks of the columns in word w, and which of a chunk's columns lie in the grid.
-#if WORDS
-#define EACH_CHUNK _Pragma("GCC unroll 4") for (int x = 64 * w; x < 64 * w + 64; x += CHUNK)
+#if WIDTH
+#define EACH_CHUNK _Pragma("GCC unroll 4") for (int x = BITS * w; x < BITS * w + BITS; x += CHUNK)
 #else
-#define EACH_CHUNK for (int x = 64 * w; x < 64 * w + 64 && x < width; x += CHUNK)
+#define EACH_CHUNK for (int x = BITS * w; x < BITS * w + BITS && x < width; x += CHUNK)
 #endif
-ALWAYS u32 inside_of(int x, int width) { return WORDS || width - x >= CHUNK ? ALL : (1u << (width - x)) - 1; }
+ALWAYS u32 inside_of(int x, int width) { return WIDTH || width - x >= CHUNK ? ALL : (1u << (width - x)) - 1; }
 // The flags of a chunk, into one world's word, which is kept little end first.
-ALWAYS void put_bits(u64* word, int x, u32 bits) {
+ALWAYS void put_bits(Word* word, int x, u32 bits) {
 #if __BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__
   if constexpr (CHUNK >= 8) {
-    memcpy((char*)word + (x & 63) / 8, &bits, CHUNK / 8);
+    memcpy((char*)word + (x & (BITS - 1)) / 8, &bits, CHUNK / 8);
     return;
   }
 #endif
-  const int by = x & 63;
-  *word = (*word & ~((u64)ALL << by)) | (u64)bits << by;
+  const int by = x & (BITS - 1);
+  *word = (*word & ~((Word)ALL << by)) | (Word)bits << by;
 }
 // After the chunks of a row: the halo, as far as columns are read beyond the edges.
 template <int FAR = REACH> ALWAYS void finish_row(const Context& c, float* row) {

@@ -76,7 +76,7 @@ ALWAYS bool near_rows(const Context& c, int dy) { return c.g.words == 1 && !c.g.
 // `by` columns to the left on the torus.
 template <bool TURNS> ALWAYS V around(const Context& c, V x, int by) {
   if (!TURNS) return x;
-  if (WORDS) return rotated(x, by);
+  if (WIDTH) return rotated(x, by);
   return ((x >> by) | (x << (c.g.width - by))) & c.valid(0);
 }
 // The rows that movers leave or enter, in the direction in which they move, and if they are asked for the cells that they

@@ -4,17 +4,17 @@
 OUTLINE V columns_far(const Context& c, const V* row, int w, int dx) {  // farther than the last word of a row is wide
   const int n = c.g.words, rest = c.rest;
   auto word = [&](int i) -> V {  // words of the endless row: the last is continued by the first
-    if (i < 0) return (row[n - 1] << (64 - rest)) | (row[n - 2] >> rest);
+    if (i < 0) return (row[n - 1] << (BITS - rest)) | (row[n - 2] >> rest);
     if (i < n - 1) return row[i];
-    return i == n - 1 ? row[i] | (row[0] << rest) : (row[0] >> (64 - rest)) | (row[1] << rest);
+    return i == n - 1 ? row[i] | (row[0] << rest) : (row[0] >> (BITS - rest)) | (row[1] << rest);
   };
-  V r = dx > 0 ? (word(w) >> dx) | (word(w + 1) << (64 - dx)) : (row[w] << -dx) | (word(w - 1) >> (64 + dx));
+  V r = dx > 0 ? (word(w) >> dx) | (word(w + 1) << (BITS - dx)) : (row[w] << -dx) | (word(w - 1) >> (BITS + dx));
   return r & c.valid(w);
 }
 ALWAYS int next_word(const Context& c, int w, int dx) {  // on the side that dx points to, around
   return dx > 0 ? (w + 1 == c.g.words ? 0 : w + 1) : (w == 0 ? c.g.words - 1 : w - 1);
 }
-ALWAYS int columns_in(const Context& c, int w) { return w == c.g.words - 1 ? c.rest : 64; }
+ALWAYS int columns_in(const Context& c, int w) { return w == c.g.words - 1 ? c.rest : BITS; }
 ALWAYS V columns(const Context& c, const V* row, int w, int dx) {
   if (__builtin_expect(c.g.words != 1, 0)) {
     if (abs(dx) > c.rest) return columns_far(c, row, w, dx);
@@ -28,8 +28,8 @@ ALWAYS V columns(const Context& c, const V* row, int w, int dx) {
 }
 ALWAYS V columns_zero(const Context& c, const V* row, int w, int dx) {
   V x = dx > 0 ? row[w] >> dx : row[w] << -dx;
-  if (dx > 0 && w + 1 < c.g.words) x |= row[w + 1] << (64 - dx);
-  if (dx < 0 && w > 0) x |= row[w - 1] >> (64 + dx);
+  if (dx > 0 && w + 1 < c.g.words) x |= row[w + 1] << (BITS - dx);
+  if (dx < 0 && w > 0) x |= row[w - 1] >> (BITS + dx);
   return x & c.valid(w);
 }
 ALWAYS const V* row_or_nothing(const Context& c, const Plane* p, int y) {
@@ -40,7 +40,10 @@ ALWAYS const V* row_or_nothing(const Context& c, const Plane* p, int y) {
 
 // Strips. What each lane sees `by` lanes on, around.
 ALWAYS V turned(V v, int by) {
-#if VECTOR == 64
+#if VECTOR == 64 && WIDTH == 32
+  const U number = NUMBERS;
+  return (V)_mm512_permutexvar_epi32((__m512i)(number + splatu(by)), (__m512i)v);  // by its low bits
+#elif VECTOR == 64
   return (V)_mm512_permutexvar_epi64((__m512i)(V{0, 1, 2, 3, 4, 5, 6, 7} + splat(by)), (__m512i)v);  // by its low bits
 #else
   V r;
@@ -58,8 +61,8 @@ OUTLINE void fill_halo(const Context& c, Plane* p, int rows, bool around) {
       const int by = strips_on(c, y);
       const V* from = p->data + (y - by * height) * words;
       V* to = around ? p->data + c.row(y) : (V*)row_or_nothing(c, p, y);
-      V kept = splat(~0ull);
-      if (!around) for (int l = 0; l < LANES; l++) kept[l] = l + by >= 0 && l + by < LANES ? ~0ull : 0;
+      V kept = splat(FULL);
+      if (!around) for (int l = 0; l < LANES; l++) kept[l] = l + by >= 0 && l + by < LANES ? FULL : 0;
       for (int w = 0; w < words; w++) to[w] = turned(from[w], by) & kept;
     }
   (around ? p->around : p->beyond) = rows;
@@ -86,12 +89,13 @@ static u32 key(u64 seed, u64 index, u64 step, u32 stream, u32 start) {
   return k;
 }
 
-// Draws: bit j of 32 columns is one hash; two make a word. A plane's hashes start a constant after those of the plane before.
+// Draws: bit j of 32 columns is one hash; a word has one or two. A plane's hashes start a constant after those of the plane before.
 constexpr u32 APART = 0x9E3779B1u;
+constexpr int HASHES = BITS / 32;  // of a word
 ALWAYS U draw_start(const Context& c, int stream, int y, int w) {
-  const u32 across = (c.g.width + 31) / 32, n = ((u32)y * across + 2 * w) * 32;
-  const I number = NUMBERS;
-  return splatu(n * APART) + (U)(number & 1) * (32 * APART) + c.k0[stream];
+  const u32 across = (c.g.width + 31) / 32, n = ((u32)y * across + HASHES * w) * 32;
+  const U number = NUMBERS;
+  return splatu(n * APART) + (number & (HASHES - 1)) * (32 * APART) + c.k0[stream];
 }
 ALWAYS V draw_plane(const Context& c, int stream, U start, int j) {
   U h = start + splatu((u32)j * APART);
@@ -117,7 +121,7 @@ ALWAYS void compare_bit(V& below, V& open, V drawn, V limit) {
   below |= open & limit & ~drawn;
   open &= ~(limit ^ drawn);
 }
-ALWAYS V limit_bit(u64 limit, int bits, int j) { return splat(0 - (limit >> (bits - 1 - j) & 1)); }
+ALWAYS V limit_bit(u64 limit, int bits, int j) { return splat((Word)0 - (Word)(limit >> (bits - 1 - j) & 1)); }
 // Which of the wanted cells draw below a constant; stops when all are decided.
 OUTLINE V draw_below(const Context& c, int stream, int y, int w, V wanted, int bits, u64 limit) {
   const U start = draw_start(c, stream, y, w);
@@ -155,10 +159,10 @@ static V* coin_plane(Context& c, int coin, int stream) {
 // A draw of one world's cell as float32.
 OUTLINE float draw_cell(const Context& c, int stream, int lane, int y, int x, int bits) {
   double value = 0;
-  const U start = draw_start(c, stream, y, x / 64);
+  const U start = draw_start(c, stream, y, x / BITS);
   for (int j = 0; j < bits; j++) {
     V p = draw_plane(c, stream, start, j);
-    value = 2 * value + (double)(p[lane] >> (x % 64) & 1);
+    value = 2 * value + (double)(p[lane] >> (x % BITS) & 1);
   }
   double scale = 1;
   for (int j = 0; j < bits; j++) scale *= 2;

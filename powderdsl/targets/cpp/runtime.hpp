@@ -14,12 +14,10 @@ struct Field {
 };
 
 constexpr int stride_of(int width) { return (width + CHUNK - 1) / CHUNK * CHUNK + (2 * REACH <= HALO ? HALO : 2 * HALO); }
-// WORDS is the number of words in a row if the library is for rows of that many whole words alone, else 0. Most work is
-// loops over the words of a row and over columns: where their number is known, they cost a quarter less and compile faster.
 struct Grid {
   int height;  // of a lane
-#if WORDS
-  static constexpr int width = 64 * WORDS, words = WORDS, stride = stride_of(width);
+#if WIDTH
+  static constexpr int width = WIDTH, words = WIDTH / BITS, stride = stride_of(width);
 #else
   int width, words, stride;
 #endif
@@ -46,7 +44,7 @@ struct Context {
   V *change, *late;  // two rows of words; a row for each plane that moves
   V* entered;   // [height + 1]: the cells that movers enter, in the rows that a movement changes
   int* moving;  // [height + 1]: these rows
-  u64* turned;                        // masks of choices, lane by lane, see turn_masks
+  Word* turned;                       // masks of choices, lane by lane, see turn_masks
   static constexpr int masks = TURNED;  // of a word, a multiple of LANES
   float* waiting;  // rows of reals that loops some rows behind read
   float* zeros;
@@ -62,14 +60,14 @@ struct Context {
   int lanes;
   u64 present;  // the ids that are there, of those that passes ask for; all bits: not known
 
-#if WORDS
-  static constexpr int rest = 64;
-  V valid(int) const { return splat(~0ull); }
+#if WIDTH
+  static constexpr int rest = BITS;
+  V valid(int) const { return splat(FULL); }
   int turn(int dx) const { return ((dx % g.width) + g.width) % g.width; }
 #else
   int rest;  // columns in the last word of a row
   V valid_last;
-  V valid(int w) const { return w == g.words - 1 ? valid_last : splat(~0ull); }
+  V valid(int w) const { return w == g.words - 1 ? valid_last : splat(FULL); }
   int turns[2 * HALO + 1];
   int turn(int dx) const { return turns[dx + HALO]; }  // dx mod width, for rotations
 #endif

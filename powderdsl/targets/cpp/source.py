@@ -15,7 +15,7 @@ from powderdsl.system.memory import collection_paused
 from powderdsl.targets.cpp.text import pass_text
 from powderdsl.targets.layout import Layout, layout_of, literal
 
-GENERATOR_VERSION = 9
+GENERATOR_VERSION = 10
 """Part of every cache key; increase it when generated code changes meaning."""
 
 LIBRARY = ("vectors", "runtime", "planes", "movements", "fields")
@@ -36,20 +36,21 @@ class NativeSource(NamedTuple):
     units: int
 
 
-def known_words(width: int) -> int:
-    """The number of words in a row that a library for grids of this width is compiled for; 0 if it takes any width.
+def known_width(width: int) -> int:
+    """The width that a library for grids of this width is compiled for; 0 if it takes any width.
 
-    Rows of whole words have a library for each number of words. All other widths share one.
+    Rows of whole words have a library for each width: words have 64 columns, or 32 if that is the width. All other
+    widths share one.
     """
-    return 0 if width % 64 else width // 64
+    return width if width == 32 or width % 64 == 0 else 0
 
 
 @collection_paused()
-def native_source(program: Program, words: int = 0) -> NativeSource:
+def native_source(program: Program, width: int = 0) -> NativeSource:
     """The source file of a program.
 
     Args:
-        words: see `known_words`.
+        width: see `known_width`.
     """
     layout = layout_of(program)
     schedules = [plan(pass_, CPU) for pass_ in program.passes]
@@ -70,7 +71,7 @@ def native_source(program: Program, words: int = 0) -> NativeSource:
     idents = [f"{ident}u" for _, ident, _ in program.streams]
     head = "\n".join([
         f"// {len(program.passes)} passes, generated; version {GENERATOR_VERSION}",
-        f"#define WORDS {words}",
+        f"#define WIDTH {width}",
         f"#define STREAMS {len(layout.streams)}",
         f"#define STEP_PLANES {len(layout.step_planes)}",
         f"#define PARAM_PLANES {len(layout.param_planes)}",

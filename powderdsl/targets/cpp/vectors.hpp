@@ -1,6 +1,7 @@
 // The library that generated code builds on. One group = LANES worlds side by side: lane l of every vector is world l.
 // Or, in strips: one world, cut into LANES strips of as many rows, one below the other; lane l is strip l.
-// A plane is one bit a cell: 64 columns in a word, a vector holds the same word of all worlds of the group.
+// A plane is one bit a cell: 64 columns in a word, or 32 if worlds have 32 columns; a vector holds the same word of all
+// worlds of the group.
 // Reals lie by world and row, with a halo of wrapped columns on both sides. Nothing here knows any rule.
 #include <algorithm>
 #include <atomic>
@@ -29,9 +30,18 @@ typedef uint32_t u32;
 #define VECTOR 16
 #define NUMBERS {0, 1, 2, 3}
 #endif
-constexpr int LANES = VECTOR / 8, CHUNK = VECTOR / 4;
+// WIDTH is the number of columns if the library is for grids of that width alone, else 0. Most work is loops over the words
+// of a row and over columns: where their number is known, they cost a quarter less and compile faster.
+#if WIDTH == 32
+typedef u32 Word;
+#else
+typedef u64 Word;
+#endif
+constexpr int BITS = 8 * sizeof(Word), LANES = VECTOR / sizeof(Word), CHUNK = VECTOR / 4;
+constexpr Word FULL = ~(Word)0;
 constexpr u32 ALL = (1u << CHUNK) - 1;  // flags of a chunk
-typedef u64 V __attribute__((vector_size(VECTOR), may_alias));
+typedef Word V __attribute__((vector_size(VECTOR), may_alias));
+typedef u64 Wide __attribute__((vector_size(VECTOR), may_alias));
 typedef u32 U __attribute__((vector_size(VECTOR), may_alias));
 typedef float F __attribute__((vector_size(VECTOR), may_alias));
 typedef float Fu __attribute__((vector_size(VECTOR), may_alias, aligned(4)));
@@ -39,7 +49,7 @@ typedef int32_t I __attribute__((vector_size(VECTOR), may_alias));
 #define ALWAYS static inline __attribute__((always_inline))
 #define OUTLINE static __attribute__((noinline))
 
-ALWAYS V splat(u64 x) { return x - V{}; }
+ALWAYS V splat(Word x) { return x - V{}; }
 ALWAYS F splatf(float x) { return x - F{}; }  // minus keeps -0
 ALWAYS U splatu(u32 x) { return x - U{}; }
 ALWAYS bool any(V a) {
@@ -48,16 +58,23 @@ ALWAYS bool any(V a) {
 #elif VECTOR == 32
   return !_mm256_testz_si256((__m256i)a, (__m256i)a);
 #else
-  return a[0] | a[1];
+  const Wide wide = (Wide)a;
+  return wide[0] | wide[1];
 #endif
 }
-ALWAYS uint8_t lanes_of(V a) {  // a bit for each world that has any
-#if VECTOR == 64
+ALWAYS u32 lanes_of(V a) {  // a bit for each world that has any
+#if VECTOR == 64 && WIDTH == 32
+  return _mm512_test_epi32_mask((__m512i)a, (__m512i)a);
+#elif VECTOR == 64
   return _mm512_test_epi64_mask((__m512i)a, (__m512i)a);
+#elif VECTOR == 32 && WIDTH == 32
+  return (u32)_mm256_movemask_ps((__m256)(a != 0));
 #elif VECTOR == 32
-  return (uint8_t)_mm256_movemask_pd((__m256d)(a != 0));
+  return (u32)_mm256_movemask_pd((__m256d)(a != 0));
 #else
-  return (uint8_t)((a[0] != 0) | (a[1] != 0) << 1);
+  u32 some = 0;
+  for (int l = 0; l < LANES; l++) some |= (u32)(a[l] != 0) << l;
+  return some;
 #endif
 }
 ALWAYS bool any_word(const V* row, int words) {
@@ -66,10 +83,12 @@ ALWAYS bool any_word(const V* row, int words) {
   return any(some);
 }
 ALWAYS V rotated(V x, int by) {  // each word to the right, by less than its width
-#if VECTOR == 64
+#if VECTOR == 64 && WIDTH == 32
+  return (V)_mm512_rorv_epi32((__m512i)x, (__m512i)splat(by));
+#elif VECTOR == 64
   return (V)_mm512_rorv_epi64((__m512i)x, (__m512i)splat(by));
 #else
-  return (x >> by) | (x << (64 - by));
+  return (x >> by) | (x << (BITS - by));
 #endif
 }
 ALWAYS V mux(V c, V a, V b) { return (c & a) | (~c & b); }

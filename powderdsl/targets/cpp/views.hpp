@@ -1,7 +1,7 @@
 // What packed worlds show: values of cells, pictures, channels, and the planes themselves, written straight into the
 // caller's memory. `apart` is the distance from one world to the next there, in items. Comes after the driver.
 
-ALWAYS u64 word_of(const Plane* p, int lane, int i) { return p->zero ? 0 : ((const u64*)p->data)[i * LANES + lane]; }
+ALWAYS u64 word_of(const Plane* p, int lane, int i) { return p->zero ? 0 : ((const Word*)p->data)[i * LANES + lane]; }
 
 // Flags as bytes 0 and 1: eight of them by a table, sixty-four at once where the machine can.
 struct Spread {
@@ -67,10 +67,10 @@ template <class T> ALWAYS void cells_of(const Planes& p, int lane, int i, T* out
   }
 }
 
-// Calls `put(word, cell, count)` for every run of up to 64 columns of a world, from the top left.
+// Calls `put(word, cell, count)` for the columns of each word of a world, from the top left.
 template <class Put> ALWAYS void each_run(const Grid& g, Put put) {
   for (int y = 0; y < g.height; y++)
-    for (int w = 0; w < g.words; w++) put(y * g.words + w, y * g.width + 64 * w, std::min(64, g.width - 64 * w));
+    for (int w = 0; w < g.words; w++) put(y * g.words + w, y * g.width + BITS * w, std::min(BITS, g.width - BITS * w));
 }
 template <class T> static void store_values(const Batch& b, int slot, int bits, int negative, T* data, int64_t apart) {
   for (int lane = 0; lane < b.lanes(); lane++) {
@@ -265,8 +265,8 @@ API void pd_count(const void* batch, int gates, const Gate* gate, int counts, co
   const Batch& b = *(const Batch*)batch;
   const Grid& g = b.g;
   const size_t mask_words = (size_t)g.world_height() * g.words;
-  const int first = g.strips ? 0 : top, last = g.strips ? g.height : bottom, rest = g.width - 64 * (g.words - 1);
-  const V whole = splat(~0ull), edge = splat(rest == 64 ? ~0ull : (1ull << rest) - 1);
+  const int first = g.strips ? 0 : top, last = g.strips ? g.height : bottom, rest = g.width - BITS * (g.words - 1);
+  const V whole = splat(FULL), edge = splat(FULL >> (BITS - rest));
   V* value = aligned<V>(gates + 1);
   std::vector<int64_t> total((size_t)counts * LANES);
   std::fill(found, found + (size_t)b.worlds * counts, 0.0);
