@@ -108,6 +108,8 @@ class Gates:
         if a.op == "shift" and a.attr[2] and wraps:
             dy, dx, _ = a.attr
             return self.shift(a.args[0], (dy + offset[0], dx + offset[1]), True)
+        if a.op == "not" and wraps:  # both may be read, and one of them is then stored
+            return self.not_(self.shift(a.args[0], offset, True))
         return self.build.shift(a, offset, wraps)
 
     # Integers

@@ -26,6 +26,7 @@ from powderdsl.schedule.types import (
     Statement,
     Var,
     combined,
+    conjuncts,
     is_movement,
     load,
 )
@@ -131,6 +132,8 @@ class _RowCutter(Cutter):
                 counts.update({id(part) for root in roots for part in _conjunctions(root)})
         self.shared = {key for key, count in counts.items() if count > 1}
         """Conjuncts that several masks have in common: if such a plane is empty, so are all these masks."""
+        self.split_masks: dict[int, Node] = {}
+        """Masks whose first parts are stored, by the id of the whole mask: the stored parts and the rest."""
 
     # Masks
 
@@ -177,14 +180,17 @@ class _RowCutter(Cutter):
         asked += [self.renamed(node) for node in guard.when if node.attr not in mine]
         outer, self.statements = self.statements, []
         scope = dict(self.known), set(self.there)
-        lazy = []
+        needed = {frozenset(map(id, conjuncts(need))): need for out in outs for need in self.needs(out.value)}
         for out, candidate in zip(outs, candidates, strict=True):
-            rest = split[id(out)][1]
-            if rest:
-                lazy.append(Out(out.var, self.under(load(graph, candidate.var), rest)))
-        self.ensure([need for out in lazy for need in self.needs(out.value)], place)
-        words = tuple(replace(out, value=self.word(out.value)) for out in lazy)
-        self.emit(Compute(words, place, "words"))
+            need = needed.get(frozenset(map(id, split[id(out)][0])))
+            if need is not None:  # the same parts, read at a neighbor
+                self.known[id(need)] = candidate.var
+        lazy = [out for out in outs if split[id(out)][1]]
+        for out, candidate in zip(outs, candidates, strict=True):
+            if rest := split[id(out)][1]:
+                self.split_masks[id(out.value)] = self.under(load(graph, candidate.var), rest)
+        # A mask that the next ones need is stored before them, under its own name.
+        self.ensure([out.value for out in lazy], place, {id(out.value): out.var for out in reversed(lazy)})
         inner, self.statements = self.statements, outer
         self.known, self.there = scope
         nothing = graph.node("const", FLAG, (), False)
@@ -205,6 +211,9 @@ class _RowCutter(Cutter):
         ):
             return [mask]
         return [part for arg in mask.args for part in self.shared_parts(arg)] if mask.op == "and" else []
+
+    def word(self, root: Node) -> Node:
+        return super().word(self.split_masks.get(id(root), root))
 
     # Guards and movements
 
@@ -324,10 +333,13 @@ class _RowCutter(Cutter):
             self.cells(pairs(floats), place)
         if flags := [node for node in flags if node not in moves]:
             self.words(pairs(flags), place, when)
+        together: dict[tuple[str, object, Node], list[Carried]] = {}
         for var, node in pairs(moves):
             content, movers, rest = (self.variable(arg) for arg in node.args)
-            self.emit(Move(node.op, node.attr, movers, (Carried(var, content, rest),), place))
+            together.setdefault((node.op, node.attr, movers), []).append(Carried(var, content, rest))
             self.known[id(node)] = var
+        for (op, offset, movers), planes in together.items():
+            self.emit(Move(op, offset, movers, tuple(planes), place))
 
     def lay(self, pairs: Sequence[tuple[Var, Node]], place: str) -> None:
         """Loops for chains of choices; chains with the same masks share one."""

@@ -11,6 +11,7 @@ from powderdsl.schedule.join import field_reads, keeps
 from powderdsl.schedule.rewrite import with_values
 from powderdsl.schedule.types import (
     ANSWER,
+    Carried,
     Compute,
     Guard,
     Move,
@@ -25,6 +26,7 @@ from powderdsl.schedule.types import (
     in_order,
     load,
     loaded,
+    read_elsewhere,
     values_of,
 )
 
@@ -60,7 +62,7 @@ def _block(
             gone = (outside | kept) - after
         elif isinstance(statement, Move):
             statement = _in_place(statement, after)
-            gone -= {str(plane.old.attr) for plane in statement.planes if plane.into}
+            gone -= {plane.into for plane in statement.planes if plane.into is not None}
         elif isinstance(statement, Sweeps) and keeps(statement.loops[0]):
             loop = _overwriting(statement.loops[0], after)
             statement = replace(statement, loops=(loop,))
@@ -69,7 +71,7 @@ def _block(
             statement = _overtaken(_put_off(statement, after, namer, graph), after)
             gone -= {out.into for loop in statement.loops for out in loop.outs if out.into is not None}
         elif isinstance(statement, Compute) and statement.region is not None:
-            statement = _updated(statement, after)
+            statement = _updated(statement, after | read_elsewhere(values_of(statement)))
             gone -= {out.into for out in statement.outs if out.into is not None}
         result.append(statement)
         if gone:
@@ -78,15 +80,17 @@ def _block(
 
 
 def _in_place(move: Move, after: set[str]) -> Move:
-    olds = Counter(str(plane.old.attr) for plane in move.planes)
-    movers = str(move.movers.attr)
-    planes = (
-        replace(
-            plane, into=plane.old.attr not in after and olds[plane.old.attr] == 1 and plane.old.attr != movers
-        )
-        for plane in move.planes
-    )
-    return replace(move, planes=tuple(planes))
+    """A movement that overwrites what ends with it: the old plane, or the one whose flags stay where none arrives."""
+    reads = Counter(loaded([move.movers]))
+    for plane in move.planes:
+        reads.update(set(loaded([plane.old, plane.leaves])))
+
+    def overwritten(plane: Carried) -> str | None:
+        stays = plane.leaves if plane.leaves.op in ("load", "const") else plane.old
+        free = stays.op == "load" and stays.attr not in after and reads[str(stays.attr)] == 1
+        return str(stays.attr) if free else None
+
+    return replace(move, planes=tuple(replace(plane, into=overwritten(plane)) for plane in move.planes))
 
 
 def _overwriting(loop: Compute, after: set[str]) -> Compute:

@@ -20,6 +20,7 @@ from powderdsl.schedule.narrow import ask_regions, narrow
 from powderdsl.schedule.presence import presence
 from powderdsl.schedule.release import release
 from powderdsl.schedule.rewrite import without_unread
+from powderdsl.schedule.swaps import swaps
 from powderdsl.schedule.types import Schedule
 from powderdsl.schedule.updates import updates
 from powderdsl.schedule.verify import verify
@@ -86,6 +87,11 @@ CPU = (
         "exact",
         exact,
         "which products and quotients of floats are exact; after `narrow`, which evaluates values",
+    ),
+    Stage(
+        "swaps",
+        swaps,
+        "which fields exchange values in place; after `cut`, which decides by which planes",
     ),
     Stage("join", join, "which loops over cells run as one; after `narrow`, which decides what they read"),
     Stage("release", release, "when a plane is no longer needed; last, after all reads have their place"),

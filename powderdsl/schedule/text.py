@@ -93,7 +93,7 @@ def _statement(statement: Statement, indent: str, names: _Names) -> Iterator[str
             yield f"{indent}{op} by {values.text(movers)} [{dy:+d},{dx:+d}]"
             for plane in planes:
                 leaves = "" if plane.leaves is plane.old else f" leaving {values.text(plane.leaves)}"
-                into = " in place" if plane.into else ""
+                into = f" into {names.of(plane.into)}" if plane.into else ""
                 yield f"{indent}  {names.of(plane.new.name)} = {values.text(plane.old)}{leaves}{into}"
         case Guard(when, inner, keeps):
             asked = " | ".join(values.text(node) for node in when)

@@ -69,8 +69,8 @@ class Carried:
     new: Var
     old: Node
     leaves: Node
-    into: bool = False
-    """Whether the new plane may overwrite the old one, which nothing reads later (set by `release`)."""
+    into: str | None = None
+    """The variable whose memory the new one reuses, since nothing reads it later: the old one, or what is left (`release`)."""
 
 
 @dataclass(frozen=True)
@@ -230,6 +230,11 @@ def conjuncts(node: Node) -> list[Node]:
     return [part for part in seen.values() if part.op != "and"]
 
 
+def read_elsewhere(values: Iterable[Node]) -> set[str]:
+    """The planes that values read at neighbors."""
+    return {str(name) for node in ordered(values) if node.op == "shift" for name in loaded(node.args)}
+
+
 # Statements
 
 
@@ -327,5 +332,5 @@ __all__ = [
     "ANSWER", "FLAG", "REAL",
     "Carried", "Compute", "Forget", "Guard", "Move", "Namer", "Out", "Release", "Schedule", "Statement", "Sweeps", "Sync", "Var",
     "combined", "conjuncts", "defined_by", "flat", "in_order", "is_movement", "load", "loaded", "map_blocks", "map_computes", "ordered",
-    "over_variables", "rewritten", "values_of", "variables", "with_args",
+    "over_variables", "read_elsewhere", "rewritten", "values_of", "variables", "with_args",
 ]  # fmt: skip

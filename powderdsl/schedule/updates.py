@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from powderdsl.ir.ops import FLAG, Graph, Node, ordered
@@ -16,6 +16,7 @@ from powderdsl.schedule.types import (
     combined,
     loaded,
     map_blocks,
+    read_elsewhere,
     rewritten,
 )
 
@@ -65,12 +66,12 @@ def _taken_out(guard: Guard, graph: Graph, *, near: bool = True) -> list[Stateme
             else:
                 found[not elsewhere].append(replace(out, otherwise=old))
         if rest:
-            body.append(replace(statement, outs=tuple(rest)))
+            body += _partly(replace(statement, outs=tuple(rest)), guard.when, graph)
     elsewhere = read_elsewhere(out.value for out in found[0])
     if any(out.otherwise is not None and out.otherwise.attr in elsewhere for out in found[0]):
         return _taken_out(guard, graph, near=False)  # in place, such a loop would read what it has changed
     if not found[0] and not found[1]:
-        return [guard]
+        return [replace(guard, body=tuple(body))]
     region = combined("or", guard.when, graph)
     loops = [Compute(tuple(outs), guard.place, "words", region) for outs in found if outs]
     names = {out.var.name for outs in found for out in outs}
@@ -80,6 +81,22 @@ def _taken_out(guard: Guard, graph: Graph, *, near: bool = True) -> list[Stateme
     left = replace(guard, body=tuple(body), keeps=keeps)
     first = any(names & reads(statement) for statement in body)
     return [*loops, left] if first else [left, *loops]
+
+
+def _partly(loop: Compute, when: Sequence[Node], graph: Graph) -> list[Compute]:
+    """A loop in a guard, of which values that are those of another plane where no mask holds are computed only elsewhere.
+
+    `if any m: loop words: b = m ? a[0,1] : a` → `if any m: loop words over m: b = m ? a[0,1] : a, else a`.
+    """
+    masks = {str(node.attr) for node in when}
+    outs: tuple[list[Out], list[Out]] = [], []
+    for out in loop.outs:
+        stays = without(out.value, masks, graph) if out.value.op != "load" else None
+        partly = stays is not None and _is_update(out.value, masks, stays, graph)
+        outs[partly].append(replace(out, otherwise=stays) if partly else out)
+    region = combined("or", when, graph)
+    parts = [replace(loop, outs=tuple(outs[0])), replace(loop, outs=tuple(outs[1]), region=region)]
+    return [part for part in parts if part.outs]
 
 
 def _is_update(value: Node, masks: set[str], old: Node, graph: Graph) -> bool:
@@ -93,11 +110,6 @@ def _is_update(value: Node, masks: set[str], old: Node, graph: Graph) -> bool:
 
 def _is_neighbor(node: Node) -> bool:
     return node.op == "shift" and node.args[0].op == "load" and node.attr[2]
-
-
-def read_elsewhere(values: Iterable[Node]) -> set[str]:
-    """The planes that values read at neighbors."""
-    return {str(name) for node in ordered(values) if node.op == "shift" for name in loaded(node.args)}
 
 
 def is_cleared(out: Out, graph: Graph) -> bool:

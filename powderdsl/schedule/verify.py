@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from powderdsl.ir.ops import FLAG, OPS, Node, Type, ordered
+from powderdsl.ir.ops import FLAG, OPS, REAL, Node, Type, ordered
 from powderdsl.ir.verify import InvalidIR
 from powderdsl.schedule.join import field_reads
 from powderdsl.schedule.types import (
@@ -20,9 +20,9 @@ from powderdsl.schedule.types import (
     defined_by,
     in_order,
     loaded,
+    read_elsewhere,
     values_of,
 )
-from powderdsl.schedule.updates import read_elsewhere
 
 _KINDS = ("flag", "real", ANSWER.name)
 
@@ -86,9 +86,13 @@ class _Checker:
                     live = self.block(loops, live) - set(statement.passing)
                     continue
                 case Move(op, _, movers, planes):
-                    live -= {plane.old.attr for plane in planes if plane.into}
+                    live -= {plane.into for plane in planes if plane.into is not None}
                     _demand(op in ("swap", "arrive"), f"a movement by {op}")
-                    _demand(all(n.type == FLAG for p in planes for n in (p.old, p.leaves)), "only flags move")
+                    _demand(all(p.new.type == p.old.type == p.leaves.type for p in planes), "values keep their type")
+                    floats = [p for p in planes if p.new.type == REAL]
+                    exchanged = op == "swap" and all(p.old is p.leaves for p in floats)
+                    _demand(not floats or exchanged, "floats are exchanged")
+                    _demand(len(floats) in (0, len(planes)), "flags and floats move apart")
                     _demand(movers.type == FLAG, "movers are flags")
                 case Release(names):
                     _demand(set(names) <= live, f"{names} are released, but not there")

@@ -88,8 +88,8 @@ class _State:
                         moved = np.where(targets, _shift(old, -dy, -dx, True), leaves)
                         if op == "swap":
                             moved = np.where(m, _shift(old, dy, dx, True), moved)
-                        if plane.into:
-                            del self.held[plane.old.attr]
+                        if plane.into is not None:
+                            del self.held[plane.into]
                         self.set(plane.new, moved)
                 case Guard(when, inner, keeps, _, otherwise):
                     before = dict(self.held)

@@ -162,3 +162,43 @@ static Field* overtaken(Context& c, Field* f) {
     first##f[i] = v##f.live[base + lines[i]] ? to : nothing; \
     if (first##f[i] == to) copy_floats(c.g, to, row_of(c, v##f, base + lines[i])); \
   }
+// Movers exchange what COUNT fields hold with their targets. No cell is both.
+template <int COUNT> OUTLINE void swap_fields(Context& c, const Plane* movers, int dy, int dx, Field** const* fields) {
+  if (movers->zero) return;
+  Field* moved[COUNT];
+  int count = 0;
+  for (int k = 0; k < COUNT; k++) {
+    if ((*fields[k])->still) continue;
+    own(c, *fields[k]);
+    moved[count++] = *fields[k];
+  }
+  if (!count) return;
+  const int words = c.g.words, width = c.g.width, height = c.g.height, *lines = c.lines.data() + HALO;
+  for (int l = 0; l < c.lanes; l++)
+    for (int y = 0; y < height; y++) {
+      if (!row_bits(movers->data, y * words, words, l)) continue;
+      const int line = l * height + y, base = c.g.strips ? 0 : l * height, there = base + lines[line - base + dy];
+      float *from[COUNT], *to[COUNT];
+      int n = 0;
+      for (int k = 0; k < count; k++) {
+        Field& f = *moved[k];
+        if (!f.live[line] && !f.live[there]) continue;
+        from[n] = row_of(c, f, line), to[n] = row_of(c, f, there);
+        if (!f.live[line]) std::fill_n(from[n], width, 0.f);
+        if (!f.live[there]) std::fill_n(to[n], width, 0.f);
+        f.live[line] = f.live[there] = 1;
+        n++;
+      }
+      for (int w = 0; w < words; w++)
+        for (Word left = lane_word(movers->data, y * words + w, l); left; left &= left - 1) {
+          const int x = BITS * w + __builtin_ctzll(left);
+          int other = x + c.turn(dx);
+          other -= other >= width ? width : 0;
+          for (int k = 0; k < n; k++) std::swap(from[k][x], to[k][other]);
+        }
+      for (int k = 0; k < n; k++) {
+        finish_row(c, from[k]);
+        if (there != line) finish_row(c, to[k]);
+      }
+    }
+}

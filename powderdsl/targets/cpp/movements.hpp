@@ -35,24 +35,6 @@ OUTLINE Plane* swap_plane(Context& c, Plane* content, const Plane* movers, const
   r->zero = !any(some);
   return r;
 }
-OUTLINE Plane* arrive_plane(Context& c, Plane* content, const Plane* targets, Plane* rest, int dy, int dx) {
-  if (targets->zero || (content->zero && rest->zero)) return keep(rest);
-  edges(c, content, abs(dy));
-  Plane* r = take(c);
-  V some = splat(0);
-  for (int y = 0; y < c.g.height; y++) {
-    const V* up = content->data + c.row(y - dy);
-    for (int w = 0; w < c.g.words; w++) {
-      int i = y * c.g.words + w;
-      V back = dx ? columns(c, up, w, -dx) : up[w];
-      V x = mux(targets->data[i], back, rest->data[i]);
-      some |= x;
-      r->data[i] = x;
-    }
-  }
-  r->zero = !any(some);
-  return r;
-}
 // A plane of this owner alone, to be written over.
 static void own(Context& c, Plane*& p) {
   if (p != c.nothing && p != c.everything && p->refs == 1) {
@@ -65,6 +47,29 @@ static void own(Context& c, Plane*& p) {
   copy->zero = p->zero;
   give(c, p);
   p = copy;
+}
+// What movers hold arrives in other planes, which are changed only in rows that movers enter.
+OUTLINE void arrive_over(Context& c, Plane* movers, int dy, int dx, Plane* const* olds, Plane** const* news, int count) {
+  if (movers->zero) return;
+  edges(c, movers, abs(dy));
+  V *from[MOVING + 1], *to[MOVING + 1];
+  int n = 0;
+  for (int k = 0; k < count; k++) {
+    if (olds[k]->zero && (*news[k])->zero) continue;
+    edges(c, olds[k], abs(dy));
+    own(c, *news[k]);
+    (*news[k])->zero = false;
+    from[n] = olds[k]->data, to[n++] = (*news[k])->data;
+  }
+  for (int y = 0; y < c.g.height; y++) {
+    const int source = c.row(y - dy), here = y * c.g.words;
+    if (!any_word(movers->data + source, c.g.words)) continue;
+    for (int w = 0; w < c.g.words; w++) {
+      const V targets = columns(c, movers->data + source, w, -dx);
+      if (!any(targets)) continue;
+      for (int k = 0; k < n; k++) to[k][here + w] = mux(targets, columns(c, from[k] + source, w, -dx), to[k][here + w]);
+    }
+  }
 }
 // Planes that move together, in place.
 enum Leaves { NOTHING, EVERYTHING, SAME };  // what movers leave behind

@@ -123,35 +123,52 @@ class _Printer:
         dy, dx = move.offset
         self.layout.around = max(self.layout.around, abs(dy))
         movers = str(move.movers.attr)
+        if move.planes[0].new.type == REAL:
+            yield from self.exchange(move, declared)
+            return
         names = {plane.new.name: "" if plane.new.name in declared else "Plane* " for plane in move.planes}
         far = move.op == "arrive" and abs(dy) > 1  # `arrive_planes` moves by one row
-        if far or any(_leaves(plane.old, plane.leaves, movers) is None for plane in move.planes):
-            (plane,) = move.planes
-            old, rest = plane.old.attr, _held(plane.leaves)
+        copies = far or any(_leaves(plane.old, plane.leaves, movers) is None for plane in move.planes)
+        if copies and move.op == "swap":
             target = f"shifted(c, {movers}, {-dy}, {-dx})"
-            call = (
-                f"swap_plane(c, {old}, {movers}, target, {rest}, {dy}, {dx})"
-                if move.op == "swap"
-                else f"arrive_plane(c, {old}, target, {rest}, {dy}, {dx})"
-            )
-            if names[plane.new.name]:
-                yield f"Plane* {plane.new.name};"
-            yield f"{{ Plane* target = {target}; {plane.new.name} = {call}; give(c, target); }}"
-            if plane.into:
-                yield f"give(c, {old});"
+            for plane in move.planes:
+                old, rest = plane.old.attr, _held(plane.leaves)
+                call = f"swap_plane(c, {old}, {movers}, target, {rest}, {dy}, {dx})"
+                if names[plane.new.name]:
+                    yield f"Plane* {plane.new.name};"
+                yield f"{{ Plane* target = {target}; {plane.new.name} = {call}; give(c, target); }}"
+                if plane.into:
+                    yield f"give(c, {plane.into});"
             return
         self.layout.moving = max(self.layout.moving, len(move.planes))
         kinds: dict[str, list[str]] = {}
         for plane in move.planes:
-            value = plane.old.attr if plane.into else f"keep({plane.old.attr})"
-            yield f"{names[plane.new.name]}{plane.new.name} = {value};"
+            kept = f"keep({_held(plane.leaves) if copies else plane.old.attr})"
+            yield f"{names[plane.new.name]}{plane.new.name} = {plane.into or kept};"
+            if copies:
+                continue
             leaves = _leaves(plane.old, plane.leaves, movers)
             assert leaves is not None
             kinds.setdefault(leaves, []).append(f"&{plane.new.name}")
+        if copies:
+            olds = ", ".join(str(plane.old.attr) for plane in move.planes)
+            news = ", ".join(f"&{plane.new.name}" for plane in move.planes)
+            call = f"arrive_over(c, {movers}, {dy}, {dx}, olds, news, {len(move.planes)});"
+            yield f"{{ Plane* const olds[] = {{{olds}}}; Plane** const news[] = {{{news}}}; {call} }}"
         for leaves, targets in kinds.items():
             function = "swap_planes" if move.op == "swap" else f"arrive_planes<{leaves}>"
             call = f"{function}(c, {movers}, {dy}, {dx}, all, {len(targets)});"
             yield f"{{ Plane** const all[] = {{{', '.join(targets)}}}; {call} }}"
+
+    def exchange(self, move: Move, declared: frozenset[str]) -> Iterator[str]:
+        """Fields that exchange values."""
+        dy, dx = move.offset
+        for field in move.planes:
+            value = field.into or f"keep({field.old.attr})"
+            yield f"{'' if field.new.name in declared else 'Field* '}{field.new.name} = {value};"
+        fields = ", ".join(f"&{field.new.name}" for field in move.planes)
+        call = f"swap_fields<{len(move.planes)}>(c, {move.movers.attr}, {dy}, {dx}, all);"
+        yield f"{{ Field** const all[] = {{{fields}}}; {call} }}"
 
     def update(self, loop: Compute, declared: frozenset[str]) -> Iterator[str]:
         """Planes that change only in words where a mask holds. Empty ones that can only lose flags need no copy."""
@@ -159,7 +176,8 @@ class _Printer:
         for out in loop.outs:
             assert out.otherwise is not None
             name, old = out.var.name, str(out.otherwise.attr)
-            values.places[old] = name
+            if out.into:
+                values.places[old] = name
             yield f"{'' if name in declared else 'Plane* '}{name} = {old if out.into else f'keep({old})'};"
         masks = [str(node.attr) for node in asked(loop)]
         yield f"if ({' || '.join(f'!{mask}->zero' for mask in masks)}) {{"
@@ -167,7 +185,7 @@ class _Printer:
         for out in loop.outs:
             assert out.otherwise is not None
             name, value = out.var.name, values.clean(out.value)
-            words = values.plane(str(out.otherwise.attr))
+            words = values.plane(name)
             if is_cleared(out, self.graph):
                 before.append(f"if (!{name}->zero) own(c, {name});")
                 stores.append(f"{words}[i] = {value};")

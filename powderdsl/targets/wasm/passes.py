@@ -269,11 +269,11 @@ class Pass:
         if not moves_in_place(move):
             self.loop(self.moved(move))
             for plane in move.planes:
-                if plane.into:
-                    f.do(library.give(self.of(plane.old)))
+                if plane.into is not None:
+                    f.do(library.give(self.vars[plane.into]))
             return
         for plane in move.planes:
-            self.define(plane.new, self.of(plane.old) if plane.into else self.kept(plane.old))
+            self.define(plane.new, self.of(plane.old) if plane.into is not None else self.kept(plane.old))
         with f.when(library.some(movers)), f.scope():
             targets = self.shifted(move.movers, move.offset)
             in_place(library, f, move, movers, [self.vars[plane.new.name] for plane in move.planes], targets)
