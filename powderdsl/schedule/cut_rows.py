@@ -90,7 +90,7 @@ def chain_of(node: Node, have: Have) -> list[Node]:
             seen.add(id(part))
             if part.op in ("select", "draw"):
                 return []
-            if part.op == "shift" and _reads(part, choice.args[2], others):
+            if part.op == "shift" and not have(choice.args[2]) and _reads(part, choice.args[2], others):
                 return []
             stack.extend(part.args)
     return chain

@@ -94,19 +94,28 @@ def _continued(first: Compute, second: Compute, reads: dict[str, int], graph: Gr
     nodes = ordered(out.value for out in second.outs)
     names = [str(node.attr) for node in nodes if node.op == "load"]
     simple = all(node.type == REAL and node.op in CONTINUING for node in nodes)
-    if not simple or len(nodes) > FEW or not made.keys() >= {*names, *asked}:
+    bases = {_base(value) for value in made.values()}
+    operations = [node for node in nodes if node.args]
+    if not simple or len(operations) > FEW or not bases | made.keys() >= {*names, *asked}:
         return None
     inside = list(loaded(values_of(second)))
     if any(reads.get(name, 0) != inside.count(name) for name in made):
         return None
 
     def known(node: Node) -> Node | None:
-        return made[str(node.attr)] if node.op == "load" else None
+        return made.get(str(node.attr)) if node.op == "load" else None
 
     outs = tuple(
         Out(out.var, over_variables(out.value, graph, known), None, out.otherwise) for out in second.outs
     )
     return replace(first, outs=outs)
+
+
+def _base(value: Node) -> str:
+    """The field that choices begin with."""
+    while value.op == "select":
+        value = value.args[2]
+    return str(value.attr)
 
 
 CONTINUING = ("load", "const", "param", "add", "sub", "mul", "fused", "neg", "abs")
