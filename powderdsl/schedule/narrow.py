@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -17,9 +17,12 @@ from powderdsl.schedule.types import (
     Schedule,
     Statement,
     combined,
+    flat,
+    in_order,
     load,
     map_computes,
     rewritten,
+    values_of,
 )
 
 
@@ -28,6 +31,7 @@ def narrow(schedule: Schedule) -> Schedule:
 
     `v' = settle(m ? a : v)`, where v was clamped → over `m`, else `v`; `w = 0.1 < v*v` → over `live(v)`, else 0.
     """
+    schedule = _where_read(schedule)
     found = {slot: var.name for slot, var in schedule.finds}
     olds = {str(node.attr): found[slot] for slot, node in schedule.leaves if slot in found}
 
@@ -36,6 +40,64 @@ def narrow(schedule: Schedule) -> Schedule:
         return [_narrowed(loop, schedule.graph, olds) if cells else loop]
 
     return map_computes(schedule, change)
+
+
+def _where_read(schedule: Schedule) -> Schedule:
+    """Fields that are only read where a flag holds, there or at the neighbor that reads them, are zero elsewhere.
+
+    `b = f(a)`, `c = m[0,1] ? x + b[0,1] : x` → `b = m ? f(a) : 0`.
+    """
+    graph = schedule.graph
+    statements = list(flat(schedule.body))
+    shifted = {
+        out.var.name: (str(out.value.args[0].attr), out.value.attr)
+        for one in statements
+        if isinstance(one, Compute)
+        for out in one.outs
+        if out.value.op == "shift" and out.value.args[0].op == "load"
+    }
+    asking: dict[str, set[str]] = {}  # by field: the flags that hold wherever it is read
+    roots = [node for one in statements for node in values_of(one)] + [node for _, node in schedule.leaves]
+    for name, where, masks in _field_reads(roots):
+        flags = {shifted[mask][0] for mask in masks if mask in shifted and shifted[mask][1] == where}
+        if where == HERE:
+            flags |= masks
+        asking[name] = asking[name] & flags if name in asking else flags
+    there = {var.name for _, var in schedule.finds}
+
+    def change(loop: Compute) -> list[Statement]:
+        outs = []
+        for out in loop.outs:
+            flags = in_order(asking.get(out.var.name, set()) & there)
+            if loop.over == "cells" and out.var.type == REAL and out.var.means is None and flags:
+                mask = graph.node("load", FLAG, (), flags[0])
+                zero = graph.node("const", REAL, (), 0.0)
+                out = replace(out, value=graph.node("select", REAL, (mask, out.value, zero)))
+            outs.append(out)
+        there.update(out.var.name for out in outs)
+        return [replace(loop, outs=tuple(outs))]
+
+    return map_computes(schedule, change)
+
+
+HERE = (0, 0, True)
+
+
+def _field_reads(roots: Sequence[Node]) -> Iterator[tuple[str, tuple[int, int, bool], set[str]]]:
+    """Where values read fields: the field, the neighbor, and the flags under which all that need it choose it."""
+    under: dict[int, set[str]] = {id(root): set() for root in roots}
+    for node in reversed(ordered(roots)):  # users first
+        masks = under.get(id(node))
+        if masks is None:  # read at neighbors only
+            continue
+        field = node.args[0] if node.op == "shift" else node
+        if field.op == "load" and field.type == REAL:
+            yield str(field.attr), node.attr if node.op == "shift" else HERE, masks
+            continue
+        for number, arg in enumerate(node.args):
+            chosen = node.op == "select" and number == 1 and node.args[0].op == "load"
+            found = masks | {str(node.args[0].attr)} if chosen else masks
+            under[id(arg)] = under[id(arg)] & found if id(arg) in under else found
 
 
 def ask_regions(schedule: Schedule) -> Schedule:

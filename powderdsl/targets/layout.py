@@ -24,6 +24,10 @@ class Layout:
     """The largest number of masks of choices that a loop applies."""
     waiting: int = 0
     """The largest number of rows of floats that wait for loops some rows behind."""
+    marks: int = 0
+    """The largest number of loops over cells that run together and ask planes in which rows to run."""
+    marked: int = 0
+    """The largest number of planes that such a loop asks."""
     moving: int = 0
     """The largest number of planes in a movement."""
     reach: int = 1

@@ -100,6 +100,7 @@ def sweeps_text(sweeps: Sweeps, declared: frozenset[str], layout: Layout, reache
     if keeps(sweeps.loops[0]):
         return _changed_text(sweeps.loops[0], declared, layout, reaches)
     waiting = _waiting(sweeps)
+    written = {out.var.name for loop in sweeps.loops for out in loop.outs}
     waits = sum(rows.depth for rows in waiting.values())
     before: list[str] = []
     rows: list[str] = []
@@ -108,8 +109,10 @@ def sweeps_text(sweeps: Sweeps, declared: frozenset[str], layout: Layout, reache
     turned, part = 0, -1
     last = {part: lag for lag, part in sorted(zip(sweeps.lags, sweeps.parts, strict=True))}
     for number, loop in enumerate(sweeps.loops):
-        printed = _Loop(loop, layout, turned, reaches, waiting, ahead=ahead)
+        marked = [name for name in _region_planes(loop) if name not in written]
+        printed = _Loop(loop, layout, turned, reaches, waiting, ahead=ahead, marks=(number, marked))
         before += printed.before()
+        before += _marking(number, marked, layout)
         if loop.over == "choices":
             turns.append(printed.turns())
             turned += -(-len(printed.masks) // SIDE_BY_SIDE) * SIDE_BY_SIDE
@@ -152,7 +155,6 @@ def sweeps_text(sweeps: Sweeps, declared: frozenset[str], layout: Layout, reache
         for out in lasting
         if out.var.name not in declared
     )
-    written = {out.var.name for out in outs}
     if any(loop.region is None for loop in sweeps.loops):
         return f"{declares}\n{{\n{loop_text}\n}}"
     asked = dict.fromkeys(
@@ -184,13 +186,15 @@ def _changed_text(loop: Compute, declared: frozenset[str], layout: Layout, reach
     """A loop that changes fields in place, in rows of its region."""
     olds = {out.var.name: str(out.otherwise.attr) for out in loop.outs if out.otherwise is not None}
     places = {out.into: out.var.name for out in loop.outs if out.into is not None}
-    printed = _Loop(loop, layout, 0, reaches, {}, places)
+    marked = _region_planes(loop)
+    printed = _Loop(loop, layout, 0, reaches, {}, places, marks=(0, marked))
     lines = []
     for name, old in olds.items():
         value = old if old in places else f"keep({old})"
         lines.append(f"{'' if name in declared else 'Field* '}{name} = {value}; bool some{name} = false;")
     asked = " || ".join(dict.fromkeys(f"!{question}" for _, question in _asked(loop))) or "false"
     lines.append(f"if ({asked}) {{ {' '.join(f'own(c, {name});' for name in olds)}")
+    lines += _marking(0, marked, layout)
     lines.append(_copies([loop], (), places))
     lines.append(f"EACH_WORLD for (int y = 0; y < rows; y++) {{\n{printed.text}\n}}")
     lines.append(" ".join(f"{name}->still = no_rows_left(c, {name});" for name in olds) + " }")
@@ -202,6 +206,24 @@ def _parts(region: Node) -> list[Node]:
     if region.op == "or":
         return [part for arg in region.args for part in _parts(arg)]
     return [] if region.op == "const" else [region]
+
+
+def _region_planes(loop: Compute) -> list[str]:
+    """The planes of a region."""
+    if loop.region is None or loop.over == "choices":  # choices test their masks themselves
+        return []
+    return [str(part.attr) for part in _parts(loop.region) if part.op == "load"]
+
+
+def _marking(number: int, planes: Sequence[str], layout: Layout) -> Iterator[str]:
+    """Which rows of a loop's planes have anything, found for all lanes at once."""
+    if planes:
+        layout.marks = max(layout.marks, number + 1)
+        layout.marked = max(layout.marked, len(planes))
+        yield (
+            f"{{ const Plane* const all[] = {{{', '.join(planes)}}}; "
+            f"mark_rows(c, {number}, all, {len(planes)}); }}"
+        )
 
 
 def _asked(loop: Compute) -> Iterator[tuple[str, str]]:
@@ -232,7 +254,10 @@ class _Loop:
         waiting: Mapping[str, Rows],
         places: Mapping[str, str] = MappingProxyType({}),
         ahead: Mapping[str, int] = MappingProxyType({}),
+        marks: tuple[int, Sequence[str]] = (0, ()),
     ):
+        """`marks`: the number under which rows of planes are marked, and these planes."""
+        self.marks = marks
         self.loop, self.layout, self.first, self.reaches, self.waiting = (
             loop,
             layout,
@@ -339,12 +364,15 @@ class _Loop:
         yield PLACE
         if region is not None:
             parts = _parts(region)
+            number, marked = self.marks
             scans = [
                 f"some |= row_bits(v{part.attr}, row * words, words, lane);"
                 for part in parts
-                if part.op == "load"
+                if part.op == "load" and part.attr not in marked
             ]
-            busy = " || ".join(self.busy(part) for part in parts if part.op == "live") or "false"
+            tests = [self.busy(part) for part in parts if part.op == "live"]
+            tests += [f"(c.marks[{number} * height + row] >> lane & 1)"] if marked else []
+            busy = " || ".join(tests) or "false"
             yield f"Word some = {busy};" + (f" if (!some) {{ {' '.join(scans)} }}" if scans else "")
             yield f"if (!some) {{ {' '.join(self.quiet())} }} else {{"
         yield " ".join([*self.pointers(), *self.starts(), *counts])

@@ -64,6 +64,7 @@ static Context* new_context(const Grid& g) {
   c->moving = aligned<int>(g.height + 1);
   c->zeros = aligned<float>(g.stride + HALO + CHUNK);
   c->turned = aligned<Word>((size_t)LANES * g.height * g.words * TURNED);
+  c->marks = aligned<u32>((size_t)(MARKS + 1) * g.height);
   c->waiting = aligned<float>((size_t)WAITING * g.stride + HALO + CHUNK);
   for (int i = 0; i < COINS; i++) c->coins[i] = aligned<V>(g.cells());
   for (const FixedPlane& f : FIXED) {
@@ -88,6 +89,7 @@ static void free_context(Context* c) {
   free(c->moving);
   free(c->zeros);
   free(c->turned);
+  free(c->marks);
   free(c->waiting);
   for (V* p : c->fixed) free(p);
   for (int i = 0; i < COINS; i++) free(c->coins[i]);

@@ -16,6 +16,22 @@ ALWAYS F inside_columns(F value, int x, int dx, int width) {
 ALWAYS F load(const float* row, int x) { return (F)*(const Fu*)(row + x); }
 // A word of a lane, and all words of one of its rows together.
 ALWAYS Word& lane_word(V* plane, int i, int lane) { return ((Word*)plane)[i * LANES + lane]; }
+// Which lanes have anything in each row of some planes.
+OUTLINE void mark_rows(Context& c, int place, const Plane* const* planes, int count) {
+  const int words = c.g.words, height = c.g.height;
+  u32* marks = c.marks + place * height;
+  std::fill_n(marks, height, 0);
+  const V* data[MARKED + 1];
+  int n = 0;
+  for (int k = 0; k < count; k++)
+    if (!planes[k]->zero) data[n++] = planes[k]->data;
+  for (int y = 0; y < height; y++) {
+    V some = splat(0);
+    for (int k = 0; k < n; k++)
+      for (int w = 0; w < words; w++) some |= data[k][y * words + w];
+    marks[y] = lanes_of(some);
+  }
+}
 ALWAYS Word row_bits(V* p, int first, int words, int lane) {
   Word some = 0;
   for (int w = 0; w < words; w++) some |= lane_word(p, first + w, lane);
@@ -174,9 +190,12 @@ template <int COUNT> OUTLINE void swap_fields(Context& c, const Plane* movers, i
   }
   if (!count) return;
   const int words = c.g.words, width = c.g.width, height = c.g.height, *lines = c.lines.data() + HALO;
-  for (int l = 0; l < c.lanes; l++)
-    for (int y = 0; y < height; y++) {
-      if (!row_bits(movers->data, y * words, words, l)) continue;
+  for (int y = 0; y < height; y++) {
+    V some = splat(0);
+    for (int w = 0; w < words; w++) some |= movers->data[y * words + w];
+    for (u32 lanes = lanes_of(some); lanes; lanes &= lanes - 1) {
+      const int l = __builtin_ctz(lanes);
+      if (l >= c.lanes) break;
       const int line = l * height + y, base = c.g.strips ? 0 : l * height, there = base + lines[line - base + dy];
       float *from[COUNT], *to[COUNT];
       int n = 0;
@@ -201,4 +220,5 @@ template <int COUNT> OUTLINE void swap_fields(Context& c, const Plane* movers, i
         if (there != line) finish_row(c, to[k]);
       }
     }
+  }
 }

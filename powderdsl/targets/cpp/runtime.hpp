@@ -46,6 +46,7 @@ struct Context {
   int* moving;  // [height + 1]: these rows
   Word* turned;                       // masks of choices, lane by lane, see turn_masks
   static constexpr int masks = TURNED;  // of a word, a multiple of LANES
+  u32* marks;      // lanes that have anything in a row of some planes, see mark_rows
   float* waiting;  // rows of reals that loops some rows behind read
   float* zeros;
   U k0[STREAMS + 1], k1[STREAMS + 1];

@@ -82,6 +82,8 @@ def native_source(program: Program, width: int = 0) -> NativeSource:
         f"#define MOVING {layout.moving}",
         f"#define TURNED {layout.turned}",
         f"#define WAITING {layout.waiting}",
+        f"#define MARKS {layout.marks}",
+        f"#define MARKED {layout.marked}",
         f"#define REACH {layout.reach}",
         f"#define REAL_ROWS {layout.rows}",
         f"#define HALO {layout.halo}",
