@@ -120,7 +120,7 @@ class CellLoop:
                 self.starts[key] = self.f.let(self.library.line(self.held[name], line))
 
     def live(self, field: Value, line: Value | None = None) -> Value:
-        return load("i32.load8_u", field + (self.line if line is None else line), HEADER)
+        return self.library.live(field, self.line if line is None else line)
 
     def set_live(self, place: int, value: Value) -> None:
         f = self.f

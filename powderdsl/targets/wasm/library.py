@@ -81,6 +81,7 @@ class Library:
         self.give, self.give_field = self._give("give", self.planes), self._give("give_field", self.fields)
         self.keep = self._keep()
         self.own = self._own()
+        self.own_field = self._own_field()
         self.edges = self._edges()
         self.mix = self._mix()
         self.draw_below, self.draw_below_planes = self._draw_below(), self._draw_below_planes()
@@ -164,6 +165,20 @@ class Library:
         f.do(self.give(old))
         f.give(new)
         return self.module.add(f, "own")
+
+    def _own_field(self) -> Callee:
+        """A field of this owner alone, to be written over."""
+        f = self.function("i32", "i32")
+        old = f.param(0)
+        with f.when(word(old, REFS).equals(const("i32", 1))):
+            f.give(old)
+        new = f.let(self.take_field())
+        copied = (new + HEADER).code + (old + HEADER).code + (self.field_size.value - HEADER).code
+        f.body += copied + op("memory.copy", tail=b"\0\0").code
+        f.store("i32.store", new, word(old, SOME), SOME)
+        f.do(self.give_field(old))
+        f.give(new)
+        return self.module.add(f, "own_field")
 
     def some(self, held: Value) -> Value:
         """Whether a plane or field may hold anything."""
@@ -421,6 +436,10 @@ class Library:
             start + (HEADER + 4 * self.memory.halo),
             self.zeros.value,
         )
+
+    def live(self, field: Value, line: Value) -> Value:
+        """Whether a line of a field may hold anything."""
+        return load("i32.load8_u", field + line, HEADER)
 
     def line_start(self, field: Value, line: Value) -> Value:
         return (

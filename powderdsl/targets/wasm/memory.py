@@ -48,6 +48,7 @@ def extent_of(schedules: Sequence[Schedule]) -> Extent:
     for statement in (one for schedule in schedules for one in flat(schedule.body)):
         if isinstance(statement, Move):
             around = max(around, abs(statement.offset[0]))
+            lines = max(lines, abs(statement.offset[0]) if statement.planes[0].new.type == REAL else 0)
         elif isinstance(statement, Sweeps):
             laid = (loop for loop in statement.loops if loop.over == "choices")
             chains = max(chains, *(len(chains_of(loop)) for loop in laid), 0)

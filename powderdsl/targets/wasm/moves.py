@@ -13,8 +13,8 @@ from typing import Literal
 from powderdsl.ir.ops import Node
 from powderdsl.schedule.types import Carried, Move
 from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, load, op
-from powderdsl.targets.wasm.library import ZERO, Library, choose, some, word
-from powderdsl.targets.wasm.memory import HALOED, SOME
+from powderdsl.targets.wasm.library import ZERO, Library, choose, either, some, word
+from powderdsl.targets.wasm.memory import HALOED, HEADER, SOME, WORD
 
 Leaves = Literal["same", "nothing", "everything"]
 TOGETHER = 4
@@ -191,3 +191,58 @@ def move(
                     f.store("i32.store", held, const("i32", 1), SOME)
         f.do(mover(library, moved.op, moved.offset, kind)(movers, entered, rows, end))
     f.do(library.give(entered))
+
+
+def exchanger(library: Library, offset: tuple[int, int]) -> Callee:
+    """Movers and their targets exchange values of a field: movers, field."""
+    return library.lazily(("exchange", offset), lambda: _exchanger(library, *offset))
+
+
+def _exchanger(library: Library, dy: int, dx: int) -> Callee:
+    f, memory = library.function("i32 i32"), library.memory
+    movers, field = f.param(0), f.param(1)
+    line = f.let(ZERO)
+    with f.each(ZERO, const("i32", 16), 8) as lane:
+        with f.each(lane, lane + library.cells.value, memory.row) as row:
+            with f.scope(), f.block() as skip:
+                found = f.let(const("i64", 0))
+                with f.each(row, row + memory.row, 16) as at:
+                    f.set(found, found | load("i64.load", movers + at, memory.base))
+                f.jump(skip, op("i64.eqz", found))
+                other = f.let(library.other_line(line, dy, wraps=True))
+                f.jump(skip, op("i32.eqz", library.live(field, line) | library.live(field, other)))
+                ends = []
+                for number in (line, other):
+                    start = f.let(library.line_start(field, number))
+                    with f.when(op("i32.eqz", library.live(field, number))):
+                        with f.each(ZERO, const("i32", 4 * memory.width), 16) as at:
+                            f.store("v128.store", start + at, const("v128", 0))
+                        f.store("i32.store8", field + number, const("i32", 1), HEADER)
+                    ends.append(start)
+                x = f.let(ZERO)
+                with f.each(row, row + memory.row, 16) as at:
+                    left = f.let(load("i64.load", movers + at, memory.base))
+                    _exchange_word(f, left, x, *ends, dx % memory.width, memory.width)
+                    f.set(x, x + WORD)
+                for start in ends:
+                    library.finish_line(f, start)
+            f.set(line, line + 1)
+    return library.module.add(f, f"exchange_{dy}_{dx}")
+
+
+def _exchange_word(
+    f: Function, left: Local, x: Local, here: Local, there: Local, by: int, width: int
+) -> None:
+    """Cells of the movers `left`, the first of which is in column `x`, exchange with those `by` columns on, around."""
+    with f.block() as done, f.loop() as again, f.scope():
+        f.jump(done, op("i64.eqz", left))
+        column = f.let(x + op("i32.wrap_i64", op("i64.ctz", left)))
+        f.set(left, left & (left - 1))
+        target = f.let(column + by)
+        if by:
+            f.set(target, either(target < width, target, target - width))
+        own, other = f.let(here + (column << 2)), f.let(there + (target << 2))
+        kept = f.let(word(own))
+        f.store("i32.store", own, word(other))
+        f.store("i32.store", other, kept)
+        f.jump(again)

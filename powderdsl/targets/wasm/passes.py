@@ -23,7 +23,7 @@ from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const,
 from powderdsl.targets.wasm.cells import sweep
 from powderdsl.targets.wasm.library import ZERO, Library, word
 from powderdsl.targets.wasm.moves import move as in_place
-from powderdsl.targets.wasm.moves import moves_in_place
+from powderdsl.targets.wasm.moves import exchanger, moves_in_place
 from powderdsl.targets.wasm.words import WordLoop
 
 ONE = const("i32", 1)
@@ -266,6 +266,9 @@ class Pass:
         """Planes that move; those that nothing moves stay as they are."""
         f, library = self.f, self.library
         movers = self.of(move.movers)
+        if move.planes[0].new.type == REAL:
+            self.exchange(move)
+            return
         if not moves_in_place(move):
             self.loop(self.moved(move))
             for plane in move.planes:
@@ -277,6 +280,17 @@ class Pass:
         with f.when(library.some(movers)), f.scope():
             targets = self.shifted(move.movers, move.offset)
             in_place(library, f, move, movers, [self.vars[plane.new.name] for plane in move.planes], targets)
+
+    def exchange(self, move: Move) -> None:
+        """Fields that exchange values."""
+        f, library = self.f, self.library
+        for field in move.planes:
+            old = self.of(field.old) if field.into is not None else self.kept(field.old)
+            self.define(field.new, old)
+            held = self.vars[field.new.name]
+            with f.when(library.some(self.of(move.movers)) & library.some(held)):
+                f.set(held, library.own_field(held))
+                f.do(exchanger(library, move.offset)(self.of(move.movers), held))
 
     def shifted(self, movers: Node, offset: Offset) -> Callee:
         """A function that makes the plane of targets: movers, it."""

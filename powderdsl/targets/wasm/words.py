@@ -41,8 +41,8 @@ class WordLoop:
         roots = [out.value for out in loop.outs]
         self.nodes = ordered(roots)
         self.updates = loop.region is not None
-        olds = {str(out.otherwise.attr) for out in loop.outs if out.otherwise is not None}
-        names = [name for name in dict.fromkeys(loaded(roots)) if not self.updates or name not in olds]
+        olds = {out.into for out in loop.outs if self.updates and out.into is not None}
+        names = [name for name in dict.fromkeys(loaded(roots)) if name not in olds]
         made = [name for node in self.nodes if (name := plane_name(node, library)) is not None]
         self.reads: list[str | tuple[str, int]] = [*names, *dict.fromkeys(made)]
         masks = self.mask_names = [str(node.attr) for node in asked(loop)] if self.updates else []
@@ -55,10 +55,9 @@ class WordLoop:
         self.f = Function(["i32"] * count)
         self.planes = {name: self.f.param(i) for i, name in enumerate(self.reads)}
         self.outs = [self.f.param(len(self.reads) + i) for i in range(len(loop.outs))]
-        if self.updates:  # the outs hold the old values
-            for out, place in zip(loop.outs, self.outs, strict=True):
-                assert out.otherwise is not None
-                self.planes[str(out.otherwise.attr)] = place
+        for out, place in zip(loop.outs, self.outs, strict=True):
+            if out.into in olds:  # what is overwritten holds the old value
+                self.planes[str(out.into)] = place
         self.masks = [self.planes[name] for name in masks]
 
     def made(self) -> Callee:
