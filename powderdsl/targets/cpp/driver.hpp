@@ -145,14 +145,14 @@ static int world_of(const Context& c, int number, int lane) {  // unused lanes a
 }
 static void begin_step(Context& c, const Clocks& k, int number, long done) {
   const u32 strip = c.g.strips ? (u32)c.g.height * ((c.g.width + 31) / 32) * 32 : 0;  // hashes from one strip to the next
-  for (int s = 0; s < STREAMS; s++)
-    for (int l = 0; l < LANES; l++) {
-      int world = world_of(c, number, l);
-      u64 step = k.step[world] + done;
-      u32 a = key(k.seed[world], k.index[world], step, STREAM_IDENT[s], 0x243F6A88u);
-      u32 b = key(k.seed[world], k.index[world], step, STREAM_IDENT[s], 0x85A308D3u);
+  for (int l = 0; l < LANES; l++) {
+    const u32 step = (u32)(k.step[world_of(c, number, l)] + done);
+    const u32 first = mix(c.world_keys[0][l] + step), second = mix(c.world_keys[1][l] + step);
+    for (int s = 0; s < STREAMS; s++) {
+      const u32 a = mix(first + STREAM_IDENT[s]), b = mix(second + STREAM_IDENT[s]);
       for (int i = HASHES * l; i < HASHES * (l + 1); i++) c.k0[s][i] = a + l * strip * APART, c.k1[s][i] = b;
     }
+  }
   std::fill_n(c.tossed, COINS, false);
   for (int i = 0; i < STEP_PLANES; i++)
     for (int l = 0; l < LANES; l++) {
@@ -171,6 +171,11 @@ static void run_group(Context& c, Batch& b, int number, long steps, const Clocks
     }
     for (int i = 0; i < PARAM_REALS; i++)
       for (int to = l; to < (c.g.strips ? LANES : l + 1); to++) c.param_real[i][to] = reals[(size_t)i * b.worlds + world];
+  }
+  for (int l = 0; l < LANES; l++) {
+    const int world = world_of(c, number, l);
+    c.world_keys[0][l] = world_key(k.seed[world], k.index[world], 0x243F6A88u);
+    c.world_keys[1][l] = world_key(k.seed[world], k.index[world], 0x85A308D3u);
   }
   Group& group = b.groups[number];
   for (int i = 0; i < SLOTS; i++) {

@@ -83,10 +83,8 @@ static inline u32 mix(u32 x) {
   x *= 0x846CA68Bu;
   return x ^ (x >> 16);
 }
-static u32 key(u64 seed, u64 index, u64 step, u32 stream, u32 start) {
-  u32 k = start;
-  for (u32 part : {(u32)seed, (u32)(seed >> 32), (u32)index, (u32)step, stream}) k = mix(k + part);
-  return k;
+static u32 world_key(u64 seed, u64 index, u32 start) {  // of all steps and streams
+  return mix(mix(mix(start + (u32)seed) + (u32)(seed >> 32)) + (u32)index);
 }
 
 // Draws: bit j of 32 columns is one hash; a word has one or two. A plane's hashes start a constant after those of the plane before.

@@ -49,6 +49,7 @@ struct Context {
   u32* marks;      // lanes that have anything in a row of some planes, see mark_rows
   float* waiting;  // rows of reals that loops some rows behind read
   float* zeros;
+  u32 world_keys[2][LANES];
   U k0[STREAMS + 1], k1[STREAMS + 1];
   V* coins[COINS + 1];      // planes
   bool tossed[COINS + 1];  // whether this step has filled them
