@@ -195,7 +195,7 @@ class _PassLowering:
         before = dict(self.state)
         for write, mask in writes:
             self._assign(write, values[id(write)], mask)
-        self._move(movers, masks, at)
+        self._move(movers, masks, at, moment.policy)
         for write, mask in effects:
             self._assign(write, values[id(write)], mask)
         changed = tuple((name, new) for name, new in self.state.items() if before[name] is not new)
@@ -218,8 +218,12 @@ class _PassLowering:
                 new = build.clamp(new, int(slot.kind.lo), int(slot.kind.hi))
             self.state[name] = build.select(mask, new, old)
 
-    def _move(self, movers: list[Mover], masks: dict[int, Node], at: Inputs) -> None:
-        """Transforms and what moves leave behind first, then arrivals, all from the world before."""
+    def _move(self, movers: list[Mover], masks: dict[int, Node], at: Inputs, policy: str) -> None:
+        """Transforms and what moves leave behind first, then arrivals, all from the world before.
+
+        Without a policy that keeps them apart, a cell may take part in several exchanges. They are then not swaps, of
+        which each cell belongs to one at most: movers take what their targets held, and what they held arrives there.
+        """
         build = self.build
         before = dict(self.state)
         travelling = [name for slot in self.slots.values() if slot.travels for name in slot_names(slot)]
@@ -237,10 +241,14 @@ class _PassLowering:
         for rule in movers:
             if isinstance(rule, Transform):
                 continue
-            op = "swap" if isinstance(rule, Swap) else "arrive"
+            swaps = isinstance(rule, Swap)
+            op = "swap" if swaps and policy != "overwrite" else "arrive"
             for name in travelling:
                 mask, rest = masks[id(rule)], self.state[name]
-                self.state[name] = build.derive(op, before[name], mask, rest, attr=rule.offset)
+                moved = build.derive(op, before[name], mask, rest, attr=rule.offset)
+                if swaps and op == "arrive":
+                    moved = build.select(mask, build.shift(before[name], rule.offset), moved)
+                self.state[name] = moved
 
     def _fresh(self, element: Node) -> dict[str, Node]:
         """What a new cell of an element holds."""
