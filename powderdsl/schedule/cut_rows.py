@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
-from powderdsl.ir.ops import FLAG, REAL, Node, walk
+from powderdsl.ir.ops import FLAG, REAL, Node, Offset, walk
 from powderdsl.schedule.costs import UNIFORM, Costs, Have, is_constant
 from powderdsl.schedule.cut import Cutter, Pairs
 from powderdsl.schedule.draws import DRAWS, is_coin
@@ -333,7 +333,7 @@ class _RowCutter(Cutter):
             self.cells(pairs(floats), place)
         if flags := [node for node in flags if node not in moves]:
             self.words(pairs(flags), place, when)
-        together: dict[tuple[str, object, Node], list[Carried]] = {}
+        together: dict[tuple[str, Offset, Node], list[Carried]] = {}
         for var, node in pairs(moves):
             content, movers, rest = (self.variable(arg) for arg in node.args)
             together.setdefault((node.op, node.attr, movers), []).append(Carried(var, content, rest))

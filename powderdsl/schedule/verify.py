@@ -88,7 +88,10 @@ class _Checker:
                 case Move(op, _, movers, planes):
                     live -= {plane.into for plane in planes if plane.into is not None}
                     _demand(op in ("swap", "arrive"), f"a movement by {op}")
-                    _demand(all(p.new.type == p.old.type == p.leaves.type for p in planes), "values keep their type")
+                    _demand(
+                        all(p.new.type == p.old.type == p.leaves.type for p in planes),
+                        "values keep their type",
+                    )
                     floats = [p for p in planes if p.new.type == REAL]
                     exchanged = op == "swap" and all(p.old is p.leaves for p in floats)
                     _demand(not floats or exchanged, "floats are exchanged")

@@ -260,7 +260,7 @@ def whole(value: Node, layout: Layout) -> str:
 
 
 class _Words(WordValues):
-    """Values of a word of 64 columns in eight worlds."""
+    """Values of a word of columns in as many worlds as a vector holds."""
 
     type, leaf = "V", "shift"
 

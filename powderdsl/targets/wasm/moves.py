@@ -202,31 +202,31 @@ def _exchanger(library: Library, dy: int, dx: int) -> Callee:
     f, memory = library.function("i32 i32"), library.memory
     movers, field = f.param(0), f.param(1)
     line = f.let(ZERO)
-    with f.each(ZERO, const("i32", 16), 8) as lane:
-        with f.each(lane, lane + library.cells.value, memory.row) as row:
-            with f.scope(), f.block() as skip:
-                found = f.let(const("i64", 0))
-                with f.each(row, row + memory.row, 16) as at:
-                    f.set(found, found | load("i64.load", movers + at, memory.base))
-                f.jump(skip, op("i64.eqz", found))
-                other = f.let(library.other_line(line, dy, wraps=True))
-                f.jump(skip, op("i32.eqz", library.live(field, line) | library.live(field, other)))
-                ends = []
-                for number in (line, other):
-                    start = f.let(library.line_start(field, number))
-                    with f.when(op("i32.eqz", library.live(field, number))):
-                        with f.each(ZERO, const("i32", 4 * memory.width), 16) as at:
-                            f.store("v128.store", start + at, const("v128", 0))
-                        f.store("i32.store8", field + number, const("i32", 1), HEADER)
-                    ends.append(start)
-                x = f.let(ZERO)
-                with f.each(row, row + memory.row, 16) as at:
-                    left = f.let(load("i64.load", movers + at, memory.base))
-                    _exchange_word(f, left, x, *ends, dx % memory.width, memory.width)
-                    f.set(x, x + WORD)
-                for start in ends:
-                    library.finish_line(f, start)
-            f.set(line, line + 1)
+    with (
+        f.each(ZERO, const("i32", 16), 8) as lane,
+        f.each(lane, lane + library.cells.value, memory.row) as row,
+    ):
+        with f.scope(), f.block() as skip:
+            found = f.let(const("i64", 0))
+            with f.each(row, row + memory.row, 16) as at:
+                f.set(found, found | load("i64.load", movers + at, memory.base))
+            f.jump(skip, op("i64.eqz", found))
+            other = f.let(library.other_line(line, dy, wraps=True))
+            f.jump(skip, op("i32.eqz", library.live(field, line) | library.live(field, other)))
+            here, there = (f.let(library.line_start(field, number)) for number in (line, other))
+            for number, start in ((line, here), (other, there)):
+                with f.when(op("i32.eqz", library.live(field, number))):
+                    with f.each(ZERO, const("i32", 4 * memory.width), 16) as at:
+                        f.store("v128.store", start + at, const("v128", 0))
+                    f.store("i32.store8", field + number, const("i32", 1), HEADER)
+            x = f.let(ZERO)
+            with f.each(row, row + memory.row, 16) as at:
+                left = f.let(load("i64.load", movers + at, memory.base))
+                _exchange_word(f, left, x, here, there, dx % memory.width, memory.width)
+                f.set(x, x + WORD)
+            library.finish_line(f, here)
+            library.finish_line(f, there)
+        f.set(line, line + 1)
     return library.module.add(f, f"exchange_{dy}_{dx}")
 
 

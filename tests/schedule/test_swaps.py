@@ -1,0 +1,48 @@
+"""Swaps exchange the values of fields in place, if no cell belongs to two of them."""
+
+from __future__ import annotations
+
+import pytest
+
+from powderdsl.ir.ops import REAL
+from powderdsl.schedule.stages import CPU, plan
+from powderdsl.schedule.types import Compute, Move, Sweeps, flat
+from powderdsl.testing.generators.cases import load_text
+from tests.schedule.test_stages import packed_passes, run_stages
+
+SINKING = """
+pack: sinking
+fields:
+  heat: {type: real(-9..9), at: element}
+elements:
+  air: {id: 0, color: '#000000'}
+  oil: {id: 1, color: '#804000'}
+  water: {id: 2, color: '#0000FF'}
+passes:
+  fall:
+    conflicts: POLICY
+    do: water swaps below if below is oil
+    then: water swaps OFFSET if OFFSET is air
+"""
+
+
+@pytest.mark.parametrize("place", ["left", "above.right", "at(-2, 3)"])
+@pytest.mark.parametrize("policy", ["drop_both", "first_wins"])
+def test_fields_are_exchanged_where_planes_are(policy: str, place: str) -> None:
+    rules = load_text(SINKING.replace("POLICY", policy).replace("OFFSET", place), "sinking.yaml")
+    run_stages(rules, CPU)
+    ((_, fall),) = packed_passes(rules)
+    statements = list(flat(plan(fall, CPU).body))
+    moves = [(one.op, one.offset, one.planes[0].new.type) for one in statements if isinstance(one, Move)]
+    fields = [(op, offset) for op, offset, type in moves if type == REAL]
+    assert fields == [(op, offset) for op, offset, type in moves if type != REAL]
+    assert len(fields) == 2
+    assert not any(isinstance(one, Sweeps) for one in statements)
+    assert not any(out.var.type == REAL for one in statements if isinstance(one, Compute) for out in one.outs)
+
+
+def test_exchanges_that_share_cells_are_computed() -> None:
+    rules = load_text(SINKING.replace("POLICY", "overwrite").replace("OFFSET", "left"), "sinking.yaml")
+    run_stages(rules, CPU)
+    ((_, fall),) = packed_passes(rules)
+    assert not any(isinstance(one, Move) and one.op == "swap" for one in flat(plan(fall, CPU).body))
