@@ -99,23 +99,49 @@ def _at_neighbor(value: Node, where: tuple[int, int, bool], graph: Graph) -> Nod
 
 
 def led(schedule: Schedule) -> Schedule:
-    """A comparison that matters only together with another one is computed only where that one holds.
+    """A comparison that matters only where another one holds is computed only there.
 
     `w & (a | b)` → `w & (led(w, a) | led(w, b))`: every path from a value to `a` goes through a conjunction with `w`.
+    Draws as floats are costly, so their comparisons follow the condition of a choice, too: `c ? (draw < x ? 1 : 2) : 3`
+    → `c ? (led(c, draw < x) ? 1 : 2) : 3`.
     """
     roots = [node for statement in flat(schedule.body) for node in values_of(statement)]
     comparisons = [node for node in ordered(roots) if is_comparison(node)]
     conjoined = _conjoined(roots, comparisons)
-    leaders: dict[int, Node] = {}
-    leading: set[int] = set()
+    leaders = _conditions(roots, [node for node in comparisons if _is_drawn(node)])
+    leading = {id(part) for leader in leaders.values() for part in ordered([leader])}
     for node in comparisons:
         for number in _bits(conjoined[id(node)]):
             leader = comparisons[number]
-            if id(leader) not in leaders and id(node) not in leading and leader.args != node.args:
+            free = id(leader) not in leaders and id(node) not in leaders and id(node) not in leading
+            if free and leader.args != node.args:
                 leaders[id(node)] = leader
                 leading.add(id(leader))
                 break
     return map_values(schedule, _rule(leaders, schedule.graph)) if leaders else schedule
+
+
+def _is_drawn(node: Node) -> bool:
+    return any(part.op == "draw" for part in ordered([node]))
+
+
+def _conditions(roots: list[Node], comparisons: list[Node]) -> dict[int, Node]:
+    """By id of a comparison: the condition of a choice that all paths to it take, if one does not depend on draws."""
+    found: dict[int, dict[int, Node]] = {id(root): {} for root in roots}
+    for node in reversed(ordered(roots)):  # users first
+        above = found[id(node)]
+        for number, arg in enumerate(node.args):
+            paths = {} if node.op in AT_NEIGHBORS else above
+            if node.op == "select" and number == 1:
+                paths = {**above, id(node.args[0]): node.args[0]}
+            known = found.get(id(arg), paths)
+            found[id(arg)] = {key: one for key, one in known.items() if key in paths}
+    leaders: dict[int, Node] = {}
+    for node in comparisons:
+        free = [one for one in found[id(node)].values() if one.op != "param" and not _is_drawn(one)]
+        if free:
+            leaders[id(node)] = free[0]
+    return leaders
 
 
 def _rule(leaders: dict[int, Node], graph: Graph) -> Rule:

@@ -194,9 +194,13 @@ def _calm(values: list[Node]) -> tuple[list[float | bool], list[Node]] | None:
         if node.op == "load":
             result: Any = 0.0
         elif node.op == "led" and node.args[0].op == "load":
-            result = visit(node.args[1])
+            try:
+                result = visit(node.args[1])
+            except LookupError:
+                result = True
             if result:  # the result depends on the flag
-                raise LookupError
+                masks[id(node.args[0])] = node.args[0]
+                result = False
         elif node.op == "const":
             result = single(node.attr)
         elif node.op == "select":
