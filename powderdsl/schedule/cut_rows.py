@@ -329,8 +329,8 @@ class _RowCutter(Cutter):
         moves = [node for node in flags if is_movement(node)]
         if laid:
             self.lay(pairs(laid), place)
-        if floats := [node for node in floats if node not in laid]:
-            self.cells(pairs(floats), place)
+        for together in _apart([node for node in floats if node not in laid]):
+            self.cells(pairs(together), place)
         if flags := [node for node in flags if node not in moves]:
             self.words(pairs(flags), place, when)
         together: dict[tuple[str, Offset, Node], list[Carried]] = {}
@@ -349,6 +349,24 @@ class _RowCutter(Cutter):
             groups.setdefault(tuple(id(choice.args[0]) for choice in chain), []).append((var, node))
         for group in groups.values():
             self.cells(group, place, "choices")
+
+
+def _apart(floats: Sequence[Node]) -> list[list[Node]]:
+    """Values that are computed in loops of their own: they share no operations, and their choices ask other masks."""
+    groups: list[tuple[set[int], list[Node]]] = []
+    for node in floats:
+        parts = [part for part in walk(node) if part.args]
+        keys = {id(part) for part in parts if part.type == REAL or part.op in ("led", "eq", "lt", "le")}
+        keys.add(hash(frozenset(id(part.args[0]) for part in parts if part.op == "select")))
+        same = [group for group in groups if group[0] & keys]
+        groups = [group for group in groups if not group[0] & keys]
+        merged = [one for _, nodes in same for one in nodes]
+        groups.append((keys.union(*(old for old, _ in same)), [*merged, node]))
+    order = {id(node): number for number, node in enumerate(floats)}
+    return sorted(
+        (sorted(nodes, key=lambda node: order[id(node)]) for _, nodes in groups),
+        key=lambda nodes: order[id(nodes[0])],
+    )
 
 
 def _leaves_simply(node: Node) -> bool:

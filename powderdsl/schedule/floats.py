@@ -29,6 +29,7 @@ def late(schedule: Schedule) -> Schedule:
     """Floats that substeps write are not stored: their users compute them from the pass's inputs and the masks.
 
     Where a guard's masks fail, the choices in the value give the old one, so the value is right outside the guard too.
+    What only moves, more than once, needs not be clamped again.
     `if any m: v2 = select(m, a, v1); … v3 = select(n, b, v2)` → `v3 = select(n, b, select(m, a, v1))`.
     """
     graph = schedule.graph
@@ -58,14 +59,44 @@ def late(schedule: Schedule) -> Schedule:
     namer = Namer(schedule)
     outs: dict[int, Out] = {}
     leaves = []
+    found = dict(schedule.finds)
     for slot, node in schedule.leaves:
         value = rewritten([node], graph, rule)[id(node)]
+        if value.op == "settle" and slot in found and _only_moves(value.args[0], found[slot].name):
+            value = value.args[0]
         if value.type == REAL and value.op != "load":
             out = outs.setdefault(id(value), Out(namer.var(REAL), value))
             value = load(graph, out.var)
         leaves.append((slot, value))
     end = (Compute(tuple(outs.values())),) if outs else ()
     return replace(schedule, body=(*body, *end), leaves=tuple(leaves))
+
+
+def _only_moves(value: Node, slot: str) -> bool:
+    """Whether a float is zero or a slot's value from another cell, after several movements: it is within its bounds already.
+
+    After one movement, `narrow` limits the loop to rows in which something moves.
+    """
+    stack, seen = [value], set[int]()
+    again = False
+    while stack:
+        node = stack.pop()
+        if id(node) in seen:
+            continue
+        seen.add(id(node))
+        match node.op:
+            case "select":
+                stack += node.args[1:]
+            case "shift":
+                again |= node.args[0].op != "load"
+                stack += node.args
+            case "const" if not node.attr:
+                pass
+            case "load" if node.attr == slot:
+                pass
+            case _:
+                return False
+    return again
 
 
 def chosen(schedule: Schedule) -> Schedule:

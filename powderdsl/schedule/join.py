@@ -52,7 +52,7 @@ def join(schedule: Schedule) -> Schedule:
         for statement in (*block, None):
             if isinstance(statement, Compute) and statement.over in ("cells", "choices"):
                 if run and (_asks_masks_of(statement, run) or keeps(statement) or keeps(run[-1])):
-                    result.append(_joined(run, reads))
+                    result += [_joined(part, reads) for part in _components(run)]
                     run = []
                 if run and (one := _continued(run[-1], statement, reads, schedule.graph)):
                     run[-1] = one
@@ -60,7 +60,7 @@ def join(schedule: Schedule) -> Schedule:
                     run.append(statement)
                 continue
             if run:
-                result.append(_joined(run, reads))
+                result += [_joined(part, reads) for part in _components(run)]
                 run = []
             if statement is not None:
                 result.append(statement)
@@ -120,6 +120,19 @@ def _base(value: Node) -> str:
 
 CONTINUING = ("load", "const", "param", "add", "sub", "mul", "fused", "neg", "abs")
 """Operations that are applied to the results of choices in registers."""
+
+
+def _components(run: Sequence[Compute]) -> list[list[Compute]]:
+    """The loops of a run, apart where none reads what another one of them computes."""
+    found: list[tuple[set[str], list[Compute]]] = []
+    for loop in run:
+        names = {out.var.name for out in loop.outs} | set(loaded(values_of(loop)))
+        joined = [part for part in found if any(out.var.name in names for one in part[1] for out in one.outs)]
+        found = [part for part in found if part not in joined]
+        found.append((names, [*(one for _, loops in joined for one in loops), loop]))
+    order = {id(loop): number for number, loop in enumerate(run)}
+    parts = [sorted(loops, key=lambda loop: order[id(loop)]) for _, loops in found]
+    return sorted(parts, key=lambda loops: order[id(loops[0])])
 
 
 def _is_zero(node: Node | None) -> bool:

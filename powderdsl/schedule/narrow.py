@@ -127,7 +127,7 @@ def _narrowed(loop: Compute, graph: Graph, slots: Mapping[str, str]) -> Compute:
     kept = [
         unchanged(out.value, {slots[out.var.name]}) if out.var.name in slots else None for out in loop.outs
     ]
-    if all(kept):
+    if all(kept) and loop.over == "cells":
         olds = [old for old, _ in kept if old is not None]  # type: ignore[misc]
         masks = [mask for _, chosen in kept for mask in chosen]  # type: ignore[misc]
         region = _any_of(masks, graph)
@@ -172,9 +172,9 @@ def _anywhere(region: Node, graph: Graph) -> Node:
 def unchanged(value: Node, found: set[str]) -> tuple[Node, list[Node]] | None:
     """For a clamped slot under choices: its old value, and the masks without which it keeps it (it was clamped)."""
     masks = []
-    if value.op != "settle":
+    if value.op not in ("settle", "select"):
         return None
-    node = value.args[0]
+    node = value.args[0] if value.op == "settle" else value
     while node.op == "select":
         masks.append(node.args[0])
         node = node.args[2]

@@ -427,11 +427,13 @@ class _Loop:
         olds = [values.row(base, 0) for base in bases]
         yield f"const Word* turned = turned_row(c, base + y) + {self.first}; const bool any = any_turned(c, turned, {count});"
         lives = " || ".join(dict.fromkeys(self.alive(base) for base in bases))
-        yield f"const bool some = any || {lives};"
+        yield " ".join(self.pointers())
+        near = " || ".join(f"{name} != nothing" for name in values.rows.values())
+        yield f"const bool some = any ? {near if self.only_moves() else 'true'} : {lives};"
         yield " ".join(f"some{name} |= v{name}.live[base + y] = some;" for name in self.lasts)
         gone = " ".join(f"{self.waiting[name].at(name, 0)} = nothing;" for name in self.waits)
         yield f"if (!some) {{ {gone} }} else {{"
-        yield " ".join([*self.pointers(), *self.starts()])
+        yield " ".join(self.starts())
         yield f"for (int w = 0; w < words; w++) {{ const Word* masks = turned + w * c.masks; const u64 which = which_turned(masks, {count});"
         yield " ".join(f"F {name}[BITS / CHUNK];" for name in heads)
         yield f"EACH_REGISTER {{ {' '.join(f'{name}[k] = load({old}, x);' for name, old in zip(heads, olds, strict=True))} }}"
@@ -441,12 +443,21 @@ class _Loop:
         yield f"EACH_REGISTER {{ {ends} }} }}"
         yield f"{' '.join(self.ends())} }}"
 
+    def only_moves(self) -> bool:
+        """Whether all choices are values of fields in other places: they are zero where these fields are."""
+        values = [choice.args[1] for chain in self.chains for choice in chain]
+        return all(node.op in ("shift", "load") or _is_zero(node) for node in ordered(values))
+
     def alive(self, name: str) -> str:
         return (
             f"{self.waiting[name].at(name, 0)} != nothing"
             if name in self.waiting
             else f"{name}->live[base + y]"
         )
+
+
+def _is_zero(value: Node) -> bool:
+    return value.op == "const" and not value.attr
 
 
 PLACE = (
