@@ -329,8 +329,8 @@ class _RowCutter(Cutter):
         moves = [node for node in flags if is_movement(node)]
         if laid:
             self.lay(pairs(laid), place)
-        for together in _apart([node for node in floats if node not in laid]):
-            self.cells(pairs(together), place)
+        for group in _apart([node for node in floats if node not in laid]):
+            self.cells(pairs(group), place)
         if flags := [node for node in flags if node not in moves]:
             self.words(pairs(flags), place, when)
         together: dict[tuple[str, Offset, Node], list[Carried]] = {}
@@ -353,11 +353,11 @@ class _RowCutter(Cutter):
 
 def _apart(floats: Sequence[Node]) -> list[list[Node]]:
     """Values that are computed in loops of their own: they share no operations, and their choices ask other masks."""
-    groups: list[tuple[set[int], list[Node]]] = []
+    groups: list[tuple[set[object], list[Node]]] = []
     for node in floats:
         parts = [part for part in walk(node) if part.args]
-        keys = {id(part) for part in parts if part.type == REAL or part.op in ("led", "eq", "lt", "le")}
-        keys.add(hash(frozenset(id(part.args[0]) for part in parts if part.op == "select")))
+        keys: set[object] = {id(part) for part in parts if of_floats(part)}
+        keys.add(("masks", frozenset(id(part.args[0]) for part in parts if part.op == "select")))
         same = [group for group in groups if group[0] & keys]
         groups = [group for group in groups if not group[0] & keys]
         merged = [one for _, nodes in same for one in nodes]
