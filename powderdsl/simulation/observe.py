@@ -87,7 +87,7 @@ class Observer:
         for ramp in self._ramps:
             _write_ramp(state, ramp, out)
         for tint in self._tints:
-            tint_cells(out, state[tint.field], tint)
+            _write_tint(state, tint, out)
         return out
 
     @torch.no_grad()
@@ -282,6 +282,17 @@ def _write_ramp(state: State, ramp: Ramp, out: Tensor) -> None:
     reached = torch.bucketize(state[ramp.field].to(ramp.starts.dtype), ramp.starts, right=True)
     cells = (state["element"] == ramp.id)[..., None]
     torch.where(cells, ramp.colors[:, :3][reached], out, out=out)
+
+
+def _write_tint(state: State, tint: CellTint, out: Tensor) -> None:
+    """Tint pictures uint8 [B, H, W, 3]."""
+    if isinstance(state, PackedState):
+        program = state.program
+        row, column = (program.layout.reals[piece.slot] for piece in program.pieces[tint.field])
+        numbers = torch.tensor([*tint.color, tint.full, tint.most])
+        program.library.pd_tint(state.handle, row, column, address(numbers), address(out), out.stride(0))
+    else:
+        tint_cells(out, state[tint.field], tint)
 
 
 def _write_channels(state: State, channels: Sequence[Channel], tables: Tensor, out: Tensor) -> None:

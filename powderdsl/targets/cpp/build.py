@@ -248,6 +248,7 @@ def load_library(path: Path) -> ctypes.CDLL:
         "pd_fill_real": (None, [pointer, integer, pointer, pointer]),
         "pd_store_real": (None, [pointer, integer, pointer, long]),
         "pd_rgb": (None, [pointer, integer, integer, pointer, pointer, long]),
+        "pd_tint": (None, [pointer, integer, integer, pointer, pointer, long]),
         "pd_ramp": (None, [pointer, *[integer] * 8, pointer, pointer, pointer, long]),
         "pd_channels": (None, [pointer, integer, pointer, pointer, pointer, long]),
         "pd_planes": (None, [pointer, integer, pointer, pointer, long]),

@@ -152,6 +152,39 @@ API void pd_ramp(const void* batch, int slot, int bits, int id, int is_real, int
   }
 }
 
+// Cells in pictures, tinted by vectors: toward a color in 0..1, by the length / `full`, at most by `most`. `numbers` has the
+// color, `full` and `most`. As `tint_cells` in simulation/draw.py, operation by operation.
+API void pd_tint(const void* batch, int row, int column, const float* numbers, uint8_t* data, int64_t apart) {
+  const Batch& b = *(const Batch*)batch;
+  const Grid& g = b.g;
+  const F full = splatf(numbers[3]), most = splatf(numbers[4]);
+  float shares[256];
+  for (int i = 0; i < 256; i++) shares[i] = (float)i / 255.f;
+  const std::vector<float> nothing(g.stride + CHUNK, 0.f);
+  for (int lane = 0; lane < b.lanes(); lane++) {
+    const Field* parts[2] = {b.groups[lane / LANES].real[row], b.groups[lane / LANES].real[column]};
+    uint8_t* out = data + b.at(lane, apart, 3 * g.width);
+    for (int y = 0; y < g.height; y++, out += 3 * g.width) {
+      const size_t line = (size_t)(lane % LANES) * g.height + y;
+      const float* in[2];
+      for (int k = 0; k < 2; k++) in[k] = parts[k]->live[line] ? parts[k]->data + line * g.stride + HALO : nothing.data();
+      if (in[0] == in[1]) continue;  // both are zero
+      for (int x = 0; x < g.width; x += CHUNK) {
+        const F down = load(in[0], x), right = load(in[1], x);
+        const F share = smaller(root(down * down + right * right) / full, most), rest = 1.0f - share;
+        if (!bits_lt(splatf(0), share)) continue;
+        float tint[CHUNK], kept[CHUNK];
+        *(Fu*)tint = (Fu)share, *(Fu*)kept = (Fu)rest;
+        for (int i = 0; i < std::min(CHUNK, g.width - x); i++)
+          for (int c = 0; c < 3; c++) {
+            uint8_t& byte = out[3 * (x + i) + c];
+            byte = (uint8_t)((shares[byte] * kept[i] + tint[i] * numbers[c]) * 255.f);
+          }
+      }
+    }
+  }
+}
+
 // Channels of float32.
 struct Channel {
   int kind;  // 0 nothing, 1 cells of a number, 2 what a table says of a number, 3 a number, 4 a real
