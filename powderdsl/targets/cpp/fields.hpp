@@ -157,8 +157,9 @@ static bool no_rows_left(const Context& c, const Field* f) { return !memchr(f->l
 static void own(Context& c, Field*& f) {
   if (f != c.calm && f->refs == 1) return;
   Field* copy = take_field(c);
-  if (!f->still) memcpy(copy->data, f->data, field_size(c.g));
   memcpy(copy->live, f->live, LANES * c.g.height);
+  for (int line = 0; line < LANES * c.g.height && !f->still; line++)
+    if (f->live[line]) copy_floats(c.g, row_of(c, *copy, line), row_of(c, *f, line));
   copy->still = f->still;
   give(c, f);
   f = copy;
