@@ -142,7 +142,12 @@ class _RowCutter(Cutter):
         self.ensure([part for out in masks.outs for part in self.shared_parts(out.value)], place)
         # A mask may be known by another name, or be such a part itself.
         self.alias({out.var.name: self.variable(out.value) for out in masks.outs if self.have(out.value)})
-        outs = [out for out in masks.outs if out.var.name not in self.same]
+        firsts: dict[int, Out] = {}
+        for out in masks.outs:
+            first = firsts.setdefault(id(out.value), out)
+            if first is not out and out.var.name not in self.same:
+                self.alias({out.var.name: load(self.graph, first.var)})
+        outs = [out for out in firsts.values() if out.var.name not in self.same]
         split = {id(out): self.split(out.value) for out in outs}
         if any(rest for _, rest in split.values()) and all(cheap for cheap, _ in split.values()):
             self.in_two(outs, split, masks, guard)
