@@ -195,8 +195,15 @@ def compositions() -> list[str]:
         for path, decl in found.items()
     }
 
+    provides = {
+        path.stem: [word.text for word in decl.provides] if isinstance(decl, PackDecl) else []
+        for path, decl in found.items()
+    }
+
     def before(name: str) -> list[str]:
-        return [*dict.fromkeys(one for need in needs[name] for one in (*before(need), need))]
+        first = dict.fromkeys(one for need in needs[name] for one in (*before(need), need))
+        provided = [other for one in first for other in provides[one]]
+        return [one for one in first if one not in provided]
 
     rules = []
     for path in files:

@@ -61,15 +61,22 @@ def seeded_ruleset(seed: int) -> Ruleset | None:
 
 
 def compositions() -> list[str]:
-    """Everything shipped, as it can be loaded: rulesets, and packs with what they need."""
+    """Everything shipped, as it can be loaded: rulesets, and packs with what they need, unless another one provides it."""
+
+    def listed(name: str, key: str) -> list[str]:
+        text = (shipped("rules") / f"{name}.yaml").read_text(encoding="utf-8")
+        line = next((line for line in text.splitlines() if line.startswith(f"{key}:")), "")
+        return line.removeprefix(f"{key}:").replace("[", " ").replace("]", " ").replace(",", " ").split()
 
     def with_needs(name: str) -> list[str]:
-        text = (shipped("rules") / f"{name}.yaml").read_text(encoding="utf-8")
-        needs = next((line for line in text.splitlines() if line.startswith("needs:")), "")
-        words = needs.removeprefix("needs:").replace("[", " ").replace("]", " ").replace(",", " ").split()
-        return [*(one for word in words for one in with_needs(word)), name]
+        return [*(one for word in listed(name, "needs") for one in with_needs(word)), name]
 
-    return ["+".join(dict.fromkeys(with_needs(name))) for name in shipped_rules()]
+    def loaded(name: str) -> list[str]:
+        names = list(dict.fromkeys(with_needs(name)))
+        provided = [other for one in names for other in listed(one, "provides")]
+        return [one for one in names if one not in provided]
+
+    return ["+".join(loaded(name)) for name in shipped_rules()]
 
 
 @pytest.mark.parametrize("name", compositions())
