@@ -7,9 +7,7 @@ random numbers, the engine must have the ids of the same rules with its defects.
 
 from __future__ import annotations
 
-import statistics
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -17,6 +15,7 @@ import torch
 
 from powderdsl.experiments.bench.plan import make_plan, start_worlds
 from tests.bench.beside_engine import State, load, stepped
+from tests.bench.rounds import microseconds
 from tests.recordings import STREAMS
 from tests.semantics.test_second_recordings import RECORDINGS, Runner, compiled, read_recording
 
@@ -68,19 +67,6 @@ def differing(like: Runner, state: State) -> int:
     return found
 
 
-def microseconds(makers: dict[str, Callable[[], Callable[[int], object]]]) -> dict[str, float]:
-    """Processor time of a step of one world: medians of some rounds. What prepares a call is not timed."""
-    found: dict[str, list[float]] = {name: [] for name in makers}
-    for number in range(ROUNDS + 1):  # the first round compiles
-        for name, make in makers.items():
-            run = make()
-            begun = time.process_time()
-            run(STEPS)
-            if number:
-                found[name].append((time.process_time() - begun) / STEPS / WORLDS)
-    return {name: 1e6 * statistics.median(seconds) for name, seconds in found.items()}
-
-
 def main() -> None:
     torch.set_num_threads(1)
     for rules, (defects, elements) in RULES.items():
@@ -93,7 +79,7 @@ def main() -> None:
                 makers[one.backend] = lambda sim=one.simulator, start=start: (
                     lambda steps: sim.step(start, steps)
                 )
-            engine, *spent = microseconds(makers).values()
+            engine, *spent = microseconds(makers, WORLDS, STEPS, ROUNDS).values()
             times = ", ".join(
                 f"{name} {ours:.1f} µs ({engine / ours:.0f}×)"
                 for name, ours in zip(BACKENDS, spent, strict=True)

@@ -1,15 +1,9 @@
-"""A step of worlds in the middle of play, beside OGBench's own simulator: `python tests/bench/ogbench_worlds.py`.
+"""A step of worlds in the middle of play, beside OGBench's own simulator: `python -m tests.bench.ogbench_worlds`.
 
 Needs `pip install --no-deps ogbench tqdm`. Worlds are those after 150 whole actions of scripted play, one thread.
 """
 
 from __future__ import annotations
-
-import statistics
-import sys
-import time
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -17,12 +11,13 @@ import torch
 from powderdsl.ogbench.env import made_program
 from powderdsl.ogbench.play import play
 from powderdsl.simulation.simulator import World
-
-sys.path.insert(0, str(Path(__file__).parent))
-from beside_ogbench import load
+from tests.bench.beside_ogbench import load
+from tests.bench.rounds import Maker, microseconds
 
 PLAYED = 150
 """Whole actions before the worlds are measured."""
+STEPS, ROUNDS = {"wasm": 16, "native": 32}, 7
+"""Steps of a call, and rounds in which all run one after the other."""
 
 
 def played(level: str, worlds: int, backend: str) -> World:
@@ -34,33 +29,23 @@ def played(level: str, worlds: int, backend: str) -> World:
     return world
 
 
-def microseconds(run: Callable[[int], object], steps: int, worlds: int, rounds: int = 5) -> float:
-    """Processor time of a step of one world: the median of some rounds."""
-    run(1)
-    found = []
-    for _ in range(rounds):
-        begun = time.process_time()
-        run(steps)
-        found.append((time.process_time() - begun) / steps / worlds)
-    return 1e6 * statistics.median(found)
-
-
 def main() -> None:
     torch.set_num_threads(1)
     for level in ("easy", "medium", "hard"):
         for worlds in (32, 256):
-            spent, state = {}, {}
-            for backend in ("wasm", "native"):
+            makers: dict[str, Maker] = {}
+            for backend in STEPS:
                 world = played(level, worlds, backend)
-                state = {name: value.numpy().copy() for name, value in world.state.items()}
-                spent[backend] = microseconds(
-                    lambda steps, world=world: world.sim.step(world, steps), 16, worlds
-                )
-            theirs = microseconds(load(state), 2, worlds, rounds=3)
+                makers[backend] = lambda world=world: lambda steps: world.sim.step(world, steps)
+            state = {name: value.numpy().copy() for name, value in world.state.items()}
+            makers["OGBench"] = lambda state=state: load(state)
+            spent = microseconds(makers, worlds, {**STEPS, "OGBench": 2}, ROUNDS)
+            theirs = spent.pop("OGBench")
             moving = (np.abs(state["velocity"]).max(1) > 0).mean()
             shown = ", ".join(f"{name} {us:.1f} µs ({theirs / us:.0f}×)" for name, us in spent.items())
             print(
-                f"{level}, {worlds} worlds, {moving:.0%} of cells in motion: OGBench {theirs:.0f} µs, {shown}"
+                f"{level}, {worlds} worlds, {moving:.0%} of cells in motion: OGBench {theirs:.0f} µs, {shown}",
+                flush=True,
             )
 
 
