@@ -191,6 +191,7 @@ template <int COUNT> OUTLINE void swap_fields(Context& c, const Plane* movers, i
   }
   if (!count) return;
   const int words = c.g.words, width = c.g.width, height = c.g.height, *lines = c.lines.data() + HALO;
+  const u32 inner = (u32)std::max(0, width - 2 * REACH);
   for (int y = 0; y < height; y++) {
     V some = splat(0);
     for (int w = 0; w < words; w++) some |= movers->data[y * words + w];
@@ -199,6 +200,7 @@ template <int COUNT> OUTLINE void swap_fields(Context& c, const Plane* movers, i
       if (l >= c.lanes) break;
       const int line = l * height + y, base = c.g.strips ? 0 : l * height, there = base + lines[line - base + dy];
       float *from[COUNT], *to[COUNT];
+      bool edge = false;  // whether the halos change
       int n = 0;
       for (int k = 0; k < count; k++) {
         Field& f = *moved[k];
@@ -206,6 +208,7 @@ template <int COUNT> OUTLINE void swap_fields(Context& c, const Plane* movers, i
         from[n] = row_of(c, f, line), to[n] = row_of(c, f, there);
         if (!f.live[line]) std::fill_n(from[n], width, 0.f);
         if (!f.live[there]) std::fill_n(to[n], width, 0.f);
+        edge |= !f.live[line] || !f.live[there];
         f.live[line] = f.live[there] = 1;
         n++;
       }
@@ -214,9 +217,10 @@ template <int COUNT> OUTLINE void swap_fields(Context& c, const Plane* movers, i
           const int x = BITS * w + __builtin_ctzll(left);
           int other = x + c.turn(dx);
           other -= other >= width ? width : 0;
+          edge |= (u32)(x - REACH) >= inner || (u32)(other - REACH) >= inner;
           for (int k = 0; k < n; k++) std::swap(from[k][x], to[k][other]);
         }
-      for (int k = 0; k < n; k++) {
+      for (int k = 0; k < n && edge; k++) {
         finish_row(c, from[k]);
         if (there != line) finish_row(c, to[k]);
       }
