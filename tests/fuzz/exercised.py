@@ -44,7 +44,8 @@ NOT_RUN = {
         "side_multiple",
     },  # how packs meet is decided before the IR
     "element": {"glyph", "about", "override", "color_by"},
-    **{context: {"about"} for context in ("property", "field", "stream", "param")},
+    **{context: {"about"} for context in ("property", "stream", "param")},
+    "field": {"about", "tint"},
     "pass": {"about", "override"},
 }
 """Keys that say nothing about what a step does."""
