@@ -15,7 +15,7 @@ from PIL import Image
 
 from powderdsl.diagnostics import CompileError
 from powderdsl.simulation import media
-from powderdsl.simulation.draw import palette, rgb, scale
+from powderdsl.simulation.draw import CellTint, palette, rgb, scale
 from powderdsl.simulation.media import write_gif, write_mp4, write_png
 from powderdsl.system.writing import replacing
 from tests.unit.elements import ELEMENTS
@@ -71,7 +71,9 @@ def test_gif_keeps_exactly_256_colors_and_comes_close_with_more(tmp_path):
     write_gif(tmp_path / "x.gif", [frame])
     assert np.array_equal(gif_frames(tmp_path / "x.gif")[0], frame)
     ids = np.random.default_rng(0).integers(0, 14, (32, 32))
-    tinted = rgb(ids, COLORS, np.random.default_rng(1).uniform(-1, 1, (2, 32, 32)))
+    wind = np.random.default_rng(1).uniform(-1, 1, (2, 32, 32))
+    tint = CellTint("wind", (0.8, 0.4, 0.4), 2, 0.5)
+    tinted = rgb(ids, COLORS, tints=[tint], fields={"wind": wind})
     assert len(np.unique(tinted.reshape(-1, 3), axis=0)) > 256
     write_gif(tmp_path / "y.gif", [tinted])
     assert np.abs(gif_frames(tmp_path / "y.gif")[0].astype(int) - tinted).mean() < 6
