@@ -13,6 +13,7 @@ from powderdsl.schedule.types import (
     Statement,
     Sweeps,
     flat,
+    is_zero,
     loaded,
     map_blocks,
     over_variables,
@@ -89,7 +90,9 @@ def _continued(first: Compute, second: Compute, reads: dict[str, int], graph: Gr
     if first.over != "choices" or first.region is None or second.region is None:
         return None
     asked = list(loaded([second.region]))
-    if any(out.var.type != REAL or not _is_zero(out.otherwise) for out in second.outs):
+    if any(
+        out.var.type != REAL or out.otherwise is None or not is_zero(out.otherwise) for out in second.outs
+    ):
         return None
     nodes = ordered(out.value for out in second.outs)
     names = [str(node.attr) for node in nodes if node.op == "load"]
@@ -133,10 +136,6 @@ def _components(run: Sequence[Compute]) -> list[list[Compute]]:
     order = {id(loop): number for number, loop in enumerate(run)}
     parts = [sorted(loops, key=lambda loop: order[id(loop)]) for _, loops in found]
     return sorted(parts, key=lambda loops: order[id(loops[0])])
-
-
-def _is_zero(node: Node | None) -> bool:
-    return node is not None and node.op == "const" and not node.attr
 
 
 def _joined(run: Sequence[Compute], reads: dict[str, int]) -> Sweeps:

@@ -21,6 +21,7 @@ from powderdsl.schedule.types import (
     in_order,
     load,
     map_computes,
+    planes_at_neighbors,
     rewritten,
     values_of,
 )
@@ -49,13 +50,7 @@ def _where_read(schedule: Schedule) -> Schedule:
     """
     graph = schedule.graph
     statements = list(flat(schedule.body))
-    shifted = {
-        out.var.name: (str(out.value.args[0].attr), out.value.attr)
-        for one in statements
-        if isinstance(one, Compute)
-        for out in one.outs
-        if out.value.op == "shift" and out.value.args[0].op == "load"
-    }
+    shifted = planes_at_neighbors(schedule)
     asking: dict[str, set[str]] = {}  # by field: the flags that hold wherever it is read
     roots = [node for one in statements for node in values_of(one)] + [node for _, node in schedule.leaves]
     for name, where, masks in _field_reads(roots):

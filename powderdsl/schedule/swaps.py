@@ -17,8 +17,10 @@ from powderdsl.schedule.types import (
     Statement,
     combined,
     flat,
+    is_zero,
     load,
     map_computes,
+    planes_at_neighbors,
 )
 
 
@@ -53,13 +55,7 @@ def swaps(schedule: Schedule) -> Schedule:
     }
     if not offsets:
         return schedule
-    shifted = {
-        out.var.name: (str(out.value.args[0].attr), out.value.attr)
-        for one in flat(schedule.body)
-        if isinstance(one, Compute)
-        for out in one.outs
-        if out.value.op == "shift" and out.value.args[0].op == "load"
-    }
+    shifted = planes_at_neighbors(schedule)
     slots = {str(node.attr): slot for slot, node in schedule.leaves if node.op == "load"}
     settled = {var.name: slot for slot, var in schedule.finds if var.type == REAL}
     """Fields that hold values of a slot, with the slot."""
@@ -102,7 +98,7 @@ def _swap(
     """The swap whose result a value is. Movers come before or after their targets: no cell is both."""
     value = out.value.args[0] if out.value.op == "settle" else out.value
     fresh: list[tuple[Node, Node]] = []
-    while value.op == "select" and value.args[0].op == "load" and _is_zero(value.args[1]):
+    while value.op == "select" and value.args[0].op == "load" and is_zero(value.args[1]):
         fresh.insert(0, (value.args[0], value.args[1]))
         value = value.args[2]
     if value.op != "select" or value.args[2].op != "select":
@@ -126,7 +122,3 @@ def _swap(
 
 def _reads(value: Node, field: Node, where: tuple[int, int, bool]) -> bool:
     return value.op == "shift" and value.args[0] is field and value.attr == where
-
-
-def _is_zero(value: Node) -> bool:
-    return value.op == "const" and not value.attr

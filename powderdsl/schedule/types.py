@@ -158,6 +158,11 @@ def load(graph: Graph, var: Var) -> Node:
     return graph.node("load", var.type, (), var.name)
 
 
+def is_zero(value: Node) -> bool:
+    """Whether a value is the constant 0."""
+    return value.op == "const" and not value.attr
+
+
 def loaded(nodes: Iterable[Node]) -> Iterator[str]:
     """The names of the variables that values read, with repetitions."""
     for node in nodes:
@@ -280,6 +285,17 @@ def flat(body: Iterable[Statement]) -> Iterator[Statement]:
             yield from flat(statement.otherwise)
 
 
+def planes_at_neighbors(schedule: Schedule) -> dict[str, tuple[str, tuple[int, int, bool]]]:
+    """The variables that are another one, read at a neighbor: by name, the other one and where it is read."""
+    return {
+        out.var.name: (str(out.value.args[0].attr), out.value.attr)
+        for one in flat(schedule.body)
+        if isinstance(one, Compute)
+        for out in one.outs
+        if out.value.op == "shift" and out.value.args[0].op == "load"
+    }
+
+
 def in_order(names: Iterable[str]) -> list[str]:
     """Names of variables sorted by number, so that no order of a set reaches a schedule."""
     return sorted(sorted(names), key=lambda name: int(name[1:]))
@@ -331,6 +347,6 @@ class Namer:
 __all__ = [
     "ANSWER", "FLAG", "REAL",
     "Carried", "Compute", "Forget", "Guard", "Move", "Namer", "Out", "Release", "Schedule", "Statement", "Sweeps", "Sync", "Var",
-    "combined", "conjuncts", "defined_by", "flat", "in_order", "is_movement", "load", "loaded", "map_blocks", "map_computes", "ordered",
-    "over_variables", "read_elsewhere", "rewritten", "values_of", "variables", "with_args",
+    "combined", "conjuncts", "defined_by", "flat", "in_order", "is_movement", "is_zero", "load", "loaded", "map_blocks", "map_computes", "ordered",
+    "over_variables", "planes_at_neighbors", "read_elsewhere", "rewritten", "values_of", "variables", "with_args",
 ]  # fmt: skip

@@ -8,7 +8,7 @@ from types import MappingProxyType
 
 from powderdsl.ir.ops import REAL, Node, ordered
 from powderdsl.schedule.join import field_reads, keeps
-from powderdsl.schedule.types import Compute, Guard, Out, Schedule, Sweeps, flat, values_of
+from powderdsl.schedule.types import Compute, Guard, Out, Schedule, Sweeps, flat, is_zero, values_of
 from powderdsl.targets.cpp.chunks import Chunks
 from powderdsl.targets.layout import Layout
 from powderdsl.targets.values import chains_of
@@ -446,7 +446,7 @@ class _Loop:
     def only_moves(self) -> bool:
         """Whether all choices are values of fields in other places: they are zero where these fields are."""
         values = [choice.args[1] for chain in self.chains for choice in chain]
-        return all(node.op in ("shift", "load") or _is_zero(node) for node in ordered(values))
+        return all(node.op in ("shift", "load") or is_zero(node) for node in ordered(values))
 
     def alive(self, name: str) -> str:
         return (
@@ -454,10 +454,6 @@ class _Loop:
             if name in self.waiting
             else f"{name}->live[base + y]"
         )
-
-
-def _is_zero(value: Node) -> bool:
-    return value.op == "const" and not value.attr
 
 
 PLACE = (
