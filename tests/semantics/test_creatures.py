@@ -23,7 +23,7 @@ from powderdsl.worlds.scene import load_start
 PAGE = Path(__file__).parents[2] / "docs" / "creatures.md"
 CREATURES = ("fish", "bird", "kangaroo", "mole", "lemming", "snake", "robot")
 LIGHT = {"empty", "water", "gas", "fire", "acid", "dust"}
-"""What moves out of the way and is no heavier than a fish."""
+"""What moves out of the way and is at most as heavy as a fish."""
 
 backends = pytest.mark.parametrize("backend", ["reference", "wasm"])
 both_worlds = pytest.mark.parametrize(
