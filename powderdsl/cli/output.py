@@ -1,17 +1,18 @@
-"""What commands print: diagnostics, JSON, tables, and progress."""
+"""What commands print: diagnostics, JSON, and progress."""
 
 from __future__ import annotations
 
 import os
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import IO, TYPE_CHECKING, Any, Protocol
 
 import click
 
 from powderdsl.diagnostics.printable import printable, printable_streams, unguarded, write_styled
+from powderdsl.system.reports import as_json
 
 if TYPE_CHECKING:
     from powderdsl.diagnostics import Diagnostic
@@ -31,46 +32,13 @@ def write_diagnostics(diagnostics: Iterable[Diagnostic], stream: IO[str]) -> Non
 
 
 def print_json(value: Any) -> None:
-    """Print a value as indented JSON."""
-    import json
-
-    click.echo(json.dumps(value, indent=2, ensure_ascii=False))
+    """Print a value as indented JSON; dataclasses are objects (`system.reports.as_json`)."""
+    click.echo(as_json(value))
 
 
 def counted(number: int, thing: str) -> str:
     """`no errors`, `1 error`, `2 errors`."""
     return f"{number or 'no'} {thing}{'' if number == 1 else 's'}"
-
-
-# Tables
-
-
-class Painted(str):
-    """A cell with our own colors; in other cells, terminal codes are escaped."""
-
-
-def table(rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    """Lines with aligned columns, the first row as heading; numbers are aligned to the right."""
-    if len(rows) < 2:
-        yield "  none"
-        return
-    rows = [[cell if isinstance(cell, Painted) else printable(cell) for cell in row] for row in rows]
-    widths = [max(_width(row[i]) for row in rows) for i in range(len(rows[0]))]
-    right = [all(_bare(row[i]).isdigit() for row in rows[1:]) for i in range(len(rows[0]))]
-    for row in rows:
-        cells = []
-        for cell, width, to_right in zip(row, widths, right, strict=True):
-            gap = " " * (width - _width(cell))
-            cells.append(gap + cell if to_right else cell + gap)
-        yield ("  " + "  ".join(cells)).rstrip()
-
-
-def _bare(cell: str) -> str:
-    return click.unstyle(cell)
-
-
-def _width(cell: str) -> int:
-    return len(_bare(cell))
 
 
 # Progress

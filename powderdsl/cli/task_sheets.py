@@ -14,9 +14,10 @@ import numpy as np
 
 from powderdsl.cli.exits import BadInput
 from powderdsl.cli.options import check_writable
-from powderdsl.cli.output import print_json, table
+from powderdsl.cli.output import print_json
 from powderdsl.cli.pictures import MAX_SIDE, USUAL_SIDE
 from powderdsl.simulation.draw import OUTLINES, contact_sheet, outline, scale
+from powderdsl.system.reports import table
 from powderdsl.tasks.shipped import check_split, is_task, load_task
 from powderdsl.tasks.task import BLOW, Agent, Task
 

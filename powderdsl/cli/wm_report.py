@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from powderdsl.cli.exits import BadInput
-from powderdsl.cli.output import table
+from powderdsl.system.reports import table
 
 if TYPE_CHECKING:
     from powderdsl.experiments.runs import RunFolder

@@ -13,7 +13,7 @@ from powderdsl.experiments.bench import make_plan, measure, report_data, report_
 from powderdsl.experiments.bench.machine import Machine, Memory, peak_growth
 from powderdsl.experiments.bench.measure import interleaved, measuring
 from powderdsl.experiments.bench.plan import start_worlds
-from powderdsl.experiments.bench.report import CellFigures, aligned, make_report, number
+from powderdsl.experiments.bench.report import CellFigures, make_report, number
 from powderdsl.model.state import slots
 from powderdsl.targets.cpp.build import Building, building
 
@@ -193,10 +193,6 @@ def test_the_table_has_a_line_a_cell(report):
     assert "elements" in table.splitlines()[0]
     assert "threads" not in table.splitlines()[0]  # only one number of them was asked for
     assert report.machine.processor in text
-
-
-def test_columns_are_aligned():
-    assert aligned([["a", "one"], ["bcd", "2"]]) == "a    one\nbcd    2"
 
 
 @pytest.mark.parametrize(

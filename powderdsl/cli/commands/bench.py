@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from powderdsl.experiments.bench.plot import require_matplotlib, write_plot
 from powderdsl.experiments.bench.programs import read_program
 from powderdsl.experiments.bench.report import CellFigures, Report, make_report, report_data, report_text
 from powderdsl.model.state import fitting
+from powderdsl.system.reports import as_json
 from powderdsl.system.writing import write_text
 from powderdsl.targets.cpp.compilers import NoCompiler, find_compiler
 
@@ -65,7 +65,7 @@ EPILOG = "\b\nWorkloads:\n" + "\n".join(f"  {name:<7} {about}" for name, about i
 @opt.integer("--seed", 0, 2**63 - 1, "Seed of the start worlds.", 0)
 @opt.parameters
 @opt.flag("--profile", "Also measure the time of each pass.")
-@opt.flag("--json", "Print one JSON object instead of tables.", to="as_json")
+@opt.flag("--json", "Print one JSON object instead of tables.", to="printed")
 @opt.path("--out", "FILE.json", "Also write the JSON object to this file.", to="data")
 @opt.path("--plot", "FILE.png", "Plot rates against batch sizes. Needs matplotlib.")
 def command(
@@ -75,7 +75,7 @@ def command(
     device: str,
     settings: dict[str, str],
     programs: tuple[Path, ...],
-    as_json: bool,
+    printed: bool,
     data: Path | None,
     plot: Path | None,
     **asked: Any,
@@ -102,13 +102,12 @@ def command(
         )
     with user_values() if plan.programs else nullcontext():
         report, interrupt = _measured(plan)
-    if as_json:
+    if printed:
         print_json(report_data(report))
     else:
         click.echo(report_text(report))
     if data is not None:
-        text = json.dumps(report_data(report), indent=2, ensure_ascii=False)
-        write_text(data, f"{text}\n", follow=True)
+        write_text(data, f"{as_json(report_data(report))}\n", follow=True)
     if plot is not None and report.cells:
         write_plot(plot, report)
     if interrupt is not None:

@@ -14,11 +14,12 @@ from powderdsl.analysis.ledger import Ledger
 from powderdsl.analysis.ledger import ledger as make_ledger
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BAD_INPUT, FAILED, OK
-from powderdsl.cli.output import counted, print_json, table, write_diagnostics
+from powderdsl.cli.output import counted, print_json, write_diagnostics
 from powderdsl.compiler import load_with_diagnostics, lower
 from powderdsl.diagnostics import CompileError, Diagnostic, Severity
 from powderdsl.diagnostics.render import diagnostic_data, render_json, render_short
 from powderdsl.model.types import Ruleset
+from powderdsl.system.reports import table
 from powderdsl.tasks.shipped import is_task
 
 if TYPE_CHECKING:

@@ -10,8 +10,9 @@ import click
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import user_values
 from powderdsl.cli.options import check_writable
-from powderdsl.cli.output import print_json, table
+from powderdsl.cli.output import print_json
 from powderdsl.cli.task_sheets import find_played
+from powderdsl.system.reports import table
 from powderdsl.tasks.task import Task
 
 if TYPE_CHECKING:

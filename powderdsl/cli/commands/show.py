@@ -13,11 +13,12 @@ from powderdsl.analysis.reactions import reactions
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput
 from powderdsl.cli.options import load_rules
-from powderdsl.cli.output import Painted, color_wanted, print_json, table
+from powderdsl.cli.output import color_wanted, print_json
 from powderdsl.diagnostics import Span
 from powderdsl.diagnostics.printable import printable, write_styled
 from powderdsl.model.text import element_name, one_line, place_of, show_set, show_value
 from powderdsl.model.types import Element, Pass, Property, Ruleset, Value
+from powderdsl.system.reports import Painted, table
 from powderdsl.tasks.shipped import is_task
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from powderdsl.experiments.bench.machine import Machine, Memory
 from powderdsl.experiments.bench.plan import WORKLOADS, Cell, Plan
+from powderdsl.system.reports import table
 
 FORMAT_VERSION = 1
 """Version of `report_data`, increased when a key changes its meaning."""
@@ -243,7 +244,8 @@ def cell_table(cells: Sequence[CellFigures], programs: Sequence[str] = ()) -> st
         ("state", lambda one: f"{one.state_bytes / one.cell.cells:.3g} B/cell"),
         *((f"÷ {name}", partial(_times, cells, name)) for name in programs),
     ]
-    return aligned([[name for name, _ in columns], *([show(one) for _, show in columns] for one in cells)])
+    rows = [[name for name, _ in columns], *([show(one) for _, show in columns] for one in cells)]
+    return "\n".join(table(rows, indent=""))
 
 
 def ratio(figures: CellFigures, cells: Iterable[CellFigures], backend: str) -> float | None:
@@ -275,7 +277,7 @@ def pass_table(cells: Sequence[CellFigures]) -> str:
     rows.append(["whole step", *(f"{number(seconds * 1e6)}     " for seconds in whole)])
     busy = [figures.processor_step_seconds.median for figures in profiled]
     rows.append(["of that, processor time", *(f"{number(seconds * 1e6)}     " for seconds in busy)])
-    return aligned(rows)
+    return "\n".join(table(rows, indent=""))
 
 
 def label(cell: Cell, among: Sequence[CellFigures]) -> str:
@@ -284,16 +286,6 @@ def label(cell: Cell, among: Sequence[CellFigures]) -> str:
     if len({one.cell.size for one in among}) > 1:
         words.append(f"{cell.size[0]}×{cell.size[1]}")
     return " ".join([*words, *extra_words(cell, among)])
-
-
-def aligned(rows: Sequence[Sequence[str]]) -> str:
-    """Columns of equal width, the first to the left, the others to the right; two spaces between columns."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = []
-    for first, *others in rows:
-        to_right = [text.rjust(width) for text, width in zip(others, widths[1:], strict=True)]
-        lines.append("  ".join([first.ljust(widths[0]), *to_right]).rstrip())
-    return "\n".join(lines)
 
 
 def number(value: float) -> str:
