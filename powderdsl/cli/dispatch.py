@@ -76,12 +76,10 @@ class GuardedCommand(click.Command):
         warnings.formatwarning = plain_warning
         if os.environ.pop(LIFELINE, None):
             end_with_stdin()
-        # Without arguments of a caller's, the command is all that this process does.
-        with printable_streams(), interruptible(until_exit=args is None) as over:
+        with printable_streams(), interruptible():
             try:
                 status = super().main(args, prog_name or self.name, *rest, **options)
             except (Exception, KeyboardInterrupt) as error:
-                over()
                 status = report_failure(error)
         sys.exit(status or 0)
 

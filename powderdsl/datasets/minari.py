@@ -36,8 +36,7 @@ from powderdsl.envs.actions import KINDS, ActionForm, action_form
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.system.reading import check_links, parse_json, read_bytes
-from powderdsl.system.scratch import scratch_folder
-from powderdsl.system.writing import failure, not_writable
+from powderdsl.system.writing import failure, not_writable, scratch_folder
 from powderdsl.tasks.episodes import TaskProgram
 from powderdsl.tasks.shipped import load_task, shipped_tasks
 from powderdsl.tasks.task import Task

@@ -12,7 +12,6 @@ from typing import Any
 
 from powderdsl.arrays import NDArray, np
 from powderdsl.simulation.draw import to_numpy
-from powderdsl.system.interrupts import held_back
 from powderdsl.system.packages import pillow
 from powderdsl.system.writing import failure, replacing
 
@@ -85,8 +84,7 @@ def _encode(command: list[str], frames: Iterable[NDArray[np.uint8]]) -> None:
         encoder = None
         try:
             # A session of its own: Ctrl-C reaches us alone, and we end the encoder.
-            with held_back():
-                encoder = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log, start_new_session=True)
+            encoder = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log, start_new_session=True)
             assert encoder.stdin is not None
             with suppress(BrokenPipeError), encoder.stdin as pipe:  # the encoder died: its words say why
                 for frame in frames:

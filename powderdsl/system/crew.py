@@ -16,8 +16,6 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any
 
-from powderdsl.system.interrupts import held_back
-
 Tell = Callable[[Any], None]
 Work = Callable[[Any, Tell], Any]
 """What a process does with a task: returns a result, and may report how far it is. Must be importable by name."""
@@ -66,8 +64,7 @@ def work_through(
         while tasks or any(worker.busy for worker in workers):
             workers = [worker for worker in workers if worker.process.is_alive() or worker.busy]
             while len(workers) < jobs and len(tasks) > sum(not worker.busy for worker in workers):
-                with held_back():  # a process that is half begun would complain, and nobody would end it
-                    workers.append(_start(work))
+                workers.append(_start(work))
             for worker in workers:
                 if tasks and not worker.busy:
                     _give(worker, tasks.popleft())

@@ -8,12 +8,10 @@ from __future__ import annotations
 
 import os
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from types import FrameType
 from typing import Any
 
@@ -22,13 +20,15 @@ SIGNALS = tuple(
 )  # Windows has no SIGHUP
 
 REPEATED = 2.0
-"""Seconds in which the same signal counts once: `timeout` sends two, a service manager one to each process."""
+"""Seconds in which the same SIGTERM or SIGHUP counts once: `timeout` sends two."""
 
 LIFELINE = "POWDERDSL_LIFELINE"
 """Environment variable of processes that end when their stdin is closed: whoever holds the other end started them."""
 
 GRACE = 30.0
 """Seconds that such a process has for its last checkpoint."""
+
+Handler = Callable[[int, FrameType | None], None]
 
 
 class Terminated(KeyboardInterrupt):
@@ -39,69 +39,36 @@ class Terminated(KeyboardInterrupt):
         self.number = number
 
 
-@dataclass
-class _State:
-    """The signals so far. `held`: the number of open `held_back` blocks; `pending`: the signal that came in them."""
-
-    last: int = 0
-    when: float = -1e9
-    held: int = 0
-    pending: int = 0
-    ending: bool = False
-
-
-_state = _State()
-
-
 @contextmanager
-def interruptible(*, until_exit: bool = False) -> Iterator[Callable[[], None]]:
-    """Turn signals into exceptions in the main thread, unless somebody else handles or ignores them.
+def interruptible() -> Iterator[None]:
+    """Raise Terminated in the main thread for SIGTERM and SIGHUP, unless somebody else handles or ignores them."""
 
-    Yields a function to call when the work is over and only its end is left to be reported.
+    def terminate(number: int, frame: FrameType | None) -> None:
+        raise Terminated(number)
 
-    Args:
-        until_exit: the process ends after the block. Signals that come when the work is over are ignored; a second one
-            ends the process at once.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield lambda: None
-        return
-    _state.last, _state.when = 0, -1e9
-    before = _installed(SIGNALS)
-    hook, sys.unraisablehook = sys.unraisablehook, _redeliver(sys.unraisablehook)
-
-    def over() -> None:
-        _state.ending = until_exit
-
-    try:
-        yield over
-    finally:
-        over()
-        if not until_exit:
-            sys.unraisablehook = hook
-            _restore(before)
+    with _handled(_once(terminate), lambda usual: usual == signal.SIG_DFL):
+        yield
 
 
 @contextmanager
 def held_back() -> Iterator[Callable[[], bool]]:
-    """Hold signals back until the end of the block, which raises then; a second signal is not held back.
+    """Hold the first signal back until the end of the block, which raises then; a second one raises at once.
 
-    Yields a function that says whether one has come. In threads other than the main one nothing is held back: signals
-    do not reach them.
+    Yields a function that says whether one has come. Threads other than the main one receive no signals.
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield lambda: False
-        return
-    before = _installed((signal.SIGINT,))  # where `interruptible` is not in use: Ctrl-C alone
-    _state.held += 1
-    try:
-        yield lambda: _state.pending != 0
-    finally:
-        _state.held -= 1
-        _restore(before)
-        if not _state.held and _state.pending:
-            number, _state.pending = _state.pending, 0
-            raise _exception(number)
+    pending: list[int] = []
+
+    def hold(number: int, frame: FrameType | None) -> None:
+        pending.append(number)
+        if len(pending) > 1:
+            usual[number](number, frame)
+
+    with _handled(_once(hold), callable) as usual:
+        try:
+            yield lambda: bool(pending)
+        finally:
+            if pending:
+                usual[pending[0]](pending[0], None)
 
 
 def end_with_stdin() -> None:
@@ -111,70 +78,34 @@ def end_with_stdin() -> None:
         while os.read(0, 1 << 10):
             pass
         os.kill(os.getpid(), signal.SIGTERM)
-        time.sleep(GRACE)
-        os.kill(os.getpid(), getattr(signal, "SIGKILL", signal.SIGTERM))
 
     threading.Thread(target=watch, daemon=True).start()
 
 
-def _installed(signals: tuple[int, ...]) -> dict[int, Any]:
-    """Install our handler for signals with default handlers; returns the previous handlers."""
-    usual = (signal.SIG_DFL, signal.default_int_handler)
-    before = {number: signal.getsignal(number) for number in signals if signal.getsignal(number) in usual}
-    for number in before:
-        signal.signal(number, _handle)
-    return before
+def _once(handler: Handler) -> Handler:
+    """A handler that ignores a SIGTERM or SIGHUP that comes again within REPEATED."""
+    last: dict[int, float] = {}
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        now = time.monotonic()
+        repeated = number != signal.SIGINT and now - last.get(number, -REPEATED) < REPEATED
+        last[number] = now
+        if not repeated:
+            handler(number, frame)
+
+    return handle
 
 
-def _restore(before: dict[int, Any]) -> None:
-    for number, handler in before.items():
+@contextmanager
+def _handled(handler: Handler, replaces: Callable[[Any], bool]) -> Iterator[dict[int, Any]]:
+    """Handle signals in place of the handlers that are to be replaced; yields these."""
+    in_main = threading.current_thread() is threading.main_thread()
+    before = {number: signal.getsignal(number) for number in SIGNALS if in_main}
+    replaced = {number: usual for number, usual in before.items() if replaces(usual)}
+    for number in replaced:
         signal.signal(number, handler)
-
-
-def _handle(number: int, frame: FrameType | None) -> None:
-    now = time.monotonic()
-    if number == _state.last != signal.SIGINT and now - _state.when < REPEATED:
-        return
-    first = not _state.last
-    _state.last, _state.when = number, now
-    if _state.ending:
-        if not first:
-            os._exit(128 + number)
-        return
-    if _state.held and not _state.pending:
-        _state.pending = number
-    elif _importing(frame):
-        _send_again(number)  # modules in C++, such as torch's, abort the process when an import raises
-    else:
-        raise _exception(number)
-
-
-def _importing(frame: FrameType | None) -> bool:
-    while frame is not None:
-        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
-            return True
-        frame = frame.f_back
-    return False
-
-
-def _send_again(number: int) -> None:
-    _state.last, _state.when = 0, -1e9
-    again = threading.Timer(0.02, os.kill, (os.getpid(), number))
-    again.daemon = True
-    again.start()
-
-
-def _exception(number: int) -> KeyboardInterrupt:
-    return KeyboardInterrupt() if number == signal.SIGINT else Terminated(number)
-
-
-def _redeliver(usual: Callable[[Any], Any]) -> Callable[[Any], None]:
-    """A hook for exceptions that cannot be raised, such as in `__del__`: a signal that came there is sent again."""
-
-    def hook(found: Any) -> None:
-        if not isinstance(found.exc_value, KeyboardInterrupt):
-            usual(found)
-            return
-        _send_again(found.exc_value.number if isinstance(found.exc_value, Terminated) else signal.SIGINT)
-
-    return hook
+    try:
+        yield replaced
+    finally:
+        for number, usual in replaced.items():
+            signal.signal(number, usual)

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory, mkstemp
 
 from powderdsl.diagnostics import CompileError, Diagnostic, Label
 from powderdsl.system.reading import refuse_irregular
-from powderdsl.system.scratch import scratch_file
+
+MARK = ".powderdsl-"
+"""What names of temporary files have in them."""
 
 
 def failure(
@@ -23,27 +26,41 @@ def failure(
 def replacing(path: Path, *, follow: bool = False) -> Iterator[Path]:
     """A temporary path beside `path`, with its suffix, that replaces it when the block succeeds.
 
-    When the block fails or is interrupted, nothing is left and an older file stays as it was. When the process is
-    killed, the next one that writes to the folder removes what is left. Raises CompileError (PD613) if the file cannot
-    be written.
+    When the block fails or is interrupted, nothing is left and an older file stays as it was. Raises CompileError (PD613)
+    if the file cannot be written.
 
     Args:
         follow: for paths that the user named: a link stays a link, and the file that it leads to is replaced. Otherwise
             the link itself is replaced, which may come from a stranger's folder.
     """
     target = destination(path, follow=follow)
-    with ExitStack() as stack:
-        try:
-            temporary = stack.enter_context(scratch_file(target))
-        except (OSError, ValueError) as error:
-            raise not_writable(path, error) from None
+    try:
+        handle, name = mkstemp(target.suffix, f".{target.stem[:40]}{MARK}", target.parent)
+    except (OSError, ValueError) as error:
+        raise not_writable(path, error) from None
+    os.close(handle)
+    temporary = Path(name)
+    try:
         yield temporary
-        # Scratch files are private to their owner; an ordinary new file follows the umask.
+        # Temporary files are private to their owner; an ordinary new file follows the umask.
         temporary.chmod(0o666 & ~_umask())
         try:
             os.replace(temporary, target)
         except OSError as error:
             raise not_writable(path, error) from None
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def scratch_folder(parent: Path) -> Iterator[Path]:
+    """An empty folder in `parent` that only its owner can read, removed at the end with all that it holds.
+
+    Raises:
+        OSError: it cannot be made there.
+    """
+    with TemporaryDirectory(prefix=MARK, dir=parent, ignore_cleanup_errors=True) as name:
+        yield Path(name)
 
 
 def write_text(path: Path, text: str, *, follow: bool = False) -> None:

@@ -3,7 +3,7 @@
 <key>/program, about.json    a library, and facts about it
 <key>.json                      the rest of a compiled program (`targets.cpp.code`)
 <key>.lock                      held by the process that compiles
-.powderdsl-…                    being added or removed: see `system.scratch`
+.powderdsl-…                    being added or removed
 """
 
 from __future__ import annotations
@@ -11,9 +11,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -23,19 +22,15 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from powderdsl.system.reading import read_bytes, read_json
-from powderdsl.system.scratch import is_scratch, scratch_file, scratch_folder, sweep
+from powderdsl.system.writing import scratch_folder
 
 LIBRARY, ABOUT = "program", "about.json"
-
-KEY = re.compile(r"[0-9A-Za-z_-]{1,64}")
-LATEST = 1e11
-"""Seconds since the epoch; a later time is an error."""
 
 LIMIT = 512 << 20
 """Bytes of libraries to keep; beyond that, those used longest ago are removed."""
 
 UNUSED = 24 * 3600.0
-"""Seconds after which a `<key>.json` without a library is removed; until then another process may add the library."""
+"""Seconds after which what is not part of a library is removed; until then another process may be at work on it."""
 
 PATIENCE = 120.0
 """Seconds to wait for another process that compiles the same source; after that both compile."""
@@ -68,29 +63,9 @@ class Entry:
         return max(0.0, time.time() - self.used)
 
 
-def _is_text(value: object) -> bool:
-    return isinstance(value, str) and len(value) <= 1000
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value <= LATEST
-
-
-_HOLDS: dict[str, Callable[[object], bool]] = {
-    "ruleset": _is_text,
-    "backend": _is_text,
-    "compiler": _is_text,
-    "created": _is_number,
-    "seconds": _is_number,
-    "size": lambda value: type(value) is int and 0 <= value <= LIMIT,
-    "sha256": lambda value: isinstance(value, str) and bool(re.fullmatch(r"[0-9a-f]{64}", value)),
-}
-"""The valid types of the fields of `About`."""
-
-
 def find(folder: Path, key: str) -> Path | None:
     """The library of a key, marked as used; None if it is missing or damaged."""
-    about = _about(folder / key) if KEY.fullmatch(key) else None
+    about = _about(folder / key)
     if about is None:
         return None
     library = folder / key / LIBRARY
@@ -98,7 +73,7 @@ def find(folder: Path, key: str) -> Path | None:
         data = read_bytes(library, LIMIT)
     except OSError:
         return None
-    if len(data) != about.size or hashlib.sha256(data).hexdigest() != about.sha256:
+    if hashlib.sha256(data).hexdigest() != about.sha256:
         return None
     with suppress(OSError):  # a cache that cannot be written is still a cache
         os.utime(folder / key / ABOUT)
@@ -116,7 +91,7 @@ def add(folder: Path, key: str, built: Path, about: dict[str, Any]) -> Path:
     """
     data = (built / LIBRARY).read_bytes()
     written = About(**about, size=len(data), sha256=hashlib.sha256(data).hexdigest())
-    (built / ABOUT).write_text(json.dumps(asdict(written)), encoding="utf-8")
+    (built / ABOUT).write_text(signed(asdict(written)), encoding="utf-8")
     for _ in range(3):
         try:
             os.rename(built, folder / key)
@@ -136,11 +111,10 @@ def entries(folder: Path) -> list[Entry]:
     """The libraries in the cache, most recently used first."""
     found = []
     for place in sorted(folder.iterdir()):
-        about = _about(place) if KEY.fullmatch(place.name) else None
+        about = _about(place)
         if about is not None:
             with suppress(OSError):
-                used = min(max((place / ABOUT).stat().st_mtime, 0.0), LATEST)
-                found.append(Entry(place.name, about, used))
+                found.append(Entry(place.name, about, (place / ABOUT).stat().st_mtime))
     return sorted(found, key=lambda entry: (-entry.used, entry.key))
 
 
@@ -152,45 +126,31 @@ def clear(folder: Path, older_than: float = 0.0) -> list[Entry]:
     if older_than <= 0:
         for place in sorted(folder.iterdir()):
             # A lock may be held, and a build in progress belongs to another process.
-            if place.suffix != ".lock" and not is_scratch(place.name):
+            if place.suffix != ".lock" and not place.name.startswith("."):
                 _discard(place)
     tidy(folder)
     return gone
 
 
 def tidy(folder: Path, limit: int = LIMIT, keep: str = "") -> None:
-    """Remove leftovers of killed processes and, beyond `limit` bytes, the libraries used longest ago, except `keep`."""
+    """Remove old leftovers and, beyond `limit` bytes, the libraries used longest ago, except `keep`."""
     total = 0
-    for entry in sorted(entries(folder), key=lambda entry: entry.key != keep):
+    libraries = entries(folder)
+    for entry in sorted(libraries, key=lambda entry: entry.key != keep):
         total += entry.about.size
         if total > limit and entry.key != keep:
             _discard(folder / entry.key)
-    sweep(folder)
-    for place in sorted(folder.iterdir()):
-        if place.suffix == ".lock":
-            _remove_free_lock(place)
+    for place in {*folder.iterdir()} - {folder / entry.key for entry in libraries}:
         with suppress(OSError):
-            old = place.suffix == ".json" and time.time() - place.stat().st_mtime > UNUSED
-            if old and not _needed(folder, place):
+            if time.time() - place.stat().st_mtime > UNUSED and not _needed(folder, place):
                 _discard(place)
-
-
-def _remove_free_lock(path: Path) -> None:
-    """Remove a lock file that no process holds. A process that waits for it then compiles too, which only costs time."""
-    lock = FileLock(path)
-    with suppress(OSError, NotImplementedError, Timeout):
-        lock.acquire(timeout=0)
-        path.unlink(missing_ok=True)
-        lock.release()
 
 
 def _needed(folder: Path, place: Path) -> bool:
     """Whether a `<key>.json` names a library that exists."""
-    if place.suffix != ".json":
-        return False
-    kept = read_object(place)
+    kept = read_signed(place)
     key = kept.get("library") if kept is not None else None
-    return isinstance(key, str) and bool(KEY.fullmatch(key)) and (folder / key / ABOUT).is_file()
+    return key is not None and (folder / key / ABOUT).is_file()
 
 
 @contextmanager
@@ -211,24 +171,25 @@ def turn(folder: Path, key: str) -> Iterator[None]:
         lock.release()
 
 
-def read_object(path: Path) -> dict[str, Any] | None:
-    """A JSON object; None if the file is missing or damaged."""
+def signed(value: dict[str, Any]) -> str:
+    """JSON with a hash that detects damage: native code reads and writes where its numbers point."""
+    return json.dumps({**value, "digest": _digest(value)})
+
+
+def read_signed(path: Path) -> dict[str, Any] | None:
+    """The object in a file that `signed` made; None if the file is missing or damaged."""
     value = read_json(path)
-    return value if isinstance(value, dict) else None
+    whole = isinstance(value, dict) and value.pop("digest", None) == _digest(value)
+    return value if whole else None
 
 
-def write_json(path: Path, value: dict[str, Any]) -> None:
-    """Write a file atomically. Raises OSError."""
-    with scratch_file(path) as temporary:
-        temporary.write_text(json.dumps(value), encoding="utf-8")
-        os.replace(temporary, path)
+def _digest(value: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
 
 
 def _about(place: Path) -> About | None:
-    kept = read_object(place / ABOUT)
-    if kept is None or kept.keys() != _HOLDS.keys():
-        return None
-    return About(**kept) if all(holds(kept[name]) for name, holds in _HOLDS.items()) else None
+    facts = read_signed(place / ABOUT)
+    return None if facts is None else About(**facts)
 
 
 def _discard(place: Path) -> None:

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from powderdsl.system.scratch import is_scratch
+from powderdsl.system.writing import MARK
 from tests.cli.commands import command_line, environment_with
 from tests.processes import alive, started, waited
 
@@ -178,7 +178,7 @@ class Place:
 
     def scratch(self) -> list[Path]:
         """Temporary files that lie somewhere in the folder."""
-        return [path for path in self.folder.rglob("*") if is_scratch(path.name) or path.suffix == ".bin"]
+        return [path for path in self.folder.rglob("*") if MARK in path.name or path.suffix == ".bin"]
 
     def run_again(self, command: Endless) -> None:
         """A short command in the same folder: it succeeds, whatever was killed there."""

@@ -18,8 +18,7 @@ import torch
 from powderdsl.compiler import RENAMED_BACKENDS
 from powderdsl.system.crew import Done, Lost, Tell, work_through
 from powderdsl.system.reading import parse_json, read_bytes
-from powderdsl.system.scratch import scratch_folder
-from powderdsl.system.writing import failure, replacing
+from powderdsl.system.writing import failure, replacing, scratch_folder
 from powderdsl.testing.generators.cases import load_text
 from powderdsl.testing.generators.rulemaker import random_ruleset_text
 from tests.fuzz.case_files import write_case

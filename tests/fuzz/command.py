@@ -162,7 +162,7 @@ def _replay(path: Path, building: Any) -> int:
     from dataclasses import replace
     from tempfile import gettempdir
 
-    from powderdsl.system.scratch import scratch_folder
+    from powderdsl.system.writing import scratch_folder
     from tests.fuzz.case_files import read_case
     from tests.fuzz.differential import check_case
 

@@ -22,7 +22,7 @@ from powderdsl.experiments.studies import cluster as on_cluster
 from powderdsl.experiments.studies.file import read_study
 from powderdsl.experiments.studies.run import StudyRun
 from powderdsl.experiments.studies.study import TASK, TEXT, Study
-from powderdsl.system.scratch import is_scratch
+from powderdsl.system.writing import MARK
 from tests.cli.commands import command_line, environment_with, powderdsl
 from tests.cli.endless import TASK as DIG
 from tests.processes import started, waited
@@ -204,7 +204,7 @@ def test_ten_deaths_change_no_number(tmp_path: Path) -> None:
         steps = list(_steps(run / "trained/metrics.jsonl"))
         assert steps == list(range(12, steps[-1] + 1, 12)), run  # no line is lost or written twice
         assert steps == list(_steps(tmp_path / "undisturbed/runs" / run.name / "trained/metrics.jsonl"))
-    left = [path for path in (tmp_path / "out").rglob("*") if is_scratch(path.name) or "claim-" in path.name]
+    left = [path for path in (tmp_path / "out").rglob("*") if MARK in path.name or "claim-" in path.name]
     assert left == []
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from filelock import FileLock
 
-from powderdsl.system.scratch import is_scratch, scratch_folder
+from powderdsl.system.writing import MARK, scratch_folder
 from powderdsl.targets import cache
 from powderdsl.targets.cpp.build import Building, build, building, run_guarded
 from powderdsl.targets.cpp.compilers import Compiler, NoCompiler, find_compiler, flags_for
@@ -96,8 +96,8 @@ def test_beyond_the_limit_the_least_recently_used_go(tmp_path: Path) -> None:
 
 def test_only_leftovers_of_killed_processes_are_removed(tmp_path: Path) -> None:
     put(tmp_path, "a", b"code")
-    cache.write_json(tmp_path / "needed.json", {"library": "a"})
-    cache.write_json(tmp_path / "orphan.json", {"library": "z"})
+    (tmp_path / "needed.json").write_text(cache.signed({"library": "a"}))
+    (tmp_path / "orphan.json").write_text(cache.signed({"library": "z"}))
     (tmp_path / ".powderdsl-0123456789abcdef").mkdir()
     (tmp_path / "a.lock").touch()
     for place in tmp_path.iterdir():
@@ -110,7 +110,7 @@ def test_only_leftovers_of_killed_processes_are_removed(tmp_path: Path) -> None:
 def test_clear(tmp_path: Path) -> None:
     for key, used in (("a", 10.0), ("b", 1000.0)):
         put(tmp_path, key, b"code", used)
-        cache.write_json(tmp_path / f"start-{key}.json", {"library": key})
+        (tmp_path / f"start-{key}.json").write_text(cache.signed({"library": key}))
     assert [entry.key for entry in cache.clear(tmp_path, older_than=100)] == ["b"]
     assert cache.find(tmp_path, "a") is not None
     (tmp_path / "damaged").mkdir()
@@ -250,7 +250,7 @@ def test_a_compiler_that_fails_is_quoted(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setenv("CXX", str(fake(tmp_path, "cc", "g++ 1", body)))
     with building(Building("-O0", tmp_path)), pytest.raises(NoCompiler, match=r"failed:\nprogram.cpp:1: bad"):
         build("// source\n")
-    assert not [name for name in names(tmp_path) if is_scratch(name)]
+    assert not [name for name in names(tmp_path) if MARK in name]
 
 
 # --- processes

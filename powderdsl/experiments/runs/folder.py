@@ -20,7 +20,6 @@ from powderdsl.diagnostics import CompileError, suggest
 from powderdsl.experiments.runs.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint
 from powderdsl.experiments.runs.metrics import Metrics
 from powderdsl.system.reading import check_links, read_json
-from powderdsl.system.scratch import sweep
 from powderdsl.system.writing import failure, not_writable, replacing
 
 if TYPE_CHECKING:
@@ -125,7 +124,7 @@ def open_run(
 
 @contextmanager
 def held(folder: Path, patience: float = 0.0) -> Iterator[None]:
-    """Keep other processes from writing to a folder. Leftovers of killed processes are deleted.
+    """Keep other processes from writing to a folder.
 
     Args:
         patience: seconds to wait for another process.
@@ -146,9 +145,6 @@ def held(folder: Path, patience: float = 0.0) -> Iterator[None]:
     except OSError as error:
         raise not_writable(folder, error) from None
     try:
-        sweep(folder)
-        for inner in sorted(folder.iterdir()):
-            sweep(inner)
         yield
     finally:
         lock.release()

@@ -32,7 +32,6 @@ from powderdsl.experiments.studies.study import (
 )
 from powderdsl.system.interrupts import GRACE, LIFELINE
 from powderdsl.system.reading import read_json
-from powderdsl.system.scratch import sweep
 from powderdsl.system.writing import failure
 
 EVALUATION, ABOUT_STUDY = "evaluation.json", "study.json"
@@ -182,7 +181,6 @@ class StudyRun:
             with claim:
                 known = self._known(point)  # somebody may have finished it in between
                 if known is None:
-                    sweep(place)
                     if elsewhere:
                         self._forget_locks(place)
                     for step in self.study.steps:

@@ -20,9 +20,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-from powderdsl.system.interrupts import held_back
-from powderdsl.system.scratch import scratch_folder
 from powderdsl.system.user_cache import cache_folder
+from powderdsl.system.writing import scratch_folder
 from powderdsl.targets import cache
 from powderdsl.targets.cpp import compiler_guard
 from powderdsl.targets.cpp.compilers import Compiler, NoCompiler, find_compiler, flags_for, processor
@@ -161,22 +160,21 @@ def run_guarded(scratch: Path, *commands: list[str]) -> tuple[int, str]:
     theirs, ours = os.pipe()
     process: subprocess.Popen[bytes] | None = None
     try:
-        with held_back():
-            try:
-                process = subprocess.Popen(
-                    called,
-                    stdin=theirs,
-                    stdout=subprocess.DEVNULL,
-                    stderr=subprocess.PIPE,
-                    env={**os.environ, "TMPDIR": str(scratch), "LC_ALL": "C"},
-                    start_new_session=True,
-                )
-            except OSError as error:
-                raise NoCompiler(f"{commands[0][0]} could not be run: {error}") from None
-            finally:
-                os.close(theirs)
-            with _lock:
-                _running[process] = scratch
+        try:
+            process = subprocess.Popen(
+                called,
+                stdin=theirs,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                env={**os.environ, "TMPDIR": str(scratch), "LC_ALL": "C"},
+                start_new_session=True,
+            )
+        except OSError as error:
+            raise NoCompiler(f"{commands[0][0]} could not be run: {error}") from None
+        finally:
+            os.close(theirs)
+        with _lock:
+            _running[process] = scratch
         said = process.communicate(timeout=TIMEOUT)[1].decode(errors="replace")
     except subprocess.TimeoutExpired:
         raise NoCompiler(f"{commands[0][0]} took longer than {TIMEOUT} s") from None

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from powderdsl.diagnostics import CompileError
 from powderdsl.ir.ops import Program, Threshold, Type
+from powderdsl.system.writing import write_text
 from powderdsl.targets import cache
 from powderdsl.targets.codec import Piece, pieces
 from powderdsl.targets.cpp.build import current, open_library
@@ -49,28 +50,15 @@ def compile_program(program: Program, planes: Program, width: int, *, clocks: bo
 def recall(key: str) -> NativeCode | None:
     """The code stored under a key, if its library still exists. Raises NoCompiler if there is no cache folder."""
     folder = current().place()
-    kept = cache.read_object(folder / f"{key}.json")
-    try:
-        if kept is None or kept.pop("sha256") != _digest(kept):
-            return None
-        library = cache.find(folder, kept["library"])
-        return None if library is None else _decode(kept, library)
-    except (KeyError, TypeError, ValueError, AttributeError):
-        return None  # damaged: it will be written again
+    kept = cache.read_signed(folder / f"{key}.json")
+    library = None if kept is None else cache.find(folder, kept["library"])
+    return None if kept is None or library is None else _decode(kept, library)
 
 
 def remember(key: str, code: NativeCode) -> None:
     """Store the rest of a compiled program under a key. A cache that cannot be written only costs time."""
-    try:
-        kept = _encode(code)
-        cache.write_json(current().place() / f"{key}.json", {**kept, "sha256": _digest(kept)})
-    except OSError:
-        return
-
-
-def _digest(kept: dict[str, Any]) -> str:
-    """A hash that detects damage: native code reads and writes where these numbers point."""
-    return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
+    with suppress(CompileError):
+        write_text(current().place() / f"{key}.json", cache.signed(_encode(code)))
 
 
 def _encode(code: NativeCode) -> dict[str, Any]:

@@ -16,8 +16,8 @@ from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
-from powderdsl.system.scratch import scratch_folder
 from powderdsl.system.user_cache import cache_folder
+from powderdsl.system.writing import scratch_folder
 from powderdsl.targets import cache as native_cache
 from powderdsl.targets.cuda.source import KernelSource
 
