@@ -5,19 +5,18 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from powderdsl.datasets.dataset import Dataset
+    from powderdsl.datasets.dataset import Dataset, Transitions, split
     from powderdsl.datasets.minari import from_minari, to_minari
     from powderdsl.datasets.recorder import record
-    from powderdsl.datasets.transitions import Transitions, split
 
 __all__ = ["Dataset", "Transitions", "from_minari", "record", "split", "to_minari"]
 
 _HOMES = {
     "Dataset": "dataset",
-    "Transitions": "transitions",
+    "Transitions": "dataset",
     "from_minari": "minari",
     "record": "recorder",
-    "split": "transitions",
+    "split": "dataset",
     "to_minari": "minari",
 }
 

@@ -1,9 +1,14 @@
-"""Reading recorded episodes: one at a time, or endless random minibatches of transitions and sequences."""
+"""Reading recorded episodes: one at a time, transitions by number, or endless random minibatches."""
 
 from __future__ import annotations
 
+import copy
+import math
 from collections import OrderedDict
-from functools import cached_property, partial
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from operator import index as integer
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,6 +40,8 @@ MAX_OPEN = 4096
 """Shards that are mapped at once, at most."""
 MEANING = ("observation", "channels", "shape", "palette", "action_nvec", "choices")
 """Fields of a recipe that define what the numbers of observations and actions mean."""
+UNITS = ("world", "episode")
+"""What `split` keeps together."""
 
 
 class Batch(NamedTuple):
@@ -76,7 +83,6 @@ class Dataset:
     def __init__(self, folder: Path, manifest: Manifest, memory: int):
         self.folder, self.manifest, self.memory = folder, manifest, memory
         self.recipe: Recipe = manifest.recipe
-        self._ends = np.cumsum([row.transitions for row in manifest.shards], dtype=np.int64)
         self._shards: OrderedDict[int, Shard] = OrderedDict()
 
     @classmethod
@@ -180,8 +186,7 @@ class Dataset:
 
         Minibatch n depends on `seed` and n alone. `start` is the first one's number, to continue where one stopped.
         """
-        _check_draw(batch, seed, start)
-        return Batches(self, None, self._ends, batch, seed, device, start)
+        return Batches(Transitions(self), batch, seed, device, start)
 
     def sequences(
         self, length: int, batch: int, *, seed: int = 0, device: str | torch.device = "cpu", start: int = 0
@@ -191,29 +196,9 @@ class Dataset:
         Raises:
             ValueError: no episode is that long.
         """
-        check_count("length", length, self.recipe.actions)
-        _check_draw(batch, seed, start)
-        windows = [np.maximum(0, one - length + 1).sum() for one in self._lengths]
-        ends = np.cumsum(windows, dtype=np.int64)
-        if not ends[-1]:
-            longest = max(int(one.max()) for one in self._lengths)
-            raise ValueError(f"no episode has {length} actions; the longest has {longest}")
-        return Batches(self, length, ends, batch, seed, device, start)
+        return Batches(Transitions(self, length=length), batch, seed, device, start)
 
-    # Drawing
-
-    def located(self, windows: Array, ends: Array, length: int) -> tuple[Array, Array]:
-        """The episode and the first action of windows of `length` transitions; `ends` count them up to each shard."""
-        episode, within = np.empty_like(windows), np.empty_like(windows)
-        number = np.searchsorted(ends, windows, side="right")
-        for one in np.unique(number).tolist():
-            rows = np.flatnonzero(number == one)
-            window = windows[rows] - (ends[one - 1] if one else 0)
-            count = np.maximum(0, self._shard(one).arrays["length"].astype(np.int64) - length + 1)
-            place = np.searchsorted(np.cumsum(count), window, side="right")
-            episode[rows] = one * self.recipe.shard + place
-            within[rows] = window - (np.cumsum(count) - count)[place]
-        return episode, within
+    # Reading
 
     def gather(self, episode: Array, first: Array, length: int) -> list[Array]:
         """The arrays of `Batch`, [n, length, …], of `length` transitions from action `first` of each episode, int64 [n]."""
@@ -239,13 +224,6 @@ class Dataset:
         length, world = (np.concatenate(one).astype(np.int64) for one in zip(*parts, strict=True))
         return length, world
 
-    @cached_property
-    def _lengths(self) -> list[Array]:
-        """The lengths of the episodes of each shard."""
-        return [
-            np.array(self._shard(number).arrays["length"], np.int64) for number in range(self.recipe.shards)
-        ]
-
     def _shard(self, number: int) -> Shard:
         """A shard, which stays open while there is room."""
         if number not in self._shards:
@@ -259,6 +237,104 @@ class Dataset:
         return self._shards[number]
 
 
+@dataclass(frozen=True)
+class _Episodes:
+    """Some episodes of several datasets, int64 [n] each: the dataset's place, their numbers in it, worlds, actions."""
+
+    source: Array
+    number: Array
+    world: Array
+    length: Array
+
+    def where(self, mask: Array) -> _Episodes:
+        """Those that a mask, bool [n], selects."""
+        return _Episodes(self.source[mask], self.number[mask], self.world[mask], self.length[mask])
+
+
+class Transitions(torch.utils.data.Dataset[Batch]):
+    """All transitions of one or several datasets, by number: dataset by dataset, episode by episode, in order.
+
+    ``rows[i]`` is transition i, a `Batch` without the dimension B; ``rows[[3, 5]]`` and ``rows[2:9]`` are a `Batch`.
+    Nothing is read before it is asked for, and workers of a `DataLoader` open the folders themselves.
+
+    Args:
+        data: a dataset, or several whose observations and actions mean the same.
+        length: sequences of that many transitions in a row of one episode, [L, …], instead of single ones.
+
+    Raises:
+        CompileError: PD630: a shard is damaged; PD631: the datasets do not fit together. ValueError: there is no dataset,
+            or no episode of that length.
+    """
+
+    def __init__(self, data: Dataset | Sequence[Dataset], *, length: int | None = None):
+        self.datasets = (data,) if isinstance(data, Dataset) else tuple(data)
+        if not self.datasets:
+            raise ValueError("Transitions needs at least one dataset")
+        for one in self.datasets[1:]:
+            one.require_equal(self.datasets[0].recipe, MEANING, self.datasets[0].folder)
+        if length is not None:
+            check_count("length", length, max(one.recipe.actions for one in self.datasets))
+        self.length = length
+        parts = [one.lengths_and_worlds() for one in self.datasets]
+        self._select(
+            _Episodes(
+                np.repeat(np.arange(len(parts)), [len(one) for one, _ in parts]),
+                np.concatenate([np.arange(len(one)) for one, _ in parts]),
+                np.concatenate([world for _, world in parts]),
+                np.concatenate([one for one, _ in parts]),
+            )
+        )
+        if not len(self):
+            raise ValueError(f"no episode has {length} actions; the longest has {self.episodes.length.max()}")
+
+    def _select(self, episodes: _Episodes) -> None:
+        self.episodes = episodes
+        self._ends = np.cumsum(np.maximum(0, episodes.length - (self.length or 1) + 1))
+
+    @property
+    def worlds(self) -> Tensor:
+        """The worlds that occur, ascending: int64 [n]."""
+        return torch.from_numpy(np.unique(self.episodes.world))
+
+    def __len__(self) -> int:
+        """The number of transitions, or of sequences."""
+        return int(self._ends[-1]) if len(self._ends) else 0
+
+    def __getitem__(self, numbers: Any) -> Batch:
+        """One transition, or a `Batch` of those of a slice, a list or an array. Raises IndexError, TypeError."""
+        if isinstance(numbers, slice):
+            return self._batch(np.arange(len(self))[numbers])
+        if isinstance(numbers, Sequence | np.ndarray | Tensor) and np.ndim(numbers):
+            return self._batch(_integers(numbers))
+        return Batch(*(value[0] for value in self._batch(np.array([integer(numbers)], np.int64))))
+
+    def __getitems__(self, numbers: Sequence[int]) -> list[Batch]:
+        """Several transitions, read together. `DataLoader` calls it for each minibatch."""
+        found = self._batch(_integers(numbers))
+        return [Batch(*row) for row in zip(*(value.unbind() for value in found), strict=True)]
+
+    def _batch(self, numbers: Array) -> Batch:
+        count = len(self)
+        wrong = numbers[(numbers < -count) | (numbers >= count)]
+        if len(wrong):
+            raise IndexError(f"no transition {wrong[0]}: there are {count}")
+        numbers = np.where(numbers < 0, numbers + count, numbers)
+        place = np.searchsorted(self._ends, numbers, side="right")
+        first = numbers - np.concatenate([[0], self._ends])[place]
+        source, episode = self.episodes.source[place], self.episodes.number[place]
+        out: list[Array] = []
+        for number in np.unique(source).tolist() or [0]:
+            rows = np.flatnonzero(source == number)
+            parts = self.datasets[number].gather(episode[rows], first[rows], self.length or 1)
+            if len(rows) == len(numbers):
+                out = parts
+                break
+            out = out or [np.empty((len(numbers), *part.shape[1:]), part.dtype) for part in parts]
+            for whole, part in zip(out, parts, strict=True):
+                whole[rows] = part
+        return Batch(*(torch.from_numpy(value if self.length else value[:, 0]) for value in out))
+
+
 class Batches(IterableDataset[Batch]):
     """An endless iterator over minibatches: see `Dataset.transitions` and `Dataset.sequences`.
 
@@ -266,20 +342,13 @@ class Batches(IterableDataset[Batch]):
     minibatch from the w-th, so the loader yields the same minibatches in the same order with any number of workers.
     """
 
-    def __init__(
-        self,
-        data: Dataset,
-        length: int | None,
-        ends: Array,
-        batch: int,
-        seed: int,
-        device: str | torch.device,
-        number: int,
-    ):
-        self.data, self.length, self.batch, self.seed, self.device = data, length, batch, seed, device
+    def __init__(self, rows: Transitions, batch: int, seed: int, device: str | torch.device, number: int):
+        check_count("batch", batch, 1 << 24)
+        check_count("seed", seed, (1 << 62) - 1, least=0)
+        check_count("start", number, (1 << 62) - 1, least=0)
+        self.rows, self.batch, self.seed, self.device = rows, batch, seed, device
         self.number = number
         """Of the next minibatch; in a worker, of the first one that its workers read next."""
-        self._ends = ends
 
     def __iter__(self) -> Batches:
         return self
@@ -288,11 +357,8 @@ class Batches(IterableDataset[Batch]):
         worker = get_worker_info()
         number = self.number + (worker.id if worker else 0)
         self.number += worker.num_workers if worker else 1
-        windows = drawn(self.seed, number, self.batch, int(self._ends[-1]))
-        length = self.length or 1
-        found = self.data.gather(*self.data.located(windows, self._ends, length), length)
-        tensors = (torch.from_numpy(value if self.length else value[:, 0]) for value in found)
-        return Batch(*(tensor.to(self.device) for tensor in tensors))
+        batch = self.rows[drawn(self.seed, number, self.batch, len(self.rows))]
+        return Batch(*(tensor.to(self.device) for tensor in batch))
 
 
 def drawn(seed: int, number: int, count: int, below: int) -> Array:
@@ -303,11 +369,56 @@ def drawn(seed: int, number: int, count: int, below: int) -> Array:
     return np.asarray((((halves[0] << 31) | (halves[1] >> 1)) % below).numpy())
 
 
-def _check_draw(batch: int, seed: int, start: int) -> None:
-    check_count("batch", batch, 1 << 24)
-    check_count("seed", seed, (1 << 62) - 1, least=0)
-    check_count("start", start, (1 << 62) - 1, least=0)
-
-
 def _tensor(rows: Array) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(rows))
+
+
+def _integers(numbers: Any) -> Array:
+    """A sequence of integers as an array, int64 [n]. Raises TypeError for other values, masks among them."""
+    found = np.asarray(numbers)
+    if found.ndim != 1 or (len(found) and found.dtype.kind not in "iu"):
+        raise TypeError(f"transitions are numbered by integers, found {found.dtype} {list(found.shape)}")
+    return found.astype(np.int64)
+
+
+def split(
+    rows: Transitions, fractions: Sequence[float], *, by: str = "world", seed: int = 0
+) -> tuple[Transitions, ...]:
+    """Parts of transitions such that no world, or no episode, has transitions in two of them.
+
+    A hash of `seed` and of the world (and of the episode's number, by episode) decides the part. So it is the same in
+    every process, in other recordings of the world, and after episodes are added; and the sizes of parts come near the
+    fractions rather than equal them.
+
+    Args:
+        fractions: of the worlds or episodes, one for each part: positive, 1 in all.
+        by: ``world``, or ``episode`` where held-out episodes may play worlds of the training set.
+
+    Raises:
+        ValueError: a wrong argument, or a part would be empty.
+    """
+    if by not in UNITS:
+        raise ValueError(f"by is one of {', '.join(UNITS)}; found {by!r}")
+    check_count("seed", seed, (1 << 62) - 1, least=0)
+    if not fractions or not all(one > 0 for one in fractions) or not math.isclose(sum(fractions), 1):
+        raise ValueError(f"fractions must be positive and sum to 1, found {list(fractions)}")
+    episodes = rows.episodes
+    numbers = torch.from_numpy(np.zeros_like(episodes.number) if by == "world" else episodes.number + 1)
+    chance = _uniform(seed, torch.from_numpy(episodes.world), numbers)
+    part = np.searchsorted(np.cumsum(fractions)[:-1], chance, side="right")
+    parts = []
+    for number in range(len(fractions)):
+        selected = copy.copy(rows)
+        selected._select(episodes.where(part == number))
+        if not len(selected):
+            count = len(rows.worlds) if by == "world" else len(episodes.number)
+            raise ValueError(f"part {number} would be empty: {count} {by}s are too few, or take another seed")
+        parts.append(selected)
+    return tuple(parts)
+
+
+def _uniform(seed: int, world: Tensor, number: Tensor) -> Array:
+    """Numbers in [0, 1), hashes of the seed, a world and a number: float64 [n]."""
+    keys = base_keys(world, torch.full_like(world, seed & MASK))[0]
+    key = mix((mix((keys + (seed >> 32)) & MASK) + number) & MASK)
+    return np.asarray(key.double() / float(1 << 32))

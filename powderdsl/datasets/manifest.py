@@ -3,27 +3,26 @@
 from __future__ import annotations
 
 import json
-import re
 import sys
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
 from datetime import UTC, datetime
 from math import prod
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from powderdsl.diagnostics import CompileError, Diagnostic, Label
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.system.reading import check_links, parse_json, read_bytes
-from powderdsl.system.writing import failure, replacing
+from powderdsl.system.settings import Limits, read_record
+from powderdsl.system.writing import failure, write_text
 from powderdsl.tasks.task import BLOW, NO_CHANGE
 
 if TYPE_CHECKING:
     from powderdsl.envs.tensor_env import TensorEnv
 
 FORMAT = "powderdsl-dataset"
-VERSION = 2
-"""Version 1 had other fingerprints, which are read as unknown."""
+VERSION = 1
 FILE = "dataset.json"
 KINDS = ("ids", "compact")
 """Observations that are recorded. The others follow from these."""
@@ -40,71 +39,11 @@ MAX_SHARDS = 1 << 16
 MAX_SIDE = 1 << 20
 
 
-# What a manifest may say
-
-
-@dataclass(frozen=True)
-class _Rule:
-    says: str
-    holds: Callable[[Any], bool]
-
-
-def _ruled(rule: _Rule) -> Any:
-    """A field whose value in a manifest obeys a rule."""
-    return field(metadata={"rule": rule})
-
-
-def _rules_of(kind: type) -> dict[str, _Rule]:
-    """The rules of a dataclass, by field."""
-    return {one.name: one.metadata["rule"] for one in fields(kind)}
-
-
-def _is_integer(value: Any, low: int, high: int) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and low <= value <= high
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _is_text(value: Any) -> bool:
-    return isinstance(value, str) and 1 <= len(value) <= 500
-
-
-def _integer(low: int, high: int) -> _Rule:
-    return _Rule(f"an integer from {low} to {high}", lambda value: _is_integer(value, low, high))
-
-
-def _list(says: str, holds: Callable[[Any], bool], low: int, high: int) -> _Rule:
-    """Lists of `low` to `high` values that hold."""
-    return _Rule(
-        says, lambda value: isinstance(value, list) and low <= len(value) <= high and all(map(holds, value))
-    )
-
-
-def _mapping(says: str, holds: Callable[[Any], bool], key: str = r".{1,500}") -> _Rule:
-    """Mappings to values that hold, from keys that match a regular expression."""
-    return _Rule(
-        says,
-        lambda value: (
-            isinstance(value, dict)
-            and len(value) <= 10_000
-            and all(re.fullmatch(key, name) and holds(one) for name, one in value.items())
-        ),
-    )
-
-
-def _one_of(*words: str) -> _Rule:
-    return _Rule(" or ".join(f"`{word}`" for word in words), lambda value: value in words)
-
-
-_TEXT = _Rule("a text", _is_text)
-_TEXTS = _list("a list of texts", _is_text, 1, 1000)
-_DIGEST = _Rule(
-    "64 hexadecimal digits",
-    lambda value: isinstance(value, str) and bool(re.fullmatch(r"[0-9a-f]{64}", value)),
-)
-_ID = r"[0-9]|[1-9][0-9]|1[0-9]{2}|2[0-4][0-9]|25[0-5]"
+Digest = Annotated[str, Limits(pattern=r"[0-9a-f]{64}", form="64 hexadecimal digits")]
+Seed = Annotated[int, Limits(0, (1 << 62) - 1)]
+Episodes = Annotated[int, Limits(1, MAX_EPISODES)]
+Names = Annotated[tuple[str, ...], Limits(length=(1, 1000))]
+Palette = Annotated[Mapping[str, str], Limits(keys=r"[0-9]|[1-9][0-9]|1[0-9]{2}|2[0-4][0-9]|25[0-5]")]
 
 
 @dataclass(frozen=True)
@@ -115,37 +54,31 @@ class Recipe:
     action's third number: elements by qualified name, ``blow``, ``nothing``.
     """
 
-    task: str = _ruled(_TEXT)
-    split: str = _ruled(_TEXT)
-    knobs: Mapping[str, int] = _ruled(
-        _mapping("a mapping to integers", lambda one: _is_integer(one, -(1 << 31), 1 << 31))
-    )
-    params: Mapping[str, float] = _ruled(_mapping("a mapping to numbers", _is_number))
-    task_fingerprint: str = _ruled(_DIGEST)
-    ruleset: str = _ruled(_TEXT)
-    ruleset_fingerprint: str = _ruled(_DIGEST)
-    powderdsl: str = _ruled(_TEXT)
-    policy: str = _ruled(_TEXT)
-    seed: int = _ruled(_integer(0, (1 << 62) - 1))
-    worlds: int = _ruled(_integer(1, (1 << 62) - 1))
-    episodes: int = _ruled(_integer(1, MAX_EPISODES))
-    shard: int = _ruled(_integer(1, MAX_EPISODES))
+    task: str
+    split: str
+    knobs: Mapping[str, Annotated[int, Limits(-(1 << 31), 1 << 31)]]
+    params: Mapping[str, float]
+    task_fingerprint: Digest
+    ruleset: str
+    ruleset_fingerprint: Digest
+    powderdsl: str
+    policy: str
+    seed: Seed
+    worlds: Annotated[int, Limits(1, (1 << 62) - 1)]
+    episodes: Episodes
+    shard: Episodes
     """Episodes of a shard; the last one may have fewer."""
-    compress: bool = _ruled(_Rule("true or false", lambda value: isinstance(value, bool)))
-    observation: str = _ruled(_one_of("ids", "compact"))
-    channels: tuple[str, ...] = _ruled(_TEXTS)
-    shape: tuple[int, ...] = _ruled(
-        _list("three integers from 1", lambda one: _is_integer(one, 1, MAX_SIDE), 3, 3)
-    )
+    compress: bool
+    observation: Annotated[str, Limits(choices=KINDS)]
+    channels: Names
+    shape: Annotated[tuple[Annotated[int, Limits(1, MAX_SIDE)], ...], Limits(length=(3, 3))]
     """Of an observation: channels, rows, columns. Its numbers are bytes."""
-    palette: Mapping[str, str] = _ruled(_mapping("names by id", _is_text, _ID))
-    action_nvec: tuple[int, ...] = _ruled(
-        _list("five integers from 1", lambda one: _is_integer(one, 1, (1 << 15) - 1), 5, 5)
-    )
-    choices: tuple[str, ...] = _ruled(_TEXTS)
-    actions: int = _ruled(_integer(1, 1_000_000))
+    palette: Palette
+    action_nvec: Annotated[tuple[Annotated[int, Limits(1, (1 << 15) - 1)], ...], Limits(length=(5, 5))]
+    choices: Names
+    actions: Annotated[int, Limits(1, 1_000_000)]
     """The most actions of an episode."""
-    last_action: str = _ruled(_one_of("truncates", "terminates"))
+    last_action: Annotated[str, Limits(choices=("truncates", "terminates"))]
     """How an episode ends when it runs out of actions."""
 
     @property
@@ -162,10 +95,10 @@ class Recipe:
 class ShardRow:
     """What the manifest says of a shard's file. The number decides the file's name, so none can lead elsewhere."""
 
-    number: int = _ruled(_integer(0, MAX_SHARDS - 1))
-    sha256: str = _ruled(_DIGEST)
-    bytes: int = _ruled(_integer(1, 2 * MAX_SHARD_BYTES))
-    transitions: int = _ruled(_integer(1, MAX_EPISODES))
+    number: Annotated[int, Limits(0, MAX_SHARDS - 1)]
+    sha256: Digest
+    bytes: Annotated[int, Limits(1, 2 * MAX_SHARD_BYTES)]
+    transitions: Annotated[int, Limits(1, MAX_EPISODES)]
 
     @property
     def file(self) -> str:
@@ -177,7 +110,7 @@ class Manifest:
     recipe: Recipe
     created: str
     """When recording began, ISO 8601."""
-    shards: tuple[ShardRow, ...]
+    shards: Annotated[tuple[ShardRow, ...], Limits(length=(0, MAX_SHARDS))]
     """The recorded shards, ascending."""
 
     @property
@@ -200,8 +133,7 @@ def new_manifest(recipe: Recipe) -> Manifest:
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write a manifest whole or not at all. Raises CompileError (PD613)."""
     data = {"format": FORMAT, "version": VERSION, **asdict(manifest)}
-    with replacing(folder / FILE) as temporary:
-        temporary.write_text(json.dumps(data, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    write_text(folder / FILE, json.dumps(data, indent=1, ensure_ascii=False) + "\n")
 
 
 def read_manifest(folder: Path) -> Manifest:
@@ -219,40 +151,30 @@ def read_manifest(folder: Path) -> Manifest:
         raise damaged(f"{folder} is not a dataset", f"{name}: {error.strerror or error}") from None
     except ValueError as error:  # also of a NUL in the name
         raise damaged(f"{path} is not a manifest", " ".join(str(error).split())) from None
-    if not isinstance(data, dict) or data.get("format") != FORMAT:
+    if not isinstance(data, dict) or data.pop("format", None) != FORMAT:
         raise damaged(f"{path} is not a manifest", f'it lacks "format": "{FORMAT}"')
-    if data.get("version") not in (1, VERSION):
-        raise damaged(
-            f"{path} has the version {_short(data.get('version'))}", f"this powderdsl reads {VERSION}"
-        )
-    problems = [f"`{key}` must be {rule.says}" for key, rule in _TOP.items() if not rule.holds(data.get(key))]
-    checked = checked_recipe(data.get("recipe"), problems)
-    rows = [] if problems or checked is None else _rows(checked, data["shards"], problems)
-    if problems or checked is None:
+    version = data.pop("version", None)
+    if version != VERSION:
+        raise damaged(f"{path} has the version {_short(version)}", f"this powderdsl reads {VERSION}")
+    problems: list[str] = []
+    manifest = read_record(Manifest, data, problems)
+    if manifest is not None:
+        problems += _misfits(manifest.recipe)
+        problems += _misfits_of_shards(manifest)
+    if manifest is None or problems:
         raise many_damaged(path, problems)
-    if data["version"] == 1:
-        checked = replace(checked, task_fingerprint="", ruleset_fingerprint="")
-    return Manifest(checked, data["created"], tuple(rows))
+    return replace(manifest, shards=tuple(sorted(manifest.shards, key=lambda shard: shard.number)))
 
 
-def checked_recipe(data: Any, problems: list[str]) -> Recipe | None:
-    """A recipe as a file has it, every value checked; what is wrong with it is added to `problems`."""
-    recipe, rules = data if isinstance(data, dict) else {}, _rules_of(Recipe)
-    found = [
-        f"`recipe.{key}` must be {rule.says}, found {_short(recipe.get(key))}"
-        for key, rule in rules.items()
-        if recipe and not rule.holds(recipe.get(key))
-    ]
-    found += [f"`recipe.{_short(key)}` is unknown" for key in recipe if key not in rules]
-    problems += found
-    if found or not recipe:
-        return None
-    values: dict[str, Any] = {
-        key: tuple(one) if isinstance(one, list) else one for key, one in recipe.items()
-    }
-    checked = Recipe(**values)
-    problems += _misfits(checked)
-    return checked
+def read_recipe(path: Path, data: Any) -> Recipe:
+    """The recipe in a file of another format. Raises CompileError (PD630)."""
+    problems: list[str] = []
+    recipe = read_record(Recipe, data, problems, "recipe")
+    if recipe is not None:
+        problems += _misfits(recipe)
+    if recipe is None or problems:
+        raise many_damaged(path, problems)
+    return recipe
 
 
 def check_place(folder: Path) -> None:
@@ -285,32 +207,17 @@ def many_damaged(path: Path, problems: list[str]) -> CompileError:
     )
 
 
-FINGERPRINTS = ("task_fingerprint", "ruleset_fingerprint")
-
-
 def differences(old: Recipe, new: Recipe) -> list[str]:
-    """The differences of two recipes, with both values. An unknown fingerprint differs from none.
-
-    Rules that differ in their name alone are the same: older names did not list all loaded packs.
-    """
+    """The differences of two recipes, with both values."""
     found = []
-    for one in fields(Recipe):
-        a, b = getattr(old, one.name), getattr(new, one.name)
-        if one.name in FINGERPRINTS and not (a and b):
-            continue
+    for item in fields(Recipe):
+        a, b = getattr(old, item.name), getattr(new, item.name)
         if isinstance(a, Mapping):
             keys = [key for key in {**a, **b} if a.get(key) != b.get(key)]
-            found += [f"{one.name}.{key}: {_short(a.get(key))}, not {_short(b.get(key))}" for key in keys]
+            found += [f"{item.name}.{key}: {_short(a.get(key))}, not {_short(b.get(key))}" for key in keys]
         elif a != b:
-            found.append(f"{one.name}: {_short(a)}, not {_short(b)}")
-    return [] if len(found) == 1 and old.ruleset != new.ruleset else found
-
-
-_TOP = {
-    "recipe": _Rule("a mapping", lambda value: isinstance(value, dict) and bool(value)),
-    "created": _TEXT,
-    "shards": _Rule("a list", lambda value: isinstance(value, list) and len(value) <= MAX_SHARDS),
-}
+            found.append(f"{item.name}: {_short(a)}, not {_short(b)}")
+    return found
 
 
 def check_count(name: str, value: Any, most: int, *, least: int = 1) -> None:
@@ -406,26 +313,20 @@ def _misfits(recipe: Recipe) -> list[str]:
     return found
 
 
-def _rows(recipe: Recipe, data: list[Any], problems: list[str]) -> list[ShardRow]:
-    """The rows of shards, ascending; problems are added to `problems`."""
-    rows: dict[int, ShardRow] = {}
-    rules = _rules_of(ShardRow)
-    for place, one in enumerate(data):
-        fits = isinstance(one, dict) and one.keys() == rules.keys()
-        if not fits or not all(rule.holds(one[key]) for key, rule in rules.items()):
-            problems.append(f"`shards[{place}]` needs number, sha256, bytes, transitions, and nothing else")
-            continue
-        row = ShardRow(**one)
+def _misfits_of_shards(manifest: Manifest) -> list[str]:
+    """Contradictions between the rows of shards and the recipe."""
+    recipe, found, numbers = manifest.recipe, [], set()
+    for place, row in enumerate(manifest.shards):
         count = len(recipe.episodes_of(row.number))
         unpacked = (row.transitions + count) * prod(recipe.shape)
-        if row.number in rows or row.number >= recipe.shards:
-            problems.append(f"`shards[{place}]`: there is no shard {row.number}, or it comes twice")
+        if row.number in numbers or row.number >= recipe.shards:
+            found.append(f"`shards[{place}]`: there is no shard {row.number}, or it comes twice")
         elif not count <= row.transitions <= count * recipe.actions:
-            problems.append(f"`shards[{place}]`: {count} episodes cannot have {row.transitions} transitions")
+            found.append(f"`shards[{place}]`: {count} episodes cannot have {row.transitions} transitions")
         elif unpacked > MAX_SHARD_BYTES:
-            problems.append(f"`shards[{place}]`: {unpacked:,} bytes, more than {MAX_SHARD_BYTES:,}")
-        rows[row.number] = row
-    return [rows[number] for number in sorted(rows)]
+            found.append(f"`shards[{place}]`: {unpacked:,} bytes, more than {MAX_SHARD_BYTES:,}")
+        numbers.add(row.number)
+    return found
 
 
 def _short(value: Any) -> str:

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,26 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from powderdsl.datasets.dataset import Dataset
-from powderdsl.datasets.manifest import (
-    MAX_BYTES,
-    MAX_EPISODES,
-    MAX_VALUES,
-    Recipe,
-    check_count,
-    checked_recipe,
-    damaged,
-    many_damaged,
-    recipe_of,
-    write_manifest,
-)
-from powderdsl.datasets.recorder import begun, held_place
-from powderdsl.datasets.shards import Defect, check_episodes, knows_ids, write_shard
+from powderdsl.datasets.manifest import Recipe, damaged, read_recipe, recipe_of
+from powderdsl.datasets.recorder import add_shard, begun, held_place
+from powderdsl.datasets.shards import DTYPES, Defect, check_episodes, knows_ids, row_shape
 from powderdsl.diagnostics import CompileError
 from powderdsl.envs import env_id
 from powderdsl.envs.actions import KINDS, ActionForm, action_form
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.model.fingerprint import fingerprint
-from powderdsl.system.reading import check_links, parse_json, read_bytes
 from powderdsl.system.writing import failure, not_writable, scratch_folder
 from powderdsl.tasks.episodes import TaskProgram
 from powderdsl.tasks.shipped import load_task, shipped_tasks
@@ -48,8 +37,8 @@ Array = NDArray[Any]
 
 KEY = "powderdsl"
 """The recipe's key in the metadata of a Minari dataset."""
-DATA, METADATA, HDF5 = "data", "metadata.json", "main_data.hdf5"
-"""The names that Minari gives."""
+DATA = "data"
+"""Minari's folder in that of a dataset."""
 
 
 def require_minari() -> None:
@@ -70,8 +59,6 @@ def to_minari(
     dataset_id: str,
     *,
     author: str | None = None,
-    author_email: str | None = None,
-    code_permalink: str | None = None,
     description: str | None = None,
 ) -> minari.MinariDataset:
     """Write a dataset to Minari's folder, episode by episode, whole or not at all.
@@ -105,7 +92,6 @@ def to_minari(
         )
     recipe = dataset.recipe
     about = f"{recipe.episodes} episodes of the task {recipe.task} ({recipe.split}), policy: {recipe.policy}."
-    given = {"author": author and {author}, "author_email": author_email and {author_email}}
     metadata = {
         "dataset_id": dataset_id,
         "minari_version": minari.__version__,
@@ -113,8 +99,7 @@ def to_minari(
         "description": description or about,
         "requirements": [f"powderdsl=={recipe.powderdsl}"],
         KEY: {"recipe": asdict(recipe)},
-        **{key: value for key, value in given.items() if value},
-        **({"code_permalink": code_permalink} if code_permalink else {}),
+        **({"author": {author}} if author else {}),
     }
     try:
         if namespace is not None and namespace not in list_local_namespaces():
@@ -218,184 +203,122 @@ def from_minari(
     require_minari()
     if task is None and (shard is not None or compress or how):
         raise TypeError("from_minari takes shard, compress and arguments of the environment only with a task")
-    source = _Source(_place(_checked_id(dataset_id)) / DATA)
+    source = _opened(_place(_checked_id(dataset_id)) / DATA)
     form: ActionForm | None = None
     if task is None:
-        recipe = source.recipe()
+        recipe = _exported_recipe(source)
     else:
         env = TensorEnv(task, 1, **{"autoreset_mode": "disabled", "observation": "ids"} | how)
-        form = source.form(env)
-        policy = str(source.metadata.get("algorithm_name") or f"Minari {dataset_id}")[:500]
-        recipe = recipe_of(env, policy=policy, episodes=source.episodes, shard=shard, compress=compress)
+        form = _form(source, env)
+        policy = str(source.storage.metadata.get("algorithm_name") or f"Minari {dataset_id}")[:500]
+        recipe = recipe_of(env, policy=policy, episodes=source.total_episodes, shard=shard, compress=compress)
     place = Path(folder)
-    with held_place(place), source.opened():
+    with held_place(place):
         manifest = begun(place, recipe)
-        have = {row.number for row in manifest.shards}
+        recorded = {row.number for row in manifest.shards}
         for number in range(recipe.shards):
-            if number in have:
-                continue
-            parts = source.shard(recipe, number, form)
-            row = write_shard(place, number, parts, compress=recipe.compress)
-            rows = sorted((*manifest.shards, row), key=lambda one: one.number)
-            manifest = replace(manifest, shards=tuple(rows))
-            write_manifest(place, manifest)
+            if number not in recorded:
+                manifest = add_shard(place, manifest, number, _shard(source, recipe, number, form))
     return Dataset.open(place)
 
 
-class _Source:
-    """The files of a Minari dataset. They may come from a stranger: nothing is read before its size is known."""
+def _opened(folder: Path) -> minari.MinariDataset:
+    """The Minari dataset in a folder. Raises CompileError (PD630)."""
+    from minari import MinariDataset
+    from minari.dataset.minari_storage import MinariStorage, is_image_space
 
-    def __init__(self, folder: Path):
-        self.folder = folder
-        self.file: Any = None
-        try:
-            self.metadata = parse_json(read_bytes(folder / METADATA, MAX_BYTES), MAX_VALUES)
-            check_links(folder)
-        except OSError as error:
-            raise self._damaged(f"{Path(error.filename or folder).name}: {error.strerror or error}") from None
-        except ValueError as error:
-            raise self._damaged(f"{METADATA}: {error}") from None
-        if not isinstance(self.metadata, dict):
-            raise self._damaged(f"{METADATA} is not a mapping")
-        self.episodes: int = self.metadata.get("total_episodes", 0)
-        try:
-            check_count("total_episodes", self.episodes, MAX_EPISODES)
-        except ValueError as error:
-            raise self._damaged(str(error)) from None
-        if self.metadata.get("data_format", "hdf5") != "hdf5":
-            raise self._damaged("its data_format is not hdf5, the only one that can be imported")
+    with _reported(folder):
+        # Minari makes an environment to get spaces that are missing, with whatever function the file names.
+        missing = {"observation_space", "action_space"} - MinariStorage.read_raw_metadata(folder).keys()
+        if missing:
+            raise Defect(f"its metadata lack {min(missing)}")
+        source = MinariDataset(folder)
+        if source.storage.jpeg_encoding and is_image_space(source.observation_space):
+            raise Defect("its observations are stored as JPEG, which does not keep their values")
+    return source
 
-    def _damaged(self, reason: str, *helps: str) -> CompileError:
-        return damaged(f"{self.folder} cannot be imported", reason, *helps)
 
-    def recipe(self) -> Recipe:
-        """The recipe that `to_minari` left. Raises CompileError (PD630)."""
-        own = self.metadata.get(KEY)
-        if not isinstance(own, dict):
-            helps = ("name the task that it was collected in: `task=`",)
-            raise self._damaged("powderdsl did not write it, so its meaning is unknown", *helps)
-        problems: list[str] = []
-        recipe = checked_recipe(own.get("recipe"), problems)
-        if problems or recipe is None:
-            raise many_damaged(self.folder / METADATA, problems or ["`powderdsl` has no recipe"])
-        return replace(recipe, episodes=self.episodes)  # some may have been added since
+@contextmanager
+def _reported(folder: Path, what: str = "") -> Iterator[None]:
+    """Turn whatever Minari raises for a damaged dataset into CompileError (PD630)."""
+    try:
+        yield
+    except Exception as error:
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise damaged(f"{folder} cannot be imported", f"{what}{reason}") from None
 
-    def form(self, env: TensorEnv) -> ActionForm:
-        """The form of the actions, after checking that these and the observations are an environment's."""
-        shown, space = self._space("observation_space"), env.observation.space
-        wanted = {"type": "Box", "dtype": space.dtype.name, "shape": list(space.shape)}
-        if {key: shown.get(key) for key in wanted} != wanted:
-            raise self._damaged(f"its observations are not {space.dtype.name} {list(space.shape)}")
-        if self.metadata.get("jpeg_encoding", True) and space.shape[0] >= 32 and space.shape[1] >= 32:
-            raise self._damaged("its observations are stored as JPEG, which does not keep their values")
-        taken = self._space("action_space")
+
+def _exported_recipe(source: minari.MinariDataset) -> Recipe:
+    """The recipe that `to_minari` left. Raises CompileError (PD630)."""
+    folder, exported = source.storage.data_path, source.storage.metadata.get(KEY)
+    if not isinstance(exported, dict) or not isinstance(exported.get("recipe"), dict):
+        reason, helps = (
+            "powderdsl did not write it, so its meaning is unknown",
+            "name the task that it was collected in: `task=`",
+        )
+        raise damaged(f"{folder} cannot be imported", reason, helps)
+    # Episodes may have been added since.
+    return read_recipe(folder, exported["recipe"] | {"episodes": source.total_episodes})
+
+
+def _form(source: minari.MinariDataset, env: TensorEnv) -> ActionForm:
+    """The form of the actions. Raises CompileError (PD630) for actions or observations that are not an environment's."""
+    with _reported(source.storage.data_path):
+        space = env.observation.space
+        if source.observation_space != space:
+            raise Defect(f"its observations are not {space.dtype} {list(space.shape)}")
         for kind in KINDS:
             form = action_form(kind, env.task.agent, env.device)
-            if kind == "discrete":
-                fits = taken.get("type") == "Discrete" and taken.get("n") == form.nvec[0]
-            else:
-                fits = taken.get("type") == "MultiDiscrete" and taken.get("nvec") == list(form.nvec)
-            if fits and not np.any(taken.get("start", 0)):
+            if source.action_space == form.space:
                 return form
-        raise self._damaged(f"its actions are not those of {env.task.name}")
-
-    def _space(self, name: str) -> dict[str, Any]:
-        text = self.metadata.get(name)
-        try:
-            found = parse_json(text.encode(), MAX_VALUES) if isinstance(text, str) else None
-        except ValueError:
-            found = None
-        if not isinstance(found, dict):
-            raise self._damaged(f"{METADATA} has no {name}")
-        return found
-
-    def opened(self) -> Any:
-        """The file of the episodes, open while the block runs."""
-        import h5py
-
-        try:
-            self.file = h5py.File(self.folder / HDF5, "r")
-        except OSError as error:
-            raise self._damaged(f"{HDF5}: {' '.join(str(error).split())[:200]}") from None
-        return self.file
-
-    def shard(self, recipe: Recipe, number: int, form: ActionForm | None) -> dict[str, list[Array]]:
-        """The arrays of a shard, in parts, all checked. Raises CompileError (PD630)."""
-        parts: dict[str, list[Array]] = {}
-        for episode in recipe.episodes_of(number):
-            name = f"episode_{episode}"
-            try:
-                found = _episode(self.file, name, recipe, form)
-                check_episodes(found, recipe)
-                if not knows_ids(recipe, found["observation"]):
-                    raise Defect("it has ids that the palette lacks")
-            except (Defect, ValueError, TypeError) as error:
-                raise self._damaged(f"{name}: {error}") from None
-            except (OSError, RuntimeError, KeyError) as error:  # h5py raises what HDF5 reports
-                raise self._damaged(f"{name}: {' '.join(str(error).split())[:200]}") from None
-            for key, value in found.items():
-                parts.setdefault(key, []).append(value)
-        return parts
+        raise Defect(f"its actions are not those of {env.task.name}")
 
 
-def _episode(file: Any, name: str, recipe: Recipe, form: ActionForm | None) -> dict[str, Array]:
-    """The arrays of one episode, as a shard holds them."""
-    group = _node(file, name)
-    shape: tuple[int, ...] = getattr(_node(group, "rewards"), "shape", ())
-    length = shape[0] if len(shape) == 1 else 0
-    if not 1 <= length <= recipe.actions:
-        raise Defect(f"its rewards must be 1 to {recipe.actions:,} numbers, found the shape {list(shape)}")
-    columns = (form.space.shape or ()) if form else (5,)
-    action = _array(group, "actions", (length, *columns), "iu")
+def _shard(
+    source: minari.MinariDataset, recipe: Recipe, number: int, form: ActionForm | None
+) -> dict[str, list[Array]]:
+    """The arrays of a shard, in parts, all checked. Raises CompileError (PD630)."""
+    parts: dict[str, list[Array]] = {name: [] for name in DTYPES}
+    for episode in recipe.episodes_of(number):
+        with _reported(source.storage.data_path, f"episode_{episode}: "):
+            for name, value in _episode(source, episode, recipe, form).items():
+                parts[name].append(value)
+    return parts
+
+
+def _episode(
+    source: minari.MinariDataset, number: int, recipe: Recipe, form: ActionForm | None
+) -> dict[str, Array]:
+    """The arrays of one episode, as a shard holds them. Raises Defect."""
+    (episode,) = source.iterate_episodes([number])
+    length, action, infos = len(episode), episode.actions, episode.infos or {}
     if form is not None:
-        action = form.decode(action.astype(np.int64)).cpu().numpy()
-    if (action < 0).any() or (action >= np.array(recipe.action_nvec)).any():
-        raise Defect("it has actions out of range")
-    terminated = _array(group, "terminations", (length,), "b")
-    infos = _node(group, "infos") if "infos" in group else {}
-    success, world = np.zeros(length + 1, bool), group.attrs.get("seed")
-    if "success" in infos:
-        success = _array(infos, "success", (length + 1,), "b")
+        action = form.decode(np.asarray(action)).cpu().numpy()
     if "world" in infos:
-        world = _array(infos, "world", (length + 1,), "iu")[0]
-    if not isinstance(world, int | np.integer):
-        raise Defect("it has neither a seed nor `world` in its infos")
-    return {
-        "observation": _array(group, "observations", (length + 1, *recipe.shape), "u", 1),
-        "action": action.astype(np.int16),
-        "reward": _array(group, "rewards", (length,), "f").astype(np.float32),
-        "terminated": terminated,
-        "truncated": _array(group, "truncations", (length,), "b") & ~terminated,
-        "success": success[1:],
+        world = infos["world"][0]
+    else:
+        (metadata,) = source.storage.get_episode_metadata([number])
+        world = metadata["seed"]
+    arrays = {
+        "observation": episode.observations,
+        "action": action,
+        "reward": episode.rewards,
+        "terminated": episode.terminations,
+        "truncated": episode.truncations & ~episode.terminations,
+        "success": infos["success"][1:] if "success" in infos else np.zeros(length, bool),
         "length": np.array([length]),
         "world": np.array([world]),
     }
-
-
-def _node(group: Any, name: str) -> Any:
-    """A member of a group of an HDF5 file, which lies in that file."""
-    import h5py
-
-    if not isinstance(group, h5py.Group) or name not in group:
-        raise Defect(f"there is no {name}")
-    if not isinstance(group.get(name, getlink=True), h5py.HardLink):
-        raise Defect(f"{name} is a link")
-    return group[name]
-
-
-def _array(group: Any, name: str, shape: tuple[int, ...], kinds: str, size: int = 8) -> Array:
-    """An array of a group, of an expected shape, kind of dtype and size of a value in bytes."""
-    import h5py
-
-    node = _node(group, name)
-    if not isinstance(node, h5py.Dataset) or node.shape != shape:
-        raise Defect(f"{name} has the shape {list(getattr(node, 'shape', ()))}, not {list(shape)}")
-    if node.external or node.is_virtual:
-        raise Defect(f"{name} lies in other files")
-    if node.dtype.kind not in kinds or node.dtype.itemsize > size:
-        raise Defect(f"{name} has the dtype {node.dtype}")
-    found: Array = node[()]
-    return found
+    rows = {"observation": length + 1, "length": 1, "world": 1}
+    for name, value in arrays.items():
+        if value.shape != (rows.get(name, length), *row_shape(recipe, name)):
+            raise Defect(f"`{name}` has the shape {list(value.shape)}")
+        if not np.can_cast(value.dtype, DTYPES[name], "same_kind"):
+            raise Defect(f"`{name}` has the dtype {value.dtype}")
+    check_episodes(arrays, recipe)
+    if not knows_ids(recipe, arrays["observation"]):
+        raise Defect("it has ids that the palette lacks")
+    return arrays
 
 
 def _checked_id(dataset_id: str) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -156,8 +156,6 @@ def held_place(folder: Path) -> Iterator[None]:
 
 def begun(folder: Path, recipe: Recipe) -> Manifest:
     """The manifest to continue with: a new one, or the one of the same recipe with its intact shards."""
-    for left in sorted([*folder.glob(".shard-*.npz"), *folder.glob(".dataset-*.json")]):
-        left.unlink(missing_ok=True)  # of a process that was killed
     if not (folder / FILE).exists():
         manifest = new_manifest(recipe)
     else:
@@ -169,6 +167,17 @@ def begun(folder: Path, recipe: Recipe) -> Manifest:
         manifest = replace(
             manifest, recipe=recipe, shards=tuple(row for row in manifest.shards if is_whole(folder, row))
         )
+    write_manifest(folder, manifest)
+    return manifest
+
+
+def add_shard(
+    folder: Path, manifest: Manifest, number: int, parts: Mapping[str, Sequence[Array]]
+) -> Manifest:
+    """Write a shard from arrays in parts, and the manifest with it, which is returned."""
+    row = write_shard(folder, number, parts, compress=manifest.recipe.compress)
+    shards = sorted((*manifest.shards, row), key=lambda shard: shard.number)
+    manifest = replace(manifest, shards=tuple(shards))
     write_manifest(folder, manifest)
     return manifest
 
@@ -286,10 +295,7 @@ class _Recording:
         parts = {name: [one[name] for one in episodes] for name in episodes[0]}
         parts["length"] = [np.array([len(one) for one in parts["action"]])]
         parts["world"] = [_worlds(self.recipe, np.array(numbers, np.int64))]
-        row = write_shard(self.folder, number, parts, compress=self.recipe.compress)
-        rows = sorted((*self.manifest.shards, row), key=lambda one: one.number)
-        self.manifest = replace(self.manifest, shards=tuple(rows))
-        write_manifest(self.folder, self.manifest)
+        self.manifest = add_shard(self.folder, self.manifest, number, parts)
 
 
 def _worlds(recipe: Recipe, episode: Array) -> Array:

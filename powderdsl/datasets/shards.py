@@ -63,17 +63,13 @@ def write_shard(
     path = folder / shard_file(number)
     with replacing(path) as temporary:
         try:
-            with zipfile.ZipFile(temporary, "w") as archive:
+            form = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
+            with zipfile.ZipFile(temporary, "w", form, compresslevel=LEVEL) as archive:
                 for name, dtype in DTYPES.items():
-                    # Without a date, so that the bytes follow from the arrays alone.
-                    entry = zipfile.ZipInfo(f"{name}.npy")
-                    entry.compress_type = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
-                    # `open` takes the level from here alone, and ZipInfo has no public name for it before 3.13.
-                    entry._compresslevel = LEVEL  # type: ignore[attr-defined]  # see above
                     values = [np.ascontiguousarray(part, dtype) for part in parts[name]]
                     shape = (sum(map(len, values)), *values[0].shape[1:])
                     header = {"descr": dtype, "fortran_order": False, "shape": shape}
-                    with archive.open(entry, "w", force_zip64=True) as member:
+                    with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                         np.lib.format.write_array_header_1_0(member, header)
                         for value in values:
                             member.write(value.data)

@@ -11,8 +11,7 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from powderdsl.datasets.dataset import Dataset, drawn
-from powderdsl.datasets.transitions import Transitions
+from powderdsl.datasets.dataset import Dataset, Transitions, drawn
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.rl.config import TrainConfig
 

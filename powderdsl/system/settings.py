@@ -1,15 +1,43 @@
-"""Settings of a run: fields of a dataclass that say what they are for and which values they take.
+"""Dataclasses whose fields declare which values they take: settings of runs, and records in files of strangers.
 
-Checks and the options of commands (`cli.options.settings_of`) follow from the declaration.
+Checks, the reader of records and the options of commands (`cli.options.settings_of`) follow from the declarations. The
+type of a record's field is the kind of its values: ``bool``, ``int``, ``float``, ``str``, another record, a named tuple
+of these, ``tuple[T, ...]``, ``Mapping[str, T]``, or any of these with limits: ``Annotated[int, Limits(1, 9)]``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import field, fields
-from typing import Any, TypeVar
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from functools import cache
+from operator import index
+from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
+
+from powderdsl.diagnostics import suggest
 
 Value = TypeVar("Value", int, float, str)
+Record = TypeVar("Record")
+
+MAX_TEXT = 500
+"""Characters of a text in a record."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of numbers, or of texts, or of lists and mappings."""
+
+    low: float | None = None
+    high: float | None = None
+    choices: tuple[str, ...] = ()
+    pattern: str = f"(?s:.{{1,{MAX_TEXT}}})"
+    """A regular expression that texts match."""
+    form: str = "a text"
+    """What such texts are called."""
+    keys: str = f".{{1,{MAX_TEXT}}}"
+    """A regular expression that the keys of a mapping match."""
+    length: tuple[int, int] = (0, 10_000)
+    """The least and most values of a list or a mapping."""
 
 
 def setting(
@@ -19,28 +47,105 @@ def setting(
     high: float | None = None,
     choices: Sequence[str] = (),
 ) -> Value:
-    """A field of a dataclass: numbers from `low` to `high` (None: any), or one of `choices`. With `about` it has an option."""
-    bounds = None if low is None else (low, high)
-    return field(default=default, metadata={"about": about, "bounds": bounds, "choices": tuple(choices)})
+    """A setting: numbers from `low` to `high` (None: any), or one of `choices`. With `about` it has an option."""
+    metadata = {"about": about, "limits": Limits(low, high, tuple(choices)), "choices": tuple(choices)}
+    return field(default=default, metadata=metadata)
 
 
 def out_of_bounds(config: Any) -> Iterator[str]:
     """Yield a sentence for each number of a dataclass of settings that is out of bounds."""
-    for one in fields(config):
-        value, bounds = getattr(config, one.name), one.metadata.get("bounds")
-        if bounds is None:
-            continue
-        low, high = bounds
-        whole = isinstance(one.default, int)
-        written = "," if whole else "g"
-        takes = f"{'an integer' if whole else 'a number'} from {low:{written}}"
-        takes += "" if high is None else f" to {high:{written}}"
-        number = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
-        if not number or not low <= value <= (value if high is None else high):
-            yield f"`{one.name}` is {value!r}: it takes {takes}"
+    for item in fields(config):
+        value, limits = getattr(config, item.name), item.metadata.get("limits", Limits())
+        if limits.low is not None and (wanted := _mismatch(type(item.default), value, limits)):
+            yield f"`{item.name}` is {value!r}: it takes {wanted}"
 
 
 def check_bounds(config: Any) -> None:
     """Raise ValueError with everything that `out_of_bounds` finds."""
     if wrong := "; ".join(out_of_bounds(config)):
         raise ValueError(wrong)
+
+
+def read_record(kind: type[Record], data: Any, problems: list[str], path: str = "") -> Record | None:
+    """The record that a file describes, or None after adding everything that is wrong to `problems`.
+
+    Args:
+        path: the place of `data` in its file, such as ``shards[3]``, with which problems name places.
+    """
+    if not isinstance(data, Mapping):
+        problems.append(f"`{path}` must be a mapping, found {data!r:.80}")
+        return None
+    start, before = f"{path}." if path else "", len(problems)
+    declared, values = _fields_of(kind), {}  # type: ignore[arg-type]  # types are hashable
+    for name, (hint, required) in declared.items():
+        if name in data:
+            values[name] = _read(hint, data[name], start + name, problems)
+        elif required:
+            problems.append(f"`{start}{name}` is missing")
+    for key in sorted(map(str, data.keys() - declared.keys())):
+        helps = suggest(key, declared, "keys here")
+        problems.append("; ".join([f"unknown key `{start}{key[:80]}`", *helps]))
+    return None if len(problems) > before else kind(**values)
+
+
+@cache
+def _fields_of(kind: Any) -> dict[str, tuple[Any, bool]]:
+    """The type of each field of a record, and whether it is required."""
+    hints = get_type_hints(kind, include_extras=True)
+    return {item.name: (hints[item.name], item.default is MISSING) for item in fields(kind)}
+
+
+def _read(kind: Any, value: Any, path: str, problems: list[str]) -> Any:
+    """A value of a type; None after adding to `problems`."""
+    limits = Limits()
+    if get_origin(kind) is Annotated:
+        kind, limits = get_args(kind)
+    if is_dataclass(kind):
+        return read_record(kind, value, problems, path)  # type: ignore[arg-type]  # it is a type, not an instance
+    if kind is int and hasattr(value, "__index__") and not isinstance(value, bool):
+        value = index(value)  # also of NumPy's integers
+    if wanted := _mismatch(kind, value, limits):
+        problems.append(f"`{path}` must be {wanted}, found {value!r:.80}")
+        return None
+    if names := getattr(kind, "_fields", ()):
+        hints = get_type_hints(kind, include_extras=True)
+        parts = zip(names, value, strict=True)
+        return kind(*(_read(hints[name], part, f"{path}.{name}", problems) for name, part in parts))
+    if get_origin(kind) is tuple:
+        item = get_args(kind)[0]
+        return tuple(_read(item, part, f"{path}[{at}]", problems) for at, part in enumerate(value))
+    if get_origin(kind) is Mapping:
+        item = get_args(kind)[1]
+        return {key: _read(item, part, f"{path}.{key}", problems) for key, part in value.items()}
+    return value
+
+
+def _mismatch(kind: Any, value: Any, limits: Limits) -> str:
+    """What a value should be, if it is something else. The values in lists and mappings are not looked at."""
+    low, high = limits.length
+    if names := getattr(kind, "_fields", ()):
+        fits = isinstance(value, list | tuple) and len(value) == len(names)
+        wanted = f"[{', '.join(names)}]"
+    elif get_origin(kind) is tuple:
+        fits = isinstance(value, list | tuple) and low <= len(value) <= high
+        wanted = f"a list of {low:,} to {high:,} values"
+    elif get_origin(kind) is Mapping:
+        fits = isinstance(value, Mapping) and low <= len(value) <= high
+        fits = fits and all(re.fullmatch(limits.keys, str(key)) for key in value)
+        wanted = f"a mapping of {low:,} to {high:,} values, with keys that match {limits.keys}"
+    elif kind is bool:
+        fits, wanted = isinstance(value, bool), "true or false"
+    elif kind is str and limits.choices:
+        fits, wanted = value in limits.choices, " or ".join(f"`{word}`" for word in limits.choices)
+    elif kind is str:
+        fits = isinstance(value, str) and re.fullmatch(limits.pattern, value) is not None
+        wanted = limits.form
+    else:
+        fits = isinstance(value, int if kind is int else int | float) and not isinstance(value, bool)
+        fits = fits and (limits.low is None or limits.low <= value)
+        fits = fits and (limits.high is None or value <= limits.high)
+        written = "," if kind is int else "g"
+        wanted = "an integer" if kind is int else "a number"
+        wanted += "" if limits.low is None else f" from {limits.low:{written}}"
+        wanted += "" if limits.high is None else f" to {limits.high:{written}}"
+    return "" if fits else wanted

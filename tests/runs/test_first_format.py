@@ -11,12 +11,10 @@ import numpy as np
 import pytest
 
 import powderdsl
-from powderdsl.datasets import Dataset
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.experiments.runs import find_run
 from powderdsl.rl import train as train_agent
 from powderdsl.rl.policies import config_of, load_policy, recorded_palette, task_of
-from powderdsl.tasks.shipped import load_task
 from powderdsl.worldmodel import Machine, TrainConfig, load_trained, train
 from powderdsl.worldmodel.trained import finetuned
 from powderdsl.worlds.store import load_world
@@ -40,13 +38,6 @@ def test_a_world_finds_its_elements_under_other_ids() -> None:
     here = {element.id: element.qualified for element in sim.ruleset.elements}
     assert (np.vectorize(here.get)(world.ids.numpy()) == names).all()
     assert "beetle.beetle" in names
-
-
-def test_a_dataset_is_read_and_fits_its_task() -> None:
-    dataset = Dataset.open("data")
-    dataset.check()
-    assert len(dataset) == 4
-    dataset.require(TensorEnv(load_task("meadow.yaml"), 1, backend="torch"), same_rules=True)
 
 
 @pytest.mark.parametrize(("name", "slots"), [("wm", 14), ("wm21", 33)])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -11,8 +10,6 @@ import pytest
 
 import powderdsl as library
 from powderdsl.compiler import MAX_BASES, load_with_diagnostics
-from powderdsl.datasets import record
-from powderdsl.datasets.manifest import differences, read_manifest
 from powderdsl.diagnostics import CompileError, Severity
 from tests.cli.commands import PACK, powderdsl
 
@@ -174,13 +171,6 @@ def test_commands_say_what_is_loaded() -> None:
         output = powderdsl(*words).output
         assert "powderworld-gas+grit:" in output
         assert "powderworld:" not in output
-
-
-def test_recordings_from_before_names_said_what_is_loaded_go_on() -> None:
-    record("herd-gas", "nothing", "recorded", episodes=1, max_episode_steps=1, backend="torch")
-    recipe = read_manifest(Path("recorded")).recipe
-    assert differences(replace(recipe, ruleset="another name"), recipe) == []
-    assert len(differences(replace(recipe, ruleset="another name", seed=3), recipe)) == 2
 
 
 # Warnings that only added packs bring about
