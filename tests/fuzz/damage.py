@@ -15,12 +15,13 @@ from pathlib import Path
 
 from powderdsl.compiler import shipped, shipped_rules
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Source
-from powderdsl.diagnostics.render import render_json, render_short, render_text
+from powderdsl.diagnostics.render import diagnostic_data, render_short, render_text
 from powderdsl.model.check import check
 from powderdsl.model.declarations import PackDecl, RulesetDecl
 from powderdsl.model.packs import read_file
 from powderdsl.model.types import Ruleset
 from powderdsl.system.crew import Lost, Tell, work_through
+from powderdsl.system.reports import as_json
 from powderdsl.system.writing import replacing
 from powderdsl.testing.generators.choices import Choices
 from powderdsl.testing.generators.rulemaker import ruleset_text
@@ -98,7 +99,7 @@ def check_printable(diagnostics: tuple[Diagnostic, ...]) -> None:
         assert span is None or 0 <= span.start < max(span.end, 1) <= max(len(span.source.text), 1) + 1
         assert render_text(one)
         assert "\n" not in render_short(one)
-    assert render_json(diagnostics, utf16=True)
+    assert as_json([diagnostic_data(one, utf16=True) for one in diagnostics])
 
 
 # Kinds of damage

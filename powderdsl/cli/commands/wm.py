@@ -132,7 +132,7 @@ def train_command(
 
     A run that was stopped continues when the same command is given again, as if it had not been stopped.
     """
-    from powderdsl.cli.task_sheets import knob_values
+    from powderdsl.cli.options import knob_values
     from powderdsl.worldmodel.config import PRESETS
     from powderdsl.worldmodel.rulesets import Variety
 
@@ -217,7 +217,7 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
 @opt.integer(
     "--rulesets", 0, 1024, "Number of rulesets that training never saw, to test under.  [default: 0]"
 )
-@opt.layouts("One JSON object instead of a table.")
+@opt.flag("--json", "One JSON object instead of a table.", to="as_json")
 @opt.path("--out", "FILE", "File of the results.  [default: RUN/evaluation.json]")
 @_network
 @_machine_options
@@ -225,7 +225,7 @@ def eval_command(
     run: str,
     only: tuple[str, ...],
     knobs: tuple[str, ...],
-    layout: str,
+    as_json: bool,
     out: Path | None,
     data: Path | None,
     network_name: str | None,
@@ -237,7 +237,7 @@ def eval_command(
     that no training takes. A network that learned from a dataset is tested on its test worlds, or on another dataset,
     and also with its actions hidden. What is found is also written to the run's evaluation.json.
     """
-    from powderdsl.cli.task_sheets import knob_values
+    from powderdsl.cli.options import knob_values
     from powderdsl.experiments.runs.folder import write_json
     from powderdsl.worldmodel.evaluation import evaluate, evaluate_recording
     from powderdsl.worldmodel.trained import load_trained
@@ -255,7 +255,7 @@ def eval_command(
         write_json(out, plain, follow=True)
     else:
         trained.run.write_json("evaluation.json", plain)
-    if layout == "json":
+    if as_json:
         print_json(plain)
     else:
         click.echo("\n".join(told(tested, plain)))
