@@ -16,7 +16,7 @@ from torch import Tensor
 from powderdsl.envs.acting import uniforms
 from powderdsl.envs.features import paper_policy, small_policy
 from powderdsl.envs.tensor_env import TensorEnv
-from powderdsl.experiments.runs import RunFolder, does_not_fit, find_run
+from powderdsl.experiments.runs import RunFolder, does_not_fit, find_run, no_run
 from powderdsl.model.composition.palette import MAX_ELEMENTS
 from powderdsl.rl.config import TrainConfig, from_json
 from powderdsl.rl.fcn import BinDistribution, BinPolicy, fcn_policy
@@ -121,8 +121,6 @@ def _own_env(run: RunFolder, config: TrainConfig, env: TensorEnv) -> TensorEnv:
     Raises CompileError (PD623) if `env` has elements for which the network has no slots.
     """
     palette = recorded_palette(run)
-    if palette is None:
-        return env
     lacking = [one.qualified for one in env.task.ruleset.elements if one.id >= len(palette)]
     if lacking:
         notes = tuple(f"there is no free slot for `{name}`: it has {len(palette)}" for name in lacking)
@@ -142,11 +140,11 @@ def _own_env(run: RunFolder, config: TrainConfig, env: TensorEnv) -> TensorEnv:
     return TensorEnv(program, 1, observation=config.observation)
 
 
-def recorded_palette(run: RunFolder) -> tuple[str | None, ...] | None:
-    """The qualified name of the element of each of a run's slots; None for a run of an older version, which did not record them."""
+def recorded_palette(run: RunFolder) -> tuple[str | None, ...]:
+    """The qualified name of the element of each of a run's slots. Raises CompileError (PD620) if it has none."""
     found = run.config.get("palette")
     if not isinstance(found, list) or len(found) > MAX_ELEMENTS:
-        return None
+        raise no_run(run.path, "its palette is damaged")
     return tuple(None if one is None else str(one) for one in found)
 
 

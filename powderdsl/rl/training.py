@@ -29,12 +29,12 @@ from powderdsl.datasets.recorder import record
 from powderdsl.envs.observations import channels_of
 from powderdsl.envs.sb3 import PowderVecEnv
 from powderdsl.envs.tensor_env import check_cells
-from powderdsl.experiments.runs import Metrics, RunFolder, does_not_fit, open_run, read_run
+from powderdsl.experiments.runs import Metrics, RunFolder, does_not_fit, open_run
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.rl.cloning import clone, open_demonstrations
 from powderdsl.rl.config import TrainConfig, check_config, check_task
 from powderdsl.rl.evaluation import mean_and_interval, play
-from powderdsl.rl.policies import TrainedPolicy, policy_of, recorded_palette
+from powderdsl.rl.policies import TrainedPolicy, policy_of
 from powderdsl.simulation.observe import Observer
 from powderdsl.system.writing import failure
 from powderdsl.tasks.episodes import TaskProgram, compile_task
@@ -63,7 +63,7 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
         KeyboardInterrupt: after the state before the rollout that was in progress has been saved.
     """
     check_config(config)
-    task, palette = _task_and_palette(config, Path(folder))
+    task, palette = _task_and_palette(config)
     check_split(task, config.split)
     if config.eval_every:
         check_split(task, config.eval_split)
@@ -124,16 +124,9 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
     return run
 
 
-def _task_and_palette(config: TrainConfig, folder: Path) -> tuple[Task, tuple[str | None, ...] | None]:
-    """The task, with the ids of the network's slots: those that its rules need, and free ones as asked for.
-
-    A run that began before palettes were kept has the ids that the rules give.
-    """
+def _task_and_palette(config: TrainConfig) -> tuple[Task, tuple[str | None, ...]]:
+    """The task, with the ids of the network's slots: those that its rules need, and free ones as asked for."""
     how: dict[str, Any] = {name: getattr(config, name) for name in ("knobs", "params", "packs")}
-    if (folder / "run.json").exists():
-        recorded = recorded_palette(read_run(folder))
-        if recorded is None:
-            return load_task(config.task, **how), None
     found = list(whole_palette(*load_task(config.task, **how).rules))
     palette = (*found, *[None] * (config.slots - len(found)))
     return load_task(config.task, **how, palette=palette), palette

@@ -61,7 +61,7 @@ def load_trained(
     if isinstance(network, CustomNetwork) and network.name != config.network:
         there = "the paper's U-net" if config.network is None else f"`{config.network}`"
         raise does_not_fit(run.path, f"it was trained with {there}, not with `{network.name}`")
-    checkpoint, encoder = run.checkpoint(device), encoder_of(config, slots)
+    checkpoint, encoder = run.checkpoint(), encoder_of(config, slots)
     if isinstance(network, CustomNetwork):
         model: nn.Module = network.build(encoder, slots, config.seed)
     elif network is not None:

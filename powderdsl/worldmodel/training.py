@@ -225,7 +225,7 @@ class _Trainer:
 
     def restore(self, parent: Checkpoint | None) -> None:
         """Continue from the run's newest checkpoint; a new run starts with the weights of `parent`."""
-        found = self.run.latest_checkpoint(self.machine.device)
+        found = self.run.latest_checkpoint()
         if found is None:
             if parent is not None:
                 fit_weights(self.model, parent, grow=True)

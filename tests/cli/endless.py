@@ -77,7 +77,7 @@ COMMANDS = {
     ),
     "train": Endless(
         ("train", "dig.yaml", *TINY, "--run", "agent", "--steps", "900000000", "--checkpoint-every", "0"),
-        "agent/checkpoints/[0-9]*.pt",
+        "agent/checkpoints/[0-9]*.safetensors",
         ("train", "dig.yaml", *TINY, "--run", "agent", "--steps", "12", "--checkpoint-every", "0"),
     ),
     "evaluate": Endless(
@@ -90,7 +90,7 @@ COMMANDS = {
             *("--refresh", "2", "--states", "100", "--backend", "torch", "--run", "model"),
             *("--iterations", "900000000", "--store", "disk", "--save-every", "1"),
         ),
-        "model/checkpoints/[0-9]*.pt",
+        "model/checkpoints/[0-9]*.safetensors",
     ),
     "bench": Endless(("bench", "life", "--backend", "wasm", "--seconds", "3600", "--out", "x.json"), ""),
     "fuzz": Endless(
@@ -105,7 +105,7 @@ COMMANDS = {
     "mutate": Endless(("test", "--mutate", "powderworld", "--jobs", "2"), "", processes=3),
     "study": Endless(
         ("study", "study.yaml", "--out", "out", "--jobs", "2"),
-        "out/runs/*seed=1/trained/checkpoints/[0-9]*.pt",
+        "out/runs/*seed=1/trained/checkpoints/[0-9]*.safetensors",
     ),
 }
 
@@ -197,7 +197,7 @@ class Place:
     def checkpoint_steps(self) -> dict[str, int]:
         """The newest checkpoint of each run, by its folder."""
         found: dict[str, int] = {}
-        for path in sorted(self.folder.rglob("*.pt")):
+        for path in sorted(self.folder.rglob("*.safetensors")):
             found[str(path.parent)] = int(path.name.partition("-")[0])
         return found
 

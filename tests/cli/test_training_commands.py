@@ -87,7 +87,7 @@ def test_what_cannot_be_done(
     result = run(*arguments)
     assert result.exit_code == 2, result.output
     assert said in result.output
-    assert not list(tmp_path.rglob("*.pt"))
+    assert not list(tmp_path.rglob("*.safetensors"))
 
 
 @pytest.mark.slow
@@ -101,4 +101,4 @@ def test_an_interrupted_run_says_how_to_go_on(tmp_path: Path) -> None:
         _, said = child.communicate(timeout=240)
     assert child.returncode == 130, said
     assert f"powderdsl train --resume {tmp_path / 'run'}" in said
-    assert list((tmp_path / "run" / "checkpoints").glob("*.pt"))
+    assert list((tmp_path / "run" / "checkpoints").glob("*.safetensors"))

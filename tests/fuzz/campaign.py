@@ -16,13 +16,13 @@ from tempfile import gettempdir
 import torch
 
 from powderdsl.compiler import RENAMED_BACKENDS
-from powderdsl.system.crew import Done, Lost, Tell, work_through
 from powderdsl.system.reading import parse_json, read_bytes
 from powderdsl.system.writing import failure, replacing, scratch_folder
 from powderdsl.testing.generators.cases import load_text
 from powderdsl.testing.generators.rulemaker import random_ruleset_text
 from tests.fuzz.case_files import write_case
 from tests.fuzz.cases import Case
+from tests.fuzz.crew import Done, Lost, Tell, work_through
 from tests.fuzz.differential import Finding, Outcome, Plan, run_seed, seeded_starts, still_fails
 from tests.fuzz.reducer import reduce_case
 

@@ -20,12 +20,12 @@ from powderdsl.model.check import check
 from powderdsl.model.declarations import PackDecl, RulesetDecl
 from powderdsl.model.packs import read_file
 from powderdsl.model.types import Ruleset
-from powderdsl.system.crew import Lost, Tell, work_through
 from powderdsl.system.reports import as_json
 from powderdsl.system.writing import replacing
 from powderdsl.testing.generators.choices import Choices
 from powderdsl.testing.generators.rulemaker import ruleset_text
 from powderdsl.testing.generators.vocabulary import Manner
+from tests.fuzz.crew import Lost, Tell, work_through
 
 HANGS = 300.0
 """Seconds after which an input counts as one that never ends: by the clock, so a busy machine needs some."""

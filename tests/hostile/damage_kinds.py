@@ -6,7 +6,6 @@ import hashlib
 import io
 import json
 import os
-import pickle
 import re
 import shutil
 import struct
@@ -20,8 +19,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from safetensors.torch import load, save
 
 from powderdsl.cli.commands.study import commands
+from powderdsl.experiments.runs.checkpoints import STATE
 from powderdsl.experiments.studies.file import load_study
 from powderdsl.experiments.studies.run import StudyRun
 
@@ -233,57 +234,52 @@ def png_damaged(data: bytes, random: Random) -> bytes:
 
 
 def checkpoint_damaged(data: bytes, random: Random) -> bytes:
-    """States of other types, storages and tensors that claim other sizes, pickles that call and nest."""
-    match random.randrange(8):
+    """States of other types, tensors that claim other sizes, a pickle in its place."""
+    tensors = load(data)
+    match random.randrange(9):
         case 0 | 1:
             return bytes_damaged(data, random)
         case 2:
-            out = io.BytesIO()
-            value = random.choice(
-                [[], {}, {"policy": 1}, {"model": {}}, "x", 7, {"policy": {}, "model": {"a": torch.zeros(3)}}]
-            )
-            torch.save(value, out)
-            return out.getvalue()
+            return b"\x80\x02cposix\nsystem\nX\x0b\0\0\0touch owned\x85R."
         case 3:
-            out = io.BytesIO()
-            torch.save(
-                {"model": {"a": torch.zeros(1).expand(10**9)}},
-                out,
-                _use_new_zipfile_serialization=random.random() < 0.5,
-            )
-            return out.getvalue()
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
-    name = next(one for one in members if one.endswith("data.pkl"))
-    match random.randrange(7):
-        case 0:
-            members[name] = bytes_damaged(members[name], random)
-        case 1:
-            members[name] = b"\x80\x02cbuiltins\nbytearray\n" + pickle.dumps(3 * 10**9, 2)[2:-1] + b"\x85R."
-        case 2:
-            members[name] = b"\x80\x02]" + b")" + b"\x85" * 200_000 + b"a."
-        case 3:
-            members[name] = b"\x80\x02}r\xff\xff\xff\x7f."
+            values = [
+                [],
+                {},
+                "x",
+                7,
+                {"dict": 7},
+                {"dict": [["policy", 1]]},
+                {"dict": [["model", {"dict": []}]]},
+            ]
+            text = json.dumps(random.choice(values)).encode()
         case 4:
-            members[name] = b"\x80\x02cposix\nsystem\nX\x0b\0\0\0touch owned\x85R."
+            text = random.choice(
+                [b"[" * 200_000, b'{"tuple":[' * 5000 + b"]}" * 5000, b"[" + b"0," * (1 << 20) + b"0]"]
+            )
         case 5:
-            at = random.choice([one for one in members if "/data/" in one])
-            members[at] = members[at][: len(members[at]) // 2] if random.random() < 0.5 else members[at] * 2
+            text = bytes_damaged(bytes(tensors[STATE].numpy()), random)
         case 6:
-            members[name] = members[name].replace(b"K\x08", b"J\xff\xff\xff\x7f")
-    out = io.BytesIO()
-    with zipfile.ZipFile(
-        out, "w", random.choice((zipfile.ZIP_STORED, zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))
-    ) as archive:
-        for member, value in members.items():
-            archive.writestr(member, value)
-    return out.getvalue()
+            name = random.choice(sorted(tensors))
+            shape = random.choice([(), (0,), (3, 0, 1 << 40), (7,)])
+            return save(
+                tensors | {name: torch.zeros(shape, dtype=random.choice([torch.bool, torch.bfloat16]))}
+            )
+        case _:
+            length = int.from_bytes(data[:8], "little")
+            header = json.loads(data[8 : 8 + length])
+            entry = header[random.choice(sorted(header))]
+            entry[random.choice(sorted(entry))] = random.choice(
+                [*VALUES, [10**9], [2**40, 2**40], [0, 10**12]]
+            )
+            changed = json.dumps(header).encode()
+            return len(changed).to_bytes(8, "little") + changed + data[8 + length :]
+    return save(tensors | {STATE: torch.frombuffer(bytearray(text), dtype=torch.uint8)})
 
 
 def renamed(path: Path) -> None:
     """Give a checkpoint the name that its digest asks for."""
     digest = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
-    path.rename(path.with_name(f"{path.name[:12]}-{digest}.pt"))
+    path.rename(path.with_name(f"{path.name[:12]}-{digest}.safetensors"))
 
 
 # Kinds
@@ -301,7 +297,7 @@ class Kind:
 
 
 def _renamed(folder: Path) -> None:
-    for path in sorted(folder.glob("*/checkpoints/*.pt")):
+    for path in sorted(folder.glob("*/checkpoints/*.safetensors")):
         if path.is_file():
             renamed(path)
 
@@ -338,9 +334,9 @@ KINDS = (
     Kind("dataset", 120, ("record", "--verify", "data"), (("data/dataset.json", json_damaged),)),
     Kind("shards", 80, ("record", "--verify", "data"), (("data/shard-000000.npz", npz_damaged),), _signed),
     Kind("agent", 60, ("evaluate", "ppo", "--episodes", "1", "--policies", "trained"), (("ppo/run.json", json_damaged),)),
-    Kind("agent's checkpoint", 80, ("evaluate", "ppo", "--episodes", "1", "--policies", "trained"), (("ppo/checkpoints/*.pt", checkpoint_damaged),), _renamed),
+    Kind("agent's checkpoint", 80, ("evaluate", "ppo", "--episodes", "1", "--policies", "trained"), (("ppo/checkpoints/*.safetensors", checkpoint_damaged),), _renamed),
     Kind("world model", 50, ("wm", "eval", "wm", "--worlds", "1", "--split", "test"), (("wm/run.json", json_damaged),)),
-    Kind("its checkpoint", 50, ("wm", "eval", "wm", "--worlds", "1", "--split", "test"), (("wm/checkpoints/*.pt", checkpoint_damaged),), _renamed),
+    Kind("its checkpoint", 50, ("wm", "eval", "wm", "--worlds", "1", "--split", "test"), (("wm/checkpoints/*.safetensors", checkpoint_damaged),), _renamed),
     Kind("cache", 80, ("cache", "list"), (("cache/powderdsl/native/" + "a" * 32 + "/about.json", json_damaged),)),
     Kind("cache to clear", 40, ("cache", "clear"), (("cache/powderdsl/native/" + "a" * 32 + "/about.json", json_damaged),)),
 )  # fmt: skip

@@ -191,5 +191,5 @@ def test_an_agent_learns(tmp_path: Path) -> None:
 
 def test_training_leaves_nothing_half_written(task: Path, tmp_path: Path) -> None:
     run = train(quick(task, steps=32), tmp_path / "run")
-    assert not [name for name in os.listdir(run.path / "checkpoints") if not name.endswith(".pt")]
+    assert not [name for name in os.listdir(run.path / "checkpoints") if not name.endswith(".safetensors")]
     assert run.about["config"]["epochs"] == 2

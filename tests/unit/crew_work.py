@@ -1,4 +1,4 @@
-"""What processes do in the tests of `system.crew`: they import it by name."""
+"""What processes do in the tests of `tests.fuzz.crew`: they import it by name."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import os
 import signal
 import time
 
-from powderdsl.system.crew import Tell
+from tests.fuzz.crew import Tell
 
 
 def work(task: int, tell: Tell) -> int:

@@ -160,9 +160,10 @@ def test_a_killed_run_ends_with_the_same_weights(dunes: str, tmp_path: Path) -> 
     folder = tmp_path / "killed"
     for kill in range(3):
         command = [sys.executable, "-c", CHILD, json.dumps(asdict(config)), str(folder)]
-        before = {path.name for path in (folder / "checkpoints").glob("*.pt")}
+        before = {path.name for path in (folder / "checkpoints").glob("*.safetensors")}
         with started(command) as process:
-            assert waited(lambda: {path.name for path in (folder / "checkpoints").glob("*.pt")} - before)  # noqa: B023
+            made = (folder / "checkpoints").glob
+            assert waited(lambda: {path.name for path in made("*.safetensors")} - before)  # noqa: B023
             time.sleep(0.037 * kill)
             assert process.poll() is None, "it ended before it could be killed"
     run = train(config, folder, machine=HERE)
@@ -276,7 +277,7 @@ def test_other_elements_get_free_slots_and_are_refused_where_none_are_left(
 
 def test_damaged_runs_are_refused(dunes: str, tmp_path: Path) -> None:
     run = train(tiny(dunes, iterations=1), tmp_path / "run", machine=HERE)
-    (path,) = (run.path / "checkpoints").glob("*.pt")
+    (path,) = (run.path / "checkpoints").glob("*.safetensors")
     data = path.read_bytes()
     path.write_bytes(data[:-20])
     with pytest.raises(CompileError) as error:

@@ -154,4 +154,4 @@ def test_ctrl_c_saves_and_says_how_to_go_on(dunes: str, tmp_path: Path) -> None:
     assert process.returncode == 130, told
     assert f"interrupted; the same command resumes {folder}" in told
     assert "Traceback" not in told
-    assert len(list((folder / "checkpoints").glob("*.pt"))) == 1
+    assert len(list((folder / "checkpoints").glob("*.safetensors"))) == 1

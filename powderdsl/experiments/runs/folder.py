@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from filelock import FileLock, Timeout
 
@@ -22,14 +22,8 @@ from powderdsl.experiments.runs.metrics import Metrics
 from powderdsl.system.reading import check_links, read_json
 from powderdsl.system.writing import failure, not_writable, replacing
 
-if TYPE_CHECKING:
-    import torch
-
 ABOUT = "run.json"
-FORMAT = 2
-FIRST_FORMAT = 1
-FINGERPRINTS = ("rules_fingerprint", "task_fingerprint", "worlds")
-"""Settings that are hashes of files."""
+FORMAT = 1
 PACKAGES = ("torch", "numpy", "gymnasium", "stable-baselines3")
 
 
@@ -56,13 +50,13 @@ class RunFolder:
         with held(self.path):
             yield
 
-    def latest_checkpoint(self, device: str | torch.device = "cpu") -> Checkpoint | None:
-        """The newest intact checkpoint, or None."""
-        return latest_checkpoint(self.path / "checkpoints", device)
+    def latest_checkpoint(self) -> Checkpoint | None:
+        """The newest intact checkpoint, with its tensors on the CPU, or None."""
+        return latest_checkpoint(self.path / "checkpoints")
 
-    def checkpoint(self, device: str | torch.device = "cpu") -> Checkpoint:
+    def checkpoint(self) -> Checkpoint:
         """The newest intact checkpoint. Raises CompileError (PD620) if there is none."""
-        found = self.latest_checkpoint(device)
+        found = self.latest_checkpoint()
         if found is None:
             raise no_run(self.path, "it has no checkpoint that can be read")
         return found
@@ -184,7 +178,7 @@ def read_run(path: str | Path, kind: str | None = None) -> RunFolder:
     whole = isinstance(about, dict) and isinstance(about.get("kind"), str)
     if not whole or not isinstance(about.get("config"), dict):
         raise no_run(folder, f"its {ABOUT} is damaged")
-    if about.get("format") not in (FIRST_FORMAT, FORMAT):
+    if about.get("format") != FORMAT:
         raise no_run(folder, f"its format is {about.get('format')!r}; this version reads {FORMAT}")
     if kind is not None and about["kind"] != kind:
         raise no_run(folder, f"it is a run of the kind `{about['kind']}`; `{kind}` is needed here")
@@ -253,12 +247,9 @@ def _differences(found: RunFolder, kind: str, config: Mapping[str, Any]) -> tupl
     if found.kind != kind:
         return (f"it is of the kind `{found.kind}`, not `{kind}`",)
     there, here = dict(_flat(found.config)), dict(_flat(config))
-    # Runs of the first format lack settings that came later, and have fingerprints that are no longer made.
-    first = found.about["format"] == FIRST_FORMAT
-    names = ({*there} & {*here}) - {*FINGERPRINTS} if first else {*there, *here}
     return tuple(
         f"`{name}` is {there.get(name, 'not set')} there, {here.get(name, 'not set')} here"
-        for name in sorted(names)
+        for name in sorted({*there, *here})
         if there.get(name) != here.get(name)
     )
 

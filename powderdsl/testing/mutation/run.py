@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import os
 import re
-from collections import Counter, deque
-from collections.abc import Callable, Generator, Iterable
+import signal
+from collections import Counter
+from collections.abc import Generator, Iterable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from multiprocessing import Pipe, get_context
+from multiprocessing.connection import Connection, wait
+from threading import Thread
 
 import numpy as np
 
 from powderdsl.compiler import starting_backend
 from powderdsl.simulation.simulator import compile
-from powderdsl.system.crew import Done, work_through
 from powderdsl.testing.mutation.distinguishing import distinguish
 from powderdsl.testing.mutation.judging import NOTICED, Verdict, judge
 from powderdsl.testing.mutation.mutants import Mutant
@@ -84,18 +89,37 @@ def run_campaign(
         numbers: places of the mutants among those of `Original.mutants`.
         worlds: look for a world that shows each survivor.
         settings: other values for parameters.
+
+    Raises:
+        OSError: a process was killed, as where memory is short.
     """
     _loaded.cache_clear()  # files may have changed since
-    tasks = deque(Task(rules, settings, packs, number, seed, worlds) for number in numbers)
+    tasks = [Task(rules, settings, packs, number, seed, worlds) for number in numbers]
     if jobs == 1:
-        for task in tasks:
-            yield work(task, lambda value: None)
+        yield from map(work, tasks)
         return
-    for found in work_through(tasks, work, jobs):
-        if isinstance(found, Done):
-            yield found.result
-        else:
-            yield Outcome(found.task.number, Verdict("survived", "", found.reason))
+    lifeline, ours = Pipe(duplex=False)
+    # A fork of a process with threads of torch's may hang.
+    pool = ProcessPoolExecutor(jobs, get_context("spawn"), _begin_process, (lifeline,))
+    try:
+        for done in as_completed([pool.submit(work, task) for task in tasks]):
+            yield done.result()
+    except BrokenProcessPool:
+        raise OSError("a process that judged mutants was killed; fewer `--jobs` need less memory") from None
+    finally:
+        ours.close()
+        pool.shutdown(cancel_futures=True)
+
+
+def _begin_process(lifeline: Connection) -> None:
+    """Ignore Ctrl-C, which is for the process that started this one, and end when that ends or closes the pipe."""
+
+    def watch() -> None:
+        wait([lifeline])
+        os._exit(1)
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    Thread(target=watch, daemon=True).start()
 
 
 @lru_cache(maxsize=1)
@@ -104,7 +128,7 @@ def _loaded(rules: str, settings: Settings, packs: tuple[str, ...]) -> tuple[Ori
     return original, original.mutants(frozenset(packs))
 
 
-def work(task: Task, tell: Callable[[Any], None]) -> Outcome:
+def work(task: Task) -> Outcome:
     """Judge one mutant."""
     original, mutants = _loaded(task.rules, task.settings, task.packs)
     mutant = mutants[task.number]
