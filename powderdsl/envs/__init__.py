@@ -6,11 +6,11 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import gymnasium
 
+from powderdsl.system.lazy import importing
 from powderdsl.tasks.shipped import shipped_tasks
 
 if TYPE_CHECKING:
@@ -40,7 +40,4 @@ for _task in shipped_tasks():
         )
 
 
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module 'powderdsl.envs' has no attribute {name!r}")
-    return getattr(import_module(f"powderdsl.envs.{_HOMES[name]}"), name)
+__getattr__ = importing("powderdsl.envs", _HOMES)

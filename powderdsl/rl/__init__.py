@@ -5,9 +5,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from powderdsl.rl.config import TrainConfig, preset
+from powderdsl.system.lazy import importing
 
 if TYPE_CHECKING:
     from powderdsl.rl.evaluation import evaluate
@@ -19,10 +20,4 @@ __all__ = ["TrainConfig", "evaluate", "load_policy", "preset", "train"]
 _HOMES = {"train": "training", "evaluate": "evaluation", "load_policy": "policies"}
 
 
-def __getattr__(name: str) -> Any:
-    """Public names are imported when first used: settings can be checked without torch."""
-    if name not in _HOMES:
-        raise AttributeError(f"module 'powderdsl.rl' has no attribute {name!r}")
-    from importlib import import_module
-
-    return getattr(import_module(f"powderdsl.rl.{_HOMES[name]}"), name)
+__getattr__ = importing("powderdsl.rl", _HOMES)

@@ -2,47 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from powderdsl.compiler import BACKENDS, RENAMED_BACKENDS
+from powderdsl.compiler import BACKENDS
 from powderdsl.diagnostics import CompileError, Diagnostic, Label, suggest
-from powderdsl.system.settings import out_of_bounds, setting
+from powderdsl.system.settings import mistakes, setting
 
 if TYPE_CHECKING:
     from powderdsl.tasks.task import Task
 
-NETWORKS = ("paper", "small", "fcn")
-OBSERVATIONS: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {
-        "paper": ("compact", "ids", "matrix"),
-        "small": ("ids", "compact", "matrix"),
-        "fcn": ("ids", "compact", "matrix"),
-    }
-)
-"""The observations that each network takes; the first is the default."""
-
-KINDS = ("compact", "ids", "matrix")
-
-HELD_OUT = ("eval_every", "eval_split", "eval_episodes")
-HOW = ("steps", "backend", "device", "threads", "checkpoint_minutes", *HELD_OUT)
-"""Settings that may change when a run is resumed: how long and on which machine it trains, not what it trains."""
-
-LATER = {
-    "reward": "task",
-    "init_from": "",
-    "init_expert": 0,
-    "init_epochs": 10,
-    "frames": 1,
-    "schedule": "constant",
-    "vf_coef": 0.5,
-    "max_grad_norm": 0.5,
-    "target_kl": 0.0,
-    "normalize": "advantage",
-}
-"""Settings that runs of earlier versions do not have, with what they trained with."""
+OBSERVATIONS = ("compact", "ids", "matrix")
+USUAL_OBSERVATION = MappingProxyType({"paper": "compact", "small": "ids", "fcn": "ids"})
+"""The networks, and the observation that each takes unless another is given."""
 
 
 @dataclass(frozen=True)
@@ -51,22 +25,24 @@ class TrainConfig:
 
     task: str
     """A shipped task's name, or a file's path."""
-    split: str = setting("train", "Split: which worlds.  [default: train]")
-    knobs: Mapping[str, int] = field(default_factory=dict)
-    params: Mapping[str, Any] = field(default_factory=dict)
+    split: str = setting("train", "Split: which worlds.  [default: train]", form="a name")
+    knobs: Mapping[str, int] = setting(dict)
+    params: Mapping[str, Any] = setting(dict)
     """Parameters of the rules: numbers, or text such as ``5%``."""
-    packs: tuple[str, ...] = ()
+    packs: tuple[str, ...] = setting(())
     """Packs, by name or file, that are added to the task's rules."""
     slots: int = setting(0, "Room for this many elements, for packs that come later.", 0, 256)
     worlds: int = setting(1_000_000, "How many worlds there are to draw from.", 1, 2**62)
-    observation: str = setting("compact", "Observation of the network.", choices=KINDS)
+    observation: str = setting("compact", "Observation of the network.", choices=OBSERVATIONS)
     network: str = setting(
-        "paper", "The paper's, a small one, or a fully convolutional one.", choices=NETWORKS
+        "paper",
+        "The paper's, a small one, or a fully convolutional one.",
+        choices=tuple(USUAL_OBSERVATION),
     )
     features: int = setting(256, "Width of its fully connected layers; of `fcn`, its channels.", 1, 1 << 16)
     frames: int = setting(1, "Observations that it sees at once, the last ones.", 1, 16)
     reward: str = setting("task", "The task's reward, or its `shaped` one.", choices=("task", "shaped"))
-    init_from: str = ""
+    init_from: str = setting("", form="the folder of a dataset")
     """The folder of a dataset whose actions the network learns first (behavior cloning)."""
     init_expert: int = setting(
         0, "Episodes of the task's expert, whose actions the network learns first; 0: none.", 0, 1_000_000
@@ -95,18 +71,29 @@ class TrainConfig:
         "advantage", "What is divided by its spread.", choices=("advantage", "reward", "both", "none")
     )
     seed: int = setting(0, "Of the run: worlds, network, and actions.", 0, 2**32 - 1)
-    steps: int = setting(1_000_000, "Interactions, of all worlds together, such as 2e5.", 1, 10**12)
-    """A run ends with the first whole rollout that reaches them."""
-    backend: str = "auto"
-    device: str = setting("cpu", "A torch device: cpu, cuda, cuda:1.  [default: cpu]")
-    threads: int = setting(1, "CPU threads.  [default: 1]", 1, 1024)
-    checkpoint_minutes: float = setting(2.0, low=0.0, high=1e6)
-    """How much work a kill may cost; 0 saves after every rollout."""
-    eval_every: int = setting(
-        0, "Interactions between two evaluations in held-out worlds; 0: none.", 0, 10**12
+    steps: int = setting(
+        1_000_000, "Interactions, of all worlds together, such as 2e5.", 1, 10**12, may_change=True
     )
-    eval_split: str = setting("test", "Split of those worlds.")
-    eval_episodes: int = setting(64, "How many of them.", 1, 1 << 20)
+    """A run ends with the first whole rollout that reaches them."""
+    backend: str = setting("auto", choices=tuple(BACKENDS), may_change=True)
+    device: str = setting(
+        "cpu", "A torch device: cpu, cuda, cuda:1.  [default: cpu]", form="a name", may_change=True
+    )
+    threads: int = setting(1, "CPU threads.  [default: 1]", 1, 1024, may_change=True)
+    checkpoint_minutes: float = setting(
+        2.0,
+        "Minutes between checkpoints; 0: after each rollout.  [default: 2]",
+        0.0,
+        1e6,
+        option="checkpoint-every",
+        may_change=True,
+    )
+    """How much work a kill may cost."""
+    eval_every: int = setting(
+        0, "Interactions between two evaluations in held-out worlds; 0: none.", 0, 10**12, may_change=True
+    )
+    eval_split: str = setting("test", "Split of those worlds.", form="a name", may_change=True)
+    eval_episodes: int = setting(64, "How many of them.", 1, 1 << 20, may_change=True)
 
     def as_json(self) -> dict[str, Any]:
         """All settings, as JSON has them."""
@@ -115,14 +102,12 @@ class TrainConfig:
     @property
     def identity(self) -> dict[str, Any]:
         """The settings that the result depends on: all but those of HOW. A falling learning rate depends on `steps`."""
-        return {
-            name: value
-            for name, value in self.as_json().items()
-            if name not in HOW and LATER.get(name, _NOTHING) != value
-        } | ({"steps": self.steps} if self.schedule != "constant" else {})
+        kept = {name: value for name, value in self.as_json().items() if name not in HOW}
+        return kept if self.schedule == "constant" else {**kept, "steps": self.steps}
 
 
-_NOTHING = object()
+HOW = tuple(one.name for one in fields(TrainConfig) if one.metadata.get("may_change"))
+"""Settings that may change when a run is resumed: how long and on which machine it trains, not what it trains."""
 
 PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {
@@ -164,26 +149,25 @@ def preset(name: str, task: str, **changes: Any) -> TrainConfig:
     known = [one.name for one in fields(TrainConfig)]
     unknown = [other for other in changes if other not in known]
     wrong += [_wrong(f"there is no setting `{other}`", suggest(other, known)) for other in unknown]
-    given = {"task": task, **PRESETS.get(name, {})}
-    given |= {one: value for one, value in changes.items() if one in known}
+    values = {"task": task, **PRESETS.get(name, {})}
+    values |= {name: value for name, value in changes.items() if name in known}
     # The usual observation depends on the network.
-    if "network" in changes and "observation" not in changes and changes["network"] in OBSERVATIONS:
-        given["observation"] = OBSERVATIONS[changes["network"]][0]
-    given["packs"] = tuple(given.get("packs", ()))
-    return check_config(TrainConfig(**given), wrong)
+    if "observation" not in changes and changes.get("network") in USUAL_OBSERVATION:
+        values["observation"] = USUAL_OBSERVATION[changes["network"]]
+    values["packs"] = tuple(values.get("packs", ()))
+    return check_config(TrainConfig(**values), wrong)
 
 
 def from_json(values: Mapping[str, Any]) -> TrainConfig:
     """Settings as `TrainConfig.as_json` gives them; missing ones have their defaults. Raises CompileError (PD640)."""
-    backend = values.get("backend", "auto")
-    if isinstance(backend, str):  # of runs from before its name changed
-        backend = RENAMED_BACKENDS.get(backend, backend)
-    return preset("paper", **{"task": "", **values, "backend": backend})
+    return preset("paper", **{"task": "", **values})
 
 
 def check_config(config: TrainConfig, known: Sequence[Diagnostic] = ()) -> TrainConfig:
     """The same settings. Raises CompileError (PD640) with everything that is wrong in them, after what is `known`."""
-    wrong = [*known, *_mistakes(config)]
+    wrong = [*known, *(_wrong(*mistake) for mistake in mistakes(config))]
+    if not wrong:
+        wrong = [_wrong(sentence) for sentence in _contradictions(config)]
     if wrong:
         raise CompileError(wrong)
     return config
@@ -200,44 +184,18 @@ def check_task(config: TrainConfig, task: Task) -> None:
         raise CompileError(wrong)
 
 
-def _mistakes(config: TrainConfig) -> list[Diagnostic]:
-    found = [_wrong(message) for message in out_of_bounds(config)]
-    for name in ("task", "split", "device", "eval_split", "init_from"):
-        value = getattr(config, name)
-        if not isinstance(value, str) or (not value and name != "init_from"):
-            found.append(_wrong(f"`{name}` is {value!r}: it takes a name"))
-    choices = {one.name: one.metadata["choices"] for one in fields(config) if one.metadata.get("choices")}
-    for name, known in {**choices, "backend": tuple(BACKENDS)}.items():
-        takes = (*known, *RENAMED_BACKENDS) if name == "backend" else known
-        if getattr(config, name) not in takes and name != "observation":
-            found.append(_no_choice(name, getattr(config, name), known))
-    seen = OBSERVATIONS.get(str(config.network), KINDS)
-    if config.observation not in seen:
-        found.append(_no_choice("observation", config.observation, seen))
-    if not all(isinstance(one, str) for one in config.packs) or "" in config.packs:
-        found.append(_wrong(f"`packs` is {config.packs!r}: it takes names or files of packs"))
-    for name in ("knobs", "params"):
-        value = getattr(config, name)
-        if not isinstance(value, Mapping) or not all(isinstance(one, str) for one in value):
-            found.append(_wrong(f"`{name}` is {value!r}: it takes values by name"))
+def _contradictions(config: TrainConfig) -> Iterator[str]:
+    """Settings that exclude each other."""
     if config.init_from and config.init_expert:
-        found.append(
-            _wrong("`init_from` and `init_expert` are both given: the network learns from one of them")
-        )
-    if config.frames != 1 and (config.init_from or config.init_expert):
-        found.append(_wrong("`frames`: recorded actions belong to single observations, so cloning takes 1"))
-    if config.observation == "matrix" and (config.init_from or config.init_expert):
-        found.append(_wrong("`observation`: episodes are recorded as `ids` or `compact`, not as `matrix`"))
-    sizes = (config.rollout, config.envs)
-    if all(isinstance(one, int) for one in sizes) and sizes[0] * sizes[1] < 2:
-        found.append(_wrong("`rollout` × `envs` is 1: an update needs two actions or more"))
-    return found
+        yield "`init_from` and `init_expert` are both given: the network learns from one of them"
+    if config.init_from or config.init_expert:
+        if config.frames != 1:
+            yield "`frames`: recorded actions belong to single observations, so cloning takes 1"
+        if config.observation == "matrix":
+            yield "`observation`: episodes are recorded as `ids` or `compact`, not as `matrix`"
+    if config.rollout * config.envs < 2:
+        yield "`rollout` × `envs` is 1: an update needs two actions or more"
 
 
-def _no_choice(name: str, value: Any, choices: tuple[str, ...]) -> Diagnostic:
-    message = f"`{name}` is {value!r}: it takes one of {', '.join(choices)}"
-    return _wrong(message, suggest(str(value), choices))
-
-
-def _wrong(message: str, helps: list[str] | tuple[str, ...] = ()) -> Diagnostic:
+def _wrong(message: str, helps: Sequence[str] = ()) -> Diagnostic:
     return Diagnostic("PD640", message, Label(None), helps=tuple(helps))

@@ -16,11 +16,10 @@ from torch import Tensor
 from powderdsl.envs.acting import uniforms
 from powderdsl.envs.features import paper_policy, small_policy
 from powderdsl.envs.tensor_env import TensorEnv
-from powderdsl.experiments.runs import RunFolder, does_not_fit, find_run, no_run
-from powderdsl.model.composition.palette import MAX_ELEMENTS
+from powderdsl.experiments.runs import RunFolder, does_not_fit, find_run
+from powderdsl.experiments.runs.palettes import check_palette, recorded_palette
 from powderdsl.rl.config import TrainConfig, from_json
 from powderdsl.rl.fcn import BinDistribution, BinPolicy, fcn_policy
-from powderdsl.system.writing import failure
 from powderdsl.tasks.episodes import compile_task
 from powderdsl.tasks.shipped import load_task
 from powderdsl.tasks.task import Task
@@ -120,32 +119,12 @@ def _own_env(run: RunFolder, config: TrainConfig, env: TensorEnv) -> TensorEnv:
 
     Raises CompileError (PD623) if `env` has elements for which the network has no slots.
     """
-    palette = recorded_palette(run)
-    lacking = [one.qualified for one in env.task.ruleset.elements if one.id >= len(palette)]
-    if lacking:
-        notes = tuple(f"there is no free slot for `{name}`: it has {len(palette)}" for name in lacking)
-        slots = len(palette) + len(lacking)
-        fix = f"train with `--slots {slots}` to leave room for packs that come later"
-        raise failure("PD623", f"{run.path} does not fit", notes=notes, helps=(fix,))
-    other = [
-        f"id {one.id} is `{palette[one.id]}` there, `{one.qualified}` here"
-        for one in env.task.ruleset.elements
-        if palette[one.id] not in (None, one.qualified)
-    ]
-    if other:
-        raise does_not_fit(run.path, *other)
+    elements = {element.id: element.qualified for element in env.task.ruleset.elements}
+    check_palette(run.path, recorded_palette(run), elements)
     if tuple(run.config.get("channels", ())) == tuple(env.observation.channels):
         return env
     program = compile_task(task_of(run), split=config.split, backend="torch", device=str(env.device))
     return TensorEnv(program, 1, observation=config.observation)
-
-
-def recorded_palette(run: RunFolder) -> tuple[str | None, ...]:
-    """The qualified name of the element of each of a run's slots. Raises CompileError (PD620) if it has none."""
-    found = run.config.get("palette")
-    if not isinstance(found, list) or len(found) > MAX_ELEMENTS:
-        raise no_run(run.path, "its palette is damaged")
-    return tuple(None if one is None else str(one) for one in found)
 
 
 def task_of(run: RunFolder, packs: Sequence[str] = ()) -> Task:

@@ -127,8 +127,8 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
 def _task_and_palette(config: TrainConfig) -> tuple[Task, tuple[str | None, ...]]:
     """The task, with the ids of the network's slots: those that its rules need, and free ones as asked for."""
     how: dict[str, Any] = {name: getattr(config, name) for name in ("knobs", "params", "packs")}
-    found = list(whole_palette(*load_task(config.task, **how).rules))
-    palette = (*found, *[None] * (config.slots - len(found)))
+    used = whole_palette(*load_task(config.task, **how).rules)
+    palette = (*used, *[None] * (config.slots - len(used)))
     return load_task(config.task, **how, palette=palette), palette
 
 

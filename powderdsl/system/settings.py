@@ -2,7 +2,7 @@
 
 Checks, the reader of records and the options of commands (`cli.options.settings_of`) follow from the declarations. The
 type of a record's field is the kind of its values: ``bool``, ``int``, ``float``, ``str``, another record, a named tuple
-of these, ``tuple[T, ...]``, ``Mapping[str, T]``, or any of these with limits: ``Annotated[int, Limits(1, 9)]``.
+of these, ``tuple[T, ...]``, ``Mapping[str, T]``, ``T | None``, or any of these with limits: ``Annotated[int, Limits(1, 9)]``.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from functools import cache
 from operator import index
+from types import NoneType, UnionType
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 from powderdsl.diagnostics import suggest
 
-Value = TypeVar("Value", int, float, str)
 Record = TypeVar("Record")
 
 MAX_TEXT = 500
@@ -41,28 +41,44 @@ class Limits:
 
 
 def setting(
-    default: Value,
+    default: Any,
     about: str = "",
     low: float | None = None,
     high: float | None = None,
+    *,
     choices: Sequence[str] = (),
-) -> Value:
-    """A setting: numbers from `low` to `high` (None: any), or one of `choices`. With `about` it has an option."""
-    metadata = {"about": about, "limits": Limits(low, high, tuple(choices)), "choices": tuple(choices)}
+    form: str = "a text",
+    option: str = "",
+    may_change: bool = False,
+) -> Any:
+    """A field of a dataclass of settings. A text may be empty only if it is by default.
+
+    Args:
+        default: a value, or a type that makes one, such as `dict`.
+        about: the help of its option; without it there is none. option: the option's name, unless it is the field's.
+        low, high, choices, form: see `Limits`.
+        may_change: whether a run may be resumed with another value.
+    """
+    pattern = f"(?s:.{{{1 if default else 0},{MAX_TEXT}}})"
+    limits = Limits(low, high, tuple(choices), pattern, form)
+    metadata = {"about": about, "limits": limits, "option": option, "may_change": may_change}
+    if isinstance(default, type):
+        return field(default_factory=default, metadata=metadata)
     return field(default=default, metadata=metadata)
 
 
-def out_of_bounds(config: Any) -> Iterator[str]:
-    """Yield a sentence for each number of a dataclass of settings that is out of bounds."""
+def mistakes(config: Any) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Yield a sentence and suggestions for each setting whose value it does not take."""
+    hints = get_type_hints(type(config))
     for item in fields(config):
-        value, limits = getattr(config, item.name), item.metadata.get("limits", Limits())
-        if limits.low is not None and (wanted := _mismatch(type(item.default), value, limits)):
-            yield f"`{item.name}` is {value!r}: it takes {wanted}"
+        value, limits = getattr(config, item.name), item.metadata.get("limits")
+        if limits is not None and (wanted := _mismatch(hints[item.name], value, limits)):
+            yield f"`{item.name}` is {value!r}: it takes {wanted}", suggest(str(value), limits.choices)
 
 
-def check_bounds(config: Any) -> None:
-    """Raise ValueError with everything that `out_of_bounds` finds."""
-    if wrong := "; ".join(out_of_bounds(config)):
+def check_settings(config: Any) -> None:
+    """Raise ValueError with all `mistakes`."""
+    if wrong := "; ".join(sentence for sentence, _ in mistakes(config)):
         raise ValueError(wrong)
 
 
@@ -91,8 +107,12 @@ def read_record(kind: type[Record], data: Any, problems: list[str], path: str = 
 @cache
 def _fields_of(kind: Any) -> dict[str, tuple[Any, bool]]:
     """The type of each field of a record, and whether it is required."""
-    hints = get_type_hints(kind, include_extras=True)
-    return {item.name: (hints[item.name], item.default is MISSING) for item in fields(kind)}
+    hints, declared = get_type_hints(kind, include_extras=True), {}
+    for item in fields(kind):
+        hint, limits = hints[item.name], item.metadata.get("limits")
+        required = item.default is MISSING and item.default_factory is MISSING
+        declared[item.name] = (hint if limits is None else Annotated[hint, limits], required)
+    return declared
 
 
 def _read(kind: Any, value: Any, path: str, problems: list[str]) -> Any:
@@ -100,6 +120,10 @@ def _read(kind: Any, value: Any, path: str, problems: list[str]) -> Any:
     limits = Limits()
     if get_origin(kind) is Annotated:
         kind, limits = get_args(kind)
+    if kind is Any or (value is None and NoneType in get_args(kind)):
+        return value
+    if isinstance(kind, UnionType):
+        kind = next(arm for arm in get_args(kind) if arm is not NoneType)
     if is_dataclass(kind):
         return read_record(kind, value, problems, path)  # type: ignore[arg-type]  # it is a type, not an instance
     if kind is int and hasattr(value, "__index__") and not isinstance(value, bool):

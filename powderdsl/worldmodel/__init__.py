@@ -1,48 +1,51 @@
 """World models: networks that learn to predict a world some steps on (Frans & Isola 2023, section 4).
 
-`pairs` makes the data, `replay` keeps it, `recordings` are transitions with actions. `unet` is the paper's network;
+`worlds` makes the data, `replay` keeps it, `recordings` are transitions with actions. `networks` has the paper's network;
 `training`, `evaluation` and `scores` take that one or any other: a callable from ids uint8 [B, H, W] to logits
 [B, slots, H, W].
 """
 
-from powderdsl.worldmodel.config import PRESETS, Machine, TrainConfig
-from powderdsl.worldmodel.evaluation import Tested, evaluate, evaluate_recording
-from powderdsl.worldmodel.networks import CustomNetwork, custom_network
-from powderdsl.worldmodel.pairs import DataConfig, TaskWorlds, Worlds, pairs_of, task_worlds, unseen_seeds
-from powderdsl.worldmodel.recordings import Recording, open_recording
-from powderdsl.worldmodel.replay import Replay
-from powderdsl.worldmodel.scores import Score, frequent, outcomes, score, still
-from powderdsl.worldmodel.trained import Trained, finetuned, load_trained
-from powderdsl.worldmodel.training import train
-from powderdsl.worldmodel.unet import UNet, fresh_unet
+from __future__ import annotations
 
-__all__ = [
-    "PRESETS",
-    "CustomNetwork",
-    "DataConfig",
-    "Machine",
-    "Recording",
-    "Replay",
-    "Score",
-    "TaskWorlds",
-    "Tested",
-    "TrainConfig",
-    "Trained",
-    "UNet",
-    "Worlds",
-    "custom_network",
-    "evaluate",
-    "evaluate_recording",
-    "finetuned",
-    "frequent",
-    "fresh_unet",
-    "load_trained",
-    "open_recording",
-    "outcomes",
-    "pairs_of",
-    "score",
-    "still",
-    "task_worlds",
-    "train",
-    "unseen_seeds",
-]
+from typing import TYPE_CHECKING
+
+from powderdsl.system.lazy import importing
+
+if TYPE_CHECKING:
+    from powderdsl.worldmodel.config import DataConfig as DataConfig
+    from powderdsl.worldmodel.config import Machine as Machine
+    from powderdsl.worldmodel.config import TrainConfig as TrainConfig
+    from powderdsl.worldmodel.evaluation import evaluate as evaluate
+    from powderdsl.worldmodel.evaluation import evaluate_recording as evaluate_recording
+    from powderdsl.worldmodel.networks import UNet as UNet
+    from powderdsl.worldmodel.networks import custom_network as custom_network
+    from powderdsl.worldmodel.recordings import open_recording as open_recording
+    from powderdsl.worldmodel.replay import Replay as Replay
+    from powderdsl.worldmodel.scores import score as score
+    from powderdsl.worldmodel.trained import finetuned as finetuned
+    from powderdsl.worldmodel.trained import load_trained as load_trained
+    from powderdsl.worldmodel.training import train as train
+    from powderdsl.worldmodel.worlds import pairs_of as pairs_of
+    from powderdsl.worldmodel.worlds import task_worlds as task_worlds
+    from powderdsl.worldmodel.worlds import unseen_seeds as unseen_seeds
+
+_HOMES = {
+    "DataConfig": "config",
+    "Machine": "config",
+    "Replay": "replay",
+    "TrainConfig": "config",
+    "UNet": "networks",
+    "custom_network": "networks",
+    "evaluate": "evaluation",
+    "evaluate_recording": "evaluation",
+    "finetuned": "trained",
+    "load_trained": "trained",
+    "open_recording": "recordings",
+    "pairs_of": "worlds",
+    "score": "scores",
+    "task_worlds": "worlds",
+    "train": "training",
+    "unseen_seeds": "worlds",
+}
+
+__getattr__ = importing("powderdsl.worldmodel", _HOMES)

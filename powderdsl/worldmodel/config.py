@@ -6,19 +6,71 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
+from powderdsl.compiler import BACKENDS
 from powderdsl.model.composition.palette import MAX_ELEMENTS
-from powderdsl.system.settings import check_bounds, setting
-from powderdsl.worldmodel.networks import is_network_name
-from powderdsl.worldmodel.pairs import DataConfig
+from powderdsl.system.settings import check_settings, read_record, setting
 
-LATER = ("network", "recorded")
-"""Settings that the first runs do not have, with the default None."""
+TEST_SEEDS = 1 << 32
+"""The first seed of worlds that models are tested on. Training takes seeds below it."""
+
+MAX_RULESETS = 1024
+"""The most rulesets of a run: each is checked before the first step, and each structure compiled."""
 
 MAX_CHANNELS = 256
 """Channels of recorded observations."""
 
-MAX_WIDTH = 1024
-"""Features of the first block."""
+
+@dataclass(frozen=True)
+class Variety:
+    """How rulesets differ from the one that they are drawn around.
+
+    `chances`: parameters that are chances are multiplied by a factor between 1/chances and chances, uniform in its
+    logarithm, up to 1. `swaps`: for each of these properties, two elements exchange their values. `leave_out`: how
+    likely each pack that no other one needs is to be left out. Raises ValueError for values out of range.
+    """
+
+    chances: float = setting(1.0, "Factor by which chances of drawn rulesets differ, at most.", 1.0, 1e6)
+    swaps: tuple[str, ...] = setting(
+        (), "Property whose values two elements swap in drawn rulesets.", option="swap"
+    )
+    leave_out: float = setting(0.0, "Probability that a ruleset leaves out a pack.", 0.0, 0.999)
+
+    def __post_init__(self) -> None:
+        check_settings(self)
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """Which pairs a network learns from. Plain values: ``dataclasses.asdict`` gives what a run's file keeps.
+
+    The worlds are those of seeds 0 to `states` − 1. Each is run for `steps`·`pairs` steps and gives `pairs` pairs: the
+    paper's 16 of 8 steps. `only` names packs: worlds draw no other pack's elements. The replay buffer holds `capacity`
+    pairs, of which each iteration replaces `refresh`; if all pairs of all worlds fit in, it holds these and stays so.
+    Raises ValueError for values out of range.
+    """
+
+    task: str = setting(
+        "world-model", "A shipped task or a file.  [default: world-model]", form="a name or a file"
+    )
+    split: str = setting("train", "Split of the task to train on.  [default: train]", form="a name")
+    rules: str = setting("")
+    """As everywhere: a shipped ruleset, packs joined by ``+``, left out behind ``-``. Empty: the task's own."""
+    only: tuple[str, ...] = setting(())
+    knobs: Mapping[str, int] = setting(dict)
+    params: Mapping[str, Any] = setting(dict)
+    states: int = setting(1_000_000, "Number of start worlds. Tests begin at 2³².", 1, TEST_SEEDS)
+    steps: int = setting(8, low=1)
+    pairs: int = setting(16, low=1)
+    rulesets: int = setting(0, "Number of rulesets to draw around the rules.", 0, MAX_RULESETS)
+    """World s runs under number `first_ruleset` + s mod `rulesets`. 0: all under `rules`."""
+    first_ruleset: int = setting(0, low=0, high=1 << 32)
+    variety: Variety = field(default_factory=Variety)
+    """The differences between the rulesets."""
+    capacity: int = setting(1024 * 256, "Capacity of the buffer, in pairs.", 1, 1 << 32, option="buffer")
+    refresh: int = setting(256, "Pairs that each iteration replaces in the buffer.", 1, 1 << 20)
+
+    def __post_init__(self) -> None:
+        check_settings(self)
 
 
 @dataclass(frozen=True)
@@ -50,43 +102,47 @@ class TrainConfig:
     and the data's rules. `slots` is how many there are at least: free ones are room for packs that come later.
     `network` is the name of a `CustomNetwork`, as text: what it names is imported only if the user gives it again.
     `recorded` is the dataset that is learned from; `data` then says which task it was recorded from.
+    Raises ValueError for values out of range.
     """
 
     data: DataConfig = field(default_factory=DataConfig)
-    width: int = setting(32, low=1, high=MAX_WIDTH)
-    iterations: int = setting(5000, low=1, high=1 << 40)
-    batch: int = setting(256, low=1, high=1 << 20)
-    learning_rate: float = 0.005
-    seed: int = setting(0, low=0, high=2**63 - 1)
+    width: int = setting(32, "Features of the first block.", 1, 1024)
+    iterations: int = setting(5000, "Steps of Adam.", 1, 1 << 40)
+    batch: int = setting(256, "Pairs per step.", 1, 1 << 20)
+    learning_rate: float = setting(0.005, "Learning rate of Adam.", 1e-300, 1e300)
+    seed: int = setting(0, "Seed of weights, worlds and batches.", 0, 2**63 - 1)
     parent: str | None = None
-    slots: int = setting(0, low=0, high=MAX_ELEMENTS)
+    slots: int = setting(0, "Room for this many elements, for packs that come later.", 0, MAX_ELEMENTS)
     palette: tuple[str | None, ...] = ()
     network: str | None = None
     recorded: Recorded | None = None
 
     def __post_init__(self) -> None:
-        """Raises ValueError for values out of range."""
-        check_bounds(self)
-        if not 0 < self.learning_rate < float("inf"):
-            raise ValueError(f"learning_rate must be above 0, found {self.learning_rate}")
-        if len(self.palette) > MAX_ELEMENTS:
-            raise ValueError(f"palette has more than {MAX_ELEMENTS} slots")
+        check_settings(self)
         if self.network is not None and not is_network_name(self.network):
             raise ValueError("network must have the form module:Class")
 
     @property
     def plain(self) -> dict[str, Any]:
-        """For ``run.json``. Settings that came later are left out unless they are used: older runs lack them."""
-        found = asdict(self)
-        return {name: value for name, value in found.items() if name not in LATER or value is not None}
+        """For ``run.json``: the settings that are used."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
 
     @staticmethod
     def of(values: Mapping[str, Any]) -> TrainConfig:
-        """The configuration in a run's JSON, without the run's other settings. Raises TypeError, ValueError."""
-        own = {one.name: values[one.name] for one in fields(TrainConfig) if one.name in values}
-        found = own.get("recorded")
-        recorded = None if found is None else Recorded(**{**found, "channels": tuple(found["channels"])})
-        return TrainConfig(**{**own, "data": DataConfig.of(own["data"]), "palette": (), "recorded": recorded})
+        """The configuration in a run's JSON, without its palette and what is no setting. Raises ValueError."""
+        names, problems = {one.name for one in fields(TrainConfig)} - {"palette"}, list[str]()
+        settings = {name: value for name, value in values.items() if name in names}
+        config = read_record(TrainConfig, settings, problems)
+        if config is None:
+            raise ValueError("; ".join(problems))
+        return config
+
+
+def is_network_name(text: Any) -> bool:
+    """Whether a text has the form ``package.module:Class``. Nothing is imported."""
+    if not isinstance(text, str) or text.count(":") != 1 or len(text) > 200:
+        return False
+    return all(part.isidentifier() for part in text.replace(":", ".").split("."))
 
 
 PAPER = TrainConfig()
@@ -104,14 +160,17 @@ PRESETS = {"paper": PAPER, "small": SMALL}
 class Machine:
     """Where a run is computed. A run may continue on another machine.
 
-    `compiled` runs the network through ``torch.compile``. `store` is that of `Replay`.
+    `compiled` runs the network through ``torch.compile``. `store` is that of `Replay`. Raises ValueError for others.
     """
 
-    device: str = "cpu"
-    threads: int = 1
-    backend: str = "auto"
-    store: str = "auto"
+    device: str = setting("cpu", form="a name")
+    threads: int = setting(1, low=1, high=1024)
+    backend: str = setting("auto", choices=tuple(BACKENDS))
+    store: str = setting("auto", choices=("auto", "memory", "disk"))
     compiled: bool = False
+
+    def __post_init__(self) -> None:
+        check_settings(self)
 
     @property
     def simulation(self) -> dict[str, Any]:

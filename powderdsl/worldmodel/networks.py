@@ -1,4 +1,4 @@
-"""Networks other than the paper's, named by the user: ``module:Class``.
+"""Networks: the paper's U-net (Frans & Isola 2023, section 4), and users' own, named ``module:Class``.
 
 Importing a module executes its code. So a name is imported only where the user gives it, on the command line or in
 Python. Runs record it as text, which nothing imports.
@@ -6,6 +6,7 @@ Python. Runs record it as text, which nothing imports.
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 import traceback
@@ -14,34 +15,177 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import reduce
 from importlib import import_module
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from powderdsl.diagnostics import CompileError, suggest
+from powderdsl.experiments.runs import Checkpoint, does_not_fit
 from powderdsl.system.writing import failure
+from powderdsl.worldmodel.config import is_network_name
+
+SIDES = 4
+"""Rows and columns are padded to a multiple of this: two poolings halve them twice."""
+
+NO_ELEMENT = 255
+"""In inputs with actions: nothing is placed on this cell."""
 
 CONTRACT = "it is called as NAME(channels, slots) and gives a torch.nn.Module: float32 [B, channels, H, W] -> logits [B, slots, H, W]"
 
 
-class Encoder(Protocol):
-    """What a world model is given, uint8 -> float32 [B, channels, H, W]."""
+# Inputs
+
+
+@dataclass(frozen=True)
+class OneHot:
+    """Ids uint8 [B, H, W] -> float32 [B, slots, H, W]: 1 in the channel of the element, 0 in the others."""
+
+    slots: int
 
     @property
     def channels(self) -> int:
-        """How many there are."""
+        return self.slots
 
     def __call__(self, inputs: Tensor) -> Tensor:
-        """The channels of some inputs."""
+        return F.one_hot(inputs.long(), self.slots).permute(0, 3, 1, 2).float().contiguous()
+
+    def example(self, size: tuple[int, int]) -> Tensor:
+        """Two inputs: uint8 [2, H, W]."""
+        cells = torch.arange(2 * size[0] * size[1]) % self.slots
+        return cells.to(torch.uint8).view(2, *size)
 
 
-def is_network_name(text: Any) -> bool:
-    """Whether a text has the form ``package.module:Class``. Nothing is imported."""
-    if not isinstance(text, str) or text.count(":") != 1 or len(text) > 200:
-        return False
-    return all(part.isidentifier() for part in text.replace(":", ".").split("."))
+@dataclass(frozen=True)
+class ActionChannels:
+    """A state and an action, uint8 [B, observed + 3, H, W] as `recordings` has them -> float32 [B, channels, H, W].
+
+    The channels: the elements, one-hot, after the action has placed its own; the other channels of the observation,
+    about −1 to 1; and, with `actions`, 1 where the action places an element, 1 where it blows, and its speed there in
+    rows and columns, −1 to 1. Without, nothing of the action is seen.
+    """
+
+    slots: int
+    observed: int
+    actions: bool = True
+
+    @property
+    def channels(self) -> int:
+        return self.slots + self.observed - 1 + (4 if self.actions else 0)
+
+    def __call__(self, inputs: Tensor) -> Tensor:
+        ids, placed, speed = inputs[:, 0], inputs[:, self.observed], inputs[:, self.observed + 1 :]
+        found = [inputs[:, 1 : self.observed].float() / 128 - 1]
+        if self.actions:
+            here = placed != NO_ELEMENT
+            ids = torch.where(here, placed, ids)
+            blown = (speed[:, :1] != 0).float()
+            found += [here[:, None].float(), blown, (speed.float() - 2) * blown]
+        return torch.cat([OneHot(self.slots)(ids), *found], 1)
+
+    def example(self, size: tuple[int, int]) -> Tensor:
+        """Two inputs: uint8 [2, observed + 3, H, W]."""
+        ids = OneHot(self.slots).example(size)[:, None]
+        return torch.cat([ids, torch.zeros(2, self.observed + 2, *size, dtype=torch.uint8)], 1)
+
+
+def without_actions(inputs: Tensor) -> Tensor:
+    """Inputs in which nothing was done: uint8 [B, C + 3, H, W]."""
+    found = inputs.clone()
+    found[:, -3], found[:, -2:] = NO_ELEMENT, 0
+    return found
+
+
+Encoder = OneHot | ActionChannels
+"""What makes the channels that networks see, float32 [B, channels, H, W], of inputs, uint8."""
+
+
+class Encoded(nn.Module):
+    """A network on channels, as one on ids: encodes its inputs first."""
+
+    def __init__(self, encoder: Encoder, network: nn.Module):
+        super().__init__()
+        self.encoder, self.network = encoder, network
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        logits: Tensor = self.network(self.encoder(inputs))
+        return logits
+
+
+# The paper's network
+
+
+class UNet(nn.Module):
+    """Element ids, uint8 [B, H, W] -> logits of what each cell will hold, float32 [B, slots, H, W].
+
+    With `channels`, the input is float32 [B, channels, H, W] instead.
+
+    Three blocks of `width`, 2·`width` and 4·`width` features, each two 3×3 convolutions with ReLU; max-pooling down,
+    transposed convolutions up, skip connections, a 1×1 head. Ids become one-hot only here, a batch at a time.
+    """
+
+    def __init__(self, slots: int, width: int = 32, channels: int | None = None):
+        super().__init__()
+        self.slots, self.width = slots, width
+        one, two, four = width, 2 * width, 4 * width
+        self.down_1, self.down_2 = _block(channels or slots, one), _block(one, two)
+        self.middle = _block(two, four)
+        self.pool = nn.MaxPool2d(2)
+        self.up_2 = nn.ConvTranspose2d(four, two, 2, stride=2)
+        self.up_1 = nn.ConvTranspose2d(two, one, 2, stride=2)
+        self.back_2, self.back_1 = _block(2 * two, two), _block(2 * one, one)
+        self.head = nn.Conv2d(one, slots, 1)
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        height, width = inputs.shape[-2:]
+        cells = inputs
+        if inputs.ndim == 3:
+            # One-hot as [B, H, W, C] seen as [B, C, H, W] has channels last in memory, and convolutions keep that.
+            cells = F.one_hot(inputs.long(), self.slots).to(self.head.weight.dtype).permute(0, 3, 1, 2)
+        cells = F.pad(cells, (0, -width % SIDES, 0, -height % SIDES))
+        cells = cells.contiguous(memory_format=torch.channels_last)
+        first = self.down_1(cells)
+        second = self.down_2(self.pool(first))
+        third = self.middle(self.pool(second))
+        second = self.back_2(torch.cat([self.up_2(third), second], 1))
+        first = self.back_1(torch.cat([self.up_1(second), first], 1))
+        logits: Tensor = self.head(first)
+        return logits[..., :height, :width]
+
+
+def _block(before: int, after: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(before, after, 3, padding=1),
+        nn.ReLU(inplace=True),
+        nn.Conv2d(after, after, 3, padding=1),
+        nn.ReLU(inplace=True),
+    )
+
+
+def fresh_unet(slots: int, width: int, seed: int, channels: int | None = None) -> UNet:
+    """A network with random weights that depend on the seed alone: made on the CPU, the same for every device.
+
+    Their spread is that of He et al. (2015): activations keep their size from layer to layer. With torch's own, which
+    shrink them, the loss takes about three times as many iterations to fall as far.
+    """
+    network = UNet(slots, width, channels)
+    source = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for layer in network.modules():
+            if isinstance(layer, nn.Conv2d):
+                inputs = layer.in_channels * layer.kernel_size[0] * layer.kernel_size[1]
+                gain = 1 if layer is network.head else 2  # a ReLU halves the mean square
+                layer.weight.normal_(std=math.sqrt(gain / inputs), generator=source)
+            elif isinstance(layer, nn.ConvTranspose2d):
+                layer.weight.normal_(std=math.sqrt(1 / layer.in_channels), generator=source)
+            if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d) and layer.bias is not None:
+                layer.bias.zero_()
+    return network
+
+
+# Users' own
 
 
 @dataclass(frozen=True)
@@ -79,12 +223,12 @@ class CustomNetwork:
             logits = network(inputs)
         given = f"for channels [{len(inputs)}, {encoder.channels}, {inputs.shape[-2]}, {inputs.shape[-1]}]"
         expected = [len(inputs), slots, *inputs.shape[-2:]]
-        if not isinstance(logits, Tensor):
-            found = type(logits).__name__
-            raise _invalid(self.name, f"must give logits {expected}, found {found}", given, helps=(CONTRACT,))
-        if list(logits.shape) != expected or not logits.is_floating_point():
-            found = f"{list(logits.shape)} of {logits.dtype}"
-            raise _invalid(self.name, f"must give logits {expected}, found {found}", given, helps=(CONTRACT,))
+        is_tensor = isinstance(logits, Tensor)
+        if not is_tensor or list(logits.shape) != expected or not logits.is_floating_point():
+            result = f"{list(logits.shape)} of {logits.dtype}" if is_tensor else type(logits).__name__
+            raise _invalid(
+                self.name, f"must give logits {expected}, found {result}", given, helps=(CONTRACT,)
+            )
         weights = [one for one in network.parameters() if one.requires_grad]
         if logits.requires_grad and weights:
             with self._told("has no gradient"):
@@ -103,81 +247,6 @@ class CustomNetwork:
             raise _invalid(self.name, what, *_words(error), helps=(CONTRACT,)) from None
 
 
-class Encoded(nn.Module):
-    """A network on channels, as one on ids: encodes its inputs first."""
-
-    def __init__(self, encoder: Encoder, network: nn.Module):
-        super().__init__()
-        self.encoder, self.network = encoder, network
-
-    def forward(self, inputs: Tensor) -> Tensor:
-        logits: Tensor = self.network(self.encoder(inputs))
-        return logits
-
-
-@dataclass(frozen=True)
-class OneHot:
-    """Ids uint8 [B, H, W] -> float32 [B, slots, H, W]: 1 in the channel of the element, 0 in the others."""
-
-    slots: int
-
-    @property
-    def channels(self) -> int:
-        return self.slots
-
-    def __call__(self, inputs: Tensor) -> Tensor:
-        return F.one_hot(inputs.long(), self.slots).permute(0, 3, 1, 2).float().contiguous()
-
-    def example(self, count: int, size: tuple[int, int]) -> Tensor:
-        """Some inputs: uint8 [count, H, W]."""
-        cells = torch.arange(count * size[0] * size[1]) % self.slots
-        return cells.to(torch.uint8).view(count, *size)
-
-
-NO_ELEMENT = 255
-"""In inputs with actions: nothing is placed on this cell."""
-
-
-@dataclass(frozen=True)
-class ActionChannels:
-    """A state and an action, uint8 [B, observed + 3, H, W] as `recordings` has them -> float32 [B, channels, H, W].
-
-    The channels: the elements, one-hot, after the action has placed its own; the other channels of the observation,
-    about −1 to 1; and, with `actions`, 1 where the action places an element, 1 where it blows, and its speed there in
-    rows and columns, −1 to 1. Without, nothing of the action is seen.
-    """
-
-    slots: int
-    observed: int
-    actions: bool = True
-
-    @property
-    def channels(self) -> int:
-        return self.slots + self.observed - 1 + (4 if self.actions else 0)
-
-    def __call__(self, inputs: Tensor) -> Tensor:
-        ids, placed, speed = inputs[:, 0], inputs[:, self.observed], inputs[:, self.observed + 1 :]
-        found = [inputs[:, 1 : self.observed].float() / 128 - 1]
-        if self.actions:
-            here = placed != NO_ELEMENT
-            ids = torch.where(here, placed, ids)
-            blown = (speed[:, :1] != 0).float()
-            found += [here[:, None].float(), blown, (speed.float() - 2) * blown]
-        return torch.cat([OneHot(self.slots)(ids), *found], 1)
-
-    def example(self, count: int, size: tuple[int, int]) -> Tensor:
-        """Some inputs."""
-        ids = OneHot(self.slots).example(count, size)[:, None]
-        return torch.cat([ids, torch.zeros(count, self.observed + 2, *size, dtype=torch.uint8)], 1)
-
-
-def without_actions(inputs: Tensor) -> Tensor:
-    """Inputs in which nothing was done: uint8 [B, C + 3, H, W]."""
-    found = inputs.clone()
-    found[:, -3], found[:, -2:] = NO_ELEMENT, 0
-    return found
-
-
 def custom_network(name: str) -> CustomNetwork:
     """Import a network by its name, ``module:Class``, from installed packages or the current folder.
 
@@ -189,15 +258,13 @@ def custom_network(name: str) -> CustomNetwork:
     module_name, _, path = name.partition(":")
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # behind all others: nothing that is installed is replaced
-    helps: tuple[str, ...] = ()
     try:
         module = import_module(module_name)
-    except ModuleNotFoundError as error:
-        if error.name and f"{module_name}.".startswith(f"{error.name}."):
-            helps = ("run the command in the module's folder",)
-            raise _invalid(name, "cannot be imported", _words(error)[0], helps=helps) from None
-        raise _invalid(name, "cannot be imported", *_words(error)) from None
     except Exception as error:
+        lacking = error.name if isinstance(error, ModuleNotFoundError) else None
+        if lacking and f"{module_name}.".startswith(f"{lacking}."):
+            fix = "run the command in the module's folder"
+            raise _invalid(name, "cannot be imported", _words(error)[0], helps=(fix,)) from None
         raise _invalid(name, "cannot be imported", *_words(error)) from None
     try:
         make = reduce(getattr, path.split("."), module)
@@ -222,3 +289,38 @@ def _words(error: Exception) -> tuple[str, str]:
 def _invalid(name: str, what: str, *notes: str, helps: tuple[str, ...] = ()) -> CompileError:
     """PD625: a network that cannot be used."""
     return failure("PD625", f"the network `{name}` {what}", notes=notes, helps=helps)
+
+
+# Weights
+
+
+def fit_weights(model: nn.Module, checkpoint: Checkpoint, *, grow: bool = False) -> None:
+    """Give a network the weights of a checkpoint, which may hold anything.
+
+    Args:
+        grow: the network may be larger: what the checkpoint lacks keeps the weights that it has.
+
+    Raises:
+        CompileError: PD623 if they are those of another network.
+    """
+    try:
+        weights = dict(checkpoint.state["model"])
+        model.load_state_dict(_grown(weights, model) if grow else weights)
+    except (RuntimeError, TypeError, ValueError, AttributeError, LookupError) as error:
+        words = [line.strip()[:200] for line in str(error).splitlines()[:4]]
+        raise does_not_fit(checkpoint.path, "its weights are those of another network", *words) from None
+
+
+def _grown(state: dict[str, Any], model: nn.Module) -> dict[str, Any]:
+    """Weights in the shapes of a network that has more slots, first in each dimension."""
+    for name, fresh in model.state_dict().items():
+        old = state.get(name)
+        if (
+            isinstance(old, Tensor)
+            and old.ndim == fresh.ndim
+            and old.shape != fresh.shape
+            and all(a <= b for a, b in zip(old.shape, fresh.shape, strict=True))
+        ):
+            state[name] = fresh.clone()
+            state[name][tuple(slice(size) for size in old.shape)] = old
+    return state

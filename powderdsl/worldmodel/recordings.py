@@ -22,9 +22,9 @@ from powderdsl.model.types import Ruleset
 from powderdsl.system.writing import failure
 from powderdsl.tasks.shipped import load_task, shipped_tasks
 from powderdsl.tasks.task import BLOW, NO_CHANGE, Task
-from powderdsl.worldmodel.config import Recorded, TrainConfig
+from powderdsl.worldmodel.config import DataConfig, Recorded, TrainConfig
 from powderdsl.worldmodel.networks import NO_ELEMENT
-from powderdsl.worldmodel.pairs import DataConfig, Pairs
+from powderdsl.worldmodel.worlds import Pairs
 
 if TYPE_CHECKING:  # datasets need the extra `rl`
     from powderdsl.datasets import Dataset, Transitions
@@ -140,9 +140,6 @@ class RecordedPairs:
 
     def advance(self) -> None:
         """Nothing changes."""
-
-    def close(self) -> None:
-        """Nothing is kept."""
 
     def batch(self, iteration: int, count: int) -> Pairs:
         """The pairs of an iteration's batch."""

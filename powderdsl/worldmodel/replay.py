@@ -6,20 +6,22 @@ iteration. So a checkpoint needs no copy of it: `Replay.go_to` makes it again, c
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
+from tempfile import TemporaryFile
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from powderdsl.system.random import MASK, base_keys, mix
-from powderdsl.worldmodel.pairs import DataConfig, HasIds, Pairs, Worlds, pairs_of
+from powderdsl.worldmodel.config import DataConfig
+from powderdsl.worldmodel.worlds import Pairs, Worlds, pairs_of
 
 TOGETHER = 1 << 20
 """The most cells that are simulated together when the buffer is filled."""
-
-STORES = ("auto", "memory", "disk")
 
 _BATCH, _FIRST = 0x57A7, 0x0FF5
 """The numbers of the hashes that choose batches and the first world."""
@@ -31,7 +33,7 @@ class Replay:
     Args:
         seed: the run's. It decides which world comes first, and which pairs a batch has.
         store: ``memory`` (of `device`), ``disk``, or ``auto``: disk where the buffer would take more than half of memory.
-        folder: where its files lie; only needed on disk.
+        folder: where its files lie, unless it is that of temporary files.
     """
 
     def __init__(
@@ -44,8 +46,6 @@ class Replay:
         store: str = "auto",
         folder: Path | None = None,
     ):
-        if store not in STORES:
-            raise ValueError(f"store must be one of {', '.join(STORES)}, found {store!r}")
         self.worlds, self.config, self.device = worlds, config, torch.device(device)
         self.all_fit = config.states * config.pairs <= config.capacity
         self.size = config.states * config.pairs if self.all_fit else config.capacity
@@ -53,12 +53,12 @@ class Replay:
         self._key = int(mix(keys[0] ^ keys[1])[0])
         first = int((keys[0, 1] << 32 | keys[1, 1]) & (2**63 - 1))
         self._first = 0 if self.all_fit else first % config.states
-        self._files: list[Path] = []
+        shape = (self.size, *worlds.size)
         if store == "auto":
-            store = "disk" if self._bytes() > memory_of(self.device) // 2 and folder else "memory"
-        self.starts, self.ends = (self._room(store, name, folder) for name in ("starts", "ends"))
+            store = "disk" if 2 * math.prod(shape) > memory_of(self.device) // 2 else "memory"
+        self.starts, self.ends = (_zeros(shape, store, folder, self.device) for _ in range(2))
         self.iteration = -1
-        self._live: HasIds | None = None
+        self._live: Any = None
 
     def go_to(self, iteration: int) -> None:
         """Make the buffer's contents before an iteration, counted from 0."""
@@ -94,12 +94,6 @@ class Replay:
         chosen = ((drawn * self.size) >> 32).to(self.starts.device)
         return self.starts[chosen].to(self.device), self.ends[chosen].to(self.device)
 
-    def close(self) -> None:
-        """Delete the files."""
-        del self.starts, self.ends
-        for path in self._files:
-            path.unlink(missing_ok=True)
-
     def _fill(self) -> None:
         """The first pairs: world by world, in the order of time."""
         pairs = self.config.pairs
@@ -125,23 +119,13 @@ class Replay:
             kept = slice(max(0, len(place) - self.size), None)
             room[place[kept]] = ids[kept].to(room.device)
 
-    def _bytes(self) -> int:
-        height, width = self.worlds.size
-        return 2 * self.size * height * width
 
-    def _room(self, store: str, name: str, folder: Path | None) -> Tensor:
-        shape = (self.size, *self.worlds.size)
-        if store == "memory":
-            return torch.zeros(shape, dtype=torch.uint8, device=self.device)
-        if folder is None:
-            raise ValueError("a buffer on disk needs a folder")
-        path = folder / f"replay-{name}.bin"
-        room = torch.from_numpy(np.memmap(path, dtype=np.uint8, mode="w+", shape=shape))
-        try:
-            path.unlink()  # what is mapped lives on without its name, and not longer than this process
-        except OSError:  # Windows does not allow it
-            self._files.append(path)
-        return room
+def _zeros(shape: tuple[int, ...], store: str, folder: Path | None, device: torch.device) -> Tensor:
+    """Zeros, uint8, in the memory of a device or in a file that is deleted with its last user."""
+    if store == "memory":
+        return torch.zeros(shape, dtype=torch.uint8, device=device)
+    with TemporaryFile(dir=folder) as file:  # what is mapped outlives the file
+        return torch.from_numpy(np.memmap(file, dtype=np.uint8, mode="w+", shape=shape))
 
 
 def memory_of(device: torch.device) -> int:

@@ -10,9 +10,8 @@ from itertools import combinations
 from typing import Any
 
 import torch
-from torch import Tensor
 
-from powderdsl.compiler import read, starting_backend
+from powderdsl.compiler import read
 from powderdsl.diagnostics import CompileError, Reporter, suggest
 from powderdsl.model.check import check
 from powderdsl.model.composition.names import with_stand_ins
@@ -20,18 +19,12 @@ from powderdsl.model.composition.palette import Palette
 from powderdsl.model.declarations import ElementDecl, PackDecl
 from powderdsl.model.parameter_values import set_params
 from powderdsl.model.types import Ruleset
-from powderdsl.simulation.simulator import World
 from powderdsl.system.random import MASK, base_keys, mix
 from powderdsl.system.writing import failure
-from powderdsl.tasks.episodes import TaskProgram, compile_task
-from powderdsl.tasks.task import Task
-from powderdsl.worldmodel.watched import SplitWorlds, watched
+from powderdsl.worldmodel.config import Variety
 
 TRIES = 8
 """How often a swap or a selection of packs is drawn again if the rules are inconsistent."""
-
-MAX_RULESETS = 1024
-"""The most rulesets of a run: each is checked before the first step, and each structure compiled."""
 
 UNSEEN_RULESETS = 1 << 32
 """The first number of rulesets that models are tested on. Training takes numbers below it."""
@@ -41,39 +34,13 @@ _DRAW = 0x9F1D
 
 
 @dataclass(frozen=True)
-class Variety:
-    """How rulesets differ from the one that they are drawn around.
-
-    `chances`: parameters that are chances are multiplied by a factor between 1/chances and chances, uniform in its
-    logarithm, up to 1. `swaps`: for each of these properties, two elements exchange their values. `leave_out`: how
-    likely each pack that no other one needs is to be left out.
-    """
-
-    chances: float = 1.0
-    swaps: tuple[str, ...] = ()
-    leave_out: float = 0.0
-
-    def __post_init__(self) -> None:
-        """Raises ValueError for values out of range."""
-        if not 1 <= self.chances <= 1e6:
-            raise ValueError(f"chances is a factor from 1 to 1,000,000, found {self.chances}")
-        if not 0 <= self.leave_out < 1:
-            raise ValueError(f"leave_out is a chance below 1, found {self.leave_out}")
-
-    @staticmethod
-    def of(values: Mapping[str, Any]) -> Variety:
-        """The configuration in a run's JSON. Raises TypeError, ValueError."""
-        return Variety(**{**values, "swaps": tuple(values.get("swaps", ()))})
-
-
-@dataclass(frozen=True)
 class Drawn:
     """A ruleset that was drawn. `left_out`: packs; `swapped`: property and two elements; `params`: other chances."""
 
     number: int
-    left_out: tuple[str, ...]
-    swapped: tuple[tuple[str, str, str], ...]
-    params: tuple[tuple[str, float], ...]
+    left_out: tuple[str, ...] = ()
+    swapped: tuple[tuple[str, str, str], ...] = ()
+    params: tuple[tuple[str, float], ...] = ()
 
     @property
     def structure(self) -> tuple[Any, ...]:
@@ -100,13 +67,12 @@ class RulesetSource:
         reporter = Reporter()
         self.packs, self.ruleset_decl = read([rules] if isinstance(rules, str) else rules, reporter)
         reporter.raise_if_errors()
-        self.palette = palette
-        self.base = self._checked(self.packs, params)
-        self.variety, self.params = variety, params
+        self.variety, self.params, self.palette = variety, params or {}, palette
+        self.base = self._checked(self.packs)
+        self.palette = palette or self.base.palette  # ids stay where they are when packs are left out
         for name in variety.swaps:
             if self.base.property(name) is None:
-                known = [one.name for one in self.base.properties]
-                helps = suggest(name, known, "properties")
+                helps = suggest(name, [prop.name for prop in self.base.properties], "properties")
                 raise failure("PD301", f"the rules {self.base.name} have no property `{name}`", helps=helps)
 
     def draw(self, number: int) -> Drawn:
@@ -114,21 +80,16 @@ class RulesetSource:
         draws = _draws(number)
         for _ in range(TRIES):
             left_out = self._left_out(draws)
-            swapped = self._swapped(draws, left_out)
+            drawn = Drawn(number, left_out, self._swapped(draws, left_out))
             try:
-                model = self.model(Drawn(number, left_out, swapped, ()))
+                model = self.model(drawn)
             except CompileError:
                 continue
-            params = self._chances(draws, model)
-            return Drawn(number, left_out, swapped, params)
-        return Drawn(number, (), (), self._chances(draws, self.base))
+            return replace(drawn, params=self._chances(draws, model))
+        return Drawn(number, params=self._chances(draws, self.base))
 
     def model(self, drawn: Drawn) -> Ruleset:
-        """The checked model of a ruleset, with the base's parameters.
-
-        Raises:
-            CompileError: the rules are inconsistent.
-        """
+        """The checked model of a ruleset, with the base's parameters. Raises CompileError for inconsistent rules."""
         return self._model(drawn.left_out, drawn.swapped)
 
     @lru_cache(maxsize=256)  # noqa: B019  a source lives as long as what it has checked
@@ -136,19 +97,18 @@ class RulesetSource:
         if not left_out and not swapped:
             return self.base
         packs = [pack for pack in self.packs if pack.name.text not in left_out]
-        for prop, one, other in swapped:
-            packs = _exchanged(packs, prop, one, other)
-        there = {f"{pack.name.text}.{param.name.text}" for pack in packs for param in pack.params}
-        return self._checked(
-            packs, {name: value for name, value in (self.params or {}).items() if name in there}
-        )
+        for prop, first, second in swapped:
+            packs = _exchanged(packs, prop, first, second)
+        return self._checked(packs)
 
-    def _checked(self, packs: Sequence[PackDecl], params: Mapping[str, Any] | None) -> Ruleset:
+    def _checked(self, packs: Sequence[PackDecl]) -> Ruleset:
         reporter = Reporter()
         model = check(list(packs), self.ruleset_decl, reporter, self.palette)
-        self.palette = self.palette or model.palette  # ids stay where they are when packs are left out
-        if params:
-            model = set_params(model, params, reporter)
+        left_out = {pack.name.text for pack in self.packs} - {pack.name.text for pack in packs}
+        params = {
+            name: value for name, value in self.params.items() if name.partition(".")[0] not in left_out
+        }
+        model = set_params(model, params, reporter) if params else model
         reporter.raise_if_errors()
         return model
 
@@ -162,119 +122,27 @@ class RulesetSource:
 
     def _swapped(self, draws: Iterator[float], left_out: tuple[str, ...]) -> tuple[tuple[str, str, str], ...]:
         """For each property, two elements with different values."""
-        found = []
+        packs = [pack for pack in self.packs if pack.name.text not in left_out]
+        swapped = []
         for prop in self.variety.swaps:
-            written = _written((pack for pack in self.packs if pack.name.text not in left_out), prop)
-            pairs = [pair for pair in combinations(written, 2) if written[pair[0]] != written[pair[1]]]
+            values = _values(packs, prop)
+            pairs = [pair for pair in combinations(values, 2) if values[pair[0]] != values[pair[1]]]
             if pairs:
-                found.append((prop, *pairs[int(next(draws) * len(pairs))]))
-        return tuple(found)
+                swapped.append((prop, *pairs[int(next(draws) * len(pairs))]))
+        return tuple(swapped)
 
     def _chances(self, draws: Iterator[float], model: Ruleset) -> tuple[tuple[str, float], ...]:
         """The chances of the model, each multiplied by a factor. All chances of the base draw one."""
         if self.variety.chances == 1:
             return ()
-        spread, there = math.log(self.variety.chances), {param.name for param in model.params}
-        found = []
+        spread, names = math.log(self.variety.chances), {param.name for param in model.params}
+        chances = []
         for param in self.base.params:
             if param.kind.name == "chance":
                 factor = math.exp(spread * (2 * next(draws) - 1))
-                if param.name in there:
-                    found.append((param.name, min(1.0, float(param.default) * factor)))
-        return tuple(found)
-
-
-@dataclass(frozen=True)
-class MixedPart:
-    """Worlds of one structure: where they stand in the batch, and their chances, float64 [worlds] by parameter."""
-
-    world: World
-    places: Tensor
-    params: Mapping[str, Tensor]
-
-
-@dataclass(frozen=True)
-class MixedWorld:
-    """A batch of worlds of several rulesets."""
-
-    parts: tuple[MixedPart, ...]
-
-    @property
-    def ids(self) -> Tensor:
-        """Element ids, uint8 [B, H, W]."""
-        order = torch.cat([part.places for part in self.parts]).argsort()
-        return torch.cat([part.world.ids for part in self.parts])[order]
-
-
-class VariedWorlds(SplitWorlds):
-    """The worlds of a task's split, each under a ruleset of its own: world s under ruleset `first` + s mod `count`.
-
-    Rulesets of one structure are compiled once and run together; their chances are parameters of each world.
-
-    Args:
-        task: under the source's own rules. only: as `DataConfig` has it.
-        backend, device, threads: those of `powderdsl.compile`. ``auto`` takes what starts at once: compiling many
-            rulesets would take longer than running them.
-
-    Raises:
-        CompileError: PD604 if worlds need an element that the rules do not have.
-    """
-
-    def __init__(
-        self,
-        task: Task,
-        split: str,
-        source: RulesetSource,
-        count: int,
-        *,
-        first: int = 0,
-        only: tuple[str, ...] = (),
-        backend: str = "auto",
-        device: str = "cpu",
-        threads: int = 1,
-    ):
-        super().__init__(watched(task, split, source.base, only), torch.device(device))
-        self.source, self.split, self.only, self._task = source, split, only, task
-        self.drawn = [source.draw(first + number) for number in range(count)]
-        self._machine: dict[str, Any] = {
-            "backend": starting_backend(device) if backend == "auto" else backend,
-            "device": device,
-            "threads": threads,
-        }
-        self._programs: dict[tuple[Any, ...], TaskProgram] = {}
-
-    def start(self, seeds: Tensor) -> MixedWorld:
-        """The worlds of seeds, int64 [B]."""
-        groups: dict[tuple[Any, ...], list[int]] = {}
-        chosen = [self.drawn[seed % len(self.drawn)] for seed in seeds.tolist()]
-        for number, one in enumerate(chosen):
-            groups.setdefault(one.structure, []).append(number)
-        parts = []
-        for members in groups.values():
-            places = torch.tensor(members, device=seeds.device)
-            world = self._program(chosen[members[0]]).start(seeds[places]).world
-            values = [dict(chosen[member].params) for member in members]
-            params = {
-                name: torch.tensor([one[name] for one in values], dtype=torch.float64, device=seeds.device)
-                for name in values[0]
-            }
-            parts.append(MixedPart(world, places, params))
-        return MixedWorld(tuple(parts))
-
-    def later(self, world: MixedWorld, steps: int) -> MixedWorld:
-        """The worlds some steps later."""
-        later = [
-            replace(part, world=part.world.sim.step(part.world, steps, params=part.params))
-            for part in world.parts
-        ]
-        return MixedWorld(tuple(later))
-
-    def _program(self, drawn: Drawn) -> TaskProgram:
-        if drawn.structure not in self._programs:
-            # Rules without some packs draw from the remaining elements; worlds that need others are replaced.
-            found = watched(self._task, self.split, self.source.model(drawn), self.only, partly=True)
-            self._programs[drawn.structure] = compile_task(found.task, split=self.split, **self._machine)
-        return self._programs[drawn.structure]
+                if param.name in names:
+                    chances.append((param.name, min(1.0, float(param.default) * factor)))
+        return tuple(chances)
 
 
 def _draws(number: int) -> Iterator[float]:
@@ -286,7 +154,7 @@ def _draws(number: int) -> Iterator[float]:
         count += 1
 
 
-def _written(packs: Iterable[PackDecl], prop: str) -> dict[str, Any]:
+def _values(packs: Iterable[PackDecl], prop: str) -> dict[str, Any]:
     """The values of a property as elements declare them, by name."""
     return {
         element.name.text: syntax
@@ -297,16 +165,16 @@ def _written(packs: Iterable[PackDecl], prop: str) -> dict[str, Any]:
     }
 
 
-def _exchanged(packs: Sequence[PackDecl], prop: str, one: str, other: str) -> list[PackDecl]:
+def _exchanged(packs: Sequence[PackDecl], prop: str, first: str, second: str) -> list[PackDecl]:
     """Packs in which two elements have exchanged their values of a property."""
-    written = _written(packs, prop)
-    new = {one: written[other], other: written[one]}
+    values = _values(packs, prop)
+    new = {first: values[second], second: values[first]}
 
     def exchanged(element: ElementDecl) -> ElementDecl:
-        values = tuple(
+        swapped = tuple(
             (name, new.get(element.name.text, syntax) if name.text == prop else syntax)
             for name, syntax in element.values
         )
-        return replace(element, values=values)
+        return replace(element, values=swapped)
 
     return [replace(pack, elements=tuple(map(exchanged, pack.elements))) for pack in packs]

@@ -6,13 +6,15 @@ All but the loss follow from counts of cells, so they are the same whatever the 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import reduce
+from operator import add
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from powderdsl.worldmodel.pairs import Pairs
+from powderdsl.worldmodel.worlds import Pairs
 
 Network = Callable[[Tensor], Tensor]
 """Ids uint8 [B, H, W] -> logits [B, slots, H, W]."""
@@ -46,12 +48,6 @@ class Score:
     changed_right: int
     predicted_changed: int
     bins: Tensor
-
-    @staticmethod
-    def none(slots: int) -> Score:
-        """The score of no cells."""
-        confusion = torch.zeros(slots, slots, dtype=torch.int64)
-        return Score(0.0, confusion, 0, 0, 0, torch.zeros(len(KINDS), BINS, 3, dtype=torch.int64))
 
     @property
     def cells(self) -> int:
@@ -109,9 +105,8 @@ class Score:
 
     def reliability(self) -> dict[str, list[dict[str, float | int]]]:
         """For each of `KINDS` the bins that have cells: their bounds, cells, mean probability, and share that was right."""
-        found: dict[str, list[dict[str, float | int]]] = {}
-        for kind, table in zip(KINDS, self.bins.tolist(), strict=True):
-            found[kind] = [
+        return {
+            kind: [
                 {
                     "low": number / BINS,
                     "high": (number + 1) / BINS,
@@ -122,17 +117,11 @@ class Score:
                 for number, (cells, right, units) in enumerate(table)
                 if cells
             ]
-        return found
+            for kind, table in zip(KINDS, self.bins.tolist(), strict=True)
+        }
 
     def __add__(self, other: Score) -> Score:
-        return Score(
-            self.loss_sum + other.loss_sum,
-            self.confusion + other.confusion,
-            self.changed + other.changed,
-            self.changed_right + other.changed_right,
-            self.predicted_changed + other.predicted_changed,
-            self.bins + other.bins,
-        )
+        return Score(*(getattr(self, one.name) + getattr(other, one.name) for one in fields(self)))
 
 
 MEASURES = (
@@ -151,23 +140,26 @@ MEASURES = (
 """The numbers of a `Score` by name."""
 
 
-def score(predict: Network, pairs: Iterable[Pairs], slots: int) -> Score:
-    """The score of a network, or of any callable from ids to logits [B, slots, H, W], on some pairs.
+def ids_of(inputs: Tensor) -> Tensor:
+    """The ids, uint8 [B, H, W], of inputs: the first channel where these also have an action."""
+    return inputs if inputs.ndim == 3 else inputs[:, 0]
 
-    Inputs with actions, uint8 [B, C, H, W], have the ids in their first channel.
-    """
-    total = Score.none(slots)
+
+def score(predict: Network, pairs: Iterable[Pairs], slots: int) -> Score:
+    """The score of a network, or of any callable from ids to logits [B, slots, H, W], on some pairs."""
+    parts = []
     for starts, ends in pairs:
         few = max(1, TOGETHER // (starts.shape[-2] * starts.shape[-1]))
-        for begin in range(0, len(starts), few):
-            total = total + _score(predict, starts[begin : begin + few], ends[begin : begin + few], slots)
-    return total
+        parts += [
+            _score(predict, *part, slots) for part in zip(starts.split(few), ends.split(few), strict=True)
+        ]
+    return reduce(add, parts)
 
 
 @torch.no_grad()
 def _score(predict: Network, starts: Tensor, ends: Tensor, slots: int) -> Score:
     logits = predict(starts).float()
-    starts = starts if starts.ndim == 3 else starts[:, 0]
+    starts = ids_of(starts)
     truth = ends.long()
     loss = F.cross_entropy(logits, truth, reduction="none").double().sum()
     chances, predicted = logits.softmax(1), logits.argmax(1)
@@ -207,7 +199,8 @@ class Table:
     def __init__(self, chances: Tensor):
         self.chances = chances
 
-    def __call__(self, ids: Tensor) -> Tensor:
+    def __call__(self, inputs: Tensor) -> Tensor:
+        ids = ids_of(inputs)
         return self.chances.log().float().to(ids.device)[ids.long()].permute(0, 3, 1, 2)
 
 
@@ -215,7 +208,7 @@ def outcomes(pairs: Iterable[Pairs], slots: int) -> Tensor:
     """How many cells went from each element to each: int64 [slots, slots]."""
     counts = torch.zeros(slots, slots, dtype=torch.int64)
     for starts, ends in pairs:
-        counts += _counts(starts.long(), ends.long(), slots)
+        counts += _counts(ids_of(starts).long(), ends.long(), slots)
     return counts
 
 
@@ -247,13 +240,13 @@ def frequent(counts: Tensor, ids: Sequence[int]) -> Table:
     return Table(seen / seen.sum(1, keepdim=True))
 
 
-def elements_of(found: Score, palette: tuple[str | None, ...]) -> dict[str, dict[str, float | int | None]]:
+def elements_of(total: Score, palette: tuple[str | None, ...]) -> dict[str, dict[str, float | int | None]]:
     """By element: cells that ended as it, the share of these that was predicted (recall), and the share of cells
     predicted as it that were (precision). None where there are no such cells."""
     table: dict[str, dict[str, float | int | None]] = {}
-    for slot, name in enumerate(palette):
-        cells, predicted = int(found.confusion[slot].sum()), int(found.confusion[:, slot].sum())
-        right = int(found.confusion[slot, slot])
+    counts = zip(total.confusion.sum(1).tolist(), total.confusion.sum(0).tolist(), strict=True)
+    rights = total.confusion.diagonal().tolist()
+    for name, (cells, predicted), right in zip(palette, counts, rights, strict=True):
         if name is not None and (cells or predicted):
             table[name] = {
                 "cells": cells,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -11,10 +10,9 @@ from numpy.typing import NDArray
 
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.draw import contact_sheet, palette, rgb, scale
-from powderdsl.worldmodel.pairs import TaskWorlds, unseen_seeds
 from powderdsl.worldmodel.recordings import Recording
-from powderdsl.worldmodel.rulesets import VariedWorlds
 from powderdsl.worldmodel.scores import Network
+from powderdsl.worldmodel.worlds import TaskWorlds, unseen_seeds
 
 RIGHT, WRONG = (235, 235, 235), (200, 30, 30)
 """Colors of cells that were predicted correctly, and of others."""
@@ -36,9 +34,7 @@ class Strip:
 
 
 @torch.no_grad()
-def strips(
-    predict: Network, worlds: TaskWorlds | VariedWorlds, *, step: int, times: int = 1, after: int = 0
-) -> list[Strip]:
+def strips(predict: Network, worlds: TaskWorlds, *, step: int, times: int = 1, after: int = 0) -> list[Strip]:
     """A strip for each variant of a split.
 
     Args:
@@ -46,8 +42,7 @@ def strips(
         after: steps that worlds have run before.
     """
     seeds = unseen_seeds(1, len(worlds.names)).to(worlds.device)
-    begun: Any = worlds.start(seeds)
-    world: Any = worlds.later(begun, after)
+    world = worlds.later(worlds.start(seeds), after)
     predicted = world.ids
     for _ in range(times):
         predicted = predict(predicted).argmax(1).to(torch.uint8)

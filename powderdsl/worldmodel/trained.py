@@ -7,19 +7,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import nn
 
 from powderdsl.experiments.runs import Checkpoint, RunFolder, does_not_fit, find_run, no_run
-from powderdsl.model.composition.palette import MAX_ELEMENTS, Palette
+from powderdsl.experiments.runs.palettes import recorded_palette
+from powderdsl.model.composition.palette import Palette
 from powderdsl.model.types import Ruleset
 from powderdsl.tasks.shipped import load_task
-from powderdsl.worldmodel.config import MAX_WIDTH, TrainConfig
-from powderdsl.worldmodel.networks import CustomNetwork, Encoded, OneHot
+from powderdsl.worldmodel.config import TrainConfig
+from powderdsl.worldmodel.networks import CustomNetwork, Encoded, OneHot, UNet, fit_weights
 from powderdsl.worldmodel.rule_words import add, pack_names
-from powderdsl.worldmodel.training import KIND, encoder_of, load_rules_of, network_missing, recorded_palette
-from powderdsl.worldmodel.unet import UNet
-from powderdsl.worldmodel.weights import fit_weights, weights_in
+from powderdsl.worldmodel.training import KIND, encoder_of, load_rules_of, network_missing
 
 
 @dataclass(frozen=True)
@@ -50,12 +48,11 @@ def load_trained(
     """
     run = path if isinstance(path, RunFolder) else find_run(path, KIND)
     try:
-        config, palette = TrainConfig.of(run.config), recorded_palette(run)
+        config = TrainConfig.of(run.config)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise no_run(run.path, str(error)) from None
+    palette = recorded_palette(run)
     slots = len(palette)
-    if not 1 <= slots <= MAX_ELEMENTS:
-        raise no_run(run.path, "its network has sizes that no training gives")
     if network is None and config.network is not None:
         raise network_missing(run.path, config.network)
     if isinstance(network, CustomNetwork) and network.name != config.network:
@@ -66,30 +63,12 @@ def load_trained(
         model: nn.Module = network.build(encoder, slots, config.seed)
     elif network is not None:
         model = network
+    elif isinstance(encoder, OneHot):
+        model = UNet(slots, config.width)
     else:
-        _check_size(run, config, slots, checkpoint)
-        model = _u_net(config, slots).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        model = Encoded(encoder, UNet(slots, config.width, encoder.channels))
     fit_weights(model, checkpoint)
     return Trained(run, config, palette, model.to(device).eval(), checkpoint)
-
-
-def _u_net(config: TrainConfig, slots: int) -> nn.Module:
-    """The U-net of a configuration, with any weights."""
-    encoder = encoder_of(config, slots)
-    if isinstance(encoder, OneHot):
-        return UNet(slots, config.width)
-    return Encoded(encoder, UNet(slots, config.width, encoder.channels))
-
-
-def _check_size(run: RunFolder, config: TrainConfig, slots: int, checkpoint: Checkpoint) -> None:
-    """Compare sizes before a network takes the memory that a damaged run.json asks for. Raises CompileError."""
-    if type(config.width) is not int or not 1 <= config.width <= MAX_WIDTH:
-        raise no_run(run.path, "its network has sizes that no training gives")
-    with torch.device("meta"):
-        wanted = {name: one.shape for name, one in _u_net(config, slots).state_dict().items()}
-    found = {name: getattr(one, "shape", None) for name, one in weights_in(checkpoint).items()}
-    if wanted != found:
-        raise does_not_fit(checkpoint.path, "its weights are those of another network")
 
 
 # Transfer: packs that a network has not seen are added to its rules, and it continues from its weights

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -15,13 +15,9 @@ from torch.nn import functional as F
 
 from powderdsl.compiler import load, whole_palette
 from powderdsl.diagnostics import CompileError
-from powderdsl.experiments.runs import (
-    Checkpoint,
-    RunFolder,
-    does_not_fit,
-    open_run,
-    read_run,
-)
+from powderdsl.experiments.runs import Checkpoint, RunFolder, does_not_fit, open_run, read_run
+from powderdsl.experiments.runs.folder import ABOUT
+from powderdsl.experiments.runs.palettes import check_palette, recorded_palette
 from powderdsl.model.composition.palette import Palette
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
@@ -29,16 +25,22 @@ from powderdsl.system.interrupts import held_back
 from powderdsl.system.random import base_keys, mix
 from powderdsl.system.writing import failure
 from powderdsl.tasks.shipped import load_task
-from powderdsl.worldmodel.config import HERE, Machine, TrainConfig
-from powderdsl.worldmodel.networks import ActionChannels, CustomNetwork, Encoded, OneHot
-from powderdsl.worldmodel.pairs import DataConfig, Pairs, Worlds, task_worlds, validation_pairs
+from powderdsl.worldmodel.config import HERE, DataConfig, Machine, TrainConfig
+from powderdsl.worldmodel.networks import (
+    ActionChannels,
+    CustomNetwork,
+    Encoded,
+    Encoder,
+    OneHot,
+    fit_weights,
+    fresh_unet,
+)
 from powderdsl.worldmodel.replay import Replay
 from powderdsl.worldmodel.scores import Network, score
-from powderdsl.worldmodel.unet import fresh_unet
-from powderdsl.worldmodel.weights import fit_weights
+from powderdsl.worldmodel.worlds import Pairs, Worlds, task_worlds, validation_pairs
 
 if TYPE_CHECKING:
-    from powderdsl.worldmodel.recordings import Recording
+    from powderdsl.worldmodel.recordings import RecordedPairs, Recording
 
 KIND = "worldmodel"
 
@@ -75,7 +77,7 @@ def train(
     network: nn.Module | CustomNetwork | None = None,
     parent: Checkpoint | None = None,
     note: Mapping[str, Any] | None = None,
-    tell: Callable[[TrainingProgress], None] | None = None,
+    tell: Tell = lambda progress: None,
     save_seconds: float = 60,
     validate_every: int = 0,
 ) -> RunFolder:
@@ -103,82 +105,60 @@ def train(
         ValueError: your own network gives logits of another shape.
         KeyboardInterrupt: Ctrl-C, after a last checkpoint.
     """
+    path = Path(folder)
     if isinstance(network, CustomNetwork):
         config = replace(config, network=network.name)
     elif network is None and config.network is not None:
-        raise network_missing(Path(folder), config.network)
+        raise network_missing(path, config.network)
+    note = {"machine": asdict(machine), **(note or {})}
     if recording is not None:
         config = recording.configured(config)
-        note = {"dataset": str(recording.dataset.folder), **(note or {})}
+        note["dataset"] = str(recording.dataset.folder)
     elif config.recorded is not None:
-        raise does_not_fit(Path(folder), "it learns from a dataset, which is not given")
-    palette = _palette_for(config, Path(folder), worlds)
+        raise does_not_fit(path, "it learns from a dataset, which is not given")
+    palette = _palette_for(config, path, worlds)
+    identity = dict(identity or {})
     if recording is None and worlds is None:
-        found = task_worlds(config.data, **machine.simulation, palette=palette)
-        worlds, identity = found, {"worlds": found.fingerprint, **(identity or {})}
-    given: Worlds | Recording = recording or worlds  # type: ignore[assignment]
-    check_palette(Path(folder), palette, given.rules)
-    own = {"palette": palette, "rules_fingerprint": fingerprint(given.rules), **(identity or {})}
+        worlds = own_worlds = task_worlds(config.data, **machine.simulation, palette=palette)
+        identity["worlds"] = own_worlds.fingerprint
+    given: Any = recording or worlds
+    check_slots(path, palette, given.rules)
+    identity |= {"palette": palette, "rules_fingerprint": fingerprint(given.rules)}
     slots, encoder = len(palette), encoder_of(config, len(palette))
     if isinstance(network, CustomNetwork):
-        network.check(encoder, slots, encoder.example(2, given.size), config.seed)
-    run = open_run(folder, KIND, {**config.plain, **own}, note={"machine": asdict(machine), **(note or {})})
+        network.check(encoder, slots, encoder.example(given.size), config.seed)
+    run = open_run(path, KIND, {**config.plain, **identity}, note=note)
     with run.locked():
         if isinstance(network, CustomNetwork):
             network = network.build(encoder, slots, config.seed)
         model = network or _fresh(config, encoder, slots)
         trainer = _Trainer(config, machine, run, model.to(machine.device), slots)
         trainer.restore(parent)
-        if trainer.done < config.iterations:
-            source, pairs = _material(config, machine, run, recording, worlds, validate_every > 0)
-            validation = Validation(validate_every, pairs)
-            trainer.train(source, validation, tell or (lambda progress: None), save_seconds)
+        if trainer.done == config.iterations:
+            return run
+        held_out: Sequence[Pairs] = ()
+        if recording is not None:
+            source: Replay | RecordedPairs = recording.source(config.seed, machine.device)
+            if validate_every:
+                held_out = recording.validation(machine.device)
+        else:
+            source = Replay(
+                given, config.data, seed=config.seed, device=machine.device, store=machine.store, folder=path
+            )
+            if validate_every:
+                held_out = validation_pairs(given, config.data, machine.device)
+        trainer.train(source, Validation(validate_every, held_out), tell, save_seconds)
     return run
 
 
-class Source(Protocol):
-    """Where batches come from: a `Replay`, or transitions that were recorded."""
-
-    def go_to(self, iteration: int) -> None:
-        """Get ready for an iteration."""
-
-    def advance(self) -> None:
-        """Go to the next iteration."""
-
-    def batch(self, iteration: int, count: int) -> Pairs:
-        """The pairs of an iteration's batch, which the seed and the iteration decide."""
-
-    def close(self) -> None:
-        """Delete what was made."""
-
-
-def _material(
-    config: TrainConfig,
-    machine: Machine,
-    run: RunFolder,
-    recording: Recording | None,
-    worlds: Worlds | None,
-    validated: bool,
-) -> tuple[Source, Sequence[Pairs]]:
-    """What a network is trained on, and validated on if asked for."""
-    device = machine.device
-    if recording is not None:
-        return recording.source(config.seed, device), recording.validation(device) if validated else ()
-    assert worlds is not None
-    replay = Replay(
-        worlds, config.data, seed=config.seed, device=device, store=machine.store, folder=run.path
-    )
-    return replay, validation_pairs(worlds, config.data, device) if validated else ()
-
-
-def encoder_of(config: TrainConfig, slots: int) -> OneHot | ActionChannels:
+def encoder_of(config: TrainConfig, slots: int) -> Encoder:
     """What makes channels of the inputs."""
     if config.recorded is None:
         return OneHot(slots)
     return ActionChannels(slots, len(config.recorded.channels), config.recorded.actions)
 
 
-def _fresh(config: TrainConfig, encoder: OneHot | ActionChannels, slots: int) -> nn.Module:
+def _fresh(config: TrainConfig, encoder: Encoder, slots: int) -> nn.Module:
     """The paper's network with random weights. It encodes worlds without actions by itself."""
     if isinstance(encoder, OneHot):
         return fresh_unet(slots, config.width, config.seed)
@@ -197,20 +177,18 @@ class Validation:
         return bool(self.every) and (done % self.every == 0 or done == of)
 
     def values(self, model: nn.Module, slots: int) -> dict[str, float]:
-        """Metrics of a network, which stays as it is."""
-        training = model.training
+        """Metrics of a network in training, which stays as it is."""
         with _random_numbers_kept(next(model.parameters()).device):
-            found = score(model.eval(), self.pairs, slots).plain()
-        model.train(training)
-        named = {"loss/validation": found["loss"]}
-        named |= {f"validation/{name}": found[name] for name in VALIDATED}
+            measured = score(model.eval(), self.pairs, slots).plain()
+        model.train()
+        named = {"loss/validation": measured["loss"]}
+        named |= {f"validation/{name}": measured[name] for name in VALIDATED}
         return {name: value for name, value in named.items() if value is not None}
 
 
 def _random_numbers_kept(device: torch.device) -> AbstractContextManager[None]:
-    """Gives torch's global generators back as they were."""
-    kept: AbstractContextManager[None] = torch.random.fork_rng([device] if device.type == "cuda" else [])
-    return kept
+    """Restore torch's global generators at the end."""
+    return torch.random.fork_rng([device] if device.type == "cuda" else [])
 
 
 class _Trainer:
@@ -238,16 +216,17 @@ class _Trainer:
             why = " ".join(str(error).split())[:300]
             raise does_not_fit(found.path, f"its state is that of another run: {why}") from None
 
-    def train(self, source: Source, validation: Validation, tell: Tell, save_seconds: float) -> None:
+    def train(
+        self, source: Replay | RecordedPairs, validation: Validation, tell: Tell, save_seconds: float
+    ) -> None:
         """Train to the end. A signal is raised once a checkpoint is written, a second one at once."""
-        try:
-            source.go_to(self.done)
-            with _random_numbers_kept(torch.device(self.machine.device)):
-                self._iterate(source, validation, tell, save_seconds)
-        finally:
-            source.close()
+        source.go_to(self.done)
+        with _random_numbers_kept(torch.device(self.machine.device)):
+            self._iterate(source, validation, tell, save_seconds)
 
-    def _iterate(self, source: Source, validation: Validation, tell: Tell, save_seconds: float) -> None:
+    def _iterate(
+        self, source: Replay | RecordedPairs, validation: Validation, tell: Tell, save_seconds: float
+    ) -> None:
         config, total = self.config, self.config.iterations
         loss, held_out, simulated, making = None, None, 0.0, 0.0
         saved = since = time.monotonic()
@@ -342,38 +321,17 @@ def _palette_for(config: TrainConfig, folder: Path, worlds: Worlds | None) -> tu
         found = worlds.rules.palette
         return (*found, *[None] * (config.slots - len(found)))
     palette = palette_of(config.data, config.slots)
-    try:
-        recorded = recorded_palette(read_run(folder, KIND))
-    except (CompileError, KeyError, TypeError):
-        return palette  # a new run; or another one, which `open_run` refuses
+    if not (folder / ABOUT).exists():
+        return palette
+    recorded = recorded_palette(read_run(folder))
     fits = len(recorded) >= config.slots and {*palette} <= {*recorded, None}
-    return recorded if fits else palette
+    return recorded if fits else palette  # `open_run` refuses another run
 
 
-def recorded_palette(run: RunFolder) -> tuple[str | None, ...]:
-    """Raises KeyError, TypeError."""
-    return tuple(None if one is None else str(one) for one in run.config["palette"])
-
-
-def check_palette(folder: Path, palette: Palette, rules: Ruleset) -> None:
-    """Whether a run's network has slots for the elements of some rules.
-
-    Raises:
-        CompileError: PD623, with every element that has no slot, or whose slot is another's.
-    """
-    why, lacking = [], 0
-    for element in rules.elements:
-        if element.id >= len(palette):
-            lacking += 1
-            why.append(f"there is no free slot for `{element.qualified}`: the network has {len(palette)}")
-        elif palette[element.id] not in (None, element.qualified):
-            why.append(f"id {element.id} is `{palette[element.id]}` there, `{element.qualified}` here")
-    if why:
-        helps = (
-            f"train with `--slots {len(palette) + lacking}` to leave room for packs that come later",
-            "or teach the network those packs: `powderdsl wm finetune RUN --packs PACK`",
-        )
-        raise does_not_fit(folder, *why, helps=helps if lacking else ())
+def check_slots(folder: Path, palette: Palette, rules: Ruleset) -> None:
+    """Raises CompileError (PD623) if a run's network has no slots for elements of some rules."""
+    fix = "or teach the network those packs: `powderdsl wm finetune RUN --packs PACK`"
+    check_palette(folder, palette, {element.id: element.qualified for element in rules.elements}, fix)
 
 
 def diverged(folder: Path, done: int, learning_rate: float) -> CompileError:

@@ -13,6 +13,7 @@ import powderdsl
 from powderdsl.compiler import BACKENDS, RENAMED_BACKENDS, starting_backend
 from powderdsl.diagnostics import CompileError
 from powderdsl.envs.tensor_env import TensorEnv
+from powderdsl.experiments.bench.plan import make_plan
 from powderdsl.rl.config import check_config, from_json, preset
 from powderdsl.simulation.programs import CompiledProgram, make_program
 from powderdsl.targets.torch.program import TorchProgram
@@ -37,6 +38,9 @@ def test_the_warning_names_the_users_line_from_anywhere() -> None:
     with pytest.warns(DeprecationWarning, match="`dense` is `torch` now") as found:
         TensorEnv("sand-pushing", 1, backend="dense")
     assert [Path(one.filename) for one in found] == [Path(__file__)]
+    with pytest.warns(DeprecationWarning, match="`planes` is `wasm` now"):
+        plan = make_plan(powderdsl.load("life"), backends=["planes", "wasm"])
+    assert {cell.backend for cell in plan.cells} == {"wasm"}
 
 
 def test_commands_note_an_old_name() -> None:

@@ -11,16 +11,9 @@ import pytest
 import torch
 
 from powderdsl.diagnostics import CompileError
-from powderdsl.worldmodel import (
-    CustomNetwork,
-    DataConfig,
-    Machine,
-    TrainConfig,
-    custom_network,
-    load_trained,
-    train,
-)
-from powderdsl.worldmodel.networks import OneHot, is_network_name
+from powderdsl.worldmodel import DataConfig, Machine, TrainConfig, custom_network, load_trained, train
+from powderdsl.worldmodel.config import is_network_name
+from powderdsl.worldmodel.networks import CustomNetwork, OneHot
 from tests.cli.commands import powderdsl as run
 from tests.worldmodel.test_training import same, weights
 
@@ -188,7 +181,7 @@ def test_weights_of_a_network_depend_on_the_seed_alone(dunes: str) -> None:
 def test_networks_that_cannot_be_trained_are_refused(name: str, said: str) -> None:
     encoder = OneHot(10)
     with pytest.raises(CompileError) as error:
-        custom_network(name).check(encoder, 10, encoder.example(2, (14, 18)), 0)
+        custom_network(name).check(encoder, 10, encoder.example((14, 18)), 0)
     (found,) = error.value.diagnostics
     assert found.code == "PD625"
     assert said in " ".join([found.message, *found.notes, *found.helps])

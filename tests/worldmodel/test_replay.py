@@ -10,8 +10,9 @@ from torch import Tensor
 
 from powderdsl.simulation.simulator import compile as compile_rules
 from powderdsl.tasks.episodes import compile_task
-from powderdsl.worldmodel import DataConfig, Replay, TaskWorlds, pairs_of, task_worlds, unseen_seeds
-from powderdsl.worldmodel.pairs import TEST_SEEDS
+from powderdsl.worldmodel import DataConfig, Replay, pairs_of, task_worlds, unseen_seeds
+from powderdsl.worldmodel.config import TEST_SEEDS
+from powderdsl.worldmodel.worlds import TaskWorlds
 
 
 def worlds_of(config: DataConfig) -> TaskWorlds:
@@ -149,7 +150,7 @@ def test_worlds_for_tests_are_no_worlds_of_training(dunes: str) -> None:
     assert len(set(seeds.tolist())) == 24
     assert int(seeds.min()) >= TEST_SEEDS
     assert (seeds.view(8, 3) % 8 == torch.arange(8)[:, None]).all()
-    with pytest.raises(ValueError, match="tests begin there"):
+    with pytest.raises(ValueError, match="`states` is 4294967297"):
         DataConfig(task=dunes, states=TEST_SEEDS + 1)
 
 

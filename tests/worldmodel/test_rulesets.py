@@ -9,10 +9,10 @@ import torch
 
 import powderdsl
 from powderdsl.diagnostics import CompileError
-from powderdsl.tasks.shipped import load_task
 from powderdsl.worldmodel import DataConfig, Machine, TrainConfig, evaluate, load_trained, task_worlds, train
+from powderdsl.worldmodel.config import Variety
 from powderdsl.worldmodel.evaluation import unseen_worlds
-from powderdsl.worldmodel.rulesets import UNSEEN_RULESETS, RulesetSource, VariedWorlds, Variety
+from powderdsl.worldmodel.rulesets import UNSEEN_RULESETS, RulesetSource
 
 TASK = """
 task: mixed
@@ -32,7 +32,7 @@ MANY = Variety(chances=4.0, swaps=("density",), leave_out=0.3)
 def _task(tmp_path: Path):  # type: ignore[no-untyped-def]
     path = tmp_path / "mixed.yaml"
     path.write_text(TASK, encoding="utf-8")
-    return load_task(path)
+    return str(path)
 
 
 def test_a_number_decides_a_ruleset() -> None:
@@ -94,13 +94,13 @@ def test_packs_that_others_need_stay() -> None:
 
 def test_every_world_runs_under_its_own_ruleset(task) -> None:  # type: ignore[no-untyped-def]
     source = RulesetSource(RULES, MANY)
-    worlds = VariedWorlds(task, "train", source, 3, backend="torch")
+    worlds = task_worlds(DataConfig(task, rulesets=3, variety=MANY), backend="torch")
     seeds = torch.tensor([5, 0, 1, 3, 2, 4])
     start = worlds.start(seeds)
     end = worlds.later(worlds.later(start, 8), 8)
     assert start.ids.shape == (6, 12, 16)
     for place, seed in enumerate(seeds.tolist()):
-        drawn = worlds.drawn[seed % 3]
+        drawn = worlds.rulesets[seed % 3]
         model = source.model(drawn)
         alone = powderdsl.compile(model.with_params(dict(drawn.params)), backend="torch")
         world = worlds.start(torch.tensor([seed]))
@@ -121,15 +121,15 @@ def test_training_and_tests_draw_different_rulesets(dunes: str, tmp_path: Path) 
     trained = load_trained(run)
     assert trained.config == config  # variety and all, through run.json
     worlds = task_worlds(data, backend="torch")
-    assert isinstance(worlds, VariedWorlds)
-    assert [one.number for one in worlds.drawn] == [0, 1, 2]
+    assert [one.number for one in worlds.rulesets] == [0, 1, 2]
     unseen = unseen_worlds(trained, split="train", rulesets=5, machine=machine)
-    assert isinstance(unseen, VariedWorlds)
-    assert [one.number for one in unseen.drawn] == [UNSEEN_RULESETS + number for number in range(5)]
+    assert [one.number for one in unseen.rulesets] == [UNSEEN_RULESETS + number for number in range(5)]
     found = evaluate(trained, split="train", worlds=5, rulesets=5, machine=machine)
     assert found.mean("model") > 0
     plain = unseen_worlds(trained, split="train", machine=machine)
-    assert not isinstance(plain, VariedWorlds)  # without being asked, the rules as they are
+    assert [one.structure for one in plain.rulesets] == [
+        ((), ())
+    ]  # without being asked, the rules as they are
 
 
 def test_unknown_properties_and_bad_numbers_are_refused() -> None:
@@ -144,13 +144,15 @@ def test_unknown_properties_and_bad_numbers_are_refused() -> None:
 
 
 def test_seeds_may_have_rulesets_of_their_own(task) -> None:  # type: ignore[no-untyped-def]
-    source = RulesetSource(RULES, MANY)
     first, other = (
-        VariedWorlds(task, "train", source, 2, first=number, backend="torch") for number in (0, 1)
+        task_worlds(
+            DataConfig(task, rulesets=2, first_ruleset=number, variety=MANY), backend="torch"
+        ).rulesets
+        for number in (0, 1)
     )
-    assert [one.number for one in other.drawn] == [1, 2]
-    assert other.drawn[0] == first.drawn[1]
-    assert other.drawn[1] not in first.drawn
+    assert [one.number for one in other] == [1, 2]
+    assert other[0] == first[1]
+    assert other[1] not in first
 
 
 def test_without_variety_a_ruleset_is_the_base() -> None:

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from powderdsl.worldmodel import UNet, frequent, fresh_unet, outcomes, score, still
-from powderdsl.worldmodel.scores import Table, elements_of
+from powderdsl.worldmodel.networks import UNet, fresh_unet
+from powderdsl.worldmodel.scores import Table, elements_of, frequent, outcomes, score, still
 
 START = torch.tensor([[[0, 0, 1, 1], [2, 2, 2, 0]]], dtype=torch.uint8)
 END = torch.tensor([[[0, 1, 1, 1], [2, 0, 2, 0]]], dtype=torch.uint8)

@@ -27,9 +27,10 @@ from powderdsl.worldmodel import (
     task_worlds,
     train,
 )
+from powderdsl.worldmodel.config import TEST_SEEDS
 from powderdsl.worldmodel.evaluation import unseen_worlds
-from powderdsl.worldmodel.pairs import TEST_SEEDS, VALIDATION_SEEDS, VALIDATION_WORLDS, validation_pairs
 from powderdsl.worldmodel.training import TrainingProgress
+from powderdsl.worldmodel.worlds import VALIDATION_SEEDS, VALIDATION_WORLDS, validation_pairs
 from tests.processes import started, waited
 
 HERE = Machine(backend="torch")

@@ -12,7 +12,7 @@ from powderdsl.tasks.shipped import load_task
 from powderdsl.worldmodel import DataConfig, task_worlds
 from powderdsl.worldmodel.rule_words import add, keep, leave_out
 from powderdsl.worldmodel.training import palette_of
-from powderdsl.worldmodel.watched import watched
+from powderdsl.worldmodel.worlds import watch
 
 PAPER = ("empty", "sand", "water", "wall", "plant", "fire", "wood", "ice", "lava", "dust", "cloner")
 
@@ -55,7 +55,7 @@ def test_stands_that_rules_cannot_have_are_left_out_or_refused() -> None:
     config = DataConfig(split="designed", rules="powderworld-gas-stone-acid")
     found = task_worlds(config, backend="reference", partly=True)
     assert found.names == ("sand-on-water", "ice-and-plants", "burning-vines", "water-flowing")
-    assert {name: lacking for name, lacking, _ in found.found.missing} == {
+    assert {name: lacking for name, lacking, _ in found.missing} == {
         "stone-arches": ("stone",),
         "acid-on-wood": ("acid",),
         "dust-on-lava": ("stone",),
@@ -127,7 +127,7 @@ def test_any_pack_can_be_the_held_out_one_that_no_other_needs() -> None:
         except CompileError as error:
             refused.append((pack, error.diagnostics[0].code))
             continue
-        variant = watched(task, "train", rules).task.splits[0].variants[0]
+        variant = watch(task, "train", rules).task.splits[0].variants[0]
         drawn = {rules_id for group in variant.groups for one in group.drawings for rules_id in one.ids}
         assert drawn == {element.id for element in task.ruleset.elements if element.pack != pack}
     assert [pack for pack, _ in refused] == ["core", "water"]

@@ -9,8 +9,9 @@ import click
 
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import user_values
-from powderdsl.cli.options import check_writable, find_played
+from powderdsl.cli.options import check_writable
 from powderdsl.cli.output import print_json
+from powderdsl.cli.task_sheets import find_played
 from powderdsl.system.reports import table
 from powderdsl.tasks.task import Task
 
@@ -48,14 +49,14 @@ def _names(ctx: click.Context, param: click.Parameter, value: str | None) -> lis
 @opt.packs
 @click.option("--backend", type=opt.BackendType(), help="Backend that runs the rules.  [default: the run's]")
 @click.option("--device", help="A torch device.  [default: the run's]")
-@opt.flag("--json", "One JSON object instead of a table.", to="as_json")
+@opt.layouts("One JSON object instead of a table.")
 @opt.path("--out", "FILE.json", "Also write the JSON object to this file.")
 def command(
     run: str,
     knobs: tuple[str, ...],
     settings: dict[str, str],
     packs: tuple[str, ...],
-    as_json: bool,
+    layout: str,
     out: Path | None,
     **asked: Any,
 ) -> None:
@@ -74,7 +75,7 @@ def command(
         found = evaluate(played, packs=() if isinstance(played, Task) else packs, **asked)
     if out is not None:
         write_json(out, found.as_json(), follow=True)
-    if as_json:
+    if layout == "json":
         print_json(found.as_json())
     else:
         click.echo("\n".join(_text(found)))

@@ -13,8 +13,8 @@ import click
 
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BAD_INPUT, OK, BadInput, user_values
-from powderdsl.cli.options import knob_values
 from powderdsl.cli.output import counted, progress, write_diagnostics
+from powderdsl.cli.task_sheets import knob_values
 from powderdsl.datasets.manifest import check_place, read_manifest
 from powderdsl.diagnostics import CompileError, Diagnostic
 from powderdsl.tasks.shipped import check_split, load_task
@@ -161,7 +161,7 @@ def _checked(
     palette = None
     if policy not in SCRIPTED:
         from powderdsl.experiments.runs import find_run
-        from powderdsl.rl.policies import recorded_palette
+        from powderdsl.experiments.runs.palettes import recorded_palette
 
         with mistakes.collected():
             palette = recorded_palette(find_run(policy, "ppo"))

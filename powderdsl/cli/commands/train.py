@@ -9,8 +9,8 @@ import click
 
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput
-from powderdsl.cli.options import knob_values
 from powderdsl.cli.output import progress
+from powderdsl.cli.task_sheets import knob_values
 from powderdsl.rl.config import PRESETS, TrainConfig, from_json, preset
 
 
@@ -34,13 +34,6 @@ from powderdsl.rl.config import PRESETS, TrainConfig, from_json, preset
 @opt.parameters
 @opt.packs
 @opt.backend("auto")
-@click.option(
-    "--checkpoint-every",
-    "checkpoint_minutes",
-    type=float,
-    metavar="MINUTES",
-    help="Time between checkpoints; 0: after each rollout.  [default: 2]",
-)
 @click.pass_context
 def command(
     ctx: click.Context,

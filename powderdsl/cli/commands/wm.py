@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,11 +14,13 @@ from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput, user_values
 from powderdsl.cli.options import check_writable
 from powderdsl.cli.output import print_json, progress
+from powderdsl.cli.task_sheets import knob_values
 from powderdsl.cli.wm_report import told, write_curve
+from powderdsl.worldmodel.config import PRESETS, DataConfig, TrainConfig, Variety
 
 if TYPE_CHECKING:
     from powderdsl.model.types import Ruleset
-    from powderdsl.worldmodel.config import Machine, TrainConfig
+    from powderdsl.worldmodel.config import Machine
     from powderdsl.worldmodel.networks import CustomNetwork
     from powderdsl.worldmodel.recordings import Recording
     from powderdsl.worldmodel.strips import Strip
@@ -28,66 +30,51 @@ if TYPE_CHECKING:
 
 KNOBS = ("kinds", "lines", "disks", "squares")
 """Knobs of the shipped task that have options of their own."""
-DATA = ("task", "split", "states", "capacity", "refresh", "rulesets", "first_ruleset")
-VARIETY = ("chances", "swaps", "leave_out")
-TRAINING = ("iterations", "batch", "learning_rate", "seed")
-MACHINE = ("device", "threads", "backend", "store", "compiled")
-NOT_OF_WORLDS = (
-    *("preset", "width", "slots", "network_name", "folder", "out", "scale", "save_every", "validate_every"),
-    *("data", "ignore_actions", *TRAINING, *MACHINE),
+ANY_RUN = (
+    "width",
+    "slots",
+    "iterations",
+    "batch",
+    "learning_rate",
+    "seed",
+    "network_name",
+    "folder",
+    "out",
+    "scale",
 )
+MACHINE = ("device", "threads", "backend", "store", "compiled")
+NOT_OF_WORLDS = {
+    *ANY_RUN,
+    *MACHINE,
+    "preset",
+    "save_every",
+    "validate_every",
+    "data",
+    "ignore_actions",
+    "task",
+}
 """Options that networks with actions have too."""
 
-_recording = opt.path("--data", "DATASET", "Transitions with actions, recorded by `powderdsl record`.")
-_data_options = opt.several(
-    _recording,
-    opt.flag("--ignore-actions", "With --data: the network does not see the actions."),
-    opt.text("--task", "TASK", "A shipped task or a file.  [default: world-model]"),
-    opt.text("--split", "SPLIT", "Split of the task to train on.  [default: train]"),
-    opt.text("--rules", "RULES", "Rules of the worlds.  [default: the task's own]"),
-    opt.text("--packs", "PACK…", "Keep only these packs of the rules, or add them.", multiple=True),
-    opt.text("--held-out", "PACK…", "Leave these packs of the rules out.", multiple=True),
-    opt.integer("--elements", 0, 255, "Number of elements drawn besides empty.", to="kinds"),
-    opt.integer("--lines", 0, 256, "Maximum number of lines per world."),
-    opt.integer("--disks", 0, 256, "Maximum number of disks per world."),
-    opt.integer("--squares", 0, 256, "Maximum number of squares per world."),
-    opt.knobs("Another value for a knob of the task."),
-    opt.integer("--states", 1, 1 << 32, "Number of start worlds."),
-    opt.integer("--buffer", 1, 1 << 32, "Capacity of the buffer, in pairs.", to="capacity"),
-    opt.integer("--refresh", 1, 1 << 20, "Pairs that each iteration replaces in the buffer."),
-    opt.parameters,
-    opt.integer("--rulesets", 0, 1024, "Number of rulesets to draw around the rules."),
-    opt.integer("--first-ruleset", 0, 1 << 31, "Number of the first drawn ruleset.  [default: 0]"),
-    click.option("--chances", type=float, help="Factor by which chances of drawn rulesets differ, at most."),
-    opt.text(
-        "--swap",
-        "PROPERTY",
-        "Property whose values two elements swap in drawn rulesets.",
-        to="swaps",
-        multiple=True,
-    ),
-    click.option(
-        "--leave-out", type=float, metavar="CHANCE", help="Probability that a ruleset leaves out a pack."
-    ),
-)
-_machine_options = opt.several(
-    opt.integer("--threads", 1, 1024, "CPU threads.", 1), opt.device, opt.backend("auto")
-)
 _network = opt.text(
     "--network",
     "MODULE:CLASS",
     "Your own network, which this imports.  [default: the U-net]",
     to="network_name",
 )
-_training_options = opt.several(
+_recording = opt.path("--data", "DATASET", "Transitions with actions, recorded by `powderdsl record`.")
+_machine_options = opt.several(
+    _network, opt.integer("--threads", 1, 1024, "CPU threads.", 1), opt.device, opt.backend("auto")
+)
+_test_options = opt.several(
+    click.argument("run", metavar="RUN"),
+    opt.text("--task", "TASK", "A shipped task or a file.  [default: the run's]"),
+    opt.text("--split", "SPLIT", "Split of the task to test on.  [default: designed]"),
+    opt.text("--rules", "RULES", "Rules to test under.  [default: the run's]"),
+    _recording,
     _machine_options,
-    _network,
-    opt.integer("--iterations", 1, 10**9, "Steps of Adam."),
-    opt.integer("--batch", 1, 1 << 20, "Pairs per step."),
-    click.option(
-        "--learning-rate", type=click.FloatRange(min=0, min_open=True), help="Learning rate of Adam."
-    ),
-    opt.integer("--seed", 0, 2**63 - 1, "Seed of weights, worlds and batches."),
+)
+_run_options = opt.several(
+    _machine_options,
     opt.path("--run", "DIR", "Folder of the run.", to="folder"),
     opt.choice("--store", ["auto", "memory", "disk"], "Where to keep the buffer.", "auto"),
     click.option("--compile/--no-compile", "compiled", default=False, help="Use torch.compile."),
@@ -114,10 +101,22 @@ def command() -> None:
     "Settings that other options change: `small` for a CPU, `paper` for a GPU.",
     "small",
 )
-@_data_options
-@opt.integer("--width", 1, 1024, "Features of the first block.")
-@opt.integer("--slots", 1, 256, "Room for this many elements, for packs that come later.")
-@_training_options
+@_recording
+@opt.flag("--ignore-actions", "With --data: the network does not see the actions.")
+@opt.settings_of(DataConfig, checked=True)
+@opt.settings_of(TrainConfig, checked=True)
+@opt.settings_of(Variety)
+@opt.integer("--first-ruleset", 0, 1 << 31, "Number of the first drawn ruleset.  [default: 0]")
+@opt.text("--rules", "RULES", "Rules of the worlds.  [default: the task's own]")
+@opt.text("--packs", "PACK…", "Keep only these packs of the rules, or add them.", multiple=True)
+@opt.text("--held-out", "PACK…", "Leave these packs of the rules out.", multiple=True)
+@opt.integer("--elements", 0, 255, "Number of elements drawn besides empty.", to="kinds")
+@opt.integer("--lines", 0, 256, "Maximum number of lines per world.")
+@opt.integer("--disks", 0, 256, "Maximum number of disks per world.")
+@opt.integer("--squares", 0, 256, "Maximum number of squares per world.")
+@opt.knobs("Another value for a knob of the task.")
+@opt.parameters
+@_run_options
 def train_command(
     preset: str,
     rules: str | None,
@@ -132,10 +131,6 @@ def train_command(
 
     A run that was stopped continues when the same command is given again, as if it had not been stopped.
     """
-    from powderdsl.cli.options import knob_values
-    from powderdsl.worldmodel.config import PRESETS
-    from powderdsl.worldmodel.rulesets import Variety
-
     if packs and held_out:
         raise BadInput("--packs says what stays, --held-out what goes: give one of them")
     recording = None
@@ -148,32 +143,31 @@ def train_command(
         recording = _opened(values["data"], values["task"])
     elif ignore_actions:
         raise BadInput("--ignore-actions goes with --data")
-    variety = _given(values, VARIETY)
+    variety = _given(values, Variety)
     if (variety or values["first_ruleset"]) and not values["rulesets"]:
         raise BadInput(
             "--chances, --swap, --leave-out and --first-ruleset say which rulesets: --rulesets says how many"
         )
     if values["network_name"] and values["width"]:
         raise BadInput("--width is that of the U-net: leave it out with --network")
-    config = PRESETS[preset]
     with user_values():
-        differ = Variety(**variety)
-    if recording is not None:
-        config = replace(config, recorded=replace(recording.recorded, actions=not ignore_actions))
-        config = replace(config, **_given(values, ("width", "slots", *TRAINING)))
-        name = f"{recording.task.name}-blind" if ignore_actions else recording.task.name
-        _run(config, folder or Path("runs") / name, values, recording=recording)
-        return
-    data = replace(
-        config.data,
-        rules=_rules_without(rules, values["task"] or config.data.task, packs, held_out),
-        knobs={**_given(values, KNOBS), **knob_values(knobs)},
-        params=settings,
-        variety=differ,
-        **_given(values, DATA),
-    )
-    config = replace(config, data=data, **_given(values, ("width", "slots", *TRAINING)))
-    _run(config, folder or Path("runs") / (Path(data.task).stem or "run"), values)
+        config = replace(PRESETS[preset], **_given(values, TrainConfig))
+        if recording is None:
+            data = replace(config.data, **_given(values, DataConfig))
+            short = {name: values[name] for name in KNOBS if values[name] is not None}
+            data = replace(
+                data,
+                rules=_rules_without(rules, data.task, packs, held_out),
+                knobs=short | knob_values(knobs),
+                params=settings,
+                variety=Variety(**variety),
+            )
+            config, name = replace(config, data=data), Path(data.task).stem or "run"
+        else:
+            recorded = replace(recording.recorded, actions=not ignore_actions)
+            config = replace(config, recorded=recorded)
+            name = f"{recording.task.name}-blind" if ignore_actions else recording.task.name
+    _run(config, folder or Path("runs") / name, values, recording=recording)
 
 
 @command.command("finetune", cls=opt.ManyWords)
@@ -184,7 +178,8 @@ def train_command(
     "The packs to learn, by name or file: added to the run's rules, and all that worlds draw.",
     multiple=True,
 )
-@_training_options
+@opt.settings_of(TrainConfig, only=("iterations", "batch", "learning_rate", "seed"), checked=True)
+@_run_options
 def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **values: Any) -> None:
     """Continue from the weights of a run, on worlds that draw only elements of other packs.
 
@@ -196,7 +191,7 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
         raise BadInput("--packs names what is to be learned")
     network = _own_network(values["network_name"])
     trained = load_trained(run, device="cpu", network=network)
-    config = finetuned(trained, packs, **_given(values, TRAINING))
+    config = finetuned(trained, packs, **_given(values, TrainConfig))
     words = "-".join(config.data.only)
     target = folder or trained.run.path.with_name(f"{trained.run.path.name}-{words}")
     note = {"parent": {"path": str(trained.run.path), "iterations": trained.checkpoint.step}}
@@ -204,11 +199,7 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
 
 
 @command.command("eval", cls=opt.ManyWords)
-@click.argument("run", metavar="RUN")
-@opt.text("--task", "TASK", "A shipped task or a file.  [default: the run's]")
-@opt.text("--split", "SPLIT", "Split of the task to test on.  [default: designed]")
-@opt.text("--rules", "RULES", "Rules to test under.  [default: the run's]")
-@_recording
+@_test_options
 @opt.text("--only", "PACK…", "Draw elements of these packs only.  [default: the run's]", multiple=True)
 @opt.knobs("Another value for a knob of the task.  [default: the run's]")
 @opt.integer(
@@ -217,15 +208,13 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
 @opt.integer(
     "--rulesets", 0, 1024, "Number of rulesets that training never saw, to test under.  [default: 0]"
 )
-@opt.flag("--json", "One JSON object instead of a table.", to="as_json")
+@opt.layouts("One JSON object instead of a table.")
 @opt.path("--out", "FILE", "File of the results.  [default: RUN/evaluation.json]")
-@_network
-@_machine_options
 def eval_command(
     run: str,
     only: tuple[str, ...],
     knobs: tuple[str, ...],
-    as_json: bool,
+    layout: str,
     out: Path | None,
     data: Path | None,
     network_name: str | None,
@@ -237,7 +226,6 @@ def eval_command(
     that no training takes. A network that learned from a dataset is tested on its test worlds, or on another dataset,
     and also with its actions hidden. What is found is also written to the run's evaluation.json.
     """
-    from powderdsl.cli.options import knob_values
     from powderdsl.experiments.runs.folder import write_json
     from powderdsl.worldmodel.evaluation import evaluate, evaluate_recording
     from powderdsl.worldmodel.trained import load_trained
@@ -255,25 +243,19 @@ def eval_command(
         write_json(out, plain, follow=True)
     else:
         trained.run.write_json("evaluation.json", plain)
-    if as_json:
+    if layout == "json":
         print_json(plain)
     else:
         click.echo("\n".join(told(tested, plain)))
 
 
 @command.command("show", cls=opt.ManyWords)
-@click.argument("run", metavar="RUN")
+@_test_options
 @opt.path("--out", "FILE", "The .png file to write.", required=True)
 @opt.flag("--curve", "Plot the losses of the training instead.")
 @opt.integer("--steps", 1, 4096, "Steps to predict.  [default: as trained]")
 @opt.integer("--after", 0, 10**6, "Steps that worlds run before the start.  [default: 0]")
-@opt.text("--task", "TASK", "A shipped task or a file.  [default: the run's]")
-@opt.text("--split", "SPLIT", "Split of the task.  [default: designed]")
-@opt.text("--rules", "RULES", "Rules to test under.  [default: the run's]")
-@_recording
 @opt.integer("--scale", 1, 16, "Pixels per cell.", 2)
-@_network
-@_machine_options
 def show_command(
     run: str,
     out: Path,
@@ -315,8 +297,8 @@ def show_command(
     worlds = unseen_worlds(trained, machine=machine, **_designed(values))
     found = strips(trained.network, worlds, step=step, times=(steps or step) // step, after=after or 0)
     _show(found, worlds.rules, out, scale)
-    for name, lacking, _ in worlds.found.missing:
-        click.echo(f"left out: {name}, which needs {', '.join(lacking)}", err=True)
+    for variant in worlds.missing:
+        click.echo(f"left out: {variant.name}, which needs {', '.join(variant.elements)}", err=True)
 
 
 def _show(found: list[Strip], rules: Ruleset, out: Path, scale: int) -> None:
@@ -335,9 +317,10 @@ def _designed(values: Mapping[str, Any]) -> dict[str, Any]:
     return {name: usual.get(name) if value is None else value for name, value in values.items()}
 
 
-def _given(values: Mapping[str, Any], names: Iterable[str]) -> dict[str, Any]:
-    """The options of these names that were given."""
-    return {name: values[name] for name in names if values[name] not in (None, ())}
+def _given(values: Mapping[str, Any], config: type) -> dict[str, Any]:
+    """The settings of a dataclass that were given as options."""
+    names = [one.name for one in fields(config) if values.get(one.name) not in (None, ())]
+    return {name: values[name] for name in names}
 
 
 def _machine(values: dict[str, Any]) -> Machine:
@@ -354,15 +337,10 @@ def _machine(values: dict[str, Any]) -> Machine:
 
 def _refuse(values: Mapping[str, Any]) -> None:
     """Refuse options that select worlds: a dataset has its own."""
-    own = ("task", *NOT_OF_WORLDS)
-    flags = {
-        one.name: one.opts[0]
-        for one in click.get_current_context().command.params
-        if isinstance(one, click.Option) and one.name not in own
-    }
-    for name, flag in flags.items():
-        if values.get(name or "") not in (None, (), {}, False):
-            raise BadInput(f"{flag} selects worlds, and --data has its own")
+    for one in click.get_current_context().command.params:
+        given = values.get(one.name or "") not in (None, (), {}, False)
+        if isinstance(one, click.Option) and one.name not in NOT_OF_WORLDS and given:
+            raise BadInput(f"{one.opts[0]} selects worlds, and --data has its own")
 
 
 def _opened(folder: Path, task: str | None) -> Recording:

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from powderdsl.cli.options import knob_values
 from powderdsl.cli.study.measures import POLICIES, check_measure, check_unused
 from powderdsl.cli.study.places import Places, Values, Word
+from powderdsl.cli.task_sheets import knob_values
 from powderdsl.compiler import load
 from powderdsl.diagnostics import CompileError, Reporter, suggest
 from powderdsl.experiments.studies.study import Study, StudyStep
@@ -350,7 +350,7 @@ class _StudyCheck:
         for word in varied:
             value = call.given.get(VARIETY[word.option])
             if word.option in ("chances", "leave-out") and value is not None:
-                from powderdsl.worldmodel.rulesets import Variety
+                from powderdsl.worldmodel.config import Variety
 
                 with self.told(word):
                     Variety(**{VARIETY[word.option]: value})
