@@ -140,87 +140,69 @@ def was_cut(text: str, begin: int, end: int) -> bool:
     return before.rstrip(" ").endswith(",") or after.lstrip(" ").startswith(",")
 
 
+_NAME = r"([^\W\d]\w*)"
+_NOT_ELEMENTS = "|".join(_WORDS) + "|is|in|and|or|if|mod|div|not|leaving|then|with|where"
+_WITHOUT_WHERE = "an assignment says `where`: `field := value where condition`"
+_WITHOUT_LEAVING = "a move says what it leaves behind: `SET moves below leaving ELEMENT if …`"
+
+_PHRASES: tuple[tuple[str, str, str], ...] = (
+    (r"\n\s*-\s.*@", "", "an item of a list starts with `- `: this one, or the one before it, lacks it"),
+    (
+        rf"\n\s*@{_NAME}$",
+        "",
+        "each rule of a list starts with `- `; a rule that continues on the next line does so with `if`, `and`, …",
+    ),
+    (rf"\b(count|sum)\s*@{_NAME}$", "", r"write `\1(\2)`"),
+    (rf"\b(above|below|left|right|here)\s*@(?!({_NOT_ELEMENTS})$){_NAME}$", "", r"write `\1 is \3`"),
+    (r"\bswaps\s*@with$", "", "write `swaps PLACE`, without `with`"),
+    (rf"^\s*set\s*@{_NAME}$", "", r"write `\1 := VALUE where …`"),
+    (r"(^|[\s(<>=+*/-])@\.$", "", "a number has a digit before its point: `0.5`"),
+    (r"^\s*(\w+)([+-])\s*@\2$", "", r"write `\1 \2= 1`"),
+    (r"\*@\*$", "", "powers are written out: `x * x`"),
+    (r"\bmoves\s+\S+\s*@$", "", _WITHOUT_LEAVING),
+    (r"\.\.\s*@$", "", "a range has two ends: `0..99`"),
+    (r"@(:=|\+=|-=)$", "", "only a field of this cell, or of a neighbor, can be assigned"),
+    (r"\bthen\b.*@", "ELSE", "a choice has two sides: `VALUE if CONDITION else VALUE`"),
+    (r"(:=|\+=|-=).*@$", "ELSE", _WITHOUT_WHERE),
+    (r"@if$", "WHERE", _WITHOUT_WHERE),
+    (r"@if$", "LEAVING", _WITHOUT_LEAVING),
+    (r"^\s*@if$", "", "a rule says first what happens: `this -> that if …`"),
+    (r"@where$", "", "only assignments say `where`; this rule says `if`"),
+    (r" is\s*@in$", "", "say `is` or `in`, not both"),
+    (r"@if$", "__ANON_0", "say what happens before the `if`: `SET -> ELEMENT if …`"),
+    (r"\b(box|ring|disc|diamond|cross|plus)\s*@(\d+)$", "", r"write `\1(\2)`"),
+    (r"/@/$", "", "integer division, rounded down, is `div`: `a div b`"),
+    (r"->.*@->$", "", "one line is one rule: put the next one on a line of its own"),
+    (r"@(.*%)$", "CHANCE", r"write `with chance \1`"),
+    (r"chance\s*@(.*%)$", "", r"write `with chance \1`"),
+    (r",\s*@(?!\))", "THEN", "one line is one rule; effects follow `then`: `…, then field := value`"),
+)
+"""Turns of phrase from other languages, and slips: the line, with an `@` before the word that cannot follow; a
+terminal that could have followed; the fix. The first match counts."""
+
+
 def token_help(token: str, accepted: Set[str], before: str, cut: bool) -> str:
     """The fix for a word that cannot stand where it does. `token` is empty at the end of the line.
 
     `accepted` are the terminals that could follow, `before` is the line up to the error.
     """
-    assigns = any(sign in before for sign in (":=", "+=", "-="))
-    if (cut and not token) or (cut and not before.strip()):
+    if cut and not (token and before.strip()):
         return CUT
-    if re.search(r"\n\s*-\s", before):
-        return "an item of a list starts with `- `: this one, or the one before it, lacks it"
-    if token.isidentifier() and "\n" in before and not before[before.rfind("\n") :].strip():
-        return "each rule of a list starts with `- `; a rule that continues on the next line does so with `if`, `and`, …"
-    meant = _phrase_help(token, before)
-    if meant:
-        return meant
-    if token in (":=", "+=", "-="):
-        return "only a field of this cell, or of a neighbor, can be assigned"
-    if "ELSE" in accepted and re.search(r"\bthen\b", before):
-        return "a choice has two sides: `VALUE if CONDITION else VALUE`"
-    if ("ELSE" in accepted and assigns and not token) or (token == "if" and "WHERE" in accepted):
-        return "an assignment says `where`: `field := value where condition`"
-    if token == "if" and "LEAVING" in accepted:
-        return "a move says what it leaves behind: `SET moves below leaving ELEMENT if …`"
-    if token == "if" and not before.strip():
-        return "a rule says first what happens: `this -> that if …`"
-    if token == "where":
-        return "only assignments say `where`; this rule says `if`"
-    if token == "in" and before.rstrip().endswith(" is"):
-        return "say `is` or `in`, not both"
-    if token == ")" and before.count("(") <= before.count(")"):
+    for pattern, terminal, fix in _PHRASES:
+        match = re.search(pattern, f"{before}@{token}", re.DOTALL)
+        if match and (not terminal or terminal in accepted):
+            return match.expand(fix)
+    missing = before.count("(") - before.count(")")
+    if token == ")" and missing <= 0:
         return "no `(` is open: remove it"
-    if not token and before.count("(") > before.count(")"):
+    if not token and missing > 0:
         return "write the missing `)`"
-    if token == "if" and "__ANON_0" in accepted:
-        return "say what happens before the `if`: `SET -> ELEMENT if …`"
-    shape = re.search(r"\b(box|ring|disc|diamond|cross|plus)\s*\Z", before)
-    if shape and token.isdigit():
-        return f"write `{shape[1]}({token})`"
-    if token == "/" and before.endswith("/"):
-        return "integer division, rounded down, is `div`: `a div b`"
-    if token == "->" and "->" in before:
-        return "one line is one rule: put the next one on a line of its own"
-    if token.endswith("%") and ("CHANCE" in accepted or before.rstrip().endswith("chance")):
-        return f"write `with chance {token}`"
-    if "THEN" in accepted and before.rstrip().endswith(","):
-        return "one line is one rule; effects follow `then`: `…, then field := value`"
-    keywords = {name.lower() for name in accepted if name.isalpha() and name not in TERMINAL_WORDS}
     instead = _WORDS.get(token.lower(), "")
     if instead and token != instead:
         return f"write `{instead}`"
+    keywords = {name.lower() for name in accepted if name.isalpha() and name not in TERMINAL_WORDS}
     close = get_close_matches(token.lower(), sorted(keywords - {token}), n=1, cutoff=0.7)
     return f"did you mean `{close[0]}`?" if close else ""
-
-
-_AFTER_PLACES = ("is", "in", "and", "or", "if", "mod", "div", "not", "leaving", "then", "with", "where")
-
-
-def _phrase_help(token: str, before: str) -> str:
-    """The fix for a turn of phrase that other languages have."""
-    last = re.search(r"([A-Za-z_]+)\s*\Z", before)
-    word = last[1] if last else ""
-    if word in ("count", "sum") and token.isidentifier():
-        return f"write `{word}({token})`"
-    if word in ("above", "below", "left", "right", "here") and token.isidentifier():
-        return "" if token in _WORDS or token in _AFTER_PLACES else f"write `{word} is {token}`"
-    if word == "swaps" and token == "with":
-        return "write `swaps PLACE`, without `with`"
-    if word == "set" and before.strip() == "set" and token.isidentifier():
-        return f"write `{token} := VALUE where …`"
-    if token == "." and re.search(r"(^|[\s(<>=+*/-])\Z", before):
-        return "a number has a digit before its point: `0.5`"
-    if token in "+-" and token and before.rstrip().endswith(token):
-        field = re.fullmatch(r"(\w+)[+-]", before.strip())
-        return f"write `{field[1]} {token}= 1`" if field else ""
-    if token == "*" and before.endswith("*"):
-        return "powers are written out: `x * x`"
-    if not token and re.search(r"\bmoves\s+\S+\Z", before.rstrip()):
-        return "a move says what it leaves behind: `SET moves below leaving ELEMENT if …`"
-    if not token and before.rstrip().endswith(".."):
-        return "a range has two ends: `0..99`"
-    return ""
 
 
 def expected_words(accepted: Set[str]) -> str:

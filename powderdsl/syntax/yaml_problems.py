@@ -1,7 +1,7 @@
-"""PyYAML's complaints in plain words: where the mistake is, and how to fix it.
+"""PyYAML's errors in plain words: where the mistake is, and how to fix it.
 
-PyYAML reports where its scanner gave up, in its own terms. Each row of the table below knows what people
-usually did there.
+PyYAML reports where its scanner gave up, in its own terms, or in libyaml's. Each row of the table below knows what
+people usually did there.
 """
 
 from __future__ import annotations
@@ -16,12 +16,11 @@ from powderdsl.diagnostics import Label, Reporter, Source, Span
 
 QUOTE = "put quotes around the whole value"
 _ENTRY = re.compile(r"\s*(?:- +)?(?P<key>[\w?]+): +(?P<value>[^\"'\s].*?)\s*\Z")
-COMMENT = "YAML reads a `#` after a space as a comment"
 
 
 @dataclass(frozen=True)
 class Problem:
-    """A complaint in plain words. `label` finishes the sentence under the caret."""
+    """An error in plain words. `label` finishes the sentence under the caret."""
 
     message: str
     span: Span
@@ -47,39 +46,34 @@ class Place:
         return self.text[self.at : self.at + 1]
 
     @property
-    def before(self) -> str:
-        """The text of the line before the place."""
-        return self.before_of(self.at)
-
-    def before_of(self, at: int) -> str:
-        """The text of the line before another place."""
-        return self.text[self.text.rfind("\n", 0, at) + 1 : at]
-
-    def line_end(self, at: int) -> int:
-        end = self.text.find("\n", at)
-        return end if end >= 0 else len(self.text)
-
-    @property
     def same_line(self) -> bool:
         return "\n" not in self.text[self.since : self.at]
+
+    def before(self, at: int) -> str:
+        """The text of a line up to `at`."""
+        return self.text[self.text.rfind("\n", 0, at) + 1 : at]
+
+    def after(self, at: int) -> str:
+        """The text of a line from `at` on."""
+        return self.text[at:].partition("\n")[0]
 
     def span(self, start: int, length: int = 1) -> Span:
         # At the end of the file the last character is underlined.
         start = min(start, max(len(self.text.rstrip()) - 1, 0))
         return Span(self.source, start, start + max(length, 1))
 
-    def quoted(self, at: int) -> str:
-        """The fix for the value on the line of a place: the same line with quotes."""
-        before = self.before_of(at)
-        found = _ENTRY.match(before + self.text[at : self.line_end(at)])
-        if found is None or found.start("value") > len(before):
-            return QUOTE
-        quote = "'" if '"' in found["value"] else '"'
-        return f"put quotes around it: {found['key']}: {quote}{found['value']}{quote}"
-
     def rest(self, start: int) -> Span:
         """From `start` to the end of its line."""
-        return self.span(start, len(self.text[start : self.line_end(start)].rstrip()))
+        return self.span(start, len(self.after(start).rstrip()))
+
+    def quoted(self, at: int) -> str:
+        """The fix for the value on the line of a place: the same line with quotes."""
+        before = self.before(at)
+        entry = _ENTRY.match(before + self.after(at))
+        if entry is None or entry.start("value") > len(before):
+            return QUOTE
+        quote = "'" if '"' in entry["value"] else '"'
+        return f"put quotes around it: {entry['key']}: {quote}{entry['value']}{quote}"
 
 
 def report_character(source: Source, at: int, reporter: Reporter) -> None:
@@ -92,35 +86,53 @@ def report_character(source: Source, at: int, reporter: Reporter) -> None:
 def report_yaml(error: yaml.YAMLError, source: Source, reporter: Reporter) -> None:
     """Report what PyYAML raised as PD103."""
     assert isinstance(error, yaml.MarkedYAMLError), error
-    found = _marked(error, source)
-    others, helps = [found.other] if found.other else [], [found.help] if found.help else []
-    message = f"invalid YAML: {found.message}"
-    reporter.error("PD103", message, found.span, found.label, secondary=others, helps=helps)
-
-
-def _marked(error: yaml.MarkedYAMLError, source: Source) -> Problem:
     mark = error.problem_mark or error.context_mark
     at = mark.index if mark else 0
     since = error.context_mark.index if error.context_mark else at
-    words = " ".join(str(error.problem or error.context or "").split())
-    place = Place(source, at, since)
-    for needles, explain in _ROWS:
-        if any(needle in words for needle in needles):
+    problem = _problem(Place(source, at, since), f"{error.context}: {error.problem}")
+    others, helps = [problem.other] if problem.other else [], [problem.help] if problem.help else []
+    message = f"invalid YAML: {problem.message}"
+    reporter.error("PD103", message, problem.span, problem.label, secondary=others, helps=helps)
+
+
+def _problem(place: Place, words: str) -> Problem:
+    for pattern, explain in _ROWS:
+        if re.search(pattern, words):
             return explain(place)
-    return Problem("not readable", place.span(at), words)
+    return Problem("not readable", place.span(place.at), words)
+
+
+def _fixed(
+    message: str, label: str, fix: str, *, since: bool = False, whole: bool = False
+) -> Callable[[Place], Problem]:
+    """A problem at one of a place's ends, `whole` up to the end of the line. Texts may use {char} and {quoted}."""
+
+    def explain(place: Place) -> Problem:
+        start = place.since if since else place.at
+        span = place.rest(start) if whole else place.span(start)
+        values = {"char": place.text[span.start : span.start + 1], "quoted": place.quoted(start)}
+        return Problem(message.format_map(values), span, label, fix.format_map(values))
+
+    return explain
+
+
+_TAB = _fixed("a tab in the indentation", "a tab", "indent with spaces")
+_MEANING = "has a meaning of its own in YAML"
+_INDICATOR = _fixed("a value cannot start with `{char}`", _MEANING, "{quoted}")
 
 
 def _second_colon(place: Place) -> Problem:
-    if ": " in place.before or place.before.rstrip().endswith(":"):
+    before = place.before(place.at)
+    if ": " in before or before.rstrip().endswith(":"):
         return Problem("a second `: ` in one line", place.span(place.at), "only a key ends with `:`", QUOTE)
-    start = place.at - len(place.before.lstrip())
+    start = place.at - len(before.lstrip())
     label = "indented deeper than the line before, or part of it"
     fix = "check the indentation, and that the line before ends as it should: a key with `:`"
     return Problem("a key that cannot stand here", place.span(start, place.at - start), label, fix)
 
 
 def _key(place: Place) -> Problem:
-    if place.before.rstrip().endswith(('"', "'")):
+    if place.before(place.at).rstrip().endswith(('"', "'")):
         label = "does not belong to the value"
         return Problem("text after a closing quote", place.rest(place.at), label, QUOTE)
     if place.char == ":":
@@ -143,13 +155,17 @@ def _unclosed(place: Place) -> Problem:
     closer = {"{": "}", "[": "]"}.get(opener, "}")
     comment = _comment(place)
     if comment is not None:
-        message = f"a comment inside `{opener}…{closer}`"
-        fix = f'put quotes around a value that starts with `#`: "{_word(place.text, comment)}"'
-        return Problem(message, place.rest(comment), COMMENT, fix, Label(opened, "opened here"))
+        value = re.split(r"[ \t\r\n,}\]]", place.text[comment:], maxsplit=1)[0]
+        message, label = (
+            f"a comment inside `{opener}…{closer}`",
+            "YAML reads a `#` after a space as a comment",
+        )
+        fix = f'put quotes around a value that starts with `#`: "{value}"'
+        return Problem(message, place.rest(comment), label, fix, Label(opened, "opened here"))
     message, fix = f"a `{opener}` that is never closed", f"write the `{closer}`"
     if place.at >= len(place.text.rstrip()) or not place.same_line:
         quoted = place.quoted(place.since)
-        drawn = re.search(r"\b(given|expect): \Z", place.before_of(place.since))
+        drawn = re.search(r"\b(given|expect): \Z", place.before(place.since))
         if drawn and closer not in place.rest(place.since).text and quoted != QUOTE:
             return Problem(message, opened, "not closed", f"{fix}, or {quoted}")
     if place.same_line and place.at < len(place.text):
@@ -172,33 +188,6 @@ def _comment(place: Place) -> int | None:
     return None
 
 
-def _word(text: str, start: int) -> str:
-    return re.split(r"[ \t\r\n,}\]]", text[start:], maxsplit=1)[0]
-
-
-def _bad_start(place: Place) -> Problem:
-    return (
-        _tab(place) if place.char == "\t" else _meaning(place, place.at, "has a meaning of its own in YAML")
-    )
-
-
-def _start_of_value(place: Place) -> Problem:
-    return _meaning(place, place.since, "has a meaning of its own in YAML")
-
-
-def _complex_key(place: Place) -> Problem:
-    return _meaning(place, place.at, "begins a key, to YAML")
-
-
-def _meaning(place: Place, at: int, label: str) -> Problem:
-    span = place.span(at)
-    return Problem(f"a value cannot start with `{span.text}`", span, label, place.quoted(at))
-
-
-def _tab(place: Place) -> Problem:
-    return Problem("a tab in the indentation", place.span(place.at), "a tab", "indent with spaces")
-
-
 def _open_quote(place: Place) -> Problem:
     if place.text[place.since : place.since + 1] not in "\"'":
         return Problem("the file ends too early", place.span(place.at), "something is not finished")
@@ -208,14 +197,8 @@ def _open_quote(place: Place) -> Problem:
 
 def _escape(place: Place) -> Problem:
     label, fix = 'in "…" a backslash starts an escape', "use '…' quotes, or no quotes"
-    return Problem("an unknown escape", place.span(place.at, 2), label, fix)
-
-
-def _no_colon(place: Place) -> Problem:
-    fix = "a key ends with `:`; text that continues is indented deeper than its key"
-    return Problem(
-        "a line that is neither a key nor a value", place.rest(place.since), "no `:` after it", fix
-    )
+    backslash = place.text.rfind("\\", 0, place.at + 1)
+    return Problem("an unknown escape", place.span(backslash, 2), label, fix)
 
 
 def _list_beside_key(place: Place) -> Problem:
@@ -226,10 +209,10 @@ def _list_beside_key(place: Place) -> Problem:
 
 
 def _nothing(place: Place) -> Problem:
-    last = Place(place.source, min(place.at, len(place.text.rstrip())), 0)
-    line = Place(place.source, last.at, last.at - len(last.before))
-    if "{" in last.before and _comment(line) is not None:
-        return _unclosed(Place(place.source, last.at, line.since + last.before.rindex("{")))
+    at = min(place.at, len(place.text.rstrip()))
+    before = place.before(at)
+    if "{" in before and _comment(Place(place.source, at, at - len(before))) is not None:
+        return _unclosed(Place(place.source, at, at - len(before) + before.rindex("{")))
     span = place.span(place.at)
     if place.char in ("}", "]"):
         label = "nothing is open, or a value is missing"
@@ -244,32 +227,49 @@ def _block_header(place: Place) -> Problem:
     return Problem(f"text after `{char}`", place.rest(place.at), label, fix)
 
 
-def _after_end(place: Place) -> Problem:
-    message, fix = "text after the end of the document", "remove it, or the line before it"
-    return Problem(message, place.rest(place.at), "not part of it", fix)
-
-
-def _directive(place: Place) -> Problem:
-    span, label = place.rest(place.since), "a line that starts with `%`"
-    return Problem("a YAML directive", span, label, "remove the line")
-
-
-_ROWS: tuple[tuple[tuple[str, ...], Callable[[Place], Problem]], ...] = (
-    (("mapping values are not allowed",), _second_colon),
-    (("mapping keys are not allowed",), _complex_key),
-    (("found a tab character",), _tab),
-    (("cannot start any token",), _bad_start),
-    (("expected ',' or '}'", "expected ',' or ']'"), _unclosed),
-    (("unexpected end of stream", "unexpected document indicator"), _open_quote),
-    (("unknown escape character", "did not find expected hexdecimal number", "invalid Unicode"), _escape),
-    (("could not find expected ':'",), _no_colon),
-    (("sequence entries are not allowed",), _list_beside_key),
-    (("expected comment or line break",), _block_header),
-    (("expected '-' indicator",), _item),
-    (("did not find expected key",), _key),
-    (("expected node content",), _nothing),
-    (("expected <document start>",), _after_end),
-    (("directive", "incompatible YAML document", "tag handle"), _directive),
-    (("alphabetic or numeric character", "expected tag URI", "expected whitespace"), _start_of_value),
+_ROWS: tuple[tuple[str, Callable[[Place], Problem]], ...] = (
+    (
+        "directive|incompatible YAML document|duplicate tag handle",
+        _fixed("a YAML directive", "a line that starts with `%`", "remove the line", since=True, whole=True),
+    ),
+    (
+        "while (scanning|parsing) (a tag|an anchor|an alias)|undefined tag handle",
+        _fixed("a value cannot start with `{char}`", _MEANING, "{quoted}", since=True),
+    ),
+    (
+        "mapping keys are not allowed",
+        _fixed("a value cannot start with `{char}`", "begins a key, to YAML", "{quoted}"),
+    ),
+    ("mapping values are not allowed", _second_colon),
+    ("found a tab character", _TAB),
+    ("cannot start any token", lambda place: (_TAB if place.char == "\t" else _INDICATOR)(place)),
+    ("unexpected ':'", _fixed("a `:` inside a value", "only a key ends with `:`", QUOTE)),
+    ("expected ',' or '[]}]'", _unclosed),
+    ("unexpected (end of stream|document indicator|document separator)", _open_quote),
+    ("unknown escape character|hexa?decimal number|invalid Unicode", _escape),
+    (
+        "could not find expected ':'",
+        _fixed(
+            "a line that is neither a key nor a value",
+            "no `:` after it",
+            "a key ends with `:`; text that continues is indented deeper than its key",
+            since=True,
+            whole=True,
+        ),
+    ),
+    ("sequence entries are not allowed", _list_beside_key),
+    ("expected (a )?comment or (a )?line break|chomping or indentation", _block_header),
+    ("while parsing a block collection", _item),
+    ("while parsing a block mapping", _key),
+    ("expected (the )?node content", _nothing),
+    (
+        "expected '?<document start>",
+        _fixed(
+            "text after the end of the document",
+            "not part of it",
+            "remove it, or the line before it",
+            whole=True,
+        ),
+    ),
 )
-"""PyYAML's words, and what they mean to the one who wrote the file. The first row that fits counts."""
+"""Patterns of what PyYAML and libyaml report, and what it means. The first match counts."""
