@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from powderdsl.moved import find_old_names
-
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
@@ -14,8 +12,6 @@ if TYPE_CHECKING:
     from powderdsl.diagnostics import CompileError
     from powderdsl.simulation.simulator import Simulator, World, compile
     from powderdsl.worlds.store import load_world, save
-
-find_old_names()
 
 _HOMES = {
     "load": "powderdsl.compiler",

@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 import re
 import sys
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -50,31 +49,15 @@ BACKENDS = {
 }
 """All of them give the same worlds, bit for bit."""
 
-RENAMED_BACKENDS = {"dense": "torch", "planes": "wasm", "arrays": "wasm"}
-"""Old names, which still work, and what runs instead."""
 
-
-def current_backend(name: str) -> str:
-    """The name of a backend as it is now: an old one is replaced, with a DeprecationWarning at the caller's line."""
-    new = RENAMED_BACKENDS.get(name)
-    if new is None:
-        return name
-    frame, level = sys._getframe(1), 2
-    while frame.f_back is not None and str(frame.f_globals.get("__name__")).startswith("powderdsl."):
-        frame, level = frame.f_back, level + 1
-    warnings.warn(f"the backend `{name}` is `{new}` now", DeprecationWarning, stacklevel=level)
-    return new
-
-
-def checked_request(ruleset: Ruleset | str, backend: str) -> tuple[Ruleset, str]:
-    """A loaded ruleset, and the backend's current name. Raises TypeError, CompileError (PD701 for other backends)."""
+def checked_request(ruleset: Ruleset | str, backend: str) -> Ruleset:
+    """A loaded ruleset. Raises TypeError, CompileError (PD701 for unknown backends)."""
     model = load(ruleset) if isinstance(ruleset, str) else ruleset
     if not isinstance(model, Ruleset):
         raise TypeError(f"ruleset must be a Ruleset or a name, found {type(model).__name__}")
-    backend = current_backend(backend)
     if backend not in BACKENDS:
         raise failure("PD701", f"no backend `{backend}`", helps=("backends: " + ", ".join(BACKENDS),))
-    return model, backend
+    return model
 
 
 def starting_backend(device: str) -> str:

@@ -44,7 +44,6 @@ _LEARNING = (
 LAYERS: dict[str, tuple[str, ...]] = {
     # A row is a package with all that lies in it, or a module; the longest row that fits a module is its own. It may
     # import from its own row and from the rows named beside it, all of them further up.
-    "moved": (),
     "arrays": (),
     "diagnostics": (),
     "system": ("arrays", "diagnostics"),
@@ -142,7 +141,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "experiments.bench",
         "experiments.studies",
     ),
-    "__init__": ("moved", *_SCREEN),  # the public names, imported when they are asked for
+    "__init__": _SCREEN,  # the public names, imported when they are asked for
     "__main__": ("cli",),
 }
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from powderdsl.cli.output import counted
-from powderdsl.compiler import BACKENDS, RENAMED_BACKENDS, load_with_diagnostics
+from powderdsl.compiler import BACKENDS, load_with_diagnostics
 from powderdsl.diagnostics import Severity
 
 if TYPE_CHECKING:
@@ -237,26 +237,11 @@ packs = click.option(
 """For commands whose class is `ManyWords`."""
 
 
-class BackendType(click.Choice):
-    """A backend. An old name is replaced, with a note on stderr."""
-
-    def __init__(self) -> None:
-        super().__init__(list(BACKENDS))
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        return super().convert(renamed_backend(value), param, ctx)
-
-
-def renamed_backend(name: str) -> str:
-    """The current name of a backend; an old name gets a note on stderr."""
-    new = RENAMED_BACKENDS.get(name, name)
-    if new != name:
-        click.echo(f"note: the backend `{name}` is `{new}` now", err=True)
-    return new
+BACKEND = click.Choice(list(BACKENDS))
 
 
 def backend(default: str | None, about: str = "Backend that runs the rules.") -> Option:
-    return click.option("--backend", type=BackendType(), default=default, help=about)
+    return click.option("--backend", type=BACKEND, default=default, help=about)
 
 
 def load_rules(rules: str, settings: dict[str, str]) -> Ruleset:

@@ -63,7 +63,7 @@ def compile_arrays(ruleset: Ruleset | str, backend: str = "auto", device: str = 
     """A simulator without torch. Raises CompileError (PD701) for a backend or device that needs torch."""
     from powderdsl.simulation.array_worlds import ArraySimulator, wasm_problem
 
-    model, backend = checked_request(ruleset, backend)
+    model = checked_request(ruleset, backend)
     problem = wasm_problem()
     if backend == "auto":
         backend = "reference" if problem else "wasm"

@@ -112,5 +112,5 @@ def compile(
     ruleset: Ruleset | str, backend: str = "auto", device: str = "cpu", threads: int = 1
 ) -> Simulator:
     """`simulation.compiling.compile`, on torch. Raises CompileError (PD701)."""
-    model, backend = checked_request(ruleset, backend)
+    model = checked_request(ruleset, backend)
     return Simulator(model, backend, device, threads)

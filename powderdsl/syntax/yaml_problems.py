@@ -169,8 +169,8 @@ def _unclosed(place: Place) -> Problem:
         if drawn and closer not in place.rest(place.since).text and quoted != QUOTE:
             return Problem(message, opened, "not closed", f"{fix}, or {quoted}")
     if place.same_line and place.at < len(place.text):
-        label = Label(opened, "opened here")
-        return Problem(f"expected `,` or `{closer}`", place.span(place.at), "", QUOTE, label)
+        other = Label(opened, "opened here")
+        return Problem(f"expected `,` or `{closer}`", place.span(place.at), "", QUOTE, other)
     return Problem(message, opened, "not closed", fix)
 
 

@@ -110,7 +110,7 @@ def _loaded(archive: Archive, sim: AnySimulator[W], source: Path) -> W:
 
 
 def _about(archive: Archive, path: Path) -> tuple[dict[int, str], dict[str, str], str]:
-    """The palette, the qualified name of each field (none in older files), and the name of the ruleset."""
+    """The palette, the qualified name of each field, and the name of the ruleset."""
     header = archive.headers.get("about")
     if header is None or header.shape != () or header.letter != "U" or header.size > MAX_ABOUT:
         raise _bad(path, "is not a saved world: it does not say what it is")
@@ -119,7 +119,7 @@ def _about(archive: Archive, path: Path) -> tuple[dict[int, str], dict[str, str]
         if not isinstance(about, dict) or about.get("format") != FORMAT:
             raise _bad(path, f"was saved in another format than {FORMAT}")
         palette = {int(number): str(name) for number, name in about["palette"].items()}
-        fields = {str(name): str(one) for name, one in about.get("fields", {}).items()}
+        fields = {str(name): str(one) for name, one in about["fields"].items()}
     except (KeyError, ValueError, TypeError, AttributeError) as error:
         words = " ".join(str(error).split())[:200]
         raise _bad(path, f"is not a saved world: {type(error).__name__} {words}") from None

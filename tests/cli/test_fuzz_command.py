@@ -12,14 +12,10 @@ import pytest
 
 from powderdsl.simulation.simulator import Simulator
 from powderdsl.targets.cpp.build import Building
-from powderdsl.testing.generators.cases import load_text
-from powderdsl.testing.generators.rulemaker import random_ruleset_text
 from tests.cli.commands import command_line, environment_with, powderdsl
 from tests.compilers import skip_without_compiler
 from tests.fuzz import COMPARED, STARTS_AT_ONCE, differential
 from tests.fuzz.case_files import read_case, write_case
-from tests.fuzz.cases import Case
-from tests.fuzz.differential import seeded_starts
 from tests.fuzz.reducer import reduce_case
 from tests.processes import started, waited
 
@@ -71,21 +67,6 @@ def test_without_a_compiler_the_others_are_compared(tmp_path: Path, monkeypatch:
     assert "leave `cuda-emulated` out of --backends" in asked.stderr
 
 
-def test_a_run_and_a_case_with_old_names_go_on(tmp_path: Path) -> None:
-    """What was saved when `torch` was `dense` and `arrays` was `planes`."""
-    given = ("fuzz", "--jobs", 1, "--worlds", 1, "--steps", 1, "--save", tmp_path)
-    assert powderdsl(*given, "--seeds", "0..1", "--backends", "torch,wasm").exit_code == 0
-    state = tmp_path / "state.json"
-    state.write_text(state.read_text().replace("torch,wasm", "dense,planes"))
-    again = powderdsl(*given, "--seeds", "0..1", "--backends", "dense,planes", "--resume")
-    assert again.exit_code == 0, again.stderr
-    assert "note: the backend `planes` is `wasm` now" in again.stderr
-    text = random_ruleset_text(0)
-    start = next(seeded_starts(load_text(text), 0, 1))
-    write_case(tmp_path / "case.yaml", Case(text, start, 1, "planes"))
-    assert read_case(tmp_path / "case.yaml").backend == "wasm"
-
-
 @pytest.mark.slow
 def test_ctrl_c_ends_a_run_with_its_report(tmp_path: Path) -> None:
     line = command_line(
@@ -109,7 +90,6 @@ def test_ctrl_c_ends_a_run_with_its_report(tmp_path: Path) -> None:
         (("--seeds", "5..2"), "is not a range of seeds"),
         (("--backends", "torch,sparse"), "no backend `sparse`"),
         (("--backends", "torch,wasm,torch"), "`torch` is named twice: nothing is compared with itself"),
-        (("--backends", "dense,torch"), "`torch` is named twice: nothing is compared with itself"),
         (("--backends", "reference"), "the reference is not compared with itself"),
         (("--seeds", "0..2", "--seconds", "3"), "not both"),
         (("--replay", "nowhere.yaml"), "cannot read `nowhere.yaml`"),

@@ -15,7 +15,6 @@ from tempfile import gettempdir
 
 import torch
 
-from powderdsl.compiler import RENAMED_BACKENDS
 from powderdsl.system.reading import parse_json, read_bytes
 from powderdsl.system.writing import failure, replacing, scratch_folder
 from powderdsl.testing.generators.cases import load_text
@@ -93,8 +92,6 @@ def load_tally(folder: Path, plan: Plan) -> Tally:
         raise failure(
             "PD602", f"{path} is not a state of `python -m tests.fuzz`", notes=(str(error),)
         ) from None
-    backends, _, rest = tally.plan.partition(" ")
-    tally.plan = ",".join(RENAMED_BACKENDS.get(name, name) for name in backends.split(",")) + f" {rest}"
     if tally.plan != describe(plan):
         notes = (f"there: {tally.plan}", f"here: {describe(plan)}")
         helps = ("give the options that it began with, or another folder",)

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from powderdsl.compiler import RENAMED_BACKENDS
 from powderdsl.model.state import slots
 from powderdsl.system.writing import replacing
 from powderdsl.testing.generators.cases import Start, load_text
@@ -69,5 +68,4 @@ def read_case(path: Path) -> Case:
         start = Start.fresh(read_array(tree["worlds"], "uint8"), seed, step, fields, params)
         if "index" in tree:
             start = replace(start, index=read_array(tree["index"], "int64"))
-        backend = line_of(tree["backend"])
-        return Case(text, start, steps, RENAMED_BACKENDS.get(backend, backend))
+        return Case(text, start, steps, line_of(tree["backend"]))

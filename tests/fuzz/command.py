@@ -13,7 +13,6 @@ import click
 from powderdsl.cli import options as opt
 from powderdsl.cli.dispatch import GuardedCommand
 from powderdsl.cli.exits import FAILED, OK, BadInput
-from powderdsl.cli.options import renamed_backend
 from powderdsl.cli.output import counted, progress
 from powderdsl.system.interrupts import Terminated
 from tests.fuzz import COMPARED, COMPILED
@@ -51,7 +50,7 @@ class BackendsType(click.ParamType):
     ) -> tuple[str, ...]:
         if isinstance(value, tuple):
             return value
-        names = [renamed_backend(name) for name in value.replace(" ", "").split(",")]
+        names = value.replace(" ", "").split(",")
         for number, name in enumerate(names):
             if name not in NAMES:
                 self.fail(f"no backend `{name}` to compare: {', '.join(NAMES)}", param, ctx)

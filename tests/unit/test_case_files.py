@@ -53,7 +53,7 @@ rules: |
         ("seed: 0\n", "", "PD602"),
         ("- - 0 0", "- - 0 900", "PD602"),
         ("- - 0 0", "- - 0 0\n    - 0", "PD602"),
-        ("backend: torch", "- dense", "PD101"),
+        ("backend: torch", "- torch", "PD101"),
         ("pack: p", "pack: [", "PD101"),
     ],
 )

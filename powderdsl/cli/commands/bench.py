@@ -40,7 +40,7 @@ EPILOG = "\b\nWorkloads:\n" + "\n".join(f"  {name:<7} {about}" for name, about i
 @click.option(
     "--backend",
     "backends",
-    type=opt.BackendType(),
+    type=opt.BACKEND,
     multiple=True,
     help="Backend that runs the rules.  [default: wasm and native; on a GPU, torch and cuda]",
 )

@@ -47,7 +47,7 @@ def _names(ctx: click.Context, param: click.Parameter, value: str | None) -> lis
 @opt.knobs("For a task: another value for a knob.")
 @opt.parameters
 @opt.packs
-@click.option("--backend", type=opt.BackendType(), help="Backend that runs the rules.  [default: the run's]")
+@click.option("--backend", type=opt.BACKEND, help="Backend that runs the rules.  [default: the run's]")
 @click.option("--device", help="A torch device.  [default: the run's]")
 @opt.layouts("One JSON object instead of a table.")
 @opt.path("--out", "FILE.json", "Also write the JSON object to this file.")

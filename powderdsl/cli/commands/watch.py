@@ -42,7 +42,7 @@ SUFFIXES = (".gif", ".mp4")
 @opt.path("--out", "FILE", "The .gif or .mp4 to write.  [default: watch.gif in the run's folder]")
 @opt.integer("--fps", 1, 240, "Frames per second.", 15)
 @opt.integer("--scale", 1, 32, "Pixels per cell.", 4)
-@click.option("--backend", type=opt.BackendType(), help="Backend that runs the rules.  [default: the run's]")
+@click.option("--backend", type=opt.BACKEND, help="Backend that runs the rules.  [default: the run's]")
 def command(
     run: str,
     split: str | None,

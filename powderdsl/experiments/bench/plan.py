@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from powderdsl.analysis.reactions import moved_ids
-from powderdsl.compiler import BACKENDS, current_backend
+from powderdsl.compiler import BACKENDS
 from powderdsl.diagnostics import suggest
 from powderdsl.experiments.bench.programs import Program
 from powderdsl.model.state import check_sides
@@ -119,7 +119,6 @@ def make_plan(
     """
     if workload not in WORKLOADS:
         raise KeyError(f"no workload `{workload}`; {'; '.join(suggest(workload, WORKLOADS, 'workloads'))}")
-    backends = [current_backend(backend) for backend in backends]
     for backend in backends:
         if backend not in BACKENDS:
             raise KeyError(f"no backend `{backend}`; {'; '.join(suggest(backend, BACKENDS, 'backends'))}")
