@@ -59,6 +59,9 @@ class Compute:
     """Whether all values are computed before any is stored, since it overwrites what it reads at neighbors (`buffers`)."""
 
 
+Leftover = Literal["same", "nothing", "everything"]
+
+
 @dataclass(frozen=True)
 class Carried:
     """A plane in a movement: its new value, its old value, and what a cell holds that its mover left and none entered.
@@ -71,6 +74,17 @@ class Carried:
     leaves: Node
     into: str | None = None
     """The variable whose memory the new one reuses, since nothing reads it later: the old one, or what is left (`release`)."""
+
+    def leftover(self, movers: Node) -> Leftover | None:
+        """The flags that movers leave behind in their cells; None for any others."""
+        if self.leaves is self.old:
+            return "same"
+        if self.leaves.op not in ("and", "or") or self.old not in self.leaves.args:
+            return None
+        (other,) = (arg for arg in self.leaves.args if arg is not self.old)
+        if self.leaves.op == "or":
+            return "everything" if other is movers else None
+        return "nothing" if other.op == "not" and other.args[0] is movers else None
 
 
 @dataclass(frozen=True)
@@ -233,6 +247,13 @@ def conjuncts(node: Node) -> list[Node]:
             seen[id(top)] = top
             stack.extend(reversed(top.args) if top.op == "and" else ())
     return [part for part in seen.values() if part.op != "and"]
+
+
+def alternatives(region: Node) -> list[Node]:
+    """The flags of which one must hold for a region to hold."""
+    if region.op == "or":
+        return [part for arg in region.args for part in alternatives(arg)]
+    return [] if region.op == "const" else [region]
 
 
 def read_elsewhere(values: Iterable[Node]) -> set[str]:

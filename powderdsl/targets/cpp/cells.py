@@ -8,7 +8,17 @@ from types import MappingProxyType
 
 from powderdsl.ir.ops import REAL, Node, ordered
 from powderdsl.schedule.join import field_reads, keeps
-from powderdsl.schedule.types import Compute, Guard, Out, Schedule, Sweeps, flat, is_zero, values_of
+from powderdsl.schedule.types import (
+    Compute,
+    Guard,
+    Out,
+    Schedule,
+    Sweeps,
+    alternatives,
+    flat,
+    is_zero,
+    values_of,
+)
 from powderdsl.targets.cpp.chunks import Chunks
 from powderdsl.targets.layout import Layout
 from powderdsl.targets.values import chains_of
@@ -201,18 +211,11 @@ def _changed_text(loop: Compute, declared: frozenset[str], layout: Layout, reach
     return "\n".join(lines)
 
 
-def _parts(region: Node) -> list[Node]:
-    """The flags of which one must hold."""
-    if region.op == "or":
-        return [part for arg in region.args for part in _parts(arg)]
-    return [] if region.op == "const" else [region]
-
-
 def _region_planes(loop: Compute) -> list[str]:
     """The planes of a region."""
     if loop.region is None or loop.over == "choices":  # choices test their masks themselves
         return []
-    return [str(part.attr) for part in _parts(loop.region) if part.op == "load"]
+    return [str(part.attr) for part in alternatives(loop.region) if part.op == "load"]
 
 
 def _marking(number: int, planes: Sequence[str], layout: Layout) -> Iterator[str]:
@@ -229,7 +232,7 @@ def _marking(number: int, planes: Sequence[str], layout: Layout) -> Iterator[str
 def _asked(loop: Compute) -> Iterator[tuple[str, str]]:
     """Tests of fields and planes, with their names; if all are true, the loop does nothing."""
     assert loop.region is not None
-    for part in _parts(loop.region):
+    for part in alternatives(loop.region):
         if part.op == "live":
             yield part.args[0].attr, f"{part.args[0].attr}->still"
         else:
@@ -363,7 +366,7 @@ class _Loop:
         region = self.loop.region
         yield PLACE
         if region is not None:
-            parts = _parts(region)
+            parts = alternatives(region)
             number, marked = self.marks
             scans = [
                 f"some |= row_bits(v{part.attr}, row * words, words, lane);"

@@ -128,7 +128,7 @@ class _Printer:
             return
         names = {plane.new.name: "" if plane.new.name in declared else "Plane* " for plane in move.planes}
         far = move.op == "arrive" and abs(dy) > 1  # `arrive_planes` moves by one row
-        copies = far or any(_leaves(plane.old, plane.leaves, movers) is None for plane in move.planes)
+        copies = far or any(plane.leftover(move.movers) is None for plane in move.planes)
         if copies and move.op == "swap":
             target = f"shifted(c, {movers}, {-dy}, {-dx})"
             for plane in move.planes:
@@ -147,16 +147,14 @@ class _Printer:
             yield f"{names[plane.new.name]}{plane.new.name} = {plane.into or kept};"
             if copies:
                 continue
-            leaves = _leaves(plane.old, plane.leaves, movers)
-            assert leaves is not None
-            kinds.setdefault(leaves, []).append(f"&{plane.new.name}")
+            kinds.setdefault(str(plane.leftover(move.movers)), []).append(f"&{plane.new.name}")
         if copies:
             olds = ", ".join(str(plane.old.attr) for plane in move.planes)
             news = ", ".join(f"&{plane.new.name}" for plane in move.planes)
             call = f"arrive_over(c, {movers}, {dy}, {dx}, olds, news, {len(move.planes)});"
             yield f"{{ Plane* const olds[] = {{{olds}}}; Plane** const news[] = {{{news}}}; {call} }}"
         for leaves, targets in kinds.items():
-            function = "swap_planes" if move.op == "swap" else f"arrive_planes<{leaves}>"
+            function = "swap_planes" if move.op == "swap" else f"arrive_planes<{leaves.upper()}>"
             call = f"{function}(c, {movers}, {dy}, {dx}, all, {len(targets)});"
             yield f"{{ Plane** const all[] = {{{', '.join(targets)}}}; {call} }}"
 
@@ -229,18 +227,6 @@ def _kept(value: Node) -> str:
     if value.op == "load" or value.type == FLAG:
         return f"keep({_held(value)})"
     return "keep(c.calm)"
-
-
-def _leaves(old: Node, rest: Node, movers: str) -> str | None:
-    """What movers leave behind, by its name in movements.hpp; None if it has none there."""
-    if rest is old:
-        return "SAME"
-    if rest.op not in ("and", "or") or old not in rest.args:
-        return None
-    (other,) = (arg for arg in rest.args if arg is not old)
-    if rest.op == "or":
-        return "EVERYTHING" if other.attr == movers else None
-    return "NOTHING" if other.op == "not" and other.args[0].attr == movers else None
 
 
 def whole(value: Node, layout: Layout) -> str:

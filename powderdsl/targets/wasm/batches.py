@@ -104,8 +104,7 @@ class Batches:
         old = f.param(0)
         new = f.let(allocate(word(old, WORLDS), library.world_rows.value))
         begin = const("i32", HEADER)
-        f.body += (new + begin).code + (old + begin).code
-        f.body += (self.groups(old) - old - HEADER).code + op("memory.copy", tail=b"\0\0").code
+        f.copy(new + begin, old + begin, self.groups(old) - old - HEADER)
         apart = f.let(new - old)
         with self.each_group(f, old) as group:
             for at, real in self.slots():

@@ -297,6 +297,14 @@ class Function:
     def store(self, name: str, address: Value, value: Value, offset: int = 0) -> None:
         self.body += address.code + value.code + OPCODES[name] + _access(name, offset)
 
+    def copy(self, target: Value, source: Value, size: Value) -> None:
+        """Copy bytes in memory."""
+        self.body += target.code + source.code + size.code + OPCODES["memory.copy"] + b"\0\0"
+
+    def fill(self, target: Value, byte: Value, size: Value) -> None:
+        """Set bytes in memory."""
+        self.body += target.code + byte.code + size.code + OPCODES["memory.fill"] + b"\0"
+
     def give(self, value: Value) -> None:
         """The result of the function is this."""
         self.body += value.code + OPCODES["return"]

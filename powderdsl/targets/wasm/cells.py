@@ -9,7 +9,7 @@ from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING
 
 from powderdsl.ir.ops import REAL, SNAP, Node, ordered
-from powderdsl.schedule.types import Compute, loaded
+from powderdsl.schedule.types import Compute, alternatives, loaded
 from powderdsl.targets.layout import param_key
 from powderdsl.targets.values import CellValues, chains_of
 from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, floats, load, op, vector
@@ -24,13 +24,6 @@ BITS = struct.pack("<4I", 1, 2, 4, 8)
 _ARITHMETIC = {"add", "sub", "mul", "neg", "abs", "sqrt", "eq", "lt", "le"}
 
 
-def parts_of(region: Node) -> list[Node]:
-    """The flags of which one must hold."""
-    if region.op == "or":
-        return [part for arg in region.args for part in parts_of(arg)]
-    return [] if region.op == "const" else [region]
-
-
 def sweep(within: Pass, loop: Compute) -> None:
     """The statements of a pass for a loop over cells."""
     f, library = within.f, within.library
@@ -43,7 +36,7 @@ def sweep(within: Pass, loop: Compute) -> None:
                 within.define(out.var, within.kept(out.value))
         elif loop.region is not None:
             condition = ZERO
-            for part in parts_of(loop.region):
+            for part in alternatives(loop.region):
                 condition = condition | library.some(within.of(part.args[0] if part.op == "live" else part))
             asked.enter_context(f.when(condition))
         if not copies:
@@ -174,7 +167,7 @@ class CellLoop:
         f, loop = self.f, self.loop
         if loop.region is None:
             return
-        parts = parts_of(loop.region)
+        parts = alternatives(loop.region)
         busy = ZERO
         for part in parts:
             if part.op == "live":

@@ -153,32 +153,28 @@ class Library:
     def _own(self) -> Callee:
         """A plane of this owner alone, to be written over."""
         f = self.function("i32", "i32")
-        old = f.param(0)
-        with f.when(word(old, REFS).equals(const("i32", 1))):
-            f.store("i32.store", old, ZERO, HALOED)
-            f.give(old)
-        new = f.let(self.take())
-        base = const("i32", self.memory.base)
-        copied = (new + base).code + (old + base).code + self.cells.value.code
-        f.body += copied + op("memory.copy", tail=b"\0\0").code
-        f.store("i32.store", new, word(old, SOME), SOME)
-        f.do(self.give(old))
-        f.give(new)
+        with f.when(word(f.param(0), REFS).equals(1)):
+            f.store("i32.store", f.param(0), ZERO, HALOED)
+            f.give(f.param(0))
+        self._duplicate(f, self.take, self.give, self.memory.base, self.cells.value)
         return self.module.add(f, "own")
 
     def _own_field(self) -> Callee:
         """A field of this owner alone, to be written over."""
         f = self.function("i32", "i32")
-        old = f.param(0)
-        with f.when(word(old, REFS).equals(const("i32", 1))):
-            f.give(old)
-        new = f.let(self.take_field())
-        copied = (new + HEADER).code + (old + HEADER).code + (self.field_size.value - HEADER).code
-        f.body += copied + op("memory.copy", tail=b"\0\0").code
-        f.store("i32.store", new, word(old, SOME), SOME)
-        f.do(self.give_field(old))
-        f.give(new)
+        with f.when(word(f.param(0), REFS).equals(1)):
+            f.give(f.param(0))
+        self._duplicate(f, self.take_field, self.give_field, HEADER, self.field_size.value - HEADER)
         return self.module.add(f, "own_field")
+
+    def _duplicate(self, f: Function, take: Callee, give: Callee, first: int, size: Value) -> None:
+        """Return a copy of the plane or field that is the first parameter, whose owner gives it back."""
+        old, new = f.param(0), f.let(take())
+        start = const("i32", first)
+        f.copy(new + start, old + start, size)
+        f.store("i32.store", new, word(old, SOME), SOME)
+        f.do(give(old))
+        f.give(new)
 
     def some(self, held: Value) -> Value:
         """Whether a plane or field may hold anything."""

@@ -8,36 +8,20 @@ comes around the edge waits in the planes' halos.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
 
-from powderdsl.ir.ops import Node
-from powderdsl.schedule.types import Carried, Move
+from powderdsl.schedule.types import Leftover, Move
 from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, load, op
 from powderdsl.targets.wasm.library import ZERO, Library, choose, either, some, word
 from powderdsl.targets.wasm.memory import HALOED, HEADER, SOME, WORD
 
-Leaves = Literal["same", "nothing", "everything"]
 TOGETHER = 4
 """Planes that a loop over rows of one word changes, since each waits for what it reads."""
-
-
-def leaves_of(plane: Carried, movers: Node) -> Leaves | None:
-    """What movers leave behind, if it is one of these."""
-    old, rest = plane.old, plane.leaves
-    if rest is old:
-        return "same"
-    if rest.op not in ("and", "or") or old not in rest.args:
-        return None
-    (other,) = (arg for arg in rest.args if arg is not old)
-    if rest.op == "or":
-        return "everything" if other is movers else None
-    return "nothing" if other.op == "not" and other.args[0] is movers else None
 
 
 def moves_in_place(move: Move) -> bool:
     """Whether a movement needs no copies: swaps reach the next row only."""
     near = move.op == "arrive" or abs(move.offset[0]) <= 1
-    kinds = {leaves_of(plane, move.movers) for plane in move.planes}
+    kinds = {plane.leftover(move.movers) for plane in move.planes}
     return near and None not in kinds and (move.op == "arrive" or kinds == {"same"})
 
 
@@ -73,14 +57,14 @@ def _rows_that_move(library: Library, downwards: bool) -> Callee:
     return library.module.add(f, "rows_that_move")
 
 
-def mover(library: Library, kind: str, offset: tuple[int, int], leaves: Leaves) -> Callee:
+def mover(library: Library, kind: str, offset: tuple[int, int], leaves: Leftover) -> Callee:
     """Moves planes: those of movers and targets, the end of the list of rows, the end of the table of planes."""
     key = ("mover", kind, offset, leaves)
     return library.lazily(key, lambda: _Mover(library, kind, offset, leaves).made())
 
 
 class _Mover:
-    def __init__(self, library: Library, kind: str, offset: tuple[int, int], leaves: Leaves):
+    def __init__(self, library: Library, kind: str, offset: tuple[int, int], leaves: Leftover):
         self.library, self.memory, self.kind, self.leaves = library, library.memory, kind, leaves
         self.dy, self.dx = offset
         self.f = library.function("i32 i32 i32 i32")
@@ -174,9 +158,9 @@ def move(
     f.do(library.edges(movers))
     f.do(targets(movers, entered))
     rows = f.let(rows_that_move(library, dy > 0)(movers, entered))
-    by_kind: dict[Leaves, list[Local]] = {}
+    by_kind: dict[Leftover, list[Local]] = {}
     for plane, local in zip(moved.planes, planes, strict=True):
-        kind = leaves_of(plane, moved.movers)
+        kind = plane.leftover(moved.movers)
         assert kind is not None
         by_kind.setdefault(kind, []).append(local)
     for kind, several in by_kind.items():

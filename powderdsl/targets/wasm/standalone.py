@@ -154,8 +154,7 @@ class Standalone(Transfer):
         for number, knob in enumerate(self.face.knobs):
             f.do(self._knob(number, knob)(const("f64", knob.default)))
         cells = const("i32", self.buffers["element"])
-        f.body += cells.code + const("i32", self.face.ids[0]).code + const("i32", self.count).code
-        f.body += op("memory.fill", tail=b"\0").code
+        f.fill(cells, const("i32", self.face.ids[0]), const("i32", self.count))
         f.do(self._fresh()(ZERO))
         return self.module.add(f, "ready")
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from powderdsl.targets.wasm.batches import Batches
-from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, load, op, vector
+from powderdsl.targets.wasm.binary import Function, Local, Value, const, load, op, vector
 from powderdsl.targets.wasm.library import ZERO, counted, either, splat, word
 from powderdsl.targets.wasm.memory import HEADER, SOME, WORD
 
@@ -30,8 +30,7 @@ class Transfer(Batches):
                 f.do(library.give(word(at)))
                 plane = f.let(library.take())
                 f.store("i32.store", at, plane)
-                fill = (plane + memory.base).code + ZERO.code + library.cells.value.code
-                f.body += fill + op("memory.fill", tail=b"\0").code
+                f.fill(plane + memory.base, ZERO, library.cells.value)
         with self.each_lane(f, batch) as (group, lane, world, top):
             start = world * self.library.world_rows.value + top
             source = f.let(address + start * size * memory.width)
@@ -118,8 +117,7 @@ class Transfer(Batches):
             f.do(library.give_field(word(at)))
             field = f.let(library.take_field())
             f.store("i32.store", at, field)
-            fill = (field + HEADER).code + ZERO.code + library.live_size.value.code
-            f.body += fill + op("memory.fill", tail=b"\0").code
+            f.fill(field + HEADER, ZERO, library.live_size.value)
         with self.each_lane(f, batch) as (group, lane, world, top):
             source = f.let(address + world * apart + top * (4 * memory.width))
             field = f.let(word(group + (slot << 2)))
@@ -193,33 +191,18 @@ class Transfer(Batches):
     def fill_real(self) -> Function:
         f, library, memory = self.library.function("i32 " * 7 + "f32"), self.library, self.memory
         batch, world, slot, top, bottom, left, right, value = (f.param(i) for i in range(8))
-        own = self._own_field()
         f.set(slot, slot + len(self.layout.planes))
         with self.each_box_row(f, batch, world, top, bottom) as (group, lane, y):
             at = f.let(group + (slot << 2))
-            field = f.let(own(word(at)))
+            field = f.let(library.own_field(word(at)))
             f.store("i32.store", at, field)
             line = f.let(lane * library.rows.value + y)
             start, alive = f.let(library.line_start(field, line)), f.let(ZERO)
             with f.when(op("i32.eqz", load("i32.load8_u", field + line, HEADER))):
-                fill = start.code + ZERO.code + const("i32", 4 * memory.width).code
-                f.body += fill + op("memory.fill", tail=b"\0").code
+                f.fill(start, ZERO, const("i32", 4 * memory.width))
             with f.each(left, right, some=False) as x:
                 f.store("f32.store", start + (x << 2), value)
             with f.each(ZERO, const("i32", 4 * memory.width), 4) as x:
                 f.set(alive, alive | (word(start + x) << 1))
             self.close_line(f, field, line, start, alive)
         return f
-
-    def _own_field(self) -> Callee:
-        f, library = self.library.function("i32", "i32"), self.library
-        old = f.param(0)
-        with f.when(word(old).equals(1)):
-            f.give(old)
-        new = f.let(library.take_field())
-        f.body += (new + HEADER).code + (old + HEADER).code
-        f.body += (library.field_size.value - HEADER).code + op("memory.copy", tail=b"\0\0").code
-        f.store("i32.store", new, word(old, SOME), SOME)
-        f.do(library.give_field(old))
-        f.give(new)
-        return library.module.add(f, "own_field")
