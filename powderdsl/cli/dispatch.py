@@ -11,7 +11,7 @@ from typing import Any, NoReturn
 
 import click
 
-from powderdsl.cli.exits import BadInput, report_failure, version
+from powderdsl.cli.exits import report_failure, version
 from powderdsl.diagnostics.printable import printable_streams
 from powderdsl.system.interrupts import LIFELINE, end_with_stdin, interruptible
 
@@ -39,12 +39,6 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "export": ("export", "Write rules as a WebAssembly module, for a page or a game."),
     "explain": ("explain", "Explain a diagnostic code and how to fix it."),
 }
-
-
-ELSEWHERE = {
-    "fuzz": "`powderdsl fuzz` is a developers' tool: run `python -m tests.fuzz` in a clone of the repository"
-}
-"""Commands that have left the package."""
 
 
 _usual = warnings.formatwarning
@@ -99,8 +93,6 @@ class CommandGroup(GuardedCommand, click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        if args and args[0] in ELSEWHERE:
-            raise BadInput(ELSEWHERE[args[0]])
         if args and args[0] not in COMMANDS and not args[0].startswith("-"):
             from powderdsl.diagnostics import suggest
 

@@ -4,49 +4,28 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import Field, fields
-from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from powderdsl.cli.exits import BadInput
 from powderdsl.cli.output import counted
 from powderdsl.compiler import BACKENDS, load_with_diagnostics
 from powderdsl.diagnostics import Severity
 
 if TYPE_CHECKING:
+    from powderdsl.experiments.runs import RunFolder
     from powderdsl.model.types import Ruleset
+    from powderdsl.tasks.task import Task
 
 Option = Callable[[Any], Any]
 """A decorator that gives a command an option."""
 
 MAX_SIDE = 1 << 24
 """Rows or columns of a world; `worlds` limits the number of cells."""
-
-
-def layouts(about: str, *more: tuple[str, str]) -> Option:
-    """`--json` for every command, passed on as `layout`: ``text``, ``json``, or one of `more` (flag, help).
-
-    `--format LAYOUT` means the same; it is the hidden older spelling.
-    """
-    flags = (("json", about), *more)
-
-    def decorate(function: Any) -> Any:
-        @wraps(function)
-        def command(*args: Any, layout: str | None, **values: Any) -> Any:
-            asked = [name for name, _ in flags if values.pop(f"as_{name}")] + ([layout] if layout else [])
-            return function(*args, layout=asked[0] if asked else "text", **values)
-
-        names = ("text", *(name for name, _ in flags))
-        option = click.option("--format", "layout", type=click.Choice(names), hidden=True)
-        decorated = option(command)
-        for name, help_text in reversed(flags):
-            decorated = click.option(f"--{name}", f"as_{name}", is_flag=True, help=help_text)(decorated)
-        return decorated
-
-    return decorate
 
 
 class Parsed(click.ParamType):
@@ -125,6 +104,26 @@ def path(name: str, metavar: str, about: str, **more: Any) -> Option:
     return _option(name, about, type=click.Path(path_type=Path), metavar=metavar, **more)
 
 
+class OutputFile(click.Path):
+    """A file to write: its suffix is one of some, if any are given, and its folder can be written to."""
+
+    def __init__(self, suffixes: Collection[str]):
+        super().__init__(path_type=Path)
+        self.suffixes = suffixes
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        path = Path(value)
+        if self.suffixes and path.suffix.lower() not in self.suffixes:
+            self.fail(f"`{value}` must end in {' or '.join(self.suffixes)}", param, ctx)
+        check_writable(path)
+        return path
+
+
+def output(name: str, metavar: str, about: str, *suffixes: str, **more: Any) -> Option:
+    """A file to write. Whether that is possible is checked before the command begins: CompileError (PD613)."""
+    return _option(name, about, type=OutputFile(suffixes), metavar=metavar, **more)
+
+
 def choice(name: str, choices: Iterable[str], about: str, default: str | None = None, **more: Any) -> Option:
     """One of some words."""
     return _option(name, about, type=click.Choice(list(choices)), default=default, **more)
@@ -136,7 +135,7 @@ def flag(name: str, about: str, **more: Any) -> Option:
 
 
 def knobs(about: str) -> Option:
-    """Values for knobs of a task, as written: see `task_sheets.knob_values`."""
+    """Values for knobs of a task, as written: see `knob_values`."""
     return _option("--knob", about, to="knobs", multiple=True, metavar="NAME=N")
 
 
@@ -251,6 +250,32 @@ def load_rules(rules: str, settings: dict[str, str]) -> Ruleset:
     if warnings:
         click.echo(f"{counted(warnings, 'warning')}: powderdsl check {rules}", err=True)
     return ruleset
+
+
+def knob_values(knobs: Sequence[str]) -> dict[str, int]:
+    """`NAME=N` options as a mapping. Raises BadInput."""
+    values = {}
+    for knob in knobs:
+        match = re.fullmatch(r"([A-Za-z_]\w*)=(-?[0-9]{1,6})", knob.strip())
+        if match is None:
+            raise BadInput(f"`{knob}`: write --knob NAME=N")
+        values[match[1]] = int(match[2])
+    return values
+
+
+def find_played(
+    name: str, knobs: Sequence[str], settings: dict[str, str], packs: Sequence[str]
+) -> Task | RunFolder:
+    """The task or the run of an agent that a command was given. Raises CompileError and BadInput."""
+    from powderdsl.tasks.shipped import is_task, load_task
+
+    if is_task(name):
+        return load_task(name, knobs=knob_values(knobs), params=settings, packs=packs)
+    if knobs or settings:
+        raise BadInput("--knob and --set go with a task: a run has its own")
+    from powderdsl.experiments.runs import find_run
+
+    return find_run(name, "ppo")
 
 
 def check_writable(path: Path) -> None:

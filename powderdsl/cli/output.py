@@ -36,9 +36,9 @@ def print_json(value: Any) -> None:
     click.echo(as_json(value))
 
 
-def counted(number: int, thing: str) -> str:
-    """`no errors`, `1 error`, `2 errors`."""
-    return f"{number or 'no'} {thing}{'' if number == 1 else 's'}"
+def counted(number: int, thing: str, things: str = "") -> str:
+    """`no errors`, `1 error`, `2 errors`; `things` is the plural of words without a simple one."""
+    return f"{number or 'no'} {thing if number == 1 else things or f'{thing}s'}"
 
 
 # Progress

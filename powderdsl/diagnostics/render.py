@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 from unicodedata import combining, east_asian_width
 
@@ -126,8 +125,3 @@ def diagnostic_data(diagnostic: Diagnostic, *, utf16: bool = False) -> dict[str,
         "notes": list(diagnostic.notes),
         "helps": list(diagnostic.helps),
     }
-
-
-def render_json(diagnostics: Iterable[Diagnostic], *, utf16: bool = False) -> str:
-    """All diagnostics as one JSON list."""
-    return json.dumps([diagnostic_data(diagnostic, utf16=utf16) for diagnostic in diagnostics], indent=2)

@@ -8,31 +8,26 @@ import pytest
 from PIL import Image
 
 import powderdsl
-from powderdsl.experiments.bench import make_plan
-from powderdsl.experiments.bench.machine import Machine, Memory
+from powderdsl.experiments.bench.machine import Machine
+from powderdsl.experiments.bench.plan import make_plan
 from powderdsl.experiments.bench.plot import require_matplotlib, write_plot
-from powderdsl.experiments.bench.report import CellFigures, make_report
+from powderdsl.experiments.bench.report import CellFigures, Report
 
 MACHINE = Machine("Linux", "some processor", 4, "cpu", "3", "2", "none", "0", load=0.1)
 
 
-def a_report(sizes):
-    plan = make_plan(powderdsl.load("life"), backends=["wasm", "native"], batches=[1, 32], sizes=sizes)
-    memory, times = Memory(0, "not at all"), [1.0, 2.0]
-    cells = [CellFigures(cell, 1.0, 1.0, memory, 100, 2, 5, times, times) for cell in plan.cells]
-    return make_report(plan, MACHINE, cells)
-
-
-def test_several_sizes_have_a_figure_of_their_own(tmp_path):
+def test_every_line_is_drawn(tmp_path):
     pytest.importorskip("matplotlib")
-    widths = []
-    for name, sizes in (("one.png", [(8, 8)]), ("two.png", [(8, 8), (16, 32)])):
-        write_plot(tmp_path / name, a_report(sizes))
+    life, times = powderdsl.load("life"), [1.0, 2.0]
+    plan = make_plan(life, backends=["wasm", "native"], batches=[1, 32], sizes=[(8, 8), (16, 32)])
+    cells = tuple(CellFigures(cell, 1.0, 1.0, None, 100, 2, 5, times, times) for cell in plan.cells)
+    colors = []
+    for name, drawn in (("all.png", cells), ("one.png", cells[:1])):
+        write_plot(tmp_path / name, Report(plan, MACHINE, drawn))
         with Image.open(tmp_path / name) as image:
-            widths.append(image.width)
-            assert len(image.convert("RGB").getcolors(1 << 24)) > 10
-    assert widths[1] > widths[0]
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["one.png", "two.png"]
+            colors.append(len(image.convert("RGB").getcolors(1 << 24)))
+    assert colors[0] > colors[1] > 10
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["all.png", "one.png"]
 
 
 def test_without_matplotlib_the_fix_is_named(monkeypatch):

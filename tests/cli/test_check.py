@@ -60,7 +60,7 @@ def test_notes_are_shown_on_request(pack):
 
 
 def test_the_short_format_has_one_line_each(pack):
-    result = powderdsl("check", pack("vanish: 20%", "vanish: 120%"), "--format", "short")
+    result = powderdsl("check", pack("vanish: 20%", "vanish: 120%"), "--short")
     assert result.exit_code == 2
     first, *_, last = result.stdout.splitlines()
     assert first.startswith("grit.yaml:4:18: error[PD40")
@@ -68,7 +68,7 @@ def test_the_short_format_has_one_line_each(pack):
 
 
 def test_json_is_one_list(pack):
-    result = powderdsl("check", pack("vanish: 20%", "vanish: 120%"), "nope", "--format", "json")
+    result = powderdsl("check", pack("vanish: 20%", "vanish: 120%"), "nope", "--json")
     assert result.exit_code == 2
     found = json.loads(result.stdout)
     assert {one["severity"] for one in found} == {"error"}
@@ -77,7 +77,7 @@ def test_json_is_one_list(pack):
 
 
 def test_json_of_clean_rules_is_empty():
-    assert json.loads(powderdsl("check", "powderworld", "--format", "json").stdout) == []
+    assert json.loads(powderdsl("check", "powderworld", "--json").stdout) == []
 
 
 def test_several_rulesets_are_checked_one_by_one(pack):
@@ -125,7 +125,7 @@ def test_the_ledger_follows_the_summary(pack):
 
 
 def test_the_ledger_as_json(pack):
-    result = powderdsl("check", rules := pack(), "life", "--ledger", "--format", "json")
+    result = powderdsl("check", rules := pack(), "life", "--ledger", "--json")
     data = json.loads(result.stdout)
     assert list(data) == ["diagnostics", "ledger"]
     ledger = data["ledger"][rules]
@@ -162,5 +162,5 @@ def test_an_invariant_that_is_easily_broken_is_an_error(pack):
     assert "error[PD512]: this invariant is broken after 1 step" in result.stdout
     assert "11 |     do: grit -> empty" in result.stdout  # the rule that breaks it
     assert "= note: before   after" in result.stdout
-    data = json.loads(powderdsl("check", rules, "--format", "json").stdout)
+    data = json.loads(powderdsl("check", rules, "--json").stdout)
     assert [one["code"] for one in data] == ["PD512"]

@@ -53,7 +53,6 @@ def test_python_m_powderdsl():
     "arguments",
     [
         ("check",),
-        ("check", "core", "--format", "xml"),
         ("run",),
         ("run", "core", "--steps", "-1"),
         ("run", "core", "--steps", "many"),
@@ -216,12 +215,3 @@ def test_json_has_one_spelling(arguments):
     assert result.exit_code == 0, result.output
     json.loads(result.stdout)
     assert "--json" in powderdsl(*arguments[: 2 if arguments[0] == "cache" else 1], "--help").stdout
-
-
-@pytest.mark.parametrize("command", ["check", "show"])
-def test_the_older_spelling_still_works_and_is_not_shown(command):
-    assert (
-        powderdsl(command, "life", "--format", "json").stdout == powderdsl(command, "life", "--json").stdout
-    )
-    assert powderdsl(command, "life", "--format", "text").stdout == powderdsl(command, "life").stdout
-    assert "--format" not in powderdsl(command, "--help").stdout

@@ -53,7 +53,7 @@ def test_show_says_where_there_is_nothing():
 
 @pytest.mark.parametrize("name", RULESETS)
 def test_show_as_json(name):
-    result = powderdsl("show", name, "--format", "json")
+    result = powderdsl("show", name, "--json")
     assert result.exit_code == 0
     data, rules = json.loads(result.stdout), package.load(name)
     assert [row["name"] for row in data["elements"]] == [element.name for element in rules.elements]

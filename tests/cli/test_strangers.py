@@ -165,7 +165,7 @@ def test_a_pack_of_each_kind_goes_through_every_command(name: str) -> None:
 
 def test_two_packs_with_one_id_and_one_that_has_no_room(tmp_path: Path) -> None:
     Path("ooze.yaml").write_text(ELEMENT.replace("slime", "ooze"))
-    shown = json.loads(run("show", "powderworld+slime.yaml+ooze.yaml", "--format", "json"))
+    shown = json.loads(run("show", "powderworld+slime.yaml+ooze.yaml", "--json"))
     ids = {one["name"]: one["id"] for one in shown["elements"]}
     assert (ids["slime"], ids["ooze"]) == (14, 15)
     run("train", "pool.yaml", *AGENT, "--slots", "15", "--run", "agent")

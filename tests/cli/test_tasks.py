@@ -16,7 +16,7 @@ def test_tasks_are_checked_beside_rules(tmp_path):
     bad.write_text(
         "# A task\ntask: bad\nrules: core\nsize: [8, 8]\nfill: emty\nagent: {may: any, actions: 0}\n"
     )
-    result = run("check", "sand-pushing", str(bad), "core", "--format", "short")
+    result = run("check", "sand-pushing", str(bad), "core", "--short")
     assert result.exit_code == 2
     assert "PD604" in result.output
     assert "PD402" in result.output
@@ -29,7 +29,7 @@ def test_a_task_is_shown_as_text_and_as_json():
     text = run("show", "path-building", "--knob", "complexity=3").output
     assert "places empty, wall; 64 actions of 3 steps" in text
     assert "lines           3  0..64" in text
-    data = json.loads(run("show", "sand-pushing", "--format", "json").output)
+    data = json.loads(run("show", "sand-pushing", "--json").output)
     assert data["agent"]["choices"] == [-1]
     assert [len(split["stands"]) for split in data["splits"]] == [1, 1, 8]
 

@@ -14,7 +14,8 @@ import pytest
 
 import powderdsl
 from powderdsl.diagnostics import CompileError, Diagnostic
-from powderdsl.diagnostics.render import render_json, render_short, render_text
+from powderdsl.diagnostics.render import diagnostic_data, render_short, render_text
+from powderdsl.system.reports import as_json
 from tests.diagnostics.malformed_details import DETAILS
 
 SECONDS = 2.0
@@ -362,7 +363,7 @@ def check(text: str | bytes, code: str, caret: str | None, path: Path) -> None:
         assert "\n" not in render_short(one)
         assert one.message[:1] == one.message[:1].lower() or one.message.startswith("`")
         assert not one.message.endswith(".")
-    assert render_json((first, *others), utf16=True)
+    assert as_json([diagnostic_data(one, utf16=True) for one in (first, *others)])
 
 
 def rows(table: list) -> list:  # type: ignore[type-arg]

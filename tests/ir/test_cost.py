@@ -62,7 +62,7 @@ def test_json_has_the_same_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.chdir(tmp_path)
     (tmp_path / "small.yaml").write_text(PACK)
     (tmp_path / "bad.yaml").write_text(PACK.replace("above is", "above i"))
-    result = powderdsl("check", "small.yaml", "bad.yaml", "--cost", "--format", "json")
+    result = powderdsl("check", "small.yaml", "bad.yaml", "--cost", "--json")
     assert result.exit_code == 2
     data = json.loads(result.stdout)
     assert [one["code"] for one in data["diagnostics"]]

@@ -200,9 +200,7 @@ def test_check_of_an_added_pack_ends_well_and_says_what_changes() -> None:
         ).exit_code
         == 0
     )
-    data = json.loads(
-        powderdsl("check", "--format", "json", f"powderworld+{ROOT / 'docs/examples/steam.yaml'}").stdout
-    )
+    data = json.loads(powderdsl("check", "--json", f"powderworld+{ROOT / 'docs/examples/steam.yaml'}").stdout)
     assert [one["code"] for one in data] == ["PD515", "PD515"]
 
 

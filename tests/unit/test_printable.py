@@ -113,7 +113,7 @@ def test_diagnostics_escape_every_part():
     assert len(render_text(one).splitlines()) == 10
 
 
-@pytest.mark.parametrize("command", ["check", "show", "test", "show --format json", "check --format json"])
+@pytest.mark.parametrize("command", ["check", "show", "test", "show --json", "check --json"])
 def test_commands_print_no_codes_from_a_pack(command, tmp_path):
     hostile = '"a\\e]0;owned\\a\\e[2J\\x9b31m\\u202eb\\nc"'
     path = tmp_path / "a\x1b[31m.yaml"

@@ -63,9 +63,7 @@ def test_train_eval_finetune_and_show(dunes: str, tmp_path: Path) -> None:
     assert about["config"]["data"]["only"] == ["stone"]
     assert about["config"]["parent"] in {path.name for path in (folder / "checkpoints").iterdir()}
     assert about["parent"] == {"path": str(folder), "iterations": 5}
-    found = run(
-        *("wm", "eval", tuned, "--split", "train", "--worlds", 2, "--format", "json", "--backend", "torch")
-    )
+    found = run(*("wm", "eval", tuned, "--split", "train", "--worlds", 2, "--json", "--backend", "torch"))
     data = json.loads(found.stdout)
     assert (data["only"], data["iterations"]) == (["stone"], 3)
     assert set(data["mean"]) == {"model", "nothing changes", "most frequent outcome"}

@@ -10,26 +10,34 @@ import click
 
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import OK, user_values
-from powderdsl.cli.options import check_writable, load_rules
 from powderdsl.cli.output import print_json, progress
 from powderdsl.compiler import starting_backend
-from powderdsl.experiments.bench.machine import load_average, this_machine
+from powderdsl.experiments.bench.machine import this_machine
 from powderdsl.experiments.bench.measure import measuring
 from powderdsl.experiments.bench.plan import WORKLOADS, Plan, make_plan
 from powderdsl.experiments.bench.plot import require_matplotlib, write_plot
 from powderdsl.experiments.bench.programs import read_program
-from powderdsl.experiments.bench.report import CellFigures, Report, make_report, report_data, report_text
+from powderdsl.experiments.bench.report import CellFigures, Report, report_data, report_text
 from powderdsl.model.state import fitting
 from powderdsl.system.reports import as_json
 from powderdsl.system.writing import write_text
 from powderdsl.targets.cpp.compilers import NoCompiler, find_compiler
 
+MAX_SECONDS = 3600
 
-def _names(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[str, ...]:
-    names = tuple(name.strip() for name in (value or "").split(",")) if value is not None else ()
+
+def _names(text: str) -> tuple[str, ...]:
+    names = tuple(name.strip() for name in text.split(","))
     if not all(names):
-        raise click.BadParameter(f"`{value}`: write NAME,NAME", ctx, param)
+        raise ValueError("is not a list of elements: write NAME,NAME")
     return names
+
+
+def _seconds(text: str) -> float:
+    seconds = float(text)
+    if not 0 < seconds <= MAX_SECONDS:  # false for NaN
+        raise ValueError(f"is not a number above 0, up to {MAX_SECONDS}")
+    return seconds
 
 
 EPILOG = "\b\nWorkloads:\n" + "\n".join(f"  {name:<7} {about}" for name, about in WORKLOADS.items())
@@ -47,7 +55,13 @@ EPILOG = "\b\nWorkloads:\n" + "\n".join(f"  {name:<7} {about}" for name, about i
 @opt.integer("--batch", 1, 1 << 20, "Number of worlds in a batch.", (1, 32), to="batches", multiple=True)
 @click.option("--size", "sizes", type=opt.SIZE, multiple=True, help="Rows and columns.  [default: 64]")
 @opt.integer("--elements", 1, 256, "Use only the first N elements in the worlds.", multiple=True)
-@click.option("--only", metavar="NAME,NAME", callback=_names, help="Use only these elements in the worlds.")
+@click.option(
+    "--only",
+    type=opt.Parsed("NAME,NAME", _names),
+    default=(),
+    show_default=False,
+    help="Use only these elements in the worlds.",
+)
 @opt.integer("--threads", 1, 1024, "CPU threads.", (1,), multiple=True)
 @click.option(
     "--beside",
@@ -57,17 +71,22 @@ EPILOG = "\b\nWorkloads:\n" + "\n".join(f"  {name:<7} {about}" for name, about i
     multiple=True,
     help="Also measure a program of yours that makes the same steps: `load(state)` returns `run(steps)`.",
 )
-@opt.choice("--workload", list(WORKLOADS), "The worlds to start from.", "gusts")
+@opt.choice("--workload", list(WORKLOADS), "The worlds to start from.", Plan.workload)
 @opt.device
-@opt.integer("--steps", 1, 1 << 20, "Maximum steps per call.", 16)
-@click.option("--seconds", type=float, default=2.0, help="Measuring time per combination, in seconds.")
-@opt.integer("--rounds", 1, 1000, "Rounds: in each, all combinations are measured in turn.", 5)
-@opt.integer("--seed", 0, 2**63 - 1, "Seed of the start worlds.", 0)
+@opt.integer("--steps", 1, 1 << 20, "Maximum steps per call.", Plan.steps)
+@click.option(
+    "--seconds",
+    type=opt.Parsed("FLOAT", _seconds),
+    default=Plan.seconds,
+    help="Measuring time per combination, in seconds.",
+)
+@opt.integer("--rounds", 1, 1000, "Rounds: in each, all combinations are measured in turn.", Plan.rounds)
+@opt.integer("--seed", 0, 2**63 - 1, "Seed of the start worlds.", Plan.seed)
 @opt.parameters
 @opt.flag("--profile", "Also measure the time of each pass.")
 @opt.flag("--json", "Print one JSON object instead of tables.", to="printed")
-@opt.path("--out", "FILE.json", "Also write the JSON object to this file.", to="data")
-@opt.path("--plot", "FILE.png", "Plot rates against batch sizes. Needs matplotlib.")
+@opt.output("--out", "FILE.json", "Also write the JSON object to this file.", to="data")
+@opt.output("--plot", "FILE.png", "Plot rates against batch sizes. Needs matplotlib.")
 def command(
     rules: str,
     backends: tuple[str, ...],
@@ -78,17 +97,14 @@ def command(
     printed: bool,
     data: Path | None,
     plot: Path | None,
-    **asked: Any,
+    **measurement: Any,
 ) -> int:
     """Measure how fast rules run.
 
     --backend, --batch, --size, --elements and --threads may be repeated. All their combinations are measured, in
     turn, round after round, and medians are shown. Ctrl-C shows what was measured so far.
     """
-    ruleset = load_rules(rules, settings)
-    for file in (data, plot):
-        if file is not None:
-            check_writable(file)
+    ruleset = opt.load_rules(rules, settings)
     if plot is not None:
         require_matplotlib()
     with user_values():
@@ -98,7 +114,7 @@ def command(
             sizes=sizes or ((fitting(ruleset, 64),) * 2,),
             device=device,
             programs=[read_program(file) for file in programs],
-            **asked,
+            **measurement,
         )
     with user_values() if plan.programs else nullcontext():
         report, interrupt = _measured(plan)
@@ -131,12 +147,13 @@ def _usual_backends(device: str) -> tuple[str, ...]:
 def _measured(plan: Plan) -> tuple[Report, KeyboardInterrupt | None]:
     """The report of a plan, or of the part that was done when Ctrl-C or another signal came."""
     machine = this_machine(plan.device)
-    cells: list[CellFigures] = []
+    figures: list[CellFigures] = []
     interrupt: KeyboardInterrupt | None = None
     try:
         with progress("bench", len(plan.cells) * (1 + plan.rounds + plan.profile)) as show:
-            for done, (what, cell) in enumerate(measuring(plan, cells)):
+            for done, (what, cell) in enumerate(measuring(plan, figures)):
                 show(done, f"{what} {cell.backend}, batch {cell.batch}")
     except KeyboardInterrupt as caught:
         interrupt = caught
-    return make_report(plan, machine, cells, load_average(), interrupted=interrupt is not None), interrupt
+    measured = tuple(cell for cell in figures if cell.round_seconds)
+    return Report(plan, machine, measured, interrupt is not None), interrupt

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -17,7 +17,7 @@ from powderdsl.cli.exits import BAD_INPUT, FAILED, OK
 from powderdsl.cli.output import counted, print_json, write_diagnostics
 from powderdsl.compiler import load_with_diagnostics, lower
 from powderdsl.diagnostics import CompileError, Diagnostic, Severity
-from powderdsl.diagnostics.render import diagnostic_data, render_json, render_short
+from powderdsl.diagnostics.render import diagnostic_data, render_short
 from powderdsl.model.types import Ruleset
 from powderdsl.system.reports import table
 from powderdsl.tasks.shipped import is_task
@@ -27,13 +27,13 @@ if TYPE_CHECKING:
     from powderdsl.tasks.task import Task
 
 
-ALWAYS_TOLD = ("PD515", "PD518")
-"""Notes that are always printed, a line each below the summary: effects of added packs, undecided invariants."""
+ALWAYS_SHOWN = ("PD515", "PD518")
+"""Note codes that are always printed, one line each: effects of added packs, undecided invariants."""
 
 
 @dataclass(frozen=True)
 class Checked:
-    """What was found in one RULES. `loaded` is None if there are errors; `cost` and `ledger` are what was asked for."""
+    """The result for one RULES. `loaded` is None if there are errors; `cost` and `ledger` only if they were requested."""
 
     name: str
     diagnostics: tuple[Diagnostic, ...]
@@ -43,12 +43,13 @@ class Checked:
 
     def number(self, severity: Severity) -> int:
         """How many diagnostics have this severity."""
-        return sum(one.severity is severity for one in self.diagnostics)
+        return sum(diagnostic.severity is severity for diagnostic in self.diagnostics)
 
 
 @click.command("check")
 @click.argument("rules", nargs=-1, required=True, metavar="RULES...")
-@opt.layouts("One JSON list instead of text.", ("short", "One line for each mistake, without carets."))
+@opt.flag("--json", "One JSON list instead of text.", to="as_json")
+@opt.flag("--short", "One line for each mistake, without carets.")
 @opt.flag("--notes", "Also list notes, such as inactive rules.")
 @opt.flag("--warnings-as-errors", "Exit with 1 if there are warnings.")
 @opt.flag("--quick", "Check only the rules themselves; do not try invariants.")
@@ -56,7 +57,8 @@ class Checked:
 @opt.flag("--ledger", "Also report what rules create, destroy and move; in JSON as a key.")
 def command(
     rules: tuple[str, ...],
-    layout: str,
+    as_json: bool,
+    short: bool,
     notes: bool,
     warnings_as_errors: bool,
     quick: bool,
@@ -70,40 +72,47 @@ def command(
 
     Exit code: 0 without errors, 1 with warnings under --warnings-as-errors, 2 with errors.
     """
-    checked = [_check(name, quick, cost, ledger) for name in rules]
-    found: dict[Diagnostic, None] = {}
-    lines: list[str] = []
-    for one in checked:
-        shown = [each for each in one.diagnostics if notes or each.severity is not Severity.NOTE]
-        differences = [each for each in one.diagnostics if each.code in ALWAYS_TOLD and not notes]
-        found |= dict.fromkeys(shown if layout == "text" else [*shown, *differences])
-        lines.append(_summary(one, notes))
-        if layout == "text":
-            lines += [f"  {each.message}" for each in differences]
-        if one.cost is not None:
-            lines += ["", *_cost_lines(one.cost)]
-        if one.ledger is not None:
-            lines += ["", ledger_text(one.ledger)]
-    if layout == "json" and (cost or ledger):
-        data: dict[str, Any] = {"diagnostics": [*map(diagnostic_data, found)]}
+    results = [_check(name, quick, cost, ledger) for name in rules]
+    text = not as_json and not short
+    # Compositions share packs: a dictionary has each diagnostic once.
+    shown = dict.fromkeys(
+        diagnostic
+        for result in results
+        for diagnostic in result.diagnostics
+        if notes or diagnostic.severity is not Severity.NOTE or (not text and diagnostic.code in ALWAYS_SHOWN)
+    )
+    if as_json:
+        data: Any = [diagnostic_data(diagnostic) for diagnostic in shown]
+        if cost or ledger:
+            data = {"diagnostics": data}
         if cost:
-            data["cost"] = {one.name: [*map(asdict, one.cost)] for one in checked if one.cost is not None}
+            data["cost"] = {result.name: result.cost for result in results if result.cost is not None}
         if ledger:
-            data["ledger"] = {one.name: ledger_data(one.ledger) for one in checked if one.ledger}
+            data["ledger"] = {result.name: ledger_data(result.ledger) for result in results if result.ledger}
         print_json(data)
-    elif layout == "json":
-        click.echo(render_json(found))
-    elif layout == "short":
-        click.echo("".join(f"{render_short(one)}\n" for one in found) + "\n".join(lines))
-    else:
-        if found:
-            write_diagnostics(found, sys.stdout)
-            click.echo()
-        click.echo("\n".join(lines))
-    if any(one.number(Severity.ERROR) for one in checked):
+    elif short:
+        click.echo("".join(f"{render_short(diagnostic)}\n" for diagnostic in shown), nl=False)
+    elif shown:
+        write_diagnostics(shown, sys.stdout)
+        click.echo()
+    if not as_json:
+        click.echo("\n".join(line for result in results for line in _lines(result, notes, text)))
+    if any(result.number(Severity.ERROR) for result in results):
         return BAD_INPUT
-    warned = any(one.number(Severity.WARNING) for one in checked)
+    warned = any(result.number(Severity.WARNING) for result in results)
     return FAILED if warned and warnings_as_errors else OK
+
+
+def _lines(result: Checked, notes: bool, text: bool) -> Iterator[str]:
+    """The summary of one RULES, its cost and its ledger."""
+    yield _summary(result, notes)
+    for diagnostic in result.diagnostics if text and not notes else ():
+        if diagnostic.code in ALWAYS_SHOWN:
+            yield f"  {diagnostic.message}"
+    if result.cost is not None:
+        yield from ("", *_cost_lines(result.cost))
+    if result.ledger is not None:
+        yield from ("", ledger_text(result.ledger))
 
 
 def _check(name: str, quick: bool, cost: bool, ledger: bool) -> Checked:
@@ -131,30 +140,32 @@ def _check(name: str, quick: bool, cost: bool, ledger: bool) -> Checked:
 
 
 def _cost_lines(passes: tuple[PassCost, ...]) -> Iterator[str]:
-    """A table, a line for each pass that planes do not carry, and what the numbers are."""
+    """A table, a line for each pass that does not run on bit planes, and an explanation of the numbers."""
     numbers = ("moments", "gates", "shifts", "moves", "random bits", "reals", "neighbors")
     rows = [["pass", "form", "share (%)", *numbers]]
-    for one in passes:
-        values = (str(getattr(one, name.replace(" ", "_"))) for name in numbers)
-        rows.append([one.name, one.form, f"{100 * one.share:.0f}", *values])
+    for cost in passes:
+        values = (str(getattr(cost, name.replace(" ", "_"))) for name in numbers)
+        rows.append([cost.name, cost.form, f"{100 * cost.share:.0f}", *values])
     yield from table(rows)
-    for one in passes:
-        if one.form == "cells":
-            yield f"{one.name}: {one.dense:,} operations on cells, not on planes: {one.why} ({one.place})"
+    for cost in passes:
+        if cost.form == "cells":
+            yield f"{cost.name}: {cost.dense:,} operations on cells, not on planes: {cost.why} ({cost.place})"
     yield "For every cell and step, if nothing is skipped. Shares are estimates."
 
 
-def _summary(one: Checked, notes: bool) -> str:
+def _summary(result: Checked, notes: bool) -> str:
     """`name: 14 elements, 12 passes, no errors`, and how many warnings and notes there are."""
-    parts = [counted(one.number(Severity.ERROR), "error")]
-    if isinstance(one.loaded, Ruleset):
-        passes = len(one.loaded.passes)
-        passes_text = "1 pass" if passes == 1 else f"{passes or 'no'} passes"
-        parts = [counted(len(one.loaded.elements), "element"), passes_text, *parts]
-    elif one.loaded is not None:
-        parts = [counted(len(one.loaded.splits), "split"), *parts]
-    if warnings := one.number(Severity.WARNING):
+    loaded, parts = result.loaded, [counted(result.number(Severity.ERROR), "error")]
+    if isinstance(loaded, Ruleset):
+        parts = [
+            counted(len(loaded.elements), "element"),
+            counted(len(loaded.passes), "pass", "passes"),
+            *parts,
+        ]
+    elif loaded is not None:
+        parts = [counted(len(loaded.splits), "split"), *parts]
+    if warnings := result.number(Severity.WARNING):
         parts.append(counted(warnings, "warning"))
-    if number := one.number(Severity.NOTE):
+    if number := result.number(Severity.NOTE):
         parts.append(counted(number, "note") + ("" if notes else " (--notes shows them)"))
-    return f"{one.loaded.name if one.loaded else one.name}: {', '.join(parts)}"
+    return f"{loaded.name if loaded else result.name}: {', '.join(parts)}"

@@ -10,7 +10,6 @@ import click
 
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput
-from powderdsl.cli.options import check_writable, load_rules
 from powderdsl.compiler import lower, read
 from powderdsl.diagnostics import Reporter, suggest
 from powderdsl.model.declarations import Block, PackDecl, PassDecl
@@ -37,7 +36,7 @@ STAGES = ("tree", "model", "ir", "planes", "schedule", "kernels")
 @opt.backend("auto", "Whose schedule or kernels are printed.")
 @opt.text("--after", "STAGE", "Print the schedule after this stage of the planner.  [default: the last]")
 @opt.text("--pass", "NAME", "Print only this pass of the rules.", to="pass_name")
-@opt.path("-o", "FILE", "Write to this file instead of stdout.", to="--out")
+@opt.output("-o", "FILE", "Write to this file instead of stdout.", to="--out")
 @opt.parameters
 def command(
     rules: str,
@@ -51,8 +50,6 @@ def command(
     """Print the output of a compiler stage."""
     if after is not None and stage != "schedule":
         raise BadInput("--after goes with --emit schedule")
-    if out is not None:
-        check_writable(out)
     if stage == "tree":
         text = _tree(rules, pass_name)
     else:
@@ -69,7 +66,7 @@ def _checked(
     rules: str, stage: str, backend: str, after: str | None, pass_name: str | None, settings: dict[str, str]
 ) -> str:
     """The output of a stage after parsing."""
-    ruleset = load_rules(rules, settings)
+    ruleset = opt.load_rules(rules, settings)
     if pass_name is not None:
         _check_known("pass", pass_name, [p.name for p in ruleset.passes], "passes")
     if stage == "model":

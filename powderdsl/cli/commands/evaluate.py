@@ -9,9 +9,8 @@ import click
 
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import user_values
-from powderdsl.cli.options import check_writable
+from powderdsl.cli.options import check_writable, find_played
 from powderdsl.cli.output import print_json
-from powderdsl.cli.task_sheets import find_played
 from powderdsl.system.reports import table
 from powderdsl.tasks.task import Task
 
@@ -49,14 +48,14 @@ def _names(ctx: click.Context, param: click.Parameter, value: str | None) -> lis
 @opt.packs
 @click.option("--backend", type=opt.BACKEND, help="Backend that runs the rules.  [default: the run's]")
 @click.option("--device", help="A torch device.  [default: the run's]")
-@opt.layouts("One JSON object instead of a table.")
+@opt.flag("--json", "One JSON object instead of a table.", to="as_json")
 @opt.path("--out", "FILE.json", "Also write the JSON object to this file.")
 def command(
     run: str,
     knobs: tuple[str, ...],
     settings: dict[str, str],
     packs: tuple[str, ...],
-    layout: str,
+    as_json: bool,
     out: Path | None,
     **asked: Any,
 ) -> None:
@@ -75,7 +74,7 @@ def command(
         found = evaluate(played, packs=() if isinstance(played, Task) else packs, **asked)
     if out is not None:
         write_json(out, found.as_json(), follow=True)
-    if layout == "json":
+    if as_json:
         print_json(found.as_json())
     else:
         click.echo("\n".join(_text(found)))

@@ -7,14 +7,12 @@ from pathlib import Path
 import click
 
 from powderdsl.cli import options as opt
-from powderdsl.cli.exits import BadInput
-from powderdsl.cli.options import check_writable, load_rules
 from powderdsl.system.writing import replacing
 
 
 @click.command("export")
 @click.argument("rules", metavar="RULES")
-@opt.path("--out", "FILE", "The .wasm file to write.", required=True)
+@opt.output("--out", "FILE", "The .wasm file to write.", ".wasm", required=True)
 @click.option("--size", type=opt.SIZE, default="64", show_default=True, help="Rows and columns.")
 @opt.parameters
 def command(rules: str, out: Path, size: tuple[int, int], settings: dict[str, str]) -> None:
@@ -23,10 +21,7 @@ def command(rules: str, out: Path, size: tuple[int, int], settings: dict[str, st
     The module is a world of one size. It imports nothing, and a page needs fifteen lines of JavaScript to run it:
     docs/export.md.
     """
-    if out.suffix.lower() != ".wasm":
-        raise BadInput(f"--out must end in .wasm, not `{out}`")
-    check_writable(out)
-    ruleset = load_rules(rules, settings)
+    ruleset = opt.load_rules(rules, settings)
     from powderdsl.simulation.standalone import standalone_module
 
     code = standalone_module(ruleset, size)

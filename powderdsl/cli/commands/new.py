@@ -11,7 +11,6 @@ import click
 
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput
-from powderdsl.cli.options import check_writable
 from powderdsl.compiler import read, shipped, shipped_rules
 from powderdsl.diagnostics import CompileError, Reporter, Severity, Source
 from powderdsl.model.check import check
@@ -39,7 +38,7 @@ def command(name: str, folder: Path) -> None:
     path = folder / f"{name}.yaml"
     if path.exists() or path.is_symlink():
         raise BadInput(f"{path} exists already")
-    check_writable(path)
+    opt.check_writable(path)
     shipped_elements = _elements(shipped("rules").glob("*.yaml"))
     if name in shipped_rules() or name in {element.name.text for element in shipped_elements}:
         raise BadInput(f"`{name}` comes with powderdsl: choose another name")

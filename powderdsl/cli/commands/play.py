@@ -10,7 +10,6 @@ import click
 
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput
-from powderdsl.cli.options import load_rules
 from powderdsl.model.types import Ruleset
 
 if TYPE_CHECKING:
@@ -47,7 +46,7 @@ def command(
         raise BadInput("--world and --set need RULES")
     first, start = None, None
     if rules is not None:
-        ruleset = load_rules(rules, settings)
+        ruleset = opt.load_rules(rules, settings)
         key = re.sub(r"[^A-Za-z0-9]+", "-", ruleset.name).strip("-") or "rules"
         first = Entry(key, (rules,), settings)
         start = _start(ruleset, world) if world is not None else None

@@ -13,8 +13,8 @@ import click
 
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BAD_INPUT, OK, BadInput, user_values
+from powderdsl.cli.options import knob_values
 from powderdsl.cli.output import counted, progress, write_diagnostics
-from powderdsl.cli.task_sheets import knob_values
 from powderdsl.datasets.manifest import check_place, read_manifest
 from powderdsl.diagnostics import CompileError, Diagnostic
 from powderdsl.tasks.shipped import check_split, load_task

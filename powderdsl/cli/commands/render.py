@@ -7,14 +7,12 @@ from pathlib import Path
 import click
 
 from powderdsl.cli import options as opt
-from powderdsl.cli.exits import BadInput
-from powderdsl.cli.options import check_writable, load_rules
 
 
 @click.command("render")
 @click.argument("world", metavar="WORLD")
 @opt.text("--rules", "RULES", "Rules whose elements the world has.", required=True)
-@opt.path("--out", "FILE", "The .png file to write.", required=True)
+@opt.output("--out", "FILE", "The .png file to write.", ".png", required=True)
 @click.option("--size", type=opt.SIZE, help="Rows and columns of a scene, such as 48x64.")
 @opt.integer("--scale", 1, 64, "Pixels per cell.  [default: about 400 a side]")
 def command(world: str, rules: str, out: Path, size: tuple[int, int] | None, scale: int | None) -> None:
@@ -23,10 +21,7 @@ def command(world: str, rules: str, out: Path, size: tuple[int, int] | None, sca
     WORLD is a saved .npz, a .txt drawing, a .png, a scene file, or a shipped scene's name. The worlds of a
     saved batch stand side by side.
     """
-    if out.suffix.lower() != ".png":
-        raise BadInput(f"--out must end in .png, not `{out}`")
-    ruleset = load_rules(rules, {})
-    check_writable(out)
+    ruleset = opt.load_rules(rules, {})
     from powderdsl.cli.pictures import pictures
     from powderdsl.cli.start_worlds import start
     from powderdsl.simulation.media import write_png

@@ -14,7 +14,6 @@ import click
 
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import user_values
-from powderdsl.cli.options import check_writable, load_rules
 from powderdsl.cli.output import counted, progress
 
 if TYPE_CHECKING:
@@ -46,15 +45,6 @@ class Playback:
         return self.out.suffix.lower() if self.out else ""
 
 
-def _out(ctx: click.Context, param: click.Parameter, value: str | None) -> Path | None:
-    if value is None:
-        return None
-    path = Path(value)
-    if path.suffix.lower() not in SUFFIXES:
-        raise click.BadParameter(f"`{value}` must end in one of {' '.join(SUFFIXES)}", ctx, param)
-    return path
-
-
 @click.command("run")
 @opt.rules
 @opt.world
@@ -65,9 +55,7 @@ def _out(ctx: click.Context, param: click.Parameter, value: str | None) -> Path 
 @opt.backend("auto")
 @opt.device
 @opt.parameters
-@click.option(
-    "--out", metavar="FILE", callback=_out, help="Write a .png, .gif or .mp4, or save the world as .npz."
-)
+@opt.output("--out", "FILE", "Write a .png, .gif or .mp4, or save the world as .npz.", *SUFFIXES)
 @opt.integer("--scale", 1, 64, "Pixels per cell.  [default: about 400 a side]")
 @opt.integer("--every", 1, 10**6, "Show every n-th step.", 1)
 @opt.integer("--fps", 1, 240, "Frames per second.", 30)
@@ -92,10 +80,8 @@ def command(
     Without --out and --watch the last step is drawn in the terminal. Without --world, shapes of all elements
     are scattered at random: the same ones for the same --seed and --size.
     """
-    ruleset = load_rules(rules, settings)
+    ruleset = opt.load_rules(rules, settings)
     plan = Playback(**playback)
-    if plan.out is not None:
-        check_writable(plan.out)
     from powderdsl.cli.start_worlds import start
 
     first = start(ruleset, world, size, batch, seed, backend=backend, device=device, threads=threads or 1)

@@ -1,18 +1,19 @@
-"""`powderdsl show`: what a ruleset consists of, as tables or as JSON."""
+"""`powderdsl show`: what a ruleset or a task consists of, as tables or as JSON, and a picture of a task's worlds."""
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterator
+from itertools import cycle
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from powderdsl.analysis.reactions import reactions
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput
-from powderdsl.cli.options import load_rules
 from powderdsl.cli.output import color_wanted, print_json
 from powderdsl.diagnostics import Span
 from powderdsl.diagnostics.printable import printable, write_styled
@@ -21,18 +22,21 @@ from powderdsl.model.types import Element, Pass, Property, Ruleset, Value
 from powderdsl.system.reports import Painted, table
 from powderdsl.tasks.shipped import is_task
 
+if TYPE_CHECKING:
+    from powderdsl.tasks.task import Task
+
 
 @click.command("show")
 @click.argument("rules", metavar="RULES|TASK")
-@opt.layouts("One JSON object instead of tables.")
+@opt.flag("--json", "One JSON object instead of tables.", to="as_json")
 @opt.parameters
 @opt.knobs("For a task: another value for a knob.")
 @opt.text("--split", "SPLIT", "For a task: the set of worlds.", "train")
 @opt.integer("--seeds", 1, 256, "For a task: the number of worlds.", 16)
-@opt.path("--out", "FILE.png", "For a task: draw these worlds, with regions outlined.")
+@opt.output("--out", "FILE.png", "For a task: draw these worlds, with regions outlined.", ".png")
 def command(
     rules: str,
-    layout: str,
+    as_json: bool,
     settings: dict[str, str],
     knobs: tuple[str, ...],
     split: str,
@@ -44,14 +48,22 @@ def command(
     TASK is a shipped task's name, or a file that begins with `task:`.
     """
     if is_task(rules):
-        from powderdsl.cli.task_sheets import show_task
+        from powderdsl.tasks.shipped import check_split, load_task
 
-        show_task(rules, layout, settings, knobs, split, seeds, out)
+        task = load_task(rules, knobs=opt.knob_values(knobs), params=settings)
+        check_split(task, split)
+        if as_json:
+            print_json(_task_data(task))
+        else:
+            click.echo("\n".join(_task_text(task)))
+        if out is not None:
+            _write_sheet(task, split, seeds, out)
+            click.echo(f"wrote {out}: seeds 0 to {seeds - 1} of {split}", err=as_json)
         return
     if out is not None or knobs:
         raise BadInput("--out and --knob go with a task")
-    ruleset = load_rules(rules, settings)
-    if layout == "json":
+    ruleset = opt.load_rules(rules, settings)
+    if as_json:
         print_json(_data(ruleset))
     else:
         write_styled(sys.stdout, "\n".join(_text(ruleset, color_wanted(sys.stdout))) + "\n")
@@ -139,8 +151,8 @@ def _data(ruleset: Ruleset) -> dict[str, Any]:
         "packs": list(ruleset.packs),
         "slots": ruleset.slots,
         "elements": [_element_data(ruleset, element) for element in ruleset.elements],
-        "properties": [_described(one, "name", "kind", "pack") for one in ruleset.properties],
-        "fields": [_described(one, "name", "kind", "at", "pack") for one in ruleset.fields],
+        "properties": [_described(prop, "name", "kind", "pack") for prop in ruleset.properties],
+        "fields": [_described(field, "name", "kind", "at", "pack") for field in ruleset.fields],
         "reactions": [
             {
                 "from": [element_name(ruleset, number) for number in one.before],
@@ -186,3 +198,81 @@ def _element_data(ruleset: Ruleset, element: Element) -> dict[str, Any]:
         "properties": {prop.name: _plain(prop.values[element.id]) for prop in ruleset.properties},
         "where": place_of(element.span),
     }
+
+
+# Tasks
+
+
+def _task_text(task: Task) -> Iterator[str]:
+    yield f"{task.name}{': ' if task.about else ''}{task.about}"
+    yield f"rules: {task.ruleset.name}"
+    yield f"worlds: {task.size[0]}×{task.size[1]} cells"
+    yield f"agent: {'; '.join(_agent_text(task))}"
+    rows = [["split", "worlds", "about"]]
+    for split in task.splits:
+        worlds = "one a seed" if len(split.variants) == 1 else f"{len(split.variants)} stands"
+        rows.append([split.name, worlds, split.about])
+    yield from ("", "Splits", *table(rows))
+    rows = [["name", "value", "range", "about"]]
+    rows += [[knob.name, str(knob.value), f"{knob.lo}..{knob.hi}", knob.about] for knob in task.knobs]
+    yield from ("", "Knobs (--knob NAME=N)", *table(rows))
+
+
+def _agent_text(task: Task) -> Iterator[str]:
+    from powderdsl.tasks.task import BLOW
+
+    agent, brush, bins = task.agent, task.agent.brush, task.agent.bins
+    names = {element.id: element.name for element in task.ruleset.elements}
+    placed = [names[choice] for choice in agent.choices if choice >= 0]
+    acts = []
+    if placed:
+        acts.append("places " + ("any element" if len(placed) == len(names) else ", ".join(placed)))
+    if BLOW in agent.choices:
+        acts.append(f"blows with {agent.speed:g} ({agent.speed_field})")
+    yield " or ".join(acts) or "does nothing"
+    yield f"{agent.actions} actions of {agent.steps_per_action} steps"
+    if agent.free_steps:
+        yield f"then {agent.free_steps} steps"
+    yield f"a brush of {brush[0]}×{brush[1]} cells at {bins[0]}×{bins[1]} places"
+
+
+def _task_data(task: Task) -> dict[str, Any]:
+    return {
+        "name": task.name,
+        "about": task.about,
+        "rules": task.ruleset.name,
+        "size": task.size,
+        "agent": task.agent,
+        "splits": [
+            {"name": split.name, "about": split.about, "stands": [stand.name for stand in split.variants]}
+            for split in task.splits
+        ],
+        "knobs": [
+            {"name": knob.name, "value": knob.value, "range": [knob.lo, knob.hi], "about": knob.about}
+            for knob in task.knobs
+        ],
+    }
+
+
+def _write_sheet(task: Task, split: str, seeds: int, out: Path) -> None:
+    """Start worlds side by side, each region outlined in a color of its own."""
+    import torch
+
+    from powderdsl.cli.pictures import MAX_SIDE, USUAL_SIDE
+    from powderdsl.simulation.draw import OUTLINES, contact_sheet, outline, scale
+    from powderdsl.simulation.media import write_png
+    from powderdsl.tasks.episodes import compile_task
+
+    program = compile_task(task, split=split, backend="torch")
+    episodes = program.start(torch.arange(seeds))
+    drawn = episodes.world.rgb().numpy()
+    columns = math.ceil(math.sqrt(seeds))
+    longest = max(task.size) * columns
+    factor = max(2, min(8, 2 * USUAL_SIDE // longest))
+    if longest * factor > MAX_SIDE:
+        raise BadInput(f"a picture of {longest * factor:,} pixels a side: show fewer --seeds")
+    images = scale(drawn, factor)
+    for color, masks in zip(cycle(OUTLINES), episodes.regions.values(), strict=False):
+        for world, image in enumerate(images):
+            outline(image, masks[world % len(masks)].numpy(), factor, color)
+    write_png(out, contact_sheet(images, columns=columns))

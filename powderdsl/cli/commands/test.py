@@ -8,7 +8,6 @@ import click
 
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import FAILED, OK, BadInput
-from powderdsl.cli.options import check_writable, load_rules
 from powderdsl.cli.output import print_json
 from powderdsl.compiler import shipped_tests
 
@@ -24,7 +23,7 @@ MAX_SECONDS = 24 * 3600
 @opt.integer("--seconds", 1, MAX_SECONDS, "Time limit for random worlds, per RULES, in seconds.", 60)
 @opt.integer("--seed", 0, 2**31 - 1, "Seed of the random worlds.", 0)
 @opt.path("--replay", "FILE", "Only try this counterexample again.")
-@opt.path("--picture", "FILE", "Draw the first counterexample, before and after, as a .png.")
+@opt.output("--picture", "FILE", "Draw the first counterexample, before and after, as a .png.", ".png")
 @click.option(
     "--keep/--no-keep",
     default=None,
@@ -82,10 +81,6 @@ def command(
 
         chosen = MutationPlan(packs, settings, mutants, seed, jobs, write, as_json)
         return report_mutants(rules or tuple(shipped_tests()), chosen)
-    if picture is not None:
-        if picture.suffix.lower() != ".png":
-            raise BadInput(f"--picture must end in .png, not `{picture}`")
-        check_writable(picture)
     if replay is not None and len(rules) != 1:
         raise BadInput("--replay takes the one RULES that the counterexample breaks")
     from powderdsl.cli.testing_report import TestingReport
@@ -95,7 +90,7 @@ def command(
         backend, SearchPlan(examples, float(seconds), seed), drawn, keep, picture, as_json
     )
     for name in rules or shipped_tests():
-        ruleset = load_rules(name, settings)
+        ruleset = opt.load_rules(name, settings)
         if replay is not None:
             session.replay(name, ruleset, replay)
         else:

@@ -9,7 +9,6 @@ import click
 
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput, user_values
-from powderdsl.cli.options import load_rules
 from powderdsl.cli.output import color_wanted, print_json
 from powderdsl.diagnostics.printable import write_styled
 
@@ -59,7 +58,7 @@ def command(
     Which rules wrote it in that step, what they read, and which rules nearly wrote it. Worlds are those of
     `powderdsl run` with the same --world, --size and --seed.
     """
-    ruleset = load_rules(rules, settings)
+    ruleset = opt.load_rules(rules, settings)
     from powderdsl.cli.start_worlds import start
     from powderdsl.simulation.tracing.data import trace_data
     from powderdsl.simulation.tracing.text import trace_text

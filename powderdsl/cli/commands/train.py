@@ -9,8 +9,8 @@ import click
 
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput
+from powderdsl.cli.options import knob_values
 from powderdsl.cli.output import progress
-from powderdsl.cli.task_sheets import knob_values
 from powderdsl.rl.config import PRESETS, TrainConfig, from_json, preset
 
 

@@ -9,9 +9,8 @@ import click
 
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput, user_values
-from powderdsl.cli.options import check_writable
+from powderdsl.cli.options import check_writable, find_played
 from powderdsl.cli.pictures import MAX_SIDE
-from powderdsl.cli.task_sheets import find_played
 from powderdsl.rl.config import TrainConfig
 from powderdsl.tasks.task import Task
 

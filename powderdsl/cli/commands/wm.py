@@ -12,9 +12,8 @@ import click
 
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput, user_values
-from powderdsl.cli.options import check_writable
+from powderdsl.cli.options import check_writable, knob_values
 from powderdsl.cli.output import print_json, progress
-from powderdsl.cli.task_sheets import knob_values
 from powderdsl.cli.wm_report import told, write_curve
 from powderdsl.worldmodel.config import PRESETS, DataConfig, TrainConfig, Variety
 
@@ -208,13 +207,13 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
 @opt.integer(
     "--rulesets", 0, 1024, "Number of rulesets that training never saw, to test under.  [default: 0]"
 )
-@opt.layouts("One JSON object instead of a table.")
+@opt.flag("--json", "One JSON object instead of a table.", to="as_json")
 @opt.path("--out", "FILE", "File of the results.  [default: RUN/evaluation.json]")
 def eval_command(
     run: str,
     only: tuple[str, ...],
     knobs: tuple[str, ...],
-    layout: str,
+    as_json: bool,
     out: Path | None,
     data: Path | None,
     network_name: str | None,
@@ -243,7 +242,7 @@ def eval_command(
         write_json(out, plain, follow=True)
     else:
         trained.run.write_json("evaluation.json", plain)
-    if layout == "json":
+    if as_json:
         print_json(plain)
     else:
         click.echo("\n".join(told(tested, plain)))

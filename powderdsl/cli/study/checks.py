@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from powderdsl.cli.options import knob_values
 from powderdsl.cli.study.measures import POLICIES, check_measure, check_unused
 from powderdsl.cli.study.places import Places, Values, Word
-from powderdsl.cli.task_sheets import knob_values
 from powderdsl.compiler import load
 from powderdsl.diagnostics import CompileError, Reporter, suggest
 from powderdsl.experiments.studies.study import Study, StudyStep

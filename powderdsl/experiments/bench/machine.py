@@ -33,83 +33,60 @@ class Machine:
 
     @property
     def busy(self) -> bool:
-        """Whether other processes were running before the measurement."""
+        """Other processes were running before the measurement."""
         return self.load is not None and self.load > BUSY * self.cpus
 
 
 def this_machine(device: str) -> Machine:
-    """The machine as it is now, and a torch device's name. Raises CompileError (PD701) without such a device."""
+    """This machine, and the name of a torch device. Raises CompileError (PD701) without such a device."""
     import torch
 
     from powderdsl.simulation.programs import find_device
+    from powderdsl.targets.cpp.compilers import NoCompiler, find_compiler
 
     kind = find_device(device)
+    try:
+        compiler = find_compiler().version
+    except NoCompiler:
+        compiler = "none"
     return Machine(
         system=f"{platform.system()} {platform.machine()}",
         processor=_processor(),
-        cpus=_cpus(),
+        cpus=len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
         device=torch.cuda.get_device_name(kind) if kind.type == "cuda" else device,
         python=platform.python_version(),
         torch=str(torch.__version__),
-        compiler=_compiler(),
+        compiler=compiler,
         powderdsl=sys.modules["powderdsl"].__version__,
-        load=load_average(),
+        load=os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
     )
 
 
-def load_average() -> float | None:
-    """The load average of the last minute; None where the system does not report it."""
-    try:
-        return os.getloadavg()[0]
-    except (OSError, AttributeError):
-        return None
-
-
-def _cpus() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
 def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        lines = []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
 
-
-def _compiler() -> str:
-    from powderdsl.targets.cpp.compilers import NoCompiler, find_compiler
-
-    try:
-        return find_compiler().version
-    except NoCompiler:
-        return "none"
-
-
-# Memory
 
 PEAK = "highest resident size of the process during the first calls, less that just before them"
-MONOTONE = "growth of the process' highest resident size so far: 0 where earlier work took more"
 ALLOCATED = "torch.cuda.max_memory_allocated during the first calls, less what was allocated before"
 UNKNOWN = "not measured on this system"
 
 
-@dataclass(frozen=True)
-class Memory:
-    """Bytes, or None where the system does not report them, and how they were measured."""
+def memory_measure(device: str) -> str:
+    """The figure that `peak_growth` returns for a device, in words."""
+    if device.startswith("cuda"):
+        return ALLOCATED
+    return PEAK if sys.platform == "linux" else UNKNOWN
 
-    growth: int | None
-    how: str
 
+def peak_growth(work: Callable[[], None], device: str) -> int | None:
+    """Do some work; returns by how many bytes the peak of memory exceeded the memory in use before.
 
-def peak_growth(work: Callable[[], None], device: str) -> Memory:
-    """Do some work; returns by how much the peak of memory exceeded the memory in use before.
-
-    On Linux the process' own peak is reset first. What freed memory still belongs to the process is handed back
-    before, so that the work cannot hide in it.
+    None where the system does not report it. On Linux the process' own peak is reset first. What freed memory still
+    belongs to the process is handed back before, so that the work cannot hide in it.
     """
     import torch
 
@@ -119,42 +96,21 @@ def peak_growth(work: Callable[[], None], device: str) -> Memory:
         before = torch.cuda.memory_allocated(device)
         work()
         torch.cuda.synchronize(device)
-        return Memory(torch.cuda.max_memory_allocated(device) - before, ALLOCATED)
+        return torch.cuda.max_memory_allocated(device) - before
     gc.collect()
-    _hand_back()
-    if _reset_peak():
-        resident = _status("VmRSS")
-        work()
-        return Memory(max(0, _status("VmHWM") - resident), PEAK)
-    so_far = _peak_so_far()
-    work()
-    now = _peak_so_far()
-    return Memory(None, UNKNOWN) if so_far is None or now is None else Memory(now - so_far, MONOTONE)
-
-
-def _hand_back() -> None:
     with suppress(OSError, AttributeError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)  # glibc only
-
-
-def _reset_peak() -> bool:
     try:
-        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # resets the peak
     except OSError:
-        return False
-    return True
+        work()
+        return None
+    resident = _status("VmRSS")
+    work()
+    return max(0, _status("VmHWM") - resident)
 
 
 def _status(name: str) -> int:
     """A line of /proc/self/status in bytes."""
-    found = re.search(rf"^{name}:\s+(\d+) kB", Path("/proc/self/status").read_text(), re.MULTILINE)
-    return int(found[1]) * 1024 if found else 0
-
-
-def _peak_so_far() -> int | None:
-    try:
-        import resource
-    except ImportError:  # Windows
-        return None
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+    line = re.search(rf"^{name}:\s+(\d+) kB", Path("/proc/self/status").read_text(), re.MULTILINE)
+    return int(line[1]) * 1024 if line else 0

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +32,6 @@ WORKLOADS: dict[str, str] = {
     "few": "shapes of two elements: by default the first two that move",
 }
 """Worlds to start from, for any ruleset."""
-
-MAX_SECONDS = 3600.0
 
 
 @dataclass(frozen=True)
@@ -59,29 +57,34 @@ class Cell:
         """Cells of all worlds of the batch."""
         return self.batch * self.world_cells
 
+    @property
+    def size_text(self) -> str:
+        return f"{self.size[0]}×{self.size[1]}"
+
 
 @dataclass(frozen=True)
 class Plan:
     """All that a measurement depends on.
 
     A sample is as many calls of `Simulator.step` as fit into ``seconds / rounds``, each of up to `steps` steps
-    from the same worlds.
+    from the same worlds. `workload` is one of `WORKLOADS`, `programs` are measured beside the backends, and `profile`
+    times each pass too.
     """
 
     ruleset: Ruleset
     cells: tuple[Cell, ...]
-    workload: str
-    device: str
-    seed: int
-    steps: int
-    seconds: float
-    rounds: int
-    profile: bool
+    workload: str = "gusts"
+    device: str = "cpu"
+    seed: int = 0
+    steps: int = 16
+    seconds: float = 2.0
+    rounds: int = 5
+    profile: bool = False
     programs: tuple[Program, ...] = ()
 
     def program(self, cell: Cell) -> Program | None:
-        """The program that a cell measures, unless it measures a backend."""
-        return next((one for one in self.programs if one.name == cell.backend), None)
+        """The program that a cell measures; None for a backend."""
+        return next((program for program in self.programs if program.name == cell.backend), None)
 
 
 def make_plan(
@@ -94,85 +97,60 @@ def make_plan(
     only: Sequence[str] = (),
     threads: Sequence[int] = (1,),
     workload: str = "gusts",
-    device: str = "cpu",
-    seed: int = 0,
-    steps: int = 16,
-    seconds: float = 2.0,
-    rounds: int = 5,
-    profile: bool = False,
     programs: Sequence[Program] = (),
+    **settings: Any,
 ) -> Plan:
-    """The plan of a cross product of backends, batches, sizes (rows, columns), elements and threads.
+    """The plan of a cross product of backends, programs, batches, sizes (rows, columns), elements and threads.
 
     Args:
         elements: numbers of elements: the worlds have the first N of the ruleset, the ground included.
         only: the worlds have these elements on the ground, by plain or qualified name.
-        workload: one of `WORKLOADS`.
-        steps: maximum steps of a call.
-        seconds: measured time of each cell, all rounds together.
-        profile: time each pass too.
-        programs: other programs for the same rules, measured beside the backends.
+        settings: other fields of the plan.
 
     Raises:
-        KeyError: an unknown backend, workload or element. ValueError: numbers out of range.
-        CompileError: PD607 for worlds of more cells than fit.
+        KeyError: an unknown element. ValueError: a size or a number of elements that the rules do not take, or a
+        program's name that is taken. CompileError: PD607 for worlds of more cells than fit.
     """
-    if workload not in WORKLOADS:
-        raise KeyError(f"no workload `{workload}`; {'; '.join(suggest(workload, WORKLOADS, 'workloads'))}")
-    for backend in backends:
-        if backend not in BACKENDS:
-            raise KeyError(f"no backend `{backend}`; {'; '.join(suggest(backend, BACKENDS, 'backends'))}")
     names = [program.name for program in programs]
     for name in names:
         if name in BACKENDS or names.count(name) > 1:
             raise ValueError(f"programs: `{name}` is the name of another program or of a backend")
-    counts = {"batches": batches, "threads": threads, "steps": (steps,), "rounds": (rounds,)}
-    for name, numbers in {**counts, "sizes": [side for size in sizes for side in size]}.items():
-        if not numbers or min(numbers) < 1:
-            raise ValueError(f"{name}: integers of 1 or more are needed")
-    if not 0 < seconds <= MAX_SECONDS:  # false for NaN
-        raise ValueError(f"seconds: a number above 0, up to {MAX_SECONDS:g}, is needed")
     for size in sizes:
         check_sides(ruleset, size)
-    for batch, size in product(batches, sizes):
-        check_cells(batch, size)
+        check_cells(max(batches), size)
     chosen = _elements(ruleset, workload, elements, only)
-    points = product(
-        dict.fromkeys([*backends, *names]),
-        dict.fromkeys(sizes),
-        dict.fromkeys(chosen),
-        dict.fromkeys(threads),
-        dict.fromkeys(batches),
-    )
     cells = tuple(
-        Cell(backend, batch, size, present, count) for backend, size, present, count, batch in points
+        dict.fromkeys(
+            Cell(backend, batch, size, present, count)
+            for backend, size, present, count, batch in product(
+                [*backends, *names], sizes, chosen, threads, batches
+            )
+        )
     )
-    return Plan(ruleset, cells, workload, device, seed, steps, seconds, rounds, profile, tuple(programs))
+    return Plan(ruleset, cells, workload, programs=tuple(programs), **settings)
 
 
 def _elements(
     ruleset: Ruleset, workload: str, counts: Sequence[int], only: Sequence[str]
 ) -> list[tuple[str, ...]]:
     """The names of the elements that worlds have, one tuple for each point of the axis."""
-    known = ruleset.elements
+    names = [element.name for element in ruleset.elements]
     if counts and only:
         raise ValueError("elements are chosen by number or by name, not by both")
+    for name in only:
+        if ruleset.element(name) is None:
+            raise KeyError(f"no element `{name}`; {'; '.join(suggest(name, names, 'elements'))}")
     if only:
-        for name in only:
-            if ruleset.element(name) is None:
-                names = [element.name for element in known]
-                raise KeyError(f"no element `{name}`; {'; '.join(suggest(name, names, 'elements'))}")
-        return [tuple(dict.fromkeys(only))]
+        return [tuple(only)]
     if counts:
-        if not 1 <= min(counts) <= max(counts) <= len(known):
-            raise ValueError(f"elements: {ruleset.name} has 1 to {len(known)} of them")
-        return [tuple(element.name for element in known[:count]) for count in counts]
+        if max(counts) > len(names):
+            raise ValueError(f"elements: {ruleset.name} has 1 to {len(names)} of them")
+        return [tuple(names[:count]) for count in counts]
     if workload == "few":
         moved = moved_ids(ruleset)
-        ground, *others = known
-        movers_first = sorted(others, key=lambda element: (element.id not in moved, element.id))
-        return [tuple(element.name for element in movers_first[:2]) or (ground.name,)]
-    return [tuple(element.name for element in known)]
+        movers_first = sorted(ruleset.elements[1:], key=lambda element: element.id not in moved)
+        return [tuple(element.name for element in movers_first[:2])]
+    return [tuple(names)]
 
 
 # Worlds
@@ -189,37 +167,37 @@ NOISE = 3.0
 
 def start_worlds(sim: Simulator, cell: Cell, workload: str, seed: int) -> World:
     """The worlds of a cell: world i depends on `seed`, its size and i alone."""
-    random = [np.random.default_rng([seed, index]) for index in range(cell.batch)]
-    ids = np.stack([_ids(sim.ruleset, cell, workload, one) for one in random])
+    streams = [np.random.default_rng([seed, index]) for index in range(cell.batch)]
+    ids = np.stack([_ids(sim.ruleset, cell, workload, random) for random in streams])
     fields = {
-        field.name: np.stack([_field(field, cell, workload, one) for one in random])
-        for field in _fields(sim.ruleset, workload)
+        field.name: np.stack([_field(field, cell, workload, random) for random in streams])
+        for field in sim.ruleset.fields
+        if _starts_moving(field, workload)
     }
     return sim.replace(sim.world(ids, seed=seed), **fields)
 
 
 def _ids(ruleset: Ruleset, cell: Cell, workload: str, random: np.random.Generator) -> NDArray[np.uint8]:
     """One world: uint8 [H, W]."""
-    found = [ruleset.element(name) for name in cell.elements]
-    ids = [element.id for element in found if element is not None]
+    elements = map(ruleset.element, cell.elements)
+    ids = [element.id for element in elements if element is not None]
     if workload == "noise":
         return random.choice(np.array(ids, dtype=np.uint8), cell.size)
     ground = ruleset.elements[0].id
     world = np.full(cell.size, ground, dtype=np.uint8)
     others = [number for number in ids if number != ground]
-    for i in range(_many(SHAPES, cell) if others else 0):
+    for i in range(_scaled(SHAPES, cell) if others else 0):
         world[mask(random_shape(random, cell.size, REACH), cell.size)] = others[i % len(others)]
     return world
 
 
-def _fields(ruleset: Ruleset, workload: str) -> list[Field]:
-    """The fields that do not start at their default."""
-    lasting = [field for field in ruleset.fields if not field.resets and field.of is None]
+def _starts_moving(field: Field, workload: str) -> bool:
+    """The field does not start at its default."""
+    if field.resets or field.of is not None:
+        return False
     if workload == "noise":
-        return [field for field in lasting if field.kind.name in ("real", "vec2")]
-    if workload == "gusts":
-        return [field for field in lasting if field.kind.name == "vec2" and field.at == "place"]
-    return []
+        return field.kind.name in ("real", "vec2")
+    return workload == "gusts" and field.kind.name == "vec2" and field.at == "place"
 
 
 def _field(field: Field, cell: Cell, workload: str, random: np.random.Generator) -> NDArray[np.float32]:
@@ -229,7 +207,7 @@ def _field(field: Field, cell: Cell, workload: str, random: np.random.Generator)
         values = NOISE * random.standard_normal(shape, dtype=np.float32)
     else:
         values = np.zeros(shape, dtype=np.float32)
-        for _ in range(_many(GUSTS, cell)):
+        for _ in range(_scaled(GUSTS, cell)):
             top, left = (int(random.integers(max(side - GUST_SIDE, 1))) for side in cell.size)
             speed = GUST_SPEED * random.integers(-1, 2, 2)
             values[:, top : top + GUST_SIDE, left : left + GUST_SIDE] = speed[:, None, None]
@@ -237,5 +215,6 @@ def _field(field: Field, cell: Cell, workload: str, random: np.random.Generator)
     return np.clip(values, field.kind.lo, field.kind.hi) if bounded else values
 
 
-def _many(count: int, cell: Cell) -> int:
+def _scaled(count: int, cell: Cell) -> int:
+    """A number for `PER_CELLS` cells, for the worlds of a cell of the plan."""
     return max(1, round(count * cell.world_cells / PER_CELLS))

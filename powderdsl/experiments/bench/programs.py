@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import sys
+import runpy
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
 
@@ -28,21 +27,15 @@ class Program:
 
 
 def read_program(path: Path) -> Program:
-    """Import a Python file that defines `load(state)`, which returns `run(steps)`. Its name is the file's.
+    """Run a Python file that defines `load(state)`, which returns `run(steps)`. Its name is the file's.
 
     The file is run as `python` would run it, so it has to be trusted.
 
     Raises:
-        ValueError: the file cannot be imported, or does not define `load`.
+        ValueError: the file cannot be run, or does not define `load`.
     """
     with _errors_of(path):
-        spec = spec_from_file_location(f"beside_{path.stem}", path)
-        if path.suffix != ".py" or spec is None or spec.loader is None:
-            raise ValueError(f"{path}: not a Python file")
-        module = module_from_spec(spec)
-        sys.modules[spec.name] = module  # dataclasses look their own module up
-        spec.loader.exec_module(module)
-    load = getattr(module, "load", None)
+        load = runpy.run_path(str(path), run_name=f"beside_{path.stem}").get("load")
     if not callable(load):
         raise ValueError(f"{path}: does not define `load(state)`, which returns `run(steps)`")
 
@@ -67,14 +60,10 @@ def _errors_of(path: Path) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        found: list[tuple[str | None, int | None]] = [
-            (frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)
-        ]
+        frames = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
+        words = str(error)
         if isinstance(error, SyntaxError):
-            found = [(error.filename, error.lineno)]
-            error = SyntaxError(error.msg)  # the full one repeats file and line
-        lines = [line for file, line in found if file and Path(file).resolve() == path.resolve()]
-        if not lines and isinstance(error, ValueError):
-            raise
+            frames, words = [(error.filename or "", error.lineno)], error.msg  # str() repeats file and line
+        lines = [line for file, line in frames if Path(file).resolve() == path.resolve()]
         place = f"{path}:{lines[-1]}" if lines else str(path)
-        raise ValueError(f"{place}: {type(error).__name__}: {error}") from error
+        raise ValueError(f"{place}: {type(error).__name__}: {words}") from error
