@@ -14,7 +14,6 @@ from powderdsl.experiments.bench.measure import measuring
 from powderdsl.experiments.bench.plan import make_plan, start_worlds
 from powderdsl.experiments.bench.programs import Program
 from powderdsl.experiments.bench.report import CellFigures, Report, number, report_data, report_text
-from powderdsl.model.state import slots
 from powderdsl.system.reports import as_json
 from powderdsl.targets.cpp.build import Building, building
 
@@ -165,7 +164,6 @@ def report(rules):
 
 def test_the_report_is_plain_data(report, rules):
     data = json.loads(as_json(report_data(report)))
-    held = sum(np.dtype(slot.dtype).itemsize * slot.planes for slot in slots(rules))
     assert data["rules"] == rules.name
     assert data["machine"]["torch"]
     assert data["machine"]["cpus"] >= 1
@@ -175,12 +173,8 @@ def test_the_report_is_plain_data(report, rules):
         assert (cell["size"], cell["threads"]) == ([6, 8], 1)
         assert len(cell["round_seconds"]) == len(cell["round_processor_seconds"]) == data["rounds"] == 2
         made = cell["batch"] * cell["steps_per_call"] * cell["calls_per_round"]
-        rate = cell["world_steps_per_second"]
-        assert rate["min"] == pytest.approx(made / max(cell["round_seconds"]))
-        assert rate["min"] <= rate["median"] <= rate["max"]
-        busy = cell["processor_microseconds_per_world_step"]
-        assert busy["max"] == pytest.approx(1e6 * max(cell["round_processor_seconds"]) / made)
-        assert cell["state_bytes"] == 48 * held * cell["batch"]
+        slowest, fastest = (made / pick(cell["round_seconds"]) for pick in (max, min))
+        assert slowest <= cell["world_steps_per_second"] <= fastest
         assert all(spent > 0 for spent in cell["passes"].values())
 
 
@@ -213,12 +207,12 @@ def test_a_busy_machine_is_warned_of(rules):
 
 def test_half_a_measurement_is_reported(rules):
     plan = make_plan(rules, rounds=3)
-    figures = CellFigures(plan.cells[0], 1.0, 1.0, None, 100, 2, 5, [2.0], [1.0])
-    assert figures.world_steps_per_second.median == 5.0
-    assert figures.processors == 0.5
+    figures = CellFigures(plan.cells[0], 1.0, 1.0, None, 2, 5, [2.0], [1.0])
+    assert figures.rates == [5 * plan.cells[0].batch]
+    assert figures.processor_microseconds == figures.world_step_microseconds / 2
     text = report_text(Report(plan, MACHINE, (figures,), interrupted=True))
     assert "interrupted: 1 of 3 rounds" in text
-    assert "  ?  " in text.splitlines()[7]  # memory, which the system does not report
+    assert text.splitlines()[7].endswith("  ?")  # memory, which the system does not report
 
 
 def test_peak_memory_sees_what_was_freed():

@@ -20,7 +20,7 @@ def test_every_line_is_drawn(tmp_path):
     pytest.importorskip("matplotlib")
     life, times = powderdsl.load("life"), [1.0, 2.0]
     plan = make_plan(life, backends=["wasm", "native"], batches=[1, 32], sizes=[(8, 8), (16, 32)])
-    cells = tuple(CellFigures(cell, 1.0, 1.0, None, 100, 2, 5, times, times) for cell in plan.cells)
+    cells = tuple(CellFigures(cell, 1.0, 1.0, None, 2, 5, times, times) for cell in plan.cells)
     colors = []
     for name, drawn in (("all.png", cells), ("one.png", cells[:1])):
         write_plot(tmp_path / name, Report(plan, MACHINE, drawn))

@@ -51,12 +51,11 @@ def measuring(plan: Plan, cells: list[CellFigures]) -> Iterator[tuple[str, Cell]
             else:
                 sim, compiling = compiled("reference", "cpu", 1)[0], 0.0
             world = start_worlds(sim, cell, plan.workload, plan.seed)
-            state_bytes = sum(value.numel() * value.element_size() for value in world.state.values())
             subject = _Subject(sim, world, program)
             memory = peak_growth(partial(subject.begin, plan), sim.device.type)
             subjects.append(subject)
             first, steps, calls = subject.first, subject.steps, subject.calls
-            cells.append(CellFigures(cell, compiling, first, memory, state_bytes, steps, calls))
+            cells.append(CellFigures(cell, compiling, first, memory, steps, calls))
         for _ in range(plan.rounds):
             for subject, figures in zip(subjects, cells, strict=True):
                 torch.set_num_threads(figures.cell.threads)

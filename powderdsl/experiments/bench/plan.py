@@ -53,11 +53,6 @@ class Cell:
         return self.size[0] * self.size[1]
 
     @property
-    def cells(self) -> int:
-        """Cells of all worlds of the batch."""
-        return self.batch * self.world_cells
-
-    @property
     def size_text(self) -> str:
         return f"{self.size[0]}×{self.size[1]}"
 

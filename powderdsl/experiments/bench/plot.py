@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 from pathlib import Path
+from statistics import median
 
-from powderdsl.experiments.bench.report import CellFigures, Report, extra_words
+from powderdsl.experiments.bench.report import CellFigures, Report, label
 from powderdsl.system.writing import failure, replacing
 
 
@@ -33,17 +34,13 @@ def write_plot(path: Path, report: Report) -> None:
     axes = figure.subplots()
     lines: dict[str, list[CellFigures]] = {}
     for figures in sorted(report.cells, key=lambda figures: figures.cell.batch):
-        cell = figures.cell
-        words = [cell.backend, cell.size_text, *extra_words(cell, report.cells)]
-        lines.setdefault(", ".join(words), []).append(figures)
+        lines.setdefault(label(figures.cell, report.cells), []).append(figures)
     for name, members in lines.items():
-        rates = [figures.world_steps_per_second for figures in members]
-        below = [rate.median - rate.min for rate in rates]
-        above = [rate.max - rate.median for rate in rates]
+        rates = [median(figures.rates) for figures in members]
+        below = [rate - figures.rates[0] for rate, figures in zip(rates, members, strict=True)]
+        above = [figures.rates[-1] - rate for rate, figures in zip(rates, members, strict=True)]
         batches = [figures.cell.batch for figures in members]
-        axes.errorbar(
-            batches, [rate.median for rate in rates], [below, above], label=name, marker="o", capsize=3
-        )
+        axes.errorbar(batches, rates, [below, above], label=name, marker="o", capsize=3)
     axes.set_xscale("log", base=2)
     batches = sorted({figures.cell.batch for figures in report.cells})
     axes.set_xticks(batches, [f"{batch:,}" for batch in batches], minor=False)

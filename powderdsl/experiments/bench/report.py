@@ -16,35 +16,18 @@ MEGABYTE = 1 << 20
 
 
 @dataclass(frozen=True)
-class Spread:
-    """The median, minimum and maximum of the rounds."""
-
-    median: float
-    min: float
-    max: float
-
-    @staticmethod
-    def of(values: Iterable[float]) -> Spread:
-        """The spread of one value a round."""
-        numbers = list(values)
-        return Spread(median(numbers), min(numbers), max(numbers))
-
-
-@dataclass(frozen=True)
 class CellFigures:
     """What was measured of a cell. `round_seconds` and `round_processor_seconds` get one value a round.
 
     `compile_seconds` are its backend's, shared by all cells that have it. `peak_memory_bytes` is None where the system
-    does not report it, `state_bytes` are those of the worlds' tensors in storage dtypes. `passes` has the microseconds
-    a world and step of each pass, in the order they run; it is empty if passes were not profiled. Processor times count
-    all threads together; other processes hardly affect them.
+    does not report it. `passes` has the microseconds a world and step of each pass, in the order they run; it is empty
+    if passes were not profiled. Processor times count all threads together; other processes hardly affect them.
     """
 
     cell: Cell
     compile_seconds: float
     first_step_seconds: float
     peak_memory_bytes: int | None
-    state_bytes: int
     steps_per_call: int
     calls_per_round: int
     round_seconds: list[float] = field(default_factory=list)
@@ -57,17 +40,18 @@ class CellFigures:
         return self.cell.batch * self.steps_per_call * self.calls_per_round
 
     @property
-    def world_steps_per_second(self) -> Spread:
-        return Spread.of(self.world_steps / seconds for seconds in self.round_seconds)
+    def rates(self) -> list[float]:
+        """World-steps per second of each round, the slowest first."""
+        return sorted(self.world_steps / seconds for seconds in self.round_seconds)
 
     @property
-    def processor_microseconds_per_world_step(self) -> Spread:
-        return Spread.of(1e6 * seconds / self.world_steps for seconds in self.round_processor_seconds)
+    def world_step_microseconds(self) -> float:
+        return 1e6 * median(self.round_seconds) / self.world_steps
 
     @property
-    def processors(self) -> float:
-        """CPUs that this process used: fewer than its threads if other processes were running."""
-        return sum(self.round_processor_seconds) / max(sum(self.round_seconds), 1e-9)
+    def processor_microseconds(self) -> float:
+        """Processor time of a world and step."""
+        return 1e6 * median(self.round_processor_seconds) / self.world_steps
 
 
 @dataclass(frozen=True)
@@ -84,45 +68,46 @@ class Report:
         """The names of the programs that were measured beside the backends."""
         return [program.name for program in self.plan.programs]
 
-    def ratio(self, figures: CellFigures, backend: str) -> float | None:
-        """The processor time of a cell divided by that of a backend or program for the same worlds."""
-        other = replace(figures.cell, backend=backend)
-        for candidate in self.cells:
-            if candidate.cell == other:
-                spent = candidate.processor_microseconds_per_world_step.median
-                return figures.processor_microseconds_per_world_step.median / max(spent, 1e-9)
-        return None
+    def ratio(self, figures: CellFigures, program: str) -> float | None:
+        """The processor time of a cell divided by that of a program for the same worlds; None if it is unknown."""
+        same = replace(figures.cell, backend=program)
+        times = [other.processor_microseconds for other in self.cells if other.cell == same]
+        return figures.processor_microseconds / times[0] if times and times[0] else None
 
 
 def report_data(report: Report) -> dict[str, Any]:
     """A report for `as_json`: every figure, and the seconds of every round."""
     plan = report.plan
+    cells = [
+        {
+            **vars(figures.cell),
+            **{key: value for key, value in vars(figures).items() if key != "cell"},
+            "world_steps_per_second": median(figures.rates),
+            "beside": {name: report.ratio(figures, name) for name in report.programs},
+        }
+        for figures in report.cells
+    ]
+    settings = ("workload", "device", "seed", "rounds")
     return {
         "machine": report.machine,
         "rules": plan.ruleset.name,
-        "workload": plan.workload,
-        "device": plan.device,
-        "seed": plan.seed,
-        "rounds": plan.rounds,
+        **{name: getattr(plan, name) for name in settings},
         "interrupted": report.interrupted,
-        "cells": [
-            {
-                **vars(figures.cell),
-                **{key: value for key, value in vars(figures).items() if key != "cell"},
-                "world_steps_per_second": figures.world_steps_per_second,
-                "processor_microseconds_per_world_step": figures.processor_microseconds_per_world_step,
-                "beside": {name: report.ratio(figures, name) for name in report.programs},
-            }
-            for figures in report.cells
-        ],
+        "cells": cells,
     }
 
 
-def extra_words(cell: Cell, among: Iterable[CellFigures]) -> list[str]:
-    """The numbers of elements and threads of a cell, if other cells have others."""
+def label(cell: Cell, among: Iterable[CellFigures]) -> str:
+    """The backend of a cell, and its size and numbers of elements and threads where other cells have others."""
     cells = [figures.cell for figures in among]
-    words = [f"{len(cell.elements)} elements"] if len({other.elements for other in cells}) > 1 else []
-    return words + ([f"{cell.threads} threads"] if len({other.threads for other in cells}) > 1 else [])
+    words = [cell.backend]
+    if len({other.size for other in cells}) > 1:
+        words.append(cell.size_text)
+    if len({other.elements for other in cells}) > 1:
+        words.append(f"{len(cell.elements)} elements")
+    if len({other.threads for other in cells}) > 1:
+        words.append(f"{cell.threads} threads")
+    return ", ".join(words)
 
 
 # Text
@@ -168,31 +153,23 @@ def _cell_table(report: Report) -> str:
     if len({figures.cell.threads for figures in report.cells}) > 1:
         columns["threads"] = lambda figures: str(figures.cell.threads)
     columns |= {
-        "world-steps/s": lambda figures: number(figures.world_steps_per_second.median),
-        "slowest..fastest": _range,
-        "cells/s": lambda figures: number(figures.world_steps_per_second.median * figures.cell.world_cells),
-        "µs/world-step": lambda figures: number(1e6 / figures.world_steps_per_second.median),
-        "ns/cell": lambda figures: number(
-            1e9 / figures.world_steps_per_second.median / figures.cell.world_cells
-        ),
-        "CPUs": lambda figures: f"{figures.processors:.2f}",
+        "world-steps/s": lambda figures: number(median(figures.rates)),
+        "slowest..fastest": lambda figures: f"{number(figures.rates[0])}..{number(figures.rates[-1])}",
+        "cells/s": lambda figures: number(median(figures.rates) * figures.cell.world_cells),
+        "µs/world-step": lambda figures: number(figures.world_step_microseconds),
+        "ns/cell": lambda figures: number(1e3 * figures.world_step_microseconds / figures.cell.world_cells),
+        "CPUs": lambda figures: f"{figures.processor_microseconds / figures.world_step_microseconds:.2f}",
         "to first step": lambda figures: f"{figures.compile_seconds + figures.first_step_seconds:.2f} s",
         "memory": _memory,
-        "state": lambda figures: f"{figures.state_bytes / figures.cell.cells:.3g} B/cell",
         **{f"÷ {name}": partial(_times, report, name) for name in report.programs},
     }
     rows = [[show(figures) for show in columns.values()] for figures in report.cells]
     return "\n".join(table([[*columns], *rows], indent=""))
 
 
-def _range(figures: CellFigures) -> str:
-    rate = figures.world_steps_per_second
-    return f"{number(rate.min)}..{number(rate.max)}"
-
-
 def _memory(figures: CellFigures) -> str:
-    growth = figures.peak_memory_bytes
-    return "?" if growth is None else f"{growth / MEGABYTE:.1f} MiB, {growth / figures.cell.cells:.0f} B/cell"
+    growth, cells = figures.peak_memory_bytes, figures.cell.batch * figures.cell.world_cells
+    return "?" if growth is None else f"{growth / MEGABYTE:.1f} MiB, {growth / cells:.0f} B/cell"
 
 
 def _times(report: Report, program: str, figures: CellFigures) -> str:
@@ -209,7 +186,6 @@ def _footnotes(report: Report) -> Iterator[str]:
     yield f"{rounds}; a call makes {shown} steps, always from the same worlds"
     yield "CPUs: processor time by time; less than the threads means that others were at work"
     yield "to first step: compiling, which all lines of a backend share, and the first step"
-    yield "state: the worlds' tensors, which are there before memory is measured"
     if report.programs:
         yield "÷: processor time divided by that of another program, from the same worlds"
     yield f"memory: {memory_measure(report.plan.device)}"
@@ -218,29 +194,19 @@ def _footnotes(report: Report) -> Iterator[str]:
 def _pass_table(profiled: Sequence[CellFigures]) -> str:
     """µs a world and step of each pass, and its share, for each cell that was profiled."""
     totals = [sum(figures.passes.values()) for figures in profiled]
-    rows = [["µs/world-step", *(_label(figures.cell, profiled) for figures in profiled)]]
+    headings = [f"{label(figures.cell, profiled)}, batch {figures.cell.batch}" for figures in profiled]
+    rows = [["µs/world-step", *headings]]
     for name in profiled[0].passes:
-        spent = [figures.passes[name] for figures in profiled]
-        shares = zip(spent, totals, strict=True)
+        shares = zip((figures.passes[name] for figures in profiled), totals, strict=True)
         rows.append([name, *(f"{number(part)} {part / total:4.0%}" for part, total in shares)])
     wholes = {
         "all passes": totals,
-        "whole step": [1e6 / figures.world_steps_per_second.median for figures in profiled],
-        "of that, processor time": [
-            figures.processor_microseconds_per_world_step.median for figures in profiled
-        ],
+        "whole step": [figures.world_step_microseconds for figures in profiled],
+        "of that, processor time": [figures.processor_microseconds for figures in profiled],
     }
     for name, values in wholes.items():
         rows.append([name, *(f"{number(value)}     " for value in values)])
     return "\n".join(table(rows, indent=""))
-
-
-def _label(cell: Cell, among: Sequence[CellFigures]) -> str:
-    """A short name of a cell: what distinguishes it from the others."""
-    words = [cell.backend, f"{cell.batch}"]
-    if len({figures.cell.size for figures in among}) > 1:
-        words.append(cell.size_text)
-    return " ".join([*words, *extra_words(cell, among)])
 
 
 def number(value: float) -> str:
