@@ -229,7 +229,7 @@ def planner() -> str:
 
 
 def commands() -> str:
-    rows = [(f"`powderdsl {name}`", about) for name, (_, about) in COMMANDS.items()]
+    rows = [(f"`powderdsl {name}`", about) for name, about in COMMANDS.items()]
     return table(("command", "what it does"), rows)
 
 

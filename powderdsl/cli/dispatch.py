@@ -15,29 +15,29 @@ from powderdsl.cli.exits import report_failure, version
 from powderdsl.diagnostics.printable import printable_streams
 from powderdsl.system.interrupts import LIFELINE, end_with_stdin, interruptible
 
-COMMANDS: dict[str, tuple[str, str]] = {
-    # name: (module in powderdsl.cli.commands, summary)
-    "run": ("run", "Run a world: watch it, or write a picture or an animation."),
-    "play": ("play", "Open a page to paint worlds and to change their rules while they run."),
-    "check": ("check", "Find all mistakes in rule files and tasks at once."),
-    "compile": ("compile", "Print the output of a compiler stage."),
-    "show": ("show", "List elements, reactions, passes and parameters, or describe a task."),
-    "test": ("test", "Run the tests of packs and check their invariants."),
-    "trace": ("trace", "Explain a cell: which rule wrote it, and what the rule read."),
-    "record": ("record", "Record episodes of a task: data for offline learning and world models."),
-    "ogbench": ("ogbench", "Collect the data sets of OGBench's Powderworld."),
-    "bench": ("bench", "Measure how fast rules run, on each backend, batch and size."),
-    "train": ("train", "Train an agent on a task, or resume an interrupted run."),
-    "evaluate": ("evaluate", "Compare an agent with a random policy and with doing nothing."),
-    "curves": ("curves", "Draw learning curves of runs, with intervals over seeds."),
-    "watch": ("watch", "Record a film of an agent at its task."),
-    "wm": ("wm", "World models: train, test and fine-tune networks that predict worlds."),
-    "study": ("study", "Run training over many settings and seeds, and compare the results."),
-    "cache": ("cache", "List or remove cached compiled code."),
-    "new": ("new", "Create a starter pack: an element, a rule and a test."),
-    "render": ("render", "Draw a world as a picture, without running it."),
-    "export": ("export", "Write rules as a WebAssembly module, for a page or a game."),
-    "explain": ("explain", "Explain a diagnostic code and how to fix it."),
+COMMANDS = {
+    # name, as of the module in powderdsl.cli.commands: summary
+    "run": "Run a world: watch it, or write a picture or an animation.",
+    "play": "Open a page to paint worlds and to change their rules while they run.",
+    "check": "Find all mistakes in rule files and tasks at once.",
+    "compile": "Print the output of a compiler stage.",
+    "show": "List elements, reactions, passes and parameters, or describe a task.",
+    "test": "Run the tests of packs and check their invariants.",
+    "trace": "Explain a cell: which rule wrote it, and what the rule read.",
+    "record": "Record episodes of a task: data for offline learning and world models.",
+    "ogbench": "Collect the data sets of OGBench's Powderworld.",
+    "bench": "Measure how fast rules run, on each backend, batch and size.",
+    "train": "Train an agent on a task, or resume an interrupted run.",
+    "evaluate": "Compare an agent with a random policy and with doing nothing.",
+    "curves": "Draw learning curves of runs, with intervals over seeds.",
+    "watch": "Record a film of an agent at its task.",
+    "wm": "World models: train, test and fine-tune networks that predict worlds.",
+    "study": "Run training over many settings and seeds, and compare the results.",
+    "cache": "List or remove cached compiled code.",
+    "new": "Create a starter pack: an element, a rule and a test.",
+    "render": "Draw a world as a picture, without running it.",
+    "export": "Write rules as a WebAssembly module, for a page or a game.",
+    "explain": "Explain a diagnostic code and how to fix it.",
 }
 
 
@@ -48,11 +48,9 @@ def plain_warning(message: Warning | str, category: type[Warning], *rest: Any, *
     """The text of a warning: our own in a sentence, others with the line that they come from."""
     from powderdsl.targets.cpp.compilers import NoCompilerWarning
 
-    return (
-        f"note: {message}\n"
-        if issubclass(category, NoCompilerWarning)
-        else _usual(message, category, *rest, **options)
-    )
+    if issubclass(category, NoCompilerWarning):
+        return f"note: {message}\n"
+    return _usual(message, category, *rest, **options)
 
 
 class GuardedCommand(click.Command):
@@ -84,24 +82,17 @@ class CommandGroup(GuardedCommand, click.Group):
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
 
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command:
         if cmd_name not in COMMANDS:
-            return None
-        command: click.Command = import_module(f"powderdsl.cli.commands.{COMMANDS[cmd_name][0]}").command
-        return command
-
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        if args and args[0] not in COMMANDS and not args[0].startswith("-"):
             from powderdsl.diagnostics import suggest
 
-            ctx.fail("; ".join([f"no command `{args[0]}`", *suggest(args[0], COMMANDS, "commands")]))
-        return super().resolve_command(ctx, args)
+            ctx.fail("; ".join([f"no command `{cmd_name}`", *suggest(cmd_name, COMMANDS, "commands")]))
+        command: click.Command = import_module(f"powderdsl.cli.commands.{cmd_name}").command
+        return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
-            formatter.write_dl([(name, summary) for name, (_, summary) in COMMANDS.items()])
+            formatter.write_dl(list(COMMANDS.items()))
 
 
 @click.group(

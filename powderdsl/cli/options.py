@@ -94,6 +94,11 @@ def integer(name: str, low: int, high: int, about: str, default: Any = None, **m
     return _option(name, about, type=_integer(low, high), default=default, **more)
 
 
+def value(name: str, kind: click.ParamType, about: str, default: Any = None, **more: Any) -> Option:
+    """A value of a type, such as SIZE."""
+    return _option(name, about, type=kind, default=default, **more)
+
+
 def text(name: str, metavar: str, about: str, default: str | None = None, **more: Any) -> Option:
     """Any text, which the help calls `metavar`."""
     return _option(name, about, metavar=metavar, default=default, **more)
@@ -199,7 +204,7 @@ parameters = click.option(
 world = click.option(
     "--world", metavar="FILE|NAME", help="A .npz, .png, .txt or .yaml file, or the name of a scene."
 )
-size = click.option("--size", type=SIZE, help="Rows and columns, such as 48x64.")
+size = value("--size", SIZE, "Rows and columns, such as 48x64.")
 device = click.option("--device", default="cpu", help="A torch device: cpu, cuda, cuda:1.")
 
 

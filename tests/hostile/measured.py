@@ -21,7 +21,7 @@ ROOM = 16 << 30
 """Bytes of addresses that a command may have, so that a mistake does not take the machine's memory."""
 
 MODULES = (
-    *(f"powderdsl.cli.commands.{module}" for module, _ in COMMANDS.values()),
+    *(f"powderdsl.cli.commands.{name}" for name in COMMANDS),
     "powderdsl.cli.start_worlds",
     "powderdsl.datasets.dataset",
     "powderdsl.testing.properties.refute",

@@ -348,7 +348,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     put(folder, "0123456789abcdef", bytes(1 << 21), used=3 * 86400)
     put(folder, "fedcba", bytes(10))
     listed = powderdsl("cache", "list")
-    assert listed.stdout.splitlines()[1].split()[:4] == ["0123456789ab", "yard", "native", "2.1"]
+    assert listed.stdout.splitlines()[2].split()[:4] == ["0123456789ab", "yard", "native", "2.1"]
     assert "used 3 d ago" in listed.stdout
     assert "2 compiled programs, 2.1 MB" in listed.stderr
     rows = json.loads(powderdsl("cache", "list", "--json").stdout)

@@ -40,46 +40,36 @@ def _seconds(text: str) -> float:
     return seconds
 
 
+NAMES, SECONDS = opt.Parsed("NAME,NAME", _names), opt.Parsed("FLOAT", _seconds)
 EPILOG = "\b\nWorkloads:\n" + "\n".join(f"  {name:<7} {about}" for name, about in WORKLOADS.items())
 
 
 @click.command("bench", epilog=EPILOG)
 @click.argument("rules", metavar="[RULES]", default="powderworld")
-@click.option(
+@opt.value(
     "--backend",
-    "backends",
-    type=opt.BACKEND,
+    opt.BACKEND,
+    "Backend that runs the rules.  [default: wasm and native; on a GPU, torch and cuda]",
+    to="backends",
     multiple=True,
-    help="Backend that runs the rules.  [default: wasm and native; on a GPU, torch and cuda]",
 )
 @opt.integer("--batch", 1, 1 << 20, "Number of worlds in a batch.", (1, 32), to="batches", multiple=True)
-@click.option("--size", "sizes", type=opt.SIZE, multiple=True, help="Rows and columns.  [default: 64]")
+@opt.value("--size", opt.SIZE, "Rows and columns.  [default: 64]", to="sizes", multiple=True)
 @opt.integer("--elements", 1, 256, "Use only the first N elements in the worlds.", multiple=True)
-@click.option(
-    "--only",
-    type=opt.Parsed("NAME,NAME", _names),
-    default=(),
-    show_default=False,
-    help="Use only these elements in the worlds.",
-)
+@opt.value("--only", NAMES, "Use only these elements in the worlds.")
 @opt.integer("--threads", 1, 1024, "CPU threads.", (1,), multiple=True)
-@click.option(
+@opt.value(
     "--beside",
-    "programs",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    click.Path(exists=True, dir_okay=False, path_type=Path),
+    "Also measure a program of yours that makes the same steps: `load(state)` returns `run(steps)`.",
+    to="programs",
     metavar="FILE.py",
     multiple=True,
-    help="Also measure a program of yours that makes the same steps: `load(state)` returns `run(steps)`.",
 )
 @opt.choice("--workload", list(WORKLOADS), "The worlds to start from.", Plan.workload)
 @opt.device
 @opt.integer("--steps", 1, 1 << 20, "Maximum steps per call.", Plan.steps)
-@click.option(
-    "--seconds",
-    type=opt.Parsed("FLOAT", _seconds),
-    default=Plan.seconds,
-    help="Measuring time per combination, in seconds.",
-)
+@opt.value("--seconds", SECONDS, "Measuring time per combination, in seconds.", Plan.seconds)
 @opt.integer("--rounds", 1, 1000, "Rounds: in each, all combinations are measured in turn.", Plan.rounds)
 @opt.integer("--seed", 0, 2**63 - 1, "Seed of the start worlds.", Plan.seed)
 @opt.parameters
@@ -91,6 +81,7 @@ def command(
     rules: str,
     backends: tuple[str, ...],
     sizes: tuple[tuple[int, int], ...],
+    only: tuple[str, ...] | None,
     device: str,
     settings: dict[str, str],
     programs: tuple[Path, ...],
@@ -112,6 +103,7 @@ def command(
             ruleset,
             backends=backends or _usual_backends(device),
             sizes=sizes or ((fitting(ruleset, 64),) * 2,),
+            only=only or (),
             device=device,
             programs=[read_program(file) for file in programs],
             **measurement,

@@ -3,29 +3,28 @@
 from __future__ import annotations
 
 import re
-from dataclasses import asdict
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
 
+from powderdsl.cli import options as opt
 from powderdsl.cli.output import counted, print_json
+from powderdsl.system.reports import table
+
+if TYPE_CHECKING:
+    from powderdsl.targets.cache import Entry
 
 UNITS = {"s": 1, "m": 60, "h": 3600, "d": 86400, "w": 7 * 86400}
 
 
-class AgeType(click.ParamType):
+def _age(text: str) -> float:
     """`30d`, `12h`: a time span in seconds."""
-
-    name = "AGE"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        if isinstance(value, float):
-            return value
-        match = re.fullmatch(r"([0-9]{1,6})([smhdw])", str(value))
-        if match is None:
-            self.fail(f"`{value}` is not a time span: write 30d, 12h or 90m", param, ctx)
-        return float(match[1]) * UNITS[match[2]]
+    match = re.fullmatch(r"([0-9]{1,6})([smhdw])", text)
+    if match is None:
+        raise ValueError("is not a time span: write 30d, 12h or 90m")
+    return float(match[1]) * UNITS[match[2]]
 
 
 @click.group("cache")
@@ -38,41 +37,40 @@ def command() -> None:
 
 
 @command.command("list")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON list with all details.")
+@opt.flag("--json", "Print one JSON list with all details.", to="as_json")
 def list_entries(as_json: bool) -> None:
     """List compiled code, the most recently used first."""
     from powderdsl.targets.cache import entries
 
-    found = entries(_folder())
+    stored = entries(_folder())
     if as_json:
-        rows = [{"key": one.key, "used": one.used, **asdict(one.about)} for one in found]
-        print_json(rows)
+        print_json([{"key": entry.key, "used": entry.used, **vars(entry.about)} for entry in stored])
         return
-    for one in found:
-        size = f"{one.about.size / 1e6:.1f} MB"
-        used = f"used {_ago(one.age)} ago"
-        made = f"{one.about.seconds:.0f} s by {one.about.compiler}"
-        name = one.about.ruleset or "?"
-        click.echo(f"{one.key[:12]}  {name:<20}  {one.about.backend}  {size:>8}  {used:<16}  {made}")
-    total = sum(one.about.size for one in found) / 1e6
-    click.echo(f"{counted(len(found), 'compiled program')}, {total:.1f} MB", err=True)
+    rows = [["program", "ruleset", "backend", "size", "last use", "made"]]
+    for entry in stored:
+        about = entry.about
+        made = f"{about.seconds:.0f} s by {about.compiler}"
+        used = f"used {_ago(entry.age)} ago"
+        rows.append([entry.key[:12], about.ruleset or "?", about.backend, _megabytes([entry]), used, made])
+    if stored:
+        click.echo("\n".join(table(rows, indent="")))
+    click.echo(f"{counted(len(stored), 'compiled program')}, {_megabytes(stored)}", err=True)
 
 
 @command.command("clear")
-@click.option(
+@opt.value(
     "--older-than",
-    type=AgeType(),
-    default=0.0,
+    opt.Parsed("AGE", _age),
+    "Remove only what has not been used for this time, such as 30d.",
+    0.0,
     show_default=False,
-    help="Remove only what has not been used for this time, such as 30d.",
 )
 def clear_entries(older_than: float) -> None:
     """Remove compiled code. Running programs continue; code is compiled again when it is next needed."""
     from powderdsl.targets.cache import clear
 
-    gone = clear(_folder(), older_than)
-    size = sum(one.about.size for one in gone) / 1e6
-    click.echo(f"removed {counted(len(gone), 'compiled program')}, {size:.1f} MB", err=True)
+    removed = clear(_folder(), older_than)
+    click.echo(f"removed {counted(len(removed), 'compiled program')}, {_megabytes(removed)}", err=True)
 
 
 @command.command("path")
@@ -94,3 +92,7 @@ def _ago(seconds: float) -> str:
         if seconds >= UNITS[unit]:
             return f"{seconds / UNITS[unit]:.0f} {unit}"
     return f"{seconds:.0f} s"
+
+
+def _megabytes(entries: Sequence[Entry]) -> str:
+    return f"{sum(entry.about.size for entry in entries) / 1e6:.1f} MB"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from string import Template
 
@@ -39,35 +39,32 @@ def command(name: str, folder: Path) -> None:
     if path.exists() or path.is_symlink():
         raise BadInput(f"{path} exists already")
     opt.check_writable(path)
-    shipped_elements = _elements(shipped("rules").glob("*.yaml"))
-    if name in shipped_rules() or name in {element.name.text for element in shipped_elements}:
+    taken = _elements(shipped("rules"))
+    if name in shipped_rules() or name in {element.name.text for element in taken}:
         raise BadInput(f"`{name}` comes with powderdsl: choose another name")
-    taken = [*shipped_elements, *_elements(folder.glob("*.yaml"))]
-    text = _pack_text(name, taken)
-    _check_names(name, text)
+    taken += _elements(folder)
+    free = set(range(256)) - {element.id for element in taken}
+    if not free:
+        raise BadInput("all 256 element ids are taken")
+    number = min(free)
+    color = _color(number, {element.color for element in taken})
+    text = Template(TEMPLATE.read_text(encoding="utf-8")).substitute(name=name, id=number, color=color)
+    for problem in _problems(name, text):
+        raise BadInput(f"`{name}` cannot name a pack: {problem}")
     write_text(path, text)
     click.echo(f"wrote {path}: powderdsl run core+{path} --watch")
 
 
-def _elements(paths: Iterable[Path]) -> list[ElementDecl]:
-    """The elements of all packs among some files; files that cannot be read have none."""
-    found: list[ElementDecl] = []
-    for path in sorted(paths):
+def _elements(folder: Path) -> list[ElementDecl]:
+    """The elements of all packs in a folder; files that cannot be read have none."""
+    elements: list[ElementDecl] = []
+    for path in sorted(folder.glob("*.yaml")):
         reporter = Reporter()
         source = read_source(path, reporter)
         decl = read_file(source, reporter) if source else None
         if isinstance(decl, PackDecl):
-            found.extend(decl.elements)
-    return found
-
-
-def _pack_text(name: str, taken: list[ElementDecl]) -> str:
-    ids = {element.id for element in taken}
-    free = next((number for number in range(256) if number not in ids), None)
-    if free is None:
-        raise BadInput("all 256 element ids are taken")
-    color = _color(free, {element.color for element in taken})
-    return Template(TEMPLATE.read_text(encoding="utf-8")).substitute(name=name, id=free, color=color)
+            elements.extend(decl.elements)
+    return elements
 
 
 def _color(number: int, taken: set[str]) -> str:
@@ -80,17 +77,14 @@ def _color(number: int, taken: set[str]) -> str:
         number += 1
 
 
-def _check_names(name: str, text: str) -> None:
-    """Refuse a name that means something in the language or in the pack that the new one needs."""
+def _problems(name: str, text: str) -> list[str]:
+    """Errors in the new pack: its name means something in the language or in the pack that it needs."""
     reporter = Reporter()
     packs, _ = read(["core"], reporter)
     new = read_file(Source(f"{name}.yaml", text), reporter)
-    problems: tuple[str, ...] = ()
-    try:
-        if isinstance(new, PackDecl):
+    if isinstance(new, PackDecl):
+        with suppress(CompileError):
             check([*packs, new], None, reporter)
-    except CompileError:
-        pass
-    problems = tuple(one.message for one in reporter.diagnostics if one.severity is Severity.ERROR)
-    if problems:
-        raise BadInput(f"`{name}` cannot name a pack: {problems[0]}")
+    return [
+        diagnostic.message for diagnostic in reporter.diagnostics if diagnostic.severity is Severity.ERROR
+    ]

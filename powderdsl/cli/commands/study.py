@@ -14,7 +14,6 @@ from typing import Any
 import click
 
 from powderdsl.cli import options as opt
-from powderdsl.cli.dispatch import COMMANDS
 from powderdsl.cli.exits import FAILED, OK
 from powderdsl.cli.output import counted, progress
 from powderdsl.cli.study import selection
@@ -91,7 +90,7 @@ def commands() -> Mapping[tuple[str, ...], Mapping[str, str]]:
 
 def called(words: tuple[str, ...]) -> click.Command:
     """The click command that some words name."""
-    found: click.Command = import_module(f"powderdsl.cli.commands.{COMMANDS[words[0]][0]}").command
+    found: click.Command = import_module(f"powderdsl.cli.commands.{words[0]}").command
     for word in words[1:]:
         assert isinstance(found, click.Group)
         found = found.commands[word]

@@ -29,7 +29,7 @@ CELL = opt.Parsed("ROW,COLUMN", _cell)
 @opt.world
 @opt.size
 @opt.integer("--seed", 0, 2**63 - 1, "Seed of all random numbers.  [default: 0]")
-@click.option("--at", "cell", type=CELL, required=True, help="Row and column of the cell, from 0.")
+@opt.value("--at", CELL, "Row and column of the cell, from 0.", to="cell", required=True)
 @opt.integer("--step", 1, 10**9, "Step of the run, from 1.", required=True)
 @opt.text(
     "--of", "NAME", "Explain only `element`, or this field. May be repeated.", to="names", multiple=True
