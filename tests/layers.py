@@ -124,7 +124,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "datasets": (*_SCREEN, *_LEARNING[:6]),
     "rl": (*_SCREEN, *_LEARNING[:7]),
     "worldmodel": (*_SCREEN, *_LEARNING[:7]),
-    "ogbench": (*_SCREEN, "experiments.runs", "tasks", "tasks.episodes", "envs"),
+    "ogbench": (*_SCREEN, "experiments.runs", "tasks", "tasks.tensors", "tasks.episodes", "envs"),
     # Calls commands, in processes of their own.
     "experiments.studies": (*_FRONT, "compiler", "experiments.runs", "experiments.bench"),
     "web.worlds": _FRONT,
@@ -183,7 +183,6 @@ _TORCH = (
     "ogbench.program",
     "ogbench.episodes",
     "ogbench.env",
-    "ogbench.vector",
     "ogbench.collect",
 )
 THIRD_PARTIES: dict[str, Home] = {

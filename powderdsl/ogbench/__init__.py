@@ -16,14 +16,13 @@ from powderdsl.ogbench.levels import find_level, shipped_levels
 
 if TYPE_CHECKING:
     from powderdsl.ogbench.datasets import load_dataset, make_env_and_datasets
-    from powderdsl.ogbench.env import PowderworldEnv
-    from powderdsl.ogbench.vector import PowderworldVectorEnv
+    from powderdsl.ogbench.env import PowderworldEnv, PowderworldVectorEnv
 
 __all__ = ["PowderworldEnv", "PowderworldVectorEnv", "load_dataset", "make_env_and_datasets"]
 
 _HOMES = {
     "PowderworldEnv": "env",
-    "PowderworldVectorEnv": "vector",
+    "PowderworldVectorEnv": "env",
     "load_dataset": "datasets",
     "make_env_and_datasets": "datasets",
 }
@@ -36,7 +35,7 @@ def _register() -> None:
                 gymnasium.register(
                     env_id,
                     entry_point="powderdsl.ogbench.env:PowderworldEnv",
-                    vector_entry_point="powderdsl.ogbench.vector:PowderworldVectorEnv",
+                    vector_entry_point="powderdsl.ogbench.env:PowderworldVectorEnv",
                     max_episode_steps=find_level(name).steps,
                     kwargs={"level": name},
                 )

@@ -1,8 +1,9 @@
-"""One world of a level as OGBench's environment: same spaces, options, infos and success."""
+"""OGBench's environment, with its spaces, options, infos and success: one world of a level, or many in one batch."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -12,28 +13,78 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box, Discrete
 from gymnasium.utils import EzPickle
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
-from powderdsl.ogbench.draws import FIRST_ELEMENT, FIRST_X, FIRST_Y, Draws, keyed
-from powderdsl.ogbench.episodes import Episodes, task_of
-from powderdsl.ogbench.levels import Level, find_level
+from powderdsl.envs.gym import objects
+from powderdsl.envs.tensor_env import check_cells, mode_of
+from powderdsl.ogbench.draws import FIRST_ELEMENT, FIRST_X, FIRST_Y, RANDOMNESS, keyed
+from powderdsl.ogbench.episodes import MODES, Episodes, task_of
+from powderdsl.ogbench.levels import GoalTask, Level, find_level
 from powderdsl.ogbench.program import LevelProgram
 
 Array = NDArray[Any]
 
 OPTIONS = ("task_id", "task_info", "render_goal")
+BATCH_OPTIONS = ("task_id", "task_info", "reset_mask")
+"""Options of `reset`."""
 
 MAX_SEED = (1 << 62) - 1
 
 
-def made_program(
-    level: str | Path | Level | LevelProgram, randomness: str | Draws, backend: str, device: str, threads: int
-) -> LevelProgram:
-    """The program of a level; environments of one process share it."""
-    if isinstance(level, LevelProgram):
-        return level
-    return _program(find_level(level), randomness != "counter", backend, str(device), threads)
+@dataclass(frozen=True)
+class EnvOptions:
+    """What single and batched environments of a level take.
+
+    Args:
+        mode: ``task``, or ``data_collection``: no goals and no rewards.
+        seed: decides goals and episodes, until `reset` is given another one.
+        randomness: ``counter``: a goal depends on the seed and its task alone, and episode n of a seed is the same
+            anywhere. ``ogbench``: draws from a `numpy.random.RandomState` of the environment's own, in OGBench's order:
+            `reset` with a seed plays what OGBench plays after `numpy.random.seed` with it.
+        render_mode: None or ``rgb_array``. width, height: of what `render` returns.
+        backend, device, threads: those of `powderdsl.compile`; ``ogbench`` runs on ``torch``.
+
+    Raises:
+        TypeError, ValueError: a value is wrong.
+    """
+
+    mode: str = "task"
+    seed: int = 0
+    randomness: str = "counter"
+    render_mode: str | None = None
+    width: int = 192
+    height: int = 192
+    backend: str = "auto"
+    device: str = "cpu"
+    threads: int = 1
+
+    def __post_init__(self) -> None:
+        seed_number(self.seed)
+        for name, choices in (
+            ("mode", MODES),
+            ("randomness", RANDOMNESS),
+            ("render_mode", (None, "rgb_array")),
+        ):
+            if getattr(self, name) not in choices:
+                raise ValueError(
+                    f"{name} is one of {', '.join(map(str, choices))}; found {getattr(self, name)!r}"
+                )
+
+    def program(self, level: str | Path | Level | LevelProgram) -> LevelProgram:
+        """The program of a level; environments of one process share it."""
+        if isinstance(level, LevelProgram):
+            return level
+        as_ogbench = self.randomness == "ogbench"
+        return _program(find_level(level), as_ogbench, self.backend, str(self.device), self.threads)
+
+    def picture(self, observation: Array) -> Array:
+        """The world's part of an observation, by its nearest pixels: uint8 [height, width, 3]."""
+        rows = np.arange(self.height) * observation.shape[0] // self.height
+        columns = np.arange(self.width) * observation.shape[1] // self.width
+        return np.ascontiguousarray(observation[rows][:, columns, :3])
 
 
 @lru_cache(maxsize=16)
@@ -55,11 +106,11 @@ def seed_number(seed: Any) -> int:
     return int(seed)
 
 
-def enlarged(picture: Array, height: int, width: int) -> Array:
-    """A picture uint8 [H, W, 3] in another size, by its nearest pixels."""
-    rows = np.arange(height) * picture.shape[0] // height
-    columns = np.arange(width) * picture.shape[1] // width
-    return np.ascontiguousarray(picture[rows][:, columns])
+def check_options(options: Mapping[str, Any], known: Sequence[str]) -> None:
+    """Raise KeyError for an option of `reset` that does not exist."""
+    for name in options:
+        if name not in known:
+            raise KeyError(f"no option `{name}`: there are {', '.join(known)}")
 
 
 class PowderworldEnv(gymnasium.Env[Array, Any], EzPickle):
@@ -70,41 +121,22 @@ class PowderworldEnv(gymnasium.Env[Array, Any], EzPickle):
 
     Args:
         level: a shipped level by name, a level's file, a `Level`, or its program to share.
-        mode: ``task``, or ``data_collection``: no goals and no rewards.
-        seed: decides goals and episodes, until `reset` is given another one.
-        randomness: ``counter``: a goal depends on the seed and its task alone, and episode n of a seed is the same
-            anywhere. ``ogbench``: draws from a `numpy.random.RandomState` of the environment's own, in OGBench's order:
-            `reset` with a seed plays what OGBench plays after `numpy.random.seed` with it.
-        render_mode: None or ``rgb_array``. width, height: of what `render` returns.
-        backend, device, threads: those of `powderdsl.compile`; ``ogbench`` runs on ``torch``.
+        options: those of `EnvOptions`.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 15}  # noqa: RUF012 as Gymnasium declares it
 
-    def __init__(
-        self,
-        level: str | Path | Level | LevelProgram,
-        *,
-        mode: str = "task",
-        seed: int = 0,
-        randomness: str | Draws = "counter",
-        render_mode: str | None = None,
-        width: int = 192,
-        height: int = 192,
-        backend: str = "auto",
-        device: str = "cpu",
-        threads: int = 1,
-    ):
-        how = {"mode": mode, "seed": seed, "randomness": randomness, "render_mode": render_mode}
-        where = {"backend": backend, "device": device, "threads": threads}
-        EzPickle.__init__(self, level, width=width, height=height, **how, **where)
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(f"render_mode is None or rgb_array; found {render_mode!r}")
-        program = made_program(level, randomness, backend, device, threads)
-        self.episodes = Episodes(program, [seed_number(seed)], randomness=randomness, mode=mode)
+    def __init__(self, level: str | Path | Level | LevelProgram, **options: Any):
+        EzPickle.__init__(self, level, **options)
+        self._options = EnvOptions(**options)
+        program = self._options.program(level)
+        seeds, how = (
+            [self._options.seed],
+            {"randomness": self._options.randomness, "mode": self._options.mode},
+        )
+        self.episodes = Episodes(program, seeds, **how)
         """The same episode in a batch of one."""
-        self.level = program.level
-        self.render_mode, self._size = render_mode, (height, width)
+        self.level, self.render_mode = program.level, self._options.render_mode
         self.observation_space, self.action_space = spaces_of(self.level)
         self.task_infos = [
             {"task_name": task.name, "action_seq": list(task.actions), "tol": task.tolerance}
@@ -136,9 +168,7 @@ class PowderworldEnv(gymnasium.Env[Array, Any], EzPickle):
             KeyError, TypeError, ValueError: an unknown option, or one that the level does not have.
         """
         given = dict(options or {})
-        for name in given:
-            if name not in OPTIONS:
-                raise KeyError(f"no option `{name}`: there are {', '.join(OPTIONS)}")
+        check_options(given, OPTIONS)
         task = task_of(self.level, given) if self.episodes.mode == "task" else None
         here = np.zeros(1, dtype=np.int64)
         if seed is not None:
@@ -153,7 +183,7 @@ class PowderworldEnv(gymnasium.Env[Array, Any], EzPickle):
         self.cur_task_info = self.task_infos[number - 1] if number else dict(given["task_info"])
         info = {"goal": _array(self.episodes.goals()[0])}
         if given.get("render_goal"):
-            info["goal_rendered"] = enlarged(info["goal"][..., :3], *self._size)
+            info["goal_rendered"] = self._options.picture(info["goal"])
         return self._observation(), info
 
     def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
@@ -171,7 +201,7 @@ class PowderworldEnv(gymnasium.Env[Array, Any], EzPickle):
         """The world's picture, uint8 [height, width, 3]."""
         if self.episodes.world is None:
             raise ResetNeeded("reset the environment before rendering it")
-        return enlarged(self._observation()[..., :3], *self._size)
+        return self._options.picture(self._observation())
 
     # For scripts that choose whole actions
 
@@ -190,6 +220,171 @@ class PowderworldEnv(gymnasium.Env[Array, Any], EzPickle):
     def sample_action(self) -> int:
         """A valid action for the present stage, all equally likely."""
         return self.semantic_action_to_action(*self.sample_semantic_action())
+
+
+class PowderworldVectorEnv(VectorEnv[Any, Any, Any]):
+    """Environment i plays the same episodes as a `PowderworldEnv` with the seed `seed` + i, whatever the others do.
+
+    Args:
+        level: as in `PowderworldEnv`.
+        num_envs: worlds at once.
+        max_episode_steps: truncates episodes; the level's number by default.
+        autoreset_mode: one of Gymnasium's, or its name.
+        options: those of `EnvOptions`.
+    """
+
+    def __init__(
+        self,
+        level: str | Path | Level | LevelProgram,
+        num_envs: int = 1,
+        *,
+        max_episode_steps: int | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        **options: Any,
+    ):
+        if not hasattr(num_envs, "__index__") or num_envs < 1:
+            raise ValueError(f"num_envs must be an integer from 1, found {num_envs!r}")
+        self._options = EnvOptions(**options)
+        program = self._options.program(level)
+        self.level = program.level
+        check_cells(num_envs, (self.level.side, self.level.side))
+        seeds = [self._options.seed + number for number in range(num_envs)]
+        how = {"randomness": self._options.randomness, "mode": self._options.mode}
+        self.episodes = Episodes(program, seeds, **how)
+        """The same episodes on tensors."""
+        self.num_envs, self.autoreset_mode = num_envs, mode_of(autoreset_mode)
+        self.max_episode_steps = max_episode_steps or self.level.steps
+        self.render_mode = self._options.render_mode
+        self.metadata = PowderworldEnv.metadata | {"autoreset_mode": self.autoreset_mode}
+        self.single_observation_space, self.single_action_space = spaces_of(self.level)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._over = np.zeros(num_envs, dtype=bool)
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: Mapping[str, Any] | None = None,
+    ) -> tuple[Array, dict[str, Any]]:
+        """Begin all episodes, or those of a mask.
+
+        Args:
+            seed: s gives environment i the seed s + i; a list gives each its own, or None.
+            options: ``task_id``: a number from 1, or one for each environment; ``task_info``: as in `PowderworldEnv`.
+                They hold for these episodes; later ones draw a task. ``reset_mask``: bool [B].
+
+        Returns:
+            observations uint8 [B, H, W, 6]; infos: ``goal``, of the same shape, and ``task_id``, int64 [B].
+
+        Raises:
+            KeyError, TypeError, ValueError: something is wrong with a seed or an option. Nothing has changed then.
+        """
+        given = dict(options or {})
+        check_options(given, BATCH_OPTIONS)
+        mask = np.asarray(given.get("reset_mask", np.ones(self.num_envs, dtype=bool)))
+        if mask.dtype != bool or mask.shape != (self.num_envs,) or not mask.any():
+            raise ValueError(f"reset_mask must be bool [{self.num_envs}], True somewhere")
+        if self.episodes.world is None and not mask.all():
+            raise ResetNeeded("the first reset begins all episodes: reset_mask must be True everywhere")
+        tasks = self._tasks(given)
+        which = np.flatnonzero(mask)
+        self._seed(seed, mask)
+        self.episodes.begin(which, [tasks[at] for at in which])
+        self._over[mask] = False
+        return self._observations(), self._begun(mask)
+
+    def _tasks(self, given: Mapping[str, Any]) -> list[int | GoalTask | None]:
+        ids = np.asarray(given.get("task_id"))
+        if self.episodes.mode != "task" or ids.ndim != 1:
+            return [task_of(self.level, given) if self.episodes.mode == "task" else None] * self.num_envs
+        if len(ids) != self.num_envs:
+            raise ValueError(f"task_id has {len(ids)} numbers for {self.num_envs} environments")
+        return [task_of(self.level, {**given, "task_id": one}) for one in ids.tolist()]
+
+    def _seed(self, seed: int | Sequence[int | None] | None, mask: NDArray[np.bool_]) -> None:
+        if seed is None:
+            return
+        if hasattr(seed, "__index__"):
+            first = seed_number(seed)
+            seeds: list[int | None] = [first + number for number in range(self.num_envs)]
+            super().reset(seed=first)
+        else:
+            seeds = [None if one is None else seed_number(one) for one in seed]
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"seed has {len(seeds)} numbers for {self.num_envs} environments")
+        which = np.array([at for at, one in enumerate(seeds) if one is not None and mask[at]], dtype=np.int64)
+        self.episodes.seed(which, np.array([seeds[at] for at in which], dtype=np.int64))
+
+    def step(self, actions: Any) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+        """One choice in every episode: integers [B]. Those that are not valid are replaced by random valid ones.
+
+        Returns:
+            observations uint8 [B, H, W, 6]; reward float64 [B]; terminated and truncated, bool [B]; infos: ``success``,
+            float64 [B]; where an episode began, its ``goal`` and ``task_id``, as `reset` gives them; under SAME_STEP
+            ``final_obs`` and ``final_info`` too.
+
+        Raises:
+            ResetNeeded: before the first reset, or under DISABLED in an episode that has ended. TypeError, ValueError:
+            actions of another type or shape.
+        """
+        given = np.asarray(actions)
+        if given.shape != (self.num_envs,) or given.dtype.kind not in "iu":
+            raise ValueError(
+                f"actions must be integers [{self.num_envs}], found {given.dtype} {list(given.shape)}"
+            )
+        if self.episodes.world is None:
+            raise ResetNeeded("reset the environment before its first step")
+        waiting = self._over.copy()
+        if self.autoreset_mode is AutoresetMode.DISABLED and waiting.any():
+            over = np.flatnonzero(waiting).tolist()
+            raise ResetNeeded(
+                f"the episodes of environments {over[:8]} are over: reset them with a reset_mask"
+            )
+        success = self.episodes.step(given.astype(np.int64), ~waiting) & ~waiting
+        truncated = (self.episodes.elapsed >= self.max_episode_steps) & ~success & ~waiting
+        ended = success | truncated
+        info: dict[str, Any] = {}
+        if self.episodes.mode == "task":
+            info = {"success": success.astype(np.float64), "_success": ~waiting}
+        begins = waiting
+        if self.autoreset_mode is AutoresetMode.SAME_STEP:
+            begins = ended
+            if ended.any():
+                info["final_obs"] = objects(self._observations()[ended], ended)
+                info["_final_obs"] = ended.copy()
+                info["final_info"] = {
+                    name: np.copy(value) for name, value in info.items() if "obs" not in name
+                }
+                info["_final_info"] = ended.copy()
+        else:
+            self._over = ended
+        if begins.any():
+            which = np.flatnonzero(begins)
+            self.episodes.begin(which, [None] * len(which))
+            info |= self._begun(begins)
+        return self._observations(), success.astype(np.float64), success, truncated, info
+
+    def _begun(self, mask: NDArray[np.bool_]) -> dict[str, Any]:
+        """What is known of episodes that begin where `mask` is set."""
+        if self.episodes.mode != "task":
+            return {}
+        goals = _array(self.episodes.goals())
+        return {
+            "goal": goals,
+            "_goal": mask.copy(),
+            "task_id": self.episodes.task_number.copy(),
+            "_task_id": mask.copy(),
+        }
+
+    def _observations(self) -> Array:
+        return _array(self.episodes.observations())
+
+    def render(self) -> tuple[Any, ...] | None:
+        """Each world's picture, uint8 [height, width, 3]."""
+        if self.render_mode is None:
+            return None
+        return tuple(self._options.picture(world) for world in self._observations())
 
 
 def _array(tensor: Tensor) -> Array:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 from powderdsl.diagnostics import suggest
 from powderdsl.system.reading import is_path, parse_json, read_bytes
+from powderdsl.system.settings import Limits, read_record
 
 FOLDER = Path(__file__).parent / "levels"
 
@@ -15,13 +16,20 @@ MAX_BYTES = 1 << 22
 """Largest file of a level."""
 MAX_SIDE = 512
 """Rows, and columns, of a level's worlds."""
-MAX_PAINTED = 10_000
-"""Actions of a task's goal."""
 FEWEST_ACTIONS = 8
 """Action spaces are never smaller."""
 
-Painted = tuple[str, int, int]
-"""One painted block: the element's name, and its place as (x, y)."""
+Record = TypeVar("Record")
+Count = Annotated[int, Limits(1, 1 << 30)]
+Cells = Annotated[int, Limits(0, 1 << 30)]
+
+
+class Painted(NamedTuple):
+    """One painted block: the element's name, and its place."""
+
+    element: str
+    x: int
+    y: int
 
 
 @dataclass(frozen=True)
@@ -32,8 +40,26 @@ class GoalTask:
     """
 
     name: str
-    tolerance: int
+    tolerance: Cells
     actions: tuple[Painted, ...]
+
+
+@dataclass(frozen=True)
+class TaskInfo:
+    """A task as `reset` takes it in ``options["task_info"]``."""
+
+    action_seq: tuple[Painted, ...]
+    tol: Cells
+    task_name: str = "task_info"
+
+
+@dataclass(frozen=True)
+class Play:
+    """The sizes of a level's data sets: episodes for training and validation, and rows of each."""
+
+    episodes: Count
+    validation: Count
+    steps: Annotated[int, Limits(2, 1 << 20)]
 
 
 @dataclass(frozen=True)
@@ -41,23 +67,21 @@ class Level:
     """Square worlds of `side` cells, `fill` with a `frame` around it, in which agents paint one of `elements`.
 
     Place x, y is the block of `brush` × `brush` cells whose first column is `grid` · x and first row `grid` · y.
-    An episode has at most `steps` environment steps; `play` has the sizes of the level's data sets.
+    An episode has at most `steps` environment steps.
     """
 
     name: str
     rules: str
     rounded: str
     """The same rules, with floats rounded as in OGBench."""
-    side: int
+    side: Annotated[int, Limits(4, MAX_SIDE)]
     fill: str
     frame: str
-    brush: int
-    grid: int
-    elements: tuple[str, ...]
-    steps: int
-    episodes: int
-    validation: int
-    episode_steps: int
+    brush: Annotated[int, Limits(1, MAX_SIDE)]
+    grid: Annotated[int, Limits(1, MAX_SIDE)]
+    elements: Annotated[tuple[str, ...], Limits(length=(1, 256))]
+    steps: Count
+    play: Play
     tasks: tuple[GoalTask, ...]
 
     @property
@@ -104,7 +128,7 @@ def find_level(level: str | Path | Level) -> Level:
         return read_level(Path(level))
     path = FOLDER / f"{level}.json"
     if not path.is_file():
-        helps = suggest(level, [one.stem for one in sorted(FOLDER.glob("*.json"))], "levels")
+        helps = suggest(level, [path.stem for path in sorted(FOLDER.glob("*.json"))], "levels")
         raise ValueError("; ".join([f"no level {level!r}", *helps]))
     return read_level(path)
 
@@ -112,114 +136,25 @@ def find_level(level: str | Path | Level) -> Level:
 def read_level(path: Path) -> Level:
     """A level's file. Raises ValueError, which says what is wrong; OSError: it cannot be read."""
     try:
-        return _level(_Fields(parse_json(read_bytes(path, MAX_BYTES)), ""))
+        level = _checked(Level, parse_json(read_bytes(path, MAX_BYTES)), "")
+        if max(level.brush, level.grid) > level.side:
+            raise ValueError(f"`brush` and `grid` must be at most {level.side}, the side of its worlds")
+        for task in level.tasks:
+            level.numbers(task)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
-
-
-def read_task(given: Any, where: str = "task_info") -> GoalTask:
-    """A task as `reset` takes it in ``options["task_info"]``: ``action_seq`` and ``tol``, and optionally ``task_name``.
-
-    Raises:
-        ValueError: it is not one.
-    """
-    fields = _Fields(given, where, optional=("task_name",))
-    name = fields.text("task_name") if "task_name" in given else where
-    task = GoalTask(name, fields.integer("tol", 0, 1 << 30), _painted(fields.list("action_seq"), where))
-    fields.end()
-    return task
-
-
-class _Fields:
-    """The values of a mapping, read one by one. Everything raises ValueError."""
-
-    def __init__(self, values: Any, where: str, optional: tuple[str, ...] = ()):
-        if not isinstance(values, dict):
-            raise ValueError(f"{where or 'a level'} must be a mapping, found {type(values).__name__}")
-        self.values, self.where, self.read = values, where, set(optional)
-
-    def _value(self, name: str, kinds: tuple[type, ...], wanted: str) -> Any:
-        self.read.add(name)
-        place = f"{self.where}.{name}" if self.where else name
-        if name not in self.values:
-            raise ValueError(f"`{place}` is missing")
-        value = self.values[name]
-        if not isinstance(value, kinds) or isinstance(value, bool):
-            raise ValueError(f"`{place}` must be {wanted}, found {value!r:.80}")
-        return value
-
-    def text(self, name: str) -> str:
-        return str(self._value(name, (str,), "a text"))
-
-    def list(self, name: str) -> list[Any]:
-        return list(self._value(name, (list, tuple), "a list"))
-
-    def inner(self, name: str) -> _Fields:
-        return _Fields(self._value(name, (dict,), "a mapping"), name)
-
-    def integer(self, name: str, least: int, most: int) -> int:
-        value = self._value(name, (int,), "an integer")
-        if not least <= value <= most:
-            raise ValueError(f"`{name}` must lie in {least:,}..{most:,}, found {value:,}")
-        return int(value)
-
-    def end(self) -> None:
-        unknown = sorted(set(self.values) - self.read)
-        if unknown:
-            place = f" of `{self.where}`" if self.where else ""
-            helps = "; ".join(suggest(unknown[0], self.read, "keys here"))
-            raise ValueError(f"unknown key `{unknown[0]}`{place}; {helps}")
-
-
-def _level(fields: _Fields) -> Level:
-    play = fields.inner("play")
-    side = fields.integer("side", 4, MAX_SIDE)
-    brush = fields.integer("brush", 1, side)
-    elements = fields.list("elements")
-    if not elements or not all(isinstance(name, str) for name in elements):
-        raise ValueError("`elements` must list at least one name")
-    tasks = [_task(_Fields(one, f"tasks[{at}]")) for at, one in enumerate(fields.list("tasks"))]
-    level = Level(
-        fields.text("level"),
-        fields.text("rules"),
-        fields.text("rounded"),
-        side,
-        fields.text("fill"),
-        fields.text("frame"),
-        brush,
-        fields.integer("grid", 1, side),
-        tuple(elements),
-        fields.integer("steps", 1, 1 << 30),
-        play.integer("episodes", 1, 1 << 30),
-        play.integer("validation", 1, 1 << 30),
-        play.integer("steps", 2, 1 << 20),
-        tuple(tasks),
-    )
-    for part in (play, fields):
-        part.end()
-    for task in level.tasks:
-        level.numbers(task)
     return level
 
 
-def _task(fields: _Fields) -> GoalTask:
-    name, tolerance = fields.text("name"), fields.integer("tolerance", 0, 1 << 30)
-    task = GoalTask(name, tolerance, _painted(fields.list("actions"), f"tasks.{name}"))
-    fields.end()
-    return task
+def read_task(info: Any) -> GoalTask:
+    """The task of ``options["task_info"]``. Raises ValueError."""
+    found = _checked(TaskInfo, info, "task_info")
+    return GoalTask(found.task_name, found.tol, found.action_seq)
 
 
-def _painted(rows: list[Any], where: str) -> tuple[Painted, ...]:
-    if len(rows) > MAX_PAINTED:
-        raise ValueError(f"`{where}` has {len(rows):,} actions, more than {MAX_PAINTED:,}")
-    found = []
-    for at, row in enumerate(rows):
-        given = tuple(row) if isinstance(row, list | tuple) else ()
-        if len(given) != 3 or not isinstance(given[0], str) or not all(_is_integer(one) for one in given[1:]):
-            raise ValueError(f"action {at} of `{where}` must be [element, x, y], found {row!r:.80}")
-        found.append((str(given[0]), int(given[1]), int(given[2])))
-    return tuple(found)
-
-
-def _is_integer(value: Any) -> bool:
-    return hasattr(value, "__index__") and not isinstance(value, bool)
+def _checked(kind: type[Record], data: Any, path: str) -> Record:
+    problems: list[str] = []
+    record = read_record(kind, data, problems, path)
+    if record is None:
+        raise ValueError("; ".join(problems[:8]))
+    return record

@@ -19,11 +19,9 @@ from powderdsl.simulation.draw import palette
 from powderdsl.simulation.simulator import Simulator, World, compile
 from powderdsl.targets.cpp.program import PackedState
 from powderdsl.targets.torch.program import TorchProgram
+from powderdsl.tasks.tensors.actions import Blocks
 
 Numbers = NDArray[np.int64]
-
-CLOCK = ("seed", "index", "step")
-"""Tensors of `World` that draws depend on."""
 
 
 class _WithoutSnap(Simulator):
@@ -69,22 +67,17 @@ class LevelProgram:
         start = torch.full((level.side, level.side), fill, dtype=torch.uint8, device=self.device)
         start[0], start[-1], start[:, 0], start[:, -1] = frame, frame, frame, frame
         self._start = start
-        known = torch.tensor([[[one.id for one in ruleset.elements]]], device=self.device)
-        fresh = self.simulator.world(known).state
-        self._fresh: dict[str, Tensor] = {}
-        """What a new cell of each known element holds: [256] or, of vectors, [256, 2]."""
-        for slot in self.simulator.slots:
-            if slot.travels:
-                value = fresh[slot.name][0, :, 0].T if slot.planes == 2 else fresh[slot.name][0, 0]
-                table = value[:1].repeat(256, *[1] * (value.ndim - 1))
-                table[known[0, 0]] = value
-                self._fresh[slot.name] = table
+        first = torch.arange(level.places, device=self.device) * level.grid
+        edges = torch.stack([first, first + level.brush], 1).clamp(1, level.side - 1)
+        self.blocks = Blocks(self.simulator, (level.side, level.side), (edges, edges))
+        """The blocks of all places, without the frame."""
+        self._covers = (edges[:, 1] > edges[:, 0]).cpu().numpy()
         self.paints = torch.from_numpy(palette(ruleset.elements)[self.ids]).to(self.device)
         """The colors of what agents paint: uint8 [n, 3]."""
 
     def start(self, seeds: Numbers, indices: Numbers) -> World:
         """New worlds. Their draws depend on seed and index, int64 [B] of at least 0 each."""
-        ids = self._start.expand(len(seeds), -1, -1)
+        ids = self._start.repeat(len(seeds), 1, 1)
         return self.simulator.world(ids, torch.from_numpy(seeds), index=torch.from_numpy(indices))
 
     def act(
@@ -101,45 +94,15 @@ class LevelProgram:
         if planes is not None:
             draws = dict(zip(self.streams, planes, strict=True))
         stepped = self.simulator.step(world, random=draws, reuse=reuse)
-        level = self.level
-        ids = torch.from_numpy(self.ids[painted[:, 0]]).to(self.device)
-        first = np.maximum(level.grid * painted[:, 1:], 1)
-        last = np.minimum(level.grid * painted[:, 1:] + level.brush, level.side - 1)
-        boxes = np.stack([first[:, 1], last[:, 1], first[:, 0], last[:, 0]], 1)
-        values = {name: table[ids] for name, table in self._fresh.items()}
-        return stepped.with_state(self._filled(stepped.state, torch.from_numpy(boxes), values))
-
-    def _filled(
-        self, state: Mapping[str, Tensor], boxes: Tensor, values: Mapping[str, Tensor]
-    ) -> Mapping[str, Tensor]:
-        """A state with boxes, int64 [B, 4], filled. `state` is nobody else's."""
-        if isinstance(state, PackedState):
-            wanted = {
-                name: value if value.dtype == torch.float32 else value.long()
-                for name, value in values.items()
-            }
-            return state.fill(boxes, wanted, reuse=True)
-        lines = torch.arange(self.level.side, device=self.device)
-        top, bottom, left, right = boxes.to(self.device)[:, :, None].unbind(1)
-        rows, columns = (lines >= top) & (lines < bottom), (lines >= left) & (lines < right)
-        cells = rows[:, :, None] & columns[:, None]
-        found = dict(state)
-        for name, value in values.items():
-            where = cells if value.ndim == 1 else cells[:, None]
-            found[name] = torch.where(where, value[..., None, None], state[name])
-        return found
-
-    def put(self, world: World, places: Tensor, part: World) -> World:
-        """The worlds with those of numbers `places`, int64 [n], replaced. `world` must not be used afterwards."""
-        if len(places) == len(world):
-            return part
-        state = world.state
-        if isinstance(state, PackedState):
-            new: Mapping[str, Tensor] = state.put(places.cpu(), part.state, reuse=True)
-        else:
-            new = {name: value.index_copy(0, places, part.state[name]) for name, value in state.items()}
-        clock = (getattr(world, one).index_copy(0, places, getattr(part, one)) for one in CLOCK)
-        return World(self.simulator, new, *clock)
+        element, x, y = painted.T
+        where: Any = self._covers[x] & self._covers[y]
+        ids: Any = self.ids[element]
+        packed = isinstance(stepped.state, PackedState)
+        if not packed:
+            ids, x, y, where = (torch.from_numpy(part).to(self.device) for part in (ids, x, y, where))
+        values = self.blocks.fresh_cells(stepped.state, ids)
+        reuse = reuse or packed  # a step makes a packed state of its own
+        return stepped.with_state(self.blocks.filled(stepped.state, y, x, where, values, reuse=reuse))
 
     def errors(self, ids: Tensor, goals: Tensor) -> Numbers:
         """Cells of goals, uint8 [B, H, W], whose element is neither there in `ids` nor beside it: int64 [B]."""

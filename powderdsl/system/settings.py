@@ -89,7 +89,7 @@ def read_record(kind: type[Record], data: Any, problems: list[str], path: str = 
         path: the place of `data` in its file, such as ``shards[3]``, with which problems name places.
     """
     if not isinstance(data, Mapping):
-        problems.append(f"`{path}` must be a mapping, found {data!r:.80}")
+        problems.append(f"`{path or 'file'}` must be a mapping, found {data!r:.80}")
         return None
     start, before = f"{path}." if path else "", len(problems)
     declared, values = _fields_of(kind), {}  # type: ignore[arg-type]  # types are hashable

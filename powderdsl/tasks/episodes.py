@@ -13,10 +13,9 @@ from torch import Tensor
 
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.simulation.simulator import compile as compile_rules
-from powderdsl.targets.cpp.program import PackedState
 from powderdsl.tasks.shipped import check_split, load_task
 from powderdsl.tasks.task import Task
-from powderdsl.tasks.tensors.actions import Hands
+from powderdsl.tasks.tensors.actions import CLOCK, Hands, put_rows, put_worlds
 from powderdsl.tasks.tensors.measures import Facts, Meter, measures_of, scalar_value, scalars_of
 from powderdsl.tasks.tensors.starts import StartWorlds
 
@@ -24,9 +23,6 @@ __all__ = ["Episodes", "TaskProgram", "check_actions", "compile_task", "load_tas
 
 ROWS = ("seed", "acted", "failed", "start", "before")
 """Tensors of `Episodes`, a row for each."""
-
-CLOCK = ("seed", "index", "step")
-"""Tensors of `World` that draws depend on."""
 
 Params = Mapping[str, Any] | None
 Seen = Callable[[World], None] | None
@@ -117,21 +113,14 @@ class TaskProgram:
             return new
 
         def placed(old: Tensor, fresh: Tensor) -> Tensor:
-            return (old if reuse else old.clone()).index_copy_(0, places, fresh)
+            return put_rows(old, places, fresh, reuse)
 
         def all_placed(old: Mapping[str, Tensor], fresh: Mapping[str, Tensor]) -> dict[str, Tensor]:
             return {name: placed(value, fresh[name]) for name, value in old.items()}
 
-        world, other = episodes.world, new.world
-        if isinstance(world.state, PackedState):
-            state: Mapping[str, Tensor] = world.state.put(places, other.state, reuse=reuse)
-        else:
-            state = all_placed(world.state, other.state)
         own = {name: value for name, value in episodes.regions.items() if name not in self._fixed}
         return Episodes(
-            World(
-                self.simulator, state, *(placed(getattr(world, one), getattr(other, one)) for one in CLOCK)
-            ),
+            put_worlds(episodes.world, places, new.world, reuse=reuse),
             regions={**episodes.regions, **all_placed(own, new.regions)},
             targets=all_placed(episodes.targets, new.targets),
             **{name: placed(getattr(episodes, name), getattr(new, name)) for name in ROWS},
@@ -241,7 +230,7 @@ class TaskProgram:
     @property
     def block_edges(self) -> tuple[Tensor, Tensor]:
         """The rows, then the columns, of the blocks that actions change: first and past the last, int64 [bins, 2]."""
-        return self._hands.edges
+        return self._hands.blocks.edges
 
     def measured(self, episodes: Episodes, params: Params = None) -> Tensor:
         """The current values of `measures`: float64 [B, n]."""

@@ -16,10 +16,9 @@ import numpy as np
 import ogbench  # noqa: F401  registers its environments
 import torch
 
-from powderdsl.ogbench.env import made_program
+from powderdsl.ogbench.collect import play
+from powderdsl.ogbench.env import EnvOptions, PowderworldVectorEnv
 from powderdsl.ogbench.levels import find_level
-from powderdsl.ogbench.play import play
-from powderdsl.ogbench.vector import PowderworldVectorEnv
 
 ROUNDS, ACTIONS = 3, 60
 """Rounds, and whole actions of an episode that are played in each."""
@@ -37,7 +36,7 @@ def single(level: str) -> Callable[[np.ndarray], None]:
 
 
 def batched(level: str, worlds: int, backend: str) -> Callable[[np.ndarray], None]:
-    program = made_program(level, "counter", backend, "cpu", 1)
+    program = EnvOptions(backend=backend).program(level)
     env = PowderworldVectorEnv(program, worlds, mode="data_collection")
 
     def run(actions: np.ndarray) -> None:

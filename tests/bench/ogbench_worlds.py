@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from powderdsl.ogbench.env import made_program
-from powderdsl.ogbench.play import play
+from powderdsl.ogbench.collect import play
+from powderdsl.ogbench.env import EnvOptions
 from powderdsl.simulation.simulator import World
 from tests.bench.beside_ogbench import load
 from tests.bench.rounds import Maker, microseconds
@@ -21,7 +21,7 @@ STEPS, ROUNDS = {"wasm": 16, "native": 32}, 7
 
 
 def played(level: str, worlds: int, backend: str) -> World:
-    program = made_program(level, "counter", backend, "cpu", 1)
+    program = EnvOptions(backend=backend).program(level)
     actions = play(program.level, 0, np.arange(worlds), PLAYED).astype(np.int64)
     world = program.start(np.zeros(worlds, dtype=np.int64), np.arange(worlds))
     for number in range(PLAYED):

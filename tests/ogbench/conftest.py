@@ -6,17 +6,17 @@ from typing import Any
 
 import pytest
 
-from powderdsl.ogbench.env import made_program
+from powderdsl.ogbench.env import EnvOptions
 from powderdsl.ogbench.program import LevelProgram
 
 
 @pytest.fixture(scope="session")
 def easy(torch: Any) -> LevelProgram:
     """The easy level on the backend `wasm`."""
-    return made_program("easy", "counter", "wasm", "cpu", 1)
+    return EnvOptions(backend="wasm").program("easy")
 
 
 @pytest.fixture(scope="session")
 def hard(torch: Any) -> LevelProgram:
     """The hard level on the backend `wasm`."""
-    return made_program("hard", "counter", "wasm", "cpu", 1)
+    return EnvOptions(backend="wasm").program("hard")

@@ -15,11 +15,10 @@ from click.testing import CliRunner
 
 from powderdsl.cli.dispatch import main
 from powderdsl.ogbench import collect as collecting
-from powderdsl.ogbench.collect import collect
+from powderdsl.ogbench.collect import collect, play, scripted
 from powderdsl.ogbench.datasets import load_dataset, make_env_and_datasets
 from powderdsl.ogbench.env import PowderworldEnv
 from powderdsl.ogbench.levels import find_level
-from powderdsl.ogbench.play import play, scripted
 from powderdsl.ogbench.program import LevelProgram
 
 ROWS = 20
@@ -30,7 +29,9 @@ NAME = "powderworld-easy-play-v0"
 def short(easy: LevelProgram) -> LevelProgram:
     """The easy level with short episodes."""
     program = object.__new__(LevelProgram)
-    program.__dict__.update(easy.__dict__, level=replace(easy.level, episode_steps=ROWS))
+    program.__dict__.update(
+        easy.__dict__, level=replace(easy.level, play=replace(easy.level.play, steps=ROWS))
+    )
     return program
 
 

@@ -13,11 +13,10 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import powderdsl.ogbench
-from powderdsl.ogbench.env import PowderworldEnv
+from powderdsl.ogbench.env import PowderworldEnv, PowderworldVectorEnv
 from powderdsl.ogbench.episodes import Episodes
 from powderdsl.ogbench.levels import find_level, read_level, shipped_levels
 from powderdsl.ogbench.program import LevelProgram
-from powderdsl.ogbench.vector import PowderworldVectorEnv
 
 
 def actions(count: int, worlds: int = 0, seed: int = 0) -> np.ndarray:
@@ -256,16 +255,17 @@ def test_damaged_levels_are_refused(tmp_path: Any) -> None:
 
     whole = json.loads((FOLDER / "easy.json").read_text())
     path = tmp_path / "mine.json"
-    path.write_text(json.dumps({**whole, "level": "mine"}))
+    path.write_text(json.dumps({**whole, "name": "mine"}))
     assert read_level(path).tasks == find_level("easy").tasks
     for change, error in (
         ({"side": "big"}, "`side` must be an integer"),
-        ({"side": 1 << 20}, "must lie in"),
+        ({"side": 1 << 20}, "`side` must be an integer from 4 to 512"),
         ({"brush": 0}, "`brush`"),
         ({"colour": 1}, "unknown key `colour`"),
-        ({"elements": []}, "at least one"),
+        ({"elements": []}, "`elements` must be a list of 1 to 256"),
+        ({"brush": 64}, "must be at most 32"),
         ({"tasks": [{"name": "a", "tolerance": 1, "actions": [["plant", 8, 0]]}]}, "not within"),
-        ({"play": {**whole["play"], "episodes": 0}}, "must lie in"),
+        ({"play": {**whole["play"], "episodes": 0}}, "`play.episodes` must be an integer from 1"),
     ):
         path.write_text(json.dumps({**whole, **change}))
         with pytest.raises(ValueError, match=error):

@@ -13,7 +13,7 @@ import pytest
 
 import powderdsl
 from powderdsl.ogbench.draws import LegacyDraws
-from powderdsl.ogbench.env import PowderworldEnv, made_program
+from powderdsl.ogbench.env import EnvOptions, PowderworldEnv
 from powderdsl.ogbench.episodes import Episodes
 
 EXCERPTS = Path(__file__).resolve().parents[1] / "data" / "second" / "ogbench"
@@ -70,7 +70,7 @@ def follow_planes(folder: Path, level: str) -> int:
     """The trace with given planes: ids, fields and pictures. Returns its number of steps."""
     with np.load(folder / "trace_planes.npz") as file:
         recorded = {name.removeprefix(f"{level}_"): file[name] for name in file if name.startswith(level)}
-    program = made_program(level, "ogbench", "torch", "cpu", 1)
+    program = EnvOptions(randomness="ogbench", backend="torch").program(level)
     episodes = Episodes(program, [0], randomness=Planes(recorded["random"]), mode="data_collection")
     episodes.begin(np.zeros(1, dtype=np.int64), [None])
     steps = len(recorded["random"])
@@ -105,7 +105,7 @@ def follow_goal(folder: Path, level: str, number: int) -> None:
         counts, ids, errors = (
             file[f"{kind}_{level}_task{number}"] for kind in ("counts", "goal_ids", "cross_error")
         )
-    program = made_program(level, "ogbench", "torch", "cpu", 1)
+    program = EnvOptions(randomness="ogbench", backend="torch").program(level)
     known = [program.simulator.ruleset.element(name) for name in names]
     seeds = np.arange(len(ids))
     draws = LegacyDraws(seeds, len(program.streams), program.level.side)
@@ -147,7 +147,7 @@ def first_successes(episodes: Episodes, number: int) -> np.ndarray:
 @pytest.mark.parametrize("randomness", ["counter", "ogbench"])
 @pytest.mark.parametrize("level", LEVELS)
 def test_replayed_goals_succeed_when_ogbenchs_do(torch: Any, level: str, randomness: str) -> None:
-    program = made_program(level, randomness, "wasm", "cpu", 1)
+    program = EnvOptions(randomness=randomness, backend="wasm").program(level)
     count = 5 if randomness == "ogbench" else 32
     for number, expected in enumerate(REPLAYED[level], 1):
         episodes = Episodes(program, np.arange(1000, 1000 + count), randomness=randomness)

@@ -49,7 +49,7 @@ def command(
     from powderdsl.ogbench.program import LevelProgram
 
     try:
-        with user_values(), progress(found.name, episodes or found.episodes, lines=True) as show:
+        with user_values(), progress(found.name, episodes or found.play.episodes, lines=True) as show:
             files = collect(
                 LevelProgram(found, backend=backend, device=device, threads=threads),
                 out,

@@ -15,7 +15,102 @@ from powderdsl.targets.cpp.program import PackedState
 from powderdsl.tasks.task import BLOW, Agent
 from powderdsl.worlds.raster import Size
 
-Array = np.ndarray[Any, np.dtype[Any]]
+CLOCK = ("seed", "index", "step")
+"""Tensors of `World` that draws depend on."""
+
+Numbers = Any
+"""int64 [B]: tensors, or for packed worlds NumPy's arrays, which start an operation on a few numbers in a fraction of
+the time."""
+
+
+def put_worlds(world: World, places: Tensor, part: World, *, reuse: bool) -> World:
+    """The worlds with those of numbers `places`, int64 [n], replaced. `reuse` writes into the world's own tensors."""
+    if len(places) == len(world):
+        return part
+    state: Mapping[str, Tensor]
+    if isinstance(world.state, PackedState):
+        state = world.state.put(places.cpu(), part.state, reuse=reuse)
+    else:
+        state = {
+            name: put_rows(value, places, part.state[name], reuse) for name, value in world.state.items()
+        }
+    clock = (put_rows(getattr(world, name), places, getattr(part, name), reuse) for name in CLOCK)
+    return World(world.sim, state, *clock)
+
+
+def put_rows(rows: Tensor, places: Tensor, part: Tensor, reuse: bool) -> Tensor:
+    """The rows of a tensor with those of numbers `places` replaced, in place with `reuse`."""
+    return (rows if reuse else rows.clone()).index_copy_(0, places, part)
+
+
+class Blocks:
+    """Blocks of cells in the worlds of one simulator and size.
+
+    Args:
+        edges: of rows, then of columns: the first line of each bin's block and the one after its last, int64 [bins, 2].
+    """
+
+    def __init__(self, sim: Simulator, size: Size, edges: tuple[Tensor, Tensor]):
+        self.size, self.edges = size, edges
+        self._lines = []
+        """Of rows, then of columns: all lines of each block, int64 [bins, n]; short blocks repeat their last."""
+        for first, end in (axis.T[:, :, None] for axis in edges):
+            width = torch.arange(int((end - first).max()), device=sim.device)
+            self._lines.append(torch.minimum(first + width, end - 1))
+        known = torch.tensor([[element.id for element in sim.ruleset.elements]], device=sim.device)
+        state = sim.world(known[None]).state
+        self.fresh: dict[str, Tensor] = {}
+        """What a new cell holds, by id: [256] or, of vectors, [256, 2]."""
+        for slot in sim.slots:
+            if slot.travels:
+                fresh = state[slot.name][0]
+                value = fresh[:, 0].T if slot.planes == 2 else fresh[0]
+                table = value[:1].repeat(256, *[1] * (value.ndim - 1))
+                table[known[0]] = value
+                self.fresh[slot.name] = table
+        self._arrays = {name: table.cpu().numpy() for name, table in self.fresh.items()}
+        self._edges = [axis.cpu().numpy() for axis in edges]
+
+    def fresh_cells(self, state: Mapping[str, Tensor], ids: Numbers) -> dict[str, Any]:
+        """What new cells of elements hold: arrays [B, …] for a packed state, tensors for others."""
+        tables: Mapping[str, Any] = self._arrays if isinstance(state, PackedState) else self.fresh
+        return {name: table[ids] for name, table in tables.items()}
+
+    def filled(
+        self,
+        state: Mapping[str, Tensor],
+        rows: Numbers,
+        columns: Numbers,
+        where: Any,
+        values: Mapping[str, Any],
+        *,
+        reuse: bool,
+    ) -> Mapping[str, Tensor]:
+        """A state with the block at bins `rows` and `columns` filled in the worlds of `where`, bool [B].
+
+        Args:
+            values: a value a world, [B] or [B, 2]. All are arrays for a packed state, and tensors for others.
+            reuse: write into the tensors of `state`.
+        """
+        if isinstance(state, PackedState):  # only the blocks are written, nothing is unpacked
+            boxes = np.concatenate([self._edges[0][rows], self._edges[1][columns]], 1) * where[:, None]
+            numbers = {
+                name: torch.from_numpy(value if value.dtype == np.float32 else value.astype(np.int64))
+                for name, value in values.items()
+            }
+            return state.fill(torch.from_numpy(boxes), numbers, reuse=reuse)
+        lines, across = self._lines[0][rows], self._lines[1][columns]
+        cells = (lines[:, :, None] * self.size[1] + across[:, None]).flatten(1)
+        found = dict(state)
+        for name, value in values.items():
+            slot = state[name] if reuse else state[name].clone()
+            flat = slot.flatten(-2)
+            index = cells if flat.ndim == 2 else cells[:, None].expand(-1, 2, -1)
+            before = flat.gather(-1, index)
+            filled = where.view(-1, *[1] * (before.ndim - 1))
+            flat.scatter_(-1, index, torch.where(filled, value.to(slot.dtype)[..., None], before))
+            found[name] = flat.view(slot.shape)
+        return found
 
 
 class Hands:
@@ -24,39 +119,17 @@ class Hands:
     def __init__(self, sim: Simulator, agent: Agent, size: Size, *, counts: bool):
         """`counts`: whether the cells that actions change are counted."""
         self.agent, self.size, self.device, self.counts = agent, size, sim.device, counts
+        edges = []
+        for axis, side in enumerate(size):
+            first = agent.first_line(axis, torch.arange(agent.bins[axis], device=self.device), side)
+            edges.append(torch.stack([first, first + agent.brush[axis]], 1).clamp(0, side))
+        self.blocks = Blocks(sim, size, (edges[0], edges[1]))
         self.choices = torch.tensor(agent.choices, device=self.device)
-        self.edges: tuple[Tensor, Tensor]
-        """Of rows, then of columns: the first line of each bin's block and the one after its last, int64 [bins, 2]."""
-        self.edges, self._lines = zip(*(self._brush(axis) for axis in (0, 1)), strict=True)
+        self._choices = self.choices.cpu().numpy()
         self.places_elements = any(choice >= 0 for choice in agent.choices)
-        known = torch.tensor([[element.id for element in sim.ruleset.elements]], device=self.device)
-        state = sim.world(known[None]).state
         self._slots = sim.slots
-        self._fresh: dict[str, Tensor] = {}
-        """What a new cell holds, by id: [256] or, of vectors, [256, 2]."""
-        for slot in sim.slots:
-            if slot.travels:
-                fresh = state[slot.name][0]
-                value = fresh[:, 0].T if slot.planes == 2 else fresh[0]
-                table = value[:1].repeat(256, *[1] * (value.ndim - 1))
-                table[known[0]] = value
-                self._fresh[slot.name] = table
-        # For packed worlds.
-        self._tables = {name: table.cpu().numpy() for name, table in self._fresh.items()}
-        self._choices, *self._edges = (one.cpu().numpy() for one in (self.choices, *self.edges))
-        self._by_element = [name for name, table in self._fresh.items() if (table != table[0]).any()]
-
-    def _brush(self, axis: int) -> tuple[Tensor, Tensor]:
-        """The rows (or columns) of the brush at each bin within the grid.
-
-        Returns:
-            the first, and the one after the last, int64 [bins, 2]; all of them, int64 [bins, brush], where those
-            outside stand for the nearest one inside, which the brush covers as well.
-        """
-        side, brush = self.size[axis], self.agent.brush[axis]
-        first = self.agent.first_line(axis, torch.arange(self.agent.bins[axis], device=self.device), side)
-        lines = first[:, None] + torch.arange(brush, device=self.device)
-        return torch.stack([first, first + brush], 1).clamp(0, side), lines.clamp(0, side - 1)
+        fresh = self.blocks.fresh
+        self._by_element = [name for name, table in fresh.items() if (table != table[0]).any()]
 
     def fresh_state(self, ids: Tensor) -> dict[str, Tensor]:
         """The state of new worlds of known ids, uint8 [B, H, W]: what `Simulator.world` makes, without its checks."""
@@ -64,10 +137,11 @@ class Hands:
         return {"element": ids, **{slot.name: self._fresh_slot(slot, ids) for slot in others}}
 
     def _fresh_slot(self, slot: Slot, ids: Tensor) -> Tensor:
+        fresh = self.blocks.fresh
         if slot.name in self._by_element:
-            new = self._fresh[slot.name][ids.int()]
+            new = fresh[slot.name][ids.int()]
             return new.movedim(-1, 1).contiguous() if slot.planes == 2 else new
-        default = self._fresh[slot.name][0] if slot.name in self._fresh else slot.default
+        default = fresh[slot.name][0] if slot.name in fresh else slot.default
         value = torch.as_tensor(default, dtype=getattr(torch, slot.dtype), device=self.device)
         everywhere = value[..., None, None].expand(len(ids), *value.shape, *self.size)
         return everywhere.clone(memory_format=torch.contiguous_format)
@@ -79,80 +153,23 @@ class Hands:
             the worlds; int64 [B] each: the number of cells ``painted``, and 1 if an element was ``placed``, or cells
             were ``blown``.
         """
-        if isinstance(world.state, PackedState) and not self.counts:
-            return self._act_packed(world, world.state, actions, reuse)
-        choice = self.choices[actions[:, 2]]
-        blown, placed = choice == BLOW, choice >= 0
-        state, painted = world.state, torch.zeros_like(choice)
+        state, packed = world.state, isinstance(world.state, PackedState)
+        numbers: Any = actions.numpy() if packed else actions
+        choice = (self._choices if packed else self.choices)[numbers[:, 2]]
+        rows, columns, blown, placed = numbers[:, 1], numbers[:, 0], choice == BLOW, choice >= 0
+        painted = torch.zeros(len(choice), dtype=torch.int64, device=self.device)
         if self.places_elements:
-            ids = choice.clamp(min=0)
             before = state["element"].clone() if self.counts else None
-            values = {name: table[ids] for name, table in self._fresh.items()}
-            state = self._filled(world, state, actions, placed, values, reuse)
+            values = self.blocks.fresh_cells(state, choice.clip(0))
+            state = self.blocks.filled(state, rows, columns, placed, values, reuse=reuse)
             if before is not None:
                 painted = (before != state["element"]).sum((1, 2))
         if self.agent.speed_field is not None:
-            speed = self.agent.speed * (actions[:, [4, 3]] - 1).float()
-            state = self._filled(world, state, actions, blown, {self.agent.speed_field: speed}, reuse)
-        done = {"painted": painted, "placed": placed.long(), "blown": blown.long()}
-        return world.with_state(state), done
-
-    def _act_packed(
-        self, world: World, state: PackedState, actions: Tensor, reuse: bool
-    ) -> tuple[World, dict[str, Tensor]]:
-        """The same in native memory. NumPy starts an operation on a few numbers in a fraction of torch's time."""
-        numbers = actions.numpy()
-        choice = self._choices[numbers[:, 2]]
-        blown, placed = choice == BLOW, choice >= 0
-        boxes = np.concatenate([edges[numbers[:, 1 - axis]] for axis, edges in enumerate(self._edges)], 1)
-        if self.places_elements:
-            ids = choice.clip(0)
-            values = {name: table[ids] for name, table in self._tables.items()}
-            state = _filled_packed(state, boxes, placed, values, reuse)
-        if self.agent.speed_field is not None:
-            speed = (np.float32(self.agent.speed) * (numbers[:, [4, 3]] - 1)).astype(np.float32)
-            reuse = reuse or state is not world.state
-            state = _filled_packed(state, boxes, blown, {self.agent.speed_field: speed}, reuse)
-        done = {"painted": np.zeros(len(choice)), "placed": placed, "blown": blown}
-        numbered = {name: torch.from_numpy(value.astype(np.int64)) for name, value in done.items()}
-        return world.with_state(state), numbered
-
-    def _filled(
-        self,
-        world: World,
-        state: Mapping[str, Tensor],
-        actions: Tensor,
-        where: Tensor,
-        values: Mapping[str, Tensor],
-        reuse: bool,
-    ) -> Mapping[str, Tensor]:
-        """A state of `world`'s with the block of each action filled: a value a world, [B] or [B, 2], in those of `where`."""
-        if isinstance(state, PackedState):  # only the blocks are written, nothing is unpacked
-            boxes = torch.cat([edges[actions[:, 1 - axis]] for axis, edges in enumerate(self.edges)], 1)
-            arrays = {name: value.numpy() for name, value in values.items()}
-            return _filled_packed(
-                state, boxes.numpy(), where.numpy(), arrays, reuse or state is not world.state
-            )
-        rows, columns = (lines[actions[:, 1 - axis]] for axis, lines in enumerate(self._lines))
-        cells = (rows[:, :, None] * self.size[1] + columns[:, None]).flatten(1)
-        found = dict(state)
-        for name, value in values.items():
-            slot = state[name] if reuse else state[name].clone()
-            flat = slot.flatten(-2)
-            index = cells if flat.ndim == 2 else cells[:, None].expand(-1, 2, -1)
-            kept = flat.gather(-1, index)
-            filled = where.view(-1, *[1] * (kept.ndim - 1))
-            flat.scatter_(-1, index, torch.where(filled, value.to(slot.dtype)[..., None], kept))
-            found[name] = flat.view(slot.shape)
-        return found
-
-
-def _filled_packed(
-    state: PackedState, boxes: Array, where: Array, values: Mapping[str, Array], reuse: bool
-) -> PackedState:
-    """A state with boxes int64 [B, 4] filled where `where`, bool [B], is set: only they are written, nothing is unpacked."""
-    numbers = {
-        name: torch.from_numpy(one if one.dtype == np.float32 else one.astype(np.int64))
-        for name, one in values.items()
-    }
-    return state.fill(torch.from_numpy(boxes * where[:, None]), numbers, reuse=reuse)
+            # Directions are −1, 0 and 1, so that products in double precision are exact.
+            speed = self.agent.speed * (numbers[:, [4, 3]] - 1)
+            speed = speed.astype(np.float32) if packed else speed.float()
+            values = {self.agent.speed_field: speed}
+            own = reuse or (packed and state is not world.state)
+            state = self.blocks.filled(state, rows, columns, blown, values, reuse=own)
+        done = {"placed": torch.as_tensor(placed).long(), "blown": torch.as_tensor(blown).long()}
+        return world.with_state(state), {"painted": painted, **done}
