@@ -81,7 +81,7 @@ class Patches(MatrixPatches):
         values: [C, 256], what the bytes of each channel stand for; those of the first are not used.
     """
 
-    def __init__(self, elements: int, size: tuple[int, int], patches: tuple[int, int], values: Any):
+    def __init__(self, elements: int, size: tuple[int, int], patches: tuple[int, int], values: Tensor):
         super().__init__(elements + len(values) - 1, size, patches)
         self.elements = elements
         first = (self.places[0][:, None] * patches[1] + self.places[1]) * elements
@@ -89,7 +89,7 @@ class Patches(MatrixPatches):
         rows, columns = self.get_buffer("rows").T, self.get_buffer("columns")
         share = rows.amax(0)[:, None] * columns.amax(0)  # one cell's part of its patch
         self.register_buffer("share", share[..., None].contiguous())
-        self.register_buffer("values", torch.as_tensor(values, dtype=torch.float32))
+        self.register_buffer("values", values.float().cpu())
 
     def forward(self, observed: Tensor) -> Tensor:
         batch, count = len(observed), self.patches[0] * self.patches[1] * self.elements
@@ -118,16 +118,27 @@ class Frames(nn.Module):
         return seen.view(len(observed), self.channels, *seen.shape[2:])
 
 
-class _Convolutions(BaseFeaturesExtractor):
-    """Two convolutions on what `see` makes of observations, and a fully connected layer."""
+class Features(BaseFeaturesExtractor):
+    """Two convolutions on what `see` makes of observations, and a fully connected layer.
+
+    Args:
+        channels: of what `see` makes. widths: features of the two convolutions. strides: (kernel, stride, padding) of both.
+    """
 
     def __init__(
-        self, space: spaces.Box, features_dim: int, see: nn.Module, first: nn.Conv2d, second: nn.Conv2d
+        self,
+        observation_space: spaces.Box,
+        features_dim: int,
+        see: nn.Module,
+        channels: int,
+        widths: tuple[int, int],
+        shapes: tuple[tuple[int, int, int], tuple[int, int, int]],
     ):
-        super().__init__(space, features_dim)
+        super().__init__(observation_space, features_dim)
+        first, second = nn.Conv2d(channels, widths[0], *shapes[0]), nn.Conv2d(*widths, *shapes[1])
         convolutions = nn.Sequential(see, first, nn.ReLU(), second, nn.ReLU(), nn.Flatten())
         with torch.no_grad():
-            width = convolutions(torch.zeros(1, *space.shape)).shape[1]
+            width = convolutions(torch.zeros(1, *observation_space.shape)).shape[1]
         self.layers = nn.Sequential(convolutions, nn.Linear(width, features_dim), nn.ReLU())
 
     def forward(self, observed: Tensor) -> Tensor:
@@ -136,78 +147,27 @@ class _Convolutions(BaseFeaturesExtractor):
         return features
 
 
-class PaperFeatures(_Convolutions):
-    """Two convolutions of kernel 3 with 32 and 64 features, and a fully connected layer; the policy's own layer is the
-    second. The paper does not give the stride; with 2, the fully connected layer has a sixteenth of the weights.
-
-    Args:
-        sources, tables: those of `Expand`; without them, observations are channels already.
-    """
-
-    def __init__(
-        self,
-        observation_space: spaces.Box,
-        features_dim: int = 256,
-        stride: int = 2,
-        sources: tuple[int, ...] | None = None,
-        tables: Any = None,
-        frames: int = 1,
-    ):
-        see: nn.Module = nn.Identity() if sources is None else Expand(sources, tables)
-        channels = observation_space.shape[0] if sources is None else len(sources) * frames
-        if frames > 1 and sources is not None:
-            see = Frames(see, frames)
-        first, second = nn.Conv2d(channels, 32, 3, stride), nn.Conv2d(32, 64, 3, stride)
-        super().__init__(observation_space, features_dim, see, first, second)
-
-
-class PatchFeatures(_Convolutions):
-    """Two convolutions of 32 features on patches, and a fully connected layer.
-
-    Args:
-        elements, patches, values: those of `Patches`; `values` is None for `matrix` observations.
-    """
-
-    def __init__(
-        self,
-        observation_space: spaces.Box,
-        features_dim: int,
-        elements: int,
-        patches: tuple[int, int],
-        values: Any = None,
-        frames: int = 1,
-    ):
-        channels, height, width = observation_space.shape
-        see = _patches(elements, channels // frames, (height, width), patches, values, frames)
-        first, second = nn.Conv2d(see.channels, 32, 3, 2, 1), nn.Conv2d(32, 32, 3, 1, 1)
-        super().__init__(observation_space, features_dim, see, first, second)
-
-
-def _patches(
-    elements: int, channels: int, size: tuple[int, int], patches: tuple[int, int], values: Any, frames: int
-) -> Any:
-    if values is None:
-        see: Any = MatrixPatches(channels, size, patches)
-    else:
-        see = Patches(elements, size, patches, values)
-    return see if frames == 1 else Frames(see, frames)
-
-
 def patches_of(env: TensorEnv, patches: tuple[int, int], frames: int = 1) -> Any:
     """A module from stacked observations of an environment to patches [B, its `channels`, rows, columns].
 
     Raises:
         ValueError: for observations that are pictures.
     """
-    if env.observation.kind == "rgb":
-        raise ValueError("this network does not take pictures: use the policy's own")
-    count = len(env.observation.channels)
-    values = None if env.observation.kind == "matrix" else env.simulator.observer.compact_values[:count]
-    return _patches(env.simulator.ruleset.slots, count, env.task.size, patches, values, frames)
+    _refuse_pictures(env)
+    count, size = len(env.observation.channels), env.task.size
+    if env.observation.kind == "matrix":
+        see = MatrixPatches(count, size, patches)
+    else:
+        values = env.simulator.observer.compact_values[:count]
+        see = Patches(env.simulator.ruleset.slots, size, patches, values)
+    return see if frames == 1 else Frames(see, frames)
 
 
-def paper_policy(env: TensorEnv, features_dim: int = 256, stride: int = 2, frames: int = 1) -> dict[str, Any]:
+def paper_policy(env: TensorEnv, features_dim: int = 256, frames: int = 1) -> dict[str, Any]:
     """`policy_kwargs` of ``CnnPolicy`` for the observations of an environment: the paper's network.
+
+    Two convolutions of kernel 3 with 32 and 64 features, and a fully connected layer; the policy's own layer is the
+    second. The paper does not give the stride; with 2, the fully connected layer has a sixteenth of the weights.
 
     Args:
         frames: how many observations are stacked, as `VecFrameStack` of Stable-Baselines3 does.
@@ -215,14 +175,16 @@ def paper_policy(env: TensorEnv, features_dim: int = 256, stride: int = 2, frame
     Raises:
         ValueError: for observations that are pictures.
     """
-    how: dict[str, Any] = {"stride": stride, "frames": frames}
-    if env.observation.kind in ("ids", "compact"):
+    _refuse_pictures(env)
+    see: nn.Module = nn.Identity()
+    channels = len(env.observation.channels) * frames
+    if env.observation.kind != "matrix":
         sources, tables = env.simulator.observer.matrix_tables
         every = env.observation.kind == "compact"
-        kept = [channel for channel, source in enumerate(sources) if every or source == 0]
-        how["sources"] = tuple(sources[channel] for channel in kept)
-        how["tables"] = tables[kept].tolist()
-    return _policy(env, PaperFeatures, features_dim, how)
+        shown = [channel for channel, source in enumerate(sources) if every or source == 0]
+        see = Expand(tuple(sources[channel] for channel in shown), tables[shown].cpu())
+        see, channels = (see if frames == 1 else Frames(see, frames)), len(shown) * frames
+    return _policy(features_dim, see, channels, (32, 64), ((3, 2, 0), (3, 2, 0)))
 
 
 def small_policy(env: TensorEnv, features_dim: int = 128, frames: int = 1) -> dict[str, Any]:
@@ -233,26 +195,29 @@ def small_policy(env: TensorEnv, features_dim: int = 128, frames: int = 1) -> di
     Raises:
         ValueError: for observations that are pictures.
     """
-    sides = zip(env.task.size, env.task.agent.bins, strict=True)
-    how: dict[str, Any] = {
-        "elements": env.simulator.ruleset.slots,
-        "frames": frames,
-        "patches": tuple(min(side, max(FEWEST, min(MOST, count))) for side, count in sides),
-    }
-    if env.observation.kind != "matrix":
-        values = env.simulator.observer.compact_values[: len(env.observation.channels)]
-        how["values"] = values.tolist()
-    return _policy(env, PatchFeatures, features_dim, how)
+    rows, columns = (
+        min(side, max(FEWEST, min(MOST, count)))
+        for side, count in zip(env.task.size, env.task.agent.bins, strict=True)
+    )
+    see = patches_of(env, (rows, columns), frames)
+    return _policy(features_dim, see, see.channels, (32, 32), ((3, 2, 1), (3, 1, 1)))
 
 
-def _policy(
-    env: TensorEnv, features: type[_Convolutions], features_dim: int, how: dict[str, Any]
-) -> dict[str, Any]:
+def _refuse_pictures(env: TensorEnv) -> None:
     if env.observation.kind == "rgb":
         raise ValueError("this network does not take pictures: use the policy's own")
+
+
+def _policy(features_dim: int, see: nn.Module, channels: int, widths: Any, shapes: Any) -> dict[str, Any]:
     return {
-        "features_extractor_class": features,
-        "features_extractor_kwargs": {"features_dim": features_dim, **how},
+        "features_extractor_class": Features,
+        "features_extractor_kwargs": {
+            "features_dim": features_dim,
+            "see": see,
+            "channels": channels,
+            "widths": widths,
+            "shapes": shapes,
+        },
         "net_arch": [features_dim],
         "normalize_images": False,
     }

@@ -90,19 +90,21 @@ class TensorEnv:
         device: str | torch.device = "cpu",
         threads: int | None = None,
     ):
-        _check_count("num_envs", num_envs)
-        _check_count("worlds", worlds)
-        _check_count("max_episode_steps", 1 if max_episode_steps is None else max_episode_steps)
+        steps = 1 if max_episode_steps is None else max_episode_steps
+        counts: dict[str, Any] = {"num_envs": num_envs, "worlds": worlds, "max_episode_steps": steps}
+        for name, value in counts.items():
+            if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
+                raise ValueError(f"{name} must be an integer from 1, found {value!r}")
         if last_action not in LAST_ACTIONS:
             raise ValueError(f"last_action is one of {', '.join(LAST_ACTIONS)}; found {last_action!r}")
-        if not isinstance(task, TaskProgram):
-            if isinstance(task, Task) and (knobs or params):
-                raise ValueError("knobs and params are given to `load_task` where the task is loaded before")
-            found = task if isinstance(task, Task) else load_task(task, knobs=knobs, params=params)
-            check_cells(num_envs, found.size)
-            task = compile_task(found, split=split, backend=backend, device=device, threads=threads)
+        if isinstance(task, Task) and (knobs or params):
+            raise ValueError("knobs and params are given to `load_task` where the task is loaded before")
+        if isinstance(task, str | Path):
+            task = load_task(task, knobs=knobs, params=params)
+        check_cells(num_envs, task.size if isinstance(task, Task) else task.task.size)
+        if isinstance(task, Task):
+            task = compile_task(task, split=split, backend=backend, device=device, threads=threads)
         self.program, self.task, self.split = task, task.task, task.split
-        check_cells(num_envs, self.task.size)
         self.num_envs, self.worlds = num_envs, worlds
         self.simulator = self.program.simulator
         self.device = self.simulator.device
@@ -150,9 +152,8 @@ class TensorEnv:
             TypeError, ValueError, KeyError: something is wrong with a seed or an option. Nothing has changed then.
         """
         given = dict(options or {})
-        unknown = [name for name in given if name not in OPTIONS]
-        if unknown:
-            raise KeyError(f"no option `{unknown[0]}`: there are {', '.join(OPTIONS)}")
+        if unknown := given.keys() - {*OPTIONS}:
+            raise KeyError(f"no option `{min(unknown)}`: there are {', '.join(OPTIONS)}")
         mask = self._mask(given.get("reset_mask"))
         base, seeded = self._bases(seed)
         params = self._new_params(given.get("params"), mask)
@@ -206,20 +207,17 @@ class TensorEnv:
             old = torch.arange(first, first + self.num_envs, device=self.device)
         if seed is None:
             return old, torch.zeros_like(self._ended)
-        if _is_integer(seed):
-            seeds: list[int | None] = [int(seed) + i for i in range(self.num_envs)]
+        if isinstance(seed, int | np.integer) and not isinstance(seed, bool):
+            seeds: Sequence[int | None] = [int(seed) + number for number in range(self.num_envs)]
         elif isinstance(seed, Sequence) and not isinstance(seed, str):
-            seeds = list(seed)
+            seeds = seed
         else:
             raise TypeError(f"seed takes an integer, a list of them, or None; found {seed!r}")
         if len(seeds) != self.num_envs:
             raise ValueError(f"seed has {len(seeds)} numbers for {self.num_envs} environments")
-        for one in seeds:
-            if one is not None and not _is_integer(one):
-                raise TypeError(f"a seed is an integer, found {one!r}")
-            if one is not None and not 0 <= one < 1 << 62:
-                raise ValueError(f"a seed lies in 0..2⁶²−1, found {one}")
-        new = torch.tensor([0 if one is None else int(one) for one in seeds], device=self.device)
+        new = integer_tensor("seed", [0 if one is None else one for one in seeds], self.device)
+        if bool(((new < 0) | (new >= 1 << 62)).any()):
+            raise ValueError(f"a seed lies in 0..2⁶²−1, found {seed}")
         given = torch.tensor([one is not None for one in seeds], device=self.device)
         return torch.where(given, new, old), given
 
@@ -227,12 +225,11 @@ class TensorEnv:
         if value is None:
             return torch.ones_like(self._ended)
         mask = torch.as_tensor(value, device=self.device)
-        if mask.dtype != torch.bool:
-            raise TypeError(f"reset_mask must be a bool array, found {mask.dtype}")
-        if mask.shape != self._ended.shape:
-            raise ValueError(f"reset_mask must have the shape [{self.num_envs}], found {list(mask.shape)}")
-        if not bool(mask.any()):
-            raise ValueError("reset_mask is False everywhere")
+        if mask.dtype != torch.bool or mask.shape != self._ended.shape or not bool(mask.any()):
+            found = f"{mask.dtype} {list(mask.shape)}"
+            raise ValueError(
+                f"reset_mask must be bool [{self.num_envs}], True for some environments; found {found}"
+            )
         if self.episodes is None and not bool(mask.all()):
             raise ResetNeeded("the first reset begins all episodes: reset_mask must be True everywhere")
         return mask
@@ -371,15 +368,6 @@ class TensorEnv:
         fresh = self.program.start(world_seeds(self._base, self._episode, self.worlds)[places])
         self.episodes = self.program.put(self.episodes, places, fresh, reuse=True)
         observed[places] = self.observation.of(fresh.world)
-
-
-def _is_integer(value: Any) -> bool:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool)
-
-
-def _check_count(name: str, value: Any) -> None:
-    if not _is_integer(value) or value < 1:
-        raise ValueError(f"{name} must be an integer from 1, found {value!r}")
 
 
 def check_cells(num_envs: int, size: tuple[int, int]) -> None:

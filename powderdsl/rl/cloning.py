@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,27 +25,22 @@ def open_demonstrations(folder: str | Path, env: TensorEnv) -> Dataset:
     return found
 
 
-def clone(
-    policy: ActorCriticPolicy,
-    dataset: Dataset,
-    config: TrainConfig,
-    tell: Callable[[int, int, dict[str, float]], None] | None = None,
-) -> None:
+def clone(policy: ActorCriticPolicy, dataset: Dataset, config: TrainConfig) -> dict[str, float]:
     """Fit a policy to a dataset: its likelihood of the actions, and its values to the discounted returns.
 
     `config.init_epochs` times as many transitions are drawn as there are; which ones depends on `config.seed` alone. The
     learning rate falls to zero.
 
-    Args:
-        tell: called after every hundredth update with its number, the number of all, and the loss, the accuracy (the share
-            of transitions whose recorded action is the policy's likeliest) and the error of values since the last call.
+    Returns:
+        means over the last hundred updates at most: the loss, the accuracy (the share of transitions whose recorded
+        action is the policy's likeliest) and the error of values.
     """
     rows, returns = Transitions(dataset), _returns(dataset, config.gamma)
     updates = max(1, config.init_epochs * len(rows) // BATCH)
     spread = max(float(returns.var()), 1e-6)  # so that values do not outweigh actions
     optimizer = torch.optim.Adam(policy.parameters(), lr=RATE)
     policy.set_training_mode(True)
-    sums, since = np.zeros(3), 0
+    figures = []
     for number in range(updates):
         for group in optimizer.param_groups:
             group["lr"] = RATE * (1 - number / updates)
@@ -62,18 +56,13 @@ def clone(
         loss.backward()
         torch.nn.utils.clip_grad_norm_(policy.parameters(), config.max_grad_norm)
         optimizer.step()
-        if tell is None:
-            continue
-        with torch.no_grad():
-            likeliest: Any = policy.get_distribution(observed).mode()
-        agree = (likeliest == actions).all(1).float().mean()
-        sums += [-float(likelihood.detach().mean()), float(agree), float(error.detach())]
-        since += 1
-        if since == 100 or number + 1 == updates:
-            loss_, accuracy, error_ = sums / since
-            tell(number + 1, updates, {"loss": loss_, "accuracy": accuracy, "value_error": error_})
-            sums, since = np.zeros(3), 0
+        if number >= (updates - 1) // 100 * 100:
+            with torch.no_grad():
+                likeliest: Any = policy.get_distribution(observed).mode()
+            agree = (likeliest == actions).all(1).float().mean()
+            figures.append([-float(likelihood.detach().mean()), float(agree), float(error.detach())])
     policy.set_training_mode(False)
+    return dict(zip(("loss", "accuracy", "value_error"), np.mean(figures, 0).tolist(), strict=True))
 
 
 def _returns(dataset: Dataset, gamma: float) -> NDArray[np.float32]:

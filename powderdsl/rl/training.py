@@ -18,11 +18,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger
-from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, unwrap_vec_wrapper
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
 
 from powderdsl.compiler import whole_palette
 from powderdsl.datasets.recorder import record
@@ -84,8 +83,8 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
     run = open_run(folder, KIND, plain)
     with run.locked(), _own_random_numbers(config.threads):
         run.write_json(ASKED, config.as_json())
-        found = run.latest_checkpoint()
-        step = 0 if found is None else found.step
+        checkpoint = run.latest_checkpoint()
+        step = 0 if checkpoint is None else checkpoint.step
         if step >= config.steps:
             return run
         program = compile_task(
@@ -95,32 +94,30 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
             device=config.device,
             threads=config.threads,
         )
-        env = PowderVecEnv(
-            program, config.envs, observation=config.observation, worlds=config.worlds, actions="full"
-        )
-        model = _model(config, env)
+        learner = _Learner(config, program)
         with run.metrics(step) as metrics:
-            model.set_logger(Logger(None, [_MetricsWriter(metrics)]))
-            if found is not None:
+            learner.model.set_logger(Logger(None, [_MetricsWriter(metrics)]))
+            if checkpoint is not None:
                 try:
-                    _restore(model, env, found.state)
+                    learner.restore(checkpoint.state)
                 except (RuntimeError, TypeError, ValueError, AttributeError, LookupError) as error:
                     why = " ".join(str(error).split())[:300]
-                    raise does_not_fit(found.path, f"its state is that of another run: {why}") from None
+                    raise does_not_fit(checkpoint.path, f"its state is that of another run: {why}") from None
             elif config.init_from or config.init_expert:
-                _clone(model, env, run, config, metrics)
+                _clone(learner, run, config, metrics)
             held_out = None
             if config.eval_every:
-                held_out = _HeldOut(task, program, model, metrics, config, -1 if found is None else step)
-            keeper = _Keeper(run, env, config.checkpoint_minutes, progress, held_out)
+                unseen = TaskProgram(task, config.eval_split, program.simulator)
+                held_out = _HeldOut(unseen, learner, metrics, -1 if checkpoint is None else step)
+            keeper = _Keeper(run, learner, progress, held_out)
             try:
-                model.learn(config.steps - step, callback=keeper, reset_num_timesteps=found is None)
+                learner.model.learn(config.steps - step, keeper, reset_num_timesteps=checkpoint is None)
             except KeyboardInterrupt:
-                keeper.save_kept()
+                keeper.save_latest()
                 raise
             if held_out is not None:
-                held_out.after(model.num_timesteps)
-            run.save_checkpoint(model.num_timesteps, _state(model, env))
+                held_out.after(learner.step)
+            run.save_checkpoint(learner.step, learner.state())
     return run
 
 
@@ -132,30 +129,96 @@ def _task_and_palette(config: TrainConfig) -> tuple[Task, tuple[str | None, ...]
     return load_task(config.task, **how, palette=palette), palette
 
 
-def _model(config: TrainConfig, env: PowderVecEnv) -> PPO:
-    with warnings.catch_warnings():
-        # Where batches do not divide a rollout, the last one of an epoch is smaller: no mistake.
-        warnings.filterwarnings("ignore", "You have specified a mini-batch size", UserWarning)
-        kind, how = policy_of(config, env.tensors)
-        return PPO(
-            kind,
-            _wrapped(config, env),
-            learning_rate=_rate(config),
-            n_steps=config.rollout,
-            batch_size=config.batch,
-            n_epochs=config.epochs,
-            gamma=config.gamma,
-            gae_lambda=config.gae_lambda,
-            clip_range=config.clip,
-            ent_coef=config.entropy,
-            vf_coef=config.vf_coef,
-            max_grad_norm=config.max_grad_norm,
-            target_kl=config.target_kl or None,
-            normalize_advantage=config.normalize in ("advantage", "both"),
-            policy_kwargs=how,
-            device=config.device,
-            seed=config.seed,
+class _Learner:
+    """The PPO of a run, with its environment: perhaps with stacked observations and normalized rewards."""
+
+    def __init__(self, config: TrainConfig, program: TaskProgram):
+        self.config = config
+        self.worlds = PowderVecEnv(
+            program, config.envs, observation=config.observation, worlds=config.worlds, actions="full"
         )
+        env: VecEnv = self.worlds
+        self.stack = self.normal = None
+        if config.frames > 1:
+            env = self.stack = VecFrameStack(env, config.frames, channels_order="first")
+        if config.normalize in ("reward", "both"):
+            env = self.normal = VecNormalize(env, norm_obs=False, gamma=config.gamma)
+        kind, how = policy_of(config, self.worlds.tensors)
+        with warnings.catch_warnings():
+            # Where batches do not divide a rollout, the last one of an epoch is smaller: no mistake.
+            warnings.filterwarnings("ignore", "You have specified a mini-batch size", UserWarning)
+            self.model = PPO(
+                kind,
+                env,
+                learning_rate=_rate(config),
+                n_steps=config.rollout,
+                batch_size=config.batch,
+                n_epochs=config.epochs,
+                gamma=config.gamma,
+                gae_lambda=config.gae_lambda,
+                clip_range=config.clip,
+                ent_coef=config.entropy,
+                vf_coef=config.vf_coef,
+                max_grad_norm=config.max_grad_norm,
+                target_kl=config.target_kl or None,
+                normalize_advantage=config.normalize in ("advantage", "both"),
+                policy_kwargs=how,
+                device=config.device,
+                seed=config.seed,
+            )
+
+    @property
+    def step(self) -> int:
+        """The interactions so far."""
+        return self.model.num_timesteps
+
+    def state(self) -> dict[str, Any]:
+        """Everything that later training depends on. Tensors of the model are not copied."""
+        model = self.model
+        state = {
+            "policy": model.policy.state_dict(),
+            "optimizer": model.policy.optimizer.state_dict(),
+            "env": self.worlds.state(),
+            "starts": torch.as_tensor(np.asarray(model._last_episode_starts)),
+            "episodes": [[one["r"], one["l"], one["t"]] for one in model.ep_info_buffer or ()],
+            "successes": [bool(one) for one in model.ep_success_buffer or ()],
+            "updates": model._n_updates,
+            "logged": _numbers(
+                model.logger.name_to_value
+            ),  # of the update that is shown after the next rollout
+            "steps": self.step,
+            "random": _random_state(),
+        }
+        if self.stack is not None:
+            state["frames"] = torch.from_numpy(self.stack.stacked_obs.stacked_obs.copy())
+        if self.normal is not None:
+            spread = self.normal.ret_rms
+            state["rewards"] = [float(spread.mean), float(spread.var), float(spread.count)]
+            state["returns"] = torch.from_numpy(self.normal.returns.copy())
+        return state
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from a `state`."""
+        model = self.model
+        model.policy.load_state_dict(state["policy"])
+        model.policy.optimizer.load_state_dict(state["optimizer"])
+        model._last_obs = self.worlds.restore(state["env"])
+        if self.stack is not None:
+            self.stack.stacked_obs.stacked_obs[...] = state["frames"].numpy()
+            model._last_obs = self.stack.stacked_obs.stacked_obs.copy()
+        if self.normal is not None:
+            spread: Any = self.normal.ret_rms
+            spread.mean, spread.var, spread.count = (np.float64(one) for one in state["rewards"])
+            self.normal.returns[...] = state["returns"].numpy()
+        model._last_episode_starts = state["starts"].numpy()
+        size = model._stats_window_size
+        episodes = ({"r": r, "l": length, "t": t} for r, length, t in state["episodes"])
+        model.ep_info_buffer = deque(episodes, maxlen=size)
+        model.ep_success_buffer = deque(state["successes"], maxlen=size)
+        model._n_updates, model.num_timesteps = state["updates"], state["steps"]
+        for name, value in state["logged"].items():
+            model.logger.record(name, value)
+        _set_random_state(state["random"])
 
 
 def _rate(config: TrainConfig) -> float | Callable[[float], float]:
@@ -176,23 +239,15 @@ def _rate(config: TrainConfig) -> float | Callable[[float], float]:
     return rate
 
 
-def _wrapped(config: TrainConfig, env: PowderVecEnv) -> VecEnv:
-    """The environment with stacked observations and normalized rewards, as far as they are asked for."""
-    found: VecEnv = env
-    if config.frames > 1:
-        found = VecFrameStack(found, config.frames, channels_order="first")
-    if config.normalize in ("reward", "both"):
-        found = VecNormalize(found, norm_obs=False, gamma=config.gamma)
-    return found
-
-
-def _clone(model: PPO, env: PowderVecEnv, run: RunFolder, config: TrainConfig, metrics: Metrics) -> None:
+def _clone(learner: _Learner, run: RunFolder, config: TrainConfig, metrics: Metrics) -> None:
     """Behavior cloning of `config.init_from`, or of the task's expert. Its numbers are metrics of the run at step 0."""
+    env, folder = learner.worlds.tensors, Path(config.init_from)
     if config.init_expert:
+        folder = run.path / DEMONSTRATIONS
         record(
-            env.tensors.program,
+            env.program,
             "expert",
-            run.path / DEMONSTRATIONS,
+            folder,
             episodes=config.init_expert,
             seed=config.seed * config.init_expert,
             observation=config.observation,
@@ -200,11 +255,8 @@ def _clone(model: PPO, env: PowderVecEnv, run: RunFolder, config: TrainConfig, m
             envs=config.envs,
             worlds=config.worlds,
         )
-    folder = run.path / DEMONSTRATIONS if config.init_expert else config.init_from
-    dataset = open_demonstrations(folder, env.tensors)
-    found: dict[str, float] = {}
-    clone(model.policy, dataset, config, lambda number, of, numbers: found.update(numbers))
-    metrics.write(0, {f"clone/{name}": value for name, value in found.items()})
+    numbers = clone(learner.model.policy, open_demonstrations(folder, env), config)
+    metrics.write(0, {f"clone/{name}": value for name, value in numbers.items()})
 
 
 class _HeldOut:
@@ -214,78 +266,62 @@ class _HeldOut:
         done: the interactions up to which this has been done; -1 for a run that begins.
     """
 
-    def __init__(
-        self,
-        task: Task,
-        program: TaskProgram,
-        model: PPO,
-        metrics: Metrics,
-        config: TrainConfig,
-        done: int,
-    ):
-        self.program = TaskProgram(task, config.eval_split, program.simulator)
-        self.model, self.metrics, self.config, self.done = model, metrics, config, done
+    def __init__(self, program: TaskProgram, learner: _Learner, metrics: Metrics, done: int):
+        self.program, self.learner, self.metrics, self.done = program, learner, metrics, done
 
     def after(self, step: int) -> None:
         """Play after some interactions, if a multiple of `eval_every` lies in the last rollout, and before the first."""
-        config = self.config
+        config = self.learner.config
         before = step - config.rollout * config.envs
         if step > self.done and (not step or step // config.eval_every > before // config.eval_every):
             self._play(step)
         self.done = step
 
     def _play(self, step: int) -> None:
-        config, policy = self.config, self.model.policy
-        channels = len(channels_of(config.observation, self.program.simulator.observer))
+        config, policy = self.learner.config, self.learner.model.policy
+        channels = len(self.learner.worlds.tensors.observation.channels)
         trained = TrainedPolicy(policy, config.observation, channels, step, frames=config.frames)
         policy.set_training_mode(False)
         worlds = torch.arange(config.eval_episodes)
         returns = play(self.program, trained, worlds, observation=config.observation).returns
         mean, half = mean_and_interval(returns)
-        found = {"held_out/return": mean} | ({} if half is None else {"held_out/interval": half})
-        self.metrics.write(step, found)
+        interval = {} if half is None else {"held_out/interval": half}
+        self.metrics.write(step, {"held_out/return": mean, **interval})
 
 
 class _Keeper(BaseCallback):
     """Saves between rollouts, and keeps the latest unsaved state in memory."""
 
     def __init__(
-        self,
-        run: RunFolder,
-        env: PowderVecEnv,
-        minutes: float,
-        progress: Progress | None,
-        held_out: _HeldOut | None,
+        self, run: RunFolder, learner: _Learner, progress: Progress | None, held_out: _HeldOut | None
     ):
         super().__init__()
-        self.model: PPO
-        self.run, self.worlds, self.seconds, self.progress = run, env, minutes * 60, progress
-        self.held_out = held_out
+        self.run, self.learner, self.progress, self.held_out = run, learner, progress, held_out
         self.saved_at = time.monotonic()
-        self.kept: tuple[int, dict[str, Any]] | None = None
+        self.latest: tuple[int, dict[str, Any]] | None = None
         self.mean: float | None = None
 
     def _on_rollout_start(self) -> None:
-        step, state = self.model.num_timesteps, _state(self.model, self.worlds)
+        step, state = self.learner.step, self.learner.state()
         if self.held_out is not None:
             self.held_out.after(step)
-        if step and time.monotonic() - self.saved_at >= self.seconds:
+        if step and time.monotonic() - self.saved_at >= 60 * self.learner.config.checkpoint_minutes:
             self.run.save_checkpoint(step, state)
-            self.saved_at, self.kept = time.monotonic(), None
+            self.saved_at, self.latest = time.monotonic(), None
         else:
-            self.kept = step, deepcopy(state)
-        recent = [one["r"] for one in self.model.ep_info_buffer or ()]
+            self.latest = step, deepcopy(state)
+        recent = [one["r"] for one in self.learner.model.ep_info_buffer or ()]
         self.mean = sum(recent) / len(recent) if recent else None
 
     def _on_step(self) -> bool:
         if self.progress is not None:
-            self.progress(self.model.num_timesteps, self.mean)
+            self.progress(self.learner.step, self.mean)
         return True
 
-    def save_kept(self) -> None:
+    def save_latest(self) -> None:
         """Save the state before the rollout that is in progress, unless that has been done."""
-        if self.kept is not None and self.kept[0]:
-            self.run.save_checkpoint(*self.kept)
+        if self.latest is not None and self.latest[0]:
+            self.run.save_checkpoint(*self.latest)
 
 
 class _MetricsWriter(KVWriter):
@@ -301,9 +337,6 @@ class _MetricsWriter(KVWriter):
         """The run closes its metrics."""
 
 
-# State
-
-
 def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
     """The values that are numbers: Python's or NumPy's."""
     return {
@@ -311,64 +344,7 @@ def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
     }
 
 
-def _state(model: PPO, env: PowderVecEnv) -> dict[str, Any]:
-    """Everything that later training depends on. Tensors of the model are not copied."""
-    return {
-        "policy": model.policy.state_dict(),
-        "optimizer": model.policy.optimizer.state_dict(),
-        "env": env.state(),
-        "starts": torch.as_tensor(np.asarray(model._last_episode_starts)),
-        "episodes": [[one["r"], one["l"], one["t"]] for one in model.ep_info_buffer or ()],
-        "successes": [bool(one) for one in model.ep_success_buffer or ()],
-        "updates": model._n_updates,
-        "logged": _numbers(model.logger.name_to_value),  # of the update that is shown after the next rollout
-        "steps": model.num_timesteps,
-        "random": _random_state(),
-        **_wrappers(model),
-    }
-
-
-def _wrappers(model: PPO) -> dict[str, Any]:
-    """The state of stacked observations and normalized rewards."""
-    found: dict[str, Any] = {}
-    env = model.get_env()
-    assert env is not None
-    if (stack := unwrap_vec_wrapper(env, VecFrameStack)) is not None:
-        found["frames"] = torch.from_numpy(stack.stacked_obs.stacked_obs.copy())
-    if (normal := unwrap_vec_wrapper(env, VecNormalize)) is not None:
-        spread = normal.ret_rms
-        found["rewards"] = [float(spread.mean), float(spread.var), float(spread.count)]
-        found["returns"] = torch.from_numpy(normal.returns.copy())
-    return found
-
-
-def _restore_wrappers(model: PPO, state: Mapping[str, Any], observed: NDArray[Any]) -> None:
-    model._last_obs = observed
-    env = model.get_env()
-    assert env is not None
-    if (stack := unwrap_vec_wrapper(env, VecFrameStack)) is not None:
-        stack.stacked_obs.stacked_obs[...] = state["frames"].numpy()
-        model._last_obs = stack.stacked_obs.stacked_obs.copy()
-    if (normal := unwrap_vec_wrapper(env, VecNormalize)) is not None:
-        spread: Any = normal.ret_rms
-        spread.mean, spread.var, spread.count = (np.float64(one) for one in state["rewards"])
-        normal.returns[...] = state["returns"].numpy()
-
-
-def _restore(model: PPO, env: PowderVecEnv, state: Mapping[str, Any]) -> None:
-    model.policy.load_state_dict(state["policy"])
-    model.policy.optimizer.load_state_dict(state["optimizer"])
-    _restore_wrappers(model, state, env.restore(state["env"]))
-    model._last_episode_starts = state["starts"].numpy()
-    size = model._stats_window_size
-    model.ep_info_buffer = deque(
-        ({"r": r, "l": length, "t": t} for r, length, t in state["episodes"]), maxlen=size
-    )
-    model.ep_success_buffer = deque(state["successes"], maxlen=size)
-    model._n_updates, model.num_timesteps = state["updates"], state["steps"]
-    for name, value in state["logged"].items():
-        model.logger.record(name, value)
-    _set_random_state(state["random"])
+# Random numbers
 
 
 def _random_state() -> dict[str, Any]:
