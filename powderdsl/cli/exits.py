@@ -34,8 +34,7 @@ class BadInput(click.ClickException):
 
 def version() -> str:
     """The version of powderdsl."""
-    found: str = sys.modules["powderdsl"].__version__  # our own package, so it has been imported
-    return found
+    return str(sys.modules["powderdsl"].__version__)  # our own package, so it has been imported
 
 
 @contextmanager
@@ -84,23 +83,17 @@ def report_failure(error: BaseException) -> int:
 
 def _report_internal(error: BaseException) -> None:
     import platform
+    import traceback
 
     from powderdsl.diagnostics import Diagnostic, Label
 
     if os.environ.get("POWDERDSL_DEBUG") == "1":
-        import traceback
-
         traceback.print_exception(error)
-    words = " ".join(str(error).split())[:300]
+    words = " ".join([f"{type(error).__name__}:", *str(error).split()])[:300].rstrip(":")
+    message = f"a mistake in powderdsl itself: {words}"
     system = f"powderdsl {version()}, Python {platform.python_version()}, {platform.system()}"
-    diagnostic = Diagnostic(
-        "PD901",
-        f"a mistake in powderdsl itself: {type(error).__name__}{': ' if words else ''}{words}",
-        Label(None),
-        notes=(system,),
-        helps=(
-            "please report it, with the command and the files it was given",
-            "POWDERDSL_DEBUG=1 shows where it happened",
-        ),
+    helps = (
+        "please report it, with the command and the files it was given",
+        "POWDERDSL_DEBUG=1 shows where it happened",
     )
-    write_diagnostics([diagnostic], sys.stderr)
+    write_diagnostics([Diagnostic("PD901", message, Label(None), notes=(system,), helps=helps)], sys.stderr)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import Any, TextIO
@@ -54,11 +55,16 @@ class LiveView:
 
     Where the output is not a terminal, frames follow one another as plain text. With NO_COLOR set
     (https://no-color.org) or an encoding without half blocks, glyphs are redrawn in place. Worlds that do not
-    fit are thinned out.
+    fit are thinned out. On a terminal, frames follow one another no faster than `fps`.
     """
 
     def __init__(
-        self, elements: Sequence[Element], stream: TextIO | None = None, *, fields: Sequence[Field] = ()
+        self,
+        elements: Sequence[Element],
+        stream: TextIO | None = None,
+        *,
+        fields: Sequence[Field] = (),
+        fps: int | None = None,
     ):
         self.stream: TextIO = unguarded(sys.stdout if stream is None else stream)
         self.elements = elements
@@ -66,6 +72,7 @@ class LiveView:
         self.color = self.in_place and not os.environ.get("NO_COLOR") and _can_encode(self.stream)
         self._colors, self._ramps, self._tints = palette(elements), ramps(elements), tints(fields)
         self._height = 0
+        self._frame_seconds, self._due = 1 / fps if fps else 0.0, time.perf_counter()
 
     def __enter__(self) -> LiveView:
         if self.in_place:
@@ -104,6 +111,8 @@ class LiveView:
         back = f"\x1b[{self._height}F" if self._height else ""
         self._write(back + "".join(f"{_CLEAR_LINE}{line}\n" for line in lines) + _CLEAR_BELOW)
         self._height = len(lines)
+        self._due = max(self._due + self._frame_seconds, time.perf_counter())
+        time.sleep(max(self._due - time.perf_counter(), 0))
 
     def _thinning(self, height: int, width: int) -> int:
         """The step between rows and columns that are shown, so that the frame fits: no line may wrap."""

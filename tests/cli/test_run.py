@@ -355,6 +355,6 @@ def test_what_render_cannot_draw(tmp_path, arguments):
     before = sorted(tmp_path.iterdir())
     result = powderdsl("render", *arguments)
     assert result.exit_code == 2
-    assert "error" in result.stderr
+    assert "error" in result.stderr.lower()
     assert "PD901" not in result.stderr
     assert sorted(tmp_path.iterdir()) == before

@@ -120,9 +120,9 @@ def _check(name: str, quick: bool, cost: bool, ledger: bool) -> Checked:
         if is_task(name):
             from powderdsl.tasks.shipped import load_task_with_diagnostics  # brings numpy
 
-            task, remarks = load_task_with_diagnostics(name)
-            return Checked(name, remarks, task)
-        ruleset, remarks = load_with_diagnostics(name)
+            task, diagnostics = load_task_with_diagnostics(name)
+            return Checked(name, diagnostics, task)
+        ruleset, diagnostics = load_with_diagnostics(name)
     except CompileError as error:
         return Checked(name, error.diagnostics)
     book = None
@@ -130,13 +130,13 @@ def _check(name: str, quick: bool, cost: bool, ledger: bool) -> Checked:
         from powderdsl.testing.properties.refute import refuted  # brings numpy
 
         book = make_ledger(ruleset)
-        remarks = (*remarks, *refuted(ruleset, book))
+        diagnostics = (*diagnostics, *refuted(ruleset, book))
     expenses = None
     if cost:
         from powderdsl.ir.cost import costs
 
         expenses = costs(lower(ruleset))
-    return Checked(name, remarks, ruleset, expenses, (book or make_ledger(ruleset)) if ledger else None)
+    return Checked(name, diagnostics, ruleset, expenses, (book or make_ledger(ruleset)) if ledger else None)
 
 
 def _cost_lines(passes: tuple[PassCost, ...]) -> Iterator[str]:
@@ -155,15 +155,12 @@ def _cost_lines(passes: tuple[PassCost, ...]) -> Iterator[str]:
 
 def _summary(result: Checked, notes: bool) -> str:
     """`name: 14 elements, 12 passes, no errors`, and how many warnings and notes there are."""
-    loaded, parts = result.loaded, [counted(result.number(Severity.ERROR), "error")]
+    loaded, parts = result.loaded, []
     if isinstance(loaded, Ruleset):
-        parts = [
-            counted(len(loaded.elements), "element"),
-            counted(len(loaded.passes), "pass", "passes"),
-            *parts,
-        ]
+        parts += [counted(len(loaded.elements), "element"), counted(len(loaded.passes), "pass", "passes")]
     elif loaded is not None:
-        parts = [counted(len(loaded.splits), "split"), *parts]
+        parts.append(counted(len(loaded.splits), "split"))
+    parts.append(counted(result.number(Severity.ERROR), "error"))
     if warnings := result.number(Severity.WARNING):
         parts.append(counted(warnings, "warning"))
     if number := result.number(Severity.NOTE):

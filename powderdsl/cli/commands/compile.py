@@ -14,7 +14,9 @@ from powderdsl.compiler import lower, read
 from powderdsl.diagnostics import Reporter, suggest
 from powderdsl.model.declarations import Block, PackDecl, PassDecl
 from powderdsl.model.text import one_line, place_of, print_model
+from powderdsl.model.types import Ruleset
 from powderdsl.syntax.ast import Syntax
+from powderdsl.system.writing import write_text
 
 if TYPE_CHECKING:
     from powderdsl.ir.ops import Program
@@ -53,22 +55,18 @@ def command(
     if stage == "tree":
         text = _tree(rules, pass_name)
     else:
-        text = _checked(rules, stage, backend, after, pass_name, settings)
+        text = _checked(opt.load_rules(rules, settings), stage, backend, after, pass_name)
+    text = text if text.endswith("\n") else f"{text}\n"
     if out is None:
-        click.echo(text, nl=not text.endswith("\n"))
-        return
-    from powderdsl.system.writing import write_text
-
-    write_text(out, text if text.endswith("\n") else text + "\n", follow=True)
+        click.echo(text, nl=False)
+    else:
+        write_text(out, text, follow=True)
 
 
-def _checked(
-    rules: str, stage: str, backend: str, after: str | None, pass_name: str | None, settings: dict[str, str]
-) -> str:
+def _checked(ruleset: Ruleset, stage: str, backend: str, after: str | None, pass_name: str | None) -> str:
     """The output of a stage after parsing."""
-    ruleset = opt.load_rules(rules, settings)
     if pass_name is not None:
-        _check_known("pass", pass_name, [p.name for p in ruleset.passes], "passes")
+        _check_known("pass", pass_name, [pass_.name for pass_ in ruleset.passes], "passes")
     if stage == "model":
         return print_model(ruleset, None if pass_name is None else [pass_name])
     program = lower(ruleset)
@@ -79,11 +77,11 @@ def _checked(
         case "ir":
             return print_program(program, pass_name)
         case "planes":
-            parts = [one.planes or one.program for one in segments(program)]
-            chosen = [one for one in parts if pass_name in (None, *(p.name for p in one.passes))]
+            parts = [segment.planes or segment.program for segment in segments(program)]
+            chosen = [part for part in parts if pass_name in (None, *(p.name for p in part.passes))]
             return "\n".join(print_program(part, pass_name) for part in chosen)
         case "schedule":
-            return "\n\n".join(_schedules(segments(program), backend, after, pass_name)) + "\n"
+            return "\n\n".join(_schedules(segments(program), backend, after, pass_name))
         case _:
             return "\n\n".join(text for text in _kernels(program, backend, pass_name) if text)
 
@@ -159,21 +157,18 @@ def _tree(rules: str, pass_name: str | None) -> str:
     packs, _ = read([rules], reporter)
     reporter.raise_if_errors()
     if pass_name is not None:
-        known = [one.name.text for pack in packs for one in pack.passes]
-        _check_known("pass", pass_name, known, "passes")
-    return "\n".join(line for pack in packs for line in _pack_lines(pack, pass_name)) + "\n"
+        _check_known("pass", pass_name, [decl.name.text for pack in packs for decl in pack.passes], "passes")
+    return "\n".join(line for pack in packs for line in _pack_lines(pack, pass_name))
 
 
 def _pack_lines(pack: PackDecl, pass_name: str | None) -> Iterator[str]:
-    chosen = [one for one in pack.passes if pass_name in (None, one.name.text)]
-    if pass_name is not None and not chosen:
-        return
-    yield f"pack {pack.name.text}  # {place_of(pack.name.span)}"
-    if pass_name is None:
-        for decl in pack.sets:
-            yield from _syntax_lines(f"set {decl.name.text}", decl.members, "  ")
-    for one in chosen:
-        yield from _pass_lines(one)
+    chosen = [decl for decl in pack.passes if pass_name in (None, decl.name.text)]
+    if chosen or pass_name is None:
+        yield f"pack {pack.name.text}  # {place_of(pack.name.span)}"
+    for named_set in pack.sets if pass_name is None else ():
+        yield from _syntax_lines(f"set {named_set.name.text}", named_set.members, "  ")
+    for decl in chosen:
+        yield from _pass_lines(decl)
 
 
 def _pass_lines(decl: PassDecl) -> Iterator[str]:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
+from itertools import chain
 from math import prod
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +18,6 @@ from powderdsl.cli.exits import user_values
 from powderdsl.cli.output import counted, progress
 
 if TYPE_CHECKING:
-    from powderdsl.cli.terminal import LiveView
     from powderdsl.simulation.any_arrays import AnyWorld
 
 ANIMATIONS = (".gif", ".mp4")
@@ -137,11 +137,19 @@ def play(start: AnyWorld, plan: Playback) -> AnyWorld:
     from powderdsl.cli.terminal import LiveView
 
     ruleset, world = start.sim.ruleset, start
+    # Where nobody looks in between, short calls still let progress be shown and Ctrl-C be heard.
+    looking = plan.watch or plan.suffix in ANIMATIONS
+    stride = plan.every if looking else max(1, min(64, plan.steps // 50))
 
     def stream() -> Iterator[AnyWorld]:
+        """The world each time it is shown."""
         nonlocal world
-        for step, world in _worlds(start, plan):
-            show(step, world)
+        done = 0
+        for step in chain(range(0, plan.steps, stride), [plan.steps]):
+            if step > done:
+                world = world.sim.step(world, steps=step - done)
+            done = step
+            show(step)
             yield world
 
     def picture(world: AnyWorld) -> Any:
@@ -149,11 +157,15 @@ def play(start: AnyWorld, plan: Playback) -> AnyWorld:
 
     with ExitStack() as stack:
         if plan.watch:
-            show = _watcher(stack.enter_context(LiveView(ruleset.elements, fields=ruleset.fields)), plan)
+            view = stack.enter_context(LiveView(ruleset.elements, fields=ruleset.fields, fps=plan.fps))
+
+            def show(step: float) -> None:
+                view.show(**first_world(world), caption=f"{ruleset.name}  step {step} of {plan.steps}")
+
         else:
             bar = stack.enter_context(progress(ruleset.name, plan.steps))
 
-            def show(step: int, world: AnyWorld) -> None:
+            def show(step: float) -> None:
                 bar(step)
 
         if plan.out is not None and plan.suffix in ANIMATIONS:
@@ -178,34 +190,3 @@ def play(start: AnyWorld, plan: Playback) -> AnyWorld:
 
         save(world, plan.out)
     return world
-
-
-def _worlds(world: AnyWorld, plan: Playback) -> Iterator[tuple[int, AnyWorld]]:
-    """The world each time it is shown, after the number of steps that it has made."""
-    # Where nobody looks in between, short calls still let progress be shown and Ctrl-C be heard.
-    looking = plan.watch or plan.suffix in ANIMATIONS
-    stride = plan.every if looking else max(1, min(64, plan.steps // 50))
-    done = 0
-    yield done, world
-    while done < plan.steps:
-        count = min(stride, plan.steps - done)
-        world = world.sim.step(world, steps=count)
-        done += count
-        yield done, world
-
-
-def _watcher(view: LiveView, plan: Playback) -> Callable[[int, AnyWorld], None]:
-    """A function that shows a world, no faster than the frame rate on a terminal."""
-    from powderdsl.cli.pictures import first_world
-
-    due = time.perf_counter()
-
-    def show(step: int, world: AnyWorld) -> None:
-        nonlocal due
-        caption = f"{world.sim.ruleset.name}  step {step} of {plan.steps}"
-        view.show(**first_world(world), caption=caption)
-        if view.in_place:
-            due = max(due + 1 / plan.fps, time.perf_counter())
-            time.sleep(max(due - time.perf_counter(), 0))
-
-    return show
