@@ -140,71 +140,43 @@ def _overlaps(ledger: Ledger) -> Iterator[str]:
 
 
 def ledger_data(ledger: Ledger) -> dict[str, Any]:
-    """The ledger as plain lists and mappings: the form is in docs/testing.md."""
+    """The ledger as plain data: the form is in docs/testing.md. Lines of rules are numbers of `rules`, from 0."""
     numbers = {entry.rule: number for number, entry in enumerate(ledger.rules)}
     return {
         "schema": SCHEMA,
         "name": ledger.name,
         "complete": ledger.complete,
-        "constant_sums": [list(names) for names in ledger.constant_sums],
-        "never_falls": [list(names) for names in ledger.rising_sums],
-        "never_rises": [list(names) for names in ledger.falling_sums],
+        "constant_sums": ledger.constant_sums,
+        "never_falls": ledger.rising_sums,
+        "never_rises": ledger.falling_sums,
         "elements": [_element_data(ledger, name, numbers) for name in ledger.elements],
         "rules": [_rule_data(entry) for entry in ledger.rules],
         "fields": [_field_data(entry, numbers) for entry in ledger.fields],
         "overlaps": [
-            {
-                "outcome": one.outcome,
-                "field": one.field or None,
-                "rules": [numbers[one.first], numbers[one.second]],
-            }
-            for one in ledger.overlaps
+            {"outcome": o.outcome, "field": o.field or None, "rules": (numbers[o.first], numbers[o.second])}
+            for o in ledger.overlaps
         ],
     }
 
 
 def _element_data(ledger: Ledger, name: str, numbers: dict[RuleLine, int]) -> dict[str, Any]:
+    changes = {pair: [numbers[line] for line in lines] for pair, lines in ledger.changes.items()}
     return {
         "name": name,
         "number": trend(ledger, name),
         "unchanged": bool(ledger.unchanged(name)),
         "never_appears": bool(ledger.never_appears(name)),
-        "made_from": _pairs_data(ledger, name, 1, numbers),
-        "becomes": _pairs_data(ledger, name, 0, numbers),
+        "made_from": {before: lines for (before, after), lines in changes.items() if after == name},
+        "becomes": {after: lines for (before, after), lines in changes.items() if before == name},
         "moved_by": [numbers[entry.rule] for entry in ledger.rules if name in entry.moves],
     }
 
 
-def _pairs_data(ledger: Ledger, name: str, side: int, numbers: dict[RuleLine, int]) -> dict[str, list[int]]:
-    """The other elements of the changes that have this one on one side, and the numbers of the lines."""
-    return {
-        pair[1 - side]: [numbers[line] for line in lines]
-        for pair, lines in ledger.changes.items()
-        if pair[side] == name
-    }
-
-
 def _rule_data(entry: RuleEntry) -> dict[str, Any]:
-    return {
-        "rule": entry.rule.text,
-        "where": str(entry.rule),
-        "pass": entry.rule.pass_name,
-        "pack": entry.rule.pack,
-        "fires": entry.fires,
-        "changes": [list(pair) for pair in entry.changes],
-        "moves": list(entry.moves),
-        "needs": [list(names) for names in entry.needs],
-        "copies": list(entry.copies),
-    }
+    line, effects = entry.rule, {name: value for name, value in vars(entry).items() if name != "rule"}
+    return {"rule": line.text, "where": str(line), "pass": line.pass_name, "pack": line.pack, **effects}
 
 
 def _field_data(entry: FieldEntry, numbers: dict[RuleLine, int]) -> dict[str, Any]:
-    return {
-        "name": entry.name,
-        "kind": entry.kind,
-        "default": entry.default,
-        "travels": entry.travels,
-        "bounds": None if entry.bounds is None else list(entry.bounds),
-        "fresh_bounds": None if entry.fresh_bounds is None else list(entry.fresh_bounds),
-        "written_by": [numbers[line] for line in entry.writers],
-    }
+    data = {name: value for name, value in vars(entry).items() if name not in ("writers", "reaches")}
+    return {**data, "written_by": [numbers[line] for line in entry.writers]}

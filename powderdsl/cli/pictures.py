@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from powderdsl.arrays import NDArray, np
 from powderdsl.cli.exits import BadInput
-from powderdsl.simulation.draw import contact_sheet, palette, ramps, rgb, scale, shown_fields, tints, to_numpy
+from powderdsl.simulation.draw import contact_sheet, palette, ramps, rgb, scale, shown_fields, tints
 
 if TYPE_CHECKING:
     from powderdsl.simulation.any_arrays import AnyWorld
@@ -33,7 +33,7 @@ def pictures(world: AnyWorld, *, most: int, factor: int | None) -> NDArray[np.ui
     rules = few.sim.ruleset
     colors, ramped, tinted = palette(rules.elements), ramps(rules.elements), tints(rules.fields)
     image = rgb(few.ids, colors, ramps=ramped, tints=tinted, fields=fields_of(few))
-    images = to_numpy(scale(image, factor))
+    images = scale(image, factor)
     return images[0] if shown == 1 else contact_sheet(images, columns=columns)
 
 

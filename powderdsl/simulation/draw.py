@@ -1,9 +1,8 @@
-"""Worlds -> RGB pictures, one pixel a cell. NumPy in, NumPy out; tensors in, tensors on their device out."""
+"""Worlds -> RGB pictures, one pixel a cell. Tensors are taken too; pictures are NumPy arrays."""
 
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -17,9 +16,6 @@ Array = Any
 
 OUTLINES = ((255, 0, 160), (0, 160, 255), (255, 160, 0), (0, 200, 80))
 """Colors of regions, in their order in the file; they repeat after the fourth."""
-
-Colors = Sequence[str] | NDArray[np.uint8]
-"""Colors by element id: ``#RRGGBB`` each, or uint8 [n, 3]."""
 
 
 def palette(elements: Sequence[Element]) -> NDArray[np.uint8]:
@@ -151,52 +147,33 @@ def _reached(value: np.float32, place: int, whole: int, rises: bool) -> bool:
 
 def rgb(
     ids: Array,
-    colors: Colors,
+    colors: NDArray[np.uint8],
     *,
     ramps: Sequence[Ramp] = (),
     tints: Sequence[CellTint] = (),
     fields: Mapping[str, Array] | None = None,
-) -> Any:
-    """Pictures uint8 [..., H, W, 3] of ids [..., H, W] (any integers), of the same kind, on the same device.
+) -> NDArray[np.uint8]:
+    """Pictures uint8 [..., H, W, 3] of ids [..., H, W], which all have a color: [n, 3], as of `palette`.
 
     With `ramps`, cells of their elements have the color of their value in `fields`, arrays [..., H, W] by name. With
     `tints`, cells are tinted by vectors in `fields`, float [..., 2, H, W], after that and in order.
-    Raises ValueError for ids without a color, fields that are missing and shapes that do not fit, TypeError for ids
-    of another type.
     """
-    table, cells = _table(colors), to_numpy(ids)
-    _check(cells, len(table))
-    image = table[cells]
+    cells = to_numpy(ids)
+    image = colors[cells]
+    values = {name: to_numpy(value) for name, value in (fields or {}).items()}
     for ramp in ramps:
-        if ramp.field not in (fields or {}):
-            raise ValueError(
-                f"the color of element {ramp.id} follows the field {ramp.field}, which is missing"
-            )
-        values = to_numpy((fields or {})[ramp.field]).astype(ramp.starts.dtype)
-        _check_shape(ramp.field, values, cells.shape)
         ramped = cells == ramp.id
-        image[ramped] = ramp.colors[np.searchsorted(ramp.starts, values[ramped], side="right")]
+        reached = values[ramp.field][ramped].astype(ramp.starts.dtype)
+        image[ramped] = ramp.colors[np.searchsorted(ramp.starts, reached, side="right")]
     for tint in tints:
-        if tint.field not in (fields or {}):
-            raise ValueError(f"cells are tinted by the field {tint.field}, which is missing")
-        vectors = to_numpy((fields or {})[tint.field]).astype(np.float32)
-        _check_shape(tint.field, vectors, (*cells.shape[:-2], 2, *cells.shape[-2:]))
-        tint_cells(image, vectors, tint)
-    if not _is_tensor(ids):
-        return image
-    import torch
-
-    return torch.from_numpy(image).to(ids.device)
+        tint_cells(image, values[tint.field].astype(np.float32), tint)
+    return image
 
 
-def scale(image: Array, factor: int) -> Any:
-    """Every pixel of [..., H, W, 3] as a square of `factor` by `factor`. Raises ValueError below 1."""
-    if factor < 1:
-        raise ValueError(f"a picture cannot be scaled by {factor}: the factor is an integer from 1")
+def scale(image: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
+    """Every pixel of [..., H, W, 3] as a square of `factor` by `factor`."""
     if factor == 1:
         return image
-    if _is_tensor(image):
-        return image.repeat_interleave(factor, dim=-3).repeat_interleave(factor, dim=-2)
     return np.repeat(np.repeat(image, factor, axis=-3), factor, axis=-2)
 
 
@@ -210,18 +187,10 @@ def contact_sheet(
     """Pictures of one size, uint8 [N, H, W, 3], side by side on one, uint8 [H', W', 3], row by row.
 
     `columns` defaults to a square of pictures; `gap` pixels of background stand between and around them.
-    Raises ValueError for no pictures, for pictures of different sizes, and for bad numbers.
     """
     pictures = [to_numpy(image) for image in images]
-    if not pictures:
-        raise ValueError("a contact sheet needs at least one picture")
     height, width = pictures[0].shape[:2]
-    if any(picture.shape != (height, width, 3) for picture in pictures):
-        raise ValueError(f"pictures of different shapes: {sorted({picture.shape for picture in pictures})}")
-    columns = math.ceil(math.sqrt(len(pictures))) if columns is None else columns
-    if columns < 1 or gap < 0:
-        raise ValueError(f"columns={columns} must be at least 1, gap={gap} at least 0")
-    columns = min(columns, len(pictures))
+    columns = min(columns or math.ceil(math.sqrt(len(pictures))), len(pictures))
     rows = math.ceil(len(pictures) / columns)
     sheet = np.empty((rows * (height + gap) + gap, columns * (width + gap) + gap, 3), dtype=np.uint8)
     sheet[:] = background
@@ -251,32 +220,6 @@ def _is_tensor(value: object) -> bool:
     return any(base.__module__.partition(".")[0] == "torch" for base in type(value).__mro__)
 
 
-def _check(ids: NDArray[Any], colors: int) -> None:
-    if ids.dtype.kind not in "iu":
-        raise TypeError(f"ids must be integers, not {ids.dtype}")
-    if ids.ndim < 2:
-        raise ValueError(f"ids must have shape [..., H, W], not {ids.shape}")
-    if ids.size and not 0 <= int(ids.min()) <= int(ids.max()) < colors:
-        raise ValueError(
-            f"ids reach from {int(ids.min())} to {int(ids.max())}, but there are {colors} colors"
-        )
-
-
-def _check_shape(name: str, values: NDArray[Any], expected: tuple[int, ...]) -> None:
-    if values.shape != expected:
-        raise ValueError(f"{name} must have shape {expected}, not {values.shape}")
-
-
-def _table(colors: Colors) -> NDArray[np.uint8]:
-    if isinstance(colors, np.ndarray):
-        if colors.ndim != 2 or colors.shape[1] != 3 or colors.dtype != np.uint8:
-            raise ValueError(f"colors must be uint8 [n, 3], not {colors.dtype} {colors.shape}")
-        return colors
-    return np.array([_components(color) for color in colors], dtype=np.uint8).reshape(-1, 3)
-
-
 def _components(color: str) -> tuple[int, int, int]:
-    if not re.fullmatch(r"#[0-9A-Fa-f]{6}", color):
-        raise ValueError(f"{color!r} is not a color: write '#RRGGBB'")
     red, green, blue = bytes.fromhex(color[1:])
     return red, green, blue

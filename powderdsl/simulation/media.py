@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from contextlib import suppress
 from itertools import chain
 from pathlib import Path
@@ -20,8 +20,8 @@ MIN_GIF_DELAY = 20
 
 
 def write_png(path: str | Path, image: Any) -> None:
-    """Write one picture, uint8 [H, W, 3] (array or tensor). Raises ValueError for another shape or type."""
-    images, frame = pillow("writing a picture"), _frame(image)
+    """Write one picture, uint8 [H, W, 3] (array or tensor)."""
+    images, frame = pillow("writing a picture"), to_numpy(image)
     with replacing(Path(path), follow=True) as temporary:
         picture = images.frombytes("RGB", (frame.shape[1], frame.shape[0]), frame.tobytes())
         picture.save(temporary, format="PNG", optimize=True)
@@ -31,11 +31,10 @@ def write_gif(path: str | Path, frames: Iterable[Any], *, fps: float = 30, loop:
     """Write an animation as GIF, from an iterable that may be lazy. At most 50 frames a second.
 
     Frames of up to 256 colors keep them exactly; others are reduced, without dithering.
-    Raises ValueError for no frames, for frames of different sizes, and for a bad `fps`.
     """
-    delay = max(round(100 / _checked_rate(fps)) * 10, MIN_GIF_DELAY)  # GIF counts hundredths of a second
+    delay = max(round(100 / fps) * 10, MIN_GIF_DELAY)  # GIF counts hundredths of a second
     module = pillow("writing an animation", "numpy")
-    images = (_indexed(module, frame) for frame in _same_size(frames))
+    images = (_indexed(module, to_numpy(frame)) for frame in frames)
     first = next(images)
     endless = {"loop": 0} if loop else {}
     with replacing(Path(path), follow=True) as temporary:
@@ -46,10 +45,8 @@ def write_gif(path: str | Path, frames: Iterable[Any], *, fps: float = 30, loop:
 def write_mp4(path: str | Path, frames: Iterable[Any], *, fps: float = 30) -> None:
     """Write an animation as H.264, from an iterable that may be lazy. Odd sizes grow by one row or column.
 
-    Raises CompileError (PD612) if imageio-ffmpeg is not installed, ValueError as `write_gif` does, and
-    OSError with the encoder's own words if it fails.
+    Raises CompileError (PD612) if imageio-ffmpeg is not installed, and OSError with the encoder's own words if it fails.
     """
-    _checked_rate(fps)
     try:
         import imageio_ffmpeg
     except ImportError:
@@ -58,13 +55,13 @@ def write_mp4(path: str | Path, frames: Iterable[Any], *, fps: float = 30) -> No
             "writing MP4 needs imageio-ffmpeg, which is not installed",
             helps=("pip install 'powderdsl[video]'", "or write a .gif, which needs nothing"),
         ) from None
-    checked = _same_size(frames)
-    first = _even(next(checked))
+    pictures = (_even(to_numpy(frame)) for frame in frames)
+    first = next(pictures)
     size = f"{first.shape[1]}x{first.shape[0]}"
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"]
     command += ["-s", size, "-r", str(fps), "-i", "-", *_ENCODING.split()]
     with replacing(Path(path), follow=True) as temporary:
-        _encode([*command, str(temporary)], chain([first], map(_even, checked)))
+        _encode([*command, str(temporary)], chain([first], pictures))
 
 
 _ENCODING = (
@@ -99,32 +96,6 @@ def _encode(command: list[str], frames: Iterable[NDArray[np.uint8]]) -> None:
             log.seek(0)
             words = log.read(2000).decode(errors="replace").strip()
             raise OSError(f"the video encoder failed (status {status}): {words}")
-
-
-def _frame(image: Any) -> NDArray[np.uint8]:
-    picture = to_numpy(image)
-    if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8 or 0 in picture.shape:
-        raise ValueError(f"a picture must be uint8 [H, W, 3], not {picture.dtype} {picture.shape}")
-    return np.ascontiguousarray(picture)
-
-
-def _same_size(frames: Iterable[Any]) -> Iterator[NDArray[np.uint8]]:
-    """Checked frames, one at a time. The first one is checked when it is asked for."""
-    shape = None
-    for number, frame in enumerate(frames):
-        picture = _frame(frame)
-        if shape is not None and picture.shape != shape:
-            raise ValueError(f"frame {number} has shape {picture.shape}, the first one {shape}")
-        shape = picture.shape
-        yield picture
-    if shape is None:
-        raise ValueError("an animation needs at least one frame")
-
-
-def _checked_rate(fps: float) -> float:
-    if not 0 < fps <= 1000:
-        raise ValueError(f"fps={fps} must lie above 0, up to 1000")
-    return fps
 
 
 def _indexed(images: Any, frame: NDArray[np.uint8]) -> Any:

@@ -68,25 +68,11 @@ def make_program(ruleset: Ruleset, backend: str, device: torch.device, threads: 
         with suppress(CompileError) if backend == "auto" else nullcontext():
             return CompiledProgram(cuda_program(lowered(), device), cells, "cuda")
     if backend == "auto" and device.type == "cpu":
-        from powderdsl.simulation.auto import AutoByWidth, AutoProgram
-        from powderdsl.simulation.native_start import latest_width, native_program, ready_program
+        from powderdsl.simulation.native import auto_by_width
 
         first = starting_backend(device.type)
         begin = cache(lambda: _wasm_program(lowered(), device)) if first == "wasm" else cells
-        latest = None
-        with suppress(NoCompiler):
-            latest = latest_width(ruleset)
-        if latest is None:
-            lowered()  # what cannot be lowered is reported before the first step
-        return AutoByWidth(
-            lambda width: AutoProgram(
-                (first, begin),
-                cells,
-                lambda: ready_program(ruleset, lowered, threads, width),
-                lambda: native_program(ruleset, lowered, threads, width),
-            ),
-            latest or 0,
-        )
+        return auto_by_width(ruleset, lowered, threads, (first, begin), cells)
     return cells()
 
 
@@ -112,8 +98,7 @@ def _wasm_program(program: Program, device: torch.device) -> Runnable:
 
 def _native(ruleset: Ruleset, lowered: Callable[[], Program], device: torch.device, threads: int) -> Runnable:
     """Native code for the width of each grid. Without a compiler, there is an error at once."""
-    from powderdsl.simulation.native_start import latest_width, native_program
-    from powderdsl.simulation.widths import ByWidth
+    from powderdsl.simulation.native import ByWidth, latest_width, native_program
 
     if device.type != "cpu":
         raise _refusal("native", "native code runs on the CPU", _ELSEWHERE.format(device))

@@ -42,7 +42,6 @@ def test_every_cell_has_its_elements_color(dtype):
     assert image.dtype == np.uint8
     assert tuple(image[0, 2]) == SAND
     assert np.array_equal(image.reshape(14, 3), COLORS)
-    assert np.array_equal(rgb(ids, [element.color for element in ELEMENTS]), image)
 
 
 @pytest.mark.parametrize(
@@ -77,41 +76,14 @@ def test_the_components_of_motion_are_not_mixed_up_with_the_batch():
     ids=arrays(np.uint8, (2, 3, 4), elements=st.integers(0, 13)),
     motion=arrays(np.float32, (2, 2, 3, 4), elements=st.floats(-8, 8, width=32)),
 )
-def test_torch_draws_what_numpy_draws(ids, motion):
-    image = tinted(torch.tensor(ids), torch.tensor(motion))
-    assert isinstance(image, torch.Tensor)
-    assert image.dtype == torch.uint8
-    assert np.array_equal(image.numpy(), tinted(ids, motion))
-    assert np.array_equal(rgb(torch.tensor(ids), COLORS).numpy(), rgb(ids, COLORS))
-    assert np.array_equal(scale(image, 3).numpy(), scale(image.numpy(), 3))
+def test_tensors_are_drawn_as_arrays(ids, motion):
+    assert np.array_equal(tinted(torch.tensor(ids), torch.tensor(motion)), tinted(ids, motion))
+    assert np.array_equal(rgb(torch.tensor(ids), COLORS), rgb(ids, COLORS))
 
 
 def test_worlds_without_worlds():
     assert rgb(np.zeros((0, 3, 4), dtype=np.uint8), COLORS).shape == (0, 3, 4, 3)
     assert rgb(torch.zeros((0, 3, 4), dtype=torch.uint8), COLORS).shape == (0, 3, 4, 3)
-
-
-@pytest.mark.parametrize("make", [np.array, torch.tensor])
-def test_what_cannot_be_drawn(make):
-    for ids in ([[14]], [[-1]]):
-        with pytest.raises(ValueError, match="14 colors"):
-            rgb(make(ids), COLORS)
-    for ids in ([[1.0]], [[True]], [[1j]]):
-        with pytest.raises(TypeError, match="must be integers"):
-            rgb(make(ids), COLORS)
-    with pytest.raises(ValueError, match=r"\[\.\.\., H, W\]"):
-        rgb(make([1]), COLORS)
-    with pytest.raises(ValueError, match=r"shape \(2, 1, 1\), not \(1, 1\)"):
-        tinted(make([[1]]), make([[1.0]]))
-    with pytest.raises(ValueError, match="tinted by the field wind, which is missing"):
-        rgb(make([[1]]), COLORS, tints=[TINT])
-
-
-def test_colors_that_are_none():
-    with pytest.raises(ValueError, match="'#12345' is not a color"):
-        rgb(np.zeros((1, 1), dtype=int), ["#12345"])
-    with pytest.raises(ValueError, match=r"uint8 \[n, 3\]"):
-        rgb(np.zeros((1, 1), dtype=int), np.zeros((1, 4), dtype=np.uint8))
 
 
 def test_scaling_makes_squares():
@@ -123,8 +95,6 @@ def test_scaling_makes_squares():
             assert np.array_equal(large[row, column], image[row // 3, column // 3])
     assert np.array_equal(scale(image, 1), image)
     assert scale(image[None], 2).shape == (1, 4, 4, 3)
-    with pytest.raises(ValueError, match="from 1"):
-        scale(image, 0)
 
 
 def test_a_contact_sheet_puts_pictures_row_by_row():
@@ -146,15 +116,6 @@ def test_a_contact_sheet_puts_pictures_row_by_row():
     assert contact_sheet(images, columns=9, gap=0).shape == (2, 9, 3)
 
 
-def test_a_contact_sheet_of_nothing_or_of_unequal_pictures():
-    with pytest.raises(ValueError, match="at least one"):
-        contact_sheet([])
-    with pytest.raises(ValueError, match="different shapes"):
-        contact_sheet([np.zeros((2, 2, 3), dtype=np.uint8), np.zeros((2, 3, 3), dtype=np.uint8)])
-    with pytest.raises(ValueError, match="columns=0"):
-        contact_sheet(np.zeros((1, 2, 2, 3), dtype=np.uint8), columns=0)
-
-
 def test_to_numpy_takes_tensors_that_know_their_gradient():
     assert to_numpy(torch.ones(2, requires_grad=True)).tolist() == [1, 1]
 
@@ -162,6 +123,6 @@ def test_to_numpy_takes_tensors_that_know_their_gradient():
 def test_drawing_arrays_does_not_import_torch():
     code = (
         "import sys, numpy; from powderdsl.simulation.draw import rgb; import powderdsl.cli.terminal, powderdsl.simulation.media;"
-        "rgb(numpy.zeros((1, 1), int), ['#000000']); assert 'torch' not in sys.modules"
+        "rgb(numpy.zeros((1, 1), int), numpy.zeros((1, 3), 'u1')); assert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

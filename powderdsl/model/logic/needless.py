@@ -23,6 +23,7 @@ from powderdsl.model.logic.satisfy import (
     substeps,
     writes_of,
 )
+from powderdsl.model.operations import OPS
 from powderdsl.model.text import place_of
 from powderdsl.model.types import (
     Assign,
@@ -106,14 +107,15 @@ def _parts(rule: Rule) -> Iterator[Expr]:
 
 def decided(node: Expr) -> bool | None:
     """The outcome of a comparison of integers by their ranges alone; None if it depends on the world."""
-    a, b = node.args
-    if a.kind.name != "int" or b.kind.name != "int" or a.op == b.op == "const":
+    kinds, bounds = [arg.kind for arg in node.args], OPS[node.op].bounds
+    if (
+        bounds is None
+        or any(kind.name != "int" for kind in kinds)
+        or all(arg.op == "const" for arg in node.args)
+    ):
         return None
-    if node.op == "eq":
-        return False if a.kind.hi < b.kind.lo or b.kind.hi < a.kind.lo else None
-    if node.op == "lt":
-        return True if a.kind.hi < b.kind.lo else False if a.kind.lo >= b.kind.hi else None
-    return True if a.kind.hi <= b.kind.lo else False if a.kind.lo > b.kind.hi else None
+    low, high = bounds(node, *((kind.lo, kind.hi) for kind in kinds))
+    return bool(low) if low == high else None
 
 
 def _inside_any(span: Span, others: Sequence[Span]) -> bool:

@@ -13,7 +13,7 @@ from powderdsl.model.restrict import Difference
 from powderdsl.model.state import slots
 from powderdsl.model.text import one_line, place_of
 from powderdsl.model.types import Kind, Ruleset
-from powderdsl.simulation.draw import palette, ramps, rgb, scale, tints, to_numpy
+from powderdsl.simulation.draw import palette, ramps, rgb, scale, tints
 from powderdsl.testing.generators.cases import Array, Start, fresh
 from powderdsl.testing.properties.breaks import Tested
 
@@ -163,7 +163,7 @@ def picture(found: Counterexample, ruleset: Ruleset) -> Array:
     colors, ramped, tinted = palette(ruleset.elements), ramps(ruleset.elements), tints(ruleset.fields)
     factor = max(1, min(32, 512 // max(found.before.shape)))
     images = [
-        to_numpy(scale(rgb(ids, colors, ramps=ramped, tints=tinted, fields=fields), factor))
+        scale(rgb(ids, colors, ramps=ramped, tints=tinted, fields=fields), factor)
         for ids, fields in zip((found.before, found.after), found.shown, strict=True)
     ]
     return contact_sheet(images, columns=2, gap=8)

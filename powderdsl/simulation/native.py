@@ -1,26 +1,56 @@
-"""The backend `auto` on the CPU: it starts on WebAssembly and switches to native code. Both give the same worlds.
+"""Native code of a checked model, by the width of grids: from the cache, compiled now, or for `auto` in the background.
 
-Native code that was compiled before is loaded when the program is made. Otherwise WebAssembly runs, or torch on machines
-that wasmtime has no wheel for; once the work done and asked
-for is worth it, a thread compiles in the background. The change comes between two steps: long calls are cut into slices
-for it. Short scripts never start a compiler.
+Each width has a library of its own, or shares one with others (`known_width`). A library is made when the first grid of
+its width is stepped, so that nobody waits for code that is not needed. If the same model was compiled before, its code
+comes from the cache and nothing is lowered. The cache's key depends on the model, on every source file that turns models
+into C++, on the compiler, the processor and the width. Values of parameters are inputs of a step, so they take no part.
+
+The backend `auto` starts on WebAssembly, or on torch where wasmtime has no wheel. Once the work done and asked for is
+worth it, a thread compiles. The change comes between two steps, with the same worlds: long calls are cut into slices for
+it. Short scripts never start a compiler.
 """
 
 from __future__ import annotations
 
+import hashlib
 import threading
 import time
 import warnings
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from contextvars import copy_context
+from dataclasses import replace
 from functools import cache
 from math import prod
+from pathlib import Path
 
+import torch
 from torch import Tensor
 
-from powderdsl.simulation.widths import ByWidth
-from powderdsl.targets.cpp.compilers import INSTALL, MISSING, NoCompiler, NoCompilerWarning
+from powderdsl.ir.ops import Program
+from powderdsl.ir.segments import segments
+from powderdsl.model.fingerprint import fingerprint
+from powderdsl.model.types import Ruleset
+from powderdsl.targets.cache import turn
+from powderdsl.targets.cpp.build import building, cache_key, current
+from powderdsl.targets.cpp.code import NativeCode, compile_program, recall, remember
+from powderdsl.targets.cpp.compilers import (
+    INSTALL,
+    MISSING,
+    NoCompiler,
+    NoCompilerWarning,
+    find_compiler,
+    flags_for,
+)
+from powderdsl.targets.cpp.program import NativeProgram
+from powderdsl.targets.cpp.source import known_width
 from powderdsl.targets.job import Job, Runnable, shape_of
+from powderdsl.targets.torch.mixed import mixed_program
+
+Lowered = Callable[[], Program]
+"""Returns a ruleset in IR; the first call does the work."""
+
+SOURCES = ("compiler.py", "simulation/native.py", "model", "analysis", "ir", "schedule", "targets")
 
 WORTH = 2.0
 """Native code is compiled once work on the first backend, done or expected in the current call, exceeds this many seconds.
@@ -28,6 +58,143 @@ Compiling takes longer, but runs in another thread, and its result is cached."""
 
 SLICE = 0.25
 """Seconds on the first backend between two checks for native code."""
+
+
+def start_key(ruleset: Ruleset, width: int | None = None) -> str:
+    """The cache's key for the native code of a ruleset; without `width`, for the code compiled last.
+
+    Raises NoCompiler if there is no compiler.
+    """
+    compiler = find_compiler()
+    params = tuple(replace(param, default=0, about="") for param in ruleset.params)
+    said = fingerprint(replace(ruleset, params=params))
+    return cache_key(f"{said}{generator()} {width}", compiler, flags_for(compiler, current().level))
+
+
+@cache
+def generator() -> str:
+    """A hash of the source files that generate C++."""
+    here = Path(__file__).resolve().parents[1]
+    found = hashlib.sha256()
+    for name in SOURCES:
+        files = sorted(p for p in (here / name).rglob("*") if p.suffix in (".py", ".hpp")) or [here / name]
+        for path in files:
+            found.update(path.read_bytes())
+    return found.hexdigest()
+
+
+def latest_width(ruleset: Ruleset) -> int | None:
+    """What the code compiled last is for; None if there is none. Raises NoCompiler if there is no compiler."""
+    code = recall(start_key(ruleset))
+    return None if code is None else code.width
+
+
+def ready_program(ruleset: Ruleset, lowered: Lowered, threads: int, width: int) -> Runnable | None:
+    """A program that was compiled before, or None. Raises NoCompiler if there is no compiler."""
+    code = recall(start_key(ruleset, width))
+    return None if code is None else _recalled(code, lowered, threads, width)
+
+
+def native_program(ruleset: Ruleset, lowered: Lowered, threads: int, width: int) -> Runnable:
+    """A program, from the cache or compiled now; passes that do not fit bit planes run on cells.
+
+    Raises:
+        NoCompiler: there is no C++ compiler, or it failed.
+    """
+    key = start_key(ruleset, width)
+    code = recall(key)
+    if code is None:
+        with turn(current().place(), key):
+            code = recall(key)  # from another process, while this one waited
+            if code is None:
+                found = segments(lowered())
+                if len(found) > 1 or found[0].planes is None:
+                    return mixed_program(
+                        found,
+                        torch.device("cpu"),
+                        lambda cells, planes: _compiled(cells, planes, threads, width),
+                    )
+                code = compile_program(found[0].program, found[0].planes, width)
+                remember(key, code)
+                remember(start_key(ruleset), code)
+    return _recalled(code, lowered, threads, width)
+
+
+def _recalled(code: NativeCode, lowered: Lowered, threads: int, width: int) -> Runnable:
+    """The program of code for a whole ruleset, which is only lowered if its passes are timed."""
+
+    def with_clocks() -> NativeCode:
+        (segment,) = segments(lowered())
+        assert segment.planes is not None
+        return compile_program(segment.program, segment.planes, width, clocks=True)
+
+    return NativeProgram(code, threads, with_clocks)
+
+
+def _compiled(cells: Program, planes: Program, threads: int, width: int) -> Runnable:
+    code = compile_program(cells, planes, width)
+    return NativeProgram(code, threads, lambda: compile_program(cells, planes, width, clocks=True))
+
+
+class ByWidth:
+    """A program for each known width of grids, and one for all others (`known_width`), made when the first such grid comes.
+
+    It is built with the settings that are in effect now. What it tells is about the width stepped last.
+    """
+
+    def __init__(self, make: Callable[[int], Runnable], width: int | None = None):
+        """`width`: the program for it is made at once."""
+        self._make, self._how = make, current()
+        self._programs: dict[int, Runnable] = {}
+        self._latest = None if width is None else self.of(width)
+
+    def of(self, width: int) -> Runnable:
+        """The program for a known width; 0 for all others."""
+        program = self._programs.get(width)
+        if program is None:
+            with building(self._how):
+                program = self._programs.setdefault(width, self._make(width))
+        return program
+
+    @property
+    def running(self) -> str:
+        """What the next step runs on: ``wasm``, ``torch`` or ``native``."""
+        return str(getattr(self._latest, "running", "native"))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences about which backend ran, and why."""
+        return tuple(getattr(self._latest, "notes", ()))
+
+    def run(self, job: Job) -> Mapping[str, Tensor]:
+        """The state `job.steps` later."""
+        self._latest = program = self.of(known_width(shape_of(job.state)[-1]))
+        return program.run(job)
+
+
+def auto_by_width(
+    ruleset: Ruleset,
+    lowered: Lowered,
+    threads: int,
+    first: tuple[str, Callable[[], Runnable]],
+    asked: Callable[[], Runnable],
+) -> ByWidth:
+    """`AutoProgram` for every width."""
+    latest = None
+    with suppress(NoCompiler):
+        latest = latest_width(ruleset)
+    if latest is None:
+        lowered()  # what cannot be lowered is reported before the first step
+
+    def make(width: int) -> AutoProgram:
+        return AutoProgram(
+            first,
+            asked,
+            lambda: ready_program(ruleset, lowered, threads, width),
+            lambda: native_program(ruleset, lowered, threads, width),
+        )
+
+    return ByWidth(make, latest or 0)
 
 
 class Build:
@@ -209,30 +376,3 @@ def _tell_of_compilers(problem: str) -> None:
         warnings.warn(
             f"{problem}; native code is many times faster: {INSTALL}", NoCompilerWarning, stacklevel=2
         )
-
-
-class AutoByWidth(ByWidth[AutoProgram]):
-    """Chooses for each width of grids. What it tells is about the width stepped last.
-
-    Args:
-        width: what it tells about before the first step, see `known_width`.
-    """
-
-    def __init__(self, make: Callable[[int], AutoProgram], width: int):
-        super().__init__(make)
-        self._latest = self.of(width)
-
-    @property
-    def running(self) -> str:
-        """What the next step runs on: ``wasm``, ``torch`` or ``native``."""
-        return self._latest.running
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Sentences about which backend ran, and why."""
-        return self._latest.notes
-
-    def run(self, job: Job) -> Mapping[str, Tensor]:
-        """The state `job.steps` later."""
-        self._latest = self.for_job(job)
-        return self._latest.run(job)
