@@ -29,8 +29,7 @@ from powderdsl.model.parameter_values import set_params
 from powderdsl.model.types import Ruleset
 from powderdsl.syntax.sources import path_beside, read_source
 from powderdsl.syntax.yaml_tree import parse_yaml
-from powderdsl.system.memo import Memo
-from powderdsl.system.memory import collection_paused
+from powderdsl.system.memo import Memo, collection_paused
 from powderdsl.system.reading import inside, is_path
 from powderdsl.system.writing import failure
 

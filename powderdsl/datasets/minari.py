@@ -25,6 +25,7 @@ from powderdsl.envs import env_id
 from powderdsl.envs.actions import KINDS, ActionForm, action_form
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.model.fingerprint import fingerprint
+from powderdsl.system.packages import require
 from powderdsl.system.writing import failure, not_writable, scratch_folder
 from powderdsl.tasks.episodes import TaskProgram
 from powderdsl.tasks.shipped import load_task, shipped_tasks
@@ -43,12 +44,8 @@ DATA = "data"
 
 def require_minari() -> None:
     """Raises CompileError (PD612) if Minari or h5py is not installed."""
-    try:
-        import h5py  # noqa: F401  only whether it can be imported
-        import minari  # noqa: F401  likewise
-    except ModuleNotFoundError as error:
-        helps = ("pip install 'powderdsl[minari]'",)
-        raise failure("PD612", f"Minari datasets need the package {error.name}", helps=helps) from None
+    for module in ("h5py", "minari"):
+        require(module, "reading and writing Minari datasets", "pip install 'powderdsl[minari]'")
 
 
 # Export

@@ -113,7 +113,7 @@ def load_dataset(
             for name in ROWS:
                 if name not in heads:
                     raise BadArchive(f"`{name}` is missing")
-                if heads[name].letter not in "biuf" or not heads[name].shape:
+                if heads[name].dtype == "str" or not heads[name].shape:
                     raise BadArchive(f"`{name}` is not an array of numbers")
             counts = {name: heads[name].shape[0] for name in ROWS}
             if len(set(counts.values())) != 1:

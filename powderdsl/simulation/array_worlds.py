@@ -13,8 +13,7 @@ from powderdsl.model.types import Ruleset
 from powderdsl.simulation.any_arrays import AnySimulator, AnyWorld
 from powderdsl.simulation.reference_program import ReferenceProgram
 from powderdsl.simulation.state_checks import unknown_slot
-from powderdsl.system.memo import Memo
-from powderdsl.system.memory import collection_paused
+from powderdsl.system.memo import Memo, collection_paused
 from powderdsl.targets.array_kind import Array, PlainArrays
 from powderdsl.targets.job import Job, Runnable
 from powderdsl.targets.mixed import MixedProgram

@@ -12,8 +12,8 @@ from typing import Any
 
 from powderdsl.arrays import NDArray, np
 from powderdsl.simulation.draw import to_numpy
-from powderdsl.system.packages import pillow
-from powderdsl.system.writing import failure, replacing
+from powderdsl.system.packages import require
+from powderdsl.system.writing import replacing
 
 MIN_GIF_DELAY = 20
 """Milliseconds. Browsers slow down GIFs whose frames are shorter."""
@@ -21,7 +21,7 @@ MIN_GIF_DELAY = 20
 
 def write_png(path: str | Path, image: Any) -> None:
     """Write one picture, uint8 [H, W, 3] (array or tensor)."""
-    images, frame = pillow("writing a picture"), to_numpy(image)
+    images, frame = require("PIL.Image", "writing a picture", "pip install pillow"), to_numpy(image)
     with replacing(Path(path), follow=True) as temporary:
         picture = images.frombytes("RGB", (frame.shape[1], frame.shape[0]), frame.tobytes())
         picture.save(temporary, format="PNG", optimize=True)
@@ -33,7 +33,8 @@ def write_gif(path: str | Path, frames: Iterable[Any], *, fps: float = 30, loop:
     Frames of up to 256 colors keep them exactly; others are reduced, without dithering.
     """
     delay = max(round(100 / fps) * 10, MIN_GIF_DELAY)  # GIF counts hundredths of a second
-    module = pillow("writing an animation", "numpy")
+    require("numpy", "writing an animation", "pip install numpy")
+    module = require("PIL.Image", "writing an animation", "pip install pillow")
     images = (_indexed(module, to_numpy(frame)) for frame in frames)
     first = next(images)
     endless = {"loop": 0} if loop else {}
@@ -47,18 +48,12 @@ def write_mp4(path: str | Path, frames: Iterable[Any], *, fps: float = 30) -> No
 
     Raises CompileError (PD612) if imageio-ffmpeg is not installed, and OSError with the encoder's own words if it fails.
     """
-    try:
-        import imageio_ffmpeg
-    except ImportError:
-        raise failure(
-            "PD612",
-            "writing MP4 needs imageio-ffmpeg, which is not installed",
-            helps=("pip install 'powderdsl[video]'", "or write a .gif, which needs nothing"),
-        ) from None
+    helps = ("pip install 'powderdsl[video]'", "or write a .gif, which needs nothing")
+    ffmpeg = require("imageio_ffmpeg", "writing MP4", *helps).get_ffmpeg_exe()
     pictures = (_even(to_numpy(frame)) for frame in frames)
     first = next(pictures)
     size = f"{first.shape[1]}x{first.shape[0]}"
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"]
+    command = [ffmpeg, "-v", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"]
     command += ["-s", size, "-r", str(fps), "-i", "-", *_ENCODING.split()]
     with replacing(Path(path), follow=True) as temporary:
         _encode([*command, str(temporary)], chain([first], pictures))

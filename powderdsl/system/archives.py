@@ -30,9 +30,9 @@ CHUNK = 1 << 24
 """Bytes of an array that are written together."""
 _MAGIC, _ALIGNMENT, _SHAPE_ROOM = b"\x93NUMPY", 64, 21
 """How arrays begin; the multiple of bytes at which their values begin; characters that may hold the first side."""
-_WORDS = {"b": "bool", "i": "int", "u": "uint", "f": "float", "U": "str"}
-_END, _END64 = struct.Struct("<4s4H2LH"), struct.Struct("<4sQ2H2L4Q")
-_LOCATOR = 20
+_TYPES = {"b": "bool", "i": "int", "u": "uint", "f": "float", "U": "str"}
+_END, _LOCATOR, _END64 = struct.Struct("<4s4H2LH"), 20, struct.Struct("<4sQ2H2L4Q")
+"""The end of a zip file; before it, where it is large, bytes of a pointer and another end."""
 
 
 class BadArchive(Exception):
@@ -43,14 +43,12 @@ class BadArchive(Exception):
 class Header:
     """What an array claims to be, and where its bytes begin in the unpacked member.
 
-    `letter` is ``b``, ``i``, ``u`` or ``f``, or ``U`` for text; `itemsize` the bytes of a number or text. Those of
-    numbers stand the other way round if `swapped`.
+    `dtype` is NumPy's name, such as ``uint8``, or ``str``; `itemsize` the bytes of a number or text.
     """
 
     shape: tuple[int, ...]
-    letter: str
+    dtype: str
     itemsize: int
-    swapped: bool
     fortran: bool
     start: int
     entry: zipfile.ZipInfo
@@ -59,12 +57,6 @@ class Header:
     def size(self) -> int:
         """Bytes."""
         return prod(self.shape) * self.itemsize
-
-    @property
-    def dtype(self) -> str:
-        """NumPy's name of it, such as ``uint8``; ``str`` for text."""
-        word = _WORDS[self.letter]
-        return word if self.letter in "bU" else f"{word}{8 * self.itemsize}"
 
 
 @dataclass(frozen=True)
@@ -81,31 +73,26 @@ class Archive:
 
     def read(self, name: str) -> NDArray[Any]:
         """Read an array of numbers, of the size that its header claims; it is read-only. Raises BadArchive."""
-        header, data = self.headers[name], self._bytes(name)
-        if header.letter == "U":
+        header = self.headers[name]
+        if header.dtype == "str":
             raise BadArchive(f"`{name}` is not an array of numbers")
-        if header.swapped:
-            parts, size = bytearray(len(data)), header.itemsize
-            for place in range(size):
-                parts[place::size] = data[size - 1 - place :: size]
-            data = memoryview(bytes(parts))
-        flat = np.frombuffer(data, header.dtype)
+        flat = np.frombuffer(self._bytes(name), header.dtype)
         if header.fortran:
             return np.transpose(flat.reshape(header.shape[::-1]))
         return flat.reshape(header.shape)
 
     def text(self, name: str) -> str:
         """Read a text. Raises BadArchive."""
-        header, data = self.headers[name], self._bytes(name)
-        if header.letter != "U" or header.shape != ():
+        header = self.headers[name]
+        if header.dtype != "str" or header.shape != ():
             raise BadArchive(f"`{name}` is not a text")
         with _as_bad_archive():
-            return str(data, "utf-32-be" if header.swapped else "utf-32-le").rstrip("\0")
+            return str(self._bytes(name), "utf-32-le").rstrip("\0")
 
     def _bytes(self, name: str) -> memoryview:
         header = self.headers[name]
-        with _as_bad_archive(), self._zip.open(header.entry) as member:
-            data = member.read()
+        with _as_bad_archive():
+            data = self._zip.read(header.entry)
         if len(data) != header.start + header.size:
             raise BadArchive(f"`{name}` does not have the bytes that it says")
         return memoryview(data)[header.start :]
@@ -145,7 +132,7 @@ def open_archive(path: Path) -> Iterator[Archive]:
     """
     with open_regular(path) as file:
         with _as_bad_archive():
-            check_directory(file, MAX_ENTRIES, MAX_DIRECTORY)
+            _check_directory(file)
             archive = zipfile.ZipFile(file)
         with archive:
             with _as_bad_archive():
@@ -166,28 +153,20 @@ def _as_bad_archive() -> Iterator[None]:
         raise BadArchive(words or type(error).__name__) from None
 
 
-def check_directory(file: BinaryIO, most: int, size_of_list: int) -> None:
-    """Raise BadArchive for a list of contents that is too long: `zipfile` reads all of it at once.
-
-    Args:
-        most: entries. size_of_list: bytes of the list.
-    """
+def _check_directory(file: BinaryIO) -> None:
+    """Raise BadArchive for a list of contents that is too long: `zipfile` reads all of it at once."""
     size = file.seek(0, os.SEEK_END)
-    tail_start = max(0, size - _END.size - (1 << 16) - _END64.size - _LOCATOR)
-    file.seek(tail_start)
+    file.seek(max(0, size - (1 << 16) - _END.size - _LOCATOR - _END64.size))
     tail = file.read()
     at = tail.rfind(b"PK\5\6")
-    if at < 0 or len(tail) - at < _END.size:
+    if at < 0:
         raise BadArchive("it is not an .npz file")
-    _, _, _, _, entries, length, _, _ = _END.unpack_from(tail, at)
+    *_, entries, length, _, _ = _END.unpack_from(tail, at)
     at64 = at - _LOCATOR - _END64.size
-    if at >= _LOCATOR and tail[at - _LOCATOR :].startswith(b"PK\6\7"):
-        if at64 < 0 or not tail[at64:].startswith(b"PK\6\6"):
-            raise BadArchive("its list of contents is damaged")
+    if at64 >= 0 and tail[at64:].startswith(b"PK\6\6"):
         *_, entries, length, _ = _END64.unpack_from(tail, at64)
-    if entries > most or length > size_of_list:
-        raise BadArchive(f"it has more than {most:,} entries")
-    file.seek(0)
+    if entries > MAX_ENTRIES or length > MAX_DIRECTORY:
+        raise BadArchive(f"it has more than {MAX_ENTRIES} entries")
 
 
 def _header(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> tuple[str, Header]:
@@ -195,31 +174,23 @@ def _header(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> tuple[str, Head
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise BadArchive(f"`{name}` is packed in another way than .npz files are")
     with archive.open(entry) as member:
-        magic, version = member.read(len(_MAGIC)), tuple(member.read(2))
-        if magic != _MAGIC:
+        magic, version = member.read(len(_MAGIC)), member.read(2)
+        if magic != _MAGIC or version not in (b"\1\0", b"\2\0"):
             raise BadArchive(f"`{name}` is not an array")
-        if version not in ((1, 0), (2, 0)):
-            raise BadArchive(f"`{name}` has the npy version {version}")
-        length = struct.Struct("<H" if version == (1, 0) else "<I")
+        length = struct.Struct("<H" if version == b"\1\0" else "<I")
         (count,) = length.unpack(member.read(length.size))
         if count > MAX_HEADER:
             raise BadArchive(f"`{name}` has a header of {count:,} bytes")
         values = literal_eval(member.read(count).decode("latin-1").strip())
         start = member.tell()
-    header = _checked_header(name, values, start, entry)
+    descr, fortran, shape = values["descr"], values["fortran_order"], values["shape"]
+    match = re.fullmatch(r"[<|](?:(b)(1)|([iu])([1248])|(f)([248])|(U)([0-9]{1,9}))", descr)
+    if match is None or any(type(side) is not int or side < 0 for side in shape):
+        raise BadArchive(f"`{name}` is not an array of numbers")
+    letter, digits = filter(None, match.groups())
+    itemsize = int(digits) * (4 if letter == "U" else 1)
+    dtype = _TYPES[letter] if letter in "bU" else f"{_TYPES[letter]}{8 * itemsize}"
+    header = Header(tuple(shape), dtype, itemsize, bool(fortran), start, entry)
     if entry.file_size != header.start + header.size:
         raise BadArchive(f"`{name}` has {entry.file_size - header.start:,} bytes, not {header.size:,}")
     return name, header
-
-
-def _checked_header(name: str, values: Any, start: int, entry: zipfile.ZipInfo) -> Header:
-    if not isinstance(values, dict) or values.keys() != {"descr", "fortran_order", "shape"}:
-        raise BadArchive(f"`{name}` does not say what it is")
-    descr, fortran, shape = values["descr"], values["fortran_order"], values["shape"]
-    found = re.fullmatch(r"([<>|=]?)(?:b(1)|[iu]([1248])|f([248])|U([0-9]{1,9}))", str(descr))
-    sides = isinstance(shape, tuple) and all(type(side) is int and side >= 0 for side in shape)
-    if not isinstance(descr, str) or found is None or not sides or not isinstance(fortran, bool):
-        raise BadArchive(f"`{name}` is not an array of numbers")
-    letter = descr.lstrip("<>|=")[0]
-    size = int(next(part for part in found.groups()[1:] if part)) * (4 if letter == "U" else 1)
-    return Header(shape, letter, size, found[1] == ">" and size > 1, fortran, start, entry)

@@ -1,4 +1,4 @@
-"""Packages that only some commands need, imported when they are asked for."""
+"""Packages that only some work needs."""
 
 from __future__ import annotations
 
@@ -8,24 +8,17 @@ from typing import Any
 from powderdsl.system.writing import failure
 
 
-def pillow(work: str, *more: str) -> Any:
-    """Pillow's module of images.
+def require(module: str, work: str, *helps: str) -> Any:
+    """Import a module.
 
     Args:
-        work: what it is needed for, as a sentence begins: ``reading a picture``.
-        more: other modules that the work needs.
+        work: what needs it, as a sentence begins: ``reading a picture``. helps: how to install it, what to do without.
 
     Raises:
-        CompileError: PD612 if one of them cannot be imported.
+        CompileError: PD612 if it cannot be imported.
     """
-    for name in more:
-        _needed(name, name, work)
-    return _needed("PIL.Image", "Pillow", work)
-
-
-def _needed(module: str, package: str, work: str) -> Any:
     try:
         return import_module(module)
-    except ImportError:
-        message = f"{work} needs {package}, which is not installed"
-        raise failure("PD612", message, helps=(f"pip install {package.lower()}",)) from None
+    except ImportError as error:
+        missing = error.name or module
+        raise failure("PD612", f"{work} needs {missing}, which is not installed", helps=helps) from None

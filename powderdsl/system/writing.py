@@ -9,7 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory, mkstemp
 
 from powderdsl.diagnostics import CompileError, Diagnostic, Label
-from powderdsl.system.reading import refuse_irregular
+from powderdsl.system.reading import check_regular
 
 MARK = ".powderdsl-"
 """What names of temporary files have in them."""
@@ -64,21 +64,24 @@ def scratch_folder(parent: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str, *, follow: bool = False) -> None:
-    """Write a text as UTF-8, whole or not at all, as `replacing` does."""
+    """Write a text as UTF-8, whole or not at all, as `replacing` does. Raises CompileError (PD613)."""
     with replacing(path, follow=follow) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        try:
+            temporary.write_text(text, encoding="utf-8")
+        except OSError as error:
+            raise not_writable(path, error) from None
 
 
 def destination(path: Path, *, follow: bool) -> Path:
     """Where a file of this name is written: the path itself, or where a link leads.
 
     Raises:
-        CompileError: PD613 if a folder, a pipe, a socket or a device is there, or links form a loop.
+        CompileError: PD613 if something else than a file is there, or links form a loop.
     """
     try:
         target = path.resolve() if follow and path.is_symlink() else path
         if target.exists() and (follow or not path.is_symlink()):
-            refuse_irregular(target)
+            check_regular(target)
     except (OSError, ValueError, RuntimeError) as error:
         raise not_writable(path, error) from None
     return target

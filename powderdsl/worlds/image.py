@@ -12,7 +12,7 @@ from powderdsl.arrays import NDArray, np
 from powderdsl.diagnostics import CompileError, Diagnostic, Label
 from powderdsl.model.types import Element
 from powderdsl.simulation.draw import ramps
-from powderdsl.system.packages import pillow
+from powderdsl.system.packages import require
 from powderdsl.system.reading import open_regular
 from powderdsl.system.writing import failure
 from powderdsl.worlds.raster import MAX_CELLS
@@ -102,7 +102,8 @@ def _pack(color: str) -> int:
 
 def _pixels(path: Path) -> NDArray[np.uint8]:
     """The picture as uint8 [H, W, 4], red, green, blue, opacity."""
-    images = pillow("reading a picture", "numpy")
+    require("numpy", "reading a picture", "pip install numpy")
+    images = require("PIL.Image", "reading a picture", "pip install pillow")
     try:
         file = open_regular(path)
     except OSError as error:

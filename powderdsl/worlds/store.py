@@ -112,7 +112,7 @@ def _loaded(archive: Archive, sim: AnySimulator[W], source: Path) -> W:
 def _about(archive: Archive, path: Path) -> tuple[dict[int, str], dict[str, str], str]:
     """The palette, the qualified name of each field, and the name of the ruleset."""
     header = archive.headers.get("about")
-    if header is None or header.shape != () or header.letter != "U" or header.size > MAX_ABOUT:
+    if header is None or header.shape != () or header.dtype != "str" or header.size > MAX_ABOUT:
         raise _bad(path, "is not a saved world: it does not say what it is")
     try:
         about = parse_json(archive.text("about").encode())
@@ -150,7 +150,7 @@ def check_saved(path: Path, shape: tuple[int, ...]) -> None:
 def _clock(archive: Archive, name: str, path: Path) -> Any:
     header = archive.headers.get(name)
     batch = archive.headers[IDS].shape[:1]
-    if header is None or header.letter not in "iu" or header.shape != batch:
+    if header is None or header.dtype[:1] not in "iu" or header.shape != batch:
         raise _bad(path, f"is not a saved world: its arrays do not fit together (`{name}`)")
     values = archive.read(name).astype(np.int64)
     if (values < 0).any():

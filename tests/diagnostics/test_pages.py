@@ -12,8 +12,8 @@ The text under the caret stands in the example, in a comment ``# ^ text`` below 
 
 from __future__ import annotations
 
-import builtins
 import re
+import sys
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -227,15 +227,8 @@ def read_a_soft_picture() -> None:
 def write_a_film_without_the_package() -> None:
     from powderdsl.simulation.media import write_mp4
 
-    imports = builtins.__import__
-
-    def refuse(name, *rest):  # type: ignore[no-untyped-def]
-        if name == "imageio_ffmpeg":
-            raise ImportError(name)
-        return imports(name, *rest)
-
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(builtins, "__import__", refuse)
+        patch.setitem(sys.modules, "imageio_ffmpeg", None)
         write_mp4("yard.mp4", [np.zeros((2, 2, 3), dtype=np.uint8)])
 
 

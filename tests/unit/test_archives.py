@@ -63,7 +63,13 @@ def test_worlds_that_could_not_be_loaded_are_not_saved(tmp_path):
 
 @pytest.mark.parametrize("member", ["x.npy", "y.npy"])
 def test_what_is_no_array_of_numbers(member, tmp_path):
-    for value in (np.array([None]), np.zeros(2, [("a", "i4")]), np.zeros(2, "S3"), np.array([1j])):
+    for value in (
+        np.array([None]),
+        np.zeros(2, [("a", "i4")]),
+        np.zeros(2, "S3"),
+        np.array([1j]),
+        np.array([1], ">i4"),
+    ):
         np.savez(tmp_path / "a.npz", **{member.removesuffix(".npy"): value})
         with pytest.raises(BadArchive), open_archive(tmp_path / "a.npz"):
             pass
@@ -97,12 +103,11 @@ def test_archives_are_those_of_numpy(tmp_path):
 
 
 def test_arrays_in_other_orders_are_read(tmp_path):
-    value = np.arange(24, dtype=">i4").reshape(2, 3, 4)
-    np.savez(tmp_path / "a.npz", a=value, b=np.asfortranarray(value), c=np.array("x", ">U3"))
+    value = np.arange(24, dtype="i4").reshape(2, 3, 4)
+    np.savez(tmp_path / "a.npz", a=np.asfortranarray(value), c=np.array("x", "U3"))
     with open_archive(tmp_path / "a.npz") as archive:
         assert archive.headers["a"].dtype == "int32"
         assert (archive.read("a") == value).all()
-        assert (archive.read("b") == value).all()
         assert archive.text("c") == "x"
         with pytest.raises(BadArchive):
             archive.text("a")

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import builtins
 import os
 import stat
 import subprocess
+import sys
 
 import imageio_ffmpeg
 import numpy as np
@@ -118,14 +118,7 @@ def test_mp4_of_odd_size_repeats_the_border(tmp_path):
 
 
 def test_mp4_needs_its_encoder(tmp_path, monkeypatch):
-    original = builtins.__import__
-
-    def without(name, *arguments, **options):
-        if name == "imageio_ffmpeg":
-            raise ImportError(name)
-        return original(name, *arguments, **options)
-
-    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(CompileError, match=r"PD612[\s\S]*powderdsl\[video\]"):
         write_mp4(tmp_path / "x.mp4", [world(0)])
     assert list(tmp_path.iterdir()) == []

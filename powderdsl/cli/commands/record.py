@@ -200,13 +200,9 @@ def _trained(path: str, task: Task, how: dict[str, Any]) -> dict[str, Any]:
 
 def require_gymnasium() -> None:
     """Raises CompileError (PD612) if the environments' package is not installed."""
-    try:
-        import powderdsl.envs  # noqa: F401  only whether it can be imported
-    except ModuleNotFoundError as error:
-        from powderdsl.system.writing import failure
+    from powderdsl.system.packages import require
 
-        helps = ("pip install 'powderdsl[rl]'",)
-        raise failure("PD612", f"recording needs the package {error.name}", helps=helps) from None
+    require("gymnasium", "recording", "pip install 'powderdsl[rl]'")
 
 
 def _verify(folder: Path) -> int:

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 from statistics import median
 
 from powderdsl.experiments.bench.report import CellFigures, Report, label
-from powderdsl.system.writing import failure, replacing
+from powderdsl.system.packages import require
+from powderdsl.system.writing import replacing
 
 
 def require_matplotlib() -> None:
     """Raise CompileError (PD612) if matplotlib is not installed: before long work, not after it."""
-    if find_spec("matplotlib") is None:
-        raise failure(
-            "PD612",
-            "drawing a plot needs matplotlib, which is not installed",
-            helps=("pip install 'powderdsl[plot]'", "or write the figures with --json"),
-        )
+    helps = ("pip install 'powderdsl[plot]'", "or write the figures with --json")
+    require("matplotlib", "drawing a plot", *helps)
 
 
 def write_plot(path: Path, report: Report) -> None:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import re
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,23 +38,18 @@ def save_checkpoint(folder: Path, step: int, state: Any) -> Path:
         CompileError: PD613 if the folder cannot be written to, or the disk is full.
     """
     data = _encoded(state)
-    path = folder / f"{step:012d}-{hashlib.sha256(data).hexdigest()[:16]}.safetensors"
+    path = folder / f"{step:012d}-{_digest(data)}.safetensors"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as temporary, temporary.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        _sync(folder)
+        with replacing(path) as temporary:
+            temporary.write_bytes(data)
     except OSError as error:
         raise not_writable(path, error) from None
-    others = [(number, old) for number, _, old in _named(folder) if old != path]
-    # Later ones are left by a run that had to go back; they must not be taken for newer.
-    spare = next((old for number, old in others if number < step), None)
-    for _, old in others:
-        if old != spare:
-            with suppress(OSError):
-                old.unlink()
+    before = [old for number, _, old in _named(folder) if number < step]
+    for _, _, other in _named(folder):
+        # Later ones are left by a run that had to go back; they must not be taken for newer.
+        if other not in (path, *before[:1]):
+            other.unlink(missing_ok=True)
     return path
 
 
@@ -73,7 +66,7 @@ def latest_checkpoint(folder: Path) -> Checkpoint | None:
             data = read_bytes(path, MAX_BYTES)
         except OSError:
             continue
-        if hashlib.sha256(data).hexdigest()[:16] == digest:
+        if _digest(data) == digest:
             try:
                 return Checkpoint(step, _decoded(data), path)
             except Exception as error:  # a crafted file raises whatever it likes
@@ -130,21 +123,11 @@ def _unpacked(value: Any, tensors: dict[str, Tensor]) -> Any:
     return value
 
 
+def _digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()[:16]
+
+
 def _named(folder: Path) -> list[tuple[int, str, Path]]:
     """Step, digest and path of all checkpoints, the newest first."""
-    try:
-        names = os.listdir(folder)
-    except OSError:
-        return []
-    found = [(match, folder / name) for name in names if (match := NAME.fullmatch(name))]
-    return sorted(((int(match[1]), match[2], path) for match, path in found), reverse=True)
-
-
-def _sync(folder: Path) -> None:
-    """Make a new name durable: without this, a power cut may undo it."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        with suppress(OSError):  # some file systems cannot
-            os.fsync(handle)
-    finally:
-        os.close(handle)
+    matches = [(NAME.fullmatch(path.name), path) for path in folder.glob("*")]
+    return sorted(((int(match[1]), match[2], path) for match, path in matches if match), reverse=True)

@@ -20,7 +20,7 @@ from powderdsl.diagnostics import CompileError, suggest
 from powderdsl.experiments.runs.checkpoints import Checkpoint, latest_checkpoint, save_checkpoint
 from powderdsl.experiments.runs.metrics import Metrics
 from powderdsl.system.reading import check_links, read_json
-from powderdsl.system.writing import failure, not_writable, replacing
+from powderdsl.system.writing import failure, not_writable, write_text
 
 ABOUT = "run.json"
 FORMAT = 1
@@ -232,14 +232,7 @@ def versions() -> dict[str, str]:
 
 def write_json(path: Path, value: Any, *, follow: bool = False) -> Path:
     """Write a file whole or not at all. `follow`: write to where a link leads. Raises CompileError (PD613)."""
-    try:
-        with replacing(path, follow=follow) as temporary, temporary.open("w", encoding="utf-8") as file:
-            json.dump(value, file, indent=1, ensure_ascii=False)
-            file.write("\n")
-            file.flush()
-            os.fsync(file.fileno())
-    except OSError as error:
-        raise not_writable(path, error) from None
+    write_text(path, json.dumps(value, indent=1, ensure_ascii=False) + "\n", follow=follow)
     return path
 
 

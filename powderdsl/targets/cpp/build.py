@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import atexit
 import ctypes
 import hashlib
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from tempfile import TemporaryFile
 
 from powderdsl.system.user_cache import cache_folder
 from powderdsl.system.writing import scratch_folder
@@ -106,7 +104,7 @@ def _compile(
         text.write_text(source, encoding="utf-8")
         built.mkdir()
         command, library = [*compiler.command, *flags], str(built / cache.LIBRARY)
-        if units == 1 or os.cpu_count() == 1 or _unguarded():
+        if units == 1 or os.cpu_count() == 1:
             _call([[*command, "-o", library, str(text)]], scratch)
         else:
             objects = [str(scratch / f"{unit}.o") for unit in range(units)]
@@ -135,84 +133,38 @@ def _call(commands: list[list[str]], scratch: Path) -> None:
         raise NoCompiler("\n".join([f"{commands[0][0]} failed:", *said.splitlines()[:8]]))
 
 
-def _unguarded() -> bool:
-    """In a program frozen into one file, sys.executable is that program, so there is no guard."""
-    return bool(getattr(sys, "frozen", False)) or not sys.executable
-
-
-_running: dict[subprocess.Popen[bytes], Path] = {}
-_lock = threading.Lock()
-
-
 def run_guarded(scratch: Path, *commands: list[str]) -> tuple[int, str]:
     """Exit code and messages of commands that run side by side and never outlive this process.
 
     Args:
-        scratch: a folder for their temporary files, removed if this process ends early. commands: one, if there is no
-            guard.
+        scratch: a folder for their temporary files, removed if this process ends early.
 
     Raises:
         NoCompiler: one cannot be started, or they take longer than TIMEOUT.
     """
-    guarded = [sys.executable, "-I", "-S", compiler_guard.__file__, json.dumps(commands)]
-    called = commands[0] if _unguarded() else guarded
-    # Nothing is written: the guard waits until the last process that holds our end is gone.
-    theirs, ours = os.pipe()
-    process: subprocess.Popen[bytes] | None = None
-    try:
+    guarded = [sys.executable, "-I", "-S", compiler_guard.__file__, str(scratch), json.dumps(commands)]
+    with TemporaryFile() as said:
         try:
             process = subprocess.Popen(
-                called,
-                stdin=theirs,
+                guarded,
+                stdin=subprocess.PIPE,  # nothing is written: the guard waits until our end is closed
                 stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
+                stderr=said,
                 env={**os.environ, "TMPDIR": str(scratch), "LC_ALL": "C"},
                 start_new_session=True,
             )
         except OSError as error:
             raise NoCompiler(f"{commands[0][0]} could not be run: {error}") from None
+        assert process.stdin is not None
+        try:
+            status = process.wait(TIMEOUT)
+        except subprocess.TimeoutExpired:
+            raise NoCompiler(f"{commands[0][0]} took longer than {TIMEOUT} s") from None
         finally:
-            os.close(theirs)
-        with _lock:
-            _running[process] = scratch
-        said = process.communicate(timeout=TIMEOUT)[1].decode(errors="replace")
-    except subprocess.TimeoutExpired:
-        raise NoCompiler(f"{commands[0][0]} took longer than {TIMEOUT} s") from None
-    finally:
-        if process is not None:
-            _end(process)
-            with _lock:
-                _running.pop(process, None)
-        os.close(ours)
-    return process.returncode, said
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """End a guard that still runs with all that it started, and reap it."""
-    if process.poll() is None:
-        with suppress(OSError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-
-
-@atexit.register
-def _end_all() -> None:
-    with _lock:
-        running = dict(_running)
-    for process, scratch in running.items():
-        _end(process)
-        shutil.rmtree(scratch, ignore_errors=True)  # the thread that waits for it does not run any more
-
-
-def _forget() -> None:
-    """In a forked child: forget the processes of the parent."""
-    global _lock
-    _lock = threading.Lock()
-    _running.clear()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_forget)
+            process.stdin.close()
+            process.wait()
+        said.seek(0)
+        return status, said.read().decode(errors="replace")
 
 
 def open_library(source: str, ruleset: str = "", units: int = 1) -> tuple[Path, ctypes.CDLL]:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from powderdsl.ir.ops import SNAP, Program
 from powderdsl.schedule.presence import asked_ids
 from powderdsl.schedule.stages import CPU, plan
-from powderdsl.system.memory import collection_paused
+from powderdsl.system.memo import collection_paused
 from powderdsl.targets.cpp.text import pass_text
 from powderdsl.targets.layout import Layout, layout_of, literal
 

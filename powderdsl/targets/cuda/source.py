@@ -9,7 +9,7 @@ from powderdsl.ir.ops import SNAP, Program
 from powderdsl.schedule.barriers import Pending, barriers
 from powderdsl.schedule.buffers import Pool, buffers
 from powderdsl.schedule.stages import CUDA, plan
-from powderdsl.system.memory import collection_paused
+from powderdsl.system.memo import collection_paused
 from powderdsl.targets.cuda.text import pass_text
 from powderdsl.targets.layout import Layout, layout_of, literal
 

@@ -8,7 +8,7 @@ import torch
 
 from powderdsl.ir.ops import Program
 from powderdsl.ir.segments import Segment, segments
-from powderdsl.system.memory import collection_paused
+from powderdsl.system.memo import collection_paused
 from powderdsl.targets.job import Runnable
 from powderdsl.targets.mixed import MixedProgram
 from powderdsl.targets.torch.program import TorchProgram

@@ -11,8 +11,7 @@ from powderdsl.ir.structure import structure
 from powderdsl.schedule.presence import asked_ids
 from powderdsl.schedule.stages import CPU, plan
 from powderdsl.schedule.types import Schedule
-from powderdsl.system.memo import Memo
-from powderdsl.system.memory import collection_paused
+from powderdsl.system.memo import Memo, collection_paused
 from powderdsl.targets.layout import Layout, layout_of
 from powderdsl.targets.wasm.binary import Module
 from powderdsl.targets.wasm.driver import add_driver
