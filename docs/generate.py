@@ -45,7 +45,7 @@ from powderdsl.model.text import show_offset
 from powderdsl.model.types import Kernel
 from powderdsl.syntax import parse, yaml_tree
 from powderdsl.syntax.parse import reserved_words
-from powderdsl.tasks.keys import TASK_KEYS
+from powderdsl.tasks.file import TASK_KEYS
 from powderdsl.worlds.scene.read import FILE_KEYS, SCENE_KEYS
 from powderdsl.worlds.scene.statements import SETTING, STATEMENTS
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
 from dataclasses import MISSING, Field, fields, is_dataclass
 from fractions import Fraction
 from types import MappingProxyType
@@ -18,9 +17,7 @@ def fingerprint(model: object) -> str:
 
     Fields that take no part in comparisons, such as places in files, take none here, nor do those with `UNMEANING` as
     metadata. A field at its default counts as absent, so that new fields change no fingerprint. The names of classes and
-    fields are part of it: renaming one changes the fingerprints that users' files have recorded.
-
-    A function as the metadata ``fingerprint`` of a field gives what stands for its value.
+    fields are part of it.
 
     Raises:
         TypeError: something else was found.
@@ -52,6 +49,5 @@ def _meaning(value: Any) -> list[tuple[Field[Any], Any]]:
         part = getattr(value, field.name)
         default = field.default_factory() if field.default_factory is not MISSING else field.default
         if field.compare and field.metadata.get("meaning", True) and (default is MISSING or part != default):
-            written: Callable[[Any], Any] = field.metadata.get("fingerprint", lambda part: part)
-            found.append((field, written(part)))
+            found.append((field, part))
     return found

@@ -1,18 +1,135 @@
-"""Statements as written -> a checked `Generator`: names known, elements resolved, numbers within bounds."""
+"""Lists of statements and pictures of a task file -> a checked `Generator`: names known, numbers within bounds."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
-from powderdsl.diagnostics import Reporter, suggest
-from powderdsl.model.types import Ruleset
-from powderdsl.tasks.statement_lists import BROKEN, Item, Repeat
-from powderdsl.tasks.task import MAX_NUMBER, MAX_REPEATS, Drawing, Generator, Group, Region, Stamp, Target
-from powderdsl.worlds.raster import Shape, Size, mask
+from powderdsl.arrays import NDArray, np
+from powderdsl.diagnostics import CompileError, Reporter, Span, suggest
+from powderdsl.model.schema import Reader, first_line
+from powderdsl.model.types import Element, Ruleset
+from powderdsl.syntax import yaml_tree
+from powderdsl.syntax.sources import path_beside
+from powderdsl.tasks.task import (
+    MAX_NUMBER,
+    MAX_REPEATS,
+    MAX_SIDE,
+    Drawing,
+    Generator,
+    Group,
+    Region,
+    Stamp,
+    Target,
+)
+from powderdsl.worlds.ascii import load_ascii, parse_ascii
+from powderdsl.worlds.image import read_image
+from powderdsl.worlds.raster import Setting, Shape, Size, mask
+from powderdsl.worlds.scene import draw_scene, find_scene, shipped_scenes
 from powderdsl.worlds.scene.amounts import Amount, Interval, filled_in, integers, interval, number
-from powderdsl.worlds.scene.read import covers_nothing
-from powderdsl.worlds.scene.statements import NUMBERS, RANGES, ElementChoice, Statement, Word
+from powderdsl.worlds.scene.read import covers_nothing, not_a_statement
+from powderdsl.worlds.scene.statements import (
+    NUMBERS,
+    RANGES,
+    ElementChoice,
+    Statement,
+    Word,
+    read_amount,
+    read_statement,
+    text_span,
+)
+
+BROKEN = Amount("broken")
+"""A number whose mistake has been reported: what depends on it is not a second one."""
+
+MAX_STATEMENTS = 2_000
+"""Statements of one list."""
+
+
+@dataclass(frozen=True)
+class Repeat:
+    """Statements that are done `count` times, with names of their own."""
+
+    count: Amount
+    lets: tuple[tuple[Word, Amount], ...]
+    statements: tuple[Statement, ...]
+    span: Span = field(compare=False, repr=False)
+
+
+Item = Statement | Repeat
+
+
+def read_items(node: yaml_tree.Node | None, reader: Reader, *, nested: bool = False) -> tuple[Item, ...]:
+    """The items of a list of statements. `nested` lists, those of a repetition, hold no repetitions."""
+    reporter = reader.reporter
+    if node is None or (isinstance(node, yaml_tree.Scalar) and node.text == ""):
+        return ()
+    if not isinstance(node, yaml_tree.Sequence):
+        reader.shape(node, "a list of statements", "write one `- statement` a line")
+        return ()
+    if len(node.items) > MAX_STATEMENTS:
+        message = f"a list of {len(node.items):,} statements"
+        reporter.error("PD508", message, first_line(node), f"the limit is {MAX_STATEMENTS:,}")
+        return ()
+    found: list[Item | None] = []
+    for item in node.items:
+        if isinstance(item, yaml_tree.Mapping):
+            if not nested:
+                found.append(_repeat(item, reader))
+            elif not _is_let(item):
+                _not_a_statement(item, reporter, nested)
+        elif isinstance(item, yaml_tree.Sequence):
+            reader.shape(item, "a statement")
+        elif span := text_span(item, reporter):
+            found.append(read_statement(span, reporter))
+    return tuple(item for item in found if item is not None)
+
+
+def _is_let(item: yaml_tree.Mapping) -> bool:
+    return [key.text for key, _ in item.entries] == ["let"]
+
+
+def _repeat(item: yaml_tree.Mapping, reader: Reader) -> Repeat | None:
+    """`repeat COUNT:` with a list below it, among whose items `let:` gives names."""
+    if len(item.entries) != 1 or not item.entries[0][0].text.startswith("repeat"):
+        _not_a_statement(item, reader.reporter, nested=False)
+        return None
+    key, body = item.entries[0]
+    count = read_amount(key.content, reader.reporter, repeat=True)
+    lets: list[tuple[Word, Amount]] = []
+    for one in body.items if isinstance(body, yaml_tree.Sequence) else ():
+        if isinstance(one, yaml_tree.Mapping) and _is_let(one):
+            lets += read_lets(one.entries[0][1], reader)
+    if isinstance(body, yaml_tree.Scalar) and body.text == "":
+        reader.reporter.error("PD109", "a repetition of nothing", key.span, "no statements stand below it")
+        return None
+    statements = tuple(one for one in read_items(body, reader, nested=True) if isinstance(one, Statement))
+    return Repeat(count, tuple(lets), statements, key.span) if count is not None else None
+
+
+def read_lets(node: yaml_tree.Node | None, reader: Reader) -> list[tuple[Word, Amount]]:
+    """The names of a `let:` and their numbers, in order; BROKEN after a report."""
+    found = []
+    for key, value in reader.named(node, "a number"):
+        if not isinstance(value, yaml_tree.Scalar):
+            reader.shape(value, "a number")
+        span = text_span(value, reader.reporter)
+        amount = read_amount(span, reader.reporter) if span is not None else None
+        found.append((Word(key.text, key.span), amount or BROKEN))
+    return found
+
+
+def _not_a_statement(item: yaml_tree.Mapping, reporter: Reporter, nested: bool) -> None:
+    word = next(iter(item.entries[0][0].text.split()), "") if item.entries else ""
+    if nested and word == "repeat":
+        fix = "repetitions do not stand in repetitions: multiply the counts"
+    elif word == "let":
+        fix = "`let:` stands at the top of the file, or in a repetition"
+    else:
+        fix = "say `48:end` for `48:`, or quote the statement; `repeat 0..5:` has a list below it"
+    not_a_statement(item, reporter, fix)
+
 
 MAX_DRAWINGS = 4_096
 """Drawings of one world, repetitions counted."""
@@ -262,3 +379,89 @@ def element_ids(word: Word, ruleset: Ruleset, reporter: Reporter) -> tuple[int, 
         label = "neither an element nor a tag of these rules"
         reporter.error("PD604", f"unknown element `{word.text}`", word.span, label, helps=helps)
     return tagged
+
+
+LEAVE = 255
+"""In a stamp: the cell stays as it is."""
+
+
+def read_stamp(key: yaml_tree.Scalar, node: yaml_tree.Node, reader: Reader, ruleset: Ruleset) -> Stamp | None:
+    """The picture of a stamp, or None after a report."""
+    entries = reader.mapping(node, "stamp", "a stamp")
+    art, scene = reader.scalar(entries, "art"), reader.scalar(entries, "scene")
+    if (art is None) == (scene is None):
+        label = "neither `art` nor `scene`" if art is None else "both `art` and `scene`"
+        reader.reporter.error("PD109", f"the stamp `{key.text}` needs one picture", key.span, label)
+        return None
+    ids = _named(scene, reader, ruleset) if scene is not None else None
+    if art is not None:
+        ids = _drawn(art, _legend(entries, reader), reader, ruleset)
+    if ids is None:
+        return None
+    if max(ids.shape) > MAX_SIDE:
+        message = f"a stamp of {ids.shape[0]}×{ids.shape[1]} cells"
+        reader.reporter.error("PD607", message, key.span, "too large")
+        return None
+    return Stamp(key.text, tuple(map(tuple, ids.tolist())))
+
+
+def _legend(entries: dict[str, tuple[yaml_tree.Scalar, yaml_tree.Node]], reader: Reader) -> dict[str, str]:
+    node = entries["legend"][1] if "legend" in entries else None
+    found = {}
+    for key, value in node.entries if isinstance(node, yaml_tree.Mapping) else ():
+        if len(key.text) != 1 or not isinstance(value, yaml_tree.Scalar):
+            reader.reporter.error("PD110", "a legend has single characters", key.span, "not one character")
+        else:
+            found[key.text] = value.text
+    return found
+
+
+def _drawn(
+    art: yaml_tree.Scalar, legend: dict[str, str], reader: Reader, ruleset: Ruleset
+) -> NDArray[np.uint8] | None:
+    """ASCII art, in which `?` leaves cells as they are."""
+    hole = replace(ruleset.elements[0], name="?", pack="?", id=LEAVE, glyph="?")
+    elements: list[Element] = [one for one in ruleset.elements if one.id != LEAVE]
+    if art.style == "quoted" and art.content.text.split() != art.text.split():
+        helps = ["write `art: |`, and the rows below it"]
+        reader.reporter.error("PD107", "art with escapes", art.span, "quoted, on one line", helps=helps)
+        return None
+    try:
+        return parse_ascii(art.content, [*elements, hole], reader.reporter, {"?": "?", **legend})
+    except CompileError as error:
+        for one in error.diagnostics:
+            reader.reporter.error(one.code, one.message, one.primary.span or art.span, helps=one.helps)
+    except ValueError as error:
+        reader.reporter.error("PD110", str(error), art.span)
+    return None
+
+
+def _named(word: yaml_tree.Scalar, reader: Reader, ruleset: Ruleset) -> NDArray[np.uint8] | None:
+    """A shipped scene, or a file beside the task's: .yaml, .png or .txt."""
+    file, _, name = word.text.rpartition("#") if "#" in word.text else (word.text, "", "")
+    suffix = Path(file).suffix.lower()
+    known = [one.name for one in shipped_scenes()]
+    if word.text not in known and suffix not in (".png", ".txt", ".yaml", ".yml"):
+        helps = suggest(word.text, known) or ("shipped: " + ", ".join(known),)
+        reader.reporter.error("PD601", f"unknown scene `{word.text[:80]}`", word.span, helps=helps)
+        return None
+    path = word.text if word.text in known else path_beside(file, word.span, reader.reporter)
+    if path is None:
+        return None
+    beside = f"{path}#{name}" if name else str(path)
+    try:
+        if suffix == ".png":
+            return read_image(beside, ruleset.elements)
+        if suffix == ".txt":
+            return load_ascii(beside, ruleset.elements)
+        found = find_scene(beside)
+        setting = next((one for one in found.paints if isinstance(one, Setting)), None)
+        if setting is not None:
+            message = f"the scene `{found.name}` sets `{setting.name}`"
+            reader.reporter.error("PD605", message, word.span, "a picture is made of elements only")
+            return None
+        return draw_scene(found, ruleset)
+    except CompileError as error:
+        for one in error.diagnostics:
+            reader.reporter.error(one.code, one.message, word.span, notes=one.notes, helps=one.helps)
+    return None

@@ -16,8 +16,8 @@ from powderdsl.simulation.simulator import compile as compile_rules
 from powderdsl.tasks.shipped import check_split, load_task
 from powderdsl.tasks.task import Task
 from powderdsl.tasks.tensors.actions import CLOCK, Hands, put_rows, put_worlds
+from powderdsl.tasks.tensors.generator import StartWorlds
 from powderdsl.tasks.tensors.measures import Facts, Meter, measures_of, scalar_value, scalars_of
-from powderdsl.tasks.tensors.starts import StartWorlds
 
 __all__ = ["Episodes", "TaskProgram", "check_actions", "compile_task", "load_task"]
 

@@ -16,6 +16,7 @@ from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.types import FLAG, REAL, Expr
 from powderdsl.syntax.ast import Syntax
 from powderdsl.tasks.task import Measure
+from powderdsl.worlds.scene.amounts import CALCULATE
 
 MEASURES = {
     "count": "count(CELLS in REGION)",
@@ -45,6 +46,15 @@ _BINARY = {
     "mod": "mod",
 }
 _COMPARE = {"<": "lt", "<=": "le", "==": "eq"}
+_CONSTANT: dict[str, Callable[..., float]] = {
+    **CALCULATE,
+    "div": operator.truediv,
+    "min": min,
+    "max": max,
+    "neg": operator.neg,
+    "abs": abs,
+}
+"""Operations on numbers alone."""
 REGION_LET = "in "
 """How the names of regions begin among the values that cell conditions read."""
 
@@ -243,19 +253,6 @@ class GoalChecker:
         return Syntax("and_", parts, "", syntax.span)
 
 
-_CONSTANT: dict[str, Callable[..., float]] = {
-    "add": operator.add,
-    "sub": operator.sub,
-    "mul": operator.mul,
-    "div": operator.truediv,
-    "mod": operator.mod,
-    "min": min,
-    "max": max,
-    "neg": operator.neg,
-    "abs": abs,
-}
-
-
 def _constant(scalar: Expr) -> float | None:
     """The value of numbers alone; None where the world matters. Divisors are known not to be 0."""
     if scalar.op == "const":
@@ -265,7 +262,7 @@ def _constant(scalar: Expr) -> float | None:
         return 0.0
     if scalar.op not in _CONSTANT or None in args:
         return None
-    return _CONSTANT[scalar.op](*args)
+    return float(_CONSTANT[scalar.op](*args))
 
 
 def parts_of(scalar: Expr) -> list[Expr]:

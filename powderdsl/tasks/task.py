@@ -6,12 +6,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
 from typing import Any
 
 from powderdsl.diagnostics import Span
 from powderdsl.model.fingerprint import UNMEANING
-from powderdsl.model.types import FLAG, Expr, Ruleset
+from powderdsl.model.types import Expr, Ruleset
 from powderdsl.worlds.raster import Shape, Size
 from powderdsl.worlds.scene.amounts import Amount
 
@@ -171,26 +170,6 @@ class Measure:
 
 
 @dataclass(frozen=True)
-class Scalar:
-    """An expression of a goal as it enters fingerprints, which runs and datasets have recorded in this form."""
-
-    op: str
-    args: tuple[Scalar, ...] = ()
-    value: Any = None
-    is_condition: bool = False
-
-
-def _scalar(expr: Expr | None) -> Scalar | None:
-    if expr is None:
-        return None
-    args = tuple(scalar for arg in expr.args if (scalar := _scalar(arg)))
-    return Scalar(expr.op, args, expr.value, expr.kind == FLAG)
-
-
-_AS_SCALAR = MappingProxyType({"fingerprint": _scalar})
-
-
-@dataclass(frozen=True)
 class Goal:
     """Rewards and ends of episodes. `each` is given after every action, `final` with the last; conditions end an episode early.
 
@@ -203,10 +182,10 @@ class Goal:
     may be trained on. See `Task.with_shaped_reward`.
     """
 
-    each: Expr | None = field(metadata=_AS_SCALAR)
-    final: Expr | None = field(metadata=_AS_SCALAR)
-    success: Expr | None = field(metadata=_AS_SCALAR)
-    failure: Expr | None = field(metadata=_AS_SCALAR)
+    each: Expr | None
+    final: Expr | None
+    success: Expr | None
+    failure: Expr | None
     shaped: Expr | None = field(default=None, metadata=UNMEANING)
 
 

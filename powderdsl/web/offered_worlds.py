@@ -11,7 +11,7 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.model.types import Ruleset
 from powderdsl.targets.array_kind import PlainArrays
 from powderdsl.tasks.shipped import load_task, shipped_tasks
-from powderdsl.tasks.tensors.starts import StartWorlds
+from powderdsl.tasks.tensors.generator import StartWorlds
 from powderdsl.web.worlds import world_data
 from powderdsl.worlds.raster import mask
 from powderdsl.worlds.scene import draw_start, shipped_scenes

@@ -12,7 +12,7 @@ from powderdsl.diagnostics import Reporter, Source
 from powderdsl.tasks.file import read_task
 from powderdsl.tasks.shipped import load_task, shipped_tasks
 from powderdsl.worlds.raster import Shape, mask
-from powderdsl.worlds.scene import load_scenes
+from powderdsl.worlds.scene.read import read_file
 
 ROOT = Path(__file__).resolve().parents[2]
 HEAD = "task: test\nrules: powderworld\nsize: [64, 64]\nfill: empty\nagent: {may: any, actions: 3}\n"
@@ -157,8 +157,8 @@ def test_the_designed_worlds_are_the_recorded_ones(torch):
     for number, expected in enumerate(recorded):
         assert np.array_equal(maker(torch, task, "designed", number).make(torch.tensor([5])).ids[0], expected)
     assert len(task.split("designed").variants) == len(recorded) == 8
-    scenes = load_scenes(ROOT / "tasks" / "scenes" / "designed.yaml", task.ruleset)
-    assert [one.name for one in task.split("designed").variants] == list(scenes)
+    scenes = read_file(ROOT / "tasks" / "scenes" / "designed.yaml")
+    assert [one.name for one in task.split("designed").variants] == [scene.name for scene in scenes]
 
 
 def element(task, name: str) -> int:

@@ -96,7 +96,7 @@ def definition(kind: str, n: list[Any], size: tuple[int, int]) -> np.ndarray:
 @pytest.mark.parametrize("kind", NUMBERS)
 def test_batches_cover_the_same_cells(torch, kind):
     from powderdsl.targets.tensor_kind import Tensors
-    from powderdsl.tasks.tensors.shapes import shape_words, unpack
+    from powderdsl.tasks.tensors.generator import shape_words, unpack
 
     @settings(max_examples=60, deadline=None, derandomize=True)
     @given(batch=st.lists(NUMBERS[kind], min_size=1, max_size=6), size=SIZES)
@@ -119,7 +119,7 @@ def test_bits_and_cells_are_the_same(seed, size):
     import torch
 
     from powderdsl.targets.tensor_kind import Tensors
-    from powderdsl.tasks.tensors.shapes import pack, unpack
+    from powderdsl.tasks.tensors.generator import pack, unpack
 
     ids = torch.from_numpy(np.random.default_rng(seed).integers(0, 16, (3, *size), dtype=np.uint8))
     planes = [pack(Tensors(), (ids >> place & 1).bool()) for place in range(4)]

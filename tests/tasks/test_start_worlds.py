@@ -12,8 +12,7 @@ import pytest
 
 from powderdsl.targets.array_kind import PlainArrays
 from powderdsl.tasks.shipped import load_task, shipped_tasks
-from powderdsl.tasks.tensors.generator import Made
-from powderdsl.tasks.tensors.starts import StartWorlds
+from powderdsl.tasks.tensors.generator import Made, StartWorlds
 from tests.unit.test_without_numpy import BLOCK
 
 SOME = shipped_tasks()[::5]
@@ -26,7 +25,7 @@ import hashlib
 from powderdsl.arrays import np
 from powderdsl.targets.array_kind import PlainArrays
 from powderdsl.tasks.shipped import load_task
-from powderdsl.tasks.tensors.starts import StartWorlds
+from powderdsl.tasks.tensors.generator import StartWorlds
 
 for name in {SOME!r}:
     made = StartWorlds(load_task(name), "train", PlainArrays()).make(np.array([{SEEDS[1]}], np.int64))

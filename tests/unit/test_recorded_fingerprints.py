@@ -27,8 +27,8 @@ splits:
   test: {knobs: {many: 5}}
 """
 RECORDED = {
-    "task": "bdedc79c413f9150",
-    "goal": "ad12fb3639bfdc2f",
+    "task": "6bef710526bd9ce7",
+    "goal": "b5ca4d0c7989337c",
     "splits": "04f902ab5213621d",
     "agent": "e387b8aca9904ca3",
 }

@@ -12,15 +12,9 @@ from hypothesis import strategies as st
 
 from powderdsl.diagnostics import CODES, CompileError, Reporter, Source, Span
 from powderdsl.worlds.raster import MAX_COORDINATE, Shape, mask, paint
-from powderdsl.worlds.scene import (
-    STATEMENTS,
-    find_scene,
-    load_scene,
-    load_scenes,
-    parse_statement,
-    read_scenes,
-    shipped_scenes,
-)
+from powderdsl.worlds.scene import draw_scene, find_scene, shipped_scenes
+from powderdsl.worlds.scene.read import parse_statement, read_file, read_scenes
+from powderdsl.worlds.scene.statements import STATEMENTS
 from tests.unit.elements import ELEMENTS, ID, RULES, Rules
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -195,9 +189,13 @@ def test_every_statement_is_written_as_its_help_says():
 # Files
 
 
+def load_scene(place: str | Path, rules, **options) -> np.ndarray:
+    return draw_scene(find_scene(place), rules, **options)
+
+
 def test_the_designed_worlds_are_the_recorded_ones_cell_for_cell():
     recorded = np.load(ROOT / "tests" / "data" / "population.npz")["start_ids"]
-    scenes = load_scenes(DESIGNED, RULES)
+    scenes = {scene.name: draw_scene(scene, RULES) for scene in read_file(DESIGNED)}
     assert tuple(scenes) == NAMES
     for name, expected in zip(NAMES, recorded, strict=True):
         assert scenes[name].dtype == np.uint8

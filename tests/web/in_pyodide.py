@@ -15,7 +15,7 @@ from powderdsl.system.memo import Memo
 from powderdsl.targets.array_kind import PlainArrays
 from powderdsl.targets.wasm.source import wasm_module
 from powderdsl.tasks.shipped import load_task
-from powderdsl.tasks.tensors.starts import StartWorlds
+from powderdsl.tasks.tensors.generator import StartWorlds
 from powderdsl.worlds.scene import load_start
 from powderdsl.worlds.store import load_world, save
 from powderdsl.worlds.strewn import strew

@@ -10,16 +10,65 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import reduce
+from functools import cache, reduce
 from math import prod
 from operator import or_
+from typing import Any
 
 from powderdsl.system.random import MASK, base_keys, mix, name_number
 from powderdsl.targets.array_kind import Array, ArrayKind
-from powderdsl.tasks.task import Drawing, Generator, Group, Region
-from powderdsl.tasks.tensors.shapes import pack, shape_words, unpack
-from powderdsl.worlds.raster import Shape, Size, mask
+from powderdsl.tasks.task import Drawing, Generator, Group, Region, Task
+from powderdsl.worlds.raster import Shape, Size, covered_rows, mask
 from powderdsl.worlds.scene.amounts import CALCULATE, Amount, integers
+
+
+def shape_words(kind: ArrayKind, shape: str, numbers: Sequence[Array | None], size: Size) -> Array:
+    """The cells of shapes, not frames, as bits: int64 [..., W, ⌈H/64⌉].
+
+    `numbers` are int64 [...], in the order of `scene.statements.NUMBERS`; None is an open end.
+    """
+    xp = kind.xp
+    given = [None if one is None else one[..., None] for one in numbers]
+    rows = covered_rows(xp, shape, given, kind.arange(size[1]), size)
+    first, last = (xp.clip(one, 0, size[0]) for one in rows)
+    below = [_bits_below(xp, last - base) & ~_bits_below(xp, first - base) for base in range(0, size[0], 64)]
+    return xp.stack(below, -1)
+
+
+def _bits_below(xp: Any, n: Array) -> Array:
+    """Words whose bits below bit n are set; all of them from 64 on."""
+    return xp.where(n >= 64, -1, (1 << xp.clip(n, 0, 63)) - 1)
+
+
+def pack(kind: ArrayKind, cells: Array) -> Array:
+    """Cells, bool [..., H, W], as bits: int64 [..., W, ⌈H/64⌉]."""
+    *batch, height, width = cells.shape
+    number, xp = -(-height // 64), kind.xp
+    missing = kind.zeros("uint8", (*batch, 64 * number - height, width))
+    padded = xp.concatenate([xp.asarray(cells, dtype=xp.uint8), missing], axis=-2)
+    bits = xp.asarray(padded.reshape(*batch, number, 64, width), dtype=xp.int64)
+    return kind.contiguous(xp.swapaxes((bits << kind.arange(64)[:, None]).sum(-2), -1, -2))
+
+
+def unpack(kind: ArrayKind, planes: Sequence[Array] | Array, height: int) -> Array:
+    """Numbers whose bits are planes, int64 [..., W, ⌈H/64⌉] each, lowest first: uint8 [..., H, W]."""
+    table = _eight_rows(kind)
+    found: Array | None = None
+    for place, words in enumerate(planes):
+        # A byte of a word is eight rows. In the table it is eight bytes, so that eight numbers are put together at once.
+        eight = kind.entries(table, kind.as_bytes(words)) << place
+        found = eight if found is None else found | eight
+    assert found is not None
+    *batch, width, number = planes[0].shape
+    columns = kind.as_bytes(found).reshape(*batch, width, 64 * number)
+    return kind.contiguous(kind.xp.swapaxes(columns[..., :height], -1, -2))
+
+
+@cache
+def _eight_rows(kind: ArrayKind) -> Array:
+    """The bits of each byte as eight bytes, which are one word: int64 [256]."""
+    return kind.put([sum((byte >> row & 1) << 8 * row for row in range(8)) for byte in range(256)], "int64")
+
 
 NOTHING = 255
 """In targets and stamps: no element."""
@@ -407,3 +456,35 @@ def _bordered(rows: tuple[tuple[int, ...], ...], kind: ArrayKind) -> Array:
     """A stamp's ids with a border of NOTHING, uint8 [h + 2, w + 2]: what lies outside is read there."""
     edge = [NOTHING] * (len(rows[0]) + 2)
     return kind.put([edge, *([NOTHING, *row, NOTHING] for row in rows), edge], "uint8")
+
+
+class StartWorlds:
+    """A task's split made executable for one kind of arrays."""
+
+    def __init__(self, task: Task, split: str, kind: ArrayKind):
+        self.kind = kind
+        self._makers = [WorldMaker(one, task.size, kind) for one in task.split(split).variants]
+        cells = [maker.fixed_cells for maker in self._makers]
+        self.fixed: Mapping[str, Array] = {
+            name: value
+            for name, value in cells[0].items()
+            if all(name in one and bool((value == one[name]).all()) for one in cells)
+        }
+        """Regions that are the same in all worlds of the split, bool [1, H, W]."""
+
+    def make(self, seeds: Array) -> Made:
+        """The start worlds of seeds, int64 [B]; where the split has several variants, each world comes from its own."""
+        if len(self._makers) == 1:
+            return self._makers[0].make(seeds)
+        variant = seeds % len(self._makers)
+        variants = variant.tolist()
+        numbers = sorted(set(variants)) or [0]
+        parts = [self._makers[number].make(seeds[variant == number]) for number in numbers]
+        made = joined(self.kind, parts, self.fixed)
+        # Back from the order of variants to that of the seeds.
+        places = [0] * len(variants)
+        for place, world in enumerate(sorted(range(len(variants)), key=variants.__getitem__)):
+            places[world] = place
+        order = self.kind.put(places, "int64")
+        regions = {name: one if name in self.fixed else one[order] for name, one in made.regions.items()}
+        return Made(made.ids[order], regions, {name: one[order] for name, one in made.targets.items()})

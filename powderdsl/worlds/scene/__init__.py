@@ -15,32 +15,6 @@
 `draw` may also be a `|` block, one statement a line. A file with several scenes has a list under `scenes`.
 """
 
-from powderdsl.worlds.scene.load import (
-    FieldValues,
-    Start,
-    draw_scene,
-    draw_start,
-    find_scene,
-    load_scene,
-    load_scenes,
-    load_start,
-    shipped_scenes,
-)
-from powderdsl.worlds.scene.read import Scene, parse_statement, read_scenes
-from powderdsl.worlds.scene.statements import STATEMENTS
+from powderdsl.worlds.scene.read import Start, draw_scene, draw_start, find_scene, load_start, shipped_scenes
 
-__all__ = [
-    "STATEMENTS",
-    "FieldValues",
-    "Scene",
-    "Start",
-    "draw_scene",
-    "draw_start",
-    "find_scene",
-    "load_scene",
-    "load_scenes",
-    "load_start",
-    "parse_statement",
-    "read_scenes",
-    "shipped_scenes",
-]
+__all__ = ["Start", "draw_scene", "draw_start", "find_scene", "load_start", "shipped_scenes"]
