@@ -18,7 +18,6 @@ import torch
 from torch import Tensor
 
 from powderdsl.model.fingerprint import fingerprint
-from powderdsl.model.types import Ruleset
 from powderdsl.system.writing import failure
 from powderdsl.tasks.shipped import load_task, shipped_tasks
 from powderdsl.tasks.task import BLOW, NO_CHANGE, Task
@@ -33,9 +32,6 @@ if TYPE_CHECKING:  # datasets need the extra `rl`
 PARTS = (0.8, 0.1, 0.1)
 """Shares of the worlds for training, validation and tests."""
 
-VALIDATED = 256
-"""The most transitions that a network is validated on."""
-
 
 class Recording:
     """A dataset of a task's transitions, ready to learn from. Made by `open_recording`.
@@ -48,16 +44,14 @@ class Recording:
         from powderdsl.datasets import Transitions, split
 
         self.dataset, self.name, self.task, self.palette = dataset, name, task, palette
-        self.rules: Ruleset = task.ruleset
-        self.size = task.size
-        """Rows and columns."""
+        self.rules, self.size = task.ruleset, task.size
         self.all = Transitions(dataset)
         try:
             self.parts: tuple[Transitions, ...] = split(self.all, PARTS)
         except ValueError as error:
-            helps = ("record episodes of more worlds: a hundred are enough",)
+            fix, why = "record episodes of more worlds: a hundred are enough", str(error)
             raise failure(
-                "PD631", f"{dataset.folder} has too few worlds", notes=(str(error),), helps=helps
+                "PD631", f"{dataset.folder} has too few worlds", notes=(why,), helps=(fix,)
             ) from None
 
     @cached_property
@@ -118,35 +112,18 @@ class Recording:
         numbers = numbers[torch.arange(min(most, len(numbers))) * len(numbers) // min(most, len(numbers))]
         return [self.pairs(rows, some, device) for some in numbers.split(64)]
 
-    def validation(self, device: str | torch.device = "cpu") -> list[Pairs]:
-        """Transitions of worlds that neither training nor tests use."""
-        return self.spread(self.parts[1], VALIDATED, device)
-
-    def source(self, seed: int, device: str | torch.device = "cpu") -> RecordedPairs:
-        """Endless batches of the training worlds' transitions."""
-        return RecordedPairs(self, seed, device)
-
-
-class RecordedPairs:
-    """Batches of transitions, all equally likely. A batch depends on the seed and the iteration alone."""
-
-    def __init__(self, recording: Recording, seed: int, device: str | torch.device):
-        self.recording, self.seed, self.device = recording, seed, device
-        self.rows = recording.parts[0]
-        self.numbers = recording.eligible(self.rows)
-
-    def go_to(self, iteration: int) -> None:
-        """Nothing has to be made."""
-
-    def advance(self) -> None:
-        """Nothing changes."""
-
-    def batch(self, iteration: int, count: int) -> Pairs:
-        """The pairs of an iteration's batch."""
+    def batch(self, iteration: int, count: int, *, seed: int, device: str | torch.device) -> Pairs:
+        """A batch of the training worlds' transitions, all equally likely, which seed and iteration decide."""
         from powderdsl.datasets.dataset import drawn
 
-        chosen = torch.from_numpy(drawn(self.seed % (1 << 62), iteration, count, len(self.numbers)))
-        return self.recording.pairs(self.rows, self.numbers[chosen], self.device)
+        numbers = self.training
+        chosen = torch.from_numpy(drawn(seed % (1 << 62), iteration, count, len(numbers)))
+        return self.pairs(self.parts[0], numbers[chosen], device)
+
+    @cached_property
+    def training(self) -> Tensor:
+        """The numbers of the eligible transitions of training worlds."""
+        return self.eligible(self.parts[0])
 
 
 def open_recording(folder: str | Path, task: str | None = None) -> Recording:
@@ -192,18 +169,16 @@ def _differences(recipe: Recipe, task: Task) -> list[str]:
     """Why a recipe is not one of a task."""
     names = {element.id: element.qualified for element in task.ruleset.elements}
     names |= {BLOW: "blow", NO_CHANGE: "nothing"}
-    rows, columns = task.agent.bins
-    there = {
-        "size": tuple(recipe.shape[1:]),
-        "actions": tuple(recipe.action_nvec),
-        "choices": tuple(recipe.choices),
+    compared = {
+        "size": (recipe.shape[1:], task.size),
+        "actions": (recipe.action_nvec, task.agent.action_nvec),
+        "choices": (recipe.choices, [names[choice] for choice in task.agent.choices]),
     }
-    here = {
-        "size": tuple(task.size),
-        "actions": (columns, rows, len(task.agent.choices), 3, 3),
-        "choices": tuple(names[choice] for choice in task.agent.choices),
-    }
-    found = [f"{key}: {list(there[key])}, not {list(here[key])}" for key in there if there[key] != here[key]]
+    found = [
+        f"{key}: {list(there)}, not {list(here)}"
+        for key, (there, here) in compared.items()
+        if list(there) != list(here)
+    ]
     if not found and recipe.task_fingerprint and recipe.task_fingerprint != fingerprint(task):
         found.append("the task, its knobs or its rules have changed since, or it had more packs")
     return found

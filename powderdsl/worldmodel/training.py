@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,14 +41,17 @@ from powderdsl.worldmodel.scores import Network, score
 from powderdsl.worldmodel.worlds import Pairs, Worlds, task_worlds, validation_pairs
 
 if TYPE_CHECKING:
-    from powderdsl.worldmodel.recordings import RecordedPairs, Recording
+    from powderdsl.worldmodel.recordings import Recording
 
 KIND = "worldmodel"
 
 LOG_EVERY = 10
 """Iterations whose mean loss makes a line of the metrics."""
 
-VALIDATED = ("accuracy", "changed_accuracy", "change_f1", "ece", "change_ece")
+VALIDATED = 256
+"""The most recorded transitions that a network is validated on."""
+
+MEASURED = ("accuracy", "changed_accuracy", "change_f1", "ece", "change_ece")
 """Measures of a validation besides the loss."""
 
 Tell = Callable[["TrainingProgress"], None]
@@ -60,8 +64,6 @@ class TrainingProgress:
     done: int
     of: int
     loss: float | None
-    simulated: float = 0.0
-    """The share of time that making worlds takes, since the last line of metrics."""
     validation: float | None = None
     """The last loss on held-out worlds."""
 
@@ -136,18 +138,21 @@ def train(
         trainer.restore(parent)
         if trainer.done == config.iterations:
             return run
-        held_out: Sequence[Pairs] = ()
+        trainer.validate_every = validate_every
         if recording is not None:
-            source: Replay | RecordedPairs = recording.source(config.seed, machine.device)
+            trainer.batch = partial(recording.batch, seed=config.seed, device=machine.device)
             if validate_every:
-                held_out = recording.validation(machine.device)
+                trainer.held_out = recording.spread(recording.parts[1], VALIDATED, machine.device)
         else:
-            source = Replay(
+            replay = Replay(
                 given, config.data, seed=config.seed, device=machine.device, store=machine.store, folder=path
             )
+            replay.go_to(trainer.done)
+            trainer.batch, trainer.advance = replay.batch, replay.advance
             if validate_every:
-                held_out = validation_pairs(given, config.data, machine.device)
-        trainer.train(source, Validation(validate_every, held_out), tell, save_seconds)
+                trainer.held_out = validation_pairs(given, config.data, machine.device)
+        with _random_numbers_kept(torch.device(machine.device)):
+            trainer.train(tell, save_seconds)
     return run
 
 
@@ -165,27 +170,6 @@ def _fresh(config: TrainConfig, encoder: Encoder, slots: int) -> nn.Module:
     return Encoded(encoder, fresh_unet(slots, config.width, config.seed, encoder.channels))
 
 
-@dataclass(frozen=True)
-class Validation:
-    """Held-out pairs, and after how many iterations a network is scored on them; 0: never."""
-
-    every: int
-    pairs: Sequence[Pairs]
-
-    def due(self, done: int, of: int) -> bool:
-        """Whether to score a network after `done` of `of` iterations."""
-        return bool(self.every) and (done % self.every == 0 or done == of)
-
-    def values(self, model: nn.Module, slots: int) -> dict[str, float]:
-        """Metrics of a network in training, which stays as it is."""
-        with _random_numbers_kept(next(model.parameters()).device):
-            measured = score(model.eval(), self.pairs, slots).plain()
-        model.train()
-        named = {"loss/validation": measured["loss"]}
-        named |= {f"validation/{name}": measured[name] for name in VALIDATED}
-        return {name: value for name, value in named.items() if value is not None}
-
-
 def _random_numbers_kept(device: torch.device) -> AbstractContextManager[None]:
     """Restore torch's global generators at the end."""
     return torch.random.fork_rng([device] if device.type == "cuda" else [])
@@ -200,6 +184,11 @@ class _Trainer:
         self.forward: Network = torch.compile(model) if machine.compiled else model
         self.done = 0
         self.recent: list[float] = []
+        self.batch: Callable[[int, int], Pairs]
+        """The pairs of an iteration's batch, by the iteration and their number."""
+        self.advance: Callable[[], None] = lambda: None
+        """Make the worlds of the next iteration."""
+        self.validate_every, self.held_out = 0, list[Pairs]()
 
     def restore(self, parent: Checkpoint | None) -> None:
         """Continue from the run's newest checkpoint; a new run starts with the weights of `parent`."""
@@ -216,27 +205,18 @@ class _Trainer:
             why = " ".join(str(error).split())[:300]
             raise does_not_fit(found.path, f"its state is that of another run: {why}") from None
 
-    def train(
-        self, source: Replay | RecordedPairs, validation: Validation, tell: Tell, save_seconds: float
-    ) -> None:
+    def train(self, tell: Tell, save_seconds: float) -> None:
         """Train to the end. A signal is raised once a checkpoint is written, a second one at once."""
-        source.go_to(self.done)
-        with _random_numbers_kept(torch.device(self.machine.device)):
-            self._iterate(source, validation, tell, save_seconds)
-
-    def _iterate(
-        self, source: Replay | RecordedPairs, validation: Validation, tell: Tell, save_seconds: float
-    ) -> None:
         config, total = self.config, self.config.iterations
-        loss, held_out, simulated, making = None, None, 0.0, 0.0
+        loss, held_out, making = None, None, 0.0
         saved = since = time.monotonic()
         self.model.train()
         # An iteration is never left half done.
         with self.run.metrics(self.done) as metrics, held_back() as interrupted:
             while self.done < total and not interrupted():
-                self.recent.append(self.step(*source.batch(self.done, config.batch)))
+                self.recent.append(self.step(*self.batch(self.done, config.batch)))
                 began = time.monotonic()
-                source.advance()
+                self.advance()
                 making += time.monotonic() - began
                 self.done += 1
                 values: dict[str, float] = {}
@@ -246,18 +226,22 @@ class _Trainer:
                     if not loss < float("inf"):
                         raise diverged(self.run.path, self.done, config.learning_rate)
                     took = time.monotonic() - since
-                    simulated = making / took
-                    speed = {"time/pairs_a_second": LOG_EVERY * config.batch / took}
-                    values = {"loss/train": loss, **speed, "time/simulation": simulated}
+                    speed = LOG_EVERY * config.batch / took
+                    values = {
+                        "loss/train": loss,
+                        "time/pairs_a_second": speed,
+                        "time/simulation": making / took,
+                    }
                     since, making = time.monotonic(), 0.0
-                if validation.due(self.done, total):
+                every = self.validate_every
+                if every and (self.done % every == 0 or self.done == total):
                     began = time.monotonic()
-                    values |= validation.values(self.model, self.slots)
+                    values |= self.validation()
                     held_out = values["loss/validation"]
                     since += time.monotonic() - began
                 if values:
                     metrics.write(self.done, values)
-                tell(TrainingProgress(self.done, total, loss, simulated, held_out))
+                tell(TrainingProgress(self.done, total, loss, held_out))
                 if time.monotonic() - saved > save_seconds:
                     self.save()
                     saved = time.monotonic()
@@ -280,6 +264,15 @@ class _Trainer:
         loss.backward()
         self.optimizer.step()
         return loss.item()
+
+    def validation(self) -> dict[str, float]:
+        """Metrics of the network on held-out pairs."""
+        with _random_numbers_kept(next(self.model.parameters()).device):
+            measured = score(self.model.eval(), self.held_out, self.slots).plain()
+        self.model.train()
+        named = {"loss/validation": measured["loss"]}
+        named |= {f"validation/{name}": measured[name] for name in MEASURED}
+        return {name: value for name, value in named.items() if value is not None}
 
     def save(self) -> None:
         model, optimizer = self.model.state_dict(), self.optimizer.state_dict()

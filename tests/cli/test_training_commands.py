@@ -76,7 +76,7 @@ def test_all_mistakes_are_said_at_once() -> None:
         (("evaluate", "nowhere", "--knob", "lines=2"), "a run has its own"),
         (("watch", "nowhere"), "PD620"),
         (("watch", "sand-pushing", "--policy", "trained"), "no trained policy"),
-        (("watch", "sand-pushing", "--out", "x.png"), ".gif .mp4"),
+        (("watch", "sand-pushing", "--out", "x.png"), ".gif or .mp4"),
         (("watch", "sand-pushing", "--scale", "32", "--worlds", "64", "--out", "no/x.gif"), "PD613"),
     ],
 )

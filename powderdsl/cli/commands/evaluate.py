@@ -9,7 +9,7 @@ import click
 
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import user_values
-from powderdsl.cli.options import check_writable, find_played
+from powderdsl.cli.options import find_played
 from powderdsl.cli.output import print_json
 from powderdsl.system.reports import table
 from powderdsl.tasks.task import Task
@@ -49,7 +49,7 @@ def _names(ctx: click.Context, param: click.Parameter, value: str | None) -> lis
 @click.option("--backend", type=opt.BACKEND, help="Backend that runs the rules.  [default: the run's]")
 @click.option("--device", help="A torch device.  [default: the run's]")
 @opt.flag("--json", "One JSON object instead of a table.", to="as_json")
-@opt.path("--out", "FILE.json", "Also write the JSON object to this file.")
+@opt.output("--out", "FILE.json", "Also write the JSON object to this file.")
 def command(
     run: str,
     knobs: tuple[str, ...],
@@ -65,8 +65,6 @@ def command(
     policies that need no training are compared.
     """
     played = find_played(run, knobs, settings, packs)
-    if out is not None:
-        check_writable(out)
     from powderdsl.experiments.runs.folder import write_json
     from powderdsl.rl.evaluation import evaluate
 

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from powderdsl.tasks.episodes import TaskProgram
     from powderdsl.tasks.players import ExpertPlayer
 
-SUFFIXES = (".gif", ".mp4")
-
 
 @click.command("watch", cls=opt.ManyWords)
 @click.argument("run", metavar="RUN|TASK")
@@ -38,7 +36,7 @@ SUFFIXES = (".gif", ".mp4")
 @opt.knobs("For a task: another value for a knob.")
 @opt.parameters
 @opt.packs
-@opt.path("--out", "FILE", "The .gif or .mp4 to write.  [default: watch.gif in the run's folder]")
+@opt.output("--out", "FILE", "The film to write.  [default: watch.gif in the run's folder]", ".gif", ".mp4")
 @opt.integer("--fps", 1, 240, "Frames per second.", 15)
 @opt.integer("--scale", 1, 32, "Pixels per cell.", 4)
 @click.option("--backend", type=opt.BACKEND, help="Backend that runs the rules.  [default: the run's]")
@@ -75,12 +73,11 @@ def command(
     policy = policy or ("random" if isinstance(played, Task) else "trained")
     names = [one.name for one in task.splits]
     split = split or ("test" if "test" in names else names[0])
-    out = out or folder / "watch.gif"
-    if out.suffix.lower() not in SUFFIXES:
-        raise BadInput(f"`{out}` must end in one of {' '.join(SUFFIXES)}")
+    if out is None:
+        out = folder / "watch.gif"
+        check_writable(out)
     if max(task.size) * scale * min(worlds, 4) > MAX_SIDE:
         raise BadInput("such a picture is too large: choose a smaller --scale, or fewer --worlds")
-    check_writable(out)
     import torch
 
     from powderdsl.rl.films import film
