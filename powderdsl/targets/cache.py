@@ -80,29 +80,31 @@ def find(folder: Path, key: str) -> Path | None:
     return library
 
 
-def add(folder: Path, key: str, built: Path, about: dict[str, Any]) -> Path:
-    """Take a folder with a LIBRARY into the cache; the library's path. The first of several processes wins.
+def add(
+    folder: Path, key: str, code: bytes, *, ruleset: str, backend: str, compiler: str, began: float
+) -> Path:
+    """Take code into the cache; the path of its library. The first of several processes wins.
 
     Args:
-        about: the fields of `About` except size and hash.
+        began: when the compiler was started, in seconds since the epoch.
 
     Raises:
         OSError: it cannot be written.
     """
-    data = (built / LIBRARY).read_bytes()
-    written = About(**about, size=len(data), sha256=hashlib.sha256(data).hexdigest())
-    (built / ABOUT).write_text(signed(asdict(written)), encoding="utf-8")
-    for _ in range(3):
+    seconds = round(time.time() - began, 2)
+    digest = hashlib.sha256(code).hexdigest()
+    about = About(ruleset, backend, compiler, began, seconds, len(code), digest)
+    with scratch_folder(folder) as scratch:
+        (scratch / LIBRARY).write_bytes(code)
+        (scratch / ABOUT).write_text(signed(asdict(about)), encoding="utf-8")
         try:
-            os.rename(built, folder / key)
-            break
-        except OSError:
+            os.rename(scratch, folder / key)
+        except OSError:  # there is one already
             found = find(folder, key)
             if found is not None:
                 return found
             _discard(folder / key)
-    else:
-        raise OSError(f"cannot write {folder / key}")
+            os.rename(scratch, folder / key)
     tidy(folder, keep=key)
     return folder / key / LIBRARY
 

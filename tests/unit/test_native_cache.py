@@ -26,16 +26,10 @@ from powderdsl.targets.layout import Layout
 from tests.cli.commands import environment_with
 from tests.processes import alive, waited
 
-ABOUT = {"ruleset": "yard", "backend": "native", "compiler": "g++ 1", "created": 1.0, "seconds": 2.0}
-
 
 def put(folder: Path, key: str, data: bytes, used: float | None = None) -> Path:
     """A library in the cache, used that many seconds ago."""
-    with scratch_folder(folder) as scratch:
-        built = scratch / "built"
-        built.mkdir()
-        (built / cache.LIBRARY).write_bytes(data)
-        library = cache.add(folder, key, built, ABOUT)
+    library = cache.add(folder, key, data, ruleset="yard", backend="native", compiler="g++ 1", began=1.0)
     if used is not None:
         os.utime(folder / key / cache.ABOUT, (time.time() - used,) * 2)
     return library

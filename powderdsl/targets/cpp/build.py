@@ -98,14 +98,13 @@ def _compile(
     source: str, units: int, ruleset: str, compiler: Compiler, flags: tuple[str, ...], folder: Path, key: str
 ) -> Path:
     cache.tidy(folder)
-    began, created = time.perf_counter(), time.time()
+    began = time.time()
     with scratch_folder(folder) as scratch:
-        text, built = scratch / "program.cpp", scratch / "built"
+        text, library = scratch / "program.cpp", scratch / "library"
         text.write_text(source, encoding="utf-8")
-        built.mkdir()
-        command, library = [*compiler.command, *flags], str(built / cache.LIBRARY)
+        command = [*compiler.command, *flags]
         if units == 1 or os.cpu_count() == 1:
-            _call([[*command, "-o", library, str(text)]], scratch)
+            _call([[*command, "-o", str(library), str(text)]], scratch)
         else:
             objects = [str(scratch / f"{unit}.o") for unit in range(units)]
             _call(
@@ -115,15 +114,11 @@ def _compile(
                 ],
                 scratch,
             )
-            _call([[*command, "-o", library, *objects]], scratch)
-        about = {
-            "ruleset": ruleset,
-            "backend": "native",
-            "compiler": compiler.version,
-            "created": created,
-            "seconds": round(time.perf_counter() - began, 2),
-        }
-        return cache.add(folder, key, built, about)
+            _call([[*command, "-o", str(library), *objects]], scratch)
+        code = library.read_bytes()
+    return cache.add(
+        folder, key, code, ruleset=ruleset, backend="native", compiler=compiler.version, began=began
+    )
 
 
 def _call(commands: list[list[str]], scratch: Path) -> None:

@@ -17,7 +17,6 @@ from functools import cache
 from pathlib import Path
 
 from powderdsl.system.user_cache import cache_folder
-from powderdsl.system.writing import scratch_folder
 from powderdsl.targets import cache as native_cache
 from powderdsl.targets.cuda.source import KernelSource
 
@@ -123,20 +122,13 @@ def machine_code(source: KernelSource, architecture: str, version: str) -> bytes
     found = native_cache.find(folder, name)
     if found is not None:
         return found.read_bytes()
-    began = time.perf_counter()
+    began = time.time()
     code = compile_text(compiler, source.text, options)
-    with suppress(OSError), scratch_folder(folder) as scratch:
-        built = scratch / "built"
-        built.mkdir()
-        (built / native_cache.LIBRARY).write_bytes(code)
-        about = {
-            "ruleset": source.name,
-            "backend": "cuda",
-            "compiler": f"NVRTC {major.value}.{minor.value} for {architecture}",
-            "created": time.time(),
-            "seconds": round(time.perf_counter() - began, 2),
-        }
-        native_cache.add(folder, name, built, about)
+    made_by = f"NVRTC {major.value}.{minor.value} for {architecture}"
+    with suppress(OSError):
+        native_cache.add(
+            folder, name, code, ruleset=source.name, backend="cuda", compiler=made_by, began=began
+        )
     return code
 
 
