@@ -25,6 +25,7 @@ from powderdsl.cli.commands.study import commands
 from powderdsl.experiments.runs.checkpoints import STATE
 from powderdsl.experiments.studies.file import load_study
 from powderdsl.experiments.studies.run import StudyRun
+from powderdsl.targets.cache import signed
 
 TEXTS = (
     "\x1b]0;owned\x07",
@@ -412,7 +413,7 @@ def make_valid(folder: Path, run: Callable[..., None]) -> None:
     (entry / "program").write_bytes(b"x")
     digest = hashlib.sha256(b"x").hexdigest()
     about = {"ruleset": "grit", "backend": "native", "compiler": "g++ 1", "created": 1.0, "seconds": 2.0, "size": 1, "sha256": digest}  # fmt: skip
-    (entry / "about.json").write_text(json.dumps(about))
+    (entry / "about.json").write_text(signed(about))
 
 
 GRIT = """\

@@ -7,7 +7,7 @@ import os
 import platform
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
@@ -23,7 +23,6 @@ from powderdsl.system.reading import check_links, read_json
 from powderdsl.system.writing import failure, not_writable, write_text
 
 ABOUT = "run.json"
-FORMAT = 1
 PACKAGES = ("torch", "numpy", "gymnasium", "stable-baselines3")
 
 
@@ -40,15 +39,9 @@ class RunFolder:
     config: Mapping[str, Any]
     about: Mapping[str, Any]
 
-    @contextmanager
-    def locked(self) -> Iterator[None]:
-        """Keep other processes from training here. The lock of a process that dies is gone with it.
-
-        Raises:
-            CompileError: PD622 if another one does.
-        """
-        with held(self.path):
-            yield
+    def locked(self) -> AbstractContextManager[None]:
+        """Keep other processes from training here, which get a CompileError (PD622)."""
+        return held(self.path)
 
     def latest_checkpoint(self) -> Checkpoint | None:
         """The newest intact checkpoint, with its tensors on the CPU, or None."""
@@ -104,7 +97,6 @@ def open_run(
         return found
     new_folder(folder)
     about = {
-        "format": FORMAT,
         "kind": kind,
         "config": plain,
         **(note or {}),
@@ -118,7 +110,7 @@ def open_run(
 
 @contextmanager
 def held(folder: Path, patience: float = 0.0) -> Iterator[None]:
-    """Keep other processes from writing to a folder.
+    """Keep other processes from writing to a folder. The lock of a process that dies is gone with it.
 
     Args:
         patience: seconds to wait for another process.
@@ -178,8 +170,6 @@ def read_run(path: str | Path, kind: str | None = None) -> RunFolder:
     whole = isinstance(about, dict) and isinstance(about.get("kind"), str)
     if not whole or not isinstance(about.get("config"), dict):
         raise no_run(folder, f"its {ABOUT} is damaged")
-    if about.get("format") != FORMAT:
-        raise no_run(folder, f"its format is {about.get('format')!r}; this version reads {FORMAT}")
     if kind is not None and about["kind"] != kind:
         raise no_run(folder, f"it is a run of the kind `{about['kind']}`; `{kind}` is needed here")
     return RunFolder(folder, about["kind"], about["config"], about)
