@@ -6,8 +6,7 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 from powderdsl.analysis.changes import RuleLine
-from powderdsl.analysis.field_writes import FieldEntry
-from powderdsl.analysis.ledger import Ledger, RuleEntry
+from powderdsl.analysis.ledger import FieldEntry, Ledger, RuleEntry
 from powderdsl.analysis.overlaps import OUTCOMES
 
 SCHEMA = 1

@@ -109,10 +109,6 @@ class PrintableStream:
         self.unguarded.write(printable(text, lines=True))
         return len(text)
 
-    def write_styled(self, text: str) -> None:
-        """Write a text that has colors: see `styled`."""
-        self.unguarded.write(styled(text))
-
     def writelines(self, texts: Iterable[str]) -> None:
         for text in texts:
             self.write(text)
@@ -140,5 +136,5 @@ def unguarded(stream: Any) -> Any:
 
 
 def write_styled(stream: Any, text: str) -> None:
-    """Write a text that has colors of ours to any stream, as `PrintableStream.write_styled` does."""
+    """Write a text that has colors of ours to any stream: see `styled`."""
     unguarded(stream).write(styled(text))

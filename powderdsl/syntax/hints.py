@@ -87,6 +87,12 @@ _WORDS = {
 }
 """Words that people write, and what the language says instead."""
 
+_LETTERS = (
+    "\u0430\u0435\u043e\u0440\u0441\u0443\u0445\u0456\u0458\u0455\u0410\u0412\u0415\u041a\u041c\u041d\u041e\u0420\u0421\u0422\u0425"
+    "\u03bf\u03b1\u03bd\u0391\u0392\u0395\u0397\u0399\u039a\u039c\u039d\u039f\u03a1\u03a4\u03a7\u0131"
+)
+"""Letters that look like ASCII ones: Cyrillic, Greek, and an i without its dot."""
+
 _LOOK_ALIKES = {
     **dict.fromkeys("\u00ad\u200b\u200c\u200d\u2060\ufeff\u200e\u200f", ""),
     **dict.fromkeys("\u00a0\u2002\u2003\u2009\u202f\u3000", " "),
@@ -95,18 +101,9 @@ _LOOK_ALIKES = {
     "\u037e": ";",
     **dict.fromkeys("\u2018\u2019", "'"),
     **dict.fromkeys("\u201d\u201e", '"'),
+    **dict(zip(_LETTERS, "aeopcyxijsABEKMHOPCTXoavABEHIKMNOPTXi", strict=True)),
 }
 """Characters that look like others, or like nothing, and what is meant."""
-
-_CONFUSED = dict(
-    zip(
-        "\u0430\u0435\u043e\u0440\u0441\u0443\u0445\u0456\u0458\u0455\u0410\u0412\u0415\u041a\u041c\u041d\u041e\u0420\u0421\u0422\u0425"
-        "\u03bf\u03b1\u03bd\u0391\u0392\u0395\u0397\u0399\u039a\u039c\u039d\u039f\u03a1\u03a4\u03a7\u0131",
-        "aeopcyxijsABEKMHOPCTXoavABEHIKMNOPTXi",
-        strict=True,
-    )
-)
-"""Letters of other scripts that look like ASCII ones: Cyrillic, Greek, and an i without its dot."""
 
 CUT = "inside `{…}` and `[…]` YAML ends a value at a comma: quote it, or give it a line of its own"
 
@@ -116,7 +113,7 @@ def character_help(text: str, position: int, begin: int) -> str:
     fix = _LOOK_ALIKES.get(text[position])
     if fix is None and not text[position].isascii():
         plain = unicodedata.normalize("NFKC", text[position])
-        fix = _CONFUSED.get(text[position]) or (plain if plain.isascii() and plain.isprintable() else None)
+        fix = plain if plain.isascii() and plain.isprintable() else None
     if fix is not None:
         wanted = "a plain blank" if fix == " " else f"`{fix}`" if fix else ""
         return f"it only looks like {wanted}: type {wanted}" if wanted else "it has no shape: remove it"

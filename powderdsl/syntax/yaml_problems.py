@@ -12,21 +12,11 @@ from dataclasses import dataclass
 
 import yaml
 
-from powderdsl.diagnostics import Label, Reporter, Source, Span
+from powderdsl.diagnostics import Diagnostic, Label, Reporter, Source, Span
 
 QUOTE = "put quotes around the whole value"
+Explain = Callable[["Place"], Diagnostic]
 _ENTRY = re.compile(r"\s*(?:- +)?(?P<key>[\w?]+): +(?P<value>[^\"'\s].*?)\s*\Z")
-
-
-@dataclass(frozen=True)
-class Problem:
-    """An error in plain words. `label` finishes the sentence under the caret."""
-
-    message: str
-    span: Span
-    label: str = ""
-    help: str = ""
-    other: Label | None = None
 
 
 @dataclass(frozen=True)
@@ -89,68 +79,65 @@ def report_yaml(error: yaml.YAMLError, source: Source, reporter: Reporter) -> No
     mark = error.problem_mark or error.context_mark
     at = mark.index if mark else 0
     since = error.context_mark.index if error.context_mark else at
-    problem = _problem(Place(source, at, since), f"{error.context}: {error.problem}")
-    others, helps = [problem.other] if problem.other else [], [problem.help] if problem.help else []
-    message = f"invalid YAML: {problem.message}"
-    reporter.error("PD103", message, problem.span, problem.label, secondary=others, helps=helps)
+    place, words = Place(source, at, since), f"{error.context}: {error.problem}"
+    explain = next((explain for pattern, explain in _ROWS if re.search(pattern, words)), None)
+    reporter.add(explain(place) if explain else _problem("not readable", place.span(at), words))
 
 
-def _problem(place: Place, words: str) -> Problem:
-    for pattern, explain in _ROWS:
-        if re.search(pattern, words):
-            return explain(place)
-    return Problem("not readable", place.span(place.at), words)
+def _problem(
+    message: str, span: Span, label: str = "", fix: str = "", other: Label | None = None
+) -> Diagnostic:
+    """A diagnostic; `label` finishes the sentence under the caret."""
+    others, helps = (other,) if other else (), (fix,) if fix else ()
+    return Diagnostic("PD103", f"invalid YAML: {message}", Label(span, label), others, helps=helps)
 
 
-def _fixed(
-    message: str, label: str, fix: str, *, since: bool = False, whole: bool = False
-) -> Callable[[Place], Problem]:
-    """A problem at one of a place's ends, `whole` up to the end of the line. Texts may use {char} and {quoted}."""
+def _fixed(message: str, label: str, fix: str, *, since: bool = False) -> Explain:
+    """A problem with one character, where a place begins or ends. Texts may use {char} and {quoted}."""
 
-    def explain(place: Place) -> Problem:
+    def explain(place: Place) -> Diagnostic:
         start = place.since if since else place.at
-        span = place.rest(start) if whole else place.span(start)
-        values = {"char": place.text[span.start : span.start + 1], "quoted": place.quoted(start)}
-        return Problem(message.format_map(values), span, label, fix.format_map(values))
+        values = {"char": place.span(start).text, "quoted": place.quoted(start)}
+        return _problem(message.format_map(values), place.span(start), label, fix.format_map(values))
 
     return explain
 
 
 _TAB = _fixed("a tab in the indentation", "a tab", "indent with spaces")
-_MEANING = "has a meaning of its own in YAML"
-_INDICATOR = _fixed("a value cannot start with `{char}`", _MEANING, "{quoted}")
+_STARTS, _MEANING = "a value cannot start with `{char}`", "has a meaning of its own in YAML"
+_INDICATOR = _fixed(_STARTS, _MEANING, "{quoted}")
 
 
-def _second_colon(place: Place) -> Problem:
+def _second_colon(place: Place) -> Diagnostic:
     before = place.before(place.at)
     if ": " in before or before.rstrip().endswith(":"):
-        return Problem("a second `: ` in one line", place.span(place.at), "only a key ends with `:`", QUOTE)
+        return _problem("a second `: ` in one line", place.span(place.at), "only a key ends with `:`", QUOTE)
     start = place.at - len(before.lstrip())
     label = "indented deeper than the line before, or part of it"
     fix = "check the indentation, and that the line before ends as it should: a key with `:`"
-    return Problem("a key that cannot stand here", place.span(start, place.at - start), label, fix)
+    return _problem("a key that cannot stand here", place.span(start, place.at - start), label, fix)
 
 
-def _key(place: Place) -> Problem:
+def _key(place: Place) -> Diagnostic:
     if place.before(place.at).rstrip().endswith(('"', "'")):
         label = "does not belong to the value"
-        return Problem("text after a closing quote", place.rest(place.at), label, QUOTE)
+        return _problem("text after a closing quote", place.rest(place.at), label, QUOTE)
     if place.char == ":":
-        return Problem("a `:` without a key", place.span(place.at), "a key is missing before it")
+        return _problem("a `:` without a key", place.span(place.at), "a key is missing before it")
     return _indentation(place, "not indented like the keys of this mapping")
 
 
-def _item(place: Place) -> Problem:
+def _item(place: Place) -> Diagnostic:
     return _indentation(place, "expected `- `, as far in as the items above")
 
 
-def _indentation(place: Place, label: str) -> Problem:
+def _indentation(place: Place, label: str) -> Diagnostic:
     other = None if place.same_line else Label(place.span(place.since), "which begins here")
     fix = "indent it like its neighbors, or deeper than its own key"
-    return Problem("a line that does not line up", place.rest(place.at), label, fix, other)
+    return _problem("a line that does not line up", place.rest(place.at), label, fix, other)
 
 
-def _unclosed(place: Place) -> Problem:
+def _unclosed(place: Place) -> Diagnostic:
     opener, opened = place.text[place.since : place.since + 1], place.span(place.since)
     closer = {"{": "}", "[": "]"}.get(opener, "}")
     comment = _comment(place)
@@ -161,17 +148,17 @@ def _unclosed(place: Place) -> Problem:
             "YAML reads a `#` after a space as a comment",
         )
         fix = f'put quotes around a value that starts with `#`: "{value}"'
-        return Problem(message, place.rest(comment), label, fix, Label(opened, "opened here"))
+        return _problem(message, place.rest(comment), label, fix, Label(opened, "opened here"))
     message, fix = f"a `{opener}` that is never closed", f"write the `{closer}`"
     if place.at >= len(place.text.rstrip()) or not place.same_line:
         quoted = place.quoted(place.since)
         drawn = re.search(r"\b(given|expect): \Z", place.before(place.since))
         if drawn and closer not in place.rest(place.since).text and quoted != QUOTE:
-            return Problem(message, opened, "not closed", f"{fix}, or {quoted}")
+            return _problem(message, opened, "not closed", f"{fix}, or {quoted}")
     if place.same_line and place.at < len(place.text):
         other = Label(opened, "opened here")
-        return Problem(f"expected `,` or `{closer}`", place.span(place.at), "", QUOTE, other)
-    return Problem(message, opened, "not closed", fix)
+        return _problem(f"expected `,` or `{closer}`", place.span(place.at), "", QUOTE, other)
+    return _problem(message, opened, "not closed", fix)
 
 
 def _comment(place: Place) -> int | None:
@@ -188,27 +175,33 @@ def _comment(place: Place) -> int | None:
     return None
 
 
-def _open_quote(place: Place) -> Problem:
+def _open_quote(place: Place) -> Diagnostic:
     if place.text[place.since : place.since + 1] not in "\"'":
-        return Problem("the file ends too early", place.span(place.at), "something is not finished")
+        return _problem("the file ends too early", place.span(place.at), "something is not finished")
     span, fix = place.span(place.since), "write the closing quote"
-    return Problem("a quote that is never closed", span, "no closing quote", fix)
+    return _problem("a quote that is never closed", span, "no closing quote", fix)
 
 
-def _escape(place: Place) -> Problem:
+def _escape(place: Place) -> Diagnostic:
     label, fix = 'in "…" a backslash starts an escape', "use '…' quotes, or no quotes"
     backslash = place.text.rfind("\\", 0, place.at + 1)
-    return Problem("an unknown escape", place.span(backslash, 2), label, fix)
+    return _problem("an unknown escape", place.span(backslash, 2), label, fix)
 
 
-def _list_beside_key(place: Place) -> Problem:
+def _no_colon(place: Place) -> Diagnostic:
+    fix = "a key ends with `:`; text that continues is indented deeper than its key"
+    span = place.rest(place.since)
+    return _problem("a line that is neither a key nor a value", span, "no `:` after it", fix)
+
+
+def _list_beside_key(place: Place) -> Diagnostic:
     quoted = place.quoted(place.at)
     fix = "put `- …` on a line of its own" + ("" if quoted == QUOTE else f"; if it is not a list, {quoted}")
     span, label = place.span(place.at), "a list starts on the next line"
-    return Problem("a list on the line of its key", span, label, fix)
+    return _problem("a list on the line of its key", span, label, fix)
 
 
-def _nothing(place: Place) -> Problem:
+def _nothing(place: Place) -> Diagnostic:
     at = min(place.at, len(place.text.rstrip()))
     before = place.before(at)
     if "{" in before and _comment(Place(place.source, at, at - len(before))) is not None:
@@ -216,30 +209,31 @@ def _nothing(place: Place) -> Problem:
     span = place.span(place.at)
     if place.char in ("}", "]"):
         label = "nothing is open, or a value is missing"
-        return Problem(f"a `{place.char}` that closes nothing", span, label)
-    return Problem("a value is missing", span, "before this", "remove one comma, or write the value")
+        return _problem(f"a `{place.char}` that closes nothing", span, label)
+    return _problem("a value is missing", span, "before this", "remove one comma, or write the value")
 
 
-def _block_header(place: Place) -> Problem:
+def _block_header(place: Place) -> Diagnostic:
     char = place.text[place.since : place.since + 1]
     fix = f"put the text on the next lines, indented; or {place.quoted(place.since)}"
     label = f"`{char}` starts a block on the next lines"
-    return Problem(f"text after `{char}`", place.rest(place.at), label, fix)
+    return _problem(f"text after `{char}`", place.rest(place.at), label, fix)
 
 
-_ROWS: tuple[tuple[str, Callable[[Place], Problem]], ...] = (
-    (
-        "directive|incompatible YAML document|duplicate tag handle",
-        _fixed("a YAML directive", "a line that starts with `%`", "remove the line", since=True, whole=True),
-    ),
-    (
-        "while (scanning|parsing) (a tag|an anchor|an alias)|undefined tag handle",
-        _fixed("a value cannot start with `{char}`", _MEANING, "{quoted}", since=True),
-    ),
-    (
-        "mapping keys are not allowed",
-        _fixed("a value cannot start with `{char}`", "begins a key, to YAML", "{quoted}"),
-    ),
+def _directive(place: Place) -> Diagnostic:
+    span, label = place.rest(place.since), "a line that starts with `%`"
+    return _problem("a YAML directive", span, label, "remove the line")
+
+
+def _after_end(place: Place) -> Diagnostic:
+    span, fix = place.rest(place.at), "remove it, or the line before it"
+    return _problem("text after the end of the document", span, "not part of it", fix)
+
+
+_ROWS: tuple[tuple[str, Explain], ...] = (
+    ("directive|YAML document|duplicate tag", _directive),
+    ("an? (tag|anchor|alias):|tag handle", _fixed(_STARTS, _MEANING, "{quoted}", since=True)),
+    ("mapping keys are not allowed", _fixed(_STARTS, "begins a key, to YAML", "{quoted}")),
     ("mapping values are not allowed", _second_colon),
     ("found a tab character", _TAB),
     ("cannot start any token", lambda place: (_TAB if place.char == "\t" else _INDICATOR)(place)),
@@ -247,29 +241,12 @@ _ROWS: tuple[tuple[str, Callable[[Place], Problem]], ...] = (
     ("expected ',' or '[]}]'", _unclosed),
     ("unexpected (end of stream|document indicator|document separator)", _open_quote),
     ("unknown escape character|hexa?decimal number|invalid Unicode", _escape),
-    (
-        "could not find expected ':'",
-        _fixed(
-            "a line that is neither a key nor a value",
-            "no `:` after it",
-            "a key ends with `:`; text that continues is indented deeper than its key",
-            since=True,
-            whole=True,
-        ),
-    ),
+    ("could not find expected ':'", _no_colon),
     ("sequence entries are not allowed", _list_beside_key),
     ("expected (a )?comment or (a )?line break|chomping or indentation", _block_header),
     ("while parsing a block collection", _item),
     ("while parsing a block mapping", _key),
     ("expected (the )?node content", _nothing),
-    (
-        "expected '?<document start>",
-        _fixed(
-            "text after the end of the document",
-            "not part of it",
-            "remove it, or the line before it",
-            whole=True,
-        ),
-    ),
+    ("expected '?<document start>", _after_end),
 )
 """Patterns of what PyYAML and libyaml report, and what it means. The first match counts."""
