@@ -457,10 +457,10 @@ def slow_imports_after(statement: str, path: Path = ROOT) -> set[str]:
         "import powderdsl.cli, powderdsl.testing.properties.refute",
         "from powderdsl.compiler import load, lower; from powderdsl.ir.bits import lower_bits; "
         "from powderdsl.targets.wasm.source import wasm_module; wasm_module(lower_bits(lower(load('life'))), 64)",
-        "from powderdsl.cli.commands.study import called, commands; "
+        "from powderdsl.cli.commands.study import commands; "
         "from powderdsl.cli.study.checks import check_study; "
-        "from powderdsl.experiments.studies.file import load_study; "
-        "load_study('learning', commands(), lambda *both: check_study(*both, called))",
+        "from powderdsl.experiments.studies.study import load_study; "
+        "load_study('learning', commands(), check_study)",
     ],
 )
 def test_the_front_end_does_without_torch(statement: str) -> None:

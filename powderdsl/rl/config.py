@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from powderdsl.compiler import BACKENDS
 from powderdsl.diagnostics import CompileError, Diagnostic, Label, suggest
 from powderdsl.system.settings import mistakes, setting
+from powderdsl.tasks.shipped import check_split
 
 if TYPE_CHECKING:
     from powderdsl.tasks.task import Task
@@ -17,6 +18,11 @@ if TYPE_CHECKING:
 OBSERVATIONS = ("compact", "ids", "matrix")
 USUAL_OBSERVATION = MappingProxyType({"paper": "compact", "small": "ids", "fcn": "ids"})
 """The networks, and the observation that each takes unless another is given."""
+
+POLICIES = ("trained", "expert", "random", "nothing")
+"""Policies that are compared. Only runs have a trained one, only some tasks an expert."""
+BASELINES = ("random", "nothing")
+"""Policies that others are compared with in the same worlds."""
 
 
 @dataclass(frozen=True)
@@ -174,7 +180,10 @@ def check_config(config: TrainConfig, known: Sequence[Diagnostic] = ()) -> Train
 
 
 def check_task(config: TrainConfig, task: Task) -> None:
-    """Raise CompileError (PD640) if a task lacks what the settings ask for."""
+    """Raise CompileError if a task lacks what the settings ask for: a split (PD801), or something else (PD640)."""
+    check_split(task, config.split)
+    if config.eval_every:
+        check_split(task, config.eval_split)
     wrong = []
     if config.reward == "shaped" and task.goal.shaped is None:
         wrong.append(_wrong(f"`reward`: the task {task.name} has no `shaped` reward"))
@@ -182,6 +191,22 @@ def check_task(config: TrainConfig, task: Task) -> None:
         wrong.append(_wrong(f"`init_expert`: the task {task.name} has no expert"))
     if wrong:
         raise CompileError(wrong)
+
+
+def chosen_policies(policies: Sequence[str] | None, task: Task, *, trained: bool) -> list[str]:
+    """The policies to play, in the order of POLICIES. Raises ValueError.
+
+    Args:
+        policies: some of POLICIES; None: all, but not an expert that searches. trained: whether there is a trained one.
+    """
+    there = {"trained": trained, "expert": task.expert is not None}
+    known = [policy for policy in POLICIES if there.get(policy, True)]
+    slow = {"expert"} if task.expert is not None and not task.expert.scripted else set()
+    chosen = [policy for policy in known if (policy not in slow if policies is None else policy in policies)]
+    unknown = [policy for policy in policies or () if policy not in known]
+    if unknown or not chosen:
+        raise ValueError(f"policies are {', '.join(known)}; found {unknown[0] if unknown else 'none'}")
+    return chosen
 
 
 def _contradictions(config: TrainConfig) -> Iterator[str]:

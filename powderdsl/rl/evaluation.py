@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,7 +14,8 @@ from powderdsl.envs.acting import FrameStack, Policy, action_keys, random_policy
 from powderdsl.envs.observations import observation_of
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.experiments.runs import RunFolder, find_run
-from powderdsl.rl.config import TrainConfig
+from powderdsl.experiments.runs.intervals import mean_and_interval
+from powderdsl.rl.config import BASELINES, TrainConfig, chosen_policies
 from powderdsl.rl.policies import config_of, load_policy, task_of
 from powderdsl.simulation.simulator import World
 from powderdsl.tasks.episodes import TaskProgram, compile_task
@@ -23,8 +23,6 @@ from powderdsl.tasks.players import ExpertPlayer
 from powderdsl.tasks.shipped import check_split
 from powderdsl.tasks.task import Task
 
-POLICIES = ("trained", "expert", "random", "nothing")
-BASELINES = ("random", "nothing")
 EVALUATION = "evaluation.json"
 BATCH = 256
 """Episodes that are played at once."""
@@ -42,7 +40,7 @@ class Played(NamedTuple):
 
 @dataclass(frozen=True)
 class Score:
-    """A policy on a split. `interval` is half of the 95 % interval of `mean`: 1.96 standard errors; None of one episode.
+    """A policy on a split. `interval` is half of the 95 % interval of `mean`; None of one episode.
 
     `above` has the mean difference to each of BASELINES in the same worlds, with its own interval, as far as they were
     played and are others. `success` is None for tasks that do not say what success is. `normalized` is the mean on a
@@ -199,7 +197,7 @@ def evaluate(
     names = [one.name for one in task.splits] if splits is None else list(dict.fromkeys(splits))
     for name in names:
         check_split(task, name)
-    chosen = _chosen(policies, task, trained=run is not None)
+    chosen = chosen_policies(policies, task, trained=run is not None)
     if episodes < 1 or not names:
         raise ValueError(
             f"episodes is {episodes}: it takes an integer from 1" if names else "splits are empty"
@@ -234,7 +232,9 @@ def evaluate(
                 own = TaskProgram(task, config.split, first.simulator)
                 training = frozenset(_starts(own, torch.arange(min(TRAINING_STARTS, config.worlds))))
             new = torch.tensor([start not in training for start in _starts(program, worlds)])
-            without = {one: mean_and_interval(of.returns[new]) for one, of in played.items() if new.any()}
+            without = {
+                one: mean_and_interval(of.returns[new].tolist()) for one, of in played.items() if new.any()
+            }
             seen[name] = Seen(int((~new).sum()), without)
         for policy in chosen:
             scores.append(_score(name, policy, played, task))
@@ -244,18 +244,6 @@ def evaluate(
     if run is not None:
         run.write_json(EVALUATION, found.as_json())
     return found
-
-
-def _chosen(policies: Sequence[str] | None, task: Task, *, trained: bool) -> list[str]:
-    """The policies to play, in the order of POLICIES. Raises ValueError."""
-    there = {"trained": trained, "expert": task.expert is not None}
-    known = [one for one in POLICIES if there.get(one, True)]
-    slow = {"expert"} if task.expert is not None and not task.expert.scripted else set()
-    chosen = [one for one in known if (one not in slow if policies is None else one in policies)]
-    unknown = [one for one in policies or () if one not in known]
-    if unknown or not chosen:
-        raise ValueError(f"policies are {', '.join(known)}; found {unknown[0] if unknown else 'none'}")
-    return chosen
 
 
 def _play_all(
@@ -279,7 +267,7 @@ def _starts(program: TaskProgram, worlds: Tensor) -> list[bytes]:
 def _score(split: str, policy: str, all_played: Mapping[str, Played], task: Task) -> Score:
     played = all_played[policy]
     above = {
-        other: mean_and_interval(played.returns - all_played[other].returns)
+        other: mean_and_interval((played.returns - all_played[other].returns).tolist())
         for other in BASELINES
         if other != policy and other in all_played
     }
@@ -293,7 +281,7 @@ def _score(split: str, policy: str, all_played: Mapping[str, Played], task: Task
         split,
         policy,
         len(played.returns),
-        *mean_and_interval(played.returns),
+        *mean_and_interval(played.returns.tolist()),
         success,
         length,
         above,
@@ -307,11 +295,5 @@ def _ratio(values: Tensor, scale: Tensor) -> tuple[float, float | None] | None:
     if whole <= 0:
         return None
     ratio = float(values.mean()) / whole
-    _, half = mean_and_interval(values - ratio * scale)
+    _, half = mean_and_interval((values - ratio * scale).tolist())
     return ratio, None if half is None else half / whole
-
-
-def mean_and_interval(values: Tensor) -> tuple[float, float | None]:
-    """The mean, and half of its 95 % interval."""
-    half = 1.96 * float(values.std()) / math.sqrt(len(values)) if len(values) > 1 else None
-    return float(values.mean()), half

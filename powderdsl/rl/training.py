@@ -29,15 +29,16 @@ from powderdsl.envs.observations import channels_of
 from powderdsl.envs.sb3 import PowderVecEnv
 from powderdsl.envs.tensor_env import check_cells
 from powderdsl.experiments.runs import Metrics, RunFolder, does_not_fit, open_run
+from powderdsl.experiments.runs.intervals import mean_and_interval
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.rl.cloning import clone, open_demonstrations
 from powderdsl.rl.config import TrainConfig, check_config, check_task
-from powderdsl.rl.evaluation import mean_and_interval, play
+from powderdsl.rl.evaluation import play
 from powderdsl.rl.policies import TrainedPolicy, policy_of
 from powderdsl.simulation.observe import Observer
 from powderdsl.system.writing import failure
 from powderdsl.tasks.episodes import TaskProgram, compile_task
-from powderdsl.tasks.shipped import check_split, load_task
+from powderdsl.tasks.shipped import load_task
 from powderdsl.tasks.task import Task
 
 KIND = "ppo"
@@ -63,9 +64,6 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
     """
     check_config(config)
     task, palette = _task_and_palette(config)
-    check_split(task, config.split)
-    if config.eval_every:
-        check_split(task, config.eval_split)
     check_task(config, task)
     trained_on = task.with_shaped_reward() if config.reward == "shaped" else task
     try:
@@ -284,7 +282,7 @@ class _HeldOut:
         policy.set_training_mode(False)
         worlds = torch.arange(config.eval_episodes)
         returns = play(self.program, trained, worlds, observation=config.observation).returns
-        mean, half = mean_and_interval(returns)
+        mean, half = mean_and_interval(returns.tolist())
         interval = {} if half is None else {"held_out/interval": half}
         self.metrics.write(step, {"held_out/return": mean, **interval})
 

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from powderdsl.experiments.runs import does_not_fit
-from powderdsl.worldmodel.config import HERE, Machine
+from powderdsl.worldmodel.config import HERE, DataConfig, Machine
 from powderdsl.worldmodel.networks import without_actions
 from powderdsl.worldmodel.recordings import Recording
 from powderdsl.worldmodel.rulesets import UNSEEN_RULESETS
@@ -153,23 +153,11 @@ def evaluate_recording(trained: Trained, recording: Recording, *, machine: Machi
     )
 
 
-def unseen_worlds(
-    trained: Trained,
-    *,
-    machine: Machine = HERE,
-    task: str | None = None,
-    split: str = "designed",
-    rules: str | None = None,
-    only: tuple[str, ...] | None = None,
-    knobs: Mapping[str, int] | None = None,
-    rulesets: int = 0,
-) -> TaskWorlds:
+def unseen_worlds(trained: Trained, *, machine: Machine = HERE, **tested_on: Any) -> TaskWorlds:
     """Worlds to test a network on. Those that the rules cannot have are left out, as long as others remain.
 
     Args:
-        task, rules, only, knobs: those of the training data unless others are given; with another task, its own knobs.
-        rulesets: how many rulesets the worlds run under in turn, drawn as those of the training data were, and none of
-            which training takes. 0: the rules as they are.
+        tested_on: see `unseen_data`.
 
     Raises:
         CompileError: as `task_worlds`; PD623 if the rules have elements that the network has no slots for, or the network
@@ -177,8 +165,29 @@ def unseen_worlds(
     """
     if trained.config.recorded is not None:
         raise does_not_fit(trained.run.path, "it predicts recorded transitions, with actions")
-    data = trained.config.data
-    data = replace(
+    data = unseen_data(trained.config.data, **tested_on)
+    check_slots(trained.run.path, trained.palette, load_rules_of(data, trained.palette))
+    return task_worlds(data, **machine.simulation, partly=True, palette=trained.palette)
+
+
+def unseen_data(
+    data: DataConfig,
+    *,
+    task: str | None = None,
+    split: str = "designed",
+    rules: str | None = None,
+    only: tuple[str, ...] | None = None,
+    knobs: Mapping[str, int] | None = None,
+    rulesets: int = 0,
+) -> DataConfig:
+    """Which worlds to test on, where `data` are those of the training.
+
+    Args:
+        task, rules, only, knobs: those of the training data unless others are given; with another task, its own knobs.
+        rulesets: how many rulesets the worlds run under in turn, drawn as those of the training data were, and none of
+            which training takes. 0: the rules as they are.
+    """
+    return replace(
         data,
         task=task or data.task,
         split=split,
@@ -189,5 +198,3 @@ def unseen_worlds(
         rulesets=rulesets,
         first_ruleset=UNSEEN_RULESETS,
     )
-    check_slots(trained.run.path, trained.palette, load_rules_of(data, trained.palette))
-    return task_worlds(data, **machine.simulation, partly=True, palette=trained.palette)

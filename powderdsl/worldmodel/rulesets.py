@@ -48,6 +48,14 @@ class Drawn:
         return self.left_out, self.swapped
 
 
+def check_properties(rules: Ruleset, names: Sequence[str]) -> None:
+    """Raise CompileError (PD301) for a property that rules do not have."""
+    for name in names:
+        if rules.property(name) is None:
+            helps = suggest(name, [prop.name for prop in rules.properties], "properties")
+            raise failure("PD301", f"the rules {rules.name} have no property `{name}`", helps=helps)
+
+
 class RulesetSource:
     """Draws rulesets around one, which is `rules` as everywhere. The same number gives the same ruleset.
 
@@ -70,10 +78,7 @@ class RulesetSource:
         self.variety, self.params, self.palette = variety, params or {}, palette
         self.base = self._checked(self.packs)
         self.palette = palette or self.base.palette  # ids stay where they are when packs are left out
-        for name in variety.swaps:
-            if self.base.property(name) is None:
-                helps = suggest(name, [prop.name for prop in self.base.properties], "properties")
-                raise failure("PD301", f"the rules {self.base.name} have no property `{name}`", helps=helps)
+        check_properties(self.base, variety.swaps)
 
     def draw(self, number: int) -> Drawn:
         """Ruleset `number`, 0 or more. Inconsistent rulesets are drawn again."""

@@ -14,7 +14,7 @@ from powderdsl.experiments.runs.palettes import recorded_palette
 from powderdsl.model.composition.palette import Palette
 from powderdsl.model.types import Ruleset
 from powderdsl.tasks.shipped import load_task
-from powderdsl.worldmodel.config import TrainConfig
+from powderdsl.worldmodel.config import DataConfig, TrainConfig
 from powderdsl.worldmodel.networks import CustomNetwork, Encoded, OneHot, UNet, fit_weights
 from powderdsl.worldmodel.rule_words import add, pack_names
 from powderdsl.worldmodel.training import KIND, encoder_of, load_rules_of, network_missing
@@ -97,13 +97,16 @@ def finetuned(
     if config.recorded is not None:
         raise does_not_fit(trained.run.path, "it learned from a dataset, and other packs are not in it")
     data = config.data
-    own = data.rules or "+".join(load_task(data.task).rules)
-    rules, names = add(own, packs), pack_names(own, packs)
-    knobs = {name: value for name, value in data.knobs.items() if name != SIMPLER}
-    data = replace(data, rules=rules, only=names, knobs=knobs, rulesets=0)
+    data = with_packs(data, data.rules or "+".join(load_task(data.task).rules), packs)
     palette = extended_palette(trained.palette, load_rules_of(data, trained.palette))
     values = {"iterations": iterations, "parent": trained.checkpoint.path.name, **changes}
     return replace(config, data=data, palette=palette, **values)
+
+
+def with_packs(data: DataConfig, own: str, packs: Sequence[str]) -> DataConfig:
+    """The worlds of `data` under its own rules with packs added, which alone are drawn. Raises CompileError as `load`."""
+    knobs = {name: value for name, value in data.knobs.items() if name != SIMPLER}
+    return replace(data, rules=add(own, packs), only=pack_names(own, packs), knobs=knobs, rulesets=0)
 
 
 def extended_palette(palette: Palette, rules: Ruleset) -> tuple[str | None, ...]:

@@ -20,7 +20,7 @@ from powderdsl.tasks.episodes import TaskProgram, compile_task
 from powderdsl.tasks.shipped import check_split, load_task
 from powderdsl.tasks.task import NO_CHANGE, Drawing, Generator, Goal, Split, Stamp, Task
 from powderdsl.worldmodel.config import TEST_SEEDS, DataConfig
-from powderdsl.worldmodel.rulesets import Drawn, RulesetSource
+from powderdsl.worldmodel.rulesets import Drawn, RulesetSource, check_properties
 
 VALIDATION_SEEDS = 1 << 33
 """The first seed of worlds that models are validated on during training: far beyond those of tests."""
@@ -170,19 +170,25 @@ def task_worlds(
     """
     own = not config.rules
     task = load_task(config.task, knobs=config.knobs, params=config.params if own else None, palette=palette)
-    check_split(task, config.split)
     source = None
     if config.rulesets:
         source = RulesetSource(config.rules or task.rules, config.variety, config.params, palette)
         rules = source.base
     else:
         rules = task.ruleset if own else load(config.rules, params=config.params, palette=palette)
+    check_data(config, task, rules)
+    machine = {"backend": backend, "device": device, "threads": threads}
+    return TaskWorlds(task, config, rules, source, machine, partly)
+
+
+def check_data(config: DataConfig, task: Task, rules: Ruleset) -> None:
+    """Raise CompileError if a task lacks a configuration's split, or rules its packs or properties."""
+    check_split(task, config.split)
     for pack in config.only:
         if pack not in rules.packs:
             helps = suggest(pack, rules.packs, "packs")
             raise failure("PD304", f"the rules {rules.name} have no pack `{pack}`", helps=helps)
-    machine = {"backend": backend, "device": device, "threads": threads}
-    return TaskWorlds(task, config, rules, source, machine, partly)
+    check_properties(rules, config.variety.swaps)
 
 
 # Pairs

@@ -32,11 +32,10 @@ from powderdsl.diagnostics import CODES, CompileError, Diagnostic, Reporter, Sev
 from powderdsl.diagnostics.codes import page
 from powderdsl.diagnostics.render import render_text
 from powderdsl.experiments.runs import does_not_fit, find_run, open_run
-from powderdsl.experiments.studies.cluster import check_address
+from powderdsl.experiments.studies.cluster import check_cluster
 from powderdsl.experiments.studies.collect import collected, read_folders
-from powderdsl.experiments.studies.file import load_study, read_study
 from powderdsl.experiments.studies.run import StudyRun
-from powderdsl.experiments.studies.study import TEXT
+from powderdsl.experiments.studies.study import TEXT, load_study, read_study
 from powderdsl.rl import preset
 from powderdsl.simulation.standalone import standalone_module
 from powderdsl.system.writing import replacing
@@ -283,8 +282,8 @@ def collect_different_results() -> None:
         StudyRun(study, Path(name), "small").prepare()
         done = Path(name) / "done"
         done.mkdir()
-        (done / "steps=100,seed=0.json").write_text(f'{{"t/mean": {reward}}}', encoding="utf-8")
-    collected(read_folders([Path("one"), Path("two")], known), list(study.points("small")))
+        (done / "steps=100,seed=0.json").write_text(f'{{"t": {{"mean": {reward}}}}}', encoding="utf-8")
+    collected(read_folders([Path("one"), Path("two")], known), next(study.points("small")))
 
 
 SITUATIONS: dict[str, Callable[[], object]] = {
@@ -302,7 +301,7 @@ SITUATIONS: dict[str, Callable[[], object]] = {
     "PD623": use_a_run_that_does_not_fit,
     "PD624": learn_too_fast,
     "PD625": lambda: custom_network("nets:Deep"),
-    "PD626": lambda: check_address("127.0.0.1:1"),
+    "PD626": lambda: check_cluster("127.0.0.1:1"),
     "PD627": collect_different_results,
     "PD630": lambda: read_manifest(Path("recorded")),
     "PD631": record_with_another_seed,

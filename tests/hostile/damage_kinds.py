@@ -23,8 +23,8 @@ from safetensors.torch import load, save
 
 from powderdsl.cli.commands.study import commands
 from powderdsl.experiments.runs.checkpoints import STATE
-from powderdsl.experiments.studies.file import load_study
 from powderdsl.experiments.studies.run import StudyRun
+from powderdsl.experiments.studies.study import load_study
 from powderdsl.targets.cache import signed
 
 TEXTS = (
@@ -383,7 +383,7 @@ def _results(folder: Path) -> None:
     (folder / "results" / "done").mkdir()
     for point in study.points("small", 1):
         done = folder / "results" / "done" / f"{point.name}.json"
-        done.write_text('{"trained/splits/test/trained/mean": 2.5}', encoding="utf-8")
+        done.write_text('{"trained": {"splits": {"test": {"trained": {"mean": 2.5}}}}}', encoding="utf-8")
 
 
 def make_valid(folder: Path, run: Callable[..., None]) -> None:

@@ -78,12 +78,12 @@ def test_scores_are_those_of_a_loop_by_hand(
     for score in found.scores:
         returns = by_hand[score.policy]
         assert score.mean == pytest.approx(returns.mean(), abs=1e-6)
-        assert score.interval == pytest.approx(1.96 * returns.std(ddof=1) / 6**0.5, abs=1e-6)
+        assert score.interval == pytest.approx(2.571 * returns.std(ddof=1) / 6**0.5, abs=1e-6)
         assert set(score.above) == {"random", "nothing"} - {score.policy}
         for other, (mean, half) in score.above.items():
             above = returns - by_hand[other]
             assert mean == pytest.approx(above.mean(), abs=1e-6)
-            assert half == pytest.approx(1.96 * above.std(ddof=1) / 6**0.5, abs=1e-6)
+            assert half == pytest.approx(2.571 * above.std(ddof=1) / 6**0.5, abs=1e-6)
     assert by_hand["random"].std() > 0
     assert json.loads((run.path / "evaluation.json").read_text()) == json.loads(json.dumps(found.as_json()))
 

@@ -7,23 +7,21 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 import threading
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
+from powderdsl.cli.commands.study import SHARD, commands, part, selected
 from powderdsl.cli.commands.study import command as study_command
-from powderdsl.cli.commands.study import commands
 from powderdsl.cli.exits import BadInput
-from powderdsl.cli.study.selection import SHARD, part, selected
-from powderdsl.experiments.studies import claims, run
-from powderdsl.experiments.studies.claims import LEASE, Claim, Claims
-from powderdsl.experiments.studies.file import load_study
-from powderdsl.experiments.studies.run import Outcome, StudyRun
-from powderdsl.experiments.studies.study import Point, StudyStep
+from powderdsl.experiments.studies.run import StudyRun
+from powderdsl.experiments.studies.study import Point, StudyStep, load_study
 from tests.cli.commands import ROOT, command_line, environment_with, powderdsl
 from tests.cli.endless import TASK
+from tests.processes import started
 from tests.tiers import tiered
 
 STUDY = """
@@ -48,10 +46,10 @@ def steps_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Work in a folder with `study.yaml`, whose steps write a number at once. The names of the points that were run."""
     found: list[str] = []
 
-    def step(self: StudyRun, step: StudyStep, point: Point, place: Path, claim: Claim) -> None:
+    def step(self: StudyRun, step: StudyStep, point: Point, place: Path) -> None:
         folder = place / "trained"
         folder.mkdir(exist_ok=True)
-        reward = int(dict(point.values)["steps"]) / 100 + 0.1 * point.seed + len(dict(point.sets)["lines"])
+        reward = int(dict(point.values)["steps"]) / 100 + 0.1 * point.seed + len(point.names["lines"])
         about = {"splits": {"test": {"trained": {"mean": reward}}}}
         (folder / "evaluation.json").write_text(json.dumps(about), encoding="utf-8")
         if step.name == "tested":
@@ -196,7 +194,9 @@ def test_collect_refuses_two_results_of_one_point(steps_run: list[str], quick: N
     powderdsl("study", "study.yaml", "--out", "one")
     powderdsl("study", "study.yaml", "--out", "two")
     path = Path("two/done/steps=200,obstacles=some,seed=1.json")
-    path.write_text(json.dumps({"trained/splits/test/trained/mean": 99.0}), encoding="utf-8")
+    path.write_text(
+        json.dumps({"trained": {"splits": {"test": {"trained": {"mean": 99.0}}}}}), encoding="utf-8"
+    )
     result = powderdsl("study", "collect", "one", "two", "--out", "all")
     assert result.exit_code == 2
     assert (
@@ -210,11 +210,12 @@ def test_collect_refuses_two_results_of_one_point(steps_run: list[str], quick: N
 def test_results_of_strangers_are_numbers(value: str, quick: None) -> None:
     powderdsl("study", "study.yaml", "--out", "one")
     path = Path("one/done/steps=100,obstacles=none,seed=0.json")
-    path.write_text(f'{{"trained/splits/test/trained/mean": {value}}}', encoding="utf-8")
+    about = f'{{"trained": {{"splits": {{"test": {{"trained": {{"mean": {value}}}}}}}}}}}'
+    path.write_text(about, encoding="utf-8")
     for words in (("collect", "one"), ("study.yaml", "--out", "one")):
         result = powderdsl("study", *words)
         assert result.exit_code == 1
-        assert "values that are not numbers" in Path("one/results.md").read_text(encoding="utf-8")
+        assert "is not a finite number" in Path("one/results.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(
@@ -259,11 +260,11 @@ def test_points_that_others_hold_are_left_to_them(steps_run: list[str], quick: N
     prepared("out")
     place = Path("out/runs/steps=200,obstacles=none,seed=1")
     place.mkdir()
-    with Claims().take(place)[0]:
+    with FileLock(place / ".lock"):
         result = powderdsl("study", "study.yaml", "--out", "out")
         assert result.exit_code == 1
         assert "the study is not complete: other processes hold 1 combination" in result.stderr
-        assert f"{place.name}: held by " in result.stderr
+        assert f"{place.name}: another process works on it" in result.stderr
         assert len(steps_run) == POINTS - 1
         assert place.name not in steps_run
         assert not Path("out/results.md").exists()
@@ -282,79 +283,39 @@ def prepared(folder: str) -> tuple[StudyRun, Point, Path]:
     return found, point, place
 
 
-def test_patience_waits_for_who_is_about_to_end(
-    steps_run: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(run, "RETRY", 0.01)
+def test_a_task_of_a_cluster_waits_for_who_holds_its_point(steps_run: list[str]) -> None:
     study, point, place = prepared("out")
-    claim, _ = Claims().take(place)
-    held = threading.Event()
-    taken = claims.Claims.take
-
-    def take(self: Claims, folder: Path) -> tuple[Claim, bool]:
-        try:
-            return taken(self, folder)
-        except claims.Held:
-            held.set()
-            raise
-
-    monkeypatch.setattr(claims.Claims, "take", take)
-
-    def end() -> None:
-        with claim:
-            assert held.wait(30)
-
-    thread = threading.Thread(target=end)
-    thread.start()
-    (found,) = study.run([point], 1, patience=30)
+    lock = FileLock(place / ".lock", thread_local=False)
+    with lock:
+        thread = threading.Timer(0.5, lock.release)
+        thread.start()
+        (outcome,) = study.run([point], 1, wait=True)
+        assert outcome.problem is None
+        assert steps_run == [point.name]
     thread.join()
-    assert found.problem is None
 
 
-def test_the_point_of_a_dead_machine_is_taken_over_with_its_locks(
-    steps_run: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A file server may keep the lock of a dead machine: the file makes way, whoever holds it."""
-    monkeypatch.setattr(run, "RETRY", 0.01)
-    now = [0.0]
+HOLD = """
+import sys, time
+from filelock import FileLock
+with FileLock(sys.argv[1]):
+    print("held", flush=True)
+    time.sleep(600)
+"""
 
-    def clock() -> float:
-        now[0] += LEASE / 10
-        return now[0]
 
+def test_a_point_is_free_once_the_process_that_holds_it_is_killed(steps_run: list[str]) -> None:
     study, point, place = prepared("out")
-    (place / "trained").mkdir()
-    (place / "trained" / ".lock").touch()
-    about = {"machine": "another", "host": "node7", "pid": 7, "locked": True}
-    (place / "claim-000001").write_text(json.dumps(about), encoding="utf-8")
-    monkeypatch.setattr(claims, "_clock", clock)
-    monkeypatch.setattr(claims, "BEAT", 3600)
-    monkeypatch.setattr(claims.Claim, "check", lambda self: None)  # the clock runs fast
-    told: list[Outcome] = []
-    (found,) = study.run([point], 1, told.append)
-    assert found.problem is None
-    assert told == [found]
-    assert not (place / "trained" / ".lock").exists()
-    assert not list(place.glob("claim-*"))
-
-
-def test_who_has_lost_a_point_keeps_nothing(steps_run: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """What an owner computes after others have taken over is not kept; it then waits for them."""
-    monkeypatch.setattr(run, "RETRY", 0.01)
-    study, point, _ = prepared("out")
-    usual: Callable[..., None] = StudyRun._step
-
-    def step(self: StudyRun, step: StudyStep, point: Point, place: Path, claim: Claim) -> None:
-        usual(self, step, point, place, claim)
-        if step.name == "tested" and len(steps_run) == 1:
-            claim._lost.set()  # as its thread does
-            claim.path.unlink()
-            assert not (place.parents[1] / "done").exists()
-
-    monkeypatch.setattr(StudyRun, "_step", step)
-    (found,) = study.run([point], 1)
-    assert found.problem is None
-    assert len(steps_run) == 2
+    command = [sys.executable, "-c", HOLD, str(place / ".lock")]
+    with started(command, stdout=subprocess.PIPE, env=environment_with()) as running:
+        assert running.stdout is not None
+        assert running.stdout.readline() == "held\n"
+        (outcome,) = study.run([point], 1)
+        assert outcome.held
+        running.kill()
+        running.wait()
+    (outcome,) = study.run([point], 1)
+    assert outcome.problem is None
 
 
 def test_the_recipe_for_slurm_runs_each_combination_once(tmp_path: Path) -> None:
@@ -387,30 +348,26 @@ def test_the_recipe_for_slurm_runs_each_combination_once(tmp_path: Path) -> None
     assert [points[0] for points in found] == list(load_study("start-states", known).points("paper"))
 
 
-@pytest.mark.skipif(claims.fcntl is None, reason="needs file locks")
 def test_a_step_waits_for_what_a_killed_study_has_started(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The lock of the log outlives the study, in the process that writes there."""
+    """The run's own lock outlives the study, in the process that saves its last checkpoint."""
     monkeypatch.chdir(tmp_path)
     Path("study.yaml").write_text(STUDY, encoding="utf-8")
     study, point, place = prepared("out")
-    with (place / "trained.log").open("ab") as log:
-        assert claims.lock_if_free(log.fileno())
-        old = subprocess.Popen(["sleep", "600"], stdout=log)
+    (place / "trained").mkdir()
+    (place / "trained" / "run.json").touch()
     began = threading.Event()
 
     def begin(*words: object, **options: object) -> None:
-        assert old.poll() is not None
         began.set()
         raise OSError("that is enough")
 
     monkeypatch.setattr(subprocess, "Popen", begin)
     thread = threading.Thread(target=study.run, args=([point], 1))
-    thread.start()
-    assert not began.wait(0.5)
-    old.kill()
-    old.wait()
+    with FileLock(place / "trained" / ".lock"):
+        thread.start()
+        assert not began.wait(0.5)
     assert began.wait(30)
     thread.join()
 

@@ -13,15 +13,13 @@ from contextlib import ExitStack
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
 from powderdsl.diagnostics import Reporter, Source
 from powderdsl.experiments.studies import cluster as on_cluster
-from powderdsl.experiments.studies.file import read_study
 from powderdsl.experiments.studies.run import StudyRun
-from powderdsl.experiments.studies.study import TASK, TEXT, Study
+from powderdsl.experiments.studies.study import TASK, TEXT, Study, read_study
 from powderdsl.system.writing import MARK
 from tests.cli.commands import command_line, environment_with, powderdsl
 from tests.cli.endless import TASK as DIG
@@ -69,8 +67,8 @@ def test_a_run_declares_what_it_needs() -> None:
     text = STUDY.format(seeds=1, steps=[12]).replace("seed: $seed", "seed: $seed, device: cpu")
     study, gpu = read(text), read(text.replace("device: cpu", "device: cuda"))
     (point,) = study.points("small")
-    assert on_cluster.resources(study, point, "small", 2) == {"num_cpus": 2, "num_gpus": 0}
-    assert on_cluster.resources(gpu, point, "small", 1) == {"num_cpus": 1, "num_gpus": 1}
+    assert on_cluster.resources(study, point, 2) == {"num_cpus": 2, "num_gpus": 0}
+    assert on_cluster.resources(gpu, point, 1) == {"num_cpus": 1, "num_gpus": 1}
 
 
 def test_a_node_without_the_folder_runs_nothing(tmp_path: Path) -> None:
@@ -94,15 +92,6 @@ def test_what_a_node_refuses_is_a_problem_of_the_run(tmp_path: Path) -> None:
     run.prepare()
     found = on_cluster.run_point(study, str(tmp_path / "out"), "small", 1, point, on_cluster._version())
     assert "the path `dig.yaml` leaves the study's folder" in str(found.problem)
-    assert not list((tmp_path / "out").rglob("claim-*"))
-
-
-def test_a_part_without_runs_needs_nothing() -> None:
-    nodes = SimpleNamespace(nodes=lambda: [{"Alive": True, "Resources": {"CPU": 1.0}}])
-    assert on_cluster._lacking(nodes, []) == []
-    asked = {"num_cpus": 1, "num_gpus": 0}
-    assert on_cluster._lacking(nodes, [asked]) == []
-    assert on_cluster._lacking(nodes, [asked, {"num_cpus": 2, "num_gpus": 1}]) == ["2 CPU cores", "1 GPU"]
 
 
 def test_without_ray_the_user_learns_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -146,7 +135,6 @@ def test_a_cluster_runs_a_study_and_sigterm_ends_one(tmp_path: Path) -> None:
             assert endless.said().endswith("terminated by SIGTERM\n")
             assert "Traceback" not in endless.said()
         assert (place / "trained.log").read_text(encoding="utf-8").endswith("terminated by SIGTERM\n")
-        assert not list(place.glob("claim-*"))
         assert not [line for line in nodes.processes().values() if " train " in line]
         written(tmp_path, 1, [12, 24])
         found = run_study(tmp_path, "--out", "out", "--ray", nodes.address)
@@ -204,7 +192,7 @@ def test_ten_deaths_change_no_number(tmp_path: Path) -> None:
         steps = list(_steps(run / "trained/metrics.jsonl"))
         assert steps == list(range(12, steps[-1] + 1, 12)), run  # no line is lost or written twice
         assert steps == list(_steps(tmp_path / "undisturbed/runs" / run.name / "trained/metrics.jsonl"))
-    left = [path for path in (tmp_path / "out").rglob("*") if MARK in path.name or "claim-" in path.name]
+    left = [path for path in (tmp_path / "out").rglob("*") if MARK in path.name]
     assert left == []
 
 

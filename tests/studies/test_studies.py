@@ -11,7 +11,6 @@ import pytest
 
 from powderdsl.cli.commands.study import commands
 from powderdsl.diagnostics import CompileError, Reporter, Source
-from powderdsl.experiments.studies.file import load_study, read_study, shipped_studies
 from powderdsl.experiments.studies.results import (
     Interval,
     as_data,
@@ -22,7 +21,17 @@ from powderdsl.experiments.studies.results import (
     write_figure,
 )
 from powderdsl.experiments.studies.run import Outcome, StudyRun
-from powderdsl.experiments.studies.study import FILE, RUN_OR_TASK, TASK, TEXT, Point, Study
+from powderdsl.experiments.studies.study import (
+    FILE,
+    RUN_OR_TASK,
+    TASK,
+    TEXT,
+    Point,
+    Study,
+    load_study,
+    read_study,
+    shipped_studies,
+)
 
 KNOWN: Mapping[tuple[str, ...], Mapping[str, str]] = {
     ("train",): {"on": TASK, **dict.fromkeys(("run", "seed", "steps", "knob"), TEXT)},
@@ -66,10 +75,9 @@ def test_a_grid_is_complete_and_each_size_has_its_own() -> None:
 
 def test_a_step_becomes_a_command(tmp_path: Path) -> None:
     study = read(TEXT)
-    run = StudyRun(study, tmp_path, "small")
     point = next(study.points("small"))
     place = tmp_path / "runs" / "x"
-    trained, tested = (run.command(step, point, place) for step in study.steps)
+    trained, tested = (study.command(step, point, place) for step in study.steps)
     words = [
         "train",
         "sand-pushing",
@@ -92,10 +100,7 @@ def test_a_value_may_set_several_names() -> None:
     study = read(
         TEXT.replace("[0, 5]", several).replace("[lines=2, squares=$squares]", "[lines=$l, disks=$d]")
     )
-    words = [
-        StudyRun(study, Path("x"), "small").command(study.steps[0], point, Path("y"))[4:8]
-        for point in study.points("small", seeds=1)
-    ]
+    words = [study.command(study.steps[0], point, Path("y"))[4:8] for point in study.points("small", seeds=1)]
     few, both = (["--knob", "lines=2", "--knob", f"disks={number}"] for number in (0, 5))
     assert words == [few, both, few, both]
     assert next(study.points("small", seeds=1)).name == "steps=100,squares=few,seed=0"

@@ -10,12 +10,10 @@ from typing import Any
 
 import pytest
 
-from powderdsl.cli.commands.study import called, commands
-from powderdsl.cli.study.checks import check_study
-from powderdsl.cli.study.measures import LEADS_TO, values_of_agent, values_of_world_model
+from powderdsl.cli.commands.study import commands
+from powderdsl.cli.study.checks import agent_keys, check_study, model_keys
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Source
-from powderdsl.experiments.studies.file import load_study, read_study, shipped_studies
-from powderdsl.experiments.studies.study import Study
+from powderdsl.experiments.studies.study import Study, load_study, read_study, shipped_studies
 from tests.cli.commands import powderdsl
 
 AGENTS = """
@@ -47,12 +45,7 @@ measures:
 
 
 def read(text: str, name: str = "study.yaml") -> Study:
-    return read_study(
-        Source(name, text),
-        Reporter(),
-        commands(),
-        lambda study, reporter: check_study(study, reporter, called),
-    )
+    return read_study(Source(name, text), Reporter(), commands(), check_study)
 
 
 def refused(text: str) -> list[tuple[str, str]]:
@@ -75,7 +68,7 @@ def test_good_studies_pass() -> None:
 
 @pytest.mark.parametrize("name", shipped_studies())
 def test_shipped_studies_pass(name: str) -> None:
-    load_study(name, commands(), lambda study, reporter: check_study(study, reporter, called))
+    load_study(name, commands(), check_study)
 
 
 @pytest.mark.parametrize(
@@ -215,18 +208,13 @@ def test_files_elsewhere_are_not_even_read(tmp_path: Path) -> None:
     assert "secret" not in str(caught.value)
 
 
-def numbers(tree: Any, keys: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
-    """The keys of all numbers in what JSON gave back."""
+def numbers(tree: Any, keys: tuple[str, ...] = ()) -> Iterator[str]:
+    """The keys of all numbers in what JSON gave back; names that are drawn are `*`."""
     if isinstance(tree, Mapping):
         for key, value in tree.items():
             yield from numbers(value, (*keys, key))
     elif isinstance(tree, int | float) and not isinstance(tree, bool):
-        yield keys
-
-
-def any_name(keys: tuple[str, ...]) -> tuple[str, ...]:
-    """Keys with those that are drawn replaced."""
-    return (keys[0], LEADS_TO, *keys[2:]) if keys[0] in ("tests", "elements") else keys
+        yield "/".join((keys[0], "*", *keys[2:]) if keys[0] in ("tests", "elements") else keys)
 
 
 @pytest.mark.slow
@@ -251,17 +239,20 @@ def test_known_keys_are_those_of_real_evaluations(tmp_path: Path, monkeypatch: p
     found = json.loads(Path("agent/evaluation.json").read_text())
     splits = list(found["splits"])
     real = set(numbers(found))
-    known = set(numbers(values_of_agent(splits, ("trained", "expert", "random", "nothing"))))
-    assert {keys for keys in known if keys[-1] != "success"} <= real <= known
+    policies = ("trained", "expert", "random", "nothing")
+    known = set(agent_keys(splits, policies, trained_on="train", success=True, intervals=True))
+    assert {keys for keys in known if not keys.endswith("success")} <= real <= known
 
     quick = ("--width", 4, "--batch", 4, "--buffer", 8, "--refresh", 2, "--states", 8, "--iterations", 1)
     trained = powderdsl("wm", "train", "--run", "model", *quick, "--backend", "wasm")
     assert trained.exit_code == 0, trained.output
     tested = powderdsl("wm", "eval", "model", "--split", "held_out", "--worlds", 1, "--backend", "wasm")
     assert tested.exit_code == 0, tested.output
-    real = {any_name(keys) for keys in numbers(json.loads(Path("model/evaluation.json").read_text()))}
-    known = set(numbers(values_of_world_model()))
-    unset = {keys for keys in known if keys[-1] == "change_precision"}  # null where no change is predicted
+    real = set(numbers(json.loads(Path("model/evaluation.json").read_text())))
+    known = set(model_keys())
+    unset = {
+        keys for keys in known if keys.endswith("/change_precision")
+    }  # null where no change is predicted
     assert known - unset <= real <= known
 
 
@@ -309,4 +300,4 @@ def test_a_measure_of_the_step_that_evaluates_is_led_to_the_run(study: str, righ
     (found,) = caught.value.diagnostics
     assert (found.code, under(found)) == ("PD806", "tested")
     assert f"`of: {right}`" in found.helps[0]
-    assert read(study.replace("{of: tested,", f"{{of: {right},")).measures[0].step == right
+    assert read(study.replace("{of: tested,", f"{{of: {right},")).measures[0].of.text == right

@@ -9,9 +9,7 @@ import pytest
 
 from powderdsl.cli.commands.study import CALLED, MEANS, NOT_FOR_STUDIES, commands
 from powderdsl.diagnostics import CompileError
-from powderdsl.experiments.studies.file import load_study
-from powderdsl.experiments.studies.run import StudyRun
-from powderdsl.experiments.studies.study import FILE, RULES, RUN_OR_TASK, TASK, confined
+from powderdsl.experiments.studies.study import FILE, RULES, RUN_OR_TASK, TASK, confined, load_study
 from tests.cli.commands import powderdsl
 
 STUDY = """
@@ -96,11 +94,10 @@ def test_a_study_cannot_choose_folders(option, tmp_path):
 def test_good_paths_become_paths_of_the_study_and_of_its_results(tmp_path):
     (tmp_path / "s.yaml").write_text(STUDY.replace("on: sand-pushing", "on: mine/task.yaml"))
     study = load_study(str(tmp_path / "s.yaml"), commands())
-    run = StudyRun(study, tmp_path / "results", "small")
     point = next(iter(study.points("small")))
     place = tmp_path / "results" / "runs" / point.name
-    assert str(tmp_path / "mine" / "task.yaml") in run.command(study.steps[0], point, place)
-    assert run.command(study.steps[1], point, place)[-1] == str(place / "scores.json")
+    assert str(tmp_path / "mine" / "task.yaml") in study.command(study.steps[0], point, place)
+    assert study.command(study.steps[1], point, place)[-1] == str(place / "scores.json")
 
 
 def test_each_kind_of_word(tmp_path, monkeypatch):

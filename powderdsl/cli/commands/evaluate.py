@@ -98,7 +98,7 @@ def _text(found: Evaluation) -> list[str]:
 
 
 def _row(score: Score) -> list[str]:
-    from powderdsl.rl.evaluation import BASELINES
+    from powderdsl.rl.config import BASELINES
 
     success = "" if score.success is None else f"{score.success:.0%}"
     return [

@@ -1,12 +1,12 @@
-"""`powderdsl study`: many runs over a grid of settings, with one table and one figure at the end."""
+"""`powderdsl study`: many runs over a grid of settings and seeds, with one table and one figure at the end."""
 
 from __future__ import annotations
 
+import re
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from functools import partial
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -14,13 +14,12 @@ from typing import Any
 import click
 
 from powderdsl.cli import options as opt
-from powderdsl.cli.exits import FAILED, OK
+from powderdsl.cli.exits import FAILED, OK, BadInput
 from powderdsl.cli.output import counted, progress
-from powderdsl.cli.study import selection
-from powderdsl.cli.study.checks import check_study
+from powderdsl.cli.study.checks import called, check_study
+from powderdsl.diagnostics import suggest
 from powderdsl.diagnostics.printable import printable
-from powderdsl.experiments.studies import cluster
-from powderdsl.experiments.studies.file import load_study, shipped_studies
+from powderdsl.experiments.studies.cluster import check_cluster, run_on_ray
 from powderdsl.experiments.studies.run import Outcome, StudyRun
 from powderdsl.experiments.studies.study import (
     FILE,
@@ -28,26 +27,23 @@ from powderdsl.experiments.studies.study import (
     RULES,
     RUN,
     RUN_OR_TASK,
+    SIZE,
     SIZES,
     TASK,
     TEXT,
     Point,
     Study,
+    load_study,
+    shipped_studies,
 )
 from powderdsl.system.writing import not_writable
 
 JOBS = 2
 """Processes at a time, unless the user says."""
+MAX_SHARDS = 1_000_000
 
-CALLED: tuple[tuple[str, ...], ...] = (
-    ("train",),
-    ("evaluate",),
-    ("wm", "train"),
-    ("wm", "finetune"),
-    ("wm", "eval"),
-)
+CALLED = (("train",), ("evaluate",), ("wm", "train"), ("wm", "finetune"), ("wm", "eval"))
 """Commands that steps of a study may call: those that write runs and evaluate them."""
-
 
 MEANS = {
     "TASK": TASK,
@@ -66,35 +62,73 @@ stranger."""
 
 
 def commands() -> Mapping[tuple[str, ...], Mapping[str, str]]:
-    """These commands, with the meaning of their options and of their argument (``on``).
+    """The commands of `CALLED`, with the meaning of their options and of their argument (``on``).
 
     Options that name folders are left out, but for `run`, which the study gives: a step writes where the study says.
     """
-    found: dict[tuple[str, ...], dict[str, str]] = {}
+    known: dict[tuple[str, ...], dict[str, str]] = {}
     for words in CALLED:
-        found[words] = {}
-        for one in called(words).params:
-            if isinstance(one, click.Argument):
-                found[words]["on"] = MEANS[one.metavar or ""]
+        known[words] = {}
+        for parameter in called(words).params:
+            means = MEANS.get(parameter.metavar or "", TEXT)
+            if isinstance(parameter, click.Argument):
+                known[words]["on"] = means
                 continue
-            means = (
-                FLAG if isinstance(one, click.Option) and one.is_flag else MEANS.get(one.metavar or "", TEXT)
+            is_folder = (
+                isinstance(parameter.type, click.Path) and means != FILE and "--run" not in parameter.opts
             )
-            if isinstance(one.type, click.Path) and means != FILE and "--run" not in one.opts:
+            if is_folder or {parameter.metavar, *parameter.opts} & {*NOT_FOR_STUDIES}:
                 continue
-            if {one.metavar, *one.opts} & {*NOT_FOR_STUDIES}:
-                continue
-            found[words] |= {name[2:]: means for name in one.opts if name.startswith("--")}
-    return found
+            means = FLAG if getattr(parameter, "is_flag", False) else means
+            known[words] |= {name[2:]: means for name in parameter.opts if name.startswith("--")}
+    return known
 
 
-def called(words: tuple[str, ...]) -> click.Command:
-    """The click command that some words name."""
-    found: click.Command = import_module(f"powderdsl.cli.commands.{words[0]}").command
-    for word in words[1:]:
-        assert isinstance(found, click.Group)
-        found = found.commands[word]
-    return found
+# Parts of a study: the combinations that `--only`, `--seeds` and `--shard` select
+
+only_option = opt.text(
+    "--only",
+    "NAME=VALUE,…",
+    "Run only combinations with these values of a setting, or `seed=0,1`. May be repeated.",
+    multiple=True,
+)
+seeds_option = opt.integer("--seeds", 1, 1000, "Runs of each combination.  [default: the study's]")
+
+
+def _shard(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"([0-9]{1,7})/([0-9]{1,7})", text)
+    number, of = (int(match[1]), int(match[2])) if match else (0, 0)
+    if not 1 <= number <= of <= MAX_SHARDS:
+        raise ValueError("is not a part: write 1/4 to 4/4 for four parts")
+    return number, of
+
+
+SHARD = opt.Parsed("I/N", _shard)
+
+
+def selected(study: Study, size: str, seeds: int | None, only: Sequence[str]) -> list[Point]:
+    """The combinations that were asked for. Raises BadInput if there are none."""
+    points = list(study.points(size, seeds))
+    known = {name: {point.names[name] for point in points} for name in points[0].names if name != SIZE}
+    wanted: dict[str, set[str]] = {}
+    for text in only:
+        name, _, values = text.partition("=")
+        if (not values and "=" not in text) or name not in known:
+            raise BadInput(f"`--only {text}`: write NAME=VALUE,… with one of {', '.join(known)} as NAME")
+        for value in {*values.split(",")} - known[name]:
+            there = suggest(value, known[name]) or (f"it has {', '.join(sorted(known[name])[:20])}",)
+            raise BadInput(f"`--only {text}`: `{name}` has no value `{value}` here; {there[0]}")
+        wanted.setdefault(name, set()).update(values.split(","))
+    points = [point for point in points if all(point.names[name] in wanted[name] for name in wanted)]
+    if not points:
+        raise BadInput(f"no combination has {' and '.join(only)}")
+    return points
+
+
+def part(points: Sequence[Point], shard: tuple[int, int] | None) -> list[Point]:
+    """A shard of some points: consecutive ones, so that a shard has large and small settings."""
+    number, of = shard or (1, 1)
+    return list(points[len(points) * (number - 1) // of : len(points) * number // of])
 
 
 class StudyCommand(click.Command):
@@ -112,8 +146,8 @@ class StudyCommand(click.Command):
 @click.argument(
     "folders", metavar="FOLDER…", nargs=-1, required=True, type=click.Path(path_type=Path, file_okay=False)
 )
-@selection.seeds
-@selection.only
+@seeds_option
+@only_option
 @opt.path("--out", "FOLDER", "Folder for the table and the figure.  [default: the first FOLDER]")
 def collect(folders: tuple[Path, ...], seeds: int | None, only: tuple[str, ...], out: Path | None) -> int:
     """Merge the results of a study that ran in several folders, or in parts.
@@ -125,24 +159,23 @@ def collect(folders: tuple[Path, ...], seeds: int | None, only: tuple[str, ...],
 
     runs = read_folders(folders, commands())
     study, size = runs[0].study, runs[0].size
-    outcomes = collected(runs, selection.selected(study, size, seeds, only))
+    outcomes = [collected(runs, point) for point in selected(study, size, seeds, only)]
     folder = out or folders[0]
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise not_writable(folder, error) from None
-    _report(study, size, folder, outcomes)
-    return _status(outcomes)
+    return _report(study, size, folder, outcomes)
 
 
 @click.command("study", cls=StudyCommand)
 @click.argument("study", metavar="STUDY", required=False)
 @opt.choice("--size", SIZES, "Size of the study: values of its settings.", "small")
-@selection.seeds
+@seeds_option
 @opt.integer("--jobs", 1, 256, "Processes that run at a time.  [default: 2; with --ray, as many as fit]")
 @opt.integer("--threads", 1, 256, "Threads per process.", 1)
-@selection.only
-@click.option("--shard", type=selection.SHARD, help="Run only part I of N parts: for job arrays.")
+@only_option
+@click.option("--shard", type=SHARD, help="Run only part I of N parts: for job arrays.")
 @opt.text("--ray", "ADDRESS", "Run on a Ray cluster: `auto`, or HOST:PORT of its head.")
 @opt.path("--out", "FOLDER", "Folder of the results.  [default: studies/STUDY-SIZE]")
 @opt.flag("--dry-run", "Print the commands without running them.")
@@ -170,29 +203,27 @@ def command(
             click.echo(f"{name:24} {load_study(name, known).about}")
         return OK
     # The nodes of a cluster have devices that this machine may lack.
-    check = partial(check_study, find=called, devices=ray is None)
-    found = load_study(study, known, check)
-    every = selection.selected(found, size, seeds, only)
-    points = selection.part(every, shard)
-    folder = out or Path("studies") / f"{found.name}-{size}"
-    run = StudyRun(found, folder, size, threads)
+    loaded = load_study(study, known, partial(check_study, devices=ray is None))
+    every = selected(loaded, size, seeds, only)
+    points = part(every, shard)
+    folder = out or Path("studies") / f"{loaded.name}-{size}"
+    run = StudyRun(loaded, folder, size, threads)
     if dry_run:
         for point in points:
-            for step in found.steps:
-                click.echo(shlex.join(["powderdsl", *run.command(step, point, folder / "runs" / point.name)]))
+            for step in loaded.steps:
+                words = loaded.command(step, point, folder / "runs" / point.name)
+                click.echo(shlex.join(["powderdsl", *words]))
         return OK
     if ray is not None:
-        cluster.require_ray()
-        cluster.check_address(ray)
+        check_cluster(ray)
     run.prepare()
     try:
-        outcomes = _with_progress(run, points, jobs, ray)
+        outcomes = {outcome.point: outcome for outcome in _with_progress(run, points, jobs, ray)}
     except KeyboardInterrupt:
         click.echo("interrupted; the same command resumes here", err=True)
         raise
-    own = {one.point: one for one in outcomes}
-    found_of = [own[point] if point in own else run.finished(point) for point in every]
-    held, missing = sum(one.held for one in outcomes), sum(one is None for one in found_of)
+    finished = [outcomes.get(point) or run.finished(point) for point in every]
+    held, missing = sum(outcome.held for outcome in outcomes.values()), finished.count(None)
     if held:
         click.echo(
             f"the study is not complete: other processes hold {counted(held, 'combination')}", err=True
@@ -201,38 +232,33 @@ def command(
         name = shlex.quote(str(folder))
         click.echo(f"other parts have {counted(missing, 'combination')} that are not done in {name}")
     if held or missing:  # whoever finishes last writes the table, or `collect`
-        _tell_lost(outcomes)
-    else:
-        _report(found, size, folder, [one for one in found_of if one is not None])
-    return _status(outcomes)
-
-
-def _status(outcomes: Sequence[Outcome]) -> int:
-    return FAILED if any(one.problem for one in outcomes) else OK
+        return _status([*outcomes.values()])
+    return _report(loaded, size, folder, [outcome for outcome in finished if outcome is not None])
 
 
 def _with_progress(run: StudyRun, points: list[Point], jobs: int | None, ray: str | None) -> list[Outcome]:
     done = 0
     with progress(run.study.name, len(points)) as show:
 
-        def told(one: Outcome) -> None:
+        def report(outcome: Outcome) -> None:
             nonlocal done
             done += 1
             show(done)
-            text = ", ".join(f"{name} {value:.4g}" for name, value in one.values.items())
-            click.echo(f"{one.point.name}: {one.problem or text}", err=True)
+            text = ", ".join(f"{name} {value:.4g}" for name, value in outcome.values.items())
+            click.echo(f"{outcome.point.name}: {outcome.problem or text}", err=True)
 
         if ray is not None:
-            return cluster.run_on_ray(run, points, ray, jobs, told, partial(click.echo, err=True))
-        return run.run(points, jobs or JOBS, told)
+            return run_on_ray(run, points, ray, jobs, report)
+        return run.run(points, jobs or JOBS, report)
 
 
-def _report(study: Study, size: str, folder: Path, outcomes: list[Outcome]) -> None:
+def _report(study: Study, size: str, folder: Path, outcomes: list[Outcome]) -> int:
+    """Write the results, and return the exit status."""
     from powderdsl.experiments.runs.folder import write_json
     from powderdsl.experiments.studies.results import as_data, as_markdown, write_figure
     from powderdsl.system.writing import write_text
 
-    text = printable(as_markdown(study, size, outcomes), lines=True)  # somebody will `cat` it
+    text = printable(as_markdown(study, size, outcomes), lines=True)  # it may be shown by `cat`
     write_json(folder / "results.json", as_data(study, size, outcomes))
     write_text(folder / "results.md", text)
     sys.stdout.write(text)
@@ -241,13 +267,15 @@ def _report(study: Study, size: str, folder: Path, outcomes: list[Outcome]) -> N
     else:
         write_figure(folder / "figure.png", study, size, outcomes)
         click.echo(str(folder / "figure.png"))
-    _tell_lost(outcomes)
+    return _status(outcomes)
 
 
-def _tell_lost(outcomes: Sequence[Outcome]) -> None:
-    lost = sum(one.problem is not None and not one.held for one in outcomes)
+def _status(outcomes: Sequence[Outcome]) -> int:
+    """The exit status, after a line about combinations that did not finish."""
+    lost = sum(outcome.problem is not None and not outcome.held for outcome in outcomes)
     if lost:
         click.echo(
             f"{counted(lost, 'combination')} did not finish; running the study again tries them again",
             err=True,
         )
+    return FAILED if any(outcome.problem for outcome in outcomes) else OK

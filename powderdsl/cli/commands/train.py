@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -36,37 +38,20 @@ from powderdsl.rl.config import PRESETS, TrainConfig, from_json, preset
 @opt.backend("auto")
 @click.pass_context
 def command(
-    ctx: click.Context,
-    /,
-    task: str | None,
-    folder: Path | None,
-    resume: Path | None,
-    preset_name: str,
-    settings: dict[str, str],
-    packs: tuple[str, ...],
-    knobs: tuple[str, ...],
-    **given: Any,
+    ctx: click.Context, /, task: str | None, folder: Path | None, resume: Path | None, **_: Any
 ) -> None:
     """Train an agent on TASK with PPO: a shipped task's name, or a task's file.
 
     The same command again, or --resume DIR, continues where a run was interrupted; more --steps continue with one that is
     done. DIR gets checkpoints, metrics.jsonl and events for TensorBoard.
     """
-    asked = {name: value for name, value in given.items() if ctx.get_parameter_source(name) is not _DEFAULT}
-    short = {name: asked.pop(name) for name in ("lines", "disks", "complexity") if name in asked}
     if resume is not None:
         if task is not None or folder is not None:
             raise BadInput("--resume goes without TASK and --run: the run knows its task")
-        config, folder = _config_of(resume, asked, settings or packs or knobs or short), resume
+        config, folder = _config_of(resume, ctx), resume
     else:
-        if task is None:
-            raise BadInput("say which TASK, or --resume DIR")
-        name = str(Path(task).absolute()) if Path(task).suffix else task
-        if "init_from" in asked:
-            asked["init_from"] = str(Path(asked["init_from"]).absolute())
-        chosen = knob_values(knobs) | short
-        config = preset(preset_name, name, **asked, knobs=chosen, params=settings, packs=packs)
-        folder = folder or Path("runs") / f"{Path(task).stem}-seed{config.seed}"
+        config = new_config(ctx)
+        folder = folder or Path("runs") / f"{Path(config.task).stem}-seed{config.seed}"
     from powderdsl.rl.training import train
 
     try:
@@ -84,20 +69,42 @@ def command(
     click.echo(f"powderdsl evaluate {folder}; powderdsl watch {folder}", err=True)
 
 
-_DEFAULT = click.core.ParameterSource.DEFAULT
+WHAT = ("lines", "disks", "complexity", "knobs", "settings", "packs")
+"""Options that decide on worlds and rules."""
 
 
-def _config_of(folder: Path, asked: dict[str, Any], more: Any) -> TrainConfig:
+def _given(ctx: click.Context, names: Iterable[str]) -> dict[str, Any]:
+    """The values of some options, if they were given."""
+    default = click.core.ParameterSource.DEFAULT
+    return {name: ctx.params[name] for name in names if ctx.get_parameter_source(name) not in (None, default)}
+
+
+def new_config(ctx: click.Context) -> TrainConfig:
+    """The settings of a new run. Raises CompileError and BadInput with what is wrong in them."""
+    values = ctx.params
+    task = values["task"]
+    if task is None:
+        raise BadInput("say which TASK, or --resume DIR")
+    given = _given(ctx, [one.name for one in fields(TrainConfig) if one.name not in (*WHAT, "task")])
+    if "init_from" in given:
+        given["init_from"] = str(given["init_from"].absolute())
+    knobs = knob_values(values["knobs"]) | _given(ctx, ("lines", "disks", "complexity"))
+    name = str(Path(task).absolute()) if Path(task).suffix else task
+    more = {"knobs": knobs, "params": values["settings"], "packs": values["packs"]}
+    return preset(values["preset_name"], name, **given, **more)
+
+
+def _config_of(folder: Path, ctx: click.Context) -> TrainConfig:
     """The settings of a run, with those changed that may change."""
     from powderdsl.experiments.runs import find_run
     from powderdsl.rl.config import HOW
     from powderdsl.rl.policies import config_of
     from powderdsl.rl.training import ASKED, KIND
 
-    fixed = [name for name in asked if name not in HOW]
-    if fixed or more:
+    given = _given(ctx, [one.name for one in fields(TrainConfig) if one.name not in WHAT])
+    if any(name not in HOW for name in given) or _given(ctx, WHAT):
         raise BadInput(f"--resume keeps what is trained; only {', '.join(HOW)} may change")
     run = find_run(folder, KIND)
     latest = run.read_json(ASKED) or {}
     how = {name: latest[name] for name in HOW if name in latest}
-    return from_json({**config_of(run).as_json(), **how, **asked})
+    return from_json({**config_of(run).as_json(), **how, **given})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -116,57 +116,55 @@ def command() -> None:
 @opt.knobs("Another value for a knob of the task.")
 @opt.parameters
 @_run_options
-def train_command(
-    preset: str,
-    rules: str | None,
-    packs: tuple[str, ...],
-    held_out: tuple[str, ...],
-    knobs: tuple[str, ...],
-    settings: dict[str, str],
-    folder: Path | None,
-    **values: Any,
-) -> None:
+def train_command(folder: Path | None, ignore_actions: bool, **values: Any) -> None:
     """Train a network on worlds that nobody touches.
 
     A run that was stopped continues when the same command is given again, as if it had not been stopped.
     """
+    if values["network_name"] and values["width"]:
+        raise BadInput("--width is that of the U-net: leave it out with --network")
+    if values["data"] is None:
+        if ignore_actions:
+            raise BadInput("--ignore-actions goes with --data")
+        config = new_config(values, rules_of)
+        _run(config, folder or Path("runs") / (Path(config.data.task).stem or "run"), values)
+        return
+    _refuse(values)
+    recording = _opened(values["data"], values["task"])
+    recorded = replace(recording.recorded, actions=not ignore_actions)
+    with user_values():
+        config = replace(PRESETS[values["preset"]], recorded=recorded, **_given(values, TrainConfig))
+    name = f"{recording.task.name}-blind" if ignore_actions else recording.task.name
+    _run(config, folder or Path("runs") / name, values, recording=recording)
+
+
+def new_config(values: Mapping[str, Any], rules_of: Callable[..., str]) -> TrainConfig:
+    """The settings of a new run on worlds. Raises CompileError and BadInput with what is wrong in them.
+
+    Args:
+        values: of the options. rules_of: the function of this name, or one that remembers its results.
+    """
+    packs, held_out = values["packs"], values["held_out"]
     if packs and held_out:
         raise BadInput("--packs says what stays, --held-out what goes: give one of them")
-    recording = None
-    ignore_actions = values.pop("ignore_actions")
-    if values["data"] is not None:
-        _refuse(
-            values
-            | {"rules": rules, "packs": packs, "held_out": held_out, "knobs": knobs, "settings": settings}
-        )
-        recording = _opened(values["data"], values["task"])
-    elif ignore_actions:
-        raise BadInput("--ignore-actions goes with --data")
     variety = _given(values, Variety)
     if (variety or values["first_ruleset"]) and not values["rulesets"]:
         raise BadInput(
             "--chances, --swap, --leave-out and --first-ruleset say which rulesets: --rulesets says how many"
         )
-    if values["network_name"] and values["width"]:
-        raise BadInput("--width is that of the U-net: leave it out with --network")
     with user_values():
-        config = replace(PRESETS[preset], **_given(values, TrainConfig))
-        if recording is None:
-            data = replace(config.data, **_given(values, DataConfig))
-            short = {name: values[name] for name in KNOBS if values[name] is not None}
-            data = replace(
-                data,
-                rules=_rules_without(rules, data.task, packs, held_out),
-                knobs=short | knob_values(knobs),
-                params=settings,
-                variety=Variety(**variety),
-            )
-            config, name = replace(config, data=data), Path(data.task).stem or "run"
-        else:
-            recorded = replace(recording.recorded, actions=not ignore_actions)
-            config = replace(config, recorded=recorded)
-            name = f"{recording.task.name}-blind" if ignore_actions else recording.task.name
-    _run(config, folder or Path("runs") / name, values, recording=recording)
+        config = replace(PRESETS[values["preset"]], **_given(values, TrainConfig))
+        data = replace(config.data, **_given(values, DataConfig))
+        rules = values["rules"] or ""
+        short = {name: values[name] for name in KNOBS if values[name] is not None}
+        data = replace(
+            data,
+            rules=rules_of(rules, data.task, packs, held_out) if packs or held_out else rules,
+            knobs=short | knob_values(values["knobs"]),
+            params=values["settings"],
+            variety=Variety(**variety),
+        )
+    return replace(config, data=data)
 
 
 @command.command("finetune", cls=opt.ManyWords)
@@ -176,6 +174,7 @@ def train_command(
     "PACK…",
     "The packs to learn, by name or file: added to the run's rules, and all that worlds draw.",
     multiple=True,
+    required=True,
 )
 @opt.settings_of(TrainConfig, only=("iterations", "batch", "learning_rate", "seed"), checked=True)
 @_run_options
@@ -186,8 +185,6 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
     """
     from powderdsl.worldmodel.trained import finetuned, load_trained
 
-    if not packs:
-        raise BadInput("--packs names what is to be learned")
     network = _own_network(values["network_name"])
     trained = load_trained(run, device="cpu", network=network)
     config = finetuned(trained, packs, **_given(values, TrainConfig))
@@ -211,8 +208,6 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
 @opt.path("--out", "FILE", "File of the results.  [default: RUN/evaluation.json]")
 def eval_command(
     run: str,
-    only: tuple[str, ...],
-    knobs: tuple[str, ...],
     as_json: bool,
     out: Path | None,
     data: Path | None,
@@ -231,12 +226,11 @@ def eval_command(
 
     machine = _machine(values)
     trained = load_trained(run, device=machine.device, network=_own_network(network_name))
-    drawn = knob_values(knobs) if knobs else None
-    recording = _recording_of(trained, data, {**values, "only": only, "knobs": knobs})
+    recording = _recording_of(trained, data, values)
     if recording is not None:
         tested = evaluate_recording(trained, recording, machine=machine)
     else:
-        tested = evaluate(trained, only=only or None, knobs=drawn, machine=machine, **_designed(values))
+        tested = evaluate(trained, worlds=values["worlds"], machine=machine, **tested_on(values))
     plain = tested.plain()
     if out is not None:
         write_json(out, plain, follow=True)
@@ -293,7 +287,7 @@ def show_command(
     step = trained.config.data.steps
     if steps is not None and steps % step:
         raise BadInput(f"--steps {steps}: this network predicts {step} steps, or several times as many")
-    worlds = unseen_worlds(trained, machine=machine, **_designed(values))
+    worlds = unseen_worlds(trained, machine=machine, **tested_on(values))
     found = strips(trained.network, worlds, step=step, times=(steps or step) // step, after=after or 0)
     _show(found, worlds.rules, out, scale)
     for variant in worlds.missing:
@@ -310,10 +304,16 @@ def _show(found: list[Strip], rules: Ruleset, out: Path, scale: int) -> None:
         click.echo(f"{number}  {strip.name}: {strip.wrong:,} of {strip.truth.size:,} cells wrong")
 
 
-def _designed(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Options of a test, with the usual split and rulesets."""
-    usual = {"split": "designed", "rulesets": 0}
-    return {name: usual.get(name) if value is None else value for name, value in values.items()}
+def tested_on(values: Mapping[str, Any]) -> dict[str, Any]:
+    """What the options of a test say about its worlds."""
+    return {
+        "task": values["task"],
+        "split": values["split"] or "designed",
+        "rules": values["rules"],
+        "only": values.get("only") or None,
+        "knobs": knob_values(values["knobs"]) if values.get("knobs") else None,
+        "rulesets": values.get("rulesets") or 0,
+    }
 
 
 def _given(values: Mapping[str, Any], config: type) -> dict[str, Any]:
@@ -375,10 +375,8 @@ def _own_network(name: str | None) -> CustomNetwork | None:
     return custom_network(name)
 
 
-def _rules_without(rules: str | None, task: str, packs: tuple[str, ...], held_out: tuple[str, ...]) -> str:
-    """The rules of a run as text; empty if they are the task's own."""
-    if not packs and not held_out:
-        return rules or ""
+def rules_of(rules: str, task: str, packs: tuple[str, ...], held_out: tuple[str, ...]) -> str:
+    """Rules, or those of a task, with some packs alone or without others."""
     from powderdsl.tasks.shipped import load_task
     from powderdsl.worldmodel.rule_words import keep, leave_out
 

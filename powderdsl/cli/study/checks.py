@@ -1,430 +1,357 @@
-"""Check a study before its first command runs, with every value of the study, as the commands would check it."""
+"""Check a study before its first command runs: each command with every value of the study.
+
+Commands say why they refuse their words, but not where the study has these. A word is to blame for a mistake if the
+mistake is gone without the word.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
-from functools import lru_cache
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from fnmatch import fnmatchcase
+from functools import cache, lru_cache
+from importlib import import_module
 from pathlib import Path
 from string import Template
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from powderdsl.cli.options import knob_values
-from powderdsl.cli.study.measures import POLICIES, check_measure, check_unused
-from powderdsl.cli.study.places import Places, Values, Word
+from powderdsl.cli.commands import train, wm
+from powderdsl.cli.exits import BadInput
+from powderdsl.cli.options import find_played
 from powderdsl.compiler import load
-from powderdsl.diagnostics import CompileError, Reporter, suggest
-from powderdsl.experiments.studies.study import Study, StudyStep
-from powderdsl.tasks.shipped import check_split, is_task, load_task
+from powderdsl.diagnostics import CompileError, Diagnostic, Label, Reporter, suggest
+from powderdsl.experiments.runs import find_run
+from powderdsl.experiments.studies.study import FLAG, SIZES, TEXT, Measure, Point, Study, StudyStep
+from powderdsl.model.types import Ruleset
+from powderdsl.rl.config import BASELINES, TrainConfig, check_task, chosen_policies
+from powderdsl.syntax.yaml_tree import Scalar
+from powderdsl.tasks.shipped import check_split, load_task
+from powderdsl.tasks.task import Task
 
 if TYPE_CHECKING:
-    from powderdsl.tasks.task import Task
+    from powderdsl.worldmodel.config import DataConfig
+    from powderdsl.worldmodel.config import TrainConfig as ModelConfig
 
-PPO, WORLD_MODEL = "ppo", "worldmodel"
-KINDS = {PPO: "an agent", WORLD_MODEL: "a world model"}
-"""Kinds of runs, and what they are of."""
-MAKES = {("train",): PPO, ("wm", "train"): WORLD_MODEL, ("wm", "finetune"): WORLD_MODEL}
-"""What kind of run a command makes."""
-NEEDS = {("evaluate",): PPO, ("wm", "finetune"): WORLD_MODEL, ("wm", "eval"): WORLD_MODEL}
-"""What kind of run a command works on."""
-SHORT_KNOBS = ("lines", "disks", "complexity", "kinds", "squares")
-"""Knobs that have options of their own, whose values have the same names."""
-DEFAULT_TASK = "world-model"
-DEFAULT_SPLITS = {("train",): "train", ("wm", "train"): "train", ("wm", "eval"): "designed"}
-VARIETY = {"chances": "chances", "swap": "swaps", "leave-out": "leave_out", "first-ruleset": "first_ruleset"}
-"""Options that say how rulesets vary, and the names of their values."""
-
-
-@dataclass(frozen=True)
-class Call:
-    """A step with some values of the study.
-
-    `words`: those of each option. `given`: values of options by the names of the command's parameters.
-    """
-
-    step: StudyStep
-    values: Values
-    words: Mapping[str, Sequence[Word]]
-    given: Mapping[str, Any]
-
-    def all(self, *options: str) -> list[Word]:
-        """The words of some options, in this order."""
-        return [word for option in options for word in self.words.get(option, ())]
-
-    def first(self, option: str) -> Word | None:
-        """The word of an option that takes one."""
-        return next(iter(self.all(option)), None)
-
-
-def check_study(
-    study: Study,
-    reporter: Reporter,
-    find: Callable[[tuple[str, ...]], click.Command],
-    *,
-    devices: bool = True,
-) -> None:
-    """Report what a study's commands would refuse, measures that lead to no number, and settings that nothing uses.
-
-    Args:
-        find: the command of some words. devices: whether the study runs on this machine, with its devices.
-    """
-    check = _StudyCheck(study, reporter, find, devices)
-    for step in study.steps:
-        check.step(step)
-    for measure in study.measures:
-        check_measure(check.places, measure, check.task_of)
-    check_unused(check.places)
-
+AGENT, NETWORK = "an agent", "a world model"
+MAKES = {("train",): AGENT, ("wm", "train"): NETWORK, ("wm", "finetune"): NETWORK}
+"""What the runs of commands train."""
+WORKS_ON = {("evaluate",): AGENT, ("wm", "finetune"): NETWORK, ("wm", "eval"): NETWORK}
+"""What the runs that commands work on have trained."""
+EVALUATES = {AGENT: "evaluate", NETWORK: "wm eval"}
 
 Pairs = tuple[tuple[str, Any], ...]
 
 
-def _task(text: str, knobs: Pairs = (), params: Pairs = ()) -> Task:
-    path = Path(text)
-    return _loaded(text, knobs, params, path.stat().st_mtime_ns if path.is_file() else 0)
+def called(words: tuple[str, ...]) -> click.Command:
+    """The click command that some words name."""
+    command: click.Command = import_module(f"powderdsl.cli.commands.{words[0]}").command
+    for word in words[1:]:
+        assert isinstance(command, click.Group)
+        command = command.commands[word]
+    return command
 
 
-@lru_cache(maxsize=64)
-def _loaded(text: str, knobs: Pairs, params: Pairs, stamp: int) -> Task:
-    """A task, once for all of its uses; `stamp` tells versions of a file apart."""
-    return load_task(text, knobs=dict(knobs), params=dict(params))
+def check_study(study: Study, reporter: Reporter, *, devices: bool = True) -> None:
+    """Report what a study's commands would refuse, and measures that lead to no number.
+
+    Args:
+        devices: whether the study runs on this machine, with its devices.
+    """
+    check = _StudyCheck(study, reporter, devices)
+    for step in study.steps:
+        for point in check.points:
+            check.result(step, point)
+    for measure in study.measures:
+        check.measure(measure)
 
 
 class _StudyCheck:
-    """The check of one study."""
+    """The check of one study. What is loaded is loaded once."""
 
-    def __init__(
-        self,
-        study: Study,
-        reporter: Reporter,
-        find: Callable[[tuple[str, ...]], click.Command],
-        devices: bool,
-    ):
-        self.devices = devices
-        self.places, self.reporter, self.find = Places(study, reporter), reporter, find
-        self.report, self.told = self.places.report, self.places.told
-        self.done: set[tuple[object, ...]] = set()
-        """Questions that have been answered: most words are the same with all values."""
+    def __init__(self, study: Study, reporter: Reporter, devices: bool):
+        self.study, self.reporter, self.devices = study, reporter, devices
+        self.points = [point for size in SIZES for point in study.points(size, 1)]
+        self.results: dict[tuple[object, ...], Any] = {}
+        self.refused: set[tuple[str, str, str]] = set()
+        """Words that are to blame for mistakes, by step and option."""
+        self.wrong = {step.name for step in study.steps if step.is_wrong}
+        """Steps with mistakes, whose consequences are not reported."""
+        self.load, self.rules_of = cache(_load), cache(self.changed_rules)
 
-    def first_time(self, *question: object) -> bool:
-        """Whether a question has not been answered before."""
-        new = question not in self.done
-        self.done.add(question)
-        return new
+    def result(self, step: StudyStep, point: Point) -> Any:
+        """What a step makes: the settings of its run, or patterns of keys of its results; None if that is not known."""
+        maker = self.study.works_on(step)
+        run = None if maker is None else self.result(maker, point)
+        if step.is_wrong or (run is None and maker is not None):
+            return None
+        key = (step.name, id(run), *(point.filled(word) for _, word in step.words))
+        if key not in self.results:
+            self.results[key] = self.checked(step, point, run)
+        return self.results[key]
 
-    def step(self, step: StudyStep) -> None:
-        """Report all mistakes of a step."""
-        self.works_on(step)
-        used = self.places.names_of(step)
-        if not self.places.known(used):
+    def checked(self, step: StudyStep, point: Point, run: Any) -> Any:
+        """The result of a step; None after reporting all mistakes in its words."""
+        rest = step
+        for option, used in step.words:
+            if (step.name, option, point.filled(used)) in self.refused:
+                if option == "on":
+                    return None
+                rest = without(rest, used)
+        while True:
+            result, mistakes = self.attempt(rest, point, run)
+            if not mistakes:
+                return result if rest == step else None
+            self.wrong.add(step.name)
+            blamed = [self.blamed(mistake, len(mistakes), rest, point, run) for mistake in mistakes]
+            for mistake, (name, word) in zip(mistakes, blamed, strict=True):
+                self.report(mistake, step, point, word)
+                if word is not None:
+                    self.refused.add((step.name, name, point.filled(word)))
+                    rest = without(rest, word)
+            if any(name in ("", "on") for name, _ in blamed):
+                return None
+
+    def attempt(self, step: StudyStep, point: Point, run: Any) -> tuple[Any, Sequence[Diagnostic]]:
+        """The result of a step, and the mistakes in its words."""
+        try:
+            return self.call(step, point, run), ()
+        except CompileError as error:
+            # Where a value is out of range, mistakes in the file that uses it are consequences.
+            own = [mistake for mistake in error.diagnostics if mistake.primary.span is None]
+            return None, own or error.diagnostics
+        except (click.ClickException, ValueError, TypeError) as error:
+            message = error.format_message() if isinstance(error, click.ClickException) else str(error)
+            return None, (Diagnostic("PD806", " ".join(message.split()), Label(None)),)
+
+    def blamed(
+        self, mistake: Diagnostic, mistakes: int, step: StudyStep, point: Point, run: Any
+    ) -> tuple[str, Scalar | None]:
+        """The option and the word without which a mistake is gone; no word if there are several such options."""
+        likely = [
+            (name, word)
+            for name, word in step.words
+            if name in mistake.message or point.filled(word) in mistake.message
+        ]
+        for words in (likely, step.words):
+            gone: dict[str, Scalar] = {}
+            fewer: dict[str, Scalar] = {}
+            for name, word in words:
+                _, others = self.attempt(without(step, word), point, run)
+                if not any(
+                    (other.code, other.message) == (mistake.code, mistake.message) for other in others
+                ):
+                    gone[name] = word
+                    if len(others) < mistakes:
+                        fewer[name] = word
+            if gone:
+                return (fewer or gone).popitem() if len(fewer or gone) == 1 else ("", None)
+        return "", None
+
+    def report(self, mistake: Diagnostic, step: StudyStep, point: Point, word: Scalar | None) -> None:
+        """Report a mistake where the value of a word is written, and where it is used."""
+        if word is None:
+            self.reporter.add(replace(mistake, primary=Label(step.key.span)))
             return
-        for values in self.places.values(used):
-            words = self.places.words(step, values)
-            call = Call(step, values, words, self.converted(step, words))
-            self.device(call)
-            match step.command:
-                case ("train",):
-                    self.train(call)
-                case ("evaluate",):
-                    self.evaluate(call)
-                case ("wm", "train"):
-                    self.world_model(call)
-                case _:
-                    self.on_world_model(call)
+        name = next(name for name, other in step.words if other is word)
+        if mistake.primary.span is not None and step.means.get(name) not in (TEXT, FLAG):
+            self.reporter.add(mistake)  # in the file that the word names
+            return
+        if mistake.code == "PD620":
+            steps = [one.name for one in self.study.steps if MAKES.get(one.command) == WORKS_ON[step.command]]
+            message = f"no step before this one and no run `{word.text}`"
+            mistake = replace(
+                mistake, code="PD806", message=message, helps=suggest(word.text, steps, "steps")
+            )
+        names = {*Template(word.text).get_identifiers()}
+        span = point.spans.get(names.pop()) if len(names) == 1 else None
+        used = () if span is None else (Label(word.span, f"as `{point.filled(word)}`"),)
+        self.reporter.add(replace(mistake, primary=Label(span or word.span), secondary=used))
 
-    def works_on(self, step: StudyStep) -> None:
-        """Whether a step works on what its command takes."""
-        command, needs = " ".join(step.command), NEEDS.get(step.command)
-        runs = self.steps_with(needs)
-        message, label = "", ""
-        helps: tuple[str, ...] = ()
-        if step.command == ("wm", "train"):
-            if step.on is not None:
-                message, label = f"`{command}` does not work on anything", "leave this out"
-                helps = ("`task:` names its task",)
-        elif step.on is None:
-            what = f"the run of {KINDS[needs]}" if needs else "a task"
-            message = f"`{command}` works on {what}, and this step has no `on`"
-            helps = (f"write `on: {runs[0]}`" if runs else "write `on:` and its name",)
-        elif step.on_step and needs is None:
-            message, helps = f"`{command}` works on a task, not on a run", ("write the name of a task",)
-        elif step.on_step and needs is not None:
-            made = MAKES.get(self.places.maker(step).command)
-            if made != needs:
-                message = f"`{command}` works on the run of {KINDS[needs]}"
-                label = f"its run is {KINDS[made]}" if made else "it has no run"
-                helps = suggest(str(step.on), runs, "steps with such runs")
-        if message:
-            self.places.wrong.add(step.name)
-            span = self.places.place("step" if step.on is None else "on", step.name)
-            self.reporter.error("PD806", message, span, label, helps=helps)
-
-    def steps_with(self, kind: str | None) -> list[str]:
-        """The names of the steps whose runs are of a kind."""
-        return [one.name for one in self.places.study.steps if kind and MAKES.get(one.command) == kind]
-
-    def options_of(self, step: StudyStep) -> dict[str, click.Option]:
-        """The options of a step's command, by their names without dashes."""
-        params = self.find(step.command).params
-        return {name[2:]: one for one in params if isinstance(one, click.Option) for name in one.opts}
-
-    def converted(self, step: StudyStep, words: Mapping[str, Sequence[Word]]) -> dict[str, Any]:
-        """The values of a step's options by the names of the command's parameters; what cannot be converted is reported."""
-        params = self.options_of(step)
-        context = click.Context(self.find(step.command), info_name=step.name)
-        found: dict[str, Any] = {}
-        for option, given in words.items():
-            param = params.get(option)
-            if param is None:
-                continue
-            if not given:
-                place = self.places.place("option", step.name, option)
-                self.reporter.error("PD806", f"`{option}` has no value", place)
-            elif len(given) > 1 and not param.multiple:
-                self.report(given[1], f"`{option}` takes one value, found {len(given)}")
-            elif param.is_flag:
-                for word in given:
-                    if word.filled not in ("yes", "no"):
-                        self.report(word, f"`{option}` is `yes` or `no`, found `{word.filled}`")
-            else:
-                for word in given:
-                    if not Template(word.text).is_valid():  # that is reported
-                        continue
-                    value = (word.filled,) if param.multiple else word.filled
-                    try:
-                        value = param.process_value(context, value)
-                    except click.ClickException as error:
-                        self.done.add((step.name, option, word.filled))  # it is wrong: nothing else is asked
-                        self.report(word, f"`{option}`: {' '.join(error.message.split())}")
-                    else:
-                        found |= {} if param.multiple else {param.name or "": value}
-        return found
-
-    # What several commands take
-
-    def device(self, call: Call) -> None:
-        """Whether the machine has the device of a step, which all of its runs would need."""
-        word = call.first("device")
-        if self.devices and word is not None and self.first_time(word.step, "device", word.filled):
+    def call(self, step: StudyStep, point: Point, run: Any) -> Any:
+        """The result of a step. Raises what its command would raise before it begins to work."""
+        command, arguments = called(step.command), self.study.command(step, point, self.study.folder)
+        parameters = {name[2:]: parameter for parameter in command.params for name in parameter.opts}
+        for name, words in step.options.items():
+            if len(words) > 1 and not getattr(parameters[name], "multiple", False):
+                raise ValueError(f"`{name}` takes one value, found {len(words)}")
+            for word in words:
+                if step.means[name] == FLAG and point.filled(word) not in ("yes", "no"):
+                    raise ValueError(f"`{name}` is `yes` or `no`, found `{point.filled(word)}`")
+        maker, needs = self.study.works_on(step), WORKS_ON.get(step.command)
+        if step.on is not None and step.on_step and (maker is None or MAKES[maker.command] != needs):
+            works_on = f"the run of {needs}" if needs else "no run"
+            raise ValueError(f"`{' '.join(step.command)}` works on {works_on}")
+        context = command.make_context(" ".join(step.command), arguments[len(step.command) :])
+        if self.devices and "device" in step.options:
             from powderdsl.simulation.programs import find_device  # imports torch
 
-            with self.told(word):
-                find_device(word.filled)
+            find_device(context.params["device"])
+        match step.command:
+            case ("train",):
+                return self.agent(train.new_config(context))
+            case ("evaluate",):
+                return self.evaluation(context.params, run)
+            case ("wm", "train"):
+                return self.model(wm.new_config(context.params, self.rules_of))
+            case ("wm", "finetune"):
+                return self.finetuned(context.params, run)
+            case _:
+                return self.test(context.params, run)
 
-    def task(self, where: Word | StudyStep, text: str) -> Task | None:
-        """The task that a text names; None after reporting that there is none."""
-        found: Task | None = None
-        with self.told(where):
-            found = _task(text)
-        return found
+    # What commands would refuse. Knobs within their ranges do not change what is loaded
 
-    def knobs_and_params(self, call: Call, name: str, task: Task) -> None:
-        """Check knobs of a task, and parameters of its rules, one by one."""
-        known = {one.name: one for one in task.knobs}
-        options = self.options_of(call.step)
-        short = {name: str(one.name) for name, one in options.items() if one.name in SHORT_KNOBS}
-        for word in call.all("knob", "set", *short):
-            wrong = (word.step, word.option, word.filled) in self.done
-            if wrong or not self.first_time(word.step, word.option, word.filled, name):
-                continue
-            with self.told(word, here=True):
-                if word.option == "set":
-                    param, _, value = word.filled.partition("=")
-                    _task(name, (), ((param.strip(), value.strip()),))
-                    continue
-                written = f"{short[word.option]}={word.filled}" if word.option in short else word.filled
-                for knob, number in knob_values((written,)).items():
-                    if knob not in known or not known[knob].lo <= number <= known[knob].hi:
-                        _task(name, ((knob, number),))
+    def task(
+        self, name: str, knobs: Mapping[str, int], params: Mapping[str, Any], packs: Sequence[str]
+    ) -> Task:
+        more = tuple(params.items()), tuple(packs)
+        task = _task(name, (), *more)
+        ranges = {knob.name: range(knob.lo, knob.hi + 1) for knob in task.knobs}
+        wrong = tuple((knob, value) for knob, value in knobs.items() if value not in ranges.get(knob, ()))
+        return _task(name, wrong, *more) if wrong else task
 
-    def split(self, call: Call, task: Task) -> None:
-        """The split of a step, or the usual one."""
-        word = call.first("split")
-        with self.told(word or call.step):
-            check_split(task, DEFAULT_SPLITS[call.step.command] if word is None else word.filled)
+    def agent(self, config: TrainConfig) -> TrainConfig:
+        check_task(config, self.task(config.task, config.knobs, config.params, config.packs))
+        return config
 
-    def run(self, word: Word, kind: str) -> None:
-        """Whether `on`, where it does not name an earlier step, names a run."""
-        from powderdsl.experiments.runs import find_run
-
-        if not self.first_time(word.step, "on", word.filled):
-            return
-        try:
-            find_run(word.filled, kind)
-        except CompileError as error:
-            what = f"there is no step and no run `{word.written}`"
-            if word.text in self.places.steps:
-                what = f"the step `{word.text}` does not come before this one"
-            notes = [note for one in error.diagnostics for note in one.notes]
-            self.report(word, what, notes=notes, helps=suggest(word.text, self.steps_with(kind), "steps"))
-
-    # Agents
-
-    def train(self, call: Call) -> None:
-        from powderdsl.rl.config import PRESETS, TrainConfig, check_task, preset
-
-        on = call.first("on")
-        task = None if on is None else self.task(on, on.filled)
-        if on is not None and task is not None:
-            self.knobs_and_params(call, on.filled, task)
-            self.split(call, task)
-        start = call.given.get("preset_name", "paper")
-        if start not in PRESETS:
-            return
-        known = {one.name for one in fields(TrainConfig)}
-        asked = {name: value for name, value in call.given.items() if name in known}
-        wrong = False
-        for option, param in self.options_of(call.step).items():
-            if param.name in asked:
-                with self.told(call.first(option) or call.step) as failed:
-                    preset(start, "task", **{param.name: asked[param.name]})
-                wrong |= bool(failed)
-        if not wrong:
-            with self.told(call.step):
-                config = preset(start, "task", **asked)
-                if task is not None:
-                    check_task(config, task)
-
-    def evaluate(self, call: Call) -> None:
-        on, task = call.first("on"), self.task_of(call.step, call.values)
-        if on is not None and not is_task(on.filled):
-            self.run(on, PPO)
-        elif on is not None and task is None:
-            task = self.task(on, on.filled)
-        if task is None:
-            return
-        if on is not None:
-            self.knobs_and_params(call, on.filled, task)
+    def evaluation(self, values: Mapping[str, Any], run: TrainConfig | None) -> Sequence[str] | None:
+        if run is None:
+            task = find_played(values["run"], values["knobs"], values["settings"], values["packs"])
+            if not isinstance(task, Task):
+                return None
+        elif values["knobs"] or values["settings"]:
+            raise BadInput("--knob and --set go with a task: a run has its own")
         else:
-            for word in call.all("knob", "set"):
-                self.report(word, f"`{word.option}` goes with a task: a run has its own")
-        for word in call.all("splits"):
-            for split in word.filled.split(","):
-                with self.told(word):
-                    check_split(task, split.strip())
-        there = {"trained": bool(call.step.on_step), "expert": task.expert is not None}
-        known = [one for one in POLICIES if there.get(one, True)]
-        for word in call.all("policies"):
-            for policy in map(str.strip, word.filled.split(",")):
-                if policy not in known:
-                    helps = suggest(policy, known, "policies")
-                    self.report(word, f"there is no policy `{policy}`", helps=helps)
+            task = self.task(run.task, run.knobs, run.params, (*run.packs, *values["packs"]))
+        for split in values["splits"] or ():
+            check_split(task, split)
+        policies = chosen_policies(values["policies"], task, trained=run is not None)
+        splits = values["splits"] or [split.name for split in task.splits]
+        return agent_keys(
+            splits,
+            policies,
+            trained_on="train" if run is None else run.split,
+            success=task.goal.success is not None,
+            intervals=values["episodes"] > 1,
+        )
 
-    def task_of(self, step: StudyStep, values: Values) -> Task | None:
-        """The task that `evaluate` plays; None if it is not known, or wrong where it is first named."""
-        step = self.places.maker(step) if step.on_step else step
-        on = next(iter(self.places.words(step, values).get("on", ())), None)
-        if on is None or step.command not in (("train",), ("evaluate",)) or not is_task(on.filled):
+    def model(self, config: ModelConfig) -> ModelConfig:
+        self.check_data(config.data)
+        return config
+
+    def changed_rules(self, rules: str, task: str, *packs: tuple[str, ...]) -> str:
+        return wm.rules_of(rules or "+".join(_task(task).rules), task, *packs)
+
+    def finetuned(self, values: Mapping[str, Any], run: ModelConfig | None) -> ModelConfig | None:
+        from powderdsl.worldmodel.trained import with_packs
+        from powderdsl.worldmodel.training import KIND
+
+        if run is None:
+            find_run(values["run"], KIND)
             return None
-        try:
-            return _task(on.filled)
-        except CompileError:
+        own = run.data.rules or "+".join(_task(run.data.task).rules)
+        return self.model(replace(run, data=with_packs(run.data, own, values["packs"])))
+
+    def test(self, values: Mapping[str, Any], run: ModelConfig | None) -> Sequence[str] | None:
+        from powderdsl.worldmodel.evaluation import unseen_data
+        from powderdsl.worldmodel.training import KIND
+
+        if run is None:
+            find_run(values["run"], KIND)
             return None
+        self.check_data(unseen_data(run.data, **wm.tested_on(values)))
+        return model_keys()
 
-    # World models
+    def check_data(self, data: DataConfig) -> None:
+        from powderdsl.worldmodel.worlds import check_data
 
-    def world_model(self, call: Call) -> None:
-        word = call.first("task")
-        name = DEFAULT_TASK if word is None else word.filled
-        task = self.task(word or call.step, name)
-        if task is None:
-            return
-        self.knobs_and_params(call, name, task)
-        self.split(call, task)
-        self.rules(call, name)
-        if call.all("packs") and call.all("held-out"):
-            message = "`packs` says what stays, `held-out` what goes: give one of them"
-            self.report(call.all("held-out")[0], message)
-        varied = [word for option in VARIETY if (word := call.first(option))]
-        if not call.given.get("rulesets"):
-            for word in varied:
-                self.report(word, f"`{word.option}` says which rulesets are drawn: `rulesets` says how many")
-        known = [one.name for one in task.ruleset.properties]
-        for word in () if call.all("rules") else call.all("swap"):
-            if word.filled not in known:
-                message = f"the rules {task.ruleset.name} have no property `{word.filled}`"
-                helps = suggest(word.filled, known, "properties")
-                self.report(word, message, code="PD301", helps=helps)
-        for word in varied:
-            value = call.given.get(VARIETY[word.option])
-            if word.option in ("chances", "leave-out") and value is not None:
-                from powderdsl.worldmodel.config import Variety
+        params = tuple(data.params.items())
+        task = self.task(data.task, data.knobs, {} if data.rules else data.params, ())
+        check_data(data, task, self.load(data.rules, params) if data.rules else task.ruleset)
 
-                with self.told(word):
-                    Variety(**{VARIETY[word.option]: value})
+    # Measures
 
-    def on_world_model(self, call: Call) -> None:
-        """A step that works on the run of a world model."""
-        step = call.step
-        if step.command == ("wm", "finetune") and not call.all("packs"):
-            self.report(step, "`wm finetune` needs `packs`: what is to be learned")
-        if not step.on_step:
-            for on in call.all("on"):
-                self.run(on, WORLD_MODEL)
-            return
-        made = self.places.maker(step)
-        learned: list[str] = []
-        while made.command != ("wm", "train") and made.on_step:
-            learned += [word.filled for word in self.places.words(made, call.values).get("packs", ())]
-            made = self.places.maker(made)
-        if made.command != ("wm", "train"):
-            return
-        trained, word = Call(made, call.values, self.places.words(made, call.values), {}), call.first("task")
-        trained_on, rules = trained.first("task"), trained.first("rules")
-        name = DEFAULT_TASK if trained_on is None else trained_on.filled
-        try:
-            task = _task(name) if word is None else self.task(word, word.filled)
-        except CompileError:  # reported where it is trained
-            return
-        if task is None:
-            return
-        self.rules(call, name, None if rules is None else rules.filled)
-        if step.command == ("wm", "eval"):
-            if rules is None and not call.all("rules"):
-                added = [one.filled for one in trained.all("packs")]
-                self.only(call, [*_task(name).ruleset.packs, *added, *learned])
-            self.knobs_and_params(call, name if word is None else word.filled, task)
-            self.split(call, task)
+    def measure(self, measure: Measure) -> None:
+        """Report a measure whose keys do not lead to a number in the last evaluation of its run."""
+        made = next((step for step in self.study.steps if step.name == measure.of.text), None)
+        if made is None or made.command not in MAKES:
+            return  # reported by the reader
+        command = EVALUATES[MAKES[made.command]]
+        steps = [
+            step
+            for step in self.study.steps
+            if " ".join(step.command) == command
+            and self.study.works_on(step) == made
+            # With `out`, `wm eval` writes there alone.
+            and (command == "evaluate" or "out" not in step.options)
+        ]
+        if not steps and not any(step.name in self.wrong for step in self.study.steps if not step.makes_run):
+            helps = [f"add a step such as `tested: {{command: {command}, on: {made.name}}}`"]
+            self.reporter.error("PD806", f"no step evaluates `{made.name}`", measure.of.span, helps=helps)
+        for point in self.points if steps else ():
+            known, keys = self.result(steps[-1], point), point.filled(measure.keys)
+            if known is not None and not any(fnmatchcase(keys, pattern) for pattern in known):
+                message = f"the evaluation of `{made.name}` has no number `{keys}`"
+                inner = [pattern for pattern in known if pattern.startswith(f"{keys}/")]
+                close = [f"such as `{inner[0]}`"] if inner else suggest(keys, known)
+                self.reporter.error("PD806", message, measure.keys.span, helps=close)
 
-    def only(self, call: Call, packs: Sequence[str]) -> None:
-        """Whether worlds can draw elements of some packs alone. The names of packs in files are not known here."""
-        if any("." in pack for pack in packs):
-            return
-        for word in call.all("only"):
-            if word.filled not in packs:
-                helps = suggest(word.filled, packs, "packs")
-                self.report(word, f"the rules have no pack `{word.filled}`", code="PD304", helps=helps)
 
-    def rules(self, call: Call, task: str, base: str | None = None) -> None:
-        """The rules of a step, and packs that are added or left out. `base`: those that a network was trained on."""
-        named = call.first("rules")
-        if named is not None:
-            base = named.filled
-            if self.first_time(named.step, "rules", base):
-                with self.told(named):
-                    load(base)
-        packs, held_out = call.all("packs"), call.all("held-out")
-        question = (base or task, *(word.filled for word in (*packs, *held_out)))
-        if (not packs and not held_out) or not self.first_time(call.step.name, "packs", question):
-            return
-        from powderdsl.worldmodel.rule_words import add, keep, leave_out
+def _load(rules: str, params: Pairs) -> Ruleset:
+    return load(rules, params=dict(params))
 
-        try:
-            start = base or "+".join(_task(task).rules)
-            load(start)
-        except CompileError:  # reported where it is named
-            return
-        change = add if call.step.command == ("wm", "finetune") else keep
-        for given, alone, together in ((packs, add, change), (held_out, leave_out, leave_out)):
-            wrong = []
-            for word in given:
-                with self.told(word) as failed:
-                    # Leaving out a pack of the rules may need others to be left out as well.
-                    if alone is add or word.filled not in load(start).packs:
-                        load(alone(start, (word.filled,)))
-                wrong += failed
-            if given and not wrong:
-                with self.told(given[0]):
-                    load(together(start, [word.filled for word in given]))
+
+def _task(name: str, knobs: Pairs = (), params: Pairs = (), packs: tuple[str, ...] = ()) -> Task:
+    path = Path(name)
+    return _load_task(name, knobs, params, packs, path.stat().st_mtime_ns if path.is_file() else 0)
+
+
+@lru_cache(maxsize=64)
+def _load_task(name: str, knobs: Pairs, params: Pairs, packs: tuple[str, ...], stamp: int) -> Task:
+    """A task; `stamp` tells versions of a file apart."""
+    return load_task(name, knobs=dict(knobs), params=dict(params), packs=packs)
+
+
+def without(step: StudyStep, word: Scalar) -> StudyStep:
+    """A step without one of its words."""
+    options = {name: tuple(one for one in words if one is not word) for name, words in step.options.items()}
+    on = None if step.on is word else step.on
+    return replace(step, on=on, options={name: words for name, words in options.items() if words})
+
+
+def agent_keys(
+    splits: Sequence[str], policies: Sequence[str], *, trained_on: str, success: bool, intervals: bool
+) -> list[str]:
+    """The keys of numbers that `evaluate` writes. A test compares them with real ones."""
+    means = ("mean", "interval") if intervals else ("mean",)
+    keys = ["seed", *(["step"] if "trained" in policies else [])]
+    for split in splits:
+        for policy in policies:
+            numbers = ["episodes", "length", *means, *(["success"] if success else [])]
+            others = [f"above/{other}" for other in BASELINES if other != policy and other in policies]
+            others += ["normalized"] if {"expert", "nothing"} <= {*policies} else []
+            numbers += [f"{other}/{mean}" for other in others for mean in means]
+            keys += [f"splits/{split}/{policy}/{number}" for number in numbers]
+            if split != trained_on:
+                keys += [f"seen/{split}/without/{policy}/{mean}" for mean in means]
+        keys += [f"seen/{split}/worlds"] if split != trained_on else []
+        keys += [f"unchanged/{split}"] if len(policies) > 1 else []
+    return keys
+
+
+def model_keys() -> list[str]:
+    """Patterns of the keys of numbers that `wm eval` writes. A test compares them with real ones."""
+    from powderdsl.worldmodel.evaluation import FREQUENT, MODEL, STILL
+    from powderdsl.worldmodel.scores import MEASURES
+
+    groups = [
+        f"{group}/{predictor}" for group in ("mean", "tests/*") for predictor in (MODEL, STILL, FREQUENT)
+    ]
+    keys = [f"{group}/{measure}" for group in groups for measure in MEASURES]
+    return [
+        "worlds_each",
+        "iterations",
+        *keys,
+        *(f"elements/*/{name}" for name in ("cells", "recall", "precision")),
+    ]

@@ -1,7 +1,6 @@
-"""Running a study on Ray: each point is a task, wherever there is room for it. The study's folder holds all state.
+"""Running a study on Ray: each point is a task. The study's folder, on storage that all nodes share, holds all state.
 
-Nodes share the storage of the folder. Ray repeats the task of a node that dies; a new driver repeats what was not done.
-Claims keep two tasks from working on the same point, whatever Ray believes about the first.
+Ray repeats the task of a node that dies; a new driver repeats what is not done.
 """
 
 from __future__ import annotations
@@ -14,8 +13,7 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from importlib import import_module
@@ -24,145 +22,83 @@ from pathlib import Path
 from typing import Any
 
 from powderdsl.diagnostics import CompileError
-from powderdsl.experiments.studies.claims import LEASE
-from powderdsl.experiments.studies.run import ABOUT_STUDY, Outcome, StudyRun
-from powderdsl.experiments.studies.study import Point, Study, filled
-from powderdsl.system.interrupts import GRACE, SIGNALS
+from powderdsl.experiments.studies.run import ABOUT_STUDY, Outcome, Report, StudyRun, run_all
+from powderdsl.experiments.studies.study import Point, Study
+from powderdsl.system.interrupts import SIGNALS
 from powderdsl.system.reading import read_json
 from powderdsl.system.writing import failure
 
 RETRIES = 20
 """How often Ray repeats the task of a node or process that died."""
-PATIENCE = LEASE + GRACE
-"""Seconds that a task waits for a process that holds its point: one of a dead driver's saves its last checkpoint."""
-QUIET = {
-    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
-    "RAY_NUM_REDIS_GET_RETRIES": "2",
-}
+QUIET = {"RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0", "RAY_NUM_REDIS_GET_RETRIES": "2"}
 """Environment of the driver, where the user has not set it: fewer warnings, and fewer attempts to connect."""
 AHEAD = 1000
 """Tasks that are submitted at a time."""
 
 
-def require_ray() -> None:
-    """Raise CompileError (PD612) if Ray is not installed."""
-    if find_spec("ray") is None:
-        raise failure(
-            "PD612",
-            "running a study on a cluster needs Ray, which is not installed",
-            helps=("pip install 'powderdsl[ray]'", "or split the study: `--shard 1/4` to `--shard 4/4`"),
-        )
-
-
-def resources(study: Study, point: Point, size: str, threads: int) -> dict[str, float]:
+def resources(study: Study, point: Point, threads: int) -> dict[str, float]:
     """What Ray reserves for a point: a CPU core per thread, and a GPU if a step's `device` is a CUDA device."""
-    words = [
-        word for step in study.steps for name, words in step.options if name == "device" for word in words
-    ]
-    gpu = any(filled(word, point, size).strip().startswith("cuda") for word in words)
-    return {"num_cpus": threads, "num_gpus": 1 if gpu else 0}
+    devices = [point.filled(word) for step in study.steps for word in step.options.get("device", ())]
+    return {"num_cpus": threads, "num_gpus": int(any(name.startswith("cuda") for name in devices))}
 
 
 def run_on_ray(
-    run: StudyRun,
-    points: Sequence[Point],
-    address: str,
-    jobs: int | None,
-    told: Callable[[Outcome], None],
-    note: Callable[[str], None],
+    run: StudyRun, points: Sequence[Point], address: str, jobs: int | None, report: Report
 ) -> list[Outcome]:
     """Run points to their end as Ray tasks. Signals end all of them; the same call resumes them.
 
     Args:
         address: of the cluster, as `ray.init` takes it. jobs: how many tasks there are at a time; None: as many as fit.
-        note: shows a sentence to the user.
 
     Raises:
-        CompileError: PD612 without Ray, PD626 if there is no such cluster, or the connection to it is lost.
+        CompileError: PD626 if the connection to the cluster cannot be made, or is lost.
     """
-    require_ray()
-    # Commands are run elsewhere, in other working directories.
-    study = replace(run.study, folder=run.study.folder.resolve(), places={})
-    folder = run.folder.resolve()
-    done: dict[Point, Outcome] = {}
+    # Commands run elsewhere, in other working directories.
+    study, folder = replace(run.study, folder=run.study.folder.resolve()), str(run.folder.resolve())
     with _connected(address) as ray:
-        for lacking in _lacking(ray, [resources(study, point, run.size, run.threads) for point in points]):
-            note(f"no node of the cluster has {lacking} yet: runs wait for one")
-        task = ray.remote(max_retries=RETRIES, scheduling_strategy="SPREAD")(run_point)
-        waiting = list(reversed(points))
-        # Futures, because a signal that comes while Ray itself waits is no longer known when it returns.
-        running: dict[Future[Outcome], tuple[Any, Point]] = {}
-        try:
-            while waiting or running:
-                while waiting and len(running) < (jobs or AHEAD):
-                    point = waiting.pop()
-                    asked = resources(study, point, run.size, run.threads)
-                    name = f"{study.name} {point.name}"
-                    arguments = (study, str(folder), run.size, run.threads, point, _version())
-                    started = task.options(name=name, **asked).remote(*arguments)
-                    running[started.future()] = started, point
-                for one in wait(running, return_when=FIRST_COMPLETED).done:
-                    _, point = running.pop(one)
-                    done[point] = _outcome(ray, one, point, address)
-                    told(done[point])
-        except BaseException:
-            for started, _ in running.values():
+        remote = ray.remote(max_retries=RETRIES, scheduling_strategy="SPREAD")(run_point)
+        tasks: list[Any] = []
+
+        def wait_for(point: Point) -> Outcome:
+            options = {"name": f"{study.name} {point.name}", **resources(study, point, run.threads)}
+            task = remote.options(**options).remote(study, folder, run.size, run.threads, point, _version())
+            tasks.append(task)
+            try:
+                outcome: Outcome = ray.get(task)
+                return outcome
+            except ray.exceptions.LocalRayletDiedError:  # no task will ever end
+                helps = ("start it again with `ray start`; the same command then resumes here",)
+                raise _no_cluster(address, "the Ray node of this machine has ended", helps) from None
+            except Exception as error:  # Ray's messages end with the exception, after a traceback
+                last = (str(error).strip().splitlines() or [""])[-1][:400]
+                return Outcome(point, {}, f"{type(error).__name__}: {last}")
+
+        def cancel_all() -> None:
+            for task in tasks:
                 with suppress(Exception):
-                    ray.cancel(started)
-            wait(running, timeout=GRACE)
-            raise
-    return [done[point] for point in points]
+                    ray.cancel(task)
+
+        return run_all(wait_for, points, jobs or max(1, min(len(points), AHEAD)), report, cancel_all)
 
 
 def run_point(study: Study, folder: str, size: str, threads: int, point: Point, version: str) -> Outcome:
-    """Run a point on a node of the cluster."""
-    host = platform.node()
+    """Run a point on a node of the cluster. If a process of a dead driver still works on it, wait for its end."""
+    host, run = platform.node(), StudyRun(study, Path(folder), size, threads)
     if version != _version():
         return Outcome(point, {}, f"{host} has powderdsl {_version()}; {version} is needed")
-    run = StudyRun(study, Path(folder), size, threads)
-    found = read_json(Path(folder) / ABOUT_STUDY)
-    if not isinstance(found, dict) or found.get("text") != study.text or not run.is_prepared():
+    about = read_json(run.folder / ABOUT_STUDY)
+    if not isinstance(about, dict) or about.get("text") != study.source.text or not run.is_prepared():
         return Outcome(point, {}, f"{host} does not see {folder}: it must be on storage that all nodes share")
     try:
-        (outcome,) = run.run([point], 1, patience=PATIENCE)
+        (outcome,) = run.run([point], 1, wait=True)
     except CompileError as error:
         return Outcome(point, {}, f"{host}: {'; '.join(one.message for one in error.diagnostics)}")
     return outcome
 
 
-def _lacking(ray: Any, asked: Sequence[dict[str, float]]) -> list[str]:
-    """What no node of a cluster has, however idle it is."""
-    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
-    found = {}
-    for kind, key, thing in (("num_cpus", "CPU", "CPU cores"), ("num_gpus", "GPU", "GPU")):
-        wanted = max((one[kind] for one in asked), default=0)
-        if all(node.get(key, 0) < wanted for node in nodes):
-            found[key] = f"{wanted:g} {thing}"
-    return list(found.values())
-
-
-def _outcome(ray: Any, task: Future[Outcome], point: Point, address: str) -> Outcome:
-    try:
-        return task.result()
-    except ray.exceptions.LocalRayletDiedError as error:  # no task will ever end
-        helps = ("start it again with `ray start`; the same command then resumes here",)
-        raise _no_cluster(
-            address, _words(error), helps, "lost the Ray node of this machine in the cluster"
-        ) from None
-    except ray.exceptions.RayTaskError as error:  # its text ends with the exception, after a traceback
-        return Outcome(point, {}, str(error).strip().splitlines()[-1][:400])
-    except Exception as error:  # whatever ended the task, the others continue
-        return Outcome(point, {}, f"{type(error).__name__}: {_words(error)}")
-
-
-def _words(error: Exception) -> str:
-    return " ".join(str(error).split())[:400] or type(error).__name__
-
-
 @contextmanager
 def _connected(address: str) -> Iterator[Any]:
     """The module `ray`, connected to a cluster. Raises CompileError (PD626)."""
-    check_address(address)
     for name, value in QUIET.items():
         os.environ.setdefault(name, value)
     ray = import_module("ray")
@@ -170,13 +106,10 @@ def _connected(address: str) -> Iterator[Any]:
     try:
         ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
     except Exception as error:
-        raise _no_cluster(address, _words(error)) from None
+        raise _no_cluster(address, " ".join(str(error).split())[:400]) from None
     finally:
         if threading.current_thread() is threading.main_thread():
-            for (
-                number,
-                handler,
-            ) in handlers.items():  # it puts its own below Python's, which abort the process
+            for number, handler in handlers.items():  # Ray's own abort the process
                 signal.signal(number, handler)
     try:
         yield ray
@@ -184,8 +117,17 @@ def _connected(address: str) -> Iterator[Any]:
         ray.shutdown()
 
 
-def check_address(address: str) -> None:
-    """Raise CompileError (PD626) if nobody listens at an address. Ray itself would try for minutes."""
+def check_cluster(address: str) -> None:
+    """Raise CompileError if Ray is not installed (PD612) or nobody listens at an address (PD626).
+
+    Ray itself would try to connect for minutes.
+    """
+    if find_spec("ray") is None:
+        raise failure(
+            "PD612",
+            "running a study on a cluster needs Ray, which is not installed",
+            helps=("pip install 'powderdsl[ray]'", "or split the study: `--shard 1/4` to `--shard 4/4`"),
+        )
     if address in ("auto", "local"):
         return
     match = re.fullmatch(r"(?:ray://)?\[?([^\s/\[\]]+)\]?:([0-9]{1,5})", address)
@@ -201,11 +143,10 @@ def _no_cluster(
     address: str,
     reason: str,
     helps: tuple[str, ...] = ("start one with `ray start --head`, which prints its address",),
-    what: str = "no Ray cluster",
 ) -> CompileError:
-    return failure("PD626", f"{what} at `{address[:80]}`", notes=(reason,), helps=helps)
+    return failure("PD626", f"no Ray cluster at `{address[:80]}`", notes=(reason,), helps=helps)
 
 
 def _version() -> str:
-    found: str = sys.modules["powderdsl"].__version__  # our own package, so it has been imported
-    return found
+    version: str = sys.modules["powderdsl"].__version__  # our own package, so it has been imported
+    return version

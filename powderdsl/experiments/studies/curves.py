@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +10,9 @@ from typing import Any
 
 from powderdsl.experiments.bench.plot import require_matplotlib
 from powderdsl.experiments.runs import RunFolder
+from powderdsl.experiments.runs.intervals import mean_and_interval
 from powderdsl.experiments.runs.metrics import read_metrics
-from powderdsl.experiments.studies.results import interval
+from powderdsl.experiments.studies.results import interval, markdown
 from powderdsl.system.reading import read_json
 from powderdsl.system.writing import replacing
 
@@ -87,14 +87,13 @@ def baselines_of(runs: Sequence[RunFolder]) -> dict[str, float]:
 
 def as_table(curves: Sequence[Curve]) -> str:
     """The curves as Markdown: the mean over seeds and its 95 % interval at each step."""
-    lines = ["| runs | seeds | steps | mean | interval |", "|---|---|---|---|---|"]
+    rows = [["runs", "seeds", "steps", "mean", "interval"]]
     for curve in curves:
         for place, step in enumerate(curve.steps):
-            found = interval([one[place] for one in curve.values])
-            half = (found.high - found.low) / 2
-            words = [curve.label or "all", str(len(curve.seeds)), f"{step:,}", f"{found.mean:.4g}"]
-            lines.append("| " + " | ".join([*words, f"{half:.2g}" if math.isfinite(half) else ""]) + " |")
-    return "\n".join(lines) + "\n"
+            mean, half = mean_and_interval([values[place] for values in curve.values])
+            words = [curve.label or "all", str(len(curve.seeds)), f"{step:,}", f"{mean:.4g}"]
+            rows.append([*words, "" if half is None else f"{half:.2g}"])
+    return markdown(rows)
 
 
 def write_curves(

@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import itertools
 import math
-import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from powderdsl.experiments.bench.plot import require_matplotlib
+from powderdsl.experiments.runs.intervals import mean_and_interval
 from powderdsl.experiments.studies.run import Outcome
 from powderdsl.experiments.studies.study import Measure, Study
 from powderdsl.system.writing import replacing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-T_975 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228)
-"""97.5 % quantiles of Student's t for 1 to 10 degrees of freedom."""
 
 
 @dataclass(frozen=True)
@@ -36,18 +33,20 @@ class Interval:
 
 @dataclass(frozen=True)
 class Cell:
-    """A measure at one combination: over seeds, and the value of each."""
+    """A measure at one combination of values, for each seed and over seeds."""
 
     values: tuple[tuple[str, str], ...]
+    by_seed: Mapping[int, float]
     over_seeds: Interval
-    samples: tuple[float, ...]
 
 
 @dataclass(frozen=True)
 class Trend:
-    """A measure along the first setting, the others fixed, which `label` names. `change` compares the last with the first,
-    seed by seed: their difference, on the scale ``log`` their ratio. `agreeing`: in how many seeds it goes as expected,
-    and how many have both. `ordered`: all means do."""
+    """A measure along the first setting, with the values of the others that `label` names.
+
+    `change` compares the last value with the first, seed by seed: their difference, on the scale ``log`` their ratio.
+    `agreeing`: in how many seeds it changes as expected, and how many seeds have both. `ordered`: all means do.
+    """
 
     label: str
     change: Interval
@@ -55,7 +54,7 @@ class Trend:
     agreeing: tuple[int, int]
 
     def verdict(self, measure: Measure) -> str:
-        """A sentence: whether the measure went as expected."""
+        """A sentence: whether the measure changed as expected."""
         sign = 1 if measure.expect == "rises" else -1
         log = measure.scale == "log"
         same = 1.0 if log else 0.0
@@ -72,7 +71,7 @@ class Trend:
 
 @dataclass(frozen=True)
 class Finding:
-    """A measure over all combinations, and its trends, one for each combination of all settings but the first."""
+    """A measure at all combinations, and its trends, one for each combination of all settings but the first."""
 
     measure: Measure
     cells: tuple[Cell, ...]
@@ -80,49 +79,41 @@ class Finding:
 
     @property
     def verdict(self) -> str:
-        """Whether the measure went as expected; empty if nothing is expected."""
+        """Sentences about whether the measure changed as expected; empty if nothing is expected."""
         return "; ".join(trend.verdict(self.measure) for trend in self.trends)
 
 
 def interval(samples: Sequence[float], scale: str = "linear") -> Interval:
     """Mean and 95 % interval of samples, which are above 0 on the scale ``log``."""
     if scale == "log":
-        found = interval([math.log(sample) for sample in samples])
-        return Interval(math.exp(found.mean), math.exp(found.low), math.exp(found.high))
-    mean = statistics.fmean(samples)
-    if len(samples) < 2:
-        return Interval(mean, -math.inf, math.inf)
-    quantile = T_975[min(len(samples) - 1, len(T_975)) - 1]  # a little wide for more than 11
-    half = quantile * statistics.stdev(samples) / math.sqrt(len(samples))
+        logs = interval([math.log(sample) for sample in samples])
+        return Interval(math.exp(logs.mean), math.exp(logs.low), math.exp(logs.high))
+    mean, half = mean_and_interval(samples)
+    half = math.inf if half is None else half
     return Interval(mean, mean - half, mean + half)
 
 
 def findings(study: Study, outcomes: Sequence[Outcome]) -> list[Finding]:
     """The findings from finished points. Combinations are in the order in which values were written."""
-    good = [one for one in outcomes if one.problem is None]
+    good = [outcome for outcome in outcomes if outcome.problem is None]
     return [_finding(measure, good) for measure in study.measures]
 
 
 def _finding(measure: Measure, outcomes: Sequence[Outcome]) -> Finding:
-    groups: dict[tuple[tuple[str, str], ...], dict[int, float]] = {}
-    for one in outcomes:
-        groups.setdefault(one.point.values, {})[one.point.seed] = one.values[measure.name]
-    cells = []
-    for values, by_seed in groups.items():
-        samples = tuple(value for _, value in sorted(by_seed.items()))
-        cells.append(Cell(values, interval(samples, measure.scale), samples))
-    trends = []
-    for label, line in _lines(cells).items():
-        found = _trend(measure, label, line, [groups[cell.values] for cell in line])
-        trends += [found] if found else []
-    return Finding(measure, tuple(cells), tuple(trends))
+    by_values: dict[tuple[tuple[str, str], ...], dict[int, float]] = {}
+    for outcome in sorted(outcomes, key=lambda outcome: outcome.point.seed):
+        by_values.setdefault(outcome.point.values, {})[outcome.point.seed] = outcome.values[measure.name]
+    cells = [
+        Cell(values, by_seed, interval([*by_seed.values()], measure.scale))
+        for values, by_seed in by_values.items()
+    ]
+    trends = [_trend(measure, label, line) for label, line in _lines(cells).items()]
+    return Finding(measure, tuple(cells), tuple(trend for trend in trends if trend is not None))
 
 
-def _trend(
-    measure: Measure, label: str, cells: Sequence[Cell], by_seed: Sequence[Mapping[int, float]]
-) -> Trend | None:
-    """How a measure goes along some cells, if that is asked and seeds have both ends."""
-    first, last = by_seed[0], by_seed[-1]
+def _trend(measure: Measure, label: str, cells: Sequence[Cell]) -> Trend | None:
+    """How a measure changes along some cells, if something is expected and seeds have both ends."""
+    first, last = cells[0].by_seed, cells[-1].by_seed
     both = sorted(first.keys() & last.keys())
     if measure.expect is None or len(cells) < 2 or not both:
         return None
@@ -131,101 +122,98 @@ def _trend(
     log = measure.scale == "log"
     change = [last[seed] / first[seed] if log else last[seed] - first[seed] for seed in both]
     means = [sign * cell.over_seeds.mean for cell in cells]
-    ordered = all(one < two for one, two in itertools.pairwise(means))
+    ordered = all(mean < after for mean, after in itertools.pairwise(means))
     return Trend(label, interval(change, measure.scale), ordered, agreeing)
 
 
 def _lines(cells: Sequence[Cell]) -> dict[str, list[Cell]]:
     """The cells of each combination of all settings but the first, labeled with the settings that vary."""
-    values: dict[str, set[str]] = {}
+    values = {pair for cell in cells for pair in cell.values[1:]}
+    varied = {
+        name for name, value in values if any(name == other and value != another for other, another in values)
+    }
+    lines: dict[str, list[Cell]] = {}
     for cell in cells:
-        for name, value in cell.values[1:]:
-            values.setdefault(name, set()).add(value)
-    found: dict[str, list[Cell]] = {}
-    for cell in cells:
-        label = ", ".join(f"{name} {value}" for name, value in cell.values[1:] if len(values[name]) > 1)
-        found.setdefault(label, []).append(cell)
-    return found
+        label = ", ".join(f"{name} {value}" for name, value in cell.values[1:] if name in varied)
+        lines.setdefault(label, []).append(cell)
+    return lines
 
 
 def as_data(study: Study, size: str, outcomes: Sequence[Outcome]) -> dict[str, Any]:
     """All results, for JSON."""
-    return {
-        "study": study.name,
-        "size": size,
-        "points": [
-            {
-                "values": dict(one.point.values),
-                "seed": one.point.seed,
-                "measures": dict(one.values),
-                "problem": one.problem,
-            }
-            for one in outcomes
-        ],
-        "findings": [
-            {
-                "measure": one.measure.name,
-                "verdict": one.verdict,
-                "cells": [
-                    {
-                        "values": dict(cell.values),
-                        **{key: _finite(value) for key, value in asdict(cell.over_seeds).items()},
-                        "samples": cell.samples,
-                    }
-                    for cell in one.cells
-                ],
-            }
-            for one in findings(study, outcomes)
-        ],
-    }
+    points = [
+        {
+            "values": dict(outcome.point.values),
+            "seed": outcome.point.seed,
+            "measures": dict(outcome.values),
+            "problem": outcome.problem,
+        }
+        for outcome in outcomes
+    ]
+    found = [
+        {
+            "measure": finding.measure.name,
+            "verdict": finding.verdict,
+            "cells": [
+                {
+                    "values": dict(cell.values),
+                    **{
+                        name: number if math.isfinite(number) else None
+                        for name, number in asdict(cell.over_seeds).items()
+                    },
+                    "samples": [*cell.by_seed.values()],
+                }
+                for cell in finding.cells
+            ],
+        }
+        for finding in findings(study, outcomes)
+    ]
+    return {"study": study.name, "size": size, "points": points, "findings": found}
 
 
 def as_markdown(study: Study, size: str, outcomes: Sequence[Outcome]) -> str:
     """A table of means and intervals, and the verdicts."""
     found = findings(study, outcomes)
-    names = [axis.name for axis in study.axes]
-    head = [*names, *(one.measure.about for one in found), "seeds"]
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    rows: dict[tuple[tuple[str, str], ...], list[str]] = {}
-    counts: dict[tuple[tuple[str, str], ...], int] = {}
-    for one in found:
-        for cell in one.cells:
-            rows.setdefault(cell.values, []).append(shown(cell.over_seeds, one.measure.scale))
-            counts[cell.values] = len(cell.samples)
-    for values, numbers in rows.items():
-        words = [*(value for _, value in values), *numbers, str(counts[values])]
-        lines.append("| " + " | ".join(words) + " |")
+    rows = [[*(axis.name for axis in study.axes), *(finding.measure.about for finding in found), "seeds"]]
+    for cells in zip(*(finding.cells for finding in found), strict=True):
+        numbers = [
+            shown(cell.over_seeds, measure.scale) for cell, measure in zip(cells, study.measures, strict=True)
+        ]
+        rows.append([*(value for _, value in cells[0].values), *numbers, str(len(cells[0].by_seed))])
+    text = f"{study.about} Size: {size}.\n\n{markdown(rows)}"
     verdicts = [
-        f"- {one.measure.about}: {trend.verdict(one.measure)}" for one in found for trend in one.trends
+        f"- {finding.measure.about}: {trend.verdict(finding.measure)}"
+        for finding in found
+        for trend in finding.trends
     ]
-    failed = [f"- {one.point.name}: {one.problem}" for one in outcomes if one.problem]
-    text = [f"{study.about} Size: {size}.", "", *lines]
-    text += ["", *verdicts] if verdicts else []
-    text += ["", "Not finished:", "", *failed] if failed else []
-    return "\n".join(text) + "\n"
+    failed = [f"- {outcome.point.name}: {outcome.problem}" for outcome in outcomes if outcome.problem]
+    for lines in (verdicts, ["Not finished:", "", *failed] if failed else []):
+        text += "\n" + "\n".join(lines) + "\n" if lines else ""
+    return text
 
 
-def shown(found: Interval, scale: str = "linear") -> str:
+def markdown(rows: Sequence[Sequence[str]]) -> str:
+    """A table as Markdown; the first row has the titles."""
+    titles, *others = ("| " + " | ".join(row) + " |" for row in rows)
+    return "\n".join([titles, "|" + "---|" * len(rows[0]), *others]) + "\n"
+
+
+def shown(number: Interval, scale: str = "linear") -> str:
     """`0.1234 ± 0.0056`, as many places as the interval deserves; `0.123 (0.118 to 0.129)` on the scale ``log``."""
-    half = (found.high - found.low) / 2
+    half = (number.high - number.low) / 2
     if not math.isfinite(half):
-        return f"{found.mean:.4g}"
+        return f"{number.mean:.4g}"
     if scale == "log":
-        mean, low, high = (f"{one:#.3g}".rstrip(".") for one in (found.mean, found.low, found.high))
+        mean, low, high = (f"{end:#.3g}".rstrip(".") for end in (number.mean, number.low, number.high))
         return f"{mean} ({low} to {high})"
     places = 4 if half <= 0 else min(max(1 - math.floor(math.log10(half)), 0), 6)
-    return f"{found.mean:.{places}f} ± {half:.{places}f}"
-
-
-def _finite(number: float) -> float | None:
-    return number if math.isfinite(number) else None
-
-
-# The figure: each measure along the first setting, a line for each combination of the others
+    return f"{number.mean:.{places}f} ± {half:.{places}f}"
 
 
 def write_figure(path: Path, study: Study, size: str, outcomes: Sequence[Outcome]) -> None:
-    """Draw what was found (PNG, or what else the suffix says). Bars are 95 % intervals over seeds.
+    """Draw each measure along the first setting, a line for each combination of the others.
+
+    Bars are 95 % intervals over seeds. The suffix of the path says which format is written.
 
     Raises:
         CompileError: PD612 without matplotlib, PD613 if the file cannot be written.
@@ -233,13 +221,13 @@ def write_figure(path: Path, study: Study, size: str, outcomes: Sequence[Outcome
     require_matplotlib()
     from matplotlib.figure import Figure
 
-    found = [one for one in findings(study, outcomes) if one.cells]
+    found = [finding for finding in findings(study, outcomes) if finding.cells]
     if not found:
         return
     figure = Figure(figsize=(5.5 * len(found), 4.2), layout="constrained")
-    for axes, one in zip(figure.subplots(1, len(found), squeeze=False)[0], found, strict=True):
-        _draw(axes, study, size, one)
-    seeds = max(len(cell.samples) for one in found for cell in one.cells)
+    for axes, finding in zip(figure.subplots(1, len(found), squeeze=False)[0], found, strict=True):
+        _draw(axes, study, size, finding)
+    seeds = max(len(cell.by_seed) for finding in found for cell in finding.cells)
     figure.suptitle(f"{study.about} ({size}, {seeds} seeds)", fontsize=8, wrap=True)
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=150)
@@ -249,29 +237,26 @@ def _draw(axes: Axes, study: Study, size: str, finding: Finding) -> None:
     from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullLocator
 
     first = study.axes[0]
-    ticks = list(first.values[size])
-    numbers = _numbers(ticks)
-    joined = "-" if numbers is not None else ""  # between words there is nothing
-    numbers = numbers or [float(place) for place in range(len(ticks))]
+    ticks = [word.text for word in first.values[size]]
+    try:
+        numbers, joined = [float(tick) for tick in ticks], "-"
+    except ValueError:  # words, which nothing lies between
+        numbers, joined = [float(number) for number in range(len(ticks))], ""
     lines = _lines(finding.cells)
     for label, cells in lines.items():
         across = [numbers[ticks.index(cell.values[0][1])] for cell in cells]
-        found = [cell.over_seeds for cell in cells]
-        # A single value has no interval.
-        bars = [
-            (one.mean - one.low, one.high - one.mean) if math.isfinite(one.high) else (0.0, 0.0)
-            for one in found
+        means = [cell.over_seeds.mean for cell in cells]
+        ends = [
+            (cell.over_seeds.mean - cell.over_seeds.low, cell.over_seeds.high - cell.over_seeds.mean)
+            for cell in cells
         ]
+        # A single value has no interval.
+        bars = [end if math.isfinite(end[1]) else (0.0, 0.0) for end in ends]
         axes.errorbar(
-            across,
-            [one.mean for one in found],
-            list(zip(*bars, strict=True)),
-            fmt=f"o{joined}",
-            capsize=3,
-            label=label or None,
+            across, means, list(zip(*bars, strict=True)), fmt=f"o{joined}", capsize=3, label=label or None
         )
         for place, cell in zip(across, cells, strict=True):
-            axes.plot([place] * len(cell.samples), cell.samples, "k.", markersize=3, alpha=0.4)
+            axes.plot([place] * len(cell.by_seed), [*cell.by_seed.values()], "k.", markersize=3, alpha=0.4)
     above = [number for number in numbers if number > 0]
     if joined and min(numbers) >= 0 and above and max(above) >= 10 * min(above):
         axes.set_xscale("symlog", linthresh=min(above)) if 0 in numbers else axes.set_xscale("log")
@@ -290,11 +275,3 @@ def _draw(axes: Axes, study: Study, size: str, finding: Finding) -> None:
     axes.grid(linewidth=0.3)
     if any(lines):
         axes.legend(fontsize=8)
-
-
-def _numbers(words: Sequence[str]) -> list[float] | None:
-    """The values as numbers, or None."""
-    try:
-        return [float(word) for word in words]
-    except ValueError:
-        return None

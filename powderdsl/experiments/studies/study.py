@@ -1,39 +1,93 @@
-"""Checked studies, and the paths that they may name."""
+"""A study's file -> a checked `Study`: settings that are varied, commands in order, and the numbers to compare."""
 
 from __future__ import annotations
 
 import itertools
+import math
 import os
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from string import Template
+from typing import Any
 
 from powderdsl.compiler import shipped, shipped_rules
-from powderdsl.diagnostics import Span
+from powderdsl.diagnostics import CompileError, Diagnostic, Label, Reporter, Source, Span, suggest
+from powderdsl.model.schema import Key, Reader
+from powderdsl.syntax.sources import read_source
+from powderdsl.syntax.yaml_tree import Mapping as Mapping_
+from powderdsl.syntax.yaml_tree import Node, Scalar, parse_yaml
 from powderdsl.system.reading import inside, is_path
+from powderdsl.system.writing import failure
 
 SIZES = ("small", "paper")
-EXPECTED = ("rises", "falls")
-SCALES = ("linear", "log")
 SEED, SIZE = "seed", "size"
+MAX_POINTS = 10_000
+
+TEXT, FLAG, FILE, TASK, RUN, RUN_OR_TASK, RULES = "text", "flag", "file", "task", "run", "run|task", "rules"
+"""The meaning of an argument or option of a command: text, a flag, a file to write, a task, a run, either, or rules."""
+
+Commands = Mapping[tuple[str, ...], Mapping[str, str]]
+"""Commands that steps may call, with the meaning of each option (without dashes) and of the argument (``on``)."""
+
+STUDY_KEYS: dict[str, dict[str, Key]] = {
+    "study": {
+        "study": Key("word", "the study's name", True),
+        "about": Key("text", "what it asks, in a sentence"),
+        "seeds": Key("number", "how many runs there are of each combination", True, bounds=(1, 1000)),
+        "vary": Key("mapping", "settings that are varied", True),
+        "steps": Key("mapping", "commands, in order: a name each", True),
+        "measures": Key("mapping", "numbers to compare, out of what steps evaluated", True),
+    },
+    "axis": {
+        "about": Key("text", "what it is, for the figure"),
+        **{size: Key("words", f"its values at the size `{size}`", True) for size in SIZES},
+        "sets": Key("mapping", "for each value, other names and what they stand for with it"),
+    },
+    "measure": {
+        "of": Key("word", "the step whose run was evaluated", True),
+        "value": Key("word", "keys of its evaluation.json that lead to the number, with `/` between", True),
+        "about": Key("text", "what it is, for the figure"),
+        "expect": Key(
+            "word", "what the number is expected to do along the first setting", options=("rises", "falls")
+        ),
+        "scale": Key("word", "`log` where ratios count, such as those of losses", options=("linear", "log")),
+    },
+}
 
 
 @dataclass(frozen=True)
 class StudyStep:
-    """A call of a command: what it works on, and its options as text, in which ``$NAME`` stands for a value.
+    """A call of a command, in whose words ``$NAME`` stands for a value; `means` has their meanings.
 
-    `on` is the argument of the command: a step before it, whose run is meant, or text. `means` says what the argument
-    (``on``) and each option are: see `confined`.
+    `on` is the command's argument; with `on_step` it names an earlier step, whose run is meant. `is_wrong`: it has a
+    mistake, which is reported, and nothing follows from it.
     """
 
-    name: str
+    key: Scalar
     command: tuple[str, ...]
-    on: str | None
+    on: Scalar | None
     on_step: bool
-    options: tuple[tuple[str, tuple[str, ...]], ...]
-    makes_run: bool
-    means: Mapping[str, str] = field(default_factory=dict)
+    options: Mapping[str, tuple[Scalar, ...]]
+    means: Mapping[str, str]
+    is_wrong: bool = False
+
+    @property
+    def name(self) -> str:
+        """Also the name of the folder of its run."""
+        return self.key.text
+
+    @property
+    def makes_run(self) -> bool:
+        """Whether its command writes a run, which it is given the folder of."""
+        return "run" in self.means
+
+    @property
+    def words(self) -> list[tuple[str, Scalar]]:
+        """What it works on (``on``), and the words of its options."""
+        on = [("on", self.on)] if self.on is not None else []
+        return [*on, *((name, word) for name, words in self.options.items() for word in words)]
 
 
 @dataclass(frozen=True)
@@ -43,44 +97,54 @@ class Axis:
     `sets`: for each value, other names and what they stand for with it; empty if the values stand for themselves.
     """
 
-    name: str
+    key: Scalar
     about: str
-    values: Mapping[str, tuple[str, ...]]
-    sets: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    values: Mapping[str, tuple[Scalar, ...]]
+    sets: Mapping[str, Mapping[str, Scalar]]
+
+    @property
+    def name(self) -> str:
+        """It stands for the value."""
+        return self.key.text
 
 
 @dataclass(frozen=True)
 class Measure:
-    """A number out of the ``evaluation.json`` of a step's run: the keys that lead to it, with ``$NAME`` as above.
+    """A number in the ``evaluation.json`` of a step's run: the keys that lead to it, joined by ``/``.
 
-    `scale` is one of `SCALES`. On ``log`` numbers are compared by their ratios: means are geometric ones.
+    On the scale ``log`` numbers are compared by their ratios: means are geometric.
     """
 
     name: str
-    step: str
-    keys: tuple[str, ...]
+    of: Scalar
+    keys: Scalar
     about: str
     expect: str | None
-    scale: str = "linear"
+    scale: str
 
 
 @dataclass(frozen=True)
 class Point:
-    """One combination of values, and a seed. `sets`: other names, and what they stand for with these values."""
+    """One combination of values, and a seed. `names`: what each ``$NAME`` stands for; `spans`: where that is written."""
 
     values: tuple[tuple[str, str], ...]
     seed: int
-    sets: tuple[tuple[str, str], ...] = ()
+    names: Mapping[str, str] = field(default_factory=dict, compare=False, repr=False)
+    spans: Mapping[str, Span] = field(default_factory=dict, compare=False, repr=False)
 
     @property
     def name(self) -> str:
-        """Names its folder."""
+        """The name of its folder."""
         return ",".join([*(f"{name}={value}" for name, value in self.values), f"seed={self.seed}"])
+
+    def filled(self, word: Scalar) -> str:
+        """A word with values in place of their names."""
+        return Template(word.text).safe_substitute(self.names)
 
 
 @dataclass(frozen=True)
 class Study:
-    """A checked study. `text` is what its file says, `folder` is where the file lies, `places` where its parts stand."""
+    """A checked study. `folder`, that of its file, has the files that it names."""
 
     name: str
     about: str
@@ -88,48 +152,68 @@ class Study:
     axes: tuple[Axis, ...]
     steps: tuple[StudyStep, ...]
     measures: tuple[Measure, ...]
-    text: str
-    folder: Path = Path()
-    places: Mapping[tuple[str, ...], Span] = field(default_factory=dict, repr=False, compare=False)
+    source: Source
+    folder: Path
 
     def points(self, size: str, seeds: int | None = None) -> Iterator[Point]:
-        """All combinations, each with every seed; the seeds outside, so that early ends leave whole sets."""
-        names = [axis.name for axis in self.axes]
+        """All combinations, each with every seed. Seeds vary slowest, so that early ends leave whole sets."""
         for seed in range(self.seeds if seeds is None else seeds):
             for values in itertools.product(*(axis.values[size] for axis in self.axes)):
-                chosen = tuple(zip(names, values, strict=True))
-                sets = [
-                    axis.sets.get(value, {}).items() for axis, value in zip(self.axes, values, strict=True)
-                ]
-                yield Point(chosen, seed, tuple(itertools.chain.from_iterable(sets)))
+                words: dict[str, Scalar] = {}
+                for axis, value in zip(self.axes, values, strict=True):
+                    words |= {axis.name: value, **axis.sets.get(value.text, {})}
+                names = {name: word.text for name, word in words.items()}
+                yield Point(
+                    tuple((axis.name, names[axis.name]) for axis in self.axes),
+                    seed,
+                    {**names, SEED: str(seed), SIZE: size},
+                    {name: word.span for name, word in words.items()},
+                )
 
+    def works_on(self, step: StudyStep) -> StudyStep | None:
+        """The step whose run is meant by `on`: the step of this name, or what that works on if it makes no run."""
+        if step.on is None or not step.on_step:
+            return None
+        other = next(other for other in self.steps if other.name == step.on.text)
+        return other if other.makes_run else self.works_on(other)
 
-def filled(text: str, point: Point, size: str) -> str:
-    """A text with the values of a point in it."""
-    return Template(text).safe_substitute(
-        {**dict(point.values), **dict(point.sets), SEED: str(point.seed), SIZE: size}
-    )
+    def command(self, step: StudyStep, point: Point, place: Path) -> list[str]:
+        """The words of a step's command, whose runs and files lie in `place`.
 
+        Raises:
+            CompileError: PD112 if a word names a path that leads out of the study's folder, or out of `place`.
+        """
+        words, run = list(step.command), self.works_on(step)
+        for name, word in step.words:
+            text, means = point.filled(word), step.means.get(name, TEXT)
+            if name == "on" and run is not None:
+                words.append(str(place / run.name))
+                continue
+            try:
+                text = confined(means, text, self.folder, place)
+            except ValueError as error:
+                message = f"the path `{text}` leaves the study's folder"
+                raise CompileError([Diagnostic("PD112", message, Label(word.span, str(error)))]) from None
+            if means != FLAG:
+                words += [text] if name == "on" else [f"--{name}", text]
+            elif text == "yes":
+                words.append(f"--{name}")
+        return [*words, "--run", str(place / step.name)] if step.makes_run else words
 
-def maker(steps: Mapping[str, StudyStep], name: str) -> StudyStep:
-    """The step whose run is meant by a step's name: the step itself, or what it works on if it makes no run."""
-    step = steps[name]
-    while not step.makes_run and step.on_step:
-        step = steps[str(step.on)]
-    return step
-
-
-# Paths. A study comes from a file: what it names lies beside that file, and what it writes in its results
-
-TEXT, FLAG, FILE, TASK, RUN, RUN_OR_TASK, RULES = "text", "flag", "file", "task", "run", "run|task", "rules"
-"""The meaning of an argument or option of a command: text, a flag, a file to write, a task, a run, either, or rules."""
+    def identity(self, size: str) -> dict[str, Any]:
+        """What makes results those of one study, as JSON: values, seeds and measures may be added later."""
+        steps = [
+            [step.name, " ".join(step.command), *([name, word.text] for name, word in step.words)]
+            for step in self.steps
+        ]
+        return {"study": self.name, "size": size, "varied": [axis.name for axis in self.axes], "steps": steps}
 
 
 def confined(means: str, text: str, folder: Path, results: Path) -> str:
-    """A word for a command, from what a study says.
+    """A word for a command, from an untrusted study.
 
     Args:
-        means: one of the above. folder: where the study's file lies. results: where files that it names are written.
+        means: its meaning. folder: that of the study's file. results: where files that it names are written.
 
     Raises:
         ValueError: it names a path that leads out of `folder`, or of `results` for a file to write.
@@ -141,8 +225,8 @@ def confined(means: str, text: str, folder: Path, results: Path) -> str:
     if means == RULES:
         return "+".join(_pack(part, folder) for part in text.split("+"))
     if means == RUN_OR_TASK:
-        named = not is_path(text) and (shipped("tasks") / f"{text}.yaml").is_file()
-        means = TASK if named else RUN
+        is_shipped = not is_path(text) and (shipped("tasks") / f"{text}.yaml").is_file()
+        means = TASK if is_shipped else RUN
     if means == RUN or (means == TASK and is_path(text)):
         return str(inside(folder, text))
     return text
@@ -154,3 +238,222 @@ def _pack(text: str, folder: Path) -> str:
     if text.split("-")[0] not in shipped_rules() and os.path.isfile(text):
         raise ValueError("a name without `/` or `.yaml` means shipped rules, and there are none of this name")
     return text
+
+
+def shipped_studies() -> list[str]:
+    """Names of the studies that come with powderdsl."""
+    return sorted(path.stem for path in (shipped("tasks") / "studies").glob("*.yaml"))
+
+
+Check = Callable[[Study, Reporter], None]
+"""Reports mistakes in a study."""
+
+
+def check_paths(study: Study, reporter: Reporter) -> None:
+    """Report paths that lead out of the study's folder with any of its values (PD112)."""
+    for size, step in itertools.product(SIZES, study.steps):
+        for point in study.points(size, 1):
+            try:
+                study.command(step, point, study.folder)
+            except CompileError as error:
+                reporter.add(error.diagnostics[0])
+
+
+def load_study(name_or_path: str, commands: Commands, check: Check = check_paths) -> Study:
+    """A shipped study by name, or a file. Raises CompileError with everything that is wrong."""
+    reporter, path = Reporter(), Path(name_or_path)
+    if name_or_path in shipped_studies():
+        path = shipped("tasks") / "studies" / f"{name_or_path}.yaml"
+    elif path.suffix.lower() not in (".yaml", ".yml"):
+        helps = suggest(name_or_path, shipped_studies()) or ("shipped: " + ", ".join(shipped_studies()),)
+        raise failure("PD801", f"no study `{name_or_path[:80]}`", helps=helps)
+    source = read_source(path, reporter)
+    reporter.raise_if_errors()
+    assert source is not None
+    return read_study(source, reporter, commands, check)
+
+
+def read_study(source: Source, reporter: Reporter, commands: Commands, check: Check = check_paths) -> Study:
+    """The checked study of a file's text. Raises CompileError with everything that is wrong.
+
+    Args:
+        check: of words and measures. It reads no file that lies out of the study's folder.
+    """
+    tree = parse_yaml(source, reporter)
+    if tree is None and not reporter.has_errors:
+        helps = ["a study starts with `study: NAME`"]
+        reporter.error("PD107", f"{source.name} is empty", None, helps=helps)
+    reporter.raise_if_errors()
+    assert tree is not None
+    study = _StudyReader(reporter, commands).study(tree)
+    check(study, reporter)
+    reporter.raise_if_errors()
+    return study
+
+
+class _StudyReader:
+    """Reads one study, section by section."""
+
+    def __init__(self, reporter: Reporter, commands: Commands):
+        self.reader, self.error, self.commands = Reader(reporter, STUDY_KEYS), reporter.error, commands
+        self.known = [SEED, SIZE]
+        self.used: set[str] = set()
+        self.is_hidden = False
+        """Whether a mistake may hide that a name is used."""
+        self.steps: dict[str, StudyStep] = {}
+
+    def study(self, tree: Node) -> Study:
+        entries = self.reader.mapping(tree, "study", "a study")
+        values = self.reader.values(entries, "study")
+        name, seeds = values.get("study"), values.get("seeds", 1)
+        if name is not None and not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,59}", name.text):
+            label = "letters, digits, `-` and `_`, up to 60"
+            self.error("PD111", "a study's name is a word", name.span, label)
+        axes = [self.axis(key, node) for key, node in self.reader.named(values.get("vary"), "a setting")]
+        for key, node in self.reader.named(values.get("steps"), "a step"):
+            self.step(key, node)
+        named = self.reader.named(values.get("measures"), "a measure")
+        measures = [measure for key, node in named if (measure := self.measure(key, node)) is not None]
+        for size in SIZES:
+            points = math.prod((seeds, *(len(axis.values[size]) for axis in axes)))
+            if points > MAX_POINTS and name is not None:
+                message = f"{points:,} combinations at the size `{size}`"
+                self.error("PD806", message, name.span, f"at most {MAX_POINTS:,}")
+        if not self.is_hidden:
+            self.check_unused(axes)
+            if seeds > 1 and SEED not in self.used:
+                helps = ("write `seed: $seed` in a step that trains, or `seeds: 1`",)
+                self.error("PD806", "no step uses `$seed`", entries["seeds"][1].span, helps=helps)
+        source = tree.span.source
+        return Study(
+            "" if name is None else name.text,
+            values.get("about", ""),
+            seeds,
+            tuple(axes),
+            tuple(self.steps.values()),
+            tuple(measures),
+            source,
+            Path(source.name).parent,
+        )
+
+    def check_unused(self, axes: list[Axis]) -> None:
+        """Report settings and names that make no difference."""
+        for axis in axes:
+            names = {name: word for words in [*axis.sets.values()][::-1] for name, word in words.items()}
+            unused = {name: word for name, word in names.items() if name not in self.used}
+            if axis.name not in self.used and unused == names:
+                helps = (f"write `${next(iter(names), axis.name)}` in a step, or leave the setting out",)
+                self.error("PD806", f"no step uses the setting `{axis.name}`", axis.key.span, helps=helps)
+                continue
+            for name, word in unused.items():
+                helps = (f"write `${name}` in a step, or leave it out",)
+                self.error("PD806", f"no step uses `{name}`", word.span, helps=helps)
+
+    def axis(self, key: Scalar, node: Node) -> Axis:
+        self.add_name(key)
+        values: dict[str, Any] = dict.fromkeys(SIZES, ())
+        if isinstance(node, Mapping_):
+            values |= self.reader.read(node, "axis", "a setting")
+        else:  # one list for every size
+            values = dict.fromkeys(SIZES, self.reader.words(node))
+        words = {size: values[size] for size in SIZES}
+        for size, scalars in words.items():
+            if not scalars:
+                self.error("PD109", f"`{key.text}` has no values", key.span, f"none for `{size}`")
+            for word in scalars:
+                if not re.fullmatch(r"[A-Za-z0-9_.+-]{1,60}", word.text):
+                    label = "letters, digits and `_.+-`: folders are named after values"
+                    self.error("PD110", "this cannot be a value here", word.span, label)
+        sets = self.sets(values["sets"], [*words["small"], *words["paper"]]) if "sets" in values else {}
+        return Axis(key, values.get("about") or key.text, words, sets)
+
+    def sets(self, node: Node, values: list[Scalar]) -> dict[str, dict[str, Scalar]]:
+        """What each value sets: the same names for all of them."""
+        sets: dict[str, dict[str, Scalar]] = {}
+        names: dict[str, Scalar] = {}
+        entries = self.reader.pairs(node, "a mapping", "write `VALUE: {NAME: VALUE, …}`")
+        for value, inner in entries:
+            words = self.reader.pairs(inner, "a mapping", "write `{NAME: VALUE, …}`")
+            sets[value.text] = {name.text: word for name, word in words if isinstance(word, Scalar)}
+            names = {name.text: name for name, _ in words} | names
+        for value, _ in entries:
+            for name in names.keys() - sets[value.text].keys():
+                self.error("PD109", f"`{value.text}` does not set `{name}`", value.span, "others do")
+        for scalar in names.values():
+            self.add_name(scalar)
+        for value in values:
+            if value.text not in sets:
+                self.error("PD109", f"`sets` does not say what `{value.text}` sets", value.span)
+        return sets
+
+    def add_name(self, name: Scalar) -> None:
+        if name.text in self.known:
+            self.error("PD111", f"`{name.text}` is given already", name.span, "choose another name")
+        self.known.append(name.text)
+
+    def step(self, key: Scalar, node: Node) -> None:
+        named = node.get("command") if isinstance(node, Mapping_) else None
+        command = tuple(named.text.split()) if isinstance(named, Scalar) else ()
+        if not isinstance(node, Mapping_) or command not in self.commands:
+            names = [" ".join(words) for words in self.commands]
+            word = named if isinstance(named, Scalar) else key
+            message = f"no command `{named.text}` for a step" if word is named else "a step lacks `command`"
+            helps = suggest(" ".join(command), names) or (f"commands: {', '.join(names)}",)
+            self.error("PD806" if word is named else "PD109", message, word.span, helps=helps)
+            self.is_hidden = True
+            return
+        means, on = self.commands[command], node.get("on")
+        options: dict[str, tuple[Scalar, ...]] = {}
+        for name, value in node.entries:
+            words = self.reader.words(value)
+            known = tuple(word for word in words if self.names_are_known(word))
+            if name.text in ("command", "on"):
+                continue
+            if name.text not in means or name.text == "run":
+                helps = suggest(name.text, means.keys() - {"on", "run"}, "options")
+                message = f"`{' '.join(command)}` has no option `{name.text}` for a study"
+                self.error("PD806", message, name.span, helps=helps)
+            elif not words:
+                self.error("PD806", f"`{name.text}` has no value", name.span)
+            elif known:
+                options[name.text] = known
+        is_right = on is None or (isinstance(on, Scalar) and self.names_are_known(on))
+        if isinstance(on, Scalar) and on.text.startswith("-"):
+            self.error("PD806", "what a step works on cannot begin with `-`", on.span)
+            is_right = False
+        elif on is not None and not isinstance(on, Scalar):
+            self.reader.shape(on, "a word")
+            on = None
+        on_step = on is not None and on.text in self.steps
+        self.steps[key.text] = StudyStep(key, command, on, on_step, options, means, not is_right)
+
+    def measure(self, key: Scalar, node: Node) -> Measure | None:
+        values = self.reader.read(node, "measure", "a measure")
+        of, keys = values.get("of"), values.get("value")
+        if of is None or keys is None:
+            self.is_hidden = True
+            return None
+        self.names_are_known(keys)
+        runs = [step.name for step in self.steps.values() if step.makes_run]
+        if of.text not in runs:
+            step = self.steps.get(of.text)
+            helps = suggest(of.text, runs, "steps that make runs")
+            if step is not None and step.on is not None and step.on_step:
+                helps = (f"write `of: {step.on.text}`: what is found is kept with the run", *helps)
+            self.error("PD806", f"no step `{of.text}` that makes a run", of.span, helps=helps)
+        about = values.get("about") or key.text
+        return Measure(key.text, of, keys, about, values.get("expect"), values.get("scale", "linear"))
+
+    def names_are_known(self, word: Scalar) -> bool:
+        """Note the names that a text uses; return False after reporting ``$NAME`` that is not varied."""
+        template = Template(word.text)
+        if not template.is_valid():
+            label = "no name follows: write `$NAME`, or `$$` for a dollar sign"
+            self.error("PD806", "`$` begins the name of a setting", word.span, label)
+        self.used |= {*template.get_identifiers()}
+        unknown = {*template.get_identifiers()} - {*self.known}
+        for name in unknown:
+            helps = suggest(name, self.known, "settings")
+            self.error("PD806", f"no setting `{name}` is varied", word.span, helps=helps)
+        self.is_hidden |= bool(unknown)
+        return template.is_valid() and not unknown
