@@ -304,13 +304,21 @@ def _load(rules: str, params: Pairs) -> Ruleset:
 
 def _task(name: str, knobs: Pairs = (), params: Pairs = (), packs: tuple[str, ...] = ()) -> Task:
     path = Path(name)
-    return _load_task(name, knobs, params, packs, path.stat().st_mtime_ns if path.is_file() else 0)
+    task = _load_task(name, knobs, params, packs, path.stat().st_mtime_ns if path.is_file() else 0)
+    if isinstance(task, CompileError):
+        raise task
+    return task
 
 
 @lru_cache(maxsize=64)
-def _load_task(name: str, knobs: Pairs, params: Pairs, packs: tuple[str, ...], stamp: int) -> Task:
-    """A task; `stamp` tells versions of a file apart."""
-    return load_task(name, knobs=dict(knobs), params=dict(params), packs=packs)
+def _load_task(
+    name: str, knobs: Pairs, params: Pairs, packs: tuple[str, ...], stamp: int
+) -> Task | CompileError:
+    """A task, or what is wrong with it; `stamp` tells versions of a file apart."""
+    try:
+        return load_task(name, knobs=dict(knobs), params=dict(params), packs=packs)
+    except CompileError as error:
+        return error
 
 
 def without(step: StudyStep, word: Scalar) -> StudyStep:
