@@ -289,7 +289,7 @@ def test_a_task_of_a_cluster_waits_for_who_holds_its_point(steps_run: list[str])
     with lock:
         thread = threading.Timer(0.5, lock.release)
         thread.start()
-        (outcome,) = study.run([point], 1, wait=True)
+        (outcome,) = study.run([point], 1, patient=True)
         assert outcome.problem is None
         assert steps_run == [point.name]
     thread.join()

@@ -90,7 +90,7 @@ def run_point(study: Study, folder: str, size: str, threads: int, point: Point, 
     if not isinstance(about, dict) or about.get("text") != study.source.text or not run.is_prepared():
         return Outcome(point, {}, f"{host} does not see {folder}: it must be on storage that all nodes share")
     try:
-        (outcome,) = run.run([point], 1, wait=True)
+        (outcome,) = run.run([point], 1, patient=True)
     except CompileError as error:
         return Outcome(point, {}, f"{host}: {'; '.join(one.message for one in error.diagnostics)}")
     return outcome

@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -86,14 +86,19 @@ class StudyRun:
         return isinstance(about, dict) and all(about.get(key) == value for key, value in identity.items())
 
     def run(
-        self, points: Sequence[Point], jobs: int, report: Report = lambda outcome: None, *, wait: bool = False
+        self,
+        points: Sequence[Point],
+        jobs: int,
+        report: Report = lambda outcome: None,
+        *,
+        patient: bool = False,
     ) -> list[Outcome]:
         """Run points to their end, `jobs` at a time. Signals end all processes; the same call resumes them.
 
         Args:
-            report: called with each outcome. wait: wait for points that other processes work on.
+            report: called with each outcome. patient: wait for points that other processes work on.
         """
-        return run_all(lambda point: self._point(point, wait), points, jobs, report, self._end_all)
+        return run_all(lambda point: self._point(point, patient), points, jobs, report, self._end_all)
 
     def finished(self, point: Point) -> Outcome | None:
         """The outcome of a point whose steps are done here; None if they are not."""
@@ -109,11 +114,11 @@ class StudyRun:
         except ValueError as error:
             return Outcome(point, {}, f"{path}: {error}")
 
-    def _point(self, point: Point, wait: bool) -> Outcome:
+    def _point(self, point: Point, patient: bool) -> Outcome:
         place = self.folder / "runs" / point.name
         try:
             place.mkdir(parents=True, exist_ok=True)
-            with FileLock(place / ".lock").acquire(timeout=-1 if wait else 0):
+            with FileLock(place / ".lock").acquire(timeout=-1 if patient else 0):
                 outcome = self.finished(point)
                 if outcome is None:
                     for step in self.study.steps:
@@ -191,9 +196,13 @@ def run_all(
     """
     with ThreadPoolExecutor(jobs) as pool:
         futures = [pool.submit(run_point, point) for point in points]
+        running = {*futures}
         try:
-            for future in as_completed(futures):
-                report(future.result())
+            while running:
+                # What Ray interrupts is not interrupted in a wait without a timeout.
+                done, running = wait(running, timeout=0.5, return_when=FIRST_COMPLETED)
+                for future in done:
+                    report(future.result())
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             end_all()
