@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from powderdsl.datasets.dataset import Dataset
 from powderdsl.datasets.manifest import Recipe, damaged, read_recipe, recipe_of
 from powderdsl.datasets.recorder import add_shard, begun, held_place
-from powderdsl.datasets.shards import DTYPES, Defect, check_episodes, knows_ids, row_shape
+from powderdsl.datasets.shards import DTYPES, check_episodes, knows_ids, row_shape
 from powderdsl.diagnostics import CompileError
 from powderdsl.envs import env_id
 from powderdsl.envs.actions import KINDS, ActionForm, action_form
@@ -78,8 +78,8 @@ def to_minari(
     from minari.dataset.minari_storage import MinariStorage
     from minari.namespace import create_namespace, list_local_namespaces
 
-    namespace, *_ = parse_dataset_id(_checked_id(dataset_id))
     place = _place(dataset_id)
+    namespace, *_ = parse_dataset_id(dataset_id)
     if place.exists():
         raise failure(
             "PD613",
@@ -200,7 +200,7 @@ def from_minari(
     require_minari()
     if task is None and (shard is not None or compress or how):
         raise TypeError("from_minari takes shard, compress and arguments of the environment only with a task")
-    source = _opened(_place(_checked_id(dataset_id)) / DATA)
+    source = _opened(_place(dataset_id) / DATA)
     form: ActionForm | None = None
     if task is None:
         recipe = _exported_recipe(source)
@@ -228,10 +228,10 @@ def _opened(folder: Path) -> minari.MinariDataset:
         # Minari makes an environment to get spaces that are missing, with whatever function the file names.
         missing = {"observation_space", "action_space"} - MinariStorage.read_raw_metadata(folder).keys()
         if missing:
-            raise Defect(f"its metadata lack {min(missing)}")
+            raise ValueError(f"its metadata lack {min(missing)}")
         source = MinariDataset(folder)
         if source.storage.jpeg_encoding and is_image_space(source.observation_space):
-            raise Defect("its observations are stored as JPEG, which does not keep their values")
+            raise ValueError("its observations are stored as JPEG, which does not keep their values")
     return source
 
 
@@ -263,12 +263,12 @@ def _form(source: minari.MinariDataset, env: TensorEnv) -> ActionForm:
     with _reported(source.storage.data_path):
         space = env.observation.space
         if source.observation_space != space:
-            raise Defect(f"its observations are not {space.dtype} {list(space.shape)}")
+            raise ValueError(f"its observations are not {space.dtype} {list(space.shape)}")
         for kind in KINDS:
             form = action_form(kind, env.task.agent, env.device)
             if source.action_space == form.space:
                 return form
-        raise Defect(f"its actions are not those of {env.task.name}")
+        raise ValueError(f"its actions are not those of {env.task.name}")
 
 
 def _shard(
@@ -286,7 +286,7 @@ def _shard(
 def _episode(
     source: minari.MinariDataset, number: int, recipe: Recipe, form: ActionForm | None
 ) -> dict[str, Array]:
-    """The arrays of one episode, as a shard holds them. Raises Defect."""
+    """The arrays of one episode, as a shard holds them. Raises ValueError."""
     (episode,) = source.iterate_episodes([number])
     length, action, infos = len(episode), episode.actions, episode.infos or {}
     if form is not None:
@@ -309,27 +309,22 @@ def _episode(
     rows = {"observation": length + 1, "length": 1, "world": 1}
     for name, value in arrays.items():
         if value.shape != (rows.get(name, length), *row_shape(recipe, name)):
-            raise Defect(f"`{name}` has the shape {list(value.shape)}")
+            raise ValueError(f"`{name}` has the shape {list(value.shape)}")
         if not np.can_cast(value.dtype, DTYPES[name], "same_kind"):
-            raise Defect(f"`{name}` has the dtype {value.dtype}")
+            raise ValueError(f"`{name}` has the dtype {value.dtype}")
     check_episodes(arrays, recipe)
     if not knows_ids(recipe, arrays["observation"]):
-        raise Defect("it has ids that the palette lacks")
+        raise ValueError("it has ids that the palette lacks")
     return arrays
 
 
-def _checked_id(dataset_id: str) -> str:
-    """The same id. Raises ValueError if Minari does not take it."""
+def _place(dataset_id: str) -> Path:
+    """The folder of a Minari dataset. Raises ValueError if Minari does not take the id."""
     from minari.dataset.minari_dataset import parse_dataset_id
+    from minari.storage import get_dataset_path
 
     try:
         parse_dataset_id(dataset_id)
     except (ValueError, TypeError):
         raise ValueError(f"a Minari dataset is named namespace/name-v0; found {dataset_id!r}") from None
-    return dataset_id
-
-
-def _place(dataset_id: str) -> Path:
-    from minari.storage import get_dataset_path
-
     return Path(get_dataset_path(dataset_id))

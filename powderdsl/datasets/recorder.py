@@ -37,7 +37,7 @@ from powderdsl.experiments.runs.folder import held
 from powderdsl.system.writing import failure, not_writable
 from powderdsl.tasks.episodes import TaskProgram
 from powderdsl.tasks.players import ExpertPlayer
-from powderdsl.tasks.task import BLOW, NO_CHANGE, Task
+from powderdsl.tasks.task import Task, still_action
 
 Array = NDArray[Any]
 Progress = Callable[[float, int], None]
@@ -51,21 +51,6 @@ def nothing_policy(program: TaskProgram) -> Policy:
     """A policy that repeats `still_action`. Raises ValueError if the task has none."""
     action = torch.tensor(still_action(program.task), device=program.simulator.device)
     return lambda observed, keys: action.expand(len(observed), 5)
-
-
-def still_action(task: Task) -> tuple[int, int, int, int, int]:
-    """The action ``nothing``; if agents lack it but can blow, blowing still air into the first bin.
-
-    Raises:
-        ValueError: the task has neither.
-    """
-    choices = task.agent.choices
-    choice = next((one for one in (NO_CHANGE, BLOW) if one in choices), None)
-    if choice is None:
-        raise ValueError(
-            f"the policy `nothing`: the agent of {task.name} may neither `blow` nor do `nothing`"
-        )
-    return 0, 0, choices.index(choice), 1, 1
 
 
 SCRIPTED: dict[str, Callable[[TaskProgram], Policy | ExpertPlayer]] = {

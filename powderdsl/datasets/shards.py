@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from powderdsl.datasets.manifest import Recipe, ShardRow, damaged, shard_file
+from powderdsl.system.archives import BadArchive, open_archive
 from powderdsl.system.reading import open_regular
 from powderdsl.system.writing import not_writable, replacing
 
@@ -116,9 +117,8 @@ def open_shard(folder: Path, recipe: Recipe, row: ShardRow) -> Shard:
     """
     path = folder / row.file
     with _defects(path):
-        _check_size(path, row)
         if not is_whole(folder, row):
-            raise Defect("its SHA-256 is another than the manifest's")
+            raise BadArchive("its size or its SHA-256 is another than the manifest's")
         shard = _read(path, shapes(recipe, row.number, row.transitions))
         check_episodes(shard.arrays, recipe)
     return shard
@@ -132,17 +132,9 @@ def read_episodes(folder: Path, recipe: Recipe, row: ShardRow) -> tuple[Array, A
     """
     path = folder / row.file
     with _defects(path):
-        _check_size(path, row)
         found = _read(path, shapes(recipe, row.number, row.transitions), only=("length", "world")).arrays
         _check_lengths(found["length"].astype(np.int64), recipe, row.transitions)
     return found["length"], found["world"]
-
-
-def _check_size(path: Path, row: ShardRow) -> None:
-    with open_regular(path) as file:
-        size = os.fstat(file.fileno()).st_size
-    if size != row.bytes:
-        raise Defect(f"{size:,} bytes instead of {row.bytes:,}")
 
 
 @contextmanager
@@ -150,19 +142,13 @@ def _defects(path: Path) -> Iterator[None]:
     """Turns whatever reading a damaged shard raises into CompileError (PD630)."""
     try:
         yield
-    except Defect as error:
-        reason = str(error)
     except OSError as error:
         reason = error.strerror or str(error)
     except Exception as error:  # a damaged archive raises whatever its codec likes
-        reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
     else:
         return
     raise damaged(f"the shard {path} is damaged", reason, "the command that recorded it records it again")
-
-
-class Defect(Exception):
-    """A defect of a shard."""
 
 
 def _read(path: Path, expected: dict[str, tuple[int, ...]], only: tuple[str, ...] = tuple(DTYPES)) -> Shard:
@@ -170,30 +156,22 @@ def _read(path: Path, expected: dict[str, tuple[int, ...]], only: tuple[str, ...
     arrays: dict[str, Array] = {}
     loaded = 0
     whole = np.memmap(path, np.uint8, "r")
-    with zipfile.ZipFile(path) as archive:
-        if sorted(archive.namelist()) != sorted(f"{name}.npy" for name in expected):
-            raise Defect(f"it must hold {', '.join(expected)}, and nothing else")
+    with open_archive(path) as archive:
+        if archive.headers.keys() != expected.keys():
+            raise BadArchive(f"it must hold {', '.join(expected)}, and nothing else")
         for name in only:
-            shape = expected[name]
-            entry = archive.getinfo(f"{name}.npy")
-            dtype = np.dtype(DTYPES[name])
-            size = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
-            with archive.open(entry) as member:
-                version = np.lib.format.read_magic(member)
-                if version != (1, 0):
-                    raise Defect(f"`{name}` has the npy version {version}")
-                header = np.lib.format.read_array_header_1_0(member, max_header_size=10_000)
-                if header != (shape, False, dtype):
-                    raise Defect(f"`{name}` is {header[2]} {list(header[0])}, not {dtype} {list(shape)}")
-                ahead = member.tell()
-                if entry.file_size != ahead + size:
-                    raise Defect(f"`{name}` has {entry.file_size - ahead:,} bytes, not {size:,}")
-                if entry.compress_type == zipfile.ZIP_STORED:
-                    start = _data_offset(whole, entry) + ahead
-                    arrays[name] = np.ndarray(shape, dtype, buffer=whole, offset=start)
-                else:
-                    arrays[name] = np.frombuffer(member.read(), dtype).reshape(shape)
-                    loaded += size
+            header, shape, dtype = archive.headers[name], expected[name], np.dtype(DTYPES[name])
+            form = (header.shape, header.dtype, header.fortran)
+            if form != (shape, dtype.name, False):
+                raise BadArchive(
+                    f"`{name}` is {header.dtype} {list(header.shape)}, not {dtype} {list(shape)}"
+                )
+            if header.entry.compress_type == zipfile.ZIP_STORED:
+                start = _data_offset(whole, header.entry) + header.start
+                arrays[name] = np.ndarray(shape, dtype, buffer=whole, offset=start)
+            else:
+                arrays[name] = archive.read(name)
+                loaded += header.size
     return Shard(arrays, loaded)
 
 
@@ -206,7 +184,7 @@ def _data_offset(whole: Array, entry: zipfile.ZipInfo) -> int:
 
 def _check_lengths(length: Array, recipe: Recipe, transitions: int) -> None:
     if length.min() < 1 or length.max() > recipe.actions or length.sum() != transitions:
-        raise Defect("the lengths of its episodes do not fit")
+        raise BadArchive("the lengths of its episodes do not fit")
 
 
 def knows_ids(recipe: Recipe, observation: Array) -> bool:
@@ -219,15 +197,15 @@ def knows_ids(recipe: Recipe, observation: Array) -> bool:
 
 
 def check_episodes(arrays: Mapping[str, Array], recipe: Recipe) -> None:
-    """Check that episodes end where their lengths say, and that actions are in range. Raises Defect."""
+    """Check that episodes end where their lengths say, and that actions are in range. Raises BadArchive."""
     length, action = arrays["length"].astype(np.int64), arrays["action"]
     _check_lengths(length, recipe, len(action))
     ended = arrays["terminated"].astype(np.int64) + arrays["truncated"]
     last = np.zeros_like(ended)
     last[np.cumsum(length) - 1] = 1
     if not np.array_equal(ended, last):
-        raise Defect("episodes do not end where their lengths say")
+        raise BadArchive("episodes do not end where their lengths say")
     if (action < 0).any() or (action >= np.array(recipe.action_nvec)).any():
-        raise Defect("it has actions out of range")
+        raise BadArchive("it has actions out of range")
     if (arrays["world"] < 0).any():
-        raise Defect("it has worlds out of range")
+        raise BadArchive("it has worlds out of range")

@@ -255,3 +255,18 @@ class Task:
             if split.name == name:
                 return split
         raise KeyError(name)
+
+
+def still_action(task: Task) -> tuple[int, int, int, int, int]:
+    """The action ``nothing``; if agents lack it but can blow, blowing still air into the first bin.
+
+    Raises:
+        ValueError: the task has neither.
+    """
+    choices = task.agent.choices
+    choice = next((one for one in (NO_CHANGE, BLOW) if one in choices), None)
+    if choice is None:
+        raise ValueError(
+            f"the policy `nothing`: the agent of {task.name} may neither `blow` nor do `nothing`"
+        )
+    return 0, 0, choices.index(choice), 1, 1

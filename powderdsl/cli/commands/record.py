@@ -18,7 +18,7 @@ from powderdsl.cli.output import counted, progress, write_diagnostics
 from powderdsl.datasets.manifest import check_place, read_manifest
 from powderdsl.diagnostics import CompileError, Diagnostic
 from powderdsl.tasks.shipped import check_split, load_task
-from powderdsl.tasks.task import Task
+from powderdsl.tasks.task import Task, still_action
 
 SCRIPTED = ("expert", "random", "nothing")
 
@@ -109,32 +109,6 @@ def command(
     return OK
 
 
-class _Mistakes:
-    """Everything that is wrong with a call."""
-
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-        self.diagnostics: list[Diagnostic] = []
-
-    @contextmanager
-    def collected(self) -> Iterator[None]:
-        """Collect what the block raises, so that it can be reported together with the rest."""
-        try:
-            yield
-        except CompileError as error:
-            self.diagnostics.extend(error.diagnostics)
-        except (BadInput, ValueError) as error:
-            self.lines.append(str(error))
-
-    def report(self) -> bool:
-        """Print all mistakes; whether there are any."""
-        if self.diagnostics:
-            write_diagnostics(self.diagnostics, sys.stderr)
-        for line in self.lines:
-            click.echo(f"error: {line}", err=True)
-        return bool(self.lines or self.diagnostics)
-
-
 def _checked(
     task: str | None,
     out: Path | None,
@@ -147,38 +121,51 @@ def _checked(
     packs: tuple[str, ...],
 ) -> Task | None:
     """The task; None after reporting everything that is wrong, before any import that takes long."""
-    mistakes = _Mistakes()
+    lines: list[str] = []
+    diagnostics: list[Diagnostic] = []
+
+    @contextmanager
+    def collected() -> Iterator[None]:
+        """Collect what the block raises, so that it can be reported together with the rest."""
+        try:
+            yield
+        except CompileError as error:
+            diagnostics.extend(error.diagnostics)
+        except (BadInput, ValueError) as error:
+            lines.append(str(error))
+
     required = {"TASK": task, "--out": out, "--episodes": episodes}
     if missing := [name for name, value in required.items() if value is None]:
-        mistakes.lines.append(f"missing {', '.join(missing)}")
+        lines.append(f"missing {', '.join(missing)}")
     values: dict[str, int] = {}
     for knob in knobs:
-        with mistakes.collected():
+        with collected():
             values |= knob_values([knob])
     if out is not None:
-        with mistakes.collected():
+        with collected():
             check_place(out)
     palette = None
     if policy not in SCRIPTED:
         from powderdsl.experiments.runs import find_run
         from powderdsl.experiments.runs.palettes import recorded_palette
 
-        with mistakes.collected():
+        with collected():
             palette = recorded_palette(find_run(policy, "ppo"))
-    found = None
+    loaded = None
     if task is not None:
-        with mistakes.collected():
-            found = load_task(task, knobs=values, params=settings, packs=packs, palette=palette)
-            check_split(found, split)
-    if found is not None and policy == "nothing":
-        with mistakes.collected():
-            require_gymnasium()
-            from powderdsl.datasets.recorder import still_action
-
-            still_action(found)
-    if found is not None and policy == "expert" and found.expert is None:
-        mistakes.lines.append(f"the task {found.name} has no `expert:`")
-    return None if mistakes.report() else found
+        with collected():
+            loaded = load_task(task, knobs=values, params=settings, packs=packs, palette=palette)
+            check_split(loaded, split)
+    if loaded is not None and policy == "nothing":
+        with collected():
+            still_action(loaded)
+    if loaded is not None and policy == "expert" and loaded.expert is None:
+        lines.append(f"the task {loaded.name} has no `expert:`")
+    if diagnostics:
+        write_diagnostics(diagnostics, sys.stderr)
+    for line in lines:
+        click.echo(f"error: {line}", err=True)
+    return None if lines or diagnostics else loaded
 
 
 def _trained(path: str, task: Task, how: dict[str, Any]) -> dict[str, Any]:
