@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from powderdsl.system.lazy import importing
 
 if TYPE_CHECKING:
     from powderdsl.datasets.dataset import Dataset, Transitions, split
@@ -20,11 +22,4 @@ _HOMES = {
     "to_minari": "minari",
 }
 
-
-def __getattr__(name: str) -> Any:
-    """Public names are imported when first used."""
-    if name not in _HOMES:
-        raise AttributeError(f"module 'powderdsl.datasets' has no attribute {name!r}")
-    from importlib import import_module
-
-    return getattr(import_module(f"powderdsl.datasets.{_HOMES[name]}"), name)
+__getattr__ = importing("powderdsl.datasets", _HOMES)

@@ -141,14 +141,8 @@ def _merged(options: Sequence[dict[str, Any]]) -> dict[str, Any]:
     if all(one is first or one == first for one in options):
         return dict(first)
     if any(one.keys() != first.keys() for one in options):
-        raise ValueError("all worlds must be given the same options, with values of their own")
-    found: dict[str, Any] = {}
-    for name in first:
-        values = [one[name] for one in options]
-        if name == "params":
-            if any(one.keys() != values[0].keys() for one in values):
-                raise ValueError("all worlds must be given the same parameters, with values of their own")
-            found[name] = {param: [one[param] for one in values] for param in values[0]}
-        else:
-            found[name] = values
-    return found
+        raise ValueError("all worlds must be given the same options and parameters, with values of their own")
+    values: dict[str, Any] = {name: [one[name] for one in options] for name in first}
+    if "params" in values:
+        values["params"] = _merged(values["params"])
+    return values

@@ -7,12 +7,12 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import gymnasium
 
 from powderdsl.ogbench.levels import find_level, shipped_levels
+from powderdsl.system.lazy import importing
 
 if TYPE_CHECKING:
     from powderdsl.ogbench.datasets import load_dataset, make_env_and_datasets
@@ -43,8 +43,4 @@ def _register() -> None:
 
 _register()
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module 'powderdsl.ogbench' has no attribute {name!r}")
-    return getattr(import_module(f"powderdsl.ogbench.{_HOMES[name]}"), name)
+__getattr__ = importing("powderdsl.ogbench", _HOMES)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -38,8 +37,7 @@ INK = (235, 235, 235)
 PAPER = (30, 30, 30)
 
 
-@dataclass(frozen=True)
-class FilmScene:
+class FilmScene(NamedTuple):
     """All worlds between two steps: `ids` uint8 [B, H, W]; `fields` [B, H, W] or of vectors [B, 2, H, W], those that
     pictures show; `actions` int64 [B, 5] or None before the first and where nobody acts; `returns`
     float64 [B] before them; `over` bool [B]."""
@@ -49,38 +47,6 @@ class FilmScene:
     actions: Tensor | None
     returns: Tensor
     over: Tensor
-
-
-class FilmRecorder:
-    """Keeps the scenes of `play`."""
-
-    def __init__(self, count: int) -> None:
-        self.regions: dict[str, NDArray[np.bool_]] = {}
-        self.scenes: list[FilmScene] = []
-        self._pending: list[tuple[Any, Any]] = []
-        self._returns = torch.zeros(count, dtype=torch.float64)
-        self._over = torch.zeros(count, dtype=torch.bool)
-
-    def begun(self, episodes: Episodes) -> None:
-        """The worlds at their start."""
-        self.regions = {name: value.cpu().numpy() for name, value in episodes.regions.items()}
-        self.seen(episodes.world)
-        self.acted(None, self._returns, self._over)
-
-    def seen(self, world: World) -> None:
-        """The worlds after an action, or a step."""
-        names = shown_fields(world.sim.ruleset)
-        fields = {name: world[name].cpu().numpy().copy() for name in names}
-        self._pending.append((world.ids.cpu().numpy().copy(), fields))
-
-    def acted(self, actions: Tensor | None, returns: Tensor, over: Tensor) -> None:
-        """Assign the worlds seen since the last call to these actions; the last of them shows the new returns."""
-        before, after = (self._returns, self._over), (returns.cpu().clone(), over.cpu().clone())
-        for number, seen in enumerate(self._pending, 1):
-            now = after if number == len(self._pending) else before
-            self.scenes.append(FilmScene(*seen, actions, *now))
-        self._pending.clear()
-        self._returns, self._over = after
 
 
 def film(
@@ -97,7 +63,7 @@ def film(
     There is a picture of the start, and one after each action and each step, free steps included. Worlds whose
     episode is over no longer change.
     """
-    recorder = FilmRecorder(len(worlds))
+    recorder = _Film(program.task, len(worlds), factor)
     played = play(
         program,
         policy,
@@ -108,48 +74,73 @@ def film(
         seen=recorder.seen,
         acted=recorder.acted,
     )
-    return played, _pictures(program.task, recorder, factor)
+    return played, recorder.pictures()
 
 
-def _pictures(task: Task, recorder: FilmRecorder, factor: int) -> Iterator[NDArray[np.uint8]]:
-    colors, font = palette(task.ruleset.elements), ImageFont.load_default()
-    still: dict[int, NDArray[np.uint8]] = {}
-    columns = min(4, len(recorder.scenes[0].ids))
-    for scene in recorder.scenes:
-        tiles = []
-        for world in range(len(scene.ids)):
-            tile = still.get(world)
-            if tile is None:
-                tile = _tile(task, recorder, scene, world, colors, factor, font)
+class _Film:
+    """Keeps the scenes of `play`, and draws them with cells of `factor`² pixels."""
+
+    def __init__(self, task: Task, count: int, factor: int) -> None:
+        self.task, self.factor = task, factor
+        self.regions: dict[str, NDArray[np.bool_]] = {}
+        self.scenes: list[FilmScene] = []
+        self._pending: list[tuple[Any, Any]] = []
+        self._returns = torch.zeros(count, dtype=torch.float64)
+        self._over = torch.zeros(count, dtype=torch.bool)
+        self._fields = shown_fields(task.ruleset)
+        self._colors, self._font = palette(task.ruleset.elements), ImageFont.load_default()
+        self._looks: Any = {"ramps": ramps(task.ruleset.elements), "tints": tints(task.ruleset.fields)}
+
+    def begun(self, episodes: Episodes) -> None:
+        """The worlds at their start."""
+        self.regions = {name: value.cpu().numpy() for name, value in episodes.regions.items()}
+        self.seen(episodes.world)
+        self.acted(None, self._returns, self._over)
+
+    def seen(self, world: World) -> None:
+        """The worlds after an action, or a step."""
+        fields = {name: world[name].cpu().numpy().copy() for name in self._fields}
+        self._pending.append((world.ids.cpu().numpy().copy(), fields))
+
+    def acted(self, actions: Tensor | None, returns: Tensor, over: Tensor) -> None:
+        """Assign the worlds seen since the last call to these actions; the last of them shows the new returns."""
+        *earlier, last = self._pending
+        self.scenes += [FilmScene(*seen, actions, self._returns, self._over) for seen in earlier]
+        self._pending, self._returns, self._over = [], returns.cpu().clone(), over.cpu().clone()
+        self.scenes.append(FilmScene(*last, actions, self._returns, self._over))
+
+    def pictures(self) -> Iterator[NDArray[np.uint8]]:
+        """A picture of each scene, all worlds side by side."""
+        over: dict[int, NDArray[np.uint8]] = {}
+        columns = min(4, len(self._over))
+        for scene in self.scenes:
+            tiles = []
+            for world in range(len(scene.ids)):
+                tile = over[world] if world in over else self._tile(scene, world)
                 if scene.over[world]:
-                    still[world] = tile
-            tiles.append(tile)
-        yield contact_sheet(tiles, columns=columns)
+                    over[world] = tile
+                tiles.append(tile)
+            yield contact_sheet(tiles, columns=columns)
 
-
-def _tile(
-    task: Task, recorder: FilmRecorder, scene: FilmScene, world: int, colors: Any, factor: int, font: Any
-) -> NDArray[np.uint8]:
-    """One world, uint8 [H·factor + LINE, W·factor, 3]."""
-    fields = {name: values[world] for name, values in scene.fields.items()}
-    ramped, tinted = ramps(task.ruleset.elements), tints(task.ruleset.fields)
-    picture = np.array(
-        scale(rgb(scene.ids[world], colors, ramps=ramped, tints=tinted, fields=fields), factor)
-    )
-    for number, masks in enumerate(recorder.regions.values()):
-        outline(picture, masks[world % len(masks)], factor, OUTLINES[number % len(OUTLINES)])
-    words = ""
-    if scene.actions is not None:
-        x, y, choice, *blow = scene.actions[world].tolist()
-        words = _words(task, choice, blow)
-        if words:
-            outline(picture, _block(task, y, x), factor, HAND)
-    image = Image.new("RGB", (picture.shape[1], picture.shape[0] + LINE), PAPER)
-    image.paste(Image.fromarray(picture), (0, 0))
-    mark = "  over" if scene.over[world] else f"  {words}"
-    text = f"{float(scene.returns[world]):.2f}{mark}"
-    ImageDraw.Draw(image).text((2, picture.shape[0] + 1), text, fill=INK, font=font)
-    return np.array(image)
+    def _tile(self, scene: FilmScene, world: int) -> NDArray[np.uint8]:
+        """One world, uint8 [H·factor + LINE, W·factor, 3]."""
+        task, factor = self.task, self.factor
+        fields = {name: values[world] for name, values in scene.fields.items()}
+        picture = np.array(scale(rgb(scene.ids[world], self._colors, fields=fields, **self._looks), factor))
+        for number, masks in enumerate(self.regions.values()):
+            outline(picture, masks[world % len(masks)], factor, OUTLINES[number % len(OUTLINES)])
+        words = ""
+        if scene.actions is not None:
+            x, y, choice, *blow = scene.actions[world].tolist()
+            words = _words(task, choice, blow)
+            if words:
+                outline(picture, _block(task, y, x), factor, HAND)
+        image = Image.new("RGB", (picture.shape[1], picture.shape[0] + LINE), PAPER)
+        image.paste(Image.fromarray(picture), (0, 0))
+        mark = "over" if scene.over[world] else words
+        text = f"{float(scene.returns[world]):.2f}  {mark}"
+        ImageDraw.Draw(image).text((2, picture.shape[0] + 1), text, fill=INK, font=self._font)
+        return np.array(image)
 
 
 def _block(task: Task, row: int, column: int) -> NDArray[np.bool_]:

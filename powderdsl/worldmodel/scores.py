@@ -69,18 +69,17 @@ class Score:
     @property
     def changed_accuracy(self) -> float | None:
         """Of the changed cells, the share whose new element is predicted: the recall of changes. None without any."""
-        return self.changed_right / self.changed if self.changed else None
+        return _share(self.changed_right, self.changed)
 
     @property
     def change_precision(self) -> float | None:
         """Of the cells predicted to change, the share whose new element is predicted. None without any."""
-        return self.changed_right / self.predicted_changed if self.predicted_changed else None
+        return _share(self.changed_right, self.predicted_changed)
 
     @property
     def change_f1(self) -> float | None:
         """The harmonic mean of precision and recall of changes. None if nothing changes nor is predicted to."""
-        both = self.changed + self.predicted_changed
-        return 2 * self.changed_right / both if both else None
+        return _share(2 * self.changed_right, self.changed + self.predicted_changed)
 
     @property
     def ece(self) -> float | None:
@@ -99,9 +98,8 @@ class Score:
 
     def _calibration_error(self, kind: str) -> float | None:
         table = self.bins[KINDS.index(kind)]
-        cells = int(table[:, 0].sum())
         gaps = (table[:, 1] * UNITS - table[:, 2]).abs().sum()
-        return int(gaps) / (UNITS * cells) if cells else None
+        return _share(int(gaps), UNITS * int(table[:, 0].sum()))
 
     def reliability(self) -> dict[str, list[dict[str, float | int]]]:
         """For each of `KINDS` the bins that have cells: their bounds, cells, mean probability, and share that was right."""
@@ -243,14 +241,17 @@ def frequent(counts: Tensor, ids: Sequence[int]) -> Table:
 def elements_of(total: Score, palette: tuple[str | None, ...]) -> dict[str, dict[str, float | int | None]]:
     """By element: cells that ended as it, the share of these that was predicted (recall), and the share of cells
     predicted as it that were (precision). None where there are no such cells."""
-    table: dict[str, dict[str, float | int | None]] = {}
-    counts = zip(total.confusion.sum(1).tolist(), total.confusion.sum(0).tolist(), strict=True)
-    rights = total.confusion.diagonal().tolist()
-    for name, (cells, predicted), right in zip(palette, counts, rights, strict=True):
-        if name is not None and (cells or predicted):
-            table[name] = {
-                "cells": cells,
-                "recall": right / cells if cells else None,
-                "precision": right / predicted if predicted else None,
-            }
-    return table
+    confusion = total.confusion
+    counts = zip(
+        confusion.sum(1).tolist(), confusion.sum(0).tolist(), confusion.diagonal().tolist(), strict=True
+    )
+    return {
+        name: {"cells": cells, "recall": _share(right, cells), "precision": _share(right, predicted)}
+        for name, (cells, predicted, right) in zip(palette, counts, strict=True)
+        if name is not None and (cells or predicted)
+    }
+
+
+def _share(part: int, whole: int) -> float | None:
+    """A ratio; None of nothing."""
+    return part / whole if whole else None
