@@ -1,13 +1,22 @@
-"""Batches of worlds as one picture, and the fields that pictures show."""
+"""Worlds as pictures: in files, and in a terminal, two cells a character in 24-bit color or as plain glyphs."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+import os
+import shutil
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, TextIO
 
 from powderdsl.arrays import NDArray, np
 from powderdsl.cli.exits import BadInput
-from powderdsl.simulation.draw import contact_sheet, palette, ramps, rgb, scale, shown_fields, tints
+from powderdsl.diagnostics.printable import printable, unguarded
+from powderdsl.model.types import Element, Field
+from powderdsl.simulation.draw import contact_sheet, palette, ramps, rgb, scale, shown_fields, tints, to_numpy
+from powderdsl.worlds.ascii import write_ascii
 
 if TYPE_CHECKING:
     from powderdsl.simulation.any_arrays import AnyWorld
@@ -45,3 +54,123 @@ def first_world(world: AnyWorld) -> dict[str, Any]:
 def fields_of(world: AnyWorld) -> dict[str, Any]:
     """The fields that pictures show, [B, H, W] or of vectors [B, 2, H, W], by name."""
     return {name: world[name] for name in shown_fields(world.sim.ruleset)}
+
+
+# In a terminal
+
+UPPER_HALF = "▀"
+"""Its color is the upper cell, its background the lower one. (Frames through `rich.live` take 20 times as long.)"""
+
+_RESET = "\x1b[0m"
+_NO_BACKGROUND = "\x1b[49m"
+_HIDE_CURSOR, _SHOW_CURSOR = "\x1b[?25l", "\x1b[?25h"
+_CLEAR_LINE, _CLEAR_BELOW = "\x1b[2K", "\x1b[J"
+
+
+def render_frame(image: Any) -> str:
+    """A picture uint8 [H, W, 3] as ⌈H/2⌉ lines of half blocks; each line resets its colors.
+
+    A color is written only where it changes, which keeps frames small enough for slow connections.
+    """
+    picture = to_numpy(image).tolist()
+    lines = []
+    for row in range(0, len(picture), 2):
+        upper = picture[row]
+        lower = picture[row + 1] if row + 1 < len(picture) else [None] * len(upper)
+        pieces: list[str] = []
+        ink = paper = None
+        for above, below in zip(upper, lower, strict=True):
+            if above != ink:
+                pieces.append(f"\x1b[38;2;{above[0]};{above[1]};{above[2]}m")
+            if below != paper:
+                pieces.append(f"\x1b[48;2;{below[0]};{below[1]};{below[2]}m" if below else _NO_BACKGROUND)
+            ink, paper = above, below
+            pieces.append(UPPER_HALF)
+        lines.append("".join(pieces) + _RESET)
+    return "\n".join(lines)
+
+
+class LiveView:
+    """Shows one world after the other in one place; a context manager that leaves the terminal as it was.
+
+        with LiveView(rules.elements, fields=rules.fields) as view:
+            view.show(ids, caption="step 12")
+
+    Where the output is not a terminal, frames follow one another as plain text. With NO_COLOR set
+    (https://no-color.org) or an encoding without half blocks, glyphs are redrawn in place. Worlds that do not
+    fit are thinned out. On a terminal, frames follow one another no faster than `fps`.
+    """
+
+    def __init__(
+        self,
+        elements: Sequence[Element],
+        stream: TextIO | None = None,
+        *,
+        fields: Sequence[Field] = (),
+        fps: int | None = None,
+    ):
+        self.stream: TextIO = unguarded(sys.stdout if stream is None else stream)
+        self.elements = elements
+        self.in_place = self.stream.isatty() and os.environ.get("TERM") != "dumb"
+        self.color = self.in_place and not os.environ.get("NO_COLOR") and _can_encode(self.stream)
+        self._colors, self._ramps, self._tints = palette(elements), ramps(elements), tints(fields)
+        self._height = 0
+        self._frame_seconds, self._due = 1 / fps if fps else 0.0, time.perf_counter()
+
+    def __enter__(self) -> LiveView:
+        if self.in_place:
+            self._write(_HIDE_CURSOR)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        # On Ctrl-C too: the frame stays on the screen, and the prompt comes below it in its usual colors.
+        if self.in_place:
+            self._write(_RESET + _SHOW_CURSOR)
+
+    def show(self, ids: Any, caption: str = "", fields: Mapping[str, Any] | None = None) -> None:
+        """Draw ids [H, W], array or tensor; `caption` stands below.
+
+        `fields` has the fields that pictures show, [H, W] or of vectors [2, H, W], by name.
+        """
+        ids = to_numpy(ids)
+        shown = {name: to_numpy(value) for name, value in (fields or {}).items()}
+        if self.in_place:
+            step = self._thinning(*ids.shape)
+            ids = ids[::step, ::step]
+            shown = {name: value[..., ::step, ::step] for name, value in shown.items()}
+        if self.color:
+            text = render_frame(rgb(ids, self._colors, ramps=self._ramps, tints=self._tints, fields=shown))
+        else:
+            text = write_ascii(ids, self.elements).rstrip("\n")
+        caption = printable(caption)
+        lines = [*text.split("\n"), caption]
+        if not self.in_place:
+            self._write("\n".join(lines) + "\n")
+            return
+        # Lines are cleared before they are written: behind a full line the cursor is on its last cell.
+        lines[-1] = caption[: shutil.get_terminal_size().columns - 1]
+        back = f"\x1b[{self._height}F" if self._height else ""
+        self._write(back + "".join(f"{_CLEAR_LINE}{line}\n" for line in lines) + _CLEAR_BELOW)
+        self._height = len(lines)
+        self._due = max(self._due + self._frame_seconds, time.perf_counter())
+        time.sleep(max(self._due - time.perf_counter(), 0))
+
+    def _thinning(self, height: int, width: int) -> int:
+        """The step between rows and columns that are shown, so that the frame fits: no line may wrap."""
+        columns, lines = shutil.get_terminal_size()
+        room = max((lines - 2) * (2 if self.color else 1), 1)
+        return max(-(-height // room), -(-width // max(columns, 1)), 1)
+
+    def _write(self, text: str) -> None:
+        self.stream.write(text)
+        self.stream.flush()
+
+
+def _can_encode(stream: TextIO) -> bool:
+    try:
+        UPPER_HALF.encode(getattr(stream, "encoding", None) or "utf-8")
+    except (UnicodeEncodeError, LookupError):
+        return False
+    return True

@@ -18,7 +18,7 @@ from powderdsl.worlds.strewn import check_cells, strew
 if TYPE_CHECKING:
     from powderdsl.simulation.any_arrays import AnyWorld
 
-DEFAULT_SIZE: Size = (64, 64)
+DEFAULT_SIDE = 64
 
 KINDS = "worlds are .npz, .png, .txt and .yaml files, FILE.yaml#NAME, or a shipped scene's name"
 
@@ -39,16 +39,15 @@ def start(
 
     sim = compile_any(ruleset, **how)
     with user_values():
-        if drawn is not None:
-            world = sim.world(drawn.ids, seed=seed or 0)
-            for key, given in drawn.fields.items():
-                values: dict[str, Any] = {key: given.values}
-                world = sim.paint(world, where=given.where, **values)
-            return world
-        from powderdsl.worlds.store import load_world
+        if drawn is None:
+            from powderdsl.worlds.store import load_world
 
-        assert name is not None
-        return load_world(name, sim)
+            return load_world(str(name), sim)
+        world = sim.world(drawn.ids, seed=seed or 0)
+        for key, given in drawn.fields.items():
+            values: dict[str, Any] = {key: given.values}
+            world = sim.paint(world, where=given.where, **values)
+        return world
 
 
 def start_drawn(
@@ -60,14 +59,14 @@ def start_drawn(
     with it. A drawn world is repeated `batch` times. Without a name, each world is scattered independently.
     """
     if name is None:
-        size = size or (fitting(ruleset, DEFAULT_SIZE[0]), fitting(ruleset, DEFAULT_SIZE[1]))
-        return Start(strew(ruleset, size, batch or 1, seed or 0), {})
+        side = fitting(ruleset, DEFAULT_SIDE)
+        return Start(strew(ruleset, size or (side, side), batch or 1, seed or 0), {})
     if name.lower().endswith(".npz"):
         _refuse_options("a saved world has its own", size=size, batch=batch, seed=seed)
         return None
-    one = drawn_world(name, ruleset, size)
-    check_cells(batch or 1, one.ids.shape)
-    return Start(np.repeat(one.ids[None], batch or 1, axis=0), one.fields)
+    world = drawn_world(name, ruleset, size)
+    check_cells(batch or 1, world.ids.shape)
+    return Start(np.repeat(world.ids[None], batch or 1, axis=0), world.fields)
 
 
 def drawn_world(name: str, ruleset: Ruleset, size: Size | None) -> Start:
@@ -83,10 +82,11 @@ def drawn_world(name: str, ruleset: Ruleset, size: Size | None) -> Start:
         from powderdsl.worlds.ascii import load_ascii
 
         return Start(load_ascii(name, ruleset.elements), {})
-    if Path(name).is_file() and suffix not in (".yaml", ".yml"):
-        raise failure("PD602", f"cannot tell what {name} is", helps=(KINDS,))
-    if re.search(r"\.[A-Za-z0-9]{1,5}\Z", name) and suffix not in (".yaml", ".yml"):
-        raise failure("PD601", f"no world {name}", helps=(KINDS,))
+    if suffix not in (".yaml", ".yml"):
+        if Path(name).is_file():
+            raise failure("PD602", f"cannot tell what {name} is", helps=(KINDS,))
+        if re.search(r"\.[A-Za-z0-9]{1,5}\Z", name):
+            raise failure("PD601", f"no world {name}", helps=(KINDS,))
     return load_start(name, ruleset, size=size)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import powderdsl
-from powderdsl.cli.terminal import LiveView, render_frame
+from powderdsl.cli.pictures import LiveView, render_frame
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.draw import palette, ramps, rgb

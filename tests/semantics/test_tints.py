@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 import powderdsl
-from powderdsl.cli.pictures import first_world, pictures
-from powderdsl.cli.terminal import LiveView, render_frame
+from powderdsl.cli.pictures import LiveView, first_world, pictures, render_frame
 from powderdsl.compiler import load_with_diagnostics
 from powderdsl.diagnostics import CompileError
 from powderdsl.model.fingerprint import fingerprint

@@ -122,7 +122,7 @@ def test_to_numpy_takes_tensors_that_know_their_gradient():
 
 def test_drawing_arrays_does_not_import_torch():
     code = (
-        "import sys, numpy; from powderdsl.simulation.draw import rgb; import powderdsl.cli.terminal, powderdsl.simulation.media;"
+        "import sys, numpy; from powderdsl.simulation.draw import rgb; import powderdsl.cli.pictures, powderdsl.simulation.media;"
         "rgb(numpy.zeros((1, 1), int), numpy.zeros((1, 3), 'u1')); assert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

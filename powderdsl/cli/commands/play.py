@@ -52,10 +52,9 @@ def command(
         start = _start(ruleset, world) if world is not None else None
     site = Site(first, start)
     if export is not None:
-        count = site.write(export)
-        click.echo(f"{export}: {count} files")
-        return
-    _serve(site, port, not no_open)
+        click.echo(f"{export}: {site.write(export)} files")
+    else:
+        _serve(site, port, not no_open)
 
 
 def _start(ruleset: Ruleset, world: str) -> dict[str, Any]:

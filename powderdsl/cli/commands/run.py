@@ -133,8 +133,7 @@ def _populations(start: AnyWorld, end: AnyWorld) -> str:
 
 def play(start: AnyWorld, plan: Playback) -> AnyWorld:
     """Run to the end; the last world. Nothing half-written stays behind when it is interrupted."""
-    from powderdsl.cli.pictures import first_world, pictures
-    from powderdsl.cli.terminal import LiveView
+    from powderdsl.cli.pictures import LiveView, first_world, pictures
 
     ruleset, world = start.sim.ruleset, start
     # Where nobody looks in between, short calls still let progress be shown and Ctrl-C be heard.

@@ -87,11 +87,10 @@ def report_data(report: Report) -> dict[str, Any]:
         }
         for figures in report.cells
     ]
-    settings = ("workload", "device", "seed", "rounds")
     return {
         "machine": report.machine,
         "rules": plan.ruleset.name,
-        **{name: getattr(plan, name) for name in settings},
+        **{name: getattr(plan, name) for name in ("workload", "device", "seed", "rounds")},
         "interrupted": report.interrupted,
         "cells": cells,
     }

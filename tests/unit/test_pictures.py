@@ -11,8 +11,8 @@ import pytest
 import torch
 
 import powderdsl
-from powderdsl.cli import terminal
-from powderdsl.cli.terminal import LiveView, render_frame
+from powderdsl.cli import pictures
+from powderdsl.cli.pictures import LiveView, render_frame
 from powderdsl.simulation.draw import palette, rgb
 from tests.unit.elements import ELEMENTS
 
@@ -84,7 +84,7 @@ def surroundings(monkeypatch):
 
 
 def set_size(monkeypatch, columns: int, lines: int) -> None:
-    monkeypatch.setattr(terminal.shutil, "get_terminal_size", lambda: os.terminal_size((columns, lines)))
+    monkeypatch.setattr(pictures.shutil, "get_terminal_size", lambda: os.terminal_size((columns, lines)))
 
 
 @pytest.mark.parametrize("height", [1, 2, 5, 6])
