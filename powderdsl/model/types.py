@@ -49,6 +49,11 @@ class Kind:
                 return f"{self.name}({self.lo:g}..{self.hi:g})" if self.hi > self.lo else self.name
         return self.name
 
+    @property
+    def reach(self) -> float:
+        """The largest magnitude."""
+        return max(abs(self.lo), abs(self.hi))
+
 
 FLAG, ELEMENT, DIRECTION, CHANCE = Kind("flag"), Kind("element"), Kind("direction"), Kind("chance")
 REAL, VEC2, DRAW = Kind("real"), Kind("vec2"), Kind("draw", 0, 1)
