@@ -20,8 +20,8 @@ from powderdsl.model.parameter_values import set_params
 from powderdsl.model.types import Example, Ruleset
 from powderdsl.simulation.simulator import Simulator, compile
 from powderdsl.testing.generators.cases import Start
-from powderdsl.testing.mutation.file_operators import mutants_of
 from powderdsl.testing.mutation.mutants import Mutant
+from powderdsl.testing.mutation.operators import mutants_of
 from powderdsl.testing.pack_tests.runner import run_examples
 from powderdsl.testing.properties.running import run_sample
 from powderdsl.testing.properties.samples import State, joined, random_samples

@@ -26,10 +26,9 @@ class Names:
     local: dict[str, str] = field(default_factory=dict)
     """`let` values of the pass at hand, with their text."""
 
-    def kind(self, name: str) -> str | None:
-        """The kind of a name without what it holds: `property:int` is a `property`."""
-        found = self.kinds.get(name)
-        return found.partition(":")[0] if found else None
+    def kind(self, name: str) -> str:
+        """The kind of a name without what it holds, or nothing: `property:int` is a `property`."""
+        return self.kinds.get(name, "").partition(":")[0]
 
     def others(self, name: str) -> list[str]:
         """Names of the same kind: those of the same pack first, then others."""
