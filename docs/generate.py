@@ -259,7 +259,7 @@ def mutation_operators() -> str:
 
 def mutation_testing() -> str:
     """What `docs/mutation_table.py` has counted, a line a pack, and the sum."""
-    from powderdsl.testing.mutation.run import COUNTED, by_hand_share, noticed_share
+    from powderdsl.testing.mutation.judging import COUNTED, by_hand_share, noticed_share
 
     path = DOCS / "mutation.json"
     measured = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}

@@ -48,7 +48,7 @@ Counts = dict[str, dict[str, int]]
 
 def packs_of(rules: str) -> list[str]:
     """The packs of a composition that are mutated, in their order."""
-    from powderdsl.testing.mutation.original import Original
+    from powderdsl.testing.mutation.judging import Original
 
     only = compositions()[rules]
     return list(dict.fromkeys(mutant.pack for mutant in Original.of(rules).mutants(frozenset(only))))
@@ -59,8 +59,7 @@ def count(rules: str, packs: Sequence[str], jobs: int, worlds: bool = False) -> 
 
     `worlds`: also look for worlds that show survivors, which takes longer.
     """
-    from powderdsl.testing.mutation.original import Original
-    from powderdsl.testing.mutation.run import Outcome, run_campaign, tally
+    from powderdsl.testing.mutation.judging import Original, Outcome, run_campaign, tally
 
     mutants = Original.of(rules).mutants(frozenset(packs))
     left = Counter(mutant.pack for mutant in mutants)

@@ -21,7 +21,7 @@ PACKAGE = ROOT / "powderdsl"
 SEEDS = range(10)
 
 ORDER_DOES_NOT_MATTER = {
-    "testing.mutation.equal_nodes": "sorts by the whole of what it sorts",
+    "testing.mutation.equivalence": "sorts by the whole of what it sorts",
     "experiments.studies.run": "stops all processes that run, and none of them reads the others",
 }
 """Modules that go through sets, and why nothing comes of it."""

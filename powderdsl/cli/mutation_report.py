@@ -15,8 +15,8 @@ from powderdsl.cli.exits import FAILED, OK, BadInput
 from powderdsl.cli.output import counted, print_json, progress
 
 if TYPE_CHECKING:
+    from powderdsl.testing.mutation.judging import Outcome
     from powderdsl.testing.mutation.mutants import Mutant
-    from powderdsl.testing.mutation.run import Outcome
     from powderdsl.testing.mutation.written import GeneratedTest
 
 
@@ -47,8 +47,7 @@ def report_mutants(names: Sequence[str], plan: MutationPlan) -> int:
 
 
 def _report(name: str, plan: MutationPlan) -> dict[str, Any]:
-    from powderdsl.testing.mutation.original import Original
-    from powderdsl.testing.mutation.run import run_campaign, sampled
+    from powderdsl.testing.mutation.judging import Original, run_campaign, sampled
 
     began = monotonic()
     settings = tuple(plan.settings.items())
@@ -106,7 +105,7 @@ def _tell(
 
 def summary(found: Sequence[tuple[Mutant, Outcome]]) -> str:
     """The number of mutants, and what noticed them."""
-    from powderdsl.testing.mutation.run import noticed_share, tally
+    from powderdsl.testing.mutation.judging import noticed_share, tally
 
     counts = tally(outcome for _, outcome in found)
     by = ", ".join(f"{counts[key]} by {words}" for key, words in WORDS.items())
@@ -136,7 +135,7 @@ def _write(found: list[tuple[Mutant, Outcome]]) -> None:
 
 
 def _data(found: list[tuple[Mutant, Outcome]]) -> dict[str, Any]:
-    from powderdsl.testing.mutation.run import tally
+    from powderdsl.testing.mutation.judging import tally
 
     packs = dict.fromkeys(mutant.pack for mutant, _ in found)
     return {

@@ -17,14 +17,18 @@ from powderdsl.model.types import Ruleset
 from powderdsl.testing.pack_tests.runner import ExampleResult, run_examples
 from powderdsl.testing.properties.blame import difference_of_test
 from powderdsl.testing.properties.breaks import breaks
-from powderdsl.testing.properties.keep import file_of, is_kept, kept_examples, read_example, write_example
 from powderdsl.testing.properties.outcomes import (
     Result,
     counterexample_lines,
     difference_lines,
+    file_of,
+    is_kept,
+    kept_examples,
     picture,
+    read_example,
     result_data,
     result_line,
+    write_example,
 )
 from powderdsl.testing.properties.running import Runner
 from powderdsl.testing.properties.search import (
@@ -32,9 +36,7 @@ from powderdsl.testing.properties.search import (
     SearchPlan,
     as_it_is,
     find_property,
-    has_hypothesis,
     told_apart,
-    try_drawn,
 )
 
 
@@ -42,13 +44,11 @@ from powderdsl.testing.properties.search import (
 class TestingReport:
     """One call of the command: what was asked for, and what came of it so far.
 
-    `drawn`: worlds that Hypothesis draws for each property. `keep`: whether counterexamples are kept; None: the usual.
-    `picture`: where the first counterexample is drawn.
+    `keep`: whether counterexamples are kept; None: the usual. `picture`: where the first counterexample is drawn.
     """
 
     backend: str | None
     plan: SearchPlan
-    drawn: int
     keep: bool | None
     picture: Path | None
     as_json: bool
@@ -104,10 +104,6 @@ class TestingReport:
                 search.try_sample(sample, steps)
                 self.say(f"tried again: {prop.owner}: {prop.text}")
         search.try_random()
-        if has_hypothesis():
-            try_drawn(search, self.drawn)
-        elif self.drawn:
-            self.say("Hypothesis is not installed: only random worlds were tried")
         results = search.finish()
         for result in results:
             self._tell(result, runner.ruleset)

@@ -48,7 +48,7 @@ def folder(tmp_path, monkeypatch):
 
 
 def test_invariants_are_proven_or_broken_by_small_worlds(folder):
-    result = powderdsl("test", "yard.yaml", "--json", "--drawn", "20")
+    result = powderdsl("test", "yard.yaml", "--json")
     assert result.exit_code == 1
     (found,) = json.loads(result.stdout).values()
     status = {one["property"]: one["status"] for one in found["properties"] if one["pack"] == "yard"}

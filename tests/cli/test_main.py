@@ -191,7 +191,7 @@ def test_a_closed_pipe_is_no_mistake():
 JSON = {
     "check life": ("check", "life"),
     "show life": ("show", "life"),
-    "test life": ("test", "life", "--drawn", "0", "--examples", "0", "--no-keep"),
+    "test life": ("test", "life", "--examples", "0", "--no-keep"),
     "cache list": ("cache", "list"),
     "trace life": ("trace", "life", "--at", "1,1", "--step", "1", "--size", "8", "--backend", "reference"),
     "bench life": (

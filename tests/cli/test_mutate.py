@@ -9,8 +9,7 @@ import pytest
 
 import powderdsl as package
 from powderdsl.compiler import shipped
-from powderdsl.testing.mutation.original import Original
-from powderdsl.testing.mutation.run import sampled
+from powderdsl.testing.mutation.judging import Original, sampled
 from tests.cli.commands import powderdsl
 
 PACK = """\
@@ -59,7 +58,7 @@ def test_written_tests_pass_and_notice_what_survived_before(folder):
     assert text.endswith("# the end\n")
     rules = package.load("spread.yaml")
     assert len(rules.tests) > 1
-    assert powderdsl("test", "spread.yaml", "--no-keep", "--examples", "10", "--drawn", "0").exit_code == 0
+    assert powderdsl("test", "spread.yaml", "--no-keep", "--examples", "10").exit_code == 0
     after = json.loads(mutate("spread.yaml", "--json").stdout)["spread.yaml"]
     assert after["mutants"] == before["mutants"]
     assert after["survived"] == 0

@@ -282,7 +282,7 @@ def test_tests_that_an_added_pack_changes_are_told_and_do_not_fail() -> None:
     changed = results["an explosion throws sand away"]
     assert (changed.passed, changed.failed, changed.added) == (False, False, ("quake",))
     rules = "core+sand+fire+wind+quake.yaml"
-    result = powderdsl("test", rules, "--examples", "64", "--drawn", "0", "--no-keep")
+    result = powderdsl("test", rules, "--examples", "64", "--no-keep")
     assert result.exit_code == 0, result.output
     assert (
         "differs  wind: an explosion throws sand away\n      with `quake`\n      quake.yaml:7: sand? swaps"
@@ -290,9 +290,7 @@ def test_tests_that_an_added_pack_changes_are_told_and_do_not_fail() -> None:
     )
     assert "differs   core: wall never changes (with `quake`: quake.yaml:7)" in result.output
     assert "come out differently with added packs" in result.output.splitlines()[-1]
-    data = json.loads(
-        powderdsl("test", rules, "--examples", "64", "--drawn", "0", "--no-keep", "--json").stdout
-    )[rules]
+    data = json.loads(powderdsl("test", rules, "--examples", "64", "--no-keep", "--json").stdout)[rules]
     assert next(one for one in data["tests"] if one["test"] == changed.example.name)["added"] == ["quake"]
     (wall,) = (one for one in data["properties"] if one["property"] == "wall never changes")
     assert (wall["status"], wall["difference"]["packs"]) == ("differs", ["quake"])
@@ -301,9 +299,7 @@ def test_tests_that_an_added_pack_changes_are_told_and_do_not_fail() -> None:
 def test_a_test_that_fails_in_its_scope_fails_with_more_packs_too() -> None:
     text = ADDED[0].text + "tests:\n  - nothing grows:\n      given: |\n        # # #\n        # o ~\n"
     text += "      after: 30 steps\n      expect: |\n        # # #\n        # o ?\n"
-    result = powderdsl(
-        "test", f"core+water+stone+sand+{write('moss', text)}", "--examples", "0", "--drawn", "0", "--no-keep"
-    )
+    result = powderdsl("test", f"core+water+stone+sand+{write('moss', text)}", "--examples", "0", "--no-keep")
     assert result.exit_code == 1
     assert "FAIL  moss: nothing grows" in result.output
 

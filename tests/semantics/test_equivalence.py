@@ -8,7 +8,7 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.simulation.simulator import compile
 from powderdsl.testing.generators.cases import load_text
 from powderdsl.testing.mutation.equivalence import proven_equal
-from powderdsl.testing.mutation.original import Invalid, Original, meaning
+from powderdsl.testing.mutation.judging import Invalid, Original, meaning
 from powderdsl.testing.properties.running import first_difference, run_sample
 
 HEAD = """\

@@ -8,9 +8,7 @@ import pytest
 
 from powderdsl.simulation.simulator import compile
 from powderdsl.testing.generators.cases import load_text
-from powderdsl.testing.mutation.judging import broken_invariant
-from powderdsl.testing.mutation.original import Original
-from powderdsl.testing.mutation.run import run_campaign
+from powderdsl.testing.mutation.judging import Original, broken_invariant, run_campaign
 
 ROCK = """\
 pack: rocks

@@ -12,7 +12,7 @@ from types import ModuleType
 
 import pytest
 
-from powderdsl.testing.mutation.run import COUNTED, by_hand_share, noticed_share
+from powderdsl.testing.mutation.judging import COUNTED, by_hand_share, noticed_share
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 
@@ -65,8 +65,7 @@ def test_the_counts_of_a_pack_are_kept_when_others_are_counted_again():
 
 def test_each_pack_is_told_as_soon_as_it_is_counted(monkeypatch):
     from powderdsl.testing.mutation import run
-    from powderdsl.testing.mutation.judging import Verdict
-    from powderdsl.testing.mutation.run import Outcome
+    from powderdsl.testing.mutation.judging import Outcome, Verdict
 
     def judged(rules, packs, numbers, jobs, seed, worlds):
         for number in numbers:

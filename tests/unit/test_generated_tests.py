@@ -7,9 +7,8 @@ import pytest
 from powderdsl.diagnostics import Source
 from powderdsl.simulation.simulator import compile
 from powderdsl.testing.generators.cases import load_text
-from powderdsl.testing.mutation.distinguishing import distinguish
-from powderdsl.testing.mutation.original import Original
-from powderdsl.testing.mutation.written import GeneratedTest, with_tests, written_test
+from powderdsl.testing.mutation.judging import Original
+from powderdsl.testing.mutation.written import GeneratedTest, distinguish, with_tests, written_test
 from powderdsl.testing.pack_tests.runner import run_examples
 
 NEW = GeneratedTest("p", "generated x", "- generated x:\n    given: a\n    expect: a\n")

@@ -9,8 +9,8 @@ import pytest
 from powderdsl.compiler import read, shipped_tests, shipped_variants
 from powderdsl.diagnostics import Reporter, Source
 from powderdsl.model.packs import read_file
-from powderdsl.testing.mutation.operators import mutants_of
 from powderdsl.testing.mutation.mutants import OPERATORS, applied
+from powderdsl.testing.mutation.operators import mutants_of
 
 PACK = """\
 pack: moss

@@ -185,7 +185,7 @@ def test_backends_that_need_torch_say_so() -> None:
     "arguments",
     [
         ("check", "powderworld", "--ledger", "--notes"),
-        ("test", "wishes.yaml", "--examples", "32", "--drawn", "2", "--no-keep"),
+        ("test", "wishes.yaml", "--examples", "32", "--no-keep"),
         ("trace", "powderworld", "--at", "9,9", "--step", "4", "--size", "16x16", "--seed", "2"),
         pytest.param(("check", "turned.yaml"), marks=pytest.mark.campaign),
         pytest.param(("test", "turned.yaml", "--examples", "64", "--no-keep"), marks=pytest.mark.campaign),

@@ -24,7 +24,7 @@ COMMANDS = (
     "check powderworld --quick",
     "check broken.yaml --quick",
     "check life",
-    "test life --examples 40 --drawn 0",
+    "test life --examples 40",
     "compile powderworld --emit model",
     "explain PD301",
     "trace powderworld --world garden --at 10,10 --step 5",

@@ -19,7 +19,6 @@ MAX_SECONDS = 24 * 3600
 @opt.backend(None, "Backend that runs the rules.  [default: wasm]")
 @opt.parameters
 @opt.integer("--examples", 0, 10_000_000, "Random worlds on which each invariant is tried.", 1000)
-@opt.integer("--drawn", 0, 1_000_000, "Additional worlds, drawn by Hypothesis.", 100)
 @opt.integer("--seconds", 1, MAX_SECONDS, "Time limit for random worlds, per RULES, in seconds.", 60)
 @opt.integer("--seed", 0, 2**31 - 1, "Seed of the random worlds.", 0)
 @opt.path("--replay", "FILE", "Only try this counterexample again.")
@@ -50,7 +49,6 @@ def command(
     backend: str | None,
     settings: dict[str, str],
     examples: int,
-    drawn: int,
     seconds: int,
     seed: int,
     replay: Path | None,
@@ -86,9 +84,7 @@ def command(
     from powderdsl.cli.testing_report import TestingReport
     from powderdsl.testing.properties.search import SearchPlan
 
-    session = TestingReport(
-        backend, SearchPlan(examples, float(seconds), seed), drawn, keep, picture, as_json
-    )
+    session = TestingReport(backend, SearchPlan(examples, float(seconds), seed), keep, picture, as_json)
     for name in rules or shipped_tests():
         ruleset = opt.load_rules(name, settings)
         if replay is not None:

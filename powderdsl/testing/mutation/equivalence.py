@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, field
+from math import lcm, prod
+from typing import Any
+
+import numpy as np
+
 from powderdsl.ir.lower.rules import lower_pass, lower_substep, slot_names
-from powderdsl.ir.ops import Graph, Node
+from powderdsl.ir.ops import COMMUTATIVE, OPS, REAL, Graph, Node, Offset
 from powderdsl.model.state import slots
 from powderdsl.model.types import Pass, Ruleset
-from powderdsl.testing.mutation.equal_nodes import Cells, Comparison, Holders
 
 
 def proven_equal(first: Ruleset, second: Ruleset) -> bool:
@@ -92,3 +98,368 @@ def _same_writes(first: dict[str, Node], second: dict[str, Node], graph: Graph, 
         if not compare.equal(one or kept, other or kept):
             return False
     return True
+
+
+Array = np.ndarray[Any, Any]
+Variable = tuple[Hashable, ...]
+
+MAX_CASES = 1 << 21
+"""Assignments that are tried for one question."""
+
+MAX_WORK = 1_000_000_000
+"""Assignments times nodes that are evaluated for one mutant. Proofs end by work, so they are the same on any machine."""
+
+VISIT = 200
+"""Work for a node that is looked at to find the variables, whether the question is decided or not."""
+
+MAX_VALUES = 301
+"""Values of one variable."""
+
+
+class Undecided(Exception):
+    """A question is too large."""
+
+
+@dataclass(frozen=True)
+class Holders:
+    """The elements whose cells can hold anything in a slot, and by id what cells of the others hold there."""
+
+    ids: frozenset[int]
+    usual: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Facts about cells: values that an input can hold, and inputs that only some elements are free to hold."""
+
+    domains: Mapping[str, tuple[int, ...]]
+    holders: Mapping[str, Holders]
+
+
+@dataclass
+class Comparison:
+    """Compares nodes of one graph. It remembers what it has decided, and how much work is left."""
+
+    cells: Cells
+    left: int = MAX_WORK
+    _known: dict[tuple[int, int], bool] = field(default_factory=dict)
+
+    def equal(self, a: Node, b: Node) -> bool:
+        """True is a proof; False means that they differ, or that it could not be decided."""
+        if a is b:
+            return True
+        key = (a.index, b.index) if a.index < b.index else (b.index, a.index)
+        if key not in self._known:
+            self._known[key] = False  # for questions that lead back to this one
+            self._known[key] = (
+                self._alike(a, b) or self._simpler(a, b) or self._simpler(b, a) or self._tried(a, b)
+            )
+        return self._known[key]
+
+    def _alike(self, a: Node, b: Node) -> bool:
+        """The same operation on equal parts."""
+        if a.op != b.op or a.attr != b.attr or len(a.args) != len(b.args) or not a.args:
+            return False
+        if all(self.equal(x, y) for x, y in zip(a.args, b.args, strict=True)):
+            return True
+        turned = a.op in COMMUTATIVE and (a.type != REAL or a.args[0].type != REAL)
+        return turned and all(self.equal(x, y) for x, y in zip(a.args, reversed(b.args), strict=True))
+
+    def _simpler(self, a: Node, b: Node) -> bool:
+        """A choice of which only one branch is ever taken, a movement in which nothing moves."""
+        if a.op == "select":
+            condition, yes, no = a.args
+            return (self.never(condition) and self.equal(no, b)) or (
+                self.always(condition) and self.equal(yes, b)
+            )
+        if a.op in ("swap", "arrive"):
+            return self.never(a.args[1]) and self.equal(a.args[2], b)
+        return False
+
+    def never(self, flag: Node) -> bool:
+        """Whether a flag is false everywhere."""
+        return self._holds(flag, lambda value: not value.any())
+
+    def always(self, flag: Node) -> bool:
+        """Whether a flag is true everywhere."""
+        return self._holds(flag, lambda value: bool(value.all()))
+
+    def _holds(self, flag: Node, question: Callable[[Array], bool]) -> bool:
+        return self._decided((flag,), lambda case: question(case.value(flag, (0, 0))[case.valid]))
+
+    def _tried(self, a: Node, b: Node) -> bool:
+        if REAL in (a.type, b.type):
+            return False
+        return self._decided(
+            (a, b),
+            lambda case: bool((case.value(a, (0, 0)) == case.value(b, (0, 0)))[case.valid].all()),
+        )
+
+    def _decided(self, roots: tuple[Node, ...], question: Callable[[_Cases], bool]) -> bool:
+        """Whether something holds in every case. If there are too many, counts of other cells may be any number."""
+        for counted in (False, True):
+            try:
+                return question(_Cases(roots, self.cells, self, counted))
+            except (Undecided, RecursionError):
+                continue
+        return False
+
+    def spend(self, work: int) -> None:
+        self.left -= work
+        if self.left < 0:
+            raise Undecided
+
+
+def _plus(a: Offset, b: Offset) -> Offset:
+    return a[0] + b[0], a[1] + b[1]
+
+
+def _minus(a: Offset, b: Offset) -> Offset:
+    return a[0] - b[0], a[1] - b[1]
+
+
+def _reads(node: Node, at: Offset) -> list[tuple[Node, Offset]]:
+    """The parts of a node and where they are read."""
+    match node.op:
+        case "shift":
+            return [(node.args[0], _plus(at, node.attr[:2]))]
+        case "count":
+            return [(node.args[0], _plus(at, (dy, dx))) for dy, dx, _ in node.attr[0]]
+        case "swap":
+            content, movers, rest = node.args
+            there, back = _plus(at, node.attr), _minus(at, node.attr)
+            return [(movers, at), (content, there), (movers, back), (content, back), (rest, at)]
+        case "arrive":
+            content, movers, rest = node.args
+            back = _minus(at, node.attr)
+            return [(movers, back), (content, back), (rest, at)]
+    return [(arg, at) for arg in node.args]
+
+
+def _is_free(node: Node) -> bool:
+    """Whether a node that is not a float is a variable of its own: it depends on some, or on a parameter."""
+    if node.op in ("param", "inside", "draw", "sqrt"):
+        return node.op != "inside"
+    if node.op == "below":
+        return node.args[0].op != "const"
+    return any(arg.type == REAL for arg in node.args)
+
+
+class _Cases:
+    """All assignments to the variables that some nodes depend on, and the nodes' values in each.
+
+    Args:
+        counted: take what a count finds in other cells for a variable of its own. More cases than there are can only
+            refute.
+
+    Raises:
+        Undecided: there are too many.
+    """
+
+    def __init__(self, roots: tuple[Node, ...], cells: Cells, work: Comparison, counted: bool):
+        self.cells, self.work, self.counted = cells, work, counted
+        self.inputs: dict[Variable, Node] = {}
+        self.uses: dict[Variable, set[Hashable]] = {}
+        """The questions about each input: its value, or only whether it is in a set."""
+        self.thresholds: dict[str, list[int]] = {}
+        self.moduli: dict[str, int] = {}
+        nodes = self._find_inputs(roots)
+        domains = {name: self._domain(name, node) for name, node in self.inputs.items()}
+        self.size = prod(len(values) for values in domains.values())
+        if self.size > MAX_CASES:
+            raise Undecided
+        work.spend(self.size * max(nodes, 1))
+        self.variables: dict[Variable, Array] = {}
+        """For each, its value in each case."""
+        stride = 1
+        number = np.arange(self.size)
+        for name, values in domains.items():
+            self.variables[name] = np.asarray(values, np.int32)[number // stride % len(values)]
+            stride *= len(values)
+        self.valid = self._valid()
+        self._values: dict[tuple[int, Offset], Array] = {}
+
+    def _find_inputs(self, roots: tuple[Node, ...]) -> int:
+        """Find the variables; the number of nodes that were looked at."""
+        seen: set[tuple[int, Offset]] = set()
+        stack: list[tuple[Node, Offset, Hashable]] = [(root, (0, 0), "value") for root in roots]
+        while stack:
+            node, at, use = stack.pop()
+            if node.op == "input" and node.type != REAL:
+                name: Variable = ("input", node.attr, at)
+                self.inputs[name] = node
+                self.uses.setdefault(name, set()).add(use)
+                continue
+            if (node.index, at) in seen:
+                continue
+            seen.add((node.index, at))
+            self.work.spend(VISIT)
+            if len(seen) > 20_000 or node.type == REAL:  # floats only through a comparison, which is free
+                raise Undecided
+            self.inputs.update(dict.fromkeys(self._own_variables(node, at), node))
+            if _is_free(node):
+                continue
+            if node.op == "below":
+                cuts = self.thresholds.get(node.attr[0], [])
+                self.thresholds[node.attr[0]] = sorted({*cuts, node.args[0].attr})
+                continue
+            if node.op == "coordinate":
+                self.moduli[node.attr[0]] = lcm(self.moduli.get(node.attr[0], 1), node.attr[1])
+            asked: Hashable = (node.op, node.attr) if node.op in ("in_set", "table") else "value"
+            for part, place in _reads(node, at):
+                if not (self.counted and node.op == "count" and place != at):
+                    stack.append((part, place, asked))
+        return len(seen)
+
+    def _own_variables(self, node: Node, at: Offset) -> list[Variable]:
+        """The variables that a node reads itself, besides those of its parts."""
+        if _is_free(node):
+            return [("free", node.index, _at(node, at))]
+        match node.op:
+            case "coordinate":
+                return [("coordinate", node.attr[0], _at(node, at))]
+            case "inside":
+                return [("inside", at, node.attr)]
+            case "below":
+                return [("draw", node.attr[0], at)]
+            case "shift" if not node.attr[2]:
+                return [("inside", at, node.attr[:2])]
+            case "count" if self.counted:
+                return [_others(node, at)]
+            case "count" if not node.attr[1]:
+                return [("inside", at, (dy, dx)) for dy, dx, _ in node.attr[0] if (dy, dx) != (0, 0)]
+        return []
+
+    def _domain(self, name: Variable, node: Node) -> list[int]:
+        """The values of a variable that can make a difference."""
+        low, high = node.type.lo, node.type.hi
+        match name[0]:
+            case "inside":
+                return [0, 1]
+            case "coordinate":
+                return list(range(self.moduli[str(name[1])]))
+            case "draw":
+                return list(range(len(self.thresholds[str(name[1])]) + 1))
+            case "counted":
+                held = node.args[0].type
+                ends = [(0, w * held.lo, w * held.hi) for dy, dx, w in node.attr[0] if (dy, dx) != (0, 0)]
+                low, high = sum(map(min, ends)), sum(map(max, ends))
+        values: Sequence[int] = range(low, high + 1)
+        if name[0] == "input":
+            values = self.cells.domains.get(str(name[1])) or values
+        if len(values) > MAX_VALUES:
+            raise Undecided
+        return self._told_apart(name, values) if name[0] == "input" else list(values)
+
+    def _told_apart(self, name: Variable, values: Sequence[int]) -> list[int]:
+        """One of each kind of values that the questions about an input tell apart."""
+        asked = set(self.uses[name])
+        if name[1] == "element":
+            for other, holders in self.cells.holders.items():
+                if ("input", other, name[2]) in self.uses:
+                    asked |= {("in_set", holders.ids), ("table", holders.usual)}
+        if "value" in asked:
+            return list(values)
+        kinds: dict[tuple[object, ...], int] = {}
+        questions: list[Any] = sorted(asked, key=repr)
+        for value in values:
+            kinds.setdefault(tuple(_answer(value, *question) for question in questions), value)
+        return list(kinds.values())
+
+    def _valid(self) -> Array:
+        """The cases that can be: where an element is not free to hold a value, there is the usual one."""
+        valid = np.ones(self.size, bool)
+        for name, values in self.variables.items():
+            element = self.variables.get(("input", "element", name[2])) if name[0] == "input" else None
+            if element is not None and name[1] in self.cells.holders:
+                holders = self.cells.holders[str(name[1])]
+                usual = np.asarray(holders.usual, np.int32)[element]
+                valid &= np.isin(element, sorted(holders.ids)) | (values == usual)
+        return valid
+
+    def value(self, node: Node, at: Offset) -> Array:
+        """The node's value at a place, in each case."""
+        key = (node.index, at)
+        if key not in self._values:
+            self._values[key] = self._value(node, at)
+        return self._values[key]
+
+    def _value(self, node: Node, at: Offset) -> Array:
+        if node.op == "input":
+            return self.variables[("input", node.attr, at)]
+        own = [self.variables[name] for name in self._own_variables(node, at)]
+        if _is_free(node):
+            return own[0]
+        match node.op:
+            case "const":
+                return np.full(self.size, int(node.attr), np.int32)
+            case "coordinate":
+                number = own[0] % node.attr[1]
+                return number >> node.attr[2] & 1 if len(node.attr) > 2 else number
+            case "inside":
+                return own[0]
+            case "below":
+                place = self.thresholds[node.attr[0]].index(node.args[0].attr)
+                return (own[0] <= place).astype(np.int32)
+            case "count":
+                return self._count(node, at)
+        parts = [self.value(part, place) for part, place in _reads(node, at)]
+        if node.op == "shift":  # nothing beyond the edge, unless it wraps
+            return parts[0] * own[0] if own else parts[0]
+        evaluate = _EVALUATE.get(node.op, OPS[node.op].evaluate)
+        if evaluate is None:
+            raise Undecided
+        found: Array = evaluate(node.attr, *parts)
+        return found.astype(np.int32)
+
+    def _count(self, node: Node, at: Offset) -> Array:
+        weights, wraps = node.attr
+        total = np.zeros(self.size, np.int32)
+        if self.counted:
+            total += self.variables[_others(node, at)]
+            weights = tuple(weight for weight in weights if weight[:2] == (0, 0))
+        for dy, dx, weight in weights:
+            held = self.value(node.args[0], _plus(at, (dy, dx)))
+            if not wraps and (dy, dx) != (0, 0):
+                held = held * self.variables[("inside", at, (dy, dx))]
+            total += weight * held
+        return total
+
+
+def _others(node: Node, at: Offset) -> Variable:
+    """A count's share from other cells, as a variable: the same one if only the cell itself makes a difference."""
+    weights, wraps = node.attr
+    return "counted", node.args[0].index, wraps, tuple(sorted(w for w in weights if w[:2] != (0, 0))), at
+
+
+def _at(node: Node, at: Offset) -> Offset:
+    """Where a variable stands: numbers of the whole world stand nowhere."""
+    everywhere = node.op == "param" or (node.op == "coordinate" and node.attr[0] == "step")
+    return (0, 0) if everywhere else at
+
+
+def _answer(value: int, op: str, attr: Any) -> object:
+    """The answer of `in_set` or `table` for a value."""
+    if op == "in_set":
+        return value in attr
+    return attr[value] if 0 <= value < len(attr) else None
+
+
+_EVALUATE: dict[str, Callable[..., Any]] = {
+    "not": lambda attr, a: 1 - a,
+    "and": lambda attr, a, b: a & b,
+    "or": lambda attr, a, b: a | b,
+    "xor": lambda attr, a, b: a ^ b,
+    "in_set": lambda attr, a: np.isin(a, sorted(attr)),
+    "table": lambda attr, a: np.asarray(attr, np.int32)[np.clip(a, 0, len(attr) - 1)],
+    "min": lambda attr, a, b: np.minimum(a, b),
+    "max": lambda attr, a, b: np.maximum(a, b),
+    "quotient": lambda attr, a, b: np.where(b == 0, 0, a // np.where(b == 0, 1, b)),
+    "select": lambda attr, c, a, b: np.where(c != 0, a, b),
+    "swap": lambda attr, moves, there, target, back, rest: np.where(
+        moves != 0, there, np.where(target != 0, back, rest)
+    ),
+    "arrive": lambda attr, target, back, rest: np.where(target != 0, back, rest),
+}
+"""Exact evaluation of the operations that read cells, look up values, or work on flags, and of those that `OPS` has for
+numbers only."""

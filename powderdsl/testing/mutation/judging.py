@@ -1,16 +1,34 @@
-"""Judges a mutant: the checker, an invariant that a world breaks, or a test notices it, or a proof that nothing can."""
+"""Judges mutants: the checker, an invariant that a world breaks, or a test notices one, or a proof that nothing can.
+
+Mutants are held against the composition without any mistake, which is loaded and run once. Several processes judge.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
-from functools import lru_cache
+import os
+import re
+import signal
+from collections import Counter
+from collections.abc import Generator, Iterable, Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+from multiprocessing import Pipe, get_context
+from multiprocessing.connection import Connection, wait
+from threading import Thread
 
 import numpy as np
 
 from powderdsl.analysis.proofs import horizon
-from powderdsl.compiler import starting_backend
-from powderdsl.diagnostics import CompileError
+from powderdsl.compiler import lower, read, starting_backend
+from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Severity, Source
+from powderdsl.ir.text import print_program
+from powderdsl.model.check import check
+from powderdsl.model.declarations import PackDecl, RulesetDecl
+from powderdsl.model.fingerprint import fingerprint
+from powderdsl.model.packs import read_file
+from powderdsl.model.parameter_values import set_params
 from powderdsl.model.state import slots
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Example, Invariant, Local, Ruleset, Symmetric
@@ -18,11 +36,155 @@ from powderdsl.simulation.simulator import Simulator, compile
 from powderdsl.testing.generators.cases import Array, Start
 from powderdsl.testing.mutation.equivalence import proven_equal
 from powderdsl.testing.mutation.mutants import Mutant
-from powderdsl.testing.mutation.original import Batch, Invalid, Original, is_generated, lowered, meaning
+from powderdsl.testing.mutation.operators import mutants_of
+from powderdsl.testing.mutation.written import GeneratedTest, distinguish, written_test
 from powderdsl.testing.pack_tests.runner import run_examples
 from powderdsl.testing.properties.breaks import breaks, is_paired, look, steps_for
-from powderdsl.testing.properties.running import first_difference, run_sample
-from powderdsl.testing.properties.samples import State
+from powderdsl.testing.properties.running import State, first_difference, joined, random_samples, run_sample
+from powderdsl.testing.properties.search import STEPS
+
+Settings = tuple[tuple[str, str], ...]
+"""Parameters and their values as text."""
+
+WORLDS = 1000
+"""Random worlds that invariants are tried on, as many as `powderdsl test` tries."""
+
+GENERATED = "generated "
+"""How names of tests begin that the tool has written: they are counted apart from those written by hand."""
+
+
+class Invalid(Exception):
+    """A text that is not a rule file: a mistake of spelling, not of meaning."""
+
+
+def is_generated(example: Example) -> bool:
+    """Whether a test was written by the tool."""
+    return example.name.startswith(GENERATED)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Start worlds of one shape, several times: once for each set of elements that some invariant leaves out.
+
+    `states` are the original's, at the start and after each step; `group` [B] says which set is left out.
+    """
+
+    sample: Start
+    steps: int
+    group: np.ndarray
+    states: list[State]
+
+
+@dataclass(eq=False)
+class Original:
+    """A composition, loaded once for all its mutants."""
+
+    rules: str
+    settings: Settings
+    packs: list[PackDecl]
+    declaration: RulesetDecl | None
+    ruleset: Ruleset
+    warnings: Counter[str]
+    _batches: list[Batch] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, rules: str, settings: Settings = ()) -> Original:
+        """Load it, with other values for parameters. Raises CompileError."""
+        reporter = Reporter()
+        packs, declaration = read([rules], reporter)
+        reporter.raise_if_errors()
+        ruleset = set_params(check(packs, declaration, reporter), dict(settings), reporter)
+        reporter.raise_if_errors()
+        return cls(rules, settings, packs, declaration, ruleset, warnings_of(reporter.diagnostics))
+
+    def mutants(self, only: frozenset[str] = frozenset()) -> list[Mutant]:
+        """The mutants of all packs, or of some, in the order of the packs and their files."""
+        return [
+            mutant
+            for pack in self.packs
+            if not only or pack.name.text in only
+            for mutant in mutants_of(pack, self.packs)
+        ]
+
+    def mutated(self, mutant: Mutant) -> tuple[Ruleset, Counter[str]]:
+        """The model with the mistake and its warnings. Raises CompileError; Invalid if it cannot even be read."""
+        reporter = Reporter()
+        decl = read_file(Source(mutant.source.name, mutant.text), reporter)
+        if reporter.has_errors or not isinstance(decl, PackDecl):
+            raise Invalid
+        packs = [decl if pack.name.text == mutant.pack else pack for pack in self.packs]
+        ruleset = set_params(check(packs, self.declaration, reporter), dict(self.settings), reporter)
+        reporter.raise_if_errors()
+        return ruleset, warnings_of(reporter.diagnostics)
+
+    @cached_property
+    def sim(self) -> Simulator:
+        return compile(self.ruleset, backend=starting_backend("cpu"))
+
+    @cached_property
+    def failing(self) -> frozenset[str]:
+        """Names of tests that fail without any mistake: their failing says nothing."""
+        return frozenset(
+            one.example.name for one in run_examples(self.ruleset, sim=self.sim) if not one.passed
+        )
+
+    @cached_property
+    def meaning(self) -> str:
+        return meaning(self.ruleset)
+
+    @cached_property
+    def lowered(self) -> str:
+        return lowered(self.ruleset)
+
+    @cached_property
+    def withouts(self) -> tuple[frozenset[int], ...]:
+        """The sets of elements that invariants leave out; the empty one comes first."""
+        return tuple(dict.fromkeys([frozenset[int](), *(one.without for one in self.ruleset.invariants)]))
+
+    @cached_property
+    def samples(self) -> list[Start]:
+        """The worlds that `powderdsl test` tries first."""
+        return list(random_samples(self.ruleset, 0, WORLDS))
+
+    def batches(self) -> Iterator[Batch]:
+        """The samples with the original's states, which are kept: the first use runs them."""
+        for number, sample in enumerate(self.samples):
+            if number == len(self._batches):
+                some = [sample.without(gone, self.ruleset) for gone in self.withouts]
+                whole = joined(some, self.ruleset)
+                steps = STEPS[number % len(STEPS)]
+                states, _ = run_sample(self.sim, whole, steps)
+                group = np.repeat(np.arange(len(some)), len(sample))
+                self._batches.append(Batch(whole, steps, group, states))
+            yield self._batches[number]
+
+
+def warnings_of(diagnostics: tuple[Diagnostic, ...]) -> Counter[str]:
+    """How often each warning is given, by code."""
+    return Counter(one.code for one in diagnostics if one.severity is Severity.WARNING)
+
+
+def meaning(ruleset: Ruleset) -> str:
+    """A fingerprint of the model: compositions with the same one turn every world into the same."""
+    return fingerprint(replace(ruleset, tests=(), invariants=(), about=""))
+
+
+def lowered(ruleset: Ruleset) -> str:
+    """The optimized program as text, with all that it reads: equal texts compute equal worlds."""
+    lines = [line.partition("#")[0] for line in print_program(lower(ruleset)).splitlines()]
+    fixed = (
+        [(e.name, e.id) for e in ruleset.elements],
+        [(p.name, p.values, sorted(p.stored)) for p in ruleset.properties],
+        [
+            (f.name, f.kind, f.default, f.at, f.resets, sorted(f.of) if f.of is not None else None)
+            for f in ruleset.fields
+        ],
+        [(p.name, p.kind, p.default) for p in ruleset.params],
+    )
+    return "\n".join([*lines, repr(fixed)])
+
+
+# Verdicts
 
 NOTICED = ("check", "invariant", "test", "generated")
 """The checks that may notice a mutant. `test`: tests written by hand; the quick ones run before invariants."""
@@ -222,3 +384,161 @@ def _broken_in(
 def same_state(first: Ruleset, second: Ruleset) -> bool:
     """Whether worlds of one composition hold what worlds of the other hold."""
     return slots(first) == slots(second) and [p.name for p in first.params] == [p.name for p in second.params]
+
+
+# Campaigns
+
+COUNTED = ("mutants", "equivalent", "killed", *NOTICED, "survived")
+"""Keys of a tally. `killed` is the sum of what noticed them; texts that are not rule files are not counted."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """A mutant by its place among all of a composition."""
+
+    rules: str
+    settings: Settings
+    packs: tuple[str, ...]
+    number: int
+    seed: int
+    worlds: bool
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The verdict on a mutant. `size` is that of a world that shows a survivor: (rows, columns, steps)."""
+
+    number: int
+    verdict: Verdict
+    size: tuple[int, int, int] | None = None
+    slot: str = ""
+    test: GeneratedTest | None = None
+
+
+def sampled(mutants: list[Mutant], most: int | None, seed: int) -> list[int]:
+    """Places of at most `most` mutants, each pack and kind of mistake in proportion, the same for the same seed."""
+    everything = list(range(len(mutants)))
+    if most is None or most >= len(mutants):
+        return everything
+    strata: dict[tuple[str, str], list[int]] = {}
+    for number in everything:
+        strata.setdefault((mutants[number].pack, mutants[number].operator), []).append(number)
+    random = np.random.default_rng(seed)
+    ranked: list[tuple[float, int]] = []
+    for numbers in strata.values():
+        order = random.permutation(len(numbers))
+        start = random.random()
+        ranked += [
+            ((rank + start) / len(numbers), numbers[place]) for rank, place in enumerate(order.tolist())
+        ]
+    return sorted(number for _, number in sorted(ranked)[:most])
+
+
+def run_campaign(
+    rules: str,
+    packs: tuple[str, ...],
+    numbers: list[int],
+    jobs: int,
+    seed: int,
+    worlds: bool = True,
+    settings: Settings = (),
+) -> Generator[Outcome]:
+    """Outcomes of mutants in the order in which they come.
+
+    Nothing is cut short by a clock: `check`, proofs and searches end by work, worlds and tests have a size. So outcomes
+    are the same on a slow or busy machine.
+
+    Args:
+        numbers: places of the mutants among those of `Original.mutants`.
+        worlds: look for a world that shows each survivor.
+        settings: other values for parameters.
+
+    Raises:
+        OSError: a process was killed, as where memory is short.
+    """
+    _loaded.cache_clear()  # files may have changed since
+    tasks = [Task(rules, settings, packs, number, seed, worlds) for number in numbers]
+    if jobs == 1:
+        yield from map(work, tasks)
+        return
+    lifeline, ours = Pipe(duplex=False)
+    # A fork of a process with threads of torch's may hang.
+    pool = ProcessPoolExecutor(jobs, get_context("spawn"), _begin_process, (lifeline,))
+    try:
+        for done in as_completed([pool.submit(work, task) for task in tasks]):
+            yield done.result()
+    except BrokenProcessPool:
+        raise OSError("a process that judged mutants was killed; fewer `--jobs` need less memory") from None
+    finally:
+        ours.close()
+        pool.shutdown(cancel_futures=True)
+
+
+def _begin_process(lifeline: Connection) -> None:
+    """Ignore Ctrl-C, which is for the process that started this one, and end when that ends or closes the pipe."""
+
+    def watch() -> None:
+        wait([lifeline])
+        os._exit(1)
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    Thread(target=watch, daemon=True).start()
+
+
+@lru_cache(maxsize=1)
+def _loaded(rules: str, settings: Settings, packs: tuple[str, ...]) -> tuple[Original, list[Mutant]]:
+    original = Original.of(rules, settings)
+    return original, original.mutants(frozenset(packs))
+
+
+def work(task: Task) -> Outcome:
+    """Judge one mutant."""
+    original, mutants = _loaded(task.rules, task.settings, task.packs)
+    mutant = mutants[task.number]
+    verdict = judge(original, mutant)
+    if verdict.status != "survived" or not task.worlds:
+        return Outcome(task.number, verdict)
+    ruleset, _ = original.mutated(mutant)
+    focus = focused(original, mutant)
+    found = distinguish(original.sim, compile(ruleset, backend=starting_backend("cpu")), focus, task.seed)
+    if found is None:
+        return Outcome(task.number, verdict)
+    rows, columns = found.sample.shape
+    test = written_test(mutant, found, original.sim, original.packs)
+    return Outcome(task.number, verdict, (rows, columns, found.steps), found.slot, test)
+
+
+def focused(original: Original, mutant: Mutant) -> tuple[int, ...]:
+    """Elements that a mutant is likely to be about: its lines name them, one of their tags or a set."""
+    words = set(re.findall(r"\w+", mutant.diff))
+    tags = words & {tag.name.text for pack in original.packs for tag in pack.tags}
+    own = {element.name for element in original.ruleset.elements if element.pack == mutant.pack}
+    return tuple(
+        element.id
+        for element in original.ruleset.elements
+        if element.name in words or element.tags & tags or element.name in own
+    )
+
+
+def tally(outcomes: Iterable[Outcome]) -> dict[str, int]:
+    """Numbers of mutants by COUNTED."""
+    counts: Counter[str] = Counter()
+    for outcome in outcomes:
+        verdict = outcome.verdict
+        if verdict.status != "invalid":
+            counts["mutants"] += 1
+            counts[verdict.status] += 1
+            counts[verdict.by if verdict.status == "killed" else ""] += 1
+    return {key: counts[key] for key in COUNTED}
+
+
+def noticed_share(counts: dict[str, int]) -> float:
+    """The part of the mutants that are not proven equivalent which something notices; 1 if there are none."""
+    real = counts["mutants"] - counts["equivalent"]
+    return counts["killed"] / real if real else 1.0
+
+
+def by_hand_share(counts: dict[str, int]) -> float:
+    """Of the mutants that invariants and tests notice, the part that those written by hand notice; 1 if there are none."""
+    tested = counts["invariant"] + counts["test"] + counts["generated"]
+    return (tested - counts["generated"]) / tested if tested else 1.0

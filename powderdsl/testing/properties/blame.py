@@ -19,12 +19,12 @@ from powderdsl.testing.properties.outcomes import Counterexample, Property
 from powderdsl.testing.properties.running import (
     MARK,
     Runner,
+    State,
     marked,
     reference_states,
     reference_step,
     rule_spans,
 )
-from powderdsl.testing.properties.samples import State
 
 MOST = 8
 """Added packs that are left out in turn, to see which of them matter."""

@@ -12,8 +12,15 @@ from powderdsl.model import reference
 from powderdsl.model.state import slots
 from powderdsl.model.types import Bounded, Claim, Local, Never, Ruleset, Symmetric, Total, Unchanging
 from powderdsl.testing.generators.cases import Array, Start, fresh, property_table
-from powderdsl.testing.properties.running import context, reference_states
-from powderdsl.testing.properties.samples import State, turned_back, turned_cells, turned_sample, turned_state
+from powderdsl.testing.properties.running import (
+    State,
+    context,
+    reference_states,
+    turned_back,
+    turned_cells,
+    turned_sample,
+    turned_state,
+)
 
 
 @dataclass(frozen=True)

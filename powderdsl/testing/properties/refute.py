@@ -20,7 +20,7 @@ from powderdsl.testing.generators.cases import Start
 from powderdsl.testing.properties.blame import Oracle
 from powderdsl.testing.properties.breaks import Alike
 from powderdsl.testing.properties.outcomes import Result, counterexample_lines
-from powderdsl.testing.properties.samples import random_samples
+from powderdsl.testing.properties.running import random_samples
 from powderdsl.testing.properties.search import (
     InvariantSearch,
     SearchPlan,

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from importlib.util import find_spec
 from time import monotonic
 
 from powderdsl.analysis.changes import RuleLine
@@ -18,7 +16,6 @@ from powderdsl.model.restrict import restricted
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Never, Ruleset, Symmetric, Total
 from powderdsl.simulation.draw import shown_fields
-from powderdsl.system.user_cache import cache_folder
 from powderdsl.testing.generators.cases import Start
 from powderdsl.testing.properties.blame import Oracle, culprits, difference, translated
 from powderdsl.testing.properties.breaks import (
@@ -34,8 +31,7 @@ from powderdsl.testing.properties.breaks import (
     steps_for,
 )
 from powderdsl.testing.properties.outcomes import Counterexample, Property, Result
-from powderdsl.testing.properties.running import Runner
-from powderdsl.testing.properties.samples import LARGE, random_samples
+from powderdsl.testing.properties.running import LARGE, Runner, random_samples
 from powderdsl.testing.properties.shrink import Work, shrink
 
 AUTOMATIC = "automatic"
@@ -45,9 +41,6 @@ STEPS = (3, 3, 3, 10)
 
 COPIES = 1024
 """How often a world runs where only frequencies can be compared."""
-
-DRAWN_STEPS = 3
-"""How many steps worlds run that Hypothesis draws."""
 
 FEW = {Agreement: 2, Alike: 2, Never: 8}
 """Batches for claims that are expensive to check: by the oracle, in many copies, over many steps."""
@@ -304,45 +297,3 @@ def _ledger_claims(ruleset: Ruleset, ledger: Ledger) -> Iterator[tuple[Total, st
                 Total(member(ELEMENT_HERE, numbers), trend, frozenset(numbers)),
                 f"count({', '.join(names)}) {verb}",
             )
-
-
-# Worlds that Hypothesis draws: it looks for them where random numbers rarely go
-
-
-def has_hypothesis() -> bool:
-    return find_spec("hypothesis") is not None
-
-
-def try_drawn(search: InvariantSearch, examples: int) -> int:
-    """Check the properties on worlds that Hypothesis draws, the same for the same seed; the number of worlds.
-
-    It makes nothing small: `shrink` tries hundreds of smaller worlds in one batch.
-    """
-    if examples == 0:
-        return 0
-    if "hypothesis" not in sys.modules:  # it would put a folder of its own into the working directory
-        from hypothesis.configuration import set_hypothesis_home_dir
-
-        set_hypothesis_home_dir(cache_folder("hypothesis"))
-    from hypothesis import HealthCheck, Phase, given, seed, settings
-
-    from powderdsl.testing.generators.strategies import worlds
-
-    count = 0
-
-    @seed(search.plan.seed)
-    @settings(
-        max_examples=examples,
-        database=None,
-        deadline=None,
-        phases=[Phase.generate],
-        suppress_health_check=list(HealthCheck),
-    )
-    @given(worlds(search.runner.ruleset, max_batch=2, max_side=9))
-    def run(start: Start) -> None:
-        nonlocal count
-        count += 1
-        search.try_sample(start.seeded(), DRAWN_STEPS)
-
-    run()
-    return count
