@@ -37,7 +37,7 @@ from powderdsl.testing.generators.cases import Array, Start
 from powderdsl.testing.mutation.equivalence import proven_equal
 from powderdsl.testing.mutation.mutants import Mutant
 from powderdsl.testing.mutation.operators import mutants_of
-from powderdsl.testing.mutation.written import GeneratedTest, distinguish, written_test
+from powderdsl.testing.mutation.written import GENERATED, GeneratedTest, distinguish, written_test
 from powderdsl.testing.pack_tests.runner import run_examples
 from powderdsl.testing.properties.breaks import breaks, is_paired, look, steps_for
 from powderdsl.testing.properties.running import State, first_difference, joined, random_samples, run_sample
@@ -48,9 +48,6 @@ Settings = tuple[tuple[str, str], ...]
 
 WORLDS = 1000
 """Random worlds that invariants are tried on, as many as `powderdsl test` tries."""
-
-GENERATED = "generated "
-"""How names of tests begin that the tool has written: they are counted apart from those written by hand."""
 
 
 class Invalid(Exception):

@@ -21,12 +21,14 @@ from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.syntax.yaml_tree import Mapping, parse_yaml
 from powderdsl.syntax.yaml_tree import Sequence as YamlSequence
 from powderdsl.testing.generators.cases import Array, Start
-from powderdsl.testing.mutation.judging import GENERATED
 from powderdsl.testing.mutation.mutants import Mutant
 from powderdsl.testing.pack_tests.fields import field_rows
 from powderdsl.testing.pack_tests.runner import ANYTHING, SEEDS
 from powderdsl.testing.properties.running import State, first_difference, random_samples, run_sample
 from powderdsl.testing.properties.shrink import Work, shrink_while
+
+GENERATED = "generated "
+"""How names of tests begin that the tool has written: they are counted apart from those written by hand."""
 
 LETTERS = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789"
 
