@@ -7,6 +7,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from powderdsl.arrays import NDArray, np
 from powderdsl.diagnostics import CompileError, Reporter
 from powderdsl.syntax.sources import read_source
@@ -19,29 +21,15 @@ Tree = str | list["Tree"] | dict[str, "Tree"]
 """YAML as Python values; every scalar is text."""
 
 
-def write_yaml(tree: Tree, indent: str = "") -> str:
+class _Dumper(yaml.SafeDumper):
+    """Writes every scalar as text, without quotes where that is possible."""
+
+    yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012  # PyYAML's own name
+
+
+def write_yaml(tree: Tree) -> str:
     """Block-style YAML of nested mappings, lists and texts."""
-    if isinstance(tree, str):
-        plain = (
-            tree
-            and tree[0] not in "#-%?@`\"'[]{}&*!|>,:"
-            and ": " not in tree
-            and " #" not in tree
-            and not tree.endswith(":")
-        )
-        return (
-            f" {tree}\n" if plain or (len(tree) > 1 and tree[0] == "-" and tree[1] != " ") else f" '{tree}'\n"
-        )
-    lines = []
-    pairs = (
-        [(f"{key}:", value) for key, value in tree.items()]
-        if isinstance(tree, dict)
-        else [("-", value) for value in tree]
-    )
-    for head, value in pairs:
-        body = write_yaml(value, indent + "  ")
-        lines.append(f"{indent}{head}" + (body if isinstance(value, str) else "\n" + body))
-    return "".join(lines) if lines else f"{indent}{{}}\n"
+    return yaml.dump(tree, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=float("inf"))
 
 
 def to_tree(node: Node) -> Tree:

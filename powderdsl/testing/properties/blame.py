@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 from powderdsl.arrays import np
 from powderdsl.diagnostics import Span
@@ -127,11 +128,13 @@ def difference(prop: Property, ruleset: Ruleset, found: Counterexample) -> Diffe
     if not lines:  # only packs that matter: rules of others may have happened too
         packs = tuple(pack for pack in added[:MOST] if not _still(prop, ruleset, found, pack)) or added
         if not is_paired(prop.claim):
-            lines = _happened(ruleset, found.sample, found.steps, packs)
+            last = reference_states(marked(ruleset), found.sample, found.steps)[-1]
+            lines = _happened(ruleset, last, packs)
     causes = [Cause(owners[span], span, one_line(span), True) for span in lines]
     causes = causes or list(_elements(found, ruleset, packs))
     if causes:
-        return Difference(_in_order(added, causes), tuple(causes))
+        named = {cause.pack for cause in causes}
+        return Difference(tuple(pack for pack in added if pack in named), tuple(causes))
     names = {element.id: element.name for element in ruleset.elements}
     near = frozenset(
         names[number] for ids in (found.before, found.after) for number in np.unique(ids).tolist()
@@ -146,11 +149,8 @@ def difference_of_test(result: ExampleResult, runner: Runner) -> Difference | No
     ruleset, example, sim = runner.ruleset, result.example, runner.sim
     world = sim.step(start_of(example, sim, result.seed), steps=max(result.step, 1))
     owners = pack_of_line(ruleset)
-    causes = [
-        Cause(owners[span], span, one_line(span), True)
-        for number, span in enumerate(rule_spans(ruleset))
-        if owners[span] in result.added and bool(world.state[f"{MARK}{number}"].any())
-    ]
+    happened = _happened(ruleset, world.state, result.added)
+    causes = [Cause(owners[span], span, one_line(span), True) for span in happened]
     drawn = {char for rows in (example.given, example.expect or (), result.after) for char in "".join(rows)}
     near = frozenset(name for char, name in example.legend if char in drawn)
     for pack in result.added:
@@ -159,14 +159,13 @@ def difference_of_test(result: ExampleResult, runner: Runner) -> Difference | No
     return Difference(result.added, tuple(causes))
 
 
-def _happened(ruleset: Ruleset, sample: Start, steps: int, packs: tuple[str, ...]) -> list[Span]:
-    """The lines of some packs that happen in a world, as the oracle runs it."""
+def _happened(ruleset: Ruleset, state: Mapping[str, Any], packs: tuple[str, ...]) -> list[Span]:
+    """The lines of some packs that happened on the way to a state, by its marks."""
     owners = pack_of_line(ruleset)
-    last = reference_states(marked(ruleset), sample, steps)[-1]
     return [
         span
         for number, span in enumerate(rule_spans(ruleset))
-        if owners[span] in packs and last[f"{MARK}{number}"].any()
+        if owners[span] in packs and bool(state[f"{MARK}{number}"].any())
     ]
 
 
@@ -175,11 +174,6 @@ def pack_of_line(ruleset: Ruleset) -> dict[Span, str]:
     return {
         rule.span: pass_.pack for pass_ in ruleset.passes for moment in pass_.moments for rule in moment.rules
     }
-
-
-def _in_order(added: tuple[str, ...], causes: list[Cause]) -> tuple[str, ...]:
-    named = {cause.pack for cause in causes}
-    return tuple(pack for pack in added if pack in named)
 
 
 def _elements(found: Counterexample, ruleset: Ruleset, added: tuple[str, ...]) -> Iterator[Cause]:

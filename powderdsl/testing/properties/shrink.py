@@ -193,17 +193,6 @@ def _fewer_fields(sample: Start) -> list[Start]:
     ]
 
 
-def _fewer_values(sample: Start) -> list[Start]:
-    """With one value of a field that is 0."""
-    found = []
-    for name, values in sample.fields.items():
-        for place in np.argwhere(values).tolist():
-            fewer = values.copy()
-            fewer[tuple(place)] = 0
-            found.append(replace(sample, fields={**sample.fields, name: fewer}))
-    return found
-
-
 def _plain_seed(sample: Start) -> list[Start]:
     """With a seed that is easy to write."""
     if 0 <= int(sample.seed[0]) < SEEDS:
@@ -248,15 +237,17 @@ def _fewer_kinds(sample: Start) -> list[Start]:
     ]
 
 
-def _fewer_cells(sample: Start) -> list[Start]:
-    """One cell replaced by the lowest element that is there."""
-    ground = sample.ids.min()
-    found = []
-    for place in np.argwhere(sample.ids != ground).tolist():
-        ids = sample.ids.copy()
-        ids[tuple(place)] = ground
-        found.append(replace(sample, ids=ids))
-    return found
+def _fewer_values(sample: Start) -> list[Start]:
+    """One cell replaced by the lowest element that is there, or one value of a field by 0."""
+    smaller = []
+    for name, values in {"": sample.ids, **sample.fields}.items():
+        ground = 0 if name else sample.ids.min()
+        for place in np.argwhere(values != ground).tolist():
+            fewer = values.copy()
+            fewer[tuple(place)] = ground
+            part = {"fields": {**sample.fields, name: fewer}} if name else {"ids": fewer}
+            smaller.append(replace(sample, **part))
+    return smaller
 
 
 _GROUPS: tuple[Group, ...] = (
@@ -271,7 +262,6 @@ _GROUPS: tuple[Group, ...] = (
     _usual("step"),
     _fewer_fields,
     _fewer_kinds,
-    _fewer_cells,
     _fewer_values,
     _absent_fields,
 )
