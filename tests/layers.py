@@ -176,7 +176,7 @@ _TORCH = (
     "ogbench.collect",
 )
 THIRD_PARTIES: dict[str, Home] = {
-    "yaml": Home(_TEXT, _TEXT),
+    "yaml": Home((*_TEXT, "testing.generators.trees"), (*_TEXT, "testing.generators.trees")),
     "lark": Home(_TEXT, _TEXT),
     "torch": Home(
         (

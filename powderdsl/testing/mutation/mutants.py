@@ -6,6 +6,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from powderdsl.diagnostics import Source, Span
+from powderdsl.syntax import yaml_tree
+from powderdsl.syntax.yaml_tree import Node, Scalar, Sequence
+
+Container = yaml_tree.Mapping | Sequence
+Path = tuple[tuple[Container, int], ...]
+"""From the file's root to an entry: each container, and which of its entries leads on."""
 
 
 @dataclass(frozen=True)
@@ -108,3 +114,83 @@ def changed_lines(before: str, after: str) -> tuple[str, str]:
     while tail < min(len(old), len(new)) - head and old[-1 - tail] == new[-1 - tail]:
         tail += 1
     return tuple(" ".join(" ".join(lines[head : len(lines) - tail]).split()) for lines in (old, new))  # type: ignore[return-value]
+
+
+# Cutting entries out of located YAML, and putting some in: the rest of the file stays as it is
+
+
+def removed(path: Path) -> Edit:
+    """The entry at the end of a path cut out; the whole container where it was the only one."""
+    container, number = path[-1]
+    spans = entry_spans(container)
+    if len(spans) == 1 and len(path) > 1:
+        return removed(path[:-1])
+    text = container.span.source.text
+    start, end = spans[number].start, spans[number].end
+    if text[container.span.start] in "[{":
+        if number + 1 < len(spans):
+            return Edit(start, spans[number + 1].start, "")
+        return Edit(spans[number - 1].end, end, "")
+    line = text.rfind("\n", 0, start) + 1
+    stop = text.find("\n", end)
+    stop = len(text) if stop < 0 else stop + 1
+    before = text[line:start]
+    if isinstance(container, yaml_tree.Mapping) and before.strip():
+        # The first key of a list's item stands beside the dash, which stays.
+        return Edit(start, spans[number + 1].start, "") if number + 1 < len(spans) else Edit(start, end, "")
+    return Edit(line, stop, "")
+
+
+def without_action(path: Path) -> tuple[Edit, ...]:
+    """A block without its action: what stood under `then` comes at once, or the block goes."""
+    block = path[-1][0]
+    assert isinstance(block, yaml_tree.Mapping)
+    then = next((key for key, _ in block.entries if key.text == "then"), None)
+    if then is None:
+        return _without_block(path[:-1])
+    return (removed(path), Edit(then.span.start, then.span.end, "do"))
+
+
+def _without_block(path: Path) -> tuple[Edit, ...]:
+    """The block at the end of a path cut out; with its action where it is all that the action does."""
+    container, number = path[-1]
+    if isinstance(container, Sequence) and len(container.items) == 1:
+        return _without_block(path[:-1])
+    inside = len(path) > 2  # a pass or block, not the list of all passes
+    if isinstance(container, yaml_tree.Mapping) and inside and is_action(container.entries[number][0]):
+        return without_action(path)
+    return (removed(path),)
+
+
+def is_action(key: Scalar) -> bool:
+    """Whether a key of a pass or block is what it does."""
+    return key.text == "do" or key.text.startswith(("for ", "repeat "))
+
+
+def inserted(path: Path, entry: str) -> Edit:
+    """A new entry after one of a mapping's, written as the mapping is: with a comma, or on a line of its own."""
+    node, number = path[-1]
+    assert isinstance(node, yaml_tree.Mapping)
+    end = entry_spans(node)[number].end
+    source = node.span.source
+    if source.text[node.span.start] == "{":
+        return Edit(end, end, f", {entry}")
+    column = source.position(node.entries[0][0].span.start)[1]
+    return Edit(end, end, "\n" + " " * (column - 1) + entry)
+
+
+def entry_spans(container: Container) -> list[Span]:
+    """Where each entry stands, key and value."""
+    if isinstance(container, Sequence):
+        return [_whole(item) for item in container.items]
+    return [key.span.to(_whole(value)) for key, value in container.entries]
+
+
+def _whole(node: Node) -> Span:
+    """A node with all of its text: a block scalar's own span is its sign alone."""
+    span = node.span
+    if isinstance(node, Scalar) and node.style == "block":
+        content = node.content
+        text = content.source.text[span.start : content.end].rstrip()
+        return Span(span.source, span.start, span.start + len(text))
+    return span
