@@ -30,48 +30,37 @@ TERMINAL_WORDS = {
 """What each terminal is called in messages; keywords, which are missing here, are called by themselves."""
 
 _VALUE_STARTS = {"NAME", "INTEGER", "LPAR"}
-_VALUES = _VALUE_STARTS | {
-    "DECIMAL",
-    "PERCENT",
-    "YES",
-    "NO",
-    "TRUE",
-    "FALSE",
-    "CHANCE",
-    "ANY",
-    "ALL",
-    "MINUS",
-    "NOT",
-}
+_LITERALS = {"DECIMAL", "PERCENT", "YES", "NO", "TRUE", "FALSE"}
+_VALUES = _VALUE_STARTS | _LITERALS | {"CHANCE", "ANY", "ALL", "MINUS", "NOT"}
 _OPERATORS = {"PLUS", "MINUS", "STAR", "SLASH", "MOD", "COMPARE", "IS", "IN", "NOT", "__ANON_1"}
 
-_PAIRS = {
-    "=>": "write `->`",
-    "=<": "write `<=`",
-    "=!": "write `!=`",
-    "&&": "write `and`",
-    "||": "write `or`",
-}
-_CHARACTERS = {
-    "=": "compare with `==`, ask for an element with `is`, assign with `:=`",
-    "&": "write `and`",
-    "|": "write `or`",
-    "!": "write `not`, or `!=` between two values",
-    **dict.fromkeys("{}", "write rules without braces"),
-    **dict.fromkeys("[]", "a set is written `(a, b)`"),
-    "→": "write `->`",
-    "≥": "write `>=`",
-    "≤": "write `<=`",
-    "≠": "write `!=`",
-    "×": "write `*`",
-    "−": "write `-`",
-    **dict.fromkeys("\"'“", "names stand without quotes"),
-    ":": "assign with `:=`",
-    ";": "one line is one rule: put the next one on a line of its own",
-    "%": "a percentage is a number and `%`, without a blank; the remainder of a division is `mod`",
-    "^": "powers are written out: `x * x`",
-    "#": "a comment needs a blank before its `#`",
-}
+_CHARACTERS: tuple[tuple[str, str], ...] = (
+    (r"\b(if|where|chance)\b.*‸=>", "write `>=`"),
+    (r"‸=>", "write `->`"),
+    (r"‸=<", "write `<=`"),
+    (r"‸=!", "write `!=`"),
+    (r"\b(if|where|chance)\b.*‸=", "compare with `==`, ask for an element with `is`"),
+    (r"^(.*\bthen)?\s*[\w.?]+\s*‸=", "assign with `:=`"),
+    (r"‸=", "compare with `==`, ask for an element with `is`, assign with `:=`"),
+    (r"‸&", "write `and`"),
+    (r"‸\|", "write `or`"),
+    (r"‸!", "write `not`, or `!=` between two values"),
+    (r"‸[{}]", "write rules without braces"),
+    (r"‸[\[\]]", "a set is written `(a, b)`"),
+    (r"‸→", "write `->`"),
+    (r"‸≥", "write `>=`"),
+    (r"‸≤", "write `<=`"),
+    (r"‸≠", "write `!=`"),
+    (r"‸×", "write `*`"),
+    (r"‸[\"'“]", "names stand without quotes"),
+    (r"‸:", "assign with `:=`"),
+    (r"‸;", "one line is one rule: put the next one on a line of its own"),
+    (r"‸%", "a percentage is a number and `%`, without a blank; the remainder of a division is `mod`"),
+    (r"‸\^", "powers are written out: `x * x`"),
+    (r"‸#", "a comment needs a blank before its `#`"),
+)
+"""Characters that no rule contains: the line, with an `‸` before the character, and the fix. The first match counts."""
+
 _WORDS = {
     **dict.fromkeys(("when", "where", "while", "provided"), "if"),
     "unless": "if not",
@@ -117,18 +106,8 @@ def character_help(text: str, position: int, begin: int) -> str:
     if fix is not None:
         wanted = "a plain blank" if fix == " " else f"`{fix}`" if fix else ""
         return f"it only looks like {wanted}: type {wanted}" if wanted else "it has no shape: remove it"
-    before = text[begin:position]
-    asks = re.search(r"\b(if|where|chance)\b", before) is not None
-    pair = text[position : position + 2]
-    if pair == "=>" and asks:
-        return "write `>=`"
-    if pair in _PAIRS:
-        return _PAIRS[pair]
-    if pair[0] == "=" and asks:
-        return "compare with `==`, ask for an element with `is`"
-    if pair[0] == "=" and re.fullmatch(r"(.*\bthen)?\s*[\w.?]+\s*", before, re.DOTALL):
-        return "assign with `:=`"
-    return _CHARACTERS.get(pair[0], "")
+    line = f"{text[begin:position]}‸{text[position : position + 2]}"
+    return next((fix for pattern, fix in _CHARACTERS if re.search(pattern, line, re.DOTALL)), "")
 
 
 def was_cut(text: str, begin: int, end: int) -> bool:
@@ -143,38 +122,38 @@ _WITHOUT_WHERE = "an assignment says `where`: `field := value where condition`"
 _WITHOUT_LEAVING = "a move says what it leaves behind: `SET moves below leaving ELEMENT if …`"
 
 _PHRASES: tuple[tuple[str, str, str], ...] = (
-    (r"\n\s*-\s.*@", "", "an item of a list starts with `- `: this one, or the one before it, lacks it"),
+    (r"\n\s*-\s.*‸", "", "an item of a list starts with `- `: this one, or the one before it, lacks it"),
     (
-        rf"\n\s*@{_NAME}$",
+        rf"\n\s*‸{_NAME}$",
         "",
         "each rule of a list starts with `- `; a rule that continues on the next line does so with `if`, `and`, …",
     ),
-    (rf"\b(count|sum)\s*@{_NAME}$", "", r"write `\1(\2)`"),
-    (rf"\b(above|below|left|right|here)\s*@(?!({_NOT_ELEMENTS})$){_NAME}$", "", r"write `\1 is \3`"),
-    (r"\bswaps\s*@with$", "", "write `swaps PLACE`, without `with`"),
-    (rf"^\s*set\s*@{_NAME}$", "", r"write `\1 := VALUE where …`"),
-    (r"(^|[\s(<>=+*/-])@\.$", "", "a number has a digit before its point: `0.5`"),
-    (r"^\s*(\w+)([+-])\s*@\2$", "", r"write `\1 \2= 1`"),
-    (r"\*@\*$", "", "powers are written out: `x * x`"),
-    (r"\bmoves\s+\S+\s*@$", "", _WITHOUT_LEAVING),
-    (r"\.\.\s*@$", "", "a range has two ends: `0..99`"),
-    (r"@(:=|\+=|-=)$", "", "only a field of this cell, or of a neighbor, can be assigned"),
-    (r"\bthen\b.*@", "ELSE", "a choice has two sides: `VALUE if CONDITION else VALUE`"),
-    (r"(:=|\+=|-=).*@$", "ELSE", _WITHOUT_WHERE),
-    (r"@if$", "WHERE", _WITHOUT_WHERE),
-    (r"@if$", "LEAVING", _WITHOUT_LEAVING),
-    (r"^\s*@if$", "", "a rule says first what happens: `this -> that if …`"),
-    (r"@where$", "", "only assignments say `where`; this rule says `if`"),
-    (r" is\s*@in$", "", "say `is` or `in`, not both"),
-    (r"@if$", "__ANON_0", "say what happens before the `if`: `SET -> ELEMENT if …`"),
-    (r"\b(box|ring|disc|diamond|cross|plus)\s*@(\d+)$", "", r"write `\1(\2)`"),
-    (r"/@/$", "", "integer division, rounded down, is `div`: `a div b`"),
-    (r"->.*@->$", "", "one line is one rule: put the next one on a line of its own"),
-    (r"@(.*%)$", "CHANCE", r"write `with chance \1`"),
-    (r"chance\s*@(.*%)$", "", r"write `with chance \1`"),
-    (r",\s*@(?!\))", "THEN", "one line is one rule; effects follow `then`: `…, then field := value`"),
+    (rf"\b(count|sum)\s*‸{_NAME}$", "", r"write `\1(\2)`"),
+    (rf"\b(above|below|left|right|here)\s*‸(?!({_NOT_ELEMENTS})$){_NAME}$", "", r"write `\1 is \3`"),
+    (r"\bswaps\s*‸with$", "", "write `swaps PLACE`, without `with`"),
+    (rf"^\s*set\s*‸{_NAME}$", "", r"write `\1 := VALUE where …`"),
+    (r"(^|[\s(<>=+*/-])‸\.$", "", "a number has a digit before its point: `0.5`"),
+    (r"^\s*(\w+)([+-])\s*‸\2$", "", r"write `\1 \2= 1`"),
+    (r"\*‸\*$", "", "powers are written out: `x * x`"),
+    (r"\bmoves\s+\S+\s*‸$", "", _WITHOUT_LEAVING),
+    (r"\.\.\s*‸$", "", "a range has two ends: `0..99`"),
+    (r"‸(:=|\+=|-=)$", "", "only a field of this cell, or of a neighbor, can be assigned"),
+    (r"\bthen\b.*‸", "ELSE", "a choice has two sides: `VALUE if CONDITION else VALUE`"),
+    (r"(:=|\+=|-=).*‸$", "ELSE", _WITHOUT_WHERE),
+    (r"‸if$", "WHERE", _WITHOUT_WHERE),
+    (r"‸if$", "LEAVING", _WITHOUT_LEAVING),
+    (r"^\s*‸if$", "", "a rule says first what happens: `this -> that if …`"),
+    (r"‸where$", "", "only assignments say `where`; this rule says `if`"),
+    (r" is\s*‸in$", "", "say `is` or `in`, not both"),
+    (r"‸if$", "__ANON_0", "say what happens before the `if`: `SET -> ELEMENT if …`"),
+    (r"\b(box|ring|disc|diamond|cross|plus)\s*‸(\d+)$", "", r"write `\1(\2)`"),
+    (r"/‸/$", "", "integer division, rounded down, is `div`: `a div b`"),
+    (r"->.*‸->$", "", "one line is one rule: put the next one on a line of its own"),
+    (r"‸(.*%)$", "CHANCE", r"write `with chance \1`"),
+    (r"chance\s*‸(.*%)$", "", r"write `with chance \1`"),
+    (r",\s*‸(?!\))", "THEN", "one line is one rule; effects follow `then`: `…, then field := value`"),
 )
-"""Turns of phrase from other languages, and slips: the line, with an `@` before the word that cannot follow; a
+"""Turns of phrase from other languages, and slips: the line, with an `‸` before the word that cannot follow; a
 terminal that could have followed; the fix. The first match counts."""
 
 
@@ -186,7 +165,7 @@ def token_help(token: str, accepted: Set[str], before: str, cut: bool) -> str:
     if cut and not (token and before.strip()):
         return CUT
     for pattern, terminal, fix in _PHRASES:
-        match = re.search(pattern, f"{before}@{token}", re.DOTALL)
+        match = re.search(pattern, f"{before}‸{token}", re.DOTALL)
         if match and (not terminal or terminal in accepted):
             return match.expand(fix)
     missing = before.count("(") - before.count(")")
