@@ -1,153 +1,556 @@
-"""The names of NumPy that this project uses, on arrays in plain Python. What is missing raises an error."""
+"""The names of NumPy that this project uses, on arrays in plain Python. What is missing raises an error.
+
+In NumPy a slice is a view, which sees what is written to its array later. Here it is a copy that cannot be written to,
+and using it after its array was written to is an error.
+"""
 
 from __future__ import annotations
 
+import math
+import operator
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
+from fractions import Fraction
+from functools import partial, reduce
+from itertools import compress
+from math import prod
 from typing import Any
 
-from powderdsl.arrays import random
-from powderdsl.arrays.dtypes import (
-    bool_,
-    dtype,
-    float32,
-    float64,
-    int8,
-    int16,
-    int32,
-    int64,
-    uint8,
-    uint16,
-    uint32,
-    uint64,
-)
-from powderdsl.arrays.functions import absolute as abs
-from powderdsl.arrays.functions import (
-    argwhere,
-    array_equal,
-    atleast_1d,
-    clip,
-    concatenate,
-    cumsum,
-    delete,
-    flatnonzero,
-    floor,
-    hypot,
-    inf,
-    isfinite,
-    isin,
-    isnan,
-    logical_or,
-    maximum,
-    mgrid,
-    minimum,
-    moveaxis,
-    nan_to_num,
-    nextafter,
-    nonzero,
-    pad,
-    repeat,
-    reshape,
-    roll,
-    rot90,
-    s_,
-    searchsorted,
-    select,
-    sqrt,
-    stack,
-    swapaxes,
-    take,
-    transpose,
-    unique,
-    where,
-)
-from powderdsl.arrays.functions import product_of as prod
-from powderdsl.arrays.making import (
-    arange,
-    array,
-    asarray,
-    ascontiguousarray,
-    broadcast_to,
-    empty,
-    frombuffer,
-    full,
-    full_like,
-    ones,
-    ones_like,
-    zeros,
-    zeros_like,
-)
-from powderdsl.arrays.ndarray import generic, ndarray
+from powderdsl.arrays import numbers
+from powderdsl.arrays.numbers import Offsets, Type, Values
 
-__all__ = [
-    "abs",
-    "arange",
-    "argwhere",
-    "array",
-    "array_equal",
-    "asarray",
-    "ascontiguousarray",
-    "atleast_1d",
-    "bool_",
-    "broadcast_to",
-    "clip",
-    "concatenate",
-    "cumsum",
-    "delete",
-    "dtype",
-    "empty",
-    "errstate",
-    "flatnonzero",
-    "float32",
-    "float64",
-    "floor",
-    "frombuffer",
-    "full",
-    "full_like",
-    "generic",
-    "hypot",
-    "inf",
-    "int8",
-    "int16",
-    "int32",
-    "int64",
-    "isfinite",
-    "isin",
-    "isnan",
-    "logical_or",
-    "maximum",
-    "mgrid",
-    "minimum",
-    "moveaxis",
-    "nan_to_num",
-    "ndarray",
-    "nextafter",
-    "nonzero",
-    "ones",
-    "ones_like",
-    "pad",
-    "prod",
-    "random",
-    "repeat",
-    "reshape",
-    "roll",
-    "rot90",
-    "s_",
-    "searchsorted",
-    "select",
-    "sqrt",
-    "stack",
-    "swapaxes",
-    "take",
-    "transpose",
-    "uint8",
-    "uint16",
-    "uint32",
-    "uint64",
-    "unique",
-    "where",
-    "zeros",
-    "zeros_like",
-]
+dtype = _dtype = numbers.dtype  # `_dtype` where an argument has the name
+bool_, int8, int16, int32, int64 = map(dtype, ("bool", "int8", "int16", "int32", "int64"))
+uint8, uint16, uint32, uint64 = map(dtype, ("uint8", "uint16", "uint32", "uint64"))
+float32, float64 = dtype("float32"), dtype("float64")
+
+Shape = tuple[int, ...]
+
+
+def __getattr__(name: str) -> Any:
+    raise AttributeError(f"`{name}` is not there without NumPy")
+
+
+def _reduction(call: Callable[[Values], Any], result: Type | None = None) -> Any:
+    """A method that makes one number of those along an axis, along some, or of all."""
+
+    def method(self: ndarray, axis: Any = None) -> ndarray:
+        full, kind = self.full, result or self.dtype
+        if call is sum:
+            _check("sum", self, "bi")
+        if self.dtype.kind == "f" and kind is not bool_ and any(value != value for value in full):
+            raise TypeError("extremes of NaN are not there without NumPy")
+        axes = range(self.ndim) if axis is None else [axis] if isinstance(axis, int) else axis
+        gone = [range(self.ndim)[one] for one in axes]
+        rest = [one for one in range(self.ndim) if one not in gone]
+        shape = tuple(self.shape[one] for one in rest)
+        if rest and rest[-1] > gone[0]:
+            offsets = self.offsets()
+            full = numbers.gathered(full, [offsets[one] for one in (*rest, *gone)])
+        length = prod(self.shape[one] for one in gone)
+        rows = [full[at * length : (at + 1) * length] for at in range(prod(shape))]
+        return ndarray(shape, kind, numbers.packed([*map(call, rows)], kind))
+
+    return method
+
+
+class ndarray:
+    """An array. One without axes is a number: what reductions and indices of single cells give."""
+
+    __slots__ = ("_base", "_seen", "_values", "_written", "dtype", "shape")
+
+    def __init__(self, shape: Shape, kind: Type, values: Values, base: ndarray | None = None):
+        """`values`: all of them, or one if they are equal. `base`: the array of which this is a view."""
+        self.shape, self.dtype, self._values, self._written = shape, kind, values, 0
+        self._base: ndarray | None = base if base is None or base._base is None else base._base
+        self._seen = 0 if self._base is None else self._base._written
+
+    def __class_getitem__(cls, _: Any) -> Any:
+        return cls
+
+    @property
+    def values(self) -> Values:
+        """All values, or one if they are equal."""
+        if self._base is not None and self._base._written != self._seen:
+            raise ValueError(
+                "a view of an array that was written to is not there without NumPy: copy it first"
+            )
+        return self._values
+
+    @property
+    def full(self) -> Values:
+        """All values."""
+        values, size = self.values, self.size
+        return values if len(values) == size else values * size
+
+    @property
+    def ndim(self) -> int:
+        return len(self.shape)
+
+    @property
+    def size(self) -> int:
+        return prod(self.shape)
+
+    any, all = _reduction(any, bool_), _reduction(all, bool_)
+    min, max, sum = _reduction(min), _reduction(max), _reduction(sum, int64)
+    argmax = _reduction(lambda values: list(values).index(max(values)), int64)
+
+    # To Python's values
+
+    def tolist(self) -> Any:
+        listed: Any = list(map(bool, self.full)) if self.dtype is bool_ else list(self.full)
+        if self.shape == ():
+            return listed[0]
+        for side in reversed(self.shape[1:]):
+            listed = [listed[at : at + side] for at in range(0, len(listed), side)] if side else []
+        return listed
+
+    def tobytes(self) -> bytes:
+        return numbers.raw_of(self.full, self.dtype)
+
+    def _number(self) -> Any:
+        if self.size != 1:
+            raise ValueError("an array of several numbers is not one: use any() or all()")
+        return self.values[0]
+
+    def __bool__(self) -> bool:
+        return bool(self._number())
+
+    def __int__(self) -> int:
+        return int(self._number())
+
+    def __float__(self) -> float:
+        return float(self._number())
+
+    def __index__(self) -> int:
+        return operator.index(self.tolist())
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __iter__(self) -> Iterator[ndarray]:
+        return (self[place] for place in range(len(self)))
+
+    # The same values in another form
+
+    def copy(self) -> ndarray:
+        return ndarray(self.shape, self.dtype, self.values)
+
+    def astype(self, kind: Any) -> ndarray:
+        wanted = dtype(kind)
+        return ndarray(self.shape, wanted, numbers.converted(self.values, self.dtype, wanted))
+
+    def reshape(self, *shape: Any) -> ndarray:
+        sides = list(shape[0] if len(shape) == 1 and not isinstance(shape[0], int) else shape)
+        if -1 in sides:
+            rest = prod(side for side in sides if side != -1)
+            sides[sides.index(-1)] = self.size // rest if rest else -1
+        if prod(sides) != self.size or min(sides, default=0) < 0:
+            raise ValueError(f"{self.size} values do not have the shape {sides}")
+        return ndarray(tuple(sides), self.dtype, self.values, self)
+
+    def offsets(self) -> list[Offsets]:
+        """Where the values along each axis are."""
+        steps = numbers.strides(self.shape)
+        return [range(0, side * step, step or 1) for side, step in zip(self.shape, steps, strict=True)]
+
+    def transposed(self, order: Sequence[int]) -> ndarray:
+        """A view with the axes in another order."""
+        axes, shape = self.offsets(), tuple(self.shape[axis] for axis in order)
+        return ndarray(shape, self.dtype, numbers.gathered(self.values, [axes[axis] for axis in order]), self)
+
+    @property
+    def T(self) -> ndarray:
+        return self.transposed(range(self.ndim)[::-1])
+
+    # Indexing
+
+    def __getitem__(self, key: Any) -> ndarray:
+        values = self.values
+        if isinstance(key, ndarray) and isinstance(values, bytes) and self.ndim == 1 and len(values) > 1:
+            places, there = key.values, bytes(range(min(len(values), 256)))
+            if key.dtype is not bool_ and isinstance(places, bytes) and not places.translate(None, there):
+                return ndarray(key.shape, self.dtype, places.translate(values[:256].ljust(256, b"\0")))
+        axes, shape, picked = self._selected(key)
+        base = None if picked or not shape else self
+        return ndarray(shape, self.dtype, numbers.gathered(values, axes), base)
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        if self._base is not None:
+            raise ValueError("writing to a view is not there without NumPy: copy it first")
+        given = asarray(value, self.dtype)
+        axes, shape, _ = self._selected(key)
+        old, new = numbers.alike([self.full, broadcast_to(given, shape).full], self.dtype)
+        self._values = numbers.replaced(old, axes, new)
+        self._written += 1
+
+    def _selected(self, key: Any) -> tuple[list[Offsets], Shape, bool]:
+        """Where the values are that a key selects, their shape, and whether arrays select them."""
+        items = [_part(one) for one in (key if isinstance(key, tuple) else (key,))]
+        taken = sum(_axes_taken(one) for one in items)
+        if taken > self.ndim:
+            raise IndexError(f"the array has {self.ndim} axes, found an index for {taken}")
+        rest = [slice(None)] * (self.ndim - taken)
+        dots = next((place for place, one in enumerate(items) if one is ...), None)
+        items = items + rest if dots is None else items[:dots] + rest + items[dots + 1 :]
+        arrays = []
+        if any(isinstance(one, ndarray) for one in items):  # integers beside arrays are like them
+            arrays = [at for at, one in enumerate(items) if isinstance(one, (ndarray, int))]
+            if arrays != [*range(arrays[0], arrays[-1] + 1)]:
+                raise IndexError("arrays that are apart in an index are not there without NumPy")
+        axes: list[Offsets] = []
+        shape: list[int] = []
+        together: list[ndarray] = []
+        steps, axis = numbers.strides(self.shape), 0
+        for place, item in enumerate(items):
+            if item is None:
+                shape.append(1)
+            elif isinstance(item, slice):
+                side, step = range(*item.indices(self.shape[axis])), steps[axis] or 1
+                axes.append(range(side.start * step, side.stop * step, side.step * step))
+                shape.append(len(side))
+            elif place not in arrays:
+                axes.append([_within([item], self.shape[axis])[0] * steps[axis]])
+            else:
+                together.append(_places(item, self.shape[axis:], steps[axis:]))
+                if place == arrays[-1]:
+                    offsets = reduce(operator.add, together)
+                    axes.append(list(offsets.full))
+                    shape += offsets.shape
+            axis += _axes_taken(item)
+        return axes, tuple(shape), bool(arrays)
+
+    # Operations
+
+    def __neg__(self) -> ndarray:
+        _check("neg", self, "iuf")
+        return _mapped(operator.neg, self)
+
+    def __invert__(self) -> ndarray:
+        _check("invert", self, "bi")
+        return _binary("xor", self, True if self.dtype is bool_ else -1)
+
+    def __abs__(self) -> ndarray:
+        _check("abs", self, "if")
+        return _mapped(operator.abs, self)
+
+    def __pow__(self, power: int) -> ndarray:
+        if power != 2:
+            raise TypeError(f"power {power} is not there without NumPy")
+        return _binary("mul", self, self)
+
+
+def _check(op: str, array: ndarray, kinds: str) -> None:
+    if array.dtype.kind not in kinds:
+        raise TypeError(f"{op} of {array.dtype} is not there without NumPy")
+
+
+def _mapped(call: Callable[[Any], Any], array: ndarray) -> ndarray:
+    return ndarray(array.shape, array.dtype, numbers.packed([*map(call, array.values)], array.dtype))
+
+
+def _part(item: Any) -> Any:
+    """A part of a key: None, Ellipsis, a slice, an integer, or an array of places or flags."""
+    if item is None or item is ... or isinstance(item, slice) or type(item) is int:
+        return item
+    array = asarray(item, int64) if isinstance(item, list) and not item else asarray(item)
+    if array.dtype.kind == "f" or (array.dtype is bool_ and not array.shape):
+        raise IndexError(f"an index of {array.dtype} is not there without NumPy")
+    return array if array.shape else int(array)
+
+
+def _axes_taken(item: Any) -> int:
+    if item is None or item is ...:
+        return 0
+    return item.ndim if isinstance(item, ndarray) and item.dtype is bool_ else 1
+
+
+def _places(item: int | ndarray, sides: Shape, steps: Sequence[int]) -> ndarray:
+    """What an integer or an array selects along the first of some axes, or flags along several: offsets."""
+    if isinstance(item, ndarray) and item.dtype is bool_:
+        if item.shape != sides[: item.ndim]:
+            raise IndexError(f"flags of the shape {item.shape} in an index of {sides}")
+        step = steps[item.ndim - 1]
+        flagged = [*compress(range(0, item.size * step, step), item.full)]
+        return ndarray((len(flagged),), int64, numbers.packed(flagged, int64))
+    shape, listed = ((), [item]) if isinstance(item, int) else (item.shape, item.full)
+    places = [place * steps[0] for place in _within(listed, sides[0])]
+    return ndarray(shape, int64, numbers.packed(places, int64))
+
+
+def _within(places: Sequence[int], side: int) -> Sequence[int]:
+    """Places along an axis, counted from its beginning."""
+    if not len(places) or 0 <= min(places) <= max(places) < side:
+        return places
+    return [range(side)[place] for place in places]
+
+
+# New arrays
+
+
+def asarray(values: Any, dtype: Any = None) -> ndarray:
+    """An array of anything that is one, of a number, or of nested lists."""
+    if isinstance(values, ndarray):
+        return values if dtype is None or dtype is values.dtype else values.astype(dtype)
+    shape, leaves = _nested(values)
+    types = {*map(type, leaves)}
+    arrays = [one for one in leaves if isinstance(one, ndarray)] if ndarray in types else []
+    if dtype is None:
+        kinds = [one.dtype for one in arrays] + [_dtype(one) for one in types - {ndarray}]
+        kind = reduce(numbers.promoted, kinds) if kinds else float64
+    else:
+        kind = _dtype(dtype)
+    if arrays:
+        leaves = [number for one in leaves for number in (one.full if isinstance(one, ndarray) else (one,))]
+    return ndarray(shape, kind, numbers.checked(leaves, kind))
+
+
+def _nested(values: Any) -> tuple[Shape, list[Any]]:
+    """The shape of nested lists, and the numbers and arrays in them."""
+    if isinstance(values, ndarray):
+        return values.shape, [values]
+    if not isinstance(values, (list, tuple, range)):
+        if not isinstance(values, (bool, int, float, Fraction)):
+            raise TypeError(f"without NumPy, {type(values).__name__} cannot become an array")
+        return (), [values]
+    if not {*map(type, values)} & {list, tuple, range, ndarray}:
+        return (len(values),), list(values)
+    parts = [_nested(one) for one in values]
+    if len({shape for shape, _ in parts}) > 1:
+        raise ValueError("lists of different lengths are no array")
+    return (len(values), *parts[0][0]), [leaf for _, leaves in parts for leaf in leaves]
+
+
+def array(values: Any, dtype: Any = None) -> ndarray:
+    return asarray(values, dtype).copy()
+
+
+ascontiguousarray = asarray
+
+
+def full(shape: Any, fill_value: Any, dtype: Any = None) -> ndarray:
+    value = asarray(fill_value, dtype)
+    return broadcast_to(value, (shape,) if isinstance(shape, int) else shape).copy()
+
+
+def zeros(shape: Any, dtype: Any = float64) -> ndarray:
+    return full(shape, 0, dtype)
+
+
+def ones(shape: Any, dtype: Any = float64) -> ndarray:
+    return full(shape, 1, dtype)
+
+
+def full_like(values: ndarray, fill_value: Any) -> ndarray:
+    return full(values.shape, fill_value, values.dtype)
+
+
+def zeros_like(values: ndarray) -> ndarray:
+    return full_like(values, 0)
+
+
+def arange(start: int, stop: int | None = None, *, dtype: Any = int64) -> ndarray:
+    return asarray(range(start) if stop is None else range(int(start), int(stop)), dtype)
+
+
+def frombuffer(buffer: Any, dtype: Any) -> ndarray:
+    """A copy, which cannot be written to."""
+    kind = _dtype(dtype)
+    values = numbers.unpacked(bytes(buffer), kind.code)
+    return ndarray((len(values),), kind, values)[:]
+
+
+# The same values elsewhere
+
+
+def broadcast_to(values: Any, shape: Any) -> ndarray:
+    """A view of values repeated along new axes and along those of one."""
+    array, target = asarray(values), tuple(shape)
+    if array.shape == target:
+        return array
+    while array.ndim > len(target) and array.shape[0] == 1:
+        array = array.reshape(array.shape[1:])
+    missing = len(target) - array.ndim
+    sides = (1,) * missing + array.shape
+    if missing < 0 or any(side not in (1, wanted) for side, wanted in zip(sides, target, strict=True)):
+        raise ValueError(f"{array.shape} does not fit {target}")
+    offsets: list[Offsets] = [*[range(1)] * missing, *array.offsets()]
+    axes = [
+        [0] * wanted if side == 1 != wanted else offset
+        for side, wanted, offset in zip(sides, target, offsets, strict=True)
+    ]
+    return ndarray(target, array.dtype, numbers.gathered(array.values, axes), array)
+
+
+def swapaxes(values: ndarray, first: int, second: int) -> ndarray:
+    order = [*range(values.ndim)]
+    order[first], order[second] = order[second], order[first]
+    return values.transposed(order)
+
+
+def moveaxis(values: ndarray, source: int, destination: int) -> ndarray:
+    moved = range(values.ndim)[source]
+    order = [axis for axis in range(values.ndim) if axis != moved]
+    order.insert(range(values.ndim)[destination], moved)
+    return values.transposed(order)
+
+
+def roll(values: ndarray, shift: Any, axis: Any) -> ndarray:
+    found, shape = values.values, values.shape
+    for places, one in [(shift, axis)] if isinstance(axis, int) else zip(shift, axis, strict=True):
+        at = range(len(shape))[one]
+        found = numbers.rolled(found, prod(shape[:at]), shape[at], prod(shape[at + 1 :]), places)
+    return ndarray(shape, values.dtype, found)
+
+
+def concatenate(arrays: Sequence[ndarray], axis: int = 0) -> ndarray:
+    kind = reduce(numbers.promoted, [one.dtype for one in arrays])
+    at = range(arrays[0].ndim)[axis]
+    rests = {(one.shape[:at], one.shape[at + 1 :]) for one in arrays}
+    if len(rests) > 1:
+        raise ValueError("arrays of different shapes cannot be joined")
+    before, after = rests.pop()
+    parts = numbers.alike([numbers.converted(one.full, one.dtype, kind) for one in arrays], kind)
+    lengths = [prod(one.shape[at:]) for one in arrays]
+    blocks = [
+        part[row * length : (row + 1) * length]
+        for row in range(prod(before))
+        for part, length in zip(parts, lengths, strict=True)
+    ]
+    shape = (*before, sum(one.shape[at] for one in arrays), *after)
+    return ndarray(shape, kind, numbers.unpacked(b"".join(blocks), numbers.code_of(parts[0])))
+
+
+def stack(arrays: Sequence[ndarray], axis: int = 0) -> ndarray:
+    at = range(arrays[0].ndim + 1)[axis]
+    return concatenate([one.reshape(*one.shape[:at], 1, *one.shape[at:]) for one in arrays], at)
+
+
+def repeat(values: ndarray, repeats: int, axis: int) -> ndarray:
+    at, axes, shape = range(values.ndim)[axis], values.offsets(), list(values.shape)
+    axes[at] = [offset for offset in axes[at] for _ in range(repeats)]
+    shape[at] *= repeats
+    return ndarray(tuple(shape), values.dtype, numbers.gathered(values.values, axes))
+
+
+# Operations on values
+
+
+def _together(first: Shape, second: Shape) -> Shape:
+    """The shape of two arrays together; what does not fit it, `broadcast_to` will refuse."""
+    count = max(len(first), len(second))
+    pairs = zip((1,) * (count - len(first)) + first, (1,) * (count - len(second)) + second, strict=True)
+    return tuple(b if a == 1 else a for a, b in pairs)
+
+
+def _matched(x: Any, y: Any) -> tuple[Values, Values, Type, Shape]:
+    """Two arrays or numbers as values of one type, and their shape. Numbers of Python adapt to the type of the other.
+
+    Raises OverflowError for an integer that the type cannot hold.
+    """
+    if type(x) is not ndarray and type(y) is not ndarray:
+        x, y = asarray(x), asarray(y)
+    if type(x) is type(y) is ndarray:
+        if x.shape == y.shape and x.dtype is y.dtype:
+            return x.values, y.values, x.dtype, x.shape
+        kind, shape = numbers.promoted(x.dtype, y.dtype), _together(x.shape, y.shape)
+    else:
+        array, number = (x, y) if type(x) is ndarray else (y, x)
+        kind, shape = numbers.adapted(number, array.dtype), array.shape
+    return _operand(x, kind, shape), _operand(y, kind, shape), kind, shape
+
+
+def _operand(one: Any, kind: Type, shape: Shape) -> Values:
+    if type(one) is not ndarray:
+        return numbers.checked([one], kind)
+    values = one.values if one.shape == shape else broadcast_to(one, shape).values
+    return numbers.converted(values, one.dtype, kind)
+
+
+def _binary(op: str, x: Any, y: Any) -> ndarray:
+    a, b, kind, shape = _matched(x, y)
+    if op == "truediv" and kind.kind != "f":
+        a, b, kind = numbers.converted(a, kind, float64), numbers.converted(b, kind, float64), float64
+    return ndarray(shape, kind, numbers.arithmetic(op, a, b, kind, prod(shape)))
+
+
+def _compare(op: str, x: Any, y: Any) -> ndarray:
+    a, b, _, shape = _matched(x, y)
+    return ndarray(shape, bool_, numbers.compared(op, a, b, prod(shape)))
+
+
+def _operator(call: Callable[[str, Any, Any], ndarray], op: str, swapped: bool = False) -> Any:
+    def operator(self: ndarray, other: Any) -> Any:
+        if not isinstance(other, (ndarray, bool, int, float)):
+            return NotImplemented
+        return call(op, other, self) if swapped else call(op, self, other)
+
+    return operator
+
+
+def _in_place(op: str) -> Any:
+    def operator(self: ndarray, other: Any) -> ndarray:
+        result = _binary(op, self, other)
+        if result.shape != self.shape or result.dtype is not self.dtype:
+            raise TypeError(f"{result.dtype} {result.shape} into {self.dtype} is not there without NumPy")
+        self[...] = result
+        return self
+
+    return operator
+
+
+for _op in ("add", "sub", "mul", "truediv", "floordiv", "mod", "and_", "or_", "xor", "lshift", "rshift"):
+    setattr(ndarray, f"__{_op.strip('_')}__", _operator(_binary, _op))
+    setattr(ndarray, f"__r{_op.strip('_')}__", _operator(_binary, _op, swapped=True))
+    setattr(ndarray, f"__i{_op.strip('_')}__", _in_place(_op))
+for _op in ("eq", "ne", "lt", "le", "gt", "ge"):
+    setattr(ndarray, f"__{_op}__", _operator(_compare, _op))
+
+
+def where(condition: Any, yes: Any, no: Any) -> ndarray:
+    flags = asarray(condition, bool_)
+    a, b, kind, shape = _matched(yes, no)
+    whole = _together(flags.shape, shape)
+    held, yes, no = (
+        broadcast_to(one, whole).values for one in (flags, ndarray(shape, kind, a), ndarray(shape, kind, b))
+    )
+    return ndarray(whole, kind, numbers.chosen(bytes(held), yes, no, kind, prod(whole)))
+
+
+def isin(values: ndarray, test_elements: Sequence[int]) -> ndarray:
+    wanted, found = frozenset(test_elements), values.values
+    if isinstance(found, bytes):
+        table = bytes(number in wanted for number in range(256))
+        return ndarray(values.shape, bool_, found.translate(table))
+    return ndarray(values.shape, bool_, bytes(map(wanted.__contains__, found)))
+
+
+minimum, maximum = partial(_binary, "minimum"), partial(_binary, "maximum")
+abs = operator.abs
+
+
+def clip(values: Any, low: Any, high: Any) -> ndarray:
+    return minimum(high, maximum(low, asarray(values)))
+
+
+def sqrt(x: ndarray) -> ndarray:
+    """NaN below 0."""
+    _check("sqrt", x, "f")
+    return _mapped(lambda value: math.sqrt(value) if value >= 0 else math.nan, x)
+
+
+def floor(x: ndarray) -> ndarray:
+    _check("floor", x, "f")
+    return _mapped(lambda value: float(math.floor(value)) if value and math.isfinite(value) else value, x)
+
+
+def isnan(x: ndarray) -> ndarray:
+    return _compare("ne", x, x)
+
+
+def isfinite(x: ndarray) -> ndarray:
+    return ndarray(x.shape, bool_, bytes(map(math.isfinite, x.values)))
 
 
 def errstate(**_: str) -> nullcontext[None]:
@@ -155,5 +558,31 @@ def errstate(**_: str) -> nullcontext[None]:
     return nullcontext()
 
 
-def __getattr__(name: str) -> Any:
-    raise AttributeError(f"`{name}` is not there without NumPy")
+# Questions
+
+
+def array_equal(x: Any, y: Any) -> bool:
+    a, b = asarray(x), asarray(y)
+    return a.shape == b.shape and bool(_compare("eq", a, b).all())
+
+
+def nonzero(values: ndarray) -> tuple[ndarray, ...]:
+    places, found = [*compress(range(values.size), values.full)], []
+    for side in reversed(values.shape):
+        found.append(asarray([place % side for place in places], int64))
+        places = [place // side for place in places]
+    return tuple(reversed(found))
+
+
+def unique(values: Any) -> ndarray:
+    """The different numbers, in ascending order."""
+    found = asarray(values)
+    return asarray(sorted(set(found.values)), found.dtype)
+
+
+def searchsorted(values: ndarray, wanted: ndarray, side: str = "left") -> ndarray:
+    """How many of ascending numbers are below others, or not above them (``right``)."""
+    call, listed = bisect_left if side == "left" else bisect_right, values.tolist()
+    if bool(isnan(wanted).any()):
+        raise TypeError("searchsorted of NaN is not there without NumPy")
+    return ndarray(wanted.shape, int64, numbers.checked([call(listed, one) for one in wanted.values], int64))

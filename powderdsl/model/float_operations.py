@@ -79,5 +79,6 @@ def octant(v: Array) -> Array:
     y, x = v[:, 0], v[:, 1]
     reach = np.sqrt(y * y + x * x) + np.float32(0.001)
     near, far = FAN["near"] * reach, FAN["far"] * reach
-    half = np.select([x > near, x > far, x > -far, x > -near], [0, 1, 2, 3], 4)
+    lower = np.where(x > -far, 2, np.where(x > -near, 3, 4))
+    half = np.where(x > near, 0, np.where(x > far, 1, lower))
     return np.where(y < 0, (8 - half) % 8, half)

@@ -55,22 +55,21 @@ class Clock:
 
 def mix(x: Array, key: Any = 0) -> Array:
     """A 32-bit finaliser (xor-shift-multiply), with a key before its last round. uint64 arrays, of 32 bits each."""
-    mask = np.uint64(0xFFFFFFFF)
+    mask = 0xFFFFFFFF
     x = x & mask
-    x = x ^ (x >> np.uint64(16))
-    x = (x * np.uint64(0x7FEB352D)) & mask
-    x = x ^ (x >> np.uint64(15))
-    x = ((x + key) * np.uint64(0x846CA68B)) & mask
-    return x ^ (x >> np.uint64(16))
+    x = x ^ (x >> 16)
+    x = (x * 0x7FEB352D) & mask
+    x = x ^ (x >> 15)
+    x = ((x + key) * 0x846CA68B) & mask
+    return x ^ (x >> 16)
 
 
 def key(clock: Clock, stream: int, start: int) -> Array:
     """One 32-bit key a world: seed, world index, step and stream mixed in one after the other."""
     seed = clock.seed.astype(np.uint64)
     result = np.full(seed.shape, start, np.uint64)
-    parts = (seed, seed >> np.uint64(32), clock.index, clock.step, np.uint64(stream))
-    for part in parts:
-        result = mix(result + (np.asarray(part).astype(np.uint64) & np.uint64(0xFFFFFFFF)))
+    for part in (seed, seed >> 32, clock.index, clock.step, np.asarray(stream)):
+        result = mix(result + (part.astype(np.uint64) & 0xFFFFFFFF))
     return result
 
 
@@ -82,14 +81,15 @@ def draw(clock: Clock, stream: int, bits: int, height: int, width: int) -> Array
     """
     key0 = key(clock, stream, 0x243F6A88)[:, None, None]
     key1 = key(clock, stream, 0x85A308D3)[:, None, None]
-    y, x = np.mgrid[:height, :width].astype(np.uint64)
-    word = y * np.uint64(-(-width // 32)) + x // np.uint64(32)
-    value = np.zeros((len(clock.seed), height, width), np.float64)
+    words = -(-width // 32)
+    y, w = np.arange(height, dtype=np.uint64)[:, None], np.arange(words, dtype=np.uint64)
+    bit = np.arange(width, dtype=np.uint64) % 32
+    value = np.zeros((len(clock.seed), height, width), np.int64)
     for j in range(bits):
-        n = (word * np.uint64(32) + np.uint64(j)) * np.uint64(0x9E3779B1)
-        h = mix(n + key0, key1)
-        value += ((h >> (x % np.uint64(32))) & np.uint64(1)).astype(np.float64) * 2.0 ** (bits - 1 - j)
-    return (value + 0.5) / 2.0**bits
+        n = ((y * words + w) * 32 + j) * 0x9E3779B1
+        hashes = mix(n + key0, key1)[:, :, np.arange(width) // 32]
+        value = value * 2 + ((hashes >> bit) & 1).astype(np.int64)
+    return (value.astype(np.float64) + 0.5) / 2.0**bits
 
 
 # Neighbors
@@ -202,8 +202,11 @@ def _draw(expr: Expr, at: Context) -> Array:
 def _coordinate(expr: Expr, at: Context) -> Array:
     name, modulus = expr.value
     _, height, width = at.shape
-    y, x = np.mgrid[:height, :width]
-    values = {"row": y, "column": x, "step": at.clock.step.astype(np.int64)[:, None, None]}
+    values = {
+        "row": np.arange(height)[:, None],
+        "column": np.arange(width),
+        "step": at.clock.step.astype(np.int64)[:, None, None],
+    }
     return np.broadcast_to(values[name] % modulus, at.shape)
 
 
@@ -413,7 +416,7 @@ def run_pass(pass_: Pass, at: Context, table: Mapping[str, Slot], seen: Seen | N
 def _fresh(slot: Slot, shape: tuple[int, int, int]) -> Array:
     batch, height, width = shape
     whole = (batch, 2, height, width) if slot.planes == 2 else shape
-    return _default(slot, np.empty(whole, WIDE.get(slot.kind.name, np.int64))).copy()
+    return _default(slot, np.zeros(whole, WIDE.get(slot.kind.name, np.int64))).copy()
 
 
 def widened(ruleset: Ruleset, state: Mapping[str, Array]) -> State:

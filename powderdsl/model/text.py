@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
 
@@ -71,6 +72,13 @@ def show_number(value: float | Fraction) -> str:
         return str(value)
     number = float(value)
     return repr(int(number)) if number.is_integer() and abs(number) < 1e15 else repr(number)
+
+
+def show_single(value: float) -> str:
+    """A float32 as the shortest text that means it."""
+    texts = (f"{value:.{digits}g}" for digits in range(1, 9))
+    text = next((text for text in texts if array("f", [float(text)])[0] == value), f"{value:.9g}")
+    return repr(float(text))
 
 
 def show_value(ruleset: Ruleset, kind: Kind, value: Value | str) -> str:

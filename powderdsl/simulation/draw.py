@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -110,38 +111,45 @@ def _steps(ramp: ColorRamp) -> tuple[NDArray[Any], NDArray[np.uint8]]:
     ends = [_components(color) for color in (ramp.start, ramp.end)]
     parts = [np.array(_first_values(new - old, ramp), dtype) for old, new in zip(*ends, strict=True)]
     starts = np.unique(np.concatenate(parts)).astype(dtype)
-    colors = np.empty((len(starts) + 1, 3), dtype=np.uint8)
+    colors = np.zeros((len(starts) + 1, 3), dtype=np.uint8)
     for channel, (old, new) in enumerate(zip(*ends, strict=True)):
         reached = np.searchsorted(parts[channel], starts, side="right")
         colors[:, channel] = old + (1 if new > old else -1) * np.concatenate([[0], reached])
     return starts, colors
 
 
-def _first_values(change: int, ramp: ColorRamp) -> list[int | np.float32]:
+def _first_values(change: int, ramp: ColorRamp) -> list[int | float]:
     """The first values, as the field stores them, at which a channel has changed by 1, 2, … to `change`.
 
     In proportion that is so far along the range: (j - 1/2) / |change|. What falls by more than a half is rounded down.
     """
-    found: list[int | np.float32] = []
+    found: list[int | float] = []
     for j in range(1, abs(change) + 1):
         whole = 2 * abs(change)
         place = ramp.lo * whole + (ramp.hi - ramp.lo) * (2 * j - 1)  # of `whole` parts
         if not ramp.real:
             found.append(-(-place // whole) if change > 0 else place // whole + 1)
             continue
-        value = np.float32(place / whole)
+        value = float(np.float32(place / whole))
         while not _reached(value, place, whole, change > 0):
-            value = np.float32(np.nextafter(value, np.float32(np.inf)))
-        while _reached(
-            before := np.float32(np.nextafter(value, -np.float32(np.inf))), place, whole, change > 0
-        ):
+            value = _beside(value, 1)
+        while _reached(before := _beside(value, -1), place, whole, change > 0):
             value = before
         found.append(value)
     return found
 
 
-def _reached(value: np.float32, place: int, whole: int, rises: bool) -> bool:
-    above, below = float(value).as_integer_ratio()
+def _beside(value: float, way: int) -> float:
+    """The next float32 above a number (1), or below it (-1)."""
+    if value == 0:
+        return way * 2.0**-149
+    (bits,) = struct.unpack("<i", struct.pack("<f", value))
+    (found,) = struct.unpack("<f", struct.pack("<i", bits + (way if value > 0 else -way)))
+    return float(found)
+
+
+def _reached(value: float, place: int, whole: int, rises: bool) -> bool:
+    above, below = value.as_integer_ratio()
     return above * whole >= place * below if rises else above * whole > place * below
 
 
@@ -192,7 +200,7 @@ def contact_sheet(
     height, width = pictures[0].shape[:2]
     columns = min(columns or math.ceil(math.sqrt(len(pictures))), len(pictures))
     rows = math.ceil(len(pictures) / columns)
-    sheet = np.empty((rows * (height + gap) + gap, columns * (width + gap) + gap, 3), dtype=np.uint8)
+    sheet = np.zeros((rows * (height + gap) + gap, columns * (width + gap) + gap, 3), dtype=np.uint8)
     sheet[:] = background
     for place, picture in enumerate(pictures):
         top, left = gap + place // columns * (height + gap), gap + place % columns * (width + gap)
@@ -205,7 +213,8 @@ def outline(
 ) -> None:
     """Draw the edge of a set of cells into a picture uint8 [H·factor, W·factor, 3], one pixel wide, inside it."""
     pixels = np.repeat(np.repeat(cells, factor, 0), factor, 1)
-    padded = np.pad(pixels, 1)
+    padded = np.zeros([side + 2 for side in pixels.shape], bool)
+    padded[1:-1, 1:-1] = pixels
     inner = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
     image[pixels & ~inner] = color
 

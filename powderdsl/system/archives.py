@@ -78,7 +78,7 @@ class Archive:
             raise BadArchive(f"`{name}` is not an array of numbers")
         flat = np.frombuffer(self._bytes(name), header.dtype)
         if header.fortran:
-            return np.transpose(flat.reshape(header.shape[::-1]))
+            return flat.reshape(header.shape[::-1]).T
         return flat.reshape(header.shape)
 
     def text(self, name: str) -> str:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import prod
 from typing import Any, ClassVar, Protocol
 
 from powderdsl.arrays import np
@@ -95,8 +94,8 @@ class ArrayKind(Protocol):
 
     # Programs in the memory of this process
 
-    def writable(self, dtype: Any, shape: tuple[int, ...]) -> tuple[Array, Bytes]:
-        """A new array with any values, and its memory, to be written to."""
+    def from_bytes(self, memory: bytearray, dtype: Any, shape: tuple[int, ...]) -> Array:
+        """The array of cells in C order; it may share their memory."""
         ...
 
     def bytes_of(self, array: Array) -> Bytes:
@@ -129,7 +128,7 @@ class PlainArrays:
         return np.array(values, dtype)
 
     def empty(self, dtype: Any, shape: tuple[int, ...]) -> Array:
-        return np.empty(shape, dtype)
+        return np.zeros(shape, dtype)
 
     def zeros(self, dtype: str, shape: tuple[int, ...]) -> Array:
         return np.zeros(shape, dtype)
@@ -164,9 +163,8 @@ class PlainArrays:
     def from_numpy(self, array: Array) -> Array:
         return array
 
-    def writable(self, dtype: Any, shape: tuple[int, ...]) -> tuple[Array, Bytes]:
-        memory = bytearray(prod(shape) * np.dtype(dtype).itemsize)
-        return np.frombuffer(memory, dtype).reshape(shape), memory
+    def from_bytes(self, memory: bytearray, dtype: Any, shape: tuple[int, ...]) -> Array:
+        return np.frombuffer(memory, dtype).reshape(shape)
 
     def bytes_of(self, array: Array) -> Bytes:
         return array.tobytes()

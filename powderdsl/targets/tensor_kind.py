@@ -78,9 +78,8 @@ class Tensors:
     def from_numpy(self, array: Any) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
 
-    def writable(self, dtype: torch.dtype, shape: tuple[int, ...]) -> tuple[Tensor, Any]:
-        made = torch.empty(shape, dtype=dtype)
-        return made, self.bytes_of(made)
+    def from_bytes(self, memory: bytearray, dtype: torch.dtype, shape: tuple[int, ...]) -> Tensor:
+        return torch.frombuffer(memory, dtype=dtype).reshape(shape)
 
     def bytes_of(self, array: Tensor) -> Any:
         """A view: the tensor must live longer."""

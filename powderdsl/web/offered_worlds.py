@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from random import Random
 from typing import Any
 
 from powderdsl.analysis.reactions import unchanging_ids
@@ -35,9 +36,9 @@ def offered_worlds(ruleset: Ruleset, names: Sequence[str]) -> tuple[list[dict[st
         _named("shapes", "Random shapes of all elements.", ruleset, strew(ruleset, (SIDE, SIDE), 1, 0)[0])
     )
     if not unchanging_ids(ruleset):
-        ids = np.array([element.id for element in ruleset.elements], np.uint8)
-        noise = ids[np.random.default_rng(0).integers(0, len(ids), (SIDE, SIDE))]
-        found.append(_named("noise", "Every cell at random.", ruleset, noise))
+        noise = Random(0).choices([element.id for element in ruleset.elements], k=SIDE * SIDE)
+        ids = np.array(noise, np.uint8).reshape(SIDE, SIDE)
+        found.append(_named("noise", "Every cell at random.", ruleset, ids))
     if len(names) > 1:
         found.append(_own(ruleset))
         shown = found[-1]["name"]
@@ -77,9 +78,8 @@ def _own(ruleset: Ruleset) -> dict[str, Any]:
     own = [element.id for element in ruleset.elements if element.pack == pack]
     ids = strew(ruleset, (SIDE, SIDE), 1, 1)[0]
     edge = ids.copy()
-    random = np.random.default_rng(2)
+    random = Random(2)
     for number in range(OWN_SHAPES if own else 0):
         ids[mask(random_shape(random, (SIDE, SIDE), SIDE // 10), (SIDE, SIDE))] = own[number % len(own)]
-    for cells in (np.s_[0], np.s_[-1], np.s_[:, 0], np.s_[:, -1]):
-        ids[cells] = edge[cells]
+    ids[[0, -1]], ids[:, [0, -1]] = edge[[0, -1]], edge[:, [0, -1]]
     return _named(pack, f"Random shapes, and more of {pack}.", ruleset, ids)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from random import Random
+
 from powderdsl.analysis.reactions import moved_ids, unchanging_ids
 from powderdsl.arrays import NDArray, np
 from powderdsl.model.types import Ruleset
@@ -37,12 +39,12 @@ def strew(ruleset: Ruleset, size: Size, batch: int, seed: int) -> NDArray[np.uin
     edge = mask(Shape("frame"), size)
     for index in range(batch):
         world = np.full(size, ground, dtype=np.uint8)
-        random = np.random.default_rng([seed, index])
+        random = Random(f"{seed} {index}")
         for _ in range(24):
             cells = mask(random_shape(random, size, max(min(size) // 8, 1)), size)
-            element = others[random.integers(len(others))]
+            element = random.choice(others)
             if random.random() < 0.5:
-                cells &= random.random(size) < 0.5
+                cells &= np.frombuffer(random.randbytes(height * width), np.uint8).reshape(size) < 128
             world[cells] = element
         if frame is not None:
             world[edge] = frame
@@ -50,16 +52,16 @@ def strew(ruleset: Ruleset, size: Size, batch: int, seed: int) -> NDArray[np.uin
     return worlds
 
 
-def random_shape(random: np.random.Generator, size: Size, reach: int) -> Shape:
+def random_shape(random: Random, size: Size, reach: int) -> Shape:
     """A disk, box or line up to about `2 * reach` cells across, anywhere in a world of `size`."""
-    row, column = (int(random.integers(side)) for side in size)
-    match random.integers(3):
+    row, column = (random.randrange(side) for side in size)
+    match random.randrange(3):
         case 0:
-            return Shape("disk", (row, column, int(random.integers(1, reach + 2))))
+            return Shape("disk", (row, column, random.randint(1, reach + 1)))
         case 1:
-            rows, columns = (int(number) for number in random.integers(1, 2 * reach + 1, 2))
+            rows, columns = random.randint(1, 2 * reach), random.randint(1, 2 * reach)
             return Shape("box", (row, row + rows, column, column + columns))
-    down, right = (int(number) for number in random.integers(-2 * reach, 2 * reach + 1, 2))
+    down, right = random.randint(-2 * reach, 2 * reach), random.randint(-2 * reach, 2 * reach)
     return Shape("line", (row, column, row + down, column + right, 1))
 
 

@@ -50,15 +50,15 @@ def test_values_have_names_and_what_decides_nothing_is_left_out(tmp_path: Path, 
     rules = load(tmp_path, rule)
     (found,) = refuted(rules, ledger(rules))
     place, *drawn = found.notes
-    assert place.startswith("broken at row 0, column 1, after 1 step with seed ")
+    assert place.startswith("broken at row 0, column 0, after 1 step with seed ")
     assert int(place.rpartition(" ")[2]) < 24
     assert drawn == [
         "before   after",
-        ". n      . o",
+        "n .      o .",
         ". air, n nut, o oak",
-        "wish: air oak",
-        "facing: right left",
-        "awake: no yes",
+        "wish: oak air",
+        "facing: left right",
+        "awake: yes no",
     ]
 
 

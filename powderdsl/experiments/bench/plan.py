@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
+from random import Random
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -181,8 +182,9 @@ def _ids(ruleset: Ruleset, cell: Cell, workload: str, random: np.random.Generato
     ground = ruleset.elements[0].id
     world = np.full(cell.size, ground, dtype=np.uint8)
     others = [number for number in ids if number != ground]
+    shapes = Random(int(random.integers(1 << 32)))
     for i in range(_scaled(SHAPES, cell) if others else 0):
-        world[mask(random_shape(random, cell.size, REACH), cell.size)] = others[i % len(others)]
+        world[mask(random_shape(shapes, cell.size, REACH), cell.size)] = others[i % len(others)]
     return world
 
 

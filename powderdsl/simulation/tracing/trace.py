@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
+from math import isfinite
 from typing import Any
 
 from powderdsl.arrays import np
@@ -325,7 +326,7 @@ def plain(ruleset: Ruleset, kind: Kind, value: Any) -> Any:
 
 def _finite(number: float) -> float | str:
     """JSON has no infinities; values within a pass may be infinite."""
-    return number if np.isfinite(number) else str(number)
+    return number if isfinite(number) else str(number)
 
 
 def show_at_cell(ruleset: Ruleset, kind: Kind, value: Any) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping
+from math import prod
 from threading import RLock
 from typing import Any
 
@@ -123,9 +124,10 @@ class Instance:
             like[name] = (value.dtype, tuple(value.shape))
             if not bool(value.any()):  # a new batch holds zeros
                 continue
-            at = self.call("scratch", value.nbytes)
-            self.running.write(at, self.kind.bytes_of(value))
-            for one in self.transfers(name, value.itemsize, like[name][1]):
+            data = self.kind.bytes_of(value)
+            at = self.call("scratch", len(data))
+            self.running.write(at, data)
+            for one in self.transfers(name, value.dtype.itemsize, like[name][1]):
                 begin = at + one["begin"]
                 if one["planes"]:
                     self.call("load", batch, one["number"], one["planes"], one["size"], begin)
@@ -135,17 +137,18 @@ class Instance:
 
     def read(self, batch: int, name: str, like: Like) -> Array:
         """One slot as a new array of its storage dtype."""
-        out, memory = self.kind.writable(*like[name])
+        dtype, shape = like[name]
+        memory = bytearray(prod(shape) * dtype.itemsize)
         with self as call:
-            at = call("scratch", out.nbytes)
-            for one in self.transfers(name, out.itemsize, like[name][1]):
+            at = call("scratch", len(memory))
+            for one in self.transfers(name, dtype.itemsize, shape):
                 begin = at + one["begin"]
                 if one["planes"]:
                     call("store", batch, one["number"], one["planes"], one["signed"], one["size"], begin)
                 else:
                     call("store_real", batch, one["number"], begin, one["apart"])
             self.running.read(at, memory)
-        return out
+        return self.kind.from_bytes(memory, dtype, shape)
 
     def input_bytes(self, params: Mapping[str, Array], worlds: int) -> bytes:
         """Parameters as the module takes them, after the clocks."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from math import prod
+from random import Random
 from typing import TYPE_CHECKING, Any
 
 from powderdsl.arrays import np
@@ -207,17 +209,14 @@ class _Fill:
     def __init__(self, choices: Choices, shape: tuple[int, ...]):
         self.choices = choices
         self.shape = shape
-        self.generator = (
-            None if np.prod(shape) <= FEW_CELLS else np.random.default_rng(choices.below(1 << 31))
-        )
+        self.random = None if prod(shape) <= FEW_CELLS else Random(choices.below(1 << 31))
 
     def choose(self, options: Sequence[Any], planes: int = 1) -> np.ndarray:
         """An array of the shape (with an axis of components, if there are two) whose cells are options."""
         shape = self.shape if planes == 1 else (self.shape[0], planes, *self.shape[1:])
-        if self.generator is not None:
-            return np.asarray(options)[self.generator.integers(0, len(options), shape)]
-        picks = [self.choices.below(len(options)) for _ in range(int(np.prod(shape)))]
-        return np.asarray(options)[np.reshape(picks, shape)]
+        if self.random is not None:
+            return np.array(self.random.choices(options, k=prod(shape))).reshape(shape)
+        return np.array([self.choices.pick(options) for _ in range(prod(shape))]).reshape(shape)
 
 
 def _values(ruleset: Ruleset, slot: Slot, ids: np.ndarray, fill: _Fill) -> np.ndarray:

@@ -11,6 +11,7 @@ import yaml
 
 from powderdsl.arrays import NDArray, np
 from powderdsl.diagnostics import CompileError, Reporter
+from powderdsl.model.text import show_single
 from powderdsl.syntax.sources import read_source
 from powderdsl.syntax.yaml_tree import Mapping, Node, Scalar, parse_yaml
 from powderdsl.system.writing import failure
@@ -44,7 +45,8 @@ def to_tree(node: Node) -> Tree:
 def write_array(values: Array) -> Tree:
     """An array as a tree; floats as the shortest text that means the same float32."""
     if values.ndim == 1:
-        return " ".join(str(value) for value in values)
+        show = show_single if values.dtype == np.float32 else str
+        return " ".join(map(show, values.tolist()))
     return [write_array(part) for part in values]
 
 
@@ -53,7 +55,7 @@ def read_array(tree: Tree, dtype: str) -> Array:
 
     def nested(part: Tree) -> list:
         if isinstance(part, str):
-            return [np.dtype(dtype).type(word) for word in part.split()]
+            return [*map(float if dtype.startswith("float") else int, part.split())]
         assert isinstance(part, list)
         return [nested(item) for item in part]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from typing import TYPE_CHECKING, Any
 
 from powderdsl.arrays import NDArray, np
@@ -12,7 +13,7 @@ from powderdsl.diagnostics import Span
 from powderdsl.model import reference
 from powderdsl.model.fields.words import direction_word
 from powderdsl.model.restrict import restricted, without
-from powderdsl.model.text import one_line, show_number, show_value
+from powderdsl.model.text import one_line, show_number, show_single, show_value
 from powderdsl.model.types import Cell, Example, FieldGrid, Kind, Ruleset
 from powderdsl.simulation.compiling import compile_any
 from powderdsl.testing.generators.cases import holding
@@ -204,7 +205,7 @@ def _run(
     copies = [np.repeat(ids[None], len(one.seeds), axis=0) for ids, one in zip(grids, batch, strict=True)]
     world = sim.world(np.concatenate(copies), seed=[seed for one in batch for seed in one.seeds])
     world = with_fields(world, [one.example for one in batch for _ in one.seeds])
-    ends = np.cumsum([len(one.seeds) for one in batch])
+    ends = list(accumulate(len(one.seeds) for one in batch))
     results: dict[int, ExampleResult] = {}
     now = 0
     for stop in sorted({0}.union(*(one.stops() for one in batch))):
@@ -213,7 +214,7 @@ def _run(
         for number, one in enumerate(batch):
             if number in results or not (stop in one.stops() or one.example.steps == stop):
                 continue
-            own = world.select(slice(int(ends[number]) - len(one.seeds), int(ends[number])))
+            own = world.select(slice(ends[number] - len(one.seeds), ends[number]))
             problem = one.look(own, stop)
             if problem is not None:
                 results[number] = problem
@@ -279,7 +280,7 @@ def field_problem(grid: FieldGrid, world: AnyWorld) -> tuple[int, str] | None:
     low, high = fresh.copy(), fresh.copy()
     counts = holding(world.sim.ruleset, slot, to_numpy(world.ids))
     if not grid.everywhere:
-        counts = np.ones_like(counts)
+        counts = np.ones(counts.shape, bool)
     for row, cells in enumerate(grid.cells):
         for column, cell in enumerate(cells):
             if cell is None:
@@ -291,7 +292,7 @@ def field_problem(grid: FieldGrid, world: AnyWorld) -> tuple[int, str] | None:
     if not wrong.any():
         return None
     index, row, column = (int(part[0]) for part in np.nonzero(wrong))
-    here = np.s_[index, ..., row, column]
+    here = (index, ..., row, column)
     wanted = _wanted(world.sim.ruleset, slot.kind, grid.cells[row][column], fresh[here])
     return (
         index,
@@ -321,7 +322,7 @@ def field_rows(name: str, world: AnyWorld, index: int) -> tuple[str, ...]:
 def _word(rules: Ruleset, kind: Kind, value: NDArray[Any]) -> str:
     """A value of a cell, as a drawing has it."""
     if kind.name in ("real", "vec2"):
-        return ",".join(str(part) for part in np.atleast_1d(value))
+        return ",".join(map(show_single, value.reshape(-1).tolist()))
     return direction_word(int(value)) if kind.name == "direction" else show_value(rules, kind, int(value))
 
 

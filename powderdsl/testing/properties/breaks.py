@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import reduce
 from itertools import pairwise
+from operator import or_
+from random import Random
 from typing import Protocol
 
 from powderdsl.arrays import np
@@ -219,7 +222,7 @@ def near(mask: Array, radius: int) -> Array:
     """Cells within `radius` rows and columns of a mask [B, H, W], across the edges too."""
     for axis in (1, 2):
         reach = min(radius, mask.shape[axis] // 2)
-        mask = np.logical_or.reduce([np.roll(mask, shift, axis) for shift in range(-reach, reach + 1)])
+        mask = reduce(or_, [np.roll(mask, shift, axis) for shift in range(-reach, reach + 1)])
     return mask
 
 
@@ -234,8 +237,9 @@ def draws_for(ruleset: Ruleset, sample: Start) -> dict[str, Array]:
     height, width = sample.shape
     found = {}
     for number, stream in enumerate(ruleset.streams):
-        rows = [np.random.default_rng([int(seed), number]).random((height, width)) for seed in sample.seed]
-        found[stream.name] = np.stack(rows)
+        random = [Random(f"{seed} {number}") for seed in sample.seed.tolist()]
+        cells = [[one.random() for _ in range(height * width)] for one in random]
+        found[stream.name] = np.array(cells).reshape(-1, height, width)
     return found
 
 
@@ -257,8 +261,8 @@ def _alike(claim: Alike, runs: Runs, sample: Start) -> Array:
         second = runs.states(turned, 1)[-1]["element"]
         mask = np.zeros(second.shape[1:], bool)
         for element in runs.ruleset.elements:
-            a = turned_cells(first == element.id, claim.turn).mean(0)
-            b = (second == element.id).mean(0)
+            a = turned_cells(first == element.id, claim.turn).sum(0) / claim.copies
+            b = (second == element.id).sum(0) / claim.copies
             mean = (a + b) / 2
             mask |= np.abs(a - b) > SIGMAS * np.sqrt(2 * mean * (1 - mean) / claim.copies) + 1e-9
         masks.append(turned_back(mask, claim.turn))

@@ -136,7 +136,7 @@ def counterexample_lines(found: Counterexample, ruleset: Ruleset) -> Iterator[st
     for lines in zip(*columns, strict=True):
         yield "".join(line.ljust(width) for line in lines).rstrip()
     names = {element.id: element.name for element in ruleset.elements}
-    there = np.unique([*found.before.ravel(), *found.after.ravel()]).tolist()
+    there = np.unique([*found.before.reshape(-1), *found.after.reshape(-1)]).tolist()
     yield ", ".join(f"{glyphs[number]} {names[number]}" for number in there if number in names)
     yield from _field_lines(found, ruleset, names)
     for name, values in found.sample.params.items():

@@ -153,7 +153,7 @@ class InvariantSearch:
         broken = np.nonzero(found.first)[0]
         if not len(broken):
             return
-        first = int(broken[found.first[broken].argmin()])
+        first = min(broken.tolist(), key=lambda world: int(found.first[world]))
         if isinstance(trial.claim, Symmetric) and self.runner.ruleset.streams:
             # The same numbers may be used in another way: then worlds agree in how often things happen.
             turn = trial.claim.turn

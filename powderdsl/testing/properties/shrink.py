@@ -207,23 +207,23 @@ def _parts(axis: int, halves: bool) -> Group:
         size = sample.shape[axis]
         if size < 2 or (halves and size < 4):
             return []
-        everything = np.arange(size)
         if halves:
             half = size // 2
-            kept = [everything[at : at + half] for at in range(size - half + 1)]
+            kept = [[*range(at, at + half)] for at in range(size - half + 1)]
         else:
-            kept = [np.delete(everything, gone) for gone in range(size - 1, -1, -1)]
+            kept = [[at for at in range(size) if at != gone] for gone in range(size - 1, -1, -1)]
         return [_cut(sample, axis, keep) for keep in kept]
 
     return group
 
 
-def _cut(sample: Start, axis: int, keep: np.ndarray) -> Start:
-    place = axis - 2  # rows and columns are the last axes of every array
+def _cut(sample: Start, axis: int, keep: list[int]) -> Start:
+    # Rows and columns are the last axes of every array.
+    cells = (..., keep, slice(None)) if axis == 0 else (..., keep)
     return replace(
         sample,
-        ids=np.take(sample.ids, keep, place),
-        fields={name: np.take(values, keep, place) for name, values in sample.fields.items()},
+        ids=sample.ids[cells],
+        fields={name: values[cells] for name, values in sample.fields.items()},
     )
 
 
@@ -242,9 +242,10 @@ def _fewer_values(sample: Start) -> list[Start]:
     smaller = []
     for name, values in {"": sample.ids, **sample.fields}.items():
         ground = 0 if name else sample.ids.min()
-        for place in np.argwhere(values != ground).tolist():
+        places = (axis.tolist() for axis in np.nonzero(values != ground))
+        for place in zip(*places, strict=True):
             fewer = values.copy()
-            fewer[tuple(place)] = ground
+            fewer[place] = ground
             part = {"fields": {**sample.fields, name: fewer}} if name else {"ids": fewer}
             smaller.append(replace(sample, **part))
     return smaller
