@@ -16,7 +16,7 @@ from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.experiments.runs import RunFolder, find_run
 from powderdsl.experiments.runs.intervals import mean_and_interval
 from powderdsl.rl.config import BASELINES, TrainConfig, chosen_policies
-from powderdsl.rl.policies import config_of, load_policy, task_of
+from powderdsl.rl.policies import TrainedPolicy, config_of, load_policy, task_of
 from powderdsl.simulation.simulator import World
 from powderdsl.tasks.episodes import TaskProgram, compile_task
 from powderdsl.tasks.players import ExpertPlayer
@@ -204,15 +204,9 @@ def evaluate(
         )
     backend, device = backend or config.backend, device or config.device
     first = compile_task(task, split=names[0], backend=backend, device=device, threads=config.threads)
-    acts: dict[str, Policy | ExpertPlayer | None] = {
-        "random": random_policy(first.action_nvec),
-        "nothing": None,
-    }
-    step = None
-    if run is not None and "trained" in chosen:
-        env = TensorEnv(first, 1, observation=config.observation)
-        trained = load_policy(run, env, deterministic=deterministic)
-        acts["trained"], step = trained, trained.step
+    players = {one: player(one, first, run, deterministic=deterministic) for one in chosen}
+    trained = players.get("trained")
+    step = trained.step if isinstance(trained, TrainedPolicy) else None
     scores: list[Score] = []
     unchanged: dict[str, int] = {}
     seen: dict[str, Seen] = {}
@@ -222,8 +216,8 @@ def evaluate(
         count = config.worlds if run is not None and name == config.split else episodes
         worlds = torch.arange(episodes) % count
         if "expert" in chosen:
-            acts["expert"] = ExpertPlayer(program)
-        played = {one: _play_all(program, acts[one], worlds, config.observation, seed) for one in chosen}
+            players["expert"] = ExpertPlayer(program)
+        played = {one: _play_all(program, players[one], worlds, config.observation, seed) for one in chosen}
         if len(chosen) > 1:
             returns = torch.stack([one.returns for one in played.values()])
             unchanged[name] = int((returns == returns[0]).all(0).sum())
@@ -244,6 +238,25 @@ def evaluate(
     if run is not None:
         run.write_json(EVALUATION, found.as_json())
     return found
+
+
+def player(
+    name: str, program: TaskProgram, run: RunFolder | None = None, *, deterministic: bool = False
+) -> Policy | ExpertPlayer | None:
+    """The policy of a name among POLICIES; None does nothing.
+
+    Args:
+        run: whose policy the trained one is. deterministic: it takes the likeliest action.
+
+    Raises:
+        CompileError: as `load_policy`.
+    """
+    if name == "trained" and run is not None:
+        env = TensorEnv(program, 1, observation=config_of(run).observation)
+        return load_policy(run, env, deterministic=deterministic)
+    if name == "expert":
+        return ExpertPlayer(program)
+    return random_policy(program.action_nvec) if name == "random" else None
 
 
 def _play_all(

@@ -123,9 +123,9 @@ def test_preset_and_options_make_the_configuration(tmp_path: Path, dunes: str) -
         (("train", "--rulesets", "2", "--swap", "densty"), "did you mean `density`?"),
         (("train", "--device", "cuda:77"), "PD701"),
         (("finetune", "nowhere", "--packs", "sand"), "PD620"),
-        (("finetune", "nowhere"), "--packs names what is to be learned"),
+        (("finetune", "nowhere"), "Missing option '--packs'"),
         (("eval", "nowhere"), "PD620"),
-        (("show", "nowhere", "--out", "x.gif"), "pictures are .png files"),
+        (("show", "nowhere", "--out", "x.gif"), "must end in .png"),
         (("show", "nowhere", "--out", "no/where.png"), "PD613"),
     ],
 )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -13,12 +12,6 @@ from powderdsl.cli.options import check_writable, find_played
 from powderdsl.cli.pictures import MAX_SIDE
 from powderdsl.rl.config import TrainConfig
 from powderdsl.tasks.task import Task
-
-if TYPE_CHECKING:
-    from powderdsl.envs.acting import Policy
-    from powderdsl.experiments.runs import RunFolder
-    from powderdsl.tasks.episodes import TaskProgram
-    from powderdsl.tasks.players import ExpertPlayer
 
 
 @click.command("watch", cls=opt.ManyWords)
@@ -80,12 +73,16 @@ def command(
         raise BadInput("such a picture is too large: choose a smaller --scale, or fewer --worlds")
     import torch
 
+    from powderdsl.rl.evaluation import player
     from powderdsl.rl.films import film
     from powderdsl.simulation.media import write_gif, write_mp4
     from powderdsl.tasks.episodes import compile_task
 
     program = compile_task(task, split=split, backend=backend or config.backend)
-    acts, observation = _acting(policy, played, program, config, deterministic)
+    run_folder = None if isinstance(played, Task) else played
+    with user_values():
+        acts = player(policy, program, run_folder, deterministic=deterministic)
+    observation = config.observation if policy == "trained" else "ids"
     numbers = torch.arange(first, first + worlds)
     episodes, pictures = film(program, acts, numbers, observation=observation, seed=seed, factor=scale)
     write = write_gif if out.suffix.lower() == ".gif" else write_mp4
@@ -94,21 +91,3 @@ def command(
     click.echo(
         f"wrote {out}: {task.name}, {policy}, worlds {first} to {first + worlds - 1} of {split}: {returns}"
     )
-
-
-def _acting(
-    name: str, played: Task | RunFolder, program: TaskProgram, config: TrainConfig, deterministic: bool
-) -> tuple[Policy | ExpertPlayer | None, str]:
-    """A policy, None if nobody acts, and the kind of observation that it is given."""
-    from powderdsl.envs.acting import random_policy
-    from powderdsl.envs.tensor_env import TensorEnv
-    from powderdsl.rl.policies import load_policy
-    from powderdsl.tasks.players import ExpertPlayer
-
-    with user_values():
-        if name == "trained" and not isinstance(played, Task):
-            env = TensorEnv(program, 1, observation=config.observation)
-            return load_policy(played, env, deterministic=deterministic), config.observation
-        if name == "expert":
-            return ExpertPlayer(program), "ids"
-        return (random_policy(program.action_nvec) if name == "random" else None), "ids"

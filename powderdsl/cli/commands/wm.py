@@ -12,7 +12,7 @@ import click
 
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput, user_values
-from powderdsl.cli.options import check_writable, knob_values
+from powderdsl.cli.options import knob_values
 from powderdsl.cli.output import print_json, progress
 from powderdsl.cli.wm_report import told, write_curve
 from powderdsl.worldmodel.config import PRESETS, DataConfig, TrainConfig, Variety
@@ -29,30 +29,10 @@ if TYPE_CHECKING:
 
 KNOBS = ("kinds", "lines", "disks", "squares")
 """Knobs of the shipped task that have options of their own."""
-ANY_RUN = (
-    "width",
-    "slots",
-    "iterations",
-    "batch",
-    "learning_rate",
-    "seed",
-    "network_name",
-    "folder",
-    "out",
-    "scale",
-)
+OF_WORLDS = {one.name for one in (*fields(DataConfig), *fields(Variety))} - {"task"}
+OF_WORLDS |= {*KNOBS, "packs", "held_out", "settings", "worlds", "after"}
+"""Options that select worlds: a dataset has its own."""
 MACHINE = ("device", "threads", "backend", "store", "compiled")
-NOT_OF_WORLDS = {
-    *ANY_RUN,
-    *MACHINE,
-    "preset",
-    "save_every",
-    "validate_every",
-    "data",
-    "ignore_actions",
-    "task",
-}
-"""Options that networks with actions have too."""
 
 _network = opt.text(
     "--network",
@@ -154,17 +134,16 @@ def new_config(values: Mapping[str, Any], rules_of: Callable[..., str]) -> Train
         )
     with user_values():
         config = replace(PRESETS[values["preset"]], **_given(values, TrainConfig))
-        data = replace(config.data, **_given(values, DataConfig))
-        rules = values["rules"] or ""
+        rules, task = values["rules"] or "", values["task"] or config.data.task
         short = {name: values[name] for name in KNOBS if values[name] is not None}
-        data = replace(
-            data,
-            rules=rules_of(rules, data.task, packs, held_out) if packs or held_out else rules,
-            knobs=short | knob_values(values["knobs"]),
-            params=values["settings"],
-            variety=Variety(**variety),
-        )
-    return replace(config, data=data)
+        changes = {
+            **_given(values, DataConfig),
+            "rules": rules_of(rules, task, packs, held_out) if packs or held_out else rules,
+            "knobs": short | knob_values(values["knobs"]),
+            "params": values["settings"],
+            "variety": Variety(**variety),
+        }
+        return replace(config, data=replace(config.data, **changes))
 
 
 @command.command("finetune", cls=opt.ManyWords)
@@ -205,15 +184,8 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
     "--rulesets", 0, 1024, "Number of rulesets that training never saw, to test under.  [default: 0]"
 )
 @opt.flag("--json", "One JSON object instead of a table.", to="as_json")
-@opt.path("--out", "FILE", "File of the results.  [default: RUN/evaluation.json]")
-def eval_command(
-    run: str,
-    as_json: bool,
-    out: Path | None,
-    data: Path | None,
-    network_name: str | None,
-    **values: Any,
-) -> None:
+@opt.output("--out", "FILE", "File of the results.  [default: RUN/evaluation.json]")
+def eval_command(run: str, as_json: bool, out: Path | None, **values: Any) -> None:
     """Test a network beside two baselines: that nothing changes, and each element's most frequent outcome.
 
     RUN is a run's folder, or its name in runs/. Losses are cross-entropies a cell, in nats. The worlds have seeds
@@ -222,11 +194,8 @@ def eval_command(
     """
     from powderdsl.experiments.runs.folder import write_json
     from powderdsl.worldmodel.evaluation import evaluate, evaluate_recording
-    from powderdsl.worldmodel.trained import load_trained
 
-    machine = _machine(values)
-    trained = load_trained(run, device=machine.device, network=_own_network(network_name))
-    recording = _recording_of(trained, data, values)
+    trained, recording, machine = _loaded(run, values)
     if recording is not None:
         tested = evaluate_recording(trained, recording, machine=machine)
     else:
@@ -244,30 +213,17 @@ def eval_command(
 
 @command.command("show", cls=opt.ManyWords)
 @_test_options
-@opt.path("--out", "FILE", "The .png file to write.", required=True)
+@opt.output("--out", "FILE", "The picture to write.", ".png", required=True)
 @opt.flag("--curve", "Plot the losses of the training instead.")
 @opt.integer("--steps", 1, 4096, "Steps to predict.  [default: as trained]")
 @opt.integer("--after", 0, 10**6, "Steps that worlds run before the start.  [default: 0]")
 @opt.integer("--scale", 1, 16, "Pixels per cell.", 2)
-def show_command(
-    run: str,
-    out: Path,
-    curve: bool,
-    steps: int | None,
-    after: int | None,
-    scale: int,
-    data: Path | None,
-    network_name: str | None,
-    **values: Any,
-) -> None:
+def show_command(run: str, out: Path, curve: bool, scale: int, **values: Any) -> None:
     """Draw each test as a strip: start, truth, prediction, and in red where that is wrong.
 
     For several times the steps that the network was trained for, it is applied to what it predicted. With --curve, the
     losses on training and on held-out worlds are plotted against the iterations, from the run's metrics.
     """
-    if out.suffix.lower() != ".png":
-        raise BadInput(f"`{out}`: pictures are .png files")
-    check_writable(out)
     if curve:
         from powderdsl.experiments.runs import find_run
         from powderdsl.worldmodel.training import KIND
@@ -276,20 +232,20 @@ def show_command(
         return
     from powderdsl.worldmodel.evaluation import unseen_worlds
     from powderdsl.worldmodel.strips import recorded_strips, strips
-    from powderdsl.worldmodel.trained import load_trained
 
-    machine = _machine(values)
-    trained = load_trained(run, device=machine.device, network=_own_network(network_name))
-    recording = _recording_of(trained, data, {**values, "steps": steps, "after": after})
+    trained, recording, machine = _loaded(run, values)
     if recording is not None:
         _show(recorded_strips(trained.network, recording), recording.rules, out, scale)
         return
     step = trained.config.data.steps
-    if steps is not None and steps % step:
+    steps = values["steps"] or step
+    if steps % step:
         raise BadInput(f"--steps {steps}: this network predicts {step} steps, or several times as many")
     worlds = unseen_worlds(trained, machine=machine, **tested_on(values))
-    found = strips(trained.network, worlds, step=step, times=(steps or step) // step, after=after or 0)
-    _show(found, worlds.rules, out, scale)
+    after = values["after"] or 0
+    _show(
+        strips(trained.network, worlds, step=step, times=steps // step, after=after), worlds.rules, out, scale
+    )
     for variant in worlds.missing:
         click.echo(f"left out: {variant.name}, which needs {', '.join(variant.elements)}", err=True)
 
@@ -337,8 +293,7 @@ def _machine(values: dict[str, Any]) -> Machine:
 def _refuse(values: Mapping[str, Any]) -> None:
     """Refuse options that select worlds: a dataset has its own."""
     for one in click.get_current_context().command.params:
-        given = values.get(one.name or "") not in (None, (), {}, False)
-        if isinstance(one, click.Option) and one.name not in NOT_OF_WORLDS and given:
+        if one.name in OF_WORLDS and values.get(one.name) not in (None, (), {}):
             raise BadInput(f"{one.opts[0]} selects worlds, and --data has its own")
 
 
@@ -352,18 +307,22 @@ def _opened(folder: Path, task: str | None) -> Recording:
     return open_recording(folder, task)
 
 
-def _recording_of(trained: Trained, folder: Path | None, values: dict[str, Any]) -> Recording | None:
-    """The recording that a network is tested on; None for a network without actions."""
+def _loaded(run: str, values: dict[str, Any]) -> tuple[Trained, Recording | None, Machine]:
+    """The network of a run, the recording that it is tested on if it has actions, and where to compute."""
+    from powderdsl.worldmodel.trained import load_trained
+
+    machine, folder = _machine(values), values["data"]
+    trained = load_trained(run, device=machine.device, network=_own_network(values["network_name"]))
     if trained.config.recorded is None:
         if folder is not None:
             raise BadInput("--data is for networks that learned from a dataset")
-        return None
+        return trained, None, machine
     _refuse(values)
     recorded = trained.run.about.get("dataset")
     if folder is None and not isinstance(recorded, str):
         raise BadInput("--data: say which dataset")
-    task = trained.config.data.task
-    return _opened(folder or Path(str(recorded)), values["task"] or task)
+    task = values["task"] or trained.config.data.task
+    return trained, _opened(folder or Path(str(recorded)), task), machine
 
 
 def _own_network(name: str | None) -> CustomNetwork | None:
