@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from powderdsl.cli.options import settings_of
-from powderdsl.system.settings import check_bounds, out_of_bounds, setting
+from powderdsl.system.settings import check_settings, mistakes, setting
 
 
 @dataclass(frozen=True)
@@ -22,22 +22,22 @@ class Config:
 
 @pytest.mark.parametrize("wrong", [0, 10, 2.0, True, "3", None, float("nan"), 10**400])
 def test_numbers_out_of_bounds(wrong: object) -> None:
-    (found,) = out_of_bounds(Config(rounds=wrong))  # type: ignore[arg-type]
+    ((found, _),) = mistakes(Config(rounds=wrong))  # type: ignore[arg-type]
     assert found == f"`rounds` is {wrong!r}: it takes an integer from 1 to 9"
 
 
 @pytest.mark.parametrize("wrong", [-0.1, float("nan"), float("inf"), False, "1", 10**400])
 def test_reals_out_of_bounds(wrong: object) -> None:
-    (found,) = out_of_bounds(Config(decay=wrong))  # type: ignore[arg-type]
+    ((found, _),) = mistakes(Config(decay=wrong))  # type: ignore[arg-type]
     assert found == f"`decay` is {wrong!r}: it takes a number from 0 to 1"
 
 
 def test_all_mistakes_are_said_at_once() -> None:
-    check_bounds(Config(9, 1, 10**30))
+    check_settings(Config(9, 1, 10**30))
     with pytest.raises(
         ValueError, match=r"`rounds` is 0: .*; `most_cells` is 1: it takes an integer from 2$"
     ):
-        check_bounds(Config(0, 1.0, 1))
+        check_settings(Config(0, 1.0, 1))
 
 
 def test_options_follow_from_settings() -> None:
