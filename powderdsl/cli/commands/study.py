@@ -20,7 +20,7 @@ from powderdsl.cli.study.checks import called, check_study
 from powderdsl.diagnostics import suggest
 from powderdsl.diagnostics.printable import printable
 from powderdsl.experiments.studies.cluster import check_cluster, run_on_ray
-from powderdsl.experiments.studies.run import Outcome, StudyRun
+from powderdsl.experiments.studies.run import Outcome, StudyRun, collected, read_folders
 from powderdsl.experiments.studies.study import (
     FILE,
     FLAG,
@@ -155,8 +155,6 @@ def collect(folders: tuple[Path, ...], seeds: int | None, only: tuple[str, ...],
     Writes results.md, results.json and figure.png, as the study does that ran in one piece. Exits with 1 if results of
     some combinations are missing.
     """
-    from powderdsl.experiments.studies.collect import collected, read_folders
-
     runs = read_folders(folders, commands())
     study, size = runs[0].study, runs[0].size
     outcomes = [collected(runs, point) for point in selected(study, size, seeds, only)]

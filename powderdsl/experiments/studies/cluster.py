@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 import os
 import platform
-import re
 import signal
 import socket
 import sys
@@ -130,13 +129,13 @@ def check_cluster(address: str) -> None:
         )
     if address in ("auto", "local"):
         return
-    match = re.fullmatch(r"(?:ray://)?\[?([^\s/\[\]]+)\]?:([0-9]{1,5})", address)
-    if match is None:
-        raise _no_cluster(address, "an address is `auto` or HOST:PORT")
+    host, _, port = address.removeprefix("ray://").rpartition(":")
     try:
-        socket.create_connection((match[1], int(match[2])), timeout=10).close()
-    except (OSError, OverflowError, UnicodeError) as error:
-        raise _no_cluster(address, getattr(error, "strerror", None) or str(error)) from None
+        socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()
+    except OSError as error:
+        raise _no_cluster(address, error.strerror or str(error)) from None
+    except (OverflowError, ValueError):
+        raise _no_cluster(address, "an address is `auto` or HOST:PORT") from None
 
 
 def _no_cluster(

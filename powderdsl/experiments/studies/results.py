@@ -234,43 +234,29 @@ def write_figure(path: Path, study: Study, size: str, outcomes: Sequence[Outcome
 
 
 def _draw(axes: Axes, study: Study, size: str, finding: Finding) -> None:
-    from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullLocator
-
-    first = study.axes[0]
-    ticks = [word.text for word in first.values[size]]
-    try:
-        numbers, joined = [float(tick) for tick in ticks], "-"
-    except ValueError:  # words, which nothing lies between
-        numbers, joined = [float(number) for number in range(len(ticks))], ""
+    """Draw a measure. The values of the first setting are at equal distances."""
+    ticks = [word.text for word in study.axes[0].values[size]]
     lines = _lines(finding.cells)
     for label, cells in lines.items():
-        across = [numbers[ticks.index(cell.values[0][1])] for cell in cells]
-        means = [cell.over_seeds.mean for cell in cells]
-        ends = [
-            (cell.over_seeds.mean - cell.over_seeds.low, cell.over_seeds.high - cell.over_seeds.mean)
-            for cell in cells
-        ]
+        across = [ticks.index(cell.values[0][1]) for cell in cells]
+        intervals = [cell.over_seeds for cell in cells]
+        means = [interval.mean for interval in intervals]
         # A single value has no interval.
-        bars = [end if math.isfinite(end[1]) else (0.0, 0.0) for end in ends]
-        axes.errorbar(
-            across, means, list(zip(*bars, strict=True)), fmt=f"o{joined}", capsize=3, label=label or None
-        )
+        bars = [
+            (interval.mean - interval.low, interval.high - interval.mean)
+            if math.isfinite(interval.high)
+            else (0.0, 0.0)
+            for interval in intervals
+        ]
+        axes.errorbar(across, means, list(zip(*bars, strict=True)), fmt="o", capsize=3, label=label or None)
         for place, cell in zip(across, cells, strict=True):
             axes.plot([place] * len(cell.by_seed), [*cell.by_seed.values()], "k.", markersize=3, alpha=0.4)
-    above = [number for number in numbers if number > 0]
-    if joined and min(numbers) >= 0 and above and max(above) >= 10 * min(above):
-        axes.set_xscale("symlog", linthresh=min(above)) if 0 in numbers else axes.set_xscale("log")
-    axes.set_xticks(numbers, ticks, minor=False)
-    if not joined and sum(map(len, ticks)) > 40:
+    axes.set_xticks(range(len(ticks)), ticks)
+    if sum(map(len, ticks)) > 40:
         axes.tick_params("x", labelrotation=25)
-    axes.xaxis.set_minor_locator(NullLocator())
     if finding.measure.scale == "log":
         axes.set_yscale("log")
-        low, high = axes.get_ylim()
-        axes.yaxis.set_major_locator(MaxNLocator(6) if high < 5 * low else LogLocator(subs=(1, 2, 5)))
-        axes.yaxis.set_minor_locator(NullLocator())
-        axes.yaxis.set_major_formatter(FormatStrFormatter("%g"))
-    axes.set_xlabel(first.about)
+    axes.set_xlabel(study.axes[0].about)
     axes.set_ylabel(finding.measure.about)
     axes.grid(linewidth=0.3)
     if any(lines):
