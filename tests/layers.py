@@ -118,7 +118,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "worldmodel": (*_SCREEN, *_LEARNING[:7]),
     "ogbench": (*_SCREEN, "experiments.runs", "tasks", "tasks.tensors", "tasks.episodes", "envs"),
     # Calls commands, in processes of their own.
-    "experiments.studies": (*_FRONT, "compiler", "experiments.runs", "experiments.bench"),
+    "experiments.studies": (*_FRONT, "compiler", "experiments.runs"),
     "web.worlds": _FRONT,
     "web": (*_BACK, "simulation.standalone", *_WORLDS, "tasks", "tasks.tensors", "web.worlds"),
     "web.bridge": (*_SCREEN, "simulation.standalone", *_TESTING, "web.worlds"),

@@ -74,8 +74,8 @@ def write_curve(run: RunFolder, out: Path) -> None:
     Raises:
         BadInput: the run has no losses yet. CompileError: PD612 without matplotlib, PD613 if the file cannot be written.
     """
-    from powderdsl.experiments.bench.plot import require_matplotlib
     from powderdsl.experiments.runs.metrics import read_metrics
+    from powderdsl.system.packages import require_matplotlib
     from powderdsl.system.writing import replacing
 
     require_matplotlib()

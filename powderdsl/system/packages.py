@@ -22,3 +22,8 @@ def require(module: str, work: str, *helps: str) -> Any:
     except ImportError as error:
         missing = error.name or module
         raise failure("PD612", f"{work} needs {missing}, which is not installed", helps=helps) from None
+
+
+def require_matplotlib() -> None:
+    """Raise CompileError (PD612) if matplotlib is not installed: before long work, not after it."""
+    require("matplotlib", "drawing a plot", "pip install 'powderdsl[plot]'")

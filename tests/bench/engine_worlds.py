@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from powderdsl.experiments.bench.plan import make_plan, start_worlds
+from powderdsl.experiments.bench.plan import Plan, start_worlds
 from tests.bench.beside_engine import State, load, stepped
 from tests.bench.rounds import microseconds
 from tests.recordings import STREAMS
@@ -39,10 +39,8 @@ def starts(runner: Runner, elements: tuple[str, ...]) -> Iterator[tuple[str, Any
     sim = runner.simulator
     for side in (64, 32):
         for workload in ("noise", "shapes"):
-            plan = make_plan(
-                sim.ruleset, workload=workload, sizes=[(side, side)], batches=[WORLDS], only=elements
-            )
-            world = start_worlds(sim, plan.cells[0], workload, 0)
+            plan = Plan(sim.ruleset, workload=workload, sizes=[(side, side)], batches=[WORLDS], only=elements)
+            world = start_worlds(sim, plan, plan.cells[0])
             if workload == "noise":
                 yield f"random cells, {side}×{side}", sim.world(world.ids)
             yield f"{workload}, {side}×{side}", world

@@ -14,13 +14,10 @@ from powderdsl.cli.output import print_json, progress
 from powderdsl.compiler import starting_backend
 from powderdsl.experiments.bench.machine import this_machine
 from powderdsl.experiments.bench.measure import measuring
-from powderdsl.experiments.bench.plan import WORKLOADS, Plan, make_plan
-from powderdsl.experiments.bench.plot import require_matplotlib, write_plot
+from powderdsl.experiments.bench.plan import WORKLOADS, Plan
 from powderdsl.experiments.bench.programs import read_program
 from powderdsl.experiments.bench.report import CellFigures, Report, report_data, report_text
 from powderdsl.model.state import fitting
-from powderdsl.system.reports import as_json
-from powderdsl.system.writing import write_text
 from powderdsl.targets.cpp.compilers import NoCompiler, find_compiler
 
 MAX_SECONDS = 3600
@@ -55,8 +52,7 @@ EPILOG = "\b\nWorkloads:\n" + "\n".join(f"  {name:<7} {about}" for name, about i
 )
 @opt.integer("--batch", 1, 1 << 20, "Number of worlds in a batch.", (1, 32), to="batches", multiple=True)
 @opt.value("--size", opt.SIZE, "Rows and columns.  [default: 64]", to="sizes", multiple=True)
-@opt.integer("--elements", 1, 256, "Use only the first N elements in the worlds.", multiple=True)
-@opt.value("--only", NAMES, "Use only these elements in the worlds.")
+@opt.value("--only", NAMES, "Use only these elements in the worlds.", ())
 @opt.integer("--threads", 1, 1024, "CPU threads.", (1,), multiple=True)
 @opt.value(
     "--beside",
@@ -75,35 +71,27 @@ EPILOG = "\b\nWorkloads:\n" + "\n".join(f"  {name:<7} {about}" for name, about i
 @opt.parameters
 @opt.flag("--profile", "Also measure the time of each pass.")
 @opt.flag("--json", "Print one JSON object instead of tables.", to="printed")
-@opt.output("--out", "FILE.json", "Also write the JSON object to this file.", to="data")
-@opt.output("--plot", "FILE.png", "Plot rates against batch sizes. Needs matplotlib.")
 def command(
     rules: str,
     backends: tuple[str, ...],
     sizes: tuple[tuple[int, int], ...],
-    only: tuple[str, ...] | None,
     device: str,
     settings: dict[str, str],
     programs: tuple[Path, ...],
     printed: bool,
-    data: Path | None,
-    plot: Path | None,
     **measurement: Any,
 ) -> int:
     """Measure how fast rules run.
 
-    --backend, --batch, --size, --elements and --threads may be repeated. All their combinations are measured, in
+    --backend, --batch, --size and --threads may be repeated. All their combinations are measured, in
     turn, round after round, and medians are shown. Ctrl-C shows what was measured so far.
     """
     ruleset = opt.load_rules(rules, settings)
-    if plot is not None:
-        require_matplotlib()
     with user_values():
-        plan = make_plan(
+        plan = Plan(
             ruleset,
             backends=backends or _usual_backends(device),
             sizes=sizes or ((fitting(ruleset, 64),) * 2,),
-            only=only or (),
             device=device,
             programs=[read_program(file) for file in programs],
             **measurement,
@@ -114,10 +102,6 @@ def command(
         print_json(report_data(report))
     else:
         click.echo(report_text(report))
-    if data is not None:
-        write_text(data, f"{as_json(report_data(report))}\n", follow=True)
-    if plot is not None and report.cells:
-        write_plot(plot, report)
     if interrupt is not None:
         raise interrupt
     return OK
@@ -144,7 +128,7 @@ def _measured(plan: Plan) -> tuple[Report, KeyboardInterrupt | None]:
     try:
         with progress("bench", len(plan.cells) * (1 + plan.rounds + plan.profile)) as show:
             for done, (what, cell) in enumerate(measuring(plan, figures)):
-                show(done, f"{what} {cell.backend}, batch {cell.batch}")
+                show(done, f"{what} {cell}")
     except KeyboardInterrupt as caught:
         interrupt = caught
     measured = tuple(cell for cell in figures if cell.round_seconds)

@@ -10,35 +10,15 @@ import re
 import sys
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
-
-BUSY = 0.5
-"""Runnable processes per CPU above which other processes disturb a measurement."""
+from typing import Any
 
 
-@dataclass(frozen=True)
-class Machine:
-    """The machine and the versions of what ran on it. `load` is the load average of the minute before."""
+def this_machine(device: str) -> dict[str, Any]:
+    """This machine, the name of a torch device, and the versions of what runs on it.
 
-    system: str
-    processor: str
-    cpus: int
-    device: str
-    python: str
-    torch: str
-    compiler: str
-    powderdsl: str
-    load: float | None
-
-    @property
-    def busy(self) -> bool:
-        """Other processes were running before the measurement."""
-        return self.load is not None and self.load > BUSY * self.cpus
-
-
-def this_machine(device: str) -> Machine:
-    """This machine, and the name of a torch device. Raises CompileError (PD701) without such a device."""
+    `load` is the load average of the minute before. Raises CompileError (PD701) without such a device.
+    """
     import torch
 
     from powderdsl.simulation.programs import find_device
@@ -49,17 +29,17 @@ def this_machine(device: str) -> Machine:
         compiler = find_compiler().version
     except NoCompiler:
         compiler = "none"
-    return Machine(
-        system=f"{platform.system()} {platform.machine()}",
-        processor=_processor(),
-        cpus=len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
-        device=torch.cuda.get_device_name(kind) if kind.type == "cuda" else device,
-        python=platform.python_version(),
-        torch=str(torch.__version__),
-        compiler=compiler,
-        powderdsl=sys.modules["powderdsl"].__version__,
-        load=os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
-    )
+    return {
+        "system": f"{platform.system()} {platform.machine()}",
+        "processor": _processor(),
+        "cpus": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
+        "device": torch.cuda.get_device_name(kind) if kind.type == "cuda" else device,
+        "python": platform.python_version(),
+        "torch": str(torch.__version__),
+        "compiler": compiler,
+        "powderdsl": sys.modules["powderdsl"].__version__,
+        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+    }
 
 
 def _processor() -> str:
@@ -68,18 +48,6 @@ def _processor() -> str:
             if line.startswith("model name"):
                 return line.partition(":")[2].strip()
     return platform.processor() or platform.machine()
-
-
-PEAK = "highest resident size of the process during the first calls, less that just before them"
-ALLOCATED = "torch.cuda.max_memory_allocated during the first calls, less what was allocated before"
-UNKNOWN = "not measured on this system"
-
-
-def memory_measure(device: str) -> str:
-    """The figure that `peak_growth` returns for a device, in words."""
-    if device.startswith("cuda"):
-        return ALLOCATED
-    return PEAK if sys.platform == "linux" else UNKNOWN
 
 
 def peak_growth(work: Callable[[], None], device: str) -> int | None:

@@ -50,7 +50,7 @@ def measuring(plan: Plan, cells: list[CellFigures]) -> Iterator[tuple[str, Cell]
                 sim, compiling = compiled(cell.backend, plan.device, cell.threads)
             else:
                 sim, compiling = compiled("reference", "cpu", 1)[0], 0.0
-            world = start_worlds(sim, cell, plan.workload, plan.seed)
+            world = start_worlds(sim, plan, cell)
             subject = _Subject(sim, world, program)
             memory = peak_growth(partial(subject.begin, plan), sim.device.type)
             subjects.append(subject)

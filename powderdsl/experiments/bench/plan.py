@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 from random import Random
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from powderdsl.compiler import BACKENDS
 from powderdsl.diagnostics import suggest
 from powderdsl.experiments.bench.programs import Program
 from powderdsl.model.state import check_sides
-from powderdsl.model.types import Field, Ruleset
+from powderdsl.model.types import Element, Field, Ruleset
 from powderdsl.worlds.raster import Size, mask
 from powderdsl.worlds.strewn import check_cells, random_shape
 
@@ -35,40 +36,46 @@ WORKLOADS: dict[str, str] = {
 """Worlds to start from, for any ruleset."""
 
 
-@dataclass(frozen=True)
-class Cell:
-    """One combination of the cross product. `size` is (rows, columns) of a world, `elements` are in the worlds.
+class Cell(NamedTuple):
+    """One combination of the cross product. `size` is (rows, columns) of a world.
 
     `backend` may be the name of a program that is measured beside the backends.
     """
 
     backend: str
-    batch: int
     size: Size
-    elements: tuple[str, ...]
     threads: int
+    batch: int
 
     @property
     def world_cells(self) -> int:
         """Cells of one world."""
         return self.size[0] * self.size[1]
 
-    @property
-    def size_text(self) -> str:
-        return f"{self.size[0]}×{self.size[1]}"
+    def __str__(self) -> str:
+        threads = f", {self.threads} threads" if self.threads > 1 else ""
+        return f"{self.backend}, {self.batch} of {self.size[0]}×{self.size[1]}{threads}"
 
 
 @dataclass(frozen=True)
 class Plan:
-    """All that a measurement depends on.
+    """All that a measurement depends on: the cross product of backends and programs, sizes, threads and batches.
 
     A sample is as many calls of `Simulator.step` as fit into ``seconds / rounds``, each of up to `steps` steps
-    from the same worlds. `workload` is one of `WORKLOADS`, `programs` are measured beside the backends, and `profile`
+    from the same worlds. `workload` is one of `WORKLOADS`, `only` names the elements on the ground, and `profile`
     times each pass too.
+
+    Raises:
+        ValueError: an unknown element, a size that the rules do not take, or a program's name that is taken.
+        CompileError: PD607 for worlds of more cells than fit.
     """
 
     ruleset: Ruleset
-    cells: tuple[Cell, ...]
+    backends: Sequence[str] = ("wasm",)
+    sizes: Sequence[Size] = ((64, 64),)
+    threads: Sequence[int] = (1,)
+    batches: Sequence[int] = (1, 32)
+    only: Sequence[str] = ()
     workload: str = "gusts"
     device: str = "cpu"
     seed: int = 0
@@ -76,77 +83,40 @@ class Plan:
     seconds: float = 2.0
     rounds: int = 5
     profile: bool = False
-    programs: tuple[Program, ...] = ()
+    programs: Sequence[Program] = ()
+
+    def __post_init__(self) -> None:
+        names = [program.name for program in self.programs]
+        for name in names:
+            if name in BACKENDS or names.count(name) > 1:
+                raise ValueError(f"programs: `{name}` is the name of another program or of a backend")
+        for size in self.sizes:
+            check_sides(self.ruleset, size)
+            check_cells(max(self.batches), size)
+        known = [element.name for element in self.ruleset.elements]
+        for name in self.only:
+            if self.ruleset.element(name) is None:
+                raise ValueError("; ".join([f"no element `{name}`", *suggest(name, known, "elements")]))
+
+    @cached_property
+    def cells(self) -> tuple[Cell, ...]:
+        """Each combination once."""
+        names = [*self.backends, *(program.name for program in self.programs)]
+        return tuple(dict.fromkeys(map(Cell._make, product(names, self.sizes, self.threads, self.batches))))
+
+    @property
+    def elements(self) -> list[Element]:
+        """The elements that worlds have."""
+        if self.only:
+            return [element for element in map(self.ruleset.element, self.only) if element is not None]
+        if self.workload == "few":
+            moved = moved_ids(self.ruleset)
+            return sorted(self.ruleset.elements[1:], key=lambda element: element.id not in moved)[:2]
+        return list(self.ruleset.elements)
 
     def program(self, cell: Cell) -> Program | None:
         """The program that a cell measures; None for a backend."""
         return next((program for program in self.programs if program.name == cell.backend), None)
-
-
-def make_plan(
-    ruleset: Ruleset,
-    *,
-    backends: Sequence[str] = ("wasm",),
-    batches: Sequence[int] = (1, 32),
-    sizes: Sequence[Size] = ((64, 64),),
-    elements: Sequence[int] = (),
-    only: Sequence[str] = (),
-    threads: Sequence[int] = (1,),
-    workload: str = "gusts",
-    programs: Sequence[Program] = (),
-    **settings: Any,
-) -> Plan:
-    """The plan of a cross product of backends, programs, batches, sizes (rows, columns), elements and threads.
-
-    Args:
-        elements: numbers of elements: the worlds have the first N of the ruleset, the ground included.
-        only: the worlds have these elements on the ground, by plain or qualified name.
-        settings: other fields of the plan.
-
-    Raises:
-        KeyError: an unknown element. ValueError: a size or a number of elements that the rules do not take, or a
-        program's name that is taken. CompileError: PD607 for worlds of more cells than fit.
-    """
-    names = [program.name for program in programs]
-    for name in names:
-        if name in BACKENDS or names.count(name) > 1:
-            raise ValueError(f"programs: `{name}` is the name of another program or of a backend")
-    for size in sizes:
-        check_sides(ruleset, size)
-        check_cells(max(batches), size)
-    chosen = _elements(ruleset, workload, elements, only)
-    cells = tuple(
-        dict.fromkeys(
-            Cell(backend, batch, size, present, count)
-            for backend, size, present, count, batch in product(
-                [*backends, *names], sizes, chosen, threads, batches
-            )
-        )
-    )
-    return Plan(ruleset, cells, workload, programs=tuple(programs), **settings)
-
-
-def _elements(
-    ruleset: Ruleset, workload: str, counts: Sequence[int], only: Sequence[str]
-) -> list[tuple[str, ...]]:
-    """The names of the elements that worlds have, one tuple for each point of the axis."""
-    names = [element.name for element in ruleset.elements]
-    if counts and only:
-        raise ValueError("elements are chosen by number or by name, not by both")
-    for name in only:
-        if ruleset.element(name) is None:
-            raise KeyError(f"no element `{name}`; {'; '.join(suggest(name, names, 'elements'))}")
-    if only:
-        return [tuple(only)]
-    if counts:
-        if max(counts) > len(names):
-            raise ValueError(f"elements: {ruleset.name} has 1 to {len(names)} of them")
-        return [tuple(names[:count]) for count in counts]
-    if workload == "few":
-        moved = moved_ids(ruleset)
-        movers_first = sorted(ruleset.elements[1:], key=lambda element: element.id not in moved)
-        return [tuple(element.name for element in movers_first[:2])]
-    return [tuple(names)]
 
 
 # Worlds
@@ -161,25 +131,24 @@ NOISE = 3.0
 """Standard deviation of noisy floats."""
 
 
-def start_worlds(sim: Simulator, cell: Cell, workload: str, seed: int) -> World:
-    """The worlds of a cell: world i depends on `seed`, its size and i alone."""
-    streams = [np.random.default_rng([seed, index]) for index in range(cell.batch)]
-    ids = np.stack([_ids(sim.ruleset, cell, workload, random) for random in streams])
+def start_worlds(sim: Simulator, plan: Plan, cell: Cell) -> World:
+    """The worlds of a cell: world i depends on the plan, its size and i alone."""
+    streams = [np.random.default_rng([plan.seed, index]) for index in range(cell.batch)]
+    ids = np.stack([_ids(plan, cell, random) for random in streams])
     fields = {
-        field.name: np.stack([_field(field, cell, workload, random) for random in streams])
+        field.name: np.stack([_field(field, cell, plan.workload, random) for random in streams])
         for field in sim.ruleset.fields
-        if _starts_moving(field, workload)
+        if _starts_moving(field, plan.workload)
     }
-    return sim.replace(sim.world(ids, seed=seed), **fields)
+    return sim.replace(sim.world(ids, seed=plan.seed), **fields)
 
 
-def _ids(ruleset: Ruleset, cell: Cell, workload: str, random: np.random.Generator) -> NDArray[np.uint8]:
+def _ids(plan: Plan, cell: Cell, random: np.random.Generator) -> NDArray[np.uint8]:
     """One world: uint8 [H, W]."""
-    elements = map(ruleset.element, cell.elements)
-    ids = [element.id for element in elements if element is not None]
-    if workload == "noise":
+    ids = [element.id for element in plan.elements]
+    if plan.workload == "noise":
         return random.choice(np.array(ids, dtype=np.uint8), cell.size)
-    ground = ruleset.elements[0].id
+    ground = plan.ruleset.elements[0].id
     world = np.full(cell.size, ground, dtype=np.uint8)
     others = [number for number in ids if number != ground]
     shapes = Random(int(random.integers(1 << 32)))

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from statistics import median
 from typing import Any
 
-from powderdsl.experiments.bench.machine import Machine, memory_measure
 from powderdsl.experiments.bench.plan import WORKLOADS, Cell, Plan
 from powderdsl.system.reports import table
 
@@ -59,7 +58,7 @@ class Report:
     """A plan and the figures of the cells that at least one round has reached."""
 
     plan: Plan
-    machine: Machine
+    machine: Mapping[str, Any]
     cells: tuple[CellFigures, ...]
     interrupted: bool = False
 
@@ -70,7 +69,7 @@ class Report:
 
     def ratio(self, figures: CellFigures, program: str) -> float | None:
         """The processor time of a cell divided by that of a program for the same worlds; None if it is unknown."""
-        same = replace(figures.cell, backend=program)
+        same = figures.cell._replace(backend=program)
         times = [other.processor_microseconds for other in self.cells if other.cell == same]
         return figures.processor_microseconds / times[0] if times and times[0] else None
 
@@ -80,7 +79,7 @@ def report_data(report: Report) -> dict[str, Any]:
     plan = report.plan
     cells = [
         {
-            **vars(figures.cell),
+            **figures.cell._asdict(),
             **{key: value for key, value in vars(figures).items() if key != "cell"},
             "world_steps_per_second": median(figures.rates),
             "beside": {name: report.ratio(figures, name) for name in report.programs},
@@ -90,23 +89,11 @@ def report_data(report: Report) -> dict[str, Any]:
     return {
         "machine": report.machine,
         "rules": plan.ruleset.name,
+        "elements": [element.name for element in plan.elements],
         **{name: getattr(plan, name) for name in ("workload", "device", "seed", "rounds")},
         "interrupted": report.interrupted,
         "cells": cells,
     }
-
-
-def label(cell: Cell, among: Iterable[CellFigures]) -> str:
-    """The backend of a cell, and its size and numbers of elements and threads where other cells have others."""
-    cells = [figures.cell for figures in among]
-    words = [cell.backend]
-    if len({other.size for other in cells}) > 1:
-        words.append(cell.size_text)
-    if len({other.elements for other in cells}) > 1:
-        words.append(f"{len(cell.elements)} elements")
-    if len({other.threads for other in cells}) > 1:
-        words.append(f"{cell.threads} threads")
-    return ", ".join(words)
 
 
 # Text
@@ -126,37 +113,25 @@ def report_text(report: Report) -> str:
 
 
 def _header(report: Report) -> Iterator[str]:
-    """Rules, worlds, versions and machine, and a warning if other processes were running."""
+    """Rules, worlds, versions and machine."""
     plan, machine = report.plan, report.machine
     yield f"{plan.ruleset.name}, worlds of {plan.workload}: {WORKLOADS[plan.workload]}"
-    versions = f"powderdsl {machine.powderdsl}, torch {machine.torch}, Python {machine.python}"
-    yield f"{versions}, C++: {machine.compiler}"
-    yield f"{machine.processor}, {machine.cpus} CPUs, {machine.system}, device {machine.device}"
-    yield f"threads: {', '.join(map(str, sorted({cell.threads for cell in plan.cells})))} (torch is held to as many)"
-    if machine.load is not None:
-        yield f"load average before: {machine.load:.1f}"
-    if machine.busy:
-        at_work = f"warning: others are at work on these {machine.cpus} CPUs"
-        yield f"{at_work}: compare figures within this table only"
+    yield "powderdsl {powderdsl}, torch {torch}, Python {python}, C++: {compiler}".format_map(machine)
+    yield "{processor}, {cpus} CPUs, {system}, device {device}".format_map(machine)
+    if machine["load"] is not None:
+        yield f"load average before: {machine['load']:.1f}"
 
 
 def _cell_table(report: Report) -> str:
-    """One line per cell. Elements and threads have columns only if cells differ in them, each program has one."""
+    """One line per cell, and a column for each program beside the backends."""
     columns: dict[str, Callable[[CellFigures], str]] = {
         "backend": lambda figures: figures.cell.backend,
         "batch": lambda figures: f"{figures.cell.batch:,}",
-        "size": lambda figures: figures.cell.size_text,
-    }
-    if len({figures.cell.elements for figures in report.cells}) > 1:
-        columns["elements"] = lambda figures: str(len(figures.cell.elements))
-    if len({figures.cell.threads for figures in report.cells}) > 1:
-        columns["threads"] = lambda figures: str(figures.cell.threads)
-    columns |= {
+        "size": lambda figures: "{}×{}".format(*figures.cell.size),
+        "threads": lambda figures: str(figures.cell.threads),
         "world-steps/s": lambda figures: number(median(figures.rates)),
         "slowest..fastest": lambda figures: f"{number(figures.rates[0])}..{number(figures.rates[-1])}",
-        "cells/s": lambda figures: number(median(figures.rates) * figures.cell.world_cells),
         "µs/world-step": lambda figures: number(figures.world_step_microseconds),
-        "ns/cell": lambda figures: number(1e3 * figures.world_step_microseconds / figures.cell.world_cells),
         "CPUs": lambda figures: f"{figures.processor_microseconds / figures.world_step_microseconds:.2f}",
         "to first step": lambda figures: f"{figures.compile_seconds + figures.first_step_seconds:.2f} s",
         "memory": _memory,
@@ -187,14 +162,13 @@ def _footnotes(report: Report) -> Iterator[str]:
     yield "to first step: compiling, which all lines of a backend share, and the first step"
     if report.programs:
         yield "÷: processor time divided by that of another program, from the same worlds"
-    yield f"memory: {memory_measure(report.plan.device)}"
+    yield "memory: the peak during the first calls, less what was in use before"
 
 
 def _pass_table(profiled: Sequence[CellFigures]) -> str:
     """µs a world and step of each pass, and its share, for each cell that was profiled."""
     totals = [sum(figures.passes.values()) for figures in profiled]
-    headings = [f"{label(figures.cell, profiled)}, batch {figures.cell.batch}" for figures in profiled]
-    rows = [["µs/world-step", *headings]]
+    rows = [["µs/world-step", *(str(figures.cell) for figures in profiled)]]
     for name in profiled[0].passes:
         shares = zip((figures.passes[name] for figures in profiled), totals, strict=True)
         rows.append([name, *(f"{number(part)} {part / total:4.0%}" for part, total in shares)])

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from powderdsl.experiments.bench.plot import require_matplotlib
 from powderdsl.experiments.runs import RunFolder
 from powderdsl.experiments.runs.intervals import mean_and_interval
 from powderdsl.experiments.runs.metrics import read_metrics
 from powderdsl.experiments.studies.results import interval, markdown
+from powderdsl.system.packages import require_matplotlib
 from powderdsl.system.reading import read_json
 from powderdsl.system.writing import replacing
 

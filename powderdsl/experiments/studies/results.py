@@ -9,10 +9,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from powderdsl.experiments.bench.plot import require_matplotlib
 from powderdsl.experiments.runs.intervals import mean_and_interval
 from powderdsl.experiments.studies.run import Outcome
 from powderdsl.experiments.studies.study import Measure, Study
+from powderdsl.system.packages import require_matplotlib
 from powderdsl.system.writing import replacing
 
 if TYPE_CHECKING:
