@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
-from typing import Any
+from typing import Any, Protocol
 
 from powderdsl.arrays import np
 from powderdsl.model import float_operations as floats
@@ -18,11 +18,13 @@ from powderdsl.model.types import (
     Assign,
     Expr,
     Kernel,
+    Kind,
     Moment,
     Move,
     Offset,
     Pass,
     Property,
+    Rule,
     Ruleset,
     Swap,
     Transform,
@@ -135,6 +137,31 @@ def neighborhood(value: Array, kernel: Kernel) -> Array:
 # Expressions
 
 
+@dataclass(frozen=True)
+class Change:
+    """How a slot is written: by a rule, or as every step does it.
+
+    `asked` is the way from a written cell to the one in which the rule's condition holds, `source` the way to the one
+    that its new content comes from.
+    """
+
+    how: str
+    slot: Slot
+    rule: Rule | None = None
+    asked: Offset = (0, 0)
+    source: Offset | None = None
+
+
+class Watch(Protocol):
+    """Is told what a step does, and changes nothing. Contexts continue changing."""
+
+    def begins(self, at: Context, masks: Mapping[int, Array]) -> None:
+        """The lets of the next substep are fixed; `masks` says where each rule will happen, by `id`."""
+
+    def wrote(self, change: Change, before: Array, after: Array, mask: Array | None = None) -> None:
+        """A slot was written where the mask holds; without a mask, anywhere."""
+
+
 @dataclass
 class Context:
     """Everything an expression reads: the world as the substep finds it, values fixed earlier, draws, parameters."""
@@ -145,6 +172,7 @@ class Context:
     draws: dict[str, Array]
     clock: Clock
     lets: dict[str, Array] = field(default_factory=dict)
+    watch: Watch | None = None
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -270,39 +298,59 @@ def run_moment(moment: Moment, at: Context, table: Mapping[str, Slot]) -> State:
     for let in moment.lets:
         at.lets[let.name] = evaluate(let.value, at)
     masks = masks_of(moment, at)
+    if at.watch is not None:
+        at.watch.begins(at, masks)
     claims = [rule for rule in moment.rules if not isinstance(rule, Assign)]
-    writes = [(rule, masks[id(rule)]) for rule in moment.rules if isinstance(rule, Assign)]
-    effects = [(effect, masks[id(rule)]) for rule in claims for effect in rule.effects]
-    values = {id(write): evaluate(write.value, at) for write, _ in (*writes, *effects)}
-
+    assigns = [rule for rule in moment.rules if isinstance(rule, Assign)]
+    effects = [(rule, effect) for rule in claims for effect in rule.effects]
+    values = {id(one): evaluate(one.value, at) for one in (*assigns, *(effect for _, effect in effects))}
+    travelling = [slot for slot in table.values() if slot.travels]
     state = dict(at.state)
-    for write, mask in writes:
-        _assign(write, values[id(write)], mask, state, table)
+
+    def write(change: Change, value: Array, mask: Array) -> None:
+        name = change.slot.name
+        old, state[name] = state[name], _where(mask, value, state[name])
+        if at.watch is not None:
+            at.watch.wrote(change, old, state[name], mask)
+
+    def assign(how: str, rule: Rule, assigned: Assign) -> None:
+        """`field op value` at the cell `offset` away from each cell where the rule happens."""
+        slot, place = table[assigned.field], back(assigned.offset)
+        value = _assigned(assigned, slot.kind, state[slot.name], look(values[id(assigned)], place))
+        write(Change(how, slot, rule, place), value, look(masks[id(rule)], place))
+
+    def become(how: str, rule: Rule, target: Expr) -> None:
+        ids = evaluate(target, at)
+        for slot in travelling:
+            write(Change(how, slot, rule), _in_fresh_cells(slot, ids, at), masks[id(rule)])
+
+    def arrive(rule: Swap | Move, source: Offset, asked: Offset = (0, 0)) -> None:
+        """Content comes from the neighbor `source` where the rule's condition holds in the neighbor `asked`."""
+        mask = look(masks[id(rule)], asked)
+        for slot in travelling:
+            write(Change("arrive", slot, rule, asked, source), look(before[slot.name], source), mask)
+
+    for assigned in assigns:
+        assign("assign", assigned, assigned)
     before = dict(state)
     for rule in claims:
-        mask = masks[id(rule)]
         if isinstance(rule, Transform):
-            _become(evaluate(rule.target, at), mask, state, at, table)
+            become("become", rule, rule.target)
         elif isinstance(rule, Move) and rule.leaving is not None:
-            _become(evaluate(rule.leaving, at), mask, state, at, table)
+            become("leave", rule, rule.leaving)
         elif isinstance(rule, Move):
-            for name in (name for name, slot in table.items() if slot.travels):
-                state[name] = _where(mask, look(before[name], rule.offset), state[name])
+            arrive(rule, rule.offset)
     for rule in claims:
         if isinstance(rule, (Swap, Move)):
-            mask, source = masks[id(rule)], back(rule.offset)
-            for name, slot in table.items():
-                if slot.travels:
-                    state[name] = _where(look(mask, source), look(before[name], source), state[name])
-                    if isinstance(rule, Swap):
-                        state[name] = _where(mask, look(before[name], rule.offset), state[name])
-    for write, mask in effects:
-        _assign(write, values[id(write)], mask, state, table)
-    for name, slot in table.items():
+            arrive(rule, back(rule.offset), back(rule.offset))
+        if isinstance(rule, Swap):
+            arrive(rule, rule.offset)
+    for claim, effect in effects:
+        assign("effect", claim, effect)
+    for slot in table.values():
         if slot.of is not None:
-            state[name] = _where(
-                np.isin(state["element"], sorted(slot.of)), state[name], _default(slot, state[name])
-            )
+            holders = np.isin(state["element"], sorted(slot.of))
+            write(Change("limit", slot), _default(slot, state[slot.name]), ~holders)
     return state
 
 
@@ -325,32 +373,24 @@ def _where(mask: Array, yes: Array, no: Array) -> Array:
     return np.where(mask[:, None] if no.ndim == 4 else mask, yes, no)
 
 
-def _become(target: Array, mask: Array, state: State, at: Context, table: Mapping[str, Slot]) -> None:
-    """Fresh cells: element, stored properties and fields that travel, as a new cell of the target has them."""
-    for name, slot in table.items():
-        if not slot.travels:
-            continue
-        if name == "element":
-            fresh = target
-        elif (prop := at.ruleset.property(name)) is not None:
-            fresh = _of_elements(prop, target, at).astype(state[name].dtype)
-        else:
-            fresh = _default(slot, state[name])
-            for identity, value in slot.own:
-                own = np.asarray(value, fresh.dtype)
-                fresh = _where(target == identity, own[:, None, None] if slot.planes == 2 else own, fresh)
-        state[name] = _where(mask, fresh, state[name])
+def _in_fresh_cells(slot: Slot, ids: Array, at: Context) -> Array:
+    """The values of a slot that travels, in new cells of these elements."""
+    if slot.name == "element":
+        return ids
+    like = at.state[slot.name]
+    if (prop := at.ruleset.property(slot.name)) is not None:
+        return _of_elements(prop, ids, at).astype(like.dtype)
+    fresh = _default(slot, like)
+    for identity, value in slot.own:
+        own = np.asarray(value, fresh.dtype)
+        fresh = _where(ids == identity, own[:, None, None] if slot.planes == 2 else own, fresh)
+    return fresh
 
 
-def _assign(write: Assign, value: Array, mask: Array, state: State, table: Mapping[str, Slot]) -> None:
-    """`field op value` at the cell `write.offset` away from each cell of the mask; integers are cut off."""
-    mask, value = look(mask, back(write.offset)), look(value, back(write.offset))
-    old = state[write.field]
-    new = value if write.op == ":=" else old + value if write.op == "+=" else old - value
-    kind = table[write.field].kind
-    if kind.name == "int":
-        new = np.clip(new, int(kind.lo), int(kind.hi))
-    state[write.field] = _where(mask, new, old)
+def _assigned(assign: Assign, kind: Kind, old: Array, value: Array) -> Array:
+    """`old op value`; integers are cut off."""
+    new = value if assign.op == ":=" else old + value if assign.op == "+=" else old - value
+    return np.clip(new, int(kind.lo), int(kind.hi)) if kind.name == "int" else new
 
 
 def _settle_claims(policy: str, claims: list[Any], masks: dict[int, Array]) -> None:
@@ -395,22 +435,19 @@ def clamped(state: State, table: Mapping[str, Slot]) -> State:
     return result
 
 
-Seen = Callable[[Pass, Moment, Context, State], None]
-"""Called after a substep with what it read, its lets among it, and what it left."""
-
-
-def run_pass(pass_: Pass, at: Context, table: Mapping[str, Slot], seen: Seen | None = None) -> State:
+def run_pass(pass_: Pass, at: Context, table: Mapping[str, Slot]) -> State:
     """The state after one pass."""
     scratch = scratch_slots(pass_)
     at.state = {**at.state, **{name: _fresh(slot, at.shape) for name, slot in scratch.items()}}
     at.lets = {}
     everything = {**table, **scratch}
     for moment in pass_.moments:
-        after = run_moment(moment, at, everything)
-        if seen is not None:
-            seen(pass_, moment, at, after)
-        at.state = after
-    return clamped({name: value for name, value in at.state.items() if name in table}, table)
+        at.state = run_moment(moment, at, everything)
+    after = clamped({name: value for name, value in at.state.items() if name in table}, table)
+    if at.watch is not None:
+        for name, slot in table.items():
+            at.watch.wrote(Change("settle", slot), at.state[name], after[name])
+    return after
 
 
 def _fresh(slot: Slot, shape: tuple[int, int, int]) -> Array:
@@ -444,7 +481,7 @@ def step(
     passes: frozenset[str] | None = None,
     draws: Mapping[str, Array] | None = None,
     tick: Callable[[str], None] | None = None,
-    seen: Seen | None = None,
+    watch: Watch | None = None,
 ) -> State:
     """One step of every world.
 
@@ -455,18 +492,20 @@ def step(
         passes: names of the passes to run; all of them by default.
         draws: float64 [B, H, W] in [0, 1) by stream name, instead of our own numbers.
         tick: called with the name of each pass when it is done.
-        seen: called after each substep; it changes nothing and keeps copies of contexts, which continue changing.
+        watch: is told of each substep and each write.
     """
     table = {slot.name: slot for slot in slots(ruleset)}
     working = widened(ruleset, state)
     shape = state["element"].shape
     for name, slot in table.items():
         if slot.resets:
-            working[name] = _fresh(slot, shape)
-    at = Context(ruleset, working, params, dict(draws or {}), clock)
+            old, working[name] = working[name], _fresh(slot, shape)
+            if watch is not None:
+                watch.wrote(Change("reset", slot), old, working[name])
+    at = Context(ruleset, working, params, dict(draws or {}), clock, watch=watch)
     for pass_ in ruleset.passes:
         if passes is None or pass_.name in passes:
-            at.state = run_pass(pass_, at, table, seen)
+            at.state = run_pass(pass_, at, table)
             if tick is not None:
                 tick(pass_.name)
     return {name: value.astype(table[name].dtype) for name, value in at.state.items()}

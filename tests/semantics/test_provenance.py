@@ -11,7 +11,7 @@ from powderdsl.compiler import load
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.provenance import SLOT, Provenance, Recorder, writers
 from powderdsl.simulation.simulator import compile
-from powderdsl.simulation.tracing.recorded import record_step, writes_of
+from powderdsl.simulation.tracing.trace import record_step
 from powderdsl.testing.generators.cases import Start, random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.fuzz import STARTS_AT_ONCE
@@ -90,9 +90,9 @@ def assert_traced_alike(ruleset: Ruleset) -> None:
         changed = found.world.ids != world.ids
         assert bool((found.numbers[changed] > 0).all()), "a change without a writer"
         for number in range(len(world)):
-            step = record_step(world, number)
             for cell in np.ndindex(*shape[1:]):
-                rules = [one.rule for one in writes_of(step, cell) if one.slot.name == "element"]
+                step = record_step(world, cell, number)
+                rules = [one.rule for one in step.writes if one.slot.name == "element"]
                 assert found.rule_at(*cell, world=number) == (rules[-1] if rules else None)
 
 

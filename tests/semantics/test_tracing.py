@@ -12,10 +12,8 @@ import pytest
 from powderdsl.compiler import load
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import World, compile
-from powderdsl.simulation.tracing.data import trace_data
-from powderdsl.simulation.tracing.recorded import pick, record_step, writes_of
-from powderdsl.simulation.tracing.text import trace_text
-from powderdsl.simulation.tracing.trace import Miss, Trace, trace
+from powderdsl.simulation.tracing.report import trace_data, trace_text
+from powderdsl.simulation.tracing.trace import Miss, Trace, pick, record_step, trace
 from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.semantics.test_differential import seeded_ruleset
@@ -137,7 +135,7 @@ def test_a_chance_that_failed_shows_the_draw_and_the_chance():
     read = values([part])
     assert read["lab.luck"] == 0
     clock = world_of(lab("do: rock -> bomb if coin < luck"), "o")
-    step = record_step(clock)
+    step = record_step(clock, (0, 0))
     assert read["draw(coin)"] == float(step.substeps[0].at.draws["coin"][0, 0, 0])
     assert part.span is not None
     assert part.span.text == "coin < luck"
@@ -260,10 +258,10 @@ def explained(ruleset: Ruleset, shape: tuple[int, int, int], seed: int) -> int:
     world = replace(random_start(ruleset, Choices.seeded(seed), shape), params={}).world(sim)
     count = 0
     for number in range(len(world)):
-        step = record_step(world, number)
         after = sim.step(world).select([number]).state
         for cell in np.ndindex(*shape[1:]):
-            writes = writes_of(step, cell)
+            step = record_step(world, cell, number)
+            writes = step.writes
             for name in step.end:
                 held = pick(step.begin[name], cell)
                 for write in writes:

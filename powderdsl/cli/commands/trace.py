@@ -60,8 +60,7 @@ def command(
     """
     ruleset = opt.load_rules(rules, settings)
     from powderdsl.cli.start_worlds import start
-    from powderdsl.simulation.tracing.data import trace_data
-    from powderdsl.simulation.tracing.text import trace_text
+    from powderdsl.simulation.tracing.report import trace_data, trace_text
     from powderdsl.simulation.tracing.trace import trace
 
     begun = start(ruleset, world, size, None, seed, backend=backend)

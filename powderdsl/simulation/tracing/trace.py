@@ -1,9 +1,9 @@
-"""The answer to "why does this cell hold what it holds?": its writes in a step, and the rules that nearly wrote it."""
+"""Why a cell holds what it holds: its writes in one step on the reference interpreter, and the rules that nearly wrote it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
 from math import isfinite
@@ -13,25 +13,177 @@ from powderdsl.arrays import np
 from powderdsl.diagnostics import Span, suggest
 from powderdsl.model import reference
 from powderdsl.model.expressions.operands import look
-from powderdsl.model.state import Slot, scratch_slots, slot_name
+from powderdsl.model.reference import Array
+from powderdsl.model.state import Slot, scratch_slots, slot_name, slots
 from powderdsl.model.text import element_name, show_expr, show_offset, show_value
-from powderdsl.model.types import ELEMENT, FLAG, Expr, Kind, Offset, Rule, Ruleset
-from powderdsl.simulation.any_arrays import AnyWorld
-from powderdsl.simulation.provenance import NumberedRule
-from powderdsl.simulation.tracing.recorded import (
-    Cell,
-    RecordedStep,
-    RecordedSubstep,
-    Write,
-    anchors,
-    pick,
-    record_step,
-    value_at,
-    writes_of,
+from powderdsl.model.types import (
+    ELEMENT,
+    FLAG,
+    Assign,
+    Expr,
+    Kind,
+    Let,
+    Moment,
+    Move,
+    Offset,
+    Pass,
+    Rule,
+    Ruleset,
+    Swap,
 )
+from powderdsl.simulation.any_arrays import AnyWorld
+from powderdsl.simulation.provenance import NumberedRule, numbered_rules
+
+Cell = tuple[int, int]
+"""(row, column)."""
 
 HERE: Offset = (0, 0)
 _LEAVES = ("element", "property", "field", "let", "draw", "coordinate", "param", "inside", "count", "sum")
+
+HOW = {
+    "assign": "a field was assigned",
+    "effect": "a field was assigned by `then`",
+    "become": "the cell became another element",
+    "leave": "the element moved away; this is what it left",
+    "arrive": "what stood in another cell came here",
+    "limit": "no rule: cells of this element keep the field's default",
+    "settle": "no rule: at the end of a pass floats are cut off at their bounds, and tiny ones are zero",
+    "reset": "no rule: the field starts each step at its default",
+}
+"""The kinds of writes. The last three have no rule."""
+
+
+@dataclass(frozen=True)
+class RecordedSubstep:
+    """A substep of the step: what it found, and its rules. Arrays have a batch of one."""
+
+    pass_: Pass
+    moment: Moment
+    rules: tuple[NumberedRule, ...]
+    at: reference.Context
+    table: dict[str, Slot]
+    """Slots of the state, and scratch fields of the pass."""
+    lets: dict[str, tuple[Let, reference.Context]]
+    """For each `let` of the pass so far, its expression and what that read."""
+    masks: Mapping[int, Array]
+    """Where each rule happened, by `id` of the rule."""
+
+    def near(self, cell: Cell, offset: Offset) -> Cell:
+        """The neighbor of a cell; the grid wraps around."""
+        _, height, width = self.at.shape
+        return (cell[0] + offset[0]) % height, (cell[1] + offset[1]) % width
+
+    def behind(self, cell: Cell, offset: Offset) -> Cell:
+        """The cell whose neighbor this one is."""
+        return self.near(cell, (-offset[0], -offset[1]))
+
+    def happened(self, rule: Rule, cell: Cell) -> bool:
+        return bool(self.masks[id(rule)][(0, *cell)])
+
+
+@dataclass(frozen=True)
+class Write:
+    """One write to one slot of the cell. Values are NumPy numbers, or two of a vector.
+
+    `cell` is where the rule's condition held; `source` is where content came from that moved here. `substep` is None
+    before the first one.
+    """
+
+    slot: Slot
+    before: Any
+    after: Any
+    how: str
+    substep: RecordedSubstep | None
+    rule: NumberedRule | None = None
+    cell: Cell | None = None
+    source: Cell | None = None
+
+    @property
+    def changed(self) -> bool:
+        return not np.array_equal(self.before, self.after)
+
+
+@dataclass
+class RecordedStep:
+    """A step as it happens: its substeps, and all writes to all slots of one cell, scratch fields among them, in order.
+
+    Each write finds what the one before it left; what the last one leaves is what the step leaves. States are the
+    reference's: integers int64, floats float32, [1, H, W] or [1, 2, H, W].
+    """
+
+    ruleset: Ruleset
+    cell: Cell
+    begin: reference.State
+    end: reference.State = field(default_factory=dict)
+    substeps: list[RecordedSubstep] = field(default_factory=list)
+    writes: list[Write] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._slots = {slot.name: slot for slot in slots(self.ruleset)}
+        self._moments = self.ruleset.substeps()
+        self._rules = iter(numbered_rules(self.ruleset))
+        self._lets: dict[str, tuple[Let, reference.Context]] = {}
+
+    def begins(self, at: reference.Context, masks: Mapping[int, Array]) -> None:
+        """Record a substep: see `reference.Watch`."""
+        pass_, moment = next(self._moments)
+        found = replace(at, lets=dict(at.lets))
+        if moment is pass_.moments[0]:
+            self._lets.clear()
+        self._lets.update((let.name, (let, found)) for let in moment.lets)
+        rules = tuple(islice(self._rules, len(moment.rules)))
+        table = {**self._slots, **scratch_slots(pass_)}
+        self.substeps.append(RecordedSubstep(pass_, moment, rules, found, table, dict(self._lets), masks))
+
+    def wrote(self, change: reference.Change, before: Array, after: Array, mask: Array | None = None) -> None:
+        """Record a write to the cell. One without a rule counts if it changes something."""
+        substep = self.substeps[-1] if self.substeps else None
+        values = pick(before, self.cell), pick(after, self.cell)
+        if change.rule is None:
+            write = Write(change.slot, *values, change.how, substep)
+            self.writes += [write] if write.changed else []
+        elif substep is not None and mask is not None and mask[(0, *self.cell)]:
+            rule = next(numbered for numbered in substep.rules if numbered.rule is change.rule)
+            source = None if change.source is None else substep.near(self.cell, change.source)
+            asked = substep.near(self.cell, change.asked)
+            self.writes.append(Write(change.slot, *values, change.how, substep, rule, asked, source))
+
+
+def record_step(world: AnyWorld, cell: Cell, number: int = 0) -> RecordedStep:
+    """The next step of one world of a batch, with default parameters, recorded."""
+    alone = world.select([number])
+    ruleset, to_numpy = world.sim.ruleset, world.sim.kind.to_numpy
+    state = {name: to_numpy(value) for name, value in alone.state.items()}
+    clock = reference.Clock(*(to_numpy(part) for part in (alone.seed, alone.index, alone.step)))
+    step = RecordedStep(ruleset, cell, reference.widened(ruleset, state))
+    params = reference.parameters(ruleset, 1, {})
+    step.end = reference.widened(ruleset, reference.step(ruleset, state, clock, params, watch=step))
+    return step
+
+
+def value_at(expr: Expr, at: reference.Context, cell: Cell) -> Any:
+    """The value of an expression in one cell: a NumPy number, or two of a vector."""
+    return pick(reference.evaluate(expr, at), cell)
+
+
+def pick(array: Array, cell: Cell) -> Any:
+    """One cell's value of a reference array."""
+    return array[0, ..., cell[0], cell[1]]
+
+
+def anchors(rule: Rule, cell: Cell, substep: RecordedSubstep, slot: str) -> tuple[Cell, ...]:
+    """The cells in which a rule's condition must hold for it to write a slot of this cell."""
+    found: list[Offset] = []
+    if isinstance(rule, Assign):
+        found += [rule.offset] if rule.field == slot else []
+    else:
+        if substep.table[slot].travels:
+            found += [(0, 0)] + ([rule.offset] if isinstance(rule, (Swap, Move)) else [])
+        found += [effect.offset for effect in rule.effects if effect.field == slot]
+    return tuple(dict.fromkeys(substep.behind(cell, offset) for offset in found))
+
+
+# Conditions
 
 
 @dataclass(frozen=True)
@@ -65,7 +217,7 @@ class Part:
 
     @property
     def text(self) -> str:
-        return show_expr(self.substep.ruleset, self.expr)
+        return show_expr(self.at.ruleset, self.expr)
 
     @property
     def span(self) -> Span | None:
@@ -166,12 +318,12 @@ def trace(
         raise ValueError("the first step is step 1")
     wanted = _slots(world, of)
     alone = world.select([number])
-    recorded = record_step(world.sim.step(alone, step - 1))
     cell = (row, column)
+    recorded = record_step(world.sim.step(alone, step - 1), cell)
     names = {slot.name for slot in wanted}
-    writes = [write for write in writes_of(recorded, cell) if write.slot.name in names]
+    writes = [write for write in recorded.writes if write.slot.name in names]
     lines = {(write.rule.span, write.substep.pass_.name) for write in writes if write.rule and write.substep}
-    misses = _misses(recorded, cell, sorted(names), every_rule)
+    misses = _misses(recorded, sorted(names), every_rule)
     if not every_rule:
         misses = [one for one in misses if (one.rule.span, one.rule.pass_name) not in lines]
     return Trace(
@@ -210,16 +362,16 @@ def _cause(write: Write) -> Cause:
     return Cause(write, _parts(write.rule.rule, write.substep, write.cell))
 
 
-def _misses(step: RecordedStep, cell: Cell, slots: Sequence[str], every_rule: bool) -> list[Miss]:
+def _misses(step: RecordedStep, names: Sequence[str], every_rule: bool) -> list[Miss]:
     """Rules that did not happen where they would have written the cell. Unless all are asked for, a line counts once a cell."""
     found: dict[Any, Miss] = {}
     for substep in step.substeps:
         for rule in substep.rules:
             places = dict.fromkeys(
                 place
-                for slot in slots
-                if slot in substep.table
-                for place in anchors(rule.rule, cell, substep, slot)
+                for name in names
+                if name in substep.table
+                for place in anchors(rule.rule, step.cell, substep, name)
             )
             for place in places:
                 key = (rule.number if every_rule else (rule.span, rule.pass_name), place)
@@ -282,7 +434,7 @@ def _reads(
 
 
 def _leaf(expr: Expr, at: reference.Context, place: Cell, offset: Offset, substep: RecordedSubstep) -> Read:
-    ruleset = substep.ruleset
+    ruleset = at.ruleset
     value = value_at(expr, at, place)
     if expr.op == "element" and offset != HERE:
         text = show_offset(offset)

@@ -1,17 +1,21 @@
-"""A trace as text: like a diagnostic, the source line of each rule with a caret under what mattered."""
+"""A trace as text, like a diagnostic with carets under what mattered, and as plain data for JSON."""
 
 from __future__ import annotations
 
 from itertools import groupby
+from typing import Any
 
-from powderdsl.diagnostics import Label
+from powderdsl.diagnostics import Label, Span
 from powderdsl.diagnostics.printable import printable
 from powderdsl.diagnostics.render import source_lines
 from powderdsl.model.state import Slot
-from powderdsl.model.text import place_of
+from powderdsl.model.text import one_line, place_of
+from powderdsl.model.types import Ruleset
 from powderdsl.simulation.provenance import NumberedRule
-from powderdsl.simulation.tracing.recorded import HOW, Cell
-from powderdsl.simulation.tracing.trace import Cause, Miss, Part, Read, Trace, show_at_cell
+from powderdsl.simulation.tracing.trace import HOW, Cause, Cell, Miss, Part, Read, Trace, plain, show_at_cell
+
+SCHEMA = 1
+"""The version of the plain data. It increases when a key changes its meaning or is removed."""
 
 MAX_MISSES = 12
 """The most rules that nearly happened in a text, unless all are asked for."""
@@ -27,14 +31,14 @@ def trace_text(trace: Trace, *, color: bool = False, every_rule: bool = False) -
         causes = list(group)
         rule = causes[0].write.rule
         if any(one.write.changed for one in causes):
-            blocks.append(_cause(trace, causes, color))
+            blocks.append(_cause_text(trace, causes, color))
         elif rule is not None:
             names = ", ".join(dict.fromkeys(one.write.slot.name for one in causes))
             again.append(printable(f"  {names}: {rule.place}, pass {rule.pass_name}"))
     if again:
         blocks.append("\n".join(["written again, as it was:", *again]))
     shown = trace.misses if every_rule else trace.misses[:MAX_MISSES]
-    blocks += [_miss(trace, one, color) for one in shown]
+    blocks += [_miss_text(trace, one, color) for one in shown]
     if len(shown) < len(trace.misses):
         blocks.append(f"{len(trace.misses) - len(shown)} more rules nearly happened: --all")
     return "\n\n".join(blocks)
@@ -66,7 +70,7 @@ def _head(trace: Trace) -> str:
     return "\n".join(map(printable, lines))
 
 
-def _cause(trace: Trace, causes: list[Cause], color: bool) -> str:
+def _cause_text(trace: Trace, causes: list[Cause], color: bool) -> str:
     lines = []
     for one in causes:
         write = one.write
@@ -82,7 +86,7 @@ def _cause(trace: Trace, causes: list[Cause], color: bool) -> str:
     return "\n".join([*lines, *_source(notes, Label(rule.span))])
 
 
-def _miss(trace: Trace, miss: Miss, color: bool) -> str:
+def _miss_text(trace: Trace, miss: Miss, color: bool) -> str:
     span = miss.rule.span
     labels = [Label(part.span or span, _reads_text(part, miss.cell)) for part in miss.failed]
     if not labels:
@@ -140,3 +144,84 @@ def _values(trace: Trace, slot: Slot, *values: object) -> list[str]:
 
 def _painted(text: str, style: str, color: bool) -> str:
     return f"\x1b[{style}m{printable(text)}\x1b[0m" if color else printable(text)
+
+
+# Plain data
+
+
+def trace_data(trace: Trace) -> dict[str, Any]:
+    """Rows and columns count from 0, steps, lines, columns of text, rules and substeps from 1."""
+    return {
+        "schema": SCHEMA,
+        "ruleset": trace.ruleset.name,
+        "world": trace.world,
+        "cell": trace.cell,
+        "step": trace.step,
+        "slots": {
+            slot.name: {
+                "before": plain(trace.ruleset, slot.kind, trace.before[slot.name]),
+                "after": plain(trace.ruleset, slot.kind, trace.after[slot.name]),
+                "writer": _rule_data(trace.writer(slot.name)),
+            }
+            for slot in trace.slots
+            if slot.name in trace.after
+        },
+        "writes": [_cause_data(trace.ruleset, one) for one in trace.causes],
+        "almost": [_miss_data(one) for one in trace.misses],
+    }
+
+
+def _cause_data(ruleset: Ruleset, cause: Cause) -> dict[str, Any]:
+    write = cause.write
+    return {
+        "slot": write.slot.name,
+        "before": plain(ruleset, write.slot.kind, write.before),
+        "after": plain(ruleset, write.slot.kind, write.after),
+        "how": write.how,
+        "rule": _rule_data(write.rule),
+        "cell": write.cell,
+        "source": write.source,
+        "parts": [_part_data(part) for part in cause.parts],
+    }
+
+
+def _miss_data(miss: Miss) -> dict[str, Any]:
+    return {
+        "rule": _rule_data(miss.rule),
+        "cell": miss.cell,
+        "failed": [_part_data(part) for part in miss.failed],
+        "held": [_part_data(part) for part in miss.parts if part.holds],
+        "gave_way": miss.policy if not miss.failed else None,
+    }
+
+
+def _rule_data(rule: NumberedRule | None) -> dict[str, Any] | None:
+    if rule is None:
+        return None
+    return {
+        "number": rule.number,
+        "pack": rule.pack,
+        "pass": rule.pass_name,
+        "moment": rule.moment + 1,
+        "label": rule.label,
+        "text": one_line(rule.span),
+        **_place(rule.span),
+    }
+
+
+def _part_data(part: Part) -> dict[str, Any]:
+    return {
+        "text": part.text,
+        "holds": part.holds,
+        "let": part.of or None,
+        **_place(part.span),
+        "reads": [
+            {name: value for name, value in vars(read).items() if name != "shown"} for read in part.reads
+        ],
+    }
+
+
+def _place(span: Span | None) -> dict[str, Any]:
+    if span is None:
+        return {"file": None, "line": None, "column": None}
+    return {"file": span.source.name, "line": span.line, "column": span.column}
