@@ -198,6 +198,6 @@ THIRD_PARTIES: dict[str, Home] = {
     "js": Home(("targets.wasm.browser_host",), ()),
     "pyodide": Home(("targets.wasm.browser_host",), ()),
     "click": Home(("cli",), ("cli",)),
-    "matplotlib": Home(("experiments.bench", "experiments.studies", "cli"), ()),
+    "matplotlib": Home(("experiments.studies", "cli"), ()),
     "ray": Home(("experiments.studies.cluster",), ()),
 }

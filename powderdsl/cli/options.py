@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import Field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -89,24 +89,33 @@ def _settings(ctx: click.Context, param: click.Parameter, values: tuple[str, ...
     return found
 
 
-def integer(name: str, low: int, high: int, about: str, default: Any = None, **more: Any) -> Option:
-    """An integer from `low` to `high`."""
-    return _option(name, about, type=_integer(low, high), default=default, **more)
+def option(name: str, kind: Any, about: str, default: Any = None, *, to: str = "", **more: Any) -> Option:
+    """An option of a command.
 
-
-def value(name: str, kind: click.ParamType, about: str, default: Any = None, **more: Any) -> Option:
-    """A value of a type, such as SIZE."""
-    return _option(name, about, type=kind, default=default, **more)
-
-
-def text(name: str, metavar: str, about: str, default: str | None = None, **more: Any) -> Option:
-    """Any text, which the help calls `metavar`."""
-    return _option(name, about, metavar=metavar, default=default, **more)
+    Args:
+        kind: two integers for one in their range, words for one of them, `bool` for a flag, a metavar for any text, or a
+            type of click, such as SIZE.
+        to: the parameter of the command, where it has another name.
+    """
+    match kind:
+        case str():
+            more["metavar"] = kind
+        case (int() as low, int() as high):
+            more["type"] = _integer(low, high)
+        case [*words]:
+            more["type"] = click.Choice(words)
+        case _ if kind is bool:
+            more["is_flag"] = True
+        case _:
+            more["type"] = kind
+    if default is not None:  # click takes None for a value, which a required option then has
+        more["default"] = default
+    return click.option(name, *([to] if to else []), help=about, **more)
 
 
 def path(name: str, metavar: str, about: str, **more: Any) -> Option:
     """A file or folder."""
-    return _option(name, about, type=click.Path(path_type=Path), metavar=metavar, **more)
+    return option(name, click.Path(path_type=Path), about, metavar=metavar, **more)
 
 
 class OutputFile(click.Path):
@@ -126,29 +135,22 @@ class OutputFile(click.Path):
 
 def output(name: str, metavar: str, about: str, *suffixes: str, **more: Any) -> Option:
     """A file to write. Whether that is possible is checked before the command begins: CompileError (PD613)."""
-    return _option(name, about, type=OutputFile(suffixes), metavar=metavar, **more)
-
-
-def choice(name: str, choices: Iterable[str], about: str, default: str | None = None, **more: Any) -> Option:
-    """One of some words."""
-    return _option(name, about, type=click.Choice(list(choices)), default=default, **more)
-
-
-def flag(name: str, about: str, **more: Any) -> Option:
-    """On or off."""
-    return _option(name, about, is_flag=True, **more)
+    return option(name, OutputFile(suffixes), about, metavar=metavar, **more)
 
 
 def knobs(about: str) -> Option:
-    """Values for knobs of a task, as written: see `knob_values`."""
-    return _option("--knob", about, to="knobs", multiple=True, metavar="NAME=N")
+    """Values for knobs of a task, as a mapping."""
+    return option("--knob", "NAME=N", about, to="knobs", multiple=True, callback=_knob_values)
 
 
-def _option(name: str, about: str, to: str = "", default: Any = None, **more: Any) -> Option:
-    """`to`: the parameter of the command, where it has another name."""
-    if default is not None:  # click takes None for a value, which a required option then has
-        more["default"] = default
-    return click.option(name, *([to] if to else []), help=about, **more)
+def _knob_values(ctx: click.Context, param: click.Parameter, knobs: tuple[str, ...]) -> dict[str, int]:
+    values = {}
+    for knob in knobs:
+        match = re.fullmatch(r"([A-Za-z_]\w*)=(-?[0-9]{1,6})", knob.strip())
+        if match is None:
+            raise click.BadParameter(f"`{knob}`: write --knob NAME=N", ctx, param)
+        values[match[1]] = int(match[2])
+    return values
 
 
 def several(*options: Option) -> Option:
@@ -177,17 +179,15 @@ def _setting(one: Field[Any], checked: bool) -> Option:
     if not about:
         return several()
     name = one.metadata["option"] or one.name.replace("_", "-")
-    more: dict[str, Any] = {}
     limits = one.metadata["limits"]
+    kind: Any = name.upper()
     if limits.choices:
-        more["type"] = click.Choice(limits.choices)
+        kind = limits.choices
     elif isinstance(one.default, int):
-        more["type"] = _integer(limits.low, limits.high) if checked else COUNT
+        kind = (limits.low, limits.high) if checked else COUNT
     elif isinstance(one.default, float):
-        more["type"] = float
-    else:
-        more = {"metavar": name.upper(), "multiple": isinstance(one.default, tuple)}
-    return _option(f"--{name}", about, to=one.name, **more)
+        kind = float
+    return option(f"--{name}", kind, about, to=one.name, multiple=isinstance(one.default, tuple))
 
 
 rules = click.argument("rules", metavar="RULES")
@@ -204,7 +204,7 @@ parameters = click.option(
 world = click.option(
     "--world", metavar="FILE|NAME", help="A .npz, .png, .txt or .yaml file, or the name of a scene."
 )
-size = value("--size", SIZE, "Rows and columns, such as 48x64.")
+size = option("--size", SIZE, "Rows and columns, such as 48x64.")
 device = click.option("--device", default="cpu", help="A torch device: cpu, cuda, cuda:1.")
 
 
@@ -226,16 +226,16 @@ class ManyWords(click.Command):
         return super().parse_args(ctx, found)
 
 
-def _place_of(word: str) -> str:
-    """A pack as runs record it: files by their absolute path."""
-    return str(Path(word).absolute()) if word.endswith((".yaml", ".yml")) else word
+def _places(ctx: click.Context, param: click.Parameter, words: tuple[str, ...]) -> tuple[str, ...]:
+    """Packs as runs record them: files by their absolute paths."""
+    return tuple(str(Path(word).absolute()) if word.endswith((".yaml", ".yml")) else word for word in words)
 
 
 packs = click.option(
     "--packs",
     multiple=True,
     metavar="PACK…",
-    callback=lambda ctx, param, words: tuple(_place_of(word) for word in words),
+    callback=_places,
     help="Packs, by name or file, that are added to the task's rules.",
 )
 """For commands whose class is `ManyWords`."""
@@ -257,25 +257,14 @@ def load_rules(rules: str, settings: dict[str, str]) -> Ruleset:
     return ruleset
 
 
-def knob_values(knobs: Sequence[str]) -> dict[str, int]:
-    """`NAME=N` options as a mapping. Raises BadInput."""
-    values = {}
-    for knob in knobs:
-        match = re.fullmatch(r"([A-Za-z_]\w*)=(-?[0-9]{1,6})", knob.strip())
-        if match is None:
-            raise BadInput(f"`{knob}`: write --knob NAME=N")
-        values[match[1]] = int(match[2])
-    return values
-
-
 def find_played(
-    name: str, knobs: Sequence[str], settings: dict[str, str], packs: Sequence[str]
+    name: str, knobs: dict[str, int], settings: dict[str, str], packs: Sequence[str]
 ) -> Task | RunFolder:
     """The task or the run of an agent that a command was given. Raises CompileError and BadInput."""
     from powderdsl.tasks.shipped import is_task, load_task
 
     if is_task(name):
-        return load_task(name, knobs=knob_values(knobs), params=settings, packs=packs)
+        return load_task(name, knobs=knobs, params=settings, packs=packs)
     if knobs or settings:
         raise BadInput("--knob and --set go with a task: a run has its own")
     from powderdsl.experiments.runs import find_run

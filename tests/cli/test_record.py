@@ -72,18 +72,9 @@ def test_a_dataset_is_recorded_and_verified(task: Path, tmp_path: Path) -> None:
 
 def test_all_mistakes_are_told_at_once(task: Path, tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
-    found = powderdsl(
-        "record", task, "--out", tmp_path, "--split", "tst", "--knob", "disks", "--knob", "squares=3"
-    )
+    found = powderdsl("record", task, "--out", tmp_path, "--split", "tst", "--knob", "squares=3")
     assert found.exit_code == 2
-    for words in (
-        "PD630",
-        "holds notes.txt",
-        "PD803",
-        "`squares`",
-        "missing --episodes",
-        "write --knob NAME=N",
-    ):
+    for words in ("PD630", "holds notes.txt", "PD803", "`squares`", "missing --episodes"):
         assert words in found.stderr
     found = powderdsl(
         "record", "destroying", "--out", tmp_path / "a/b", "--split", "tst", "--policy", "nothing"
@@ -101,6 +92,7 @@ def test_all_mistakes_are_told_at_once(task: Path, tmp_path: Path) -> None:
         (("--verify", "gone"), "PD630"),
         (("small", "--verify", "gone"), "--verify takes a folder"),
         (("--seed", "-1"), "is not an integer"),
+        (("--knob", "disks"), "write --knob NAME=N"),
         (("sand-pushing", "--out", "d", "--episodes", "1", "--policy", "runs/clever"), "PD620"),
         (("--observation", "matrix"), "matrix"),
         (("sand-pushing", "--out", "d", "--episodes", "1", "--device", "tpu"), "PD701"),

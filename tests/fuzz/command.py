@@ -64,14 +64,14 @@ class BackendsType(click.ParamType):
 
 @click.command("fuzz", cls=GuardedCommand, context_settings={"help_option_names": ["-h", "--help"]})
 @click.option("--seeds", type=SeedsType(), help="Which rulesets, or damaged files.  [default: 0..200]")
-@opt.integer("--seconds", 1, 10_000_000, "Run for this time, with as many seeds as it takes.")
+@opt.option("--seconds", (1, 10_000_000), "Run for this time, with as many seeds as it takes.")
 @click.option(
     "--backends",
     type=BackendsType(),
     help=f"What is compared: {', '.join(NAMES)}.  [default: all; those that need a C++ compiler if there is one]",
 )
-@opt.integer("--worlds", 1, 100, "Worlds of a ruleset.", 4, show_default=True)
-@opt.integer("--steps", 1, 10_000, "Steps of a world.", 3, show_default=True)
+@opt.option("--worlds", (1, 100), "Worlds of a ruleset.", 4, show_default=True)
+@opt.option("--steps", (1, 10_000), "Steps of a world.", 3, show_default=True)
 @click.option(
     "--level",
     type=click.Choice(LEVELS),
@@ -89,7 +89,7 @@ class BackendsType(click.ParamType):
 )
 @click.option("--resume", is_flag=True, help="Continue where the run in that folder ended.")
 @click.option("--front-end", is_flag=True, help="Damage rule files instead, and load them.")
-@opt.integer("--jobs", 1, 256, "Processes.  [default: one per processor]")
+@opt.option("--jobs", (1, 256), "Processes.  [default: one per processor]")
 @click.option(
     "--replay",
     type=click.Path(path_type=Path, dir_okay=False),

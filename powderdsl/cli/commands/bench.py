@@ -43,18 +43,18 @@ EPILOG = "\b\nWorkloads:\n" + "\n".join(f"  {name:<7} {about}" for name, about i
 
 @click.command("bench", epilog=EPILOG)
 @click.argument("rules", metavar="[RULES]", default="powderworld")
-@opt.value(
+@opt.option(
     "--backend",
     opt.BACKEND,
     "Backend that runs the rules.  [default: wasm and native; on a GPU, torch and cuda]",
     to="backends",
     multiple=True,
 )
-@opt.integer("--batch", 1, 1 << 20, "Number of worlds in a batch.", (1, 32), to="batches", multiple=True)
-@opt.value("--size", opt.SIZE, "Rows and columns.  [default: 64]", to="sizes", multiple=True)
-@opt.value("--only", NAMES, "Use only these elements in the worlds.", ())
-@opt.integer("--threads", 1, 1024, "CPU threads.", (1,), multiple=True)
-@opt.value(
+@opt.option("--batch", (1, 1 << 20), "Number of worlds in a batch.", (1, 32), to="batches", multiple=True)
+@opt.option("--size", opt.SIZE, "Rows and columns.  [default: 64]", to="sizes", multiple=True)
+@opt.option("--only", NAMES, "Use only these elements in the worlds.", ())
+@opt.option("--threads", (1, 1024), "CPU threads.", (1,), multiple=True)
+@opt.option(
     "--beside",
     click.Path(exists=True, dir_okay=False, path_type=Path),
     "Also measure a program of yours that makes the same steps: `load(state)` returns `run(steps)`.",
@@ -62,15 +62,15 @@ EPILOG = "\b\nWorkloads:\n" + "\n".join(f"  {name:<7} {about}" for name, about i
     metavar="FILE.py",
     multiple=True,
 )
-@opt.choice("--workload", list(WORKLOADS), "The worlds to start from.", Plan.workload)
+@opt.option("--workload", list(WORKLOADS), "The worlds to start from.", Plan.workload)
 @opt.device
-@opt.integer("--steps", 1, 1 << 20, "Maximum steps per call.", Plan.steps)
-@opt.value("--seconds", SECONDS, "Measuring time per combination, in seconds.", Plan.seconds)
-@opt.integer("--rounds", 1, 1000, "Rounds: in each, all combinations are measured in turn.", Plan.rounds)
-@opt.integer("--seed", 0, 2**63 - 1, "Seed of the start worlds.", Plan.seed)
+@opt.option("--steps", (1, 1 << 20), "Maximum steps per call.", Plan.steps)
+@opt.option("--seconds", SECONDS, "Measuring time per combination, in seconds.", Plan.seconds)
+@opt.option("--rounds", (1, 1000), "Rounds: in each, all combinations are measured in turn.", Plan.rounds)
+@opt.option("--seed", (0, 2**63 - 1), "Seed of the start worlds.", Plan.seed)
 @opt.parameters
-@opt.flag("--profile", "Also measure the time of each pass.")
-@opt.flag("--json", "Print one JSON object instead of tables.", to="printed")
+@opt.option("--profile", bool, "Also measure the time of each pass.")
+@opt.option("--json", bool, "Print one JSON object instead of tables.", to="printed")
 def command(
     rules: str,
     backends: tuple[str, ...],

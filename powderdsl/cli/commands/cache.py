@@ -37,7 +37,7 @@ def command() -> None:
 
 
 @command.command("list")
-@opt.flag("--json", "Print one JSON list with all details.", to="as_json")
+@opt.option("--json", bool, "Print one JSON list with all details.", to="as_json")
 def list_entries(as_json: bool) -> None:
     """List compiled code, the most recently used first."""
     from powderdsl.targets.cache import entries
@@ -58,7 +58,7 @@ def list_entries(as_json: bool) -> None:
 
 
 @command.command("clear")
-@opt.value(
+@opt.option(
     "--older-than",
     opt.Parsed("AGE", _age),
     "Remove only what has not been used for this time, such as 30d.",

@@ -48,13 +48,13 @@ class Checked:
 
 @click.command("check")
 @click.argument("rules", nargs=-1, required=True, metavar="RULES...")
-@opt.flag("--json", "One JSON list instead of text.", to="as_json")
-@opt.flag("--short", "One line for each mistake, without carets.")
-@opt.flag("--notes", "Also list notes, such as inactive rules.")
-@opt.flag("--warnings-as-errors", "Exit with 1 if there are warnings.")
-@opt.flag("--quick", "Check only the rules themselves; do not try invariants.")
-@opt.flag("--cost", "Also report what each pass costs; in JSON as a second key.")
-@opt.flag("--ledger", "Also report what rules create, destroy and move; in JSON as a key.")
+@opt.option("--json", bool, "One JSON list instead of text.", to="as_json")
+@opt.option("--short", bool, "One line for each mistake, without carets.")
+@opt.option("--notes", bool, "Also list notes, such as inactive rules.")
+@opt.option("--warnings-as-errors", bool, "Exit with 1 if there are warnings.")
+@opt.option("--quick", bool, "Check only the rules themselves; do not try invariants.")
+@opt.option("--cost", bool, "Also report what each pass costs; in JSON as a second key.")
+@opt.option("--ledger", bool, "Also report what rules create, destroy and move; in JSON as a key.")
 def command(
     rules: tuple[str, ...],
     as_json: bool,

@@ -27,7 +27,7 @@ STAGES = ("tree", "model", "ir", "planes", "schedule", "kernels")
 
 @click.command("compile")
 @opt.rules
-@opt.choice(
+@opt.option(
     "--emit",
     STAGES,
     "tree: rules as parsed; model: checked, loops unrolled; ir: optimized; planes: on bit planes; "
@@ -36,8 +36,8 @@ STAGES = ("tree", "model", "ir", "planes", "schedule", "kernels")
     required=True,
 )
 @opt.backend("auto", "Whose schedule or kernels are printed.")
-@opt.text("--after", "STAGE", "Print the schedule after this stage of the planner.  [default: the last]")
-@opt.text("--pass", "NAME", "Print only this pass of the rules.", to="pass_name")
+@opt.option("--after", "STAGE", "Print the schedule after this stage of the planner.  [default: the last]")
+@opt.option("--pass", "NAME", "Print only this pass of the rules.", to="pass_name")
 @opt.output("-o", "FILE", "Write to this file instead of stdout.", to="--out")
 @opt.parameters
 def command(

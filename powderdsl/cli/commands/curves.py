@@ -8,13 +8,12 @@ import click
 
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput
-from powderdsl.cli.options import check_writable
 
 
 @click.command("curves")
 @click.argument("runs", metavar="RUN…", nargs=-1, required=True)
 @click.option("--metric", default="held_out/return", metavar="NAME", help="A number of metrics.jsonl.")
-@opt.path("--out", "FILE", "The picture to write; without it, a table is printed.")
+@opt.output("--out", "FILE", "The picture to write; without it, a table is printed.")
 def command(runs: tuple[str, ...], metric: str, out: Path | None) -> None:
     """Show what agents or world models learned, step by step.
 
@@ -25,8 +24,6 @@ def command(runs: tuple[str, ...], metric: str, out: Path | None) -> None:
     from powderdsl.experiments.runs.metrics import read_metrics
     from powderdsl.experiments.studies.curves import as_table, baselines_of, curves_of, write_curves
 
-    if out is not None:
-        check_writable(out)
     found = [find_run(name) for name in runs]
     curves = curves_of(found, metric)
     if not curves:

@@ -38,21 +38,21 @@ def _names(ctx: click.Context, param: click.Parameter, value: str | None) -> lis
     metavar="A,B",
     help="Policies among trained, expert, random, nothing.  [default: all; an expert that searches only if named]",
 )
-@opt.integer("--episodes", 1, 10**6, "Episodes per split and policy.", 256)
+@opt.option("--episodes", (1, 10**6), "Episodes per split and policy.", 256)
 @click.option(
     "--deterministic/--sampled", default=False, help="Take the likeliest action, or draw one as in training."
 )
-@opt.integer("--seed", 0, 2**32 - 1, "Seed of what policies draw.", 0)
+@opt.option("--seed", (0, 2**32 - 1), "Seed of what policies draw.", 0)
 @opt.knobs("For a task: another value for a knob.")
 @opt.parameters
 @opt.packs
 @click.option("--backend", type=opt.BACKEND, help="Backend that runs the rules.  [default: the run's]")
 @click.option("--device", help="A torch device.  [default: the run's]")
-@opt.flag("--json", "One JSON object instead of a table.", to="as_json")
+@opt.option("--json", bool, "One JSON object instead of a table.", to="as_json")
 @opt.output("--out", "FILE.json", "Also write the JSON object to this file.")
 def command(
     run: str,
-    knobs: tuple[str, ...],
+    knobs: dict[str, int],
     settings: dict[str, str],
     packs: tuple[str, ...],
     as_json: bool,

@@ -13,7 +13,7 @@ from powderdsl.system.writing import replacing
 @click.command("export")
 @click.argument("rules", metavar="RULES")
 @opt.output("--out", "FILE", "The .wasm file to write.", ".wasm", required=True)
-@opt.value("--size", opt.SIZE, "Rows and columns.", "64")
+@opt.option("--size", opt.SIZE, "Rows and columns.", "64")
 @opt.parameters
 def command(rules: str, out: Path, size: tuple[int, int], settings: dict[str, str]) -> None:
     """Write rules as a WebAssembly module, for a page or a game.

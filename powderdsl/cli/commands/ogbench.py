@@ -16,10 +16,10 @@ from powderdsl.cli.output import counted, progress
 @click.command("ogbench")
 @click.argument("level", metavar="LEVEL")
 @opt.path("--out", "FOLDER", "Folder of the files.", required=True)
-@opt.integer("--episodes", 1, 1 << 30, "Training episodes.  [default: as many as OGBench has]")
-@opt.integer("--validation", 1, 1 << 30, "Validation episodes.  [default: a tenth]")
-@opt.integer("--seed", 0, (1 << 61) - 1, "Seed of the episodes.", 0)
-@opt.integer("--threads", 1, 1024, "CPU threads.", 1)
+@opt.option("--episodes", (1, 1 << 30), "Training episodes.  [default: as many as OGBench has]")
+@opt.option("--validation", (1, 1 << 30), "Validation episodes.  [default: a tenth]")
+@opt.option("--seed", (0, (1 << 61) - 1), "Seed of the episodes.", 0)
+@opt.option("--threads", (1, 1024), "CPU threads.", 1)
 @opt.backend("auto")
 @opt.device
 def command(

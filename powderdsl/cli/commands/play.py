@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 @click.command("play")
 @click.argument("rules", metavar="[RULES]", required=False)
 @opt.world
-@opt.integer("--port", 0, 65535, "Port of the server; 0 for any.", 0)
-@opt.flag("--no-open", "Do not open a browser.")
+@opt.option("--port", (0, 65535), "Port of the server; 0 for any.", 0)
+@opt.option("--no-open", bool, "Do not open a browser.")
 @opt.path("--export", "DIR", "Write the page as a folder for any web server, and exit.")
 @opt.parameters
 def command(

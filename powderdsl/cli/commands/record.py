@@ -13,7 +13,6 @@ import click
 
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BAD_INPUT, OK, BadInput, user_values
-from powderdsl.cli.options import knob_values
 from powderdsl.cli.output import counted, progress, write_diagnostics
 from powderdsl.datasets.manifest import check_place, read_manifest
 from powderdsl.diagnostics import CompileError, Diagnostic
@@ -26,30 +25,30 @@ SCRIPTED = ("expert", "random", "nothing")
 @click.command("record", cls=opt.ManyWords)
 @click.argument("task", required=False)
 @opt.path("--out", "FOLDER", "Folder of the dataset.")
-@opt.integer("--episodes", 1, 1 << 32, "Number of episodes to record.")
-@opt.text("--split", "SPLIT", "The set of worlds.", "train")
-@opt.text(
+@opt.option("--episodes", (1, 1 << 32), "Number of episodes to record.")
+@opt.option("--split", "SPLIT", "The set of worlds.", "train")
+@opt.option(
     "--policy",
     "expert|random|nothing|RUN",
     "Policy: the task's expert, every action equally likely, no action, or a trained agent.",
     "random",
 )
-@opt.choice("--observation", ("ids", "compact"), "Record elements only, or the whole state.", "ids")
-@opt.integer("--seed", 0, (1 << 61) - 1, "World of the first episode, and seed of the policy.", 0)
-@opt.integer("--worlds", 1, (1 << 61) - 1, "Number of worlds: they are numbered from 0.", 1_000_000)
+@opt.option("--observation", ("ids", "compact"), "Record elements only, or the whole state.", "ids")
+@opt.option("--seed", (0, (1 << 61) - 1), "World of the first episode, and seed of the policy.", 0)
+@opt.option("--worlds", (1, (1 << 61) - 1), "Number of worlds: they are numbered from 0.", 1_000_000)
 @opt.knobs("Another value for a knob of the task.")
 @opt.parameters
 @opt.packs
-@opt.integer("--shard", 1, 1 << 32, "Episodes per file.  [default: 256, or 256 MiB]")
-@opt.flag("--compress", "Smaller files, slower to read.")
-@opt.integer("--envs", 1, 1 << 20, "Maximum number of episodes played at once.", 256)
+@opt.option("--shard", (1, 1 << 32), "Episodes per file.  [default: 256, or 256 MiB]")
+@opt.option("--compress", bool, "Smaller files, slower to read.")
+@opt.option("--envs", (1, 1 << 20), "Maximum number of episodes played at once.", 256)
 @opt.backend("auto")
 @opt.device
 @opt.path("--verify", "FOLDER", "Record nothing: read every byte of a dataset.")
-@opt.text(
+@opt.option(
     "--to-minari", "ID", "Record nothing: write the dataset --out as a Minari dataset, namespace/name-v0."
 )
-@opt.text(
+@opt.option(
     "--from-minari",
     "ID",
     "Record nothing: read a Minari dataset into the folder --out; of TASK, unless --to-minari wrote it.",
@@ -116,7 +115,7 @@ def _checked(
     policy: str,
     split: str,
     *,
-    knobs: tuple[str, ...],
+    knobs: dict[str, int],
     settings: dict[str, str],
     packs: tuple[str, ...],
 ) -> Task | None:
@@ -137,10 +136,6 @@ def _checked(
     required = {"TASK": task, "--out": out, "--episodes": episodes}
     if missing := [name for name, value in required.items() if value is None]:
         lines.append(f"missing {', '.join(missing)}")
-    values: dict[str, int] = {}
-    for knob in knobs:
-        with collected():
-            values |= knob_values([knob])
     if out is not None:
         with collected():
             check_place(out)
@@ -154,7 +149,7 @@ def _checked(
     loaded = None
     if task is not None:
         with collected():
-            loaded = load_task(task, knobs=values, params=settings, packs=packs, palette=palette)
+            loaded = load_task(task, knobs=knobs, params=settings, packs=packs, palette=palette)
             check_split(loaded, split)
     if loaded is not None and policy == "nothing":
         with collected():
@@ -231,9 +226,7 @@ def _exchanged(
         elif task is None:
             dataset = minari.from_minari(str(from_minari), out)
         else:
-            loaded = load_task(
-                task, knobs=knob_values(how["knobs"]), params=how["settings"], packs=how["packs"]
-            )
+            loaded = load_task(task, knobs=how["knobs"], params=how["settings"], packs=how["packs"])
             names = ("split", "observation", "worlds", "shard", "compress", "backend", "device")
             dataset = minari.from_minari(
                 str(from_minari), out, task=loaded, **{name: how[name] for name in names}

@@ -11,10 +11,10 @@ from powderdsl.cli import options as opt
 
 @click.command("render")
 @click.argument("world", metavar="WORLD")
-@opt.text("--rules", "RULES", "Rules whose elements the world has.", required=True)
+@opt.option("--rules", "RULES", "Rules whose elements the world has.", required=True)
 @opt.output("--out", "FILE", "The .png file to write.", ".png", required=True)
-@opt.value("--size", opt.SIZE, "Rows and columns of a scene, such as 48x64.")
-@opt.integer("--scale", 1, 64, "Pixels per cell.  [default: about 400 a side]")
+@opt.option("--size", opt.SIZE, "Rows and columns of a scene, such as 48x64.")
+@opt.option("--scale", (1, 64), "Pixels per cell.  [default: about 400 a side]")
 def command(world: str, rules: str, out: Path, size: tuple[int, int] | None, scale: int | None) -> None:
     """Draw a world as a picture, without running it.
 

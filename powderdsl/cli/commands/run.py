@@ -49,18 +49,18 @@ class Playback:
 @opt.rules
 @opt.world
 @opt.size
-@opt.integer("--batch", 1, 1 << 20, "Number of worlds.  [default: 1]")
-@opt.integer("--steps", 0, 10**9, "Number of steps.", 240)
-@opt.integer("--seed", 0, 2**63 - 1, "Seed of all random numbers.  [default: 0]")
+@opt.option("--batch", (1, 1 << 20), "Number of worlds.  [default: 1]")
+@opt.option("--steps", (0, 10**9), "Number of steps.", 240)
+@opt.option("--seed", (0, 2**63 - 1), "Seed of all random numbers.  [default: 0]")
 @opt.backend("auto")
 @opt.device
 @opt.parameters
 @opt.output("--out", "FILE", "Write a .png, .gif or .mp4, or save the world as .npz.", *SUFFIXES)
-@opt.integer("--scale", 1, 64, "Pixels per cell.  [default: about 400 a side]")
-@opt.integer("--every", 1, 10**6, "Show every n-th step.", 1)
-@opt.integer("--fps", 1, 240, "Frames per second.", 30)
-@opt.flag("--watch", "Show the first world in the terminal while it runs.")
-@opt.integer("--threads", 1, 1024, "CPU threads.  [default: 1 for small batches]")
+@opt.option("--scale", (1, 64), "Pixels per cell.  [default: about 400 a side]")
+@opt.option("--every", (1, 10**6), "Show every n-th step.", 1)
+@opt.option("--fps", (1, 240), "Frames per second.", 30)
+@opt.option("--watch", bool, "Show the first world in the terminal while it runs.")
+@opt.option("--threads", (1, 1024), "CPU threads.  [default: 1 for small batches]")
 @click.option("-v", "--verbose", is_flag=True, help="Report the speed, and how many cells each element has.")
 def command(
     rules: str,

@@ -28,17 +28,17 @@ if TYPE_CHECKING:
 
 @click.command("show")
 @click.argument("rules", metavar="RULES|TASK")
-@opt.flag("--json", "One JSON object instead of tables.", to="as_json")
+@opt.option("--json", bool, "One JSON object instead of tables.", to="as_json")
 @opt.parameters
 @opt.knobs("For a task: another value for a knob.")
-@opt.text("--split", "SPLIT", "For a task: the set of worlds.", "train")
-@opt.integer("--seeds", 1, 256, "For a task: the number of worlds.", 16)
+@opt.option("--split", "SPLIT", "For a task: the set of worlds.", "train")
+@opt.option("--seeds", (1, 256), "For a task: the number of worlds.", 16)
 @opt.output("--out", "FILE.png", "For a task: draw these worlds, with regions outlined.", ".png")
 def command(
     rules: str,
     as_json: bool,
     settings: dict[str, str],
-    knobs: tuple[str, ...],
+    knobs: dict[str, int],
     split: str,
     seeds: int,
     out: Path | None,
@@ -50,7 +50,7 @@ def command(
     if is_task(rules):
         from powderdsl.tasks.shipped import check_split, load_task
 
-        task = load_task(rules, knobs=opt.knob_values(knobs), params=settings)
+        task = load_task(rules, knobs=knobs, params=settings)
         check_split(task, split)
         if as_json:
             print_json(_task_data(task))

@@ -86,13 +86,13 @@ def commands() -> Mapping[tuple[str, ...], Mapping[str, str]]:
 
 # Parts of a study: the combinations that `--only`, `--seeds` and `--shard` select
 
-only_option = opt.text(
+only_option = opt.option(
     "--only",
     "NAME=VALUE,…",
     "Run only combinations with these values of a setting, or `seed=0,1`. May be repeated.",
     multiple=True,
 )
-seeds_option = opt.integer("--seeds", 1, 1000, "Runs of each combination.  [default: the study's]")
+seeds_option = opt.option("--seeds", (1, 1000), "Runs of each combination.  [default: the study's]")
 
 
 def _shard(text: str) -> tuple[int, int]:
@@ -168,15 +168,15 @@ def collect(folders: tuple[Path, ...], seeds: int | None, only: tuple[str, ...],
 
 @click.command("study", cls=StudyCommand)
 @click.argument("study", metavar="STUDY", required=False)
-@opt.choice("--size", SIZES, "Size of the study: values of its settings.", "small")
+@opt.option("--size", SIZES, "Size of the study: values of its settings.", "small")
 @seeds_option
-@opt.integer("--jobs", 1, 256, "Processes that run at a time.  [default: 2; with --ray, as many as fit]")
-@opt.integer("--threads", 1, 256, "Threads per process.", 1)
+@opt.option("--jobs", (1, 256), "Processes that run at a time.  [default: 2; with --ray, as many as fit]")
+@opt.option("--threads", (1, 256), "Threads per process.", 1)
 @only_option
 @click.option("--shard", type=SHARD, help="Run only part I of N parts: for job arrays.")
-@opt.text("--ray", "ADDRESS", "Run on a Ray cluster: `auto`, or HOST:PORT of its head.")
+@opt.option("--ray", "ADDRESS", "Run on a Ray cluster: `auto`, or HOST:PORT of its head.")
 @opt.path("--out", "FOLDER", "Folder of the results.  [default: studies/STUDY-SIZE]")
-@opt.flag("--dry-run", "Print the commands without running them.")
+@opt.option("--dry-run", bool, "Print the commands without running them.")
 def command(
     study: str | None,
     size: str,

@@ -18,9 +18,9 @@ MAX_SECONDS = 24 * 3600
 @click.argument("rules", nargs=-1, metavar="[RULES]...")
 @opt.backend(None, "Backend that runs the rules.  [default: wasm]")
 @opt.parameters
-@opt.integer("--examples", 0, 10_000_000, "Random worlds on which each invariant is tried.", 1000)
-@opt.integer("--seconds", 1, MAX_SECONDS, "Time limit for random worlds, per RULES, in seconds.", 60)
-@opt.integer("--seed", 0, 2**31 - 1, "Seed of the random worlds.", 0)
+@opt.option("--examples", (0, 10_000_000), "Random worlds on which each invariant is tried.", 1000)
+@opt.option("--seconds", (1, MAX_SECONDS), "Time limit for random worlds, per RULES, in seconds.", 60)
+@opt.option("--seed", (0, 2**31 - 1), "Seed of the random worlds.", 0)
 @opt.path("--replay", "FILE", "Only try this counterexample again.")
 @opt.output("--picture", "FILE", "Draw the first counterexample, before and after, as a .png.", ".png")
 @click.option(
@@ -28,21 +28,20 @@ MAX_SECONDS = 24 * 3600
     default=None,
     help="Keep counterexamples in .powderdsl/.  [default: unless $CI is set]",
 )
-@opt.flag("--json", "One JSON object instead of text.", to="as_json")
-@opt.flag("--mutate", "Put mistakes into the packs, and list those that nothing notices.")
-@opt.text(
+@opt.option("--json", bool, "One JSON object instead of text.", to="as_json")
+@opt.option("--mutate", bool, "Put mistakes into the packs, and list those that nothing notices.")
+@opt.option(
     "--pack", "PACK", "With --mutate: only mistakes in this pack. May be repeated.", to="packs", multiple=True
 )
-@opt.integer(
+@opt.option(
     "--mutants",
-    1,
-    1_000_000,
+    (1, 1_000_000),
     "With --mutate: maximum number of mutants, of each kind in proportion.",
     metavar="N",
 )
-@opt.flag("--write", "With --mutate: add tests that notice them to their packs.")
-@opt.integer(
-    "--jobs", 1, 256, "With --mutate: number of processes.  [default: one per processor]", metavar="N"
+@opt.option("--write", bool, "With --mutate: add tests that notice them to their packs.")
+@opt.option(
+    "--jobs", (1, 256), "With --mutate: number of processes.  [default: one per processor]", metavar="N"
 )
 def command(
     rules: tuple[str, ...],

@@ -28,15 +28,15 @@ CELL = opt.Parsed("ROW,COLUMN", _cell)
 @opt.rules
 @opt.world
 @opt.size
-@opt.integer("--seed", 0, 2**63 - 1, "Seed of all random numbers.  [default: 0]")
-@opt.value("--at", CELL, "Row and column of the cell, from 0.", to="cell", required=True)
-@opt.integer("--step", 1, 10**9, "Step of the run, from 1.", required=True)
-@opt.text(
+@opt.option("--seed", (0, 2**63 - 1), "Seed of all random numbers.  [default: 0]")
+@opt.option("--at", CELL, "Row and column of the cell, from 0.", to="cell", required=True)
+@opt.option("--step", (1, 10**9), "Step of the run, from 1.", required=True)
+@opt.option(
     "--of", "NAME", "Explain only `element`, or this field. May be repeated.", to="names", multiple=True
 )
-@opt.integer("--number", 0, 1 << 20, "Number of the world in a saved batch.", 0)
-@opt.flag("--all", "List every rule that did not happen, and why.", to="every_rule")
-@opt.flag("--json", "Print one JSON object.", to="as_json")
+@opt.option("--number", (0, 1 << 20), "Number of the world in a saved batch.", 0)
+@opt.option("--all", bool, "List every rule that did not happen, and why.", to="every_rule")
+@opt.option("--json", bool, "Print one JSON object.", to="as_json")
 @opt.backend("auto", "Backend that runs the steps before it.")
 @opt.parameters
 def command(

@@ -11,7 +11,6 @@ import click
 
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput
-from powderdsl.cli.options import knob_values
 from powderdsl.cli.output import progress
 from powderdsl.rl.config import PRESETS, TrainConfig, from_json, preset
 
@@ -20,7 +19,7 @@ from powderdsl.rl.config import PRESETS, TrainConfig, from_json, preset
 @click.argument("task", metavar="TASK", required=False)
 @opt.path("--run", "DIR", "Folder of the run.  [default: runs/TASK-seedN]", to="folder")
 @opt.path("--resume", "DIR", "Continue a run with its own settings.")
-@opt.choice(
+@opt.option(
     "--preset",
     list(PRESETS),
     "Settings that other options change: the paper's, or those for a few minutes on one core.",
@@ -30,9 +29,9 @@ from powderdsl.rl.config import PRESETS, TrainConfig, from_json, preset
 @opt.path("--init-from", "DATASET", "Dataset whose actions the network learns first (behavior cloning).")
 @opt.settings_of(TrainConfig)
 @opt.knobs("Another value for a knob of the task. May be repeated.")
-@opt.integer("--n-lines", 0, 10**6, "Short for --knob lines=N.", to="lines")
-@opt.integer("--n-disks", 0, 10**6, "Short for --knob disks=N.", to="disks")
-@opt.integer("--complexity", 0, 10**6, "Short for --knob complexity=N.")
+@opt.option("--n-lines", (0, 10**6), "Short for --knob lines=N.", to="lines")
+@opt.option("--n-disks", (0, 10**6), "Short for --knob disks=N.", to="disks")
+@opt.option("--complexity", (0, 10**6), "Short for --knob complexity=N.")
 @opt.parameters
 @opt.packs
 @opt.backend("auto")
@@ -88,7 +87,7 @@ def new_config(ctx: click.Context) -> TrainConfig:
     given = _given(ctx, [one.name for one in fields(TrainConfig) if one.name not in (*WHAT, "task")])
     if "init_from" in given:
         given["init_from"] = str(given["init_from"].absolute())
-    knobs = knob_values(values["knobs"]) | _given(ctx, ("lines", "disks", "complexity"))
+    knobs = values["knobs"] | _given(ctx, ("lines", "disks", "complexity"))
     name = str(Path(task).absolute()) if Path(task).suffix else task
     more = {"knobs": knobs, "params": values["settings"], "packs": values["packs"]}
     return preset(values["preset_name"], name, **given, **more)

@@ -17,21 +17,21 @@ from powderdsl.tasks.task import Task
 @click.command("watch", cls=opt.ManyWords)
 @click.argument("run", metavar="RUN|TASK")
 @click.option("--split", help="Split: the set of worlds.  [default: test where the task has it, else train]")
-@opt.integer("--worlds", 1, 64, "Number of worlds, side by side.", 4)
-@opt.integer("--first", 0, 2**62, "Number of the first world.", 0)
-@opt.choice(
+@opt.option("--worlds", (1, 64), "Number of worlds, side by side.", 4)
+@opt.option("--first", (0, 2**62), "Number of the first world.", 0)
+@opt.option(
     "--policy",
     ("trained", "expert", "random", "nothing"),
     "Policy that acts.  [default: trained; for a TASK: random]",
 )
 @click.option("--deterministic/--sampled", default=False, help="Take the likeliest action, or draw one.")
-@opt.integer("--seed", 0, 2**32 - 1, "Seed of what the policy draws.", 0)
+@opt.option("--seed", (0, 2**32 - 1), "Seed of what the policy draws.", 0)
 @opt.knobs("For a task: another value for a knob.")
 @opt.parameters
 @opt.packs
 @opt.output("--out", "FILE", "The film to write.  [default: watch.gif in the run's folder]", ".gif", ".mp4")
-@opt.integer("--fps", 1, 240, "Frames per second.", 15)
-@opt.integer("--scale", 1, 32, "Pixels per cell.", 4)
+@opt.option("--fps", (1, 240), "Frames per second.", 15)
+@opt.option("--scale", (1, 32), "Pixels per cell.", 4)
 @click.option("--backend", type=opt.BACKEND, help="Backend that runs the rules.  [default: the run's]")
 def command(
     run: str,
@@ -41,7 +41,7 @@ def command(
     policy: str | None,
     deterministic: bool,
     seed: int,
-    knobs: tuple[str, ...],
+    knobs: dict[str, int],
     settings: dict[str, str],
     packs: tuple[str, ...],
     out: Path | None,

@@ -12,7 +12,6 @@ import click
 
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput, user_values
-from powderdsl.cli.options import knob_values
 from powderdsl.cli.output import print_json, progress
 from powderdsl.cli.wm_report import told, write_curve
 from powderdsl.worldmodel.config import PRESETS, DataConfig, TrainConfig, Variety
@@ -34,7 +33,7 @@ OF_WORLDS |= {*KNOBS, "packs", "held_out", "settings", "worlds", "after"}
 """Options that select worlds: a dataset has its own."""
 MACHINE = ("device", "threads", "backend", "store", "compiled")
 
-_network = opt.text(
+_network = opt.option(
     "--network",
     "MODULE:CLASS",
     "Your own network, which this imports.  [default: the U-net]",
@@ -42,23 +41,23 @@ _network = opt.text(
 )
 _recording = opt.path("--data", "DATASET", "Transitions with actions, recorded by `powderdsl record`.")
 _machine_options = opt.several(
-    _network, opt.integer("--threads", 1, 1024, "CPU threads.", 1), opt.device, opt.backend("auto")
+    _network, opt.option("--threads", (1, 1024), "CPU threads.", 1), opt.device, opt.backend("auto")
 )
 _test_options = opt.several(
     click.argument("run", metavar="RUN"),
-    opt.text("--task", "TASK", "A shipped task or a file.  [default: the run's]"),
-    opt.text("--split", "SPLIT", "Split of the task to test on.  [default: designed]"),
-    opt.text("--rules", "RULES", "Rules to test under.  [default: the run's]"),
+    opt.option("--task", "TASK", "A shipped task or a file.  [default: the run's]"),
+    opt.option("--split", "SPLIT", "Split of the task to test on.  [default: designed]"),
+    opt.option("--rules", "RULES", "Rules to test under.  [default: the run's]"),
     _recording,
     _machine_options,
 )
 _run_options = opt.several(
     _machine_options,
     opt.path("--run", "DIR", "Folder of the run.", to="folder"),
-    opt.choice("--store", ["auto", "memory", "disk"], "Where to keep the buffer.", "auto"),
+    opt.option("--store", ["auto", "memory", "disk"], "Where to keep the buffer.", "auto"),
     click.option("--compile/--no-compile", "compiled", default=False, help="Use torch.compile."),
-    opt.integer("--save-every", 1, 10**6, "Seconds between checkpoints.", 60),
-    opt.integer("--validate-every", 0, 10**9, "Iterations between tests on held-out worlds; 0: none.", 100),
+    opt.option("--save-every", (1, 10**6), "Seconds between checkpoints.", 60),
+    opt.option("--validate-every", (0, 10**9), "Iterations between tests on held-out worlds; 0: none.", 100),
 )
 
 
@@ -74,25 +73,25 @@ def command() -> None:
 
 
 @command.command("train", cls=opt.ManyWords)
-@opt.choice(
+@opt.option(
     "--preset",
     ["small", "paper"],
     "Settings that other options change: `small` for a CPU, `paper` for a GPU.",
     "small",
 )
 @_recording
-@opt.flag("--ignore-actions", "With --data: the network does not see the actions.")
+@opt.option("--ignore-actions", bool, "With --data: the network does not see the actions.")
 @opt.settings_of(DataConfig, checked=True)
 @opt.settings_of(TrainConfig, checked=True)
 @opt.settings_of(Variety)
-@opt.integer("--first-ruleset", 0, 1 << 31, "Number of the first drawn ruleset.  [default: 0]")
-@opt.text("--rules", "RULES", "Rules of the worlds.  [default: the task's own]")
-@opt.text("--packs", "PACK…", "Keep only these packs of the rules, or add them.", multiple=True)
-@opt.text("--held-out", "PACK…", "Leave these packs of the rules out.", multiple=True)
-@opt.integer("--elements", 0, 255, "Number of elements drawn besides empty.", to="kinds")
-@opt.integer("--lines", 0, 256, "Maximum number of lines per world.")
-@opt.integer("--disks", 0, 256, "Maximum number of disks per world.")
-@opt.integer("--squares", 0, 256, "Maximum number of squares per world.")
+@opt.option("--first-ruleset", (0, 1 << 31), "Number of the first drawn ruleset.  [default: 0]")
+@opt.option("--rules", "RULES", "Rules of the worlds.  [default: the task's own]")
+@opt.option("--packs", "PACK…", "Keep only these packs of the rules, or add them.", multiple=True)
+@opt.option("--held-out", "PACK…", "Leave these packs of the rules out.", multiple=True)
+@opt.option("--elements", (0, 255), "Number of elements drawn besides empty.", to="kinds")
+@opt.option("--lines", (0, 256), "Maximum number of lines per world.")
+@opt.option("--disks", (0, 256), "Maximum number of disks per world.")
+@opt.option("--squares", (0, 256), "Maximum number of squares per world.")
 @opt.knobs("Another value for a knob of the task.")
 @opt.parameters
 @_run_options
@@ -139,7 +138,7 @@ def new_config(values: Mapping[str, Any], rules_of: Callable[..., str]) -> Train
         changes = {
             **_given(values, DataConfig),
             "rules": rules_of(rules, task, packs, held_out) if packs or held_out else rules,
-            "knobs": short | knob_values(values["knobs"]),
+            "knobs": short | values["knobs"],
             "params": values["settings"],
             "variety": Variety(**variety),
         }
@@ -148,7 +147,7 @@ def new_config(values: Mapping[str, Any], rules_of: Callable[..., str]) -> Train
 
 @command.command("finetune", cls=opt.ManyWords)
 @click.argument("run", metavar="RUN")
-@opt.text(
+@opt.option(
     "--packs",
     "PACK…",
     "The packs to learn, by name or file: added to the run's rules, and all that worlds draw.",
@@ -175,15 +174,15 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
 
 @command.command("eval", cls=opt.ManyWords)
 @_test_options
-@opt.text("--only", "PACK…", "Draw elements of these packs only.  [default: the run's]", multiple=True)
+@opt.option("--only", "PACK…", "Draw elements of these packs only.  [default: the run's]", multiple=True)
 @opt.knobs("Another value for a knob of the task.  [default: the run's]")
-@opt.integer(
-    "--worlds", 1, 1 << 20, "Worlds of the split, or futures of each designed world.  [default: 32, 4]"
+@opt.option(
+    "--worlds", (1, 1 << 20), "Worlds of the split, or futures of each designed world.  [default: 32, 4]"
 )
-@opt.integer(
-    "--rulesets", 0, 1024, "Number of rulesets that training never saw, to test under.  [default: 0]"
+@opt.option(
+    "--rulesets", (0, 1024), "Number of rulesets that training never saw, to test under.  [default: 0]"
 )
-@opt.flag("--json", "One JSON object instead of a table.", to="as_json")
+@opt.option("--json", bool, "One JSON object instead of a table.", to="as_json")
 @opt.output("--out", "FILE", "File of the results.  [default: RUN/evaluation.json]")
 def eval_command(run: str, as_json: bool, out: Path | None, **values: Any) -> None:
     """Test a network beside two baselines: that nothing changes, and each element's most frequent outcome.
@@ -214,10 +213,10 @@ def eval_command(run: str, as_json: bool, out: Path | None, **values: Any) -> No
 @command.command("show", cls=opt.ManyWords)
 @_test_options
 @opt.output("--out", "FILE", "The picture to write.", ".png", required=True)
-@opt.flag("--curve", "Plot the losses of the training instead.")
-@opt.integer("--steps", 1, 4096, "Steps to predict.  [default: as trained]")
-@opt.integer("--after", 0, 10**6, "Steps that worlds run before the start.  [default: 0]")
-@opt.integer("--scale", 1, 16, "Pixels per cell.", 2)
+@opt.option("--curve", bool, "Plot the losses of the training instead.")
+@opt.option("--steps", (1, 4096), "Steps to predict.  [default: as trained]")
+@opt.option("--after", (0, 10**6), "Steps that worlds run before the start.  [default: 0]")
+@opt.option("--scale", (1, 16), "Pixels per cell.", 2)
 def show_command(run: str, out: Path, curve: bool, scale: int, **values: Any) -> None:
     """Draw each test as a strip: start, truth, prediction, and in red where that is wrong.
 
@@ -267,7 +266,7 @@ def tested_on(values: Mapping[str, Any]) -> dict[str, Any]:
         "split": values["split"] or "designed",
         "rules": values["rules"],
         "only": values.get("only") or None,
-        "knobs": knob_values(values["knobs"]) if values.get("knobs") else None,
+        "knobs": values.get("knobs") or None,
         "rulesets": values.get("rulesets") or 0,
     }
 
