@@ -8,9 +8,10 @@ import json
 import re
 import tempfile
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +68,7 @@ class Session:
         names[-1] = "-".join([names[-1], *named.off])
         packs: list[str] = []
         try:
-            packs = self._packs(names)
+            packs = [Path(pack.source.name).name for pack in read(names, Reporter())[0]]
             ruleset, remarks = load_with_diagnostics(*names)
         except CompileError as error:
             return {"ok": False, "diagnostics": self._data(error.diagnostics), "packs": packs}
@@ -104,11 +105,6 @@ class Session:
             raise BadRequest("every pack is off")
         taken = {name: text for name, text in files.items() if Path(name).stem not in unread}
         return Named(taken, words, [name for name in off if name not in unread])
-
-    def _packs(self, names: list[str]) -> list[str]:
-        """The files of packs that take part."""
-        packs, _ = read(names, Reporter())
-        return [Path(pack.source.name).name for pack in packs]
 
     def _data(self, found: tuple[Diagnostic, ...]) -> list[dict[str, Any]]:
         """Diagnostics with the text that `check` prints."""
@@ -207,9 +203,10 @@ class Session:
         from powderdsl.simulation.tracing.trace import trace
 
         reporter, sim = Reporter(), self._simulator()
-        usual = {one.name: float(one.default) for one in self._rules().params}
+        rules = self._rules()
+        usual = {one.name: float(one.default) for one in rules.params}
         if changed := {name: value for name, value in params.items() if value != usual.get(name)}:
-            rules = set_params(self._rules(), changed, reporter)
+            rules = set_params(rules, changed, reporter)
             reporter.raise_if_errors()
             sim = ArraySimulator(rules, memo=self.memo)
         return trace_text(trace(self._world(world, sim), int(row), int(column), 1)).replace(
@@ -265,17 +262,13 @@ class Session:
         fields: dict[str, Any] = {}
         known = qualified_slots(rules).values()
         for name, given in data["fields"].items():
-            if name not in known:
-                continue
-            values = np.frombuffer(base64.b64decode(given["values"]), np.dtype(given["type"]))
-            whole = (1, 2, *shape) if given["components"] == 2 else (1, *shape)
-            fields[slot_name(rules, name)] = values.reshape(whole)
+            if name in known:
+                values = np.frombuffer(base64.b64decode(given["values"]), np.dtype(given["type"]))
+                whole = (1, 2, *shape) if given["components"] == 2 else (1, *shape)
+                fields[slot_name(rules, name)] = values.reshape(whole)
         seed, index, step = (int(number) for number in data["clock"])
         world = sim.replace(sim.world(ids, seed=seed), **fields)
-        clock = {"index": index, "step": step}
-        return replace(
-            world, **{name: np.full_like(getattr(world, name), value) for name, value in clock.items()}
-        )
+        return replace(world, index=np.full_like(world.index, index), step=np.full_like(world.step, step))
 
 
 def _is_ruleset(text: str) -> bool:
@@ -299,40 +292,25 @@ def _words(ruleset: Ruleset) -> dict[str, list[str]]:
     }
 
 
-_session: list[Session] = []
-
-
+@cache
 def session() -> Session:
     """The session of this process."""
-    if not _session:
-        folder = Path(tempfile.mkdtemp()) / "rules"
-        folder.mkdir()
-        _session.append(Session(folder))
-    return _session[0]
-
-
-CALLS: Mapping[str, Callable[..., Any]] = {
-    "check": Session.check,
-    "compile": Session.compile,
-    "command": Session.command,
-    "save_rules": Session.save_rules,
-    "ledger": Session.ledger,
-    "invariants": Session.invariants,
-    "tests": Session.tests,
-    "trace": Session.trace,
-    "save": Session.save,
-    "open_world": Session.open_world,
-}
+    folder = Path(tempfile.mkdtemp()) / "rules"
+    folder.mkdir()
+    return Session(folder)
 
 
 def call(name: str, arguments: str) -> str | bytes:
-    """Call a function of the session with a JSON list; the result as JSON, or bytes as they are.
+    """Call a method of the session with a JSON list; the result as JSON, or bytes as they are.
 
     What is wrong with the input comes back as {"error": text}, never as an exception.
     """
     current = session()
     try:
-        found = {"result": CALLS[name](current, *json.loads(arguments))}
+        method = getattr(current, name, None)
+        if method is None:
+            raise BadRequest(f"no call {name[:80]!r}")
+        found = {"result": method(*json.loads(arguments))}
     except (BadRequest, CompileError) as error:
         found = {"error": str(error)}
     except (IndexError, KeyError, TypeError, ValueError) as error:

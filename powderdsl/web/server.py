@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from urllib.parse import unquote, urlsplit
@@ -25,30 +24,17 @@ TYPES = {
 
 
 class SiteServer(ThreadingHTTPServer):
-    """Serves one site. Files that take long to make are made once, and do not hold others up."""
+    """Serves one site. A file that takes long to make does not hold others up."""
 
     daemon_threads = True
 
     def __init__(self, site: Site, port: int = 0):
         super().__init__((ADDRESS, port), _Handler)
         self.site = site
-        self.made: dict[str, bytes] = {}
-        self.making: dict[str, threading.Lock] = {}
 
     @property
     def address(self) -> str:
         return f"http://{ADDRESS}:{self.server_port}/"
-
-    def content(self, path: str) -> bytes | None:
-        """A file of the site. Files of the page are read again each time, so that an edit shows."""
-        if not path.startswith(("rules/", "catalog.json", "python.zip", "tasks.json")):
-            return self.site.read(path)
-        if path not in self.site.files:
-            return None
-        with self.making.setdefault(path, threading.Lock()):
-            if path not in self.made:
-                self.made[path] = self.site.files[path]()
-        return self.made[path]
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -64,7 +50,7 @@ class _Handler(BaseHTTPRequestHandler):
             return
         path = unquote(urlsplit(self.path).path).lstrip("/") or "index.html"
         try:
-            data = self.server.content(path)
+            data = self.server.site.read(path)
         except CompileError as error:
             self._answer(HTTPStatus.INTERNAL_SERVER_ERROR, str(error).encode(), "txt")
             return

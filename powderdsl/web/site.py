@@ -44,11 +44,12 @@ LIBRARIES = ("click", "lark", "pyyaml")
 
 @dataclass(frozen=True)
 class Entry:
-    """Rules that the page offers. `names` is what `load` takes."""
+    """Rules that the page offers. `names` is what `load` takes; `world` is a start world of the user's, which comes first."""
 
     key: str
     names: tuple[str, ...]
     params: Mapping[str, Any] = field(default_factory=dict)
+    world: dict[str, Any] | None = None
 
     @cached_property
     def ruleset(self) -> Ruleset:
@@ -66,6 +67,11 @@ class Entry:
     def left_out(self) -> list[str]:
         """Packs that a `-` in the names leaves out."""
         return [word for name in self.names for word in split_names(name)[1]]
+
+    @property
+    def is_shipped(self) -> bool:
+        """Whether they are the shipped rules of that name, as they are."""
+        return self.names == (self.key,) and not self.params and self.world is None
 
 
 def shipped_entries() -> list[Entry]:
@@ -117,9 +123,10 @@ def _shipped_rows() -> list[dict[str, Any]]:
     return rows
 
 
-def _row(entry: Entry, *more: Size) -> dict[str, Any]:
-    """A row of the catalog: sizes are those for which there is a module, `more` of them first."""
-    sizes = dict.fromkeys([*more, *((side, side) for side in SIZES)])
+def _row(entry: Entry) -> dict[str, Any]:
+    """A row of the catalog: sizes are those for which there is a module, that of the user's world first."""
+    own = [] if entry.world is None else [(entry.world["rows"], entry.world["columns"])]
+    sizes = dict.fromkeys([*own, *((side, side) for side in SIZES)])
     return {
         "key": entry.key,
         "about": _about(entry),
@@ -127,22 +134,20 @@ def _row(entry: Entry, *more: Size) -> dict[str, Any]:
     }
 
 
-def _files_of(
-    entry: Entry, sizes: list[Size], memo: Memo, world: dict[str, Any] | None = None
-) -> dict[str, Make]:
+def _files_of(entry: Entry, sizes: list[Size], memo: Memo) -> dict[str, Make]:
     """The files about some rules: a sheet, and a module for each size."""
-    found: dict[str, Make] = {f"rules/{entry.key}.json": lambda: _dump(_sheet(entry, world))}
+    found: dict[str, Make] = {f"rules/{entry.key}.json": lambda: _dump(_sheet(entry))}
     for size in sizes:
         module = partial(lambda one: standalone_module(entry.ruleset, one, memo), size)
         found[f"rules/{entry.key}-{size[0]}x{size[1]}.wasm"] = module
     return found
 
 
-def _sheet(entry: Entry, world: dict[str, Any] | None) -> dict[str, Any]:
+def _sheet(entry: Entry) -> dict[str, Any]:
     ruleset = entry.ruleset
     worlds, shown = offered_worlds(ruleset, entry.names)
-    if world is not None:
-        worlds, shown = [world, *worlds], world["name"]
+    if entry.world is not None:
+        worlds, shown = [entry.world, *worlds], entry.world["name"]
     return {
         "key": entry.key,
         "title": ruleset.name,
@@ -156,13 +161,10 @@ def _sheet(entry: Entry, world: dict[str, Any] | None) -> dict[str, Any]:
 
 
 class Site:
-    """All files of the page, made when they are asked for.
+    """All files of the page, made when they are asked for. `first`: rules that the page opens with."""
 
-    `first`: rules that the page opens with, and `world`, their start world, if the user named one.
-    """
-
-    def __init__(self, first: Entry | None = None, world: dict[str, Any] | None = None):
-        self.first, self.world = first, world
+    def __init__(self, first: Entry | None = None):
+        self.first = first
 
     @cached_property
     def rows(self) -> list[dict[str, Any]]:
@@ -171,15 +173,8 @@ class Site:
         if self.first is None:
             return rows
         known = [row for row in rows if row["key"] == self.first.key]
-        shape = () if self.world is None else ((self.world["rows"], self.world["columns"]),)
-        own = known[0] if known and self._is_shipped else _row(self.first, *shape)
+        own = known[0] if known and self.first.is_shipped else _row(self.first)
         return [own, *(row for row in rows if row not in known)]
-
-    @property
-    def _is_shipped(self) -> bool:
-        """Whether the first rules are the shipped ones of their name, as they are."""
-        first = self.first
-        return first is not None and first.names == (first.key,) and not first.params and self.world is None
 
     @cached_property
     def files(self) -> dict[str, Make]:
@@ -192,16 +187,9 @@ class Site:
         found["index.html"], found["python.zip"] = index_page, python_archive
         found["licenses.txt"] = licenses
         found |= shipped_files()
-        if self.first is not None and not self._is_shipped:
-            own = [
-                path
-                for path in found
-                if re.fullmatch(rf"rules/{self.first.key}(-\d+x\d+\.wasm|\.json)", path)
-            ]
-            found = {path: make for path, make in found.items() if path not in own}
-            found |= _files_of(
-                self.first, [tuple(size) for size in self.rows[0]["sizes"]], Memo(), self.world
-            )
+        if self.first is not None and not (self.first.is_shipped and self.start in found):
+            own = _files_of(self.first, self.rows[0]["sizes"], Memo())
+            found |= {path: cache(make) for path, make in own.items()}
         return found | {"catalog.json": lambda: _dump({"format": 1, "rules": self.rows})}
 
     @property
@@ -218,11 +206,14 @@ class Site:
     def write(self, folder: Path) -> int:
         """Write all files, and return how many there are. Raises CompileError (PD613) where that fails."""
         for name, make in self.files.items():
-            target = folder / name
-            target.parent.mkdir(parents=True, exist_ok=True)
-            with replacing(target) as temporary:
-                temporary.write_bytes(make())
+            _write(folder / name, make())
         return len(self.files)
+
+
+def _write(path: Path, data: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
 
 
 def index_page() -> bytes:
@@ -245,50 +236,47 @@ def _dump(value: Any) -> bytes:
 
 
 def kept(name: str, make: Make) -> bytes:
-    """A file about shipped rules: that of the installation or of the user's cache, if the same code has made it."""
-    if _made_by() == code_version() and (MADE / name).is_file():
-        return (MADE / name).read_bytes()
+    """A file about shipped rules, made once for the code as it is."""
     try:
-        folder = cache_folder("play")
-        path = folder / f"{code_version()}-{name.replace('/', '-')}"
-        if path.is_file():
-            return path.read_bytes()
+        folder = _store()
     except OSError:
         return make()
-    for old in sorted(folder.iterdir()):
-        if not old.name.startswith(code_version()):
-            old.unlink(missing_ok=True)
-    data = make()
-    with replacing(path) as temporary:
-        temporary.write_bytes(data)
-    return data
+    if not (folder / name).is_file():
+        _write(folder / name, make())
+    return (folder / name).read_bytes()
 
 
-def _made_by() -> str:
+def _store() -> Path:
+    """The folder of files that this code has made: in the installation, or else in the user's cache.
+
+    There, those of other code go. Raises OSError if the user has no private cache.
+    """
     version = MADE / "version.txt"
-    return version.read_text(encoding="utf-8") if version.is_file() else ""
+    if version.is_file() and version.read_text(encoding="utf-8") == code_version():
+        return MADE
+    folder = cache_folder("play") / code_version()
+    for other in folder.parent.iterdir():
+        if other != folder:
+            shutil.rmtree(other, ignore_errors=True)
+    return folder
 
 
 def write_made() -> None:
     """Make all files about shipped rules, in the folder MADE."""
     shutil.rmtree(MADE, ignore_errors=True)
-    found = shipped_files() | {"shipped.json": lambda: _dump(_shipped_rows())}
-    for name, make in found.items():
-        (MADE / name).parent.mkdir(parents=True, exist_ok=True)
-        (MADE / name).write_bytes(make())
-    (MADE / "version.txt").write_text(code_version(), encoding="utf-8")
+    for name, make in (shipped_files() | {"shipped.json": lambda: _dump(_shipped_rows())}).items():
+        _write(MADE / name, make())
+    _write(MADE / "version.txt", code_version().encode())
 
 
 @cache
 def code_version() -> str:
     """A number that changes with any module of powderdsl, and with the rules, tasks and examples that it has."""
     found = hashlib.sha256()
-    texts = [
-        path
-        for folder in (shipped("rules"), shipped("tasks"), examples_folder())
-        for path in sorted(folder.rglob("*.yaml"))
-    ]
-    for path in sorted({*HERE.parent.rglob("*.py"), *HERE.parent.rglob("*.lark")}) + sorted(texts):
+    code = {*HERE.parent.rglob("*.py"), *HERE.parent.rglob("*.lark")}
+    folders = shipped("rules"), shipped("tasks"), examples_folder()
+    texts = [path for folder in folders for path in folder.rglob("*.yaml")]
+    for path in sorted(code) + sorted(texts):
         found.update(path.read_bytes())
     return found.hexdigest()[:16]
 
@@ -315,7 +303,7 @@ ABSENT = (
     "targets/cuda",
     "web/page",
     "web/parts",
-    "web/modules",
+    "web/made",
 )
 """Parts of powderdsl that need torch, and the page itself: Pyodide does without them."""
 

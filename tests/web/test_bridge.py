@@ -24,7 +24,7 @@ def session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> bridge.Session:
     folder = tmp_path / "rules"
     folder.mkdir()
     made = bridge.Session(folder)
-    monkeypatch.setattr(bridge, "_session", [made])
+    monkeypatch.setattr(bridge, "session", lambda: made)
     return made
 
 

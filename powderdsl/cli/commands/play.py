@@ -44,13 +44,13 @@ def command(
         )
     if rules is None and (world or settings):
         raise BadInput("--world and --set need RULES")
-    first, start = None, None
+    first = None
     if rules is not None:
         ruleset = opt.load_rules(rules, settings)
         key = re.sub(r"[^A-Za-z0-9]+", "-", ruleset.name).strip("-") or "rules"
-        first = Entry(key, (rules,), settings)
-        start = _start(ruleset, world) if world is not None else None
-    site = Site(first, start)
+        start = None if world is None else _start(ruleset, world)
+        first = Entry(key, (rules,), settings, start)
+    site = Site(first)
     if export is not None:
         click.echo(f"{export}: {site.write(export)} files")
     else:
@@ -80,7 +80,7 @@ def _serve(site: Site, port: int, opens: bool) -> None:
         raise BadInput(f"port {port} cannot be used: {error.strerror}; choose another --port") from None
     click.echo("compiling the first world", err=True)
     for path in ("catalog.json", site.start):
-        server.content(path)
+        site.read(path)
     click.echo(f"{server.address}  (Ctrl+C ends it)")
     if opens:
         webbrowser.open(server.address)
