@@ -29,7 +29,7 @@ from powderdsl.envs.observations import channels_of
 from powderdsl.envs.sb3 import PowderVecEnv
 from powderdsl.envs.tensor_env import check_cells
 from powderdsl.experiments.runs import Metrics, RunFolder, does_not_fit, open_run
-from powderdsl.experiments.runs.intervals import mean_and_interval
+from powderdsl.experiments.runs.metrics import mean_and_interval
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.rl.cloning import clone, open_demonstrations
 from powderdsl.rl.config import TrainConfig, check_config, check_task

@@ -10,7 +10,7 @@ from typing import Any
 from torch import nn
 
 from powderdsl.experiments.runs import Checkpoint, RunFolder, does_not_fit, find_run, no_run
-from powderdsl.experiments.runs.palettes import recorded_palette
+from powderdsl.experiments.runs.folder import recorded_palette
 from powderdsl.model.composition.palette import Palette
 from powderdsl.model.types import Ruleset
 from powderdsl.tasks.shipped import load_task

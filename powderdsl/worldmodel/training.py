@@ -17,8 +17,7 @@ from torch.nn import functional as F
 from powderdsl.compiler import load, whole_palette
 from powderdsl.diagnostics import CompileError
 from powderdsl.experiments.runs import Checkpoint, RunFolder, does_not_fit, open_run, read_run
-from powderdsl.experiments.runs.folder import ABOUT
-from powderdsl.experiments.runs.palettes import check_palette, recorded_palette
+from powderdsl.experiments.runs.folder import ABOUT, check_palette, recorded_palette
 from powderdsl.model.composition.palette import Palette
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset

@@ -7,6 +7,7 @@ import os
 import random
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -97,7 +98,7 @@ def test_what_a_node_refuses_is_a_problem_of_the_run(tmp_path: Path) -> None:
 def test_without_ray_the_user_learns_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     written(tmp_path, 1, [12])
-    monkeypatch.setattr(on_cluster, "find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "ray", None)
     result = powderdsl("study", "study.yaml", "--ray", "auto")
     assert result.exit_code == 2
     assert "pip install 'powderdsl[ray]'" in result.stderr

@@ -127,7 +127,21 @@ def test_results_with_a_link_that_leads_out_are_refused(tmp_path):
 
 def test_every_word_that_stands_for_a_value_is_known():
     """An option with a new kind of value must say what it is before studies may give it."""
-    plain = {"N", "A,B", "NAME=N", "PACK.PARAM=VALUE", "PROPERTY", "CHANCE", "MINUTES", "SPLIT", "DIR", ""}
+    plain = {
+        "N",
+        "A,B",
+        "NAME=N",
+        "PACK.PARAM=VALUE",
+        "PROPERTY",
+        "CHANCE",
+        "MINUTES",
+        "SPLIT",
+        "DIR",
+        "DEVICE",
+        "EVAL-SPLIT",
+        "SWAP",
+        "",
+    }
     found = commands()
     assert set(found) == set(CALLED)
     from importlib import import_module

@@ -142,7 +142,7 @@ def _checked(
     palette = None
     if policy not in SCRIPTED:
         from powderdsl.experiments.runs import find_run
-        from powderdsl.experiments.runs.palettes import recorded_palette
+        from powderdsl.experiments.runs.folder import recorded_palette
 
         with collected():
             palette = recorded_palette(find_run(policy, "ppo"))

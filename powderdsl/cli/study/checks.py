@@ -27,6 +27,7 @@ from powderdsl.experiments.studies.study import FLAG, SIZES, TEXT, Measure, Poin
 from powderdsl.model.types import Ruleset
 from powderdsl.rl.config import BASELINES, TrainConfig, check_task, chosen_policies
 from powderdsl.syntax.yaml_tree import Scalar
+from powderdsl.system.reading import is_path
 from powderdsl.tasks.shipped import check_split, load_task
 from powderdsl.tasks.task import Task
 
@@ -39,6 +40,7 @@ MAKES = {("train",): AGENT, ("wm", "train"): NETWORK, ("wm", "finetune"): NETWOR
 """What the runs of commands train."""
 WORKS_ON = {("evaluate",): AGENT, ("wm", "finetune"): NETWORK, ("wm", "eval"): NETWORK}
 """What the runs that commands work on have trained."""
+LAST = 1000
 EVALUATES = {AGENT: "evaluate", NETWORK: "wm eval"}
 
 Pairs = tuple[tuple[str, Any], ...]
@@ -92,26 +94,30 @@ class _StudyCheck:
         return self.results[key]
 
     def checked(self, step: StudyStep, point: Point, run: Any) -> Any:
-        """The result of a step; None after reporting all mistakes in its words."""
+        """The result of a step; None after reporting all mistakes in its words.
+
+        Words with mistakes are left out, which shows what is wrong with others.
+        """
         rest = step
-        for option, used in step.words:
-            if (step.name, option, point.filled(used)) in self.refused:
-                if option == "on":
-                    return None
-                rest = without(rest, used)
-        while True:
+        for name, word in step.words:
+            if (step.name, name, point.filled(word)) in self.refused:
+                rest = without(rest, word)
+        while rest.on == step.on:
             result, mistakes = self.attempt(rest, point, run)
             if not mistakes:
                 return result if rest == step else None
             self.wrong.add(step.name)
-            blamed = [self.blamed(mistake, len(mistakes), rest, point, run) for mistake in mistakes]
-            for mistake, (name, word) in zip(mistakes, blamed, strict=True):
-                self.report(mistake, step, point, word)
-                if word is not None:
-                    self.refused.add((step.name, name, point.filled(word)))
-                    rest = without(rest, word)
-            if any(name in ("", "on") for name, _ in blamed):
+            others = [self.attempt(without(rest, word), point, run)[1] for _, word in rest.words]
+            words = [*zip(rest.words, others, strict=True)]
+            blamed = [_blamed(mistake, words, point) for mistake in mistakes]
+            for mistake, (name, wrong) in zip(mistakes, blamed, strict=True):
+                self.report(mistake, step, point, name, wrong)
+                if wrong is not None:
+                    self.refused.add((step.name, name, point.filled(wrong)))
+                    rest = without(rest, wrong)
+            if ("", None) in blamed:
                 return None
+        return None
 
     def attempt(self, step: StudyStep, point: Point, run: Any) -> tuple[Any, Sequence[Diagnostic]]:
         """The result of a step, and the mistakes in its words."""
@@ -125,36 +131,13 @@ class _StudyCheck:
             message = error.format_message() if isinstance(error, click.ClickException) else str(error)
             return None, (Diagnostic("PD806", " ".join(message.split()), Label(None)),)
 
-    def blamed(
-        self, mistake: Diagnostic, mistakes: int, step: StudyStep, point: Point, run: Any
-    ) -> tuple[str, Scalar | None]:
-        """The option and the word without which a mistake is gone; no word if there are several such options."""
-        likely = [
-            (name, word)
-            for name, word in step.words
-            if name in mistake.message or point.filled(word) in mistake.message
-        ]
-        for words in (likely, step.words):
-            gone: dict[str, Scalar] = {}
-            fewer: dict[str, Scalar] = {}
-            for name, word in words:
-                _, others = self.attempt(without(step, word), point, run)
-                if not any(
-                    (other.code, other.message) == (mistake.code, mistake.message) for other in others
-                ):
-                    gone[name] = word
-                    if len(others) < mistakes:
-                        fewer[name] = word
-            if gone:
-                return (fewer or gone).popitem() if len(fewer or gone) == 1 else ("", None)
-        return "", None
-
-    def report(self, mistake: Diagnostic, step: StudyStep, point: Point, word: Scalar | None) -> None:
+    def report(
+        self, mistake: Diagnostic, step: StudyStep, point: Point, name: str, word: Scalar | None
+    ) -> None:
         """Report a mistake where the value of a word is written, and where it is used."""
         if word is None:
             self.reporter.add(replace(mistake, primary=Label(step.key.span)))
             return
-        name = next(name for name, other in step.words if other is word)
         if mistake.primary.span is not None and step.means.get(name) not in (TEXT, FLAG):
             self.reporter.add(mistake)  # in the file that the word names
             return
@@ -173,18 +156,20 @@ class _StudyCheck:
         """The result of a step. Raises what its command would raise before it begins to work."""
         command, arguments = called(step.command), self.study.command(step, point, self.study.folder)
         parameters = {name[2:]: parameter for parameter in command.params for name in parameter.opts}
-        for name, words in step.options.items():
-            if len(words) > 1 and not getattr(parameters[name], "multiple", False):
-                raise ValueError(f"`{name}` takes one value, found {len(words)}")
-            for word in words:
-                if step.means[name] == FLAG and point.filled(word) not in ("yes", "no"):
-                    raise ValueError(f"`{name}` is `yes` or `no`, found `{point.filled(word)}`")
+        given: dict[str, int] = {}
+        for name, word in step.words:
+            given[name] = given.get(name, 0) + 1
+            text = point.filled(word)
+            if step.means.get(name) == FLAG and text not in ("yes", "no"):
+                raise ValueError(f"`{name}` is `yes` or `no`, found `{text}`")
+            if given[name] > 1 and not getattr(parameters[name], "multiple", False):
+                raise ValueError(f"`{name}` takes one value, found `{text}` too")
         maker, needs = self.study.works_on(step), WORKS_ON.get(step.command)
         if step.on is not None and step.on_step and (maker is None or MAKES[maker.command] != needs):
             works_on = f"the run of {needs}" if needs else "no run"
-            raise ValueError(f"`{' '.join(step.command)}` works on {works_on}")
+            raise ValueError(f"`{' '.join(step.command)}` works on {works_on}, not on `{step.on.text}`")
         context = command.make_context(" ".join(step.command), arguments[len(step.command) :])
-        if self.devices and "device" in step.options:
+        if self.devices and "device" in given:
             from powderdsl.simulation.programs import find_device  # imports torch
 
             find_device(context.params["device"])
@@ -284,7 +269,7 @@ class _StudyCheck:
             if " ".join(step.command) == command
             and self.study.works_on(step) == made
             # With `out`, `wm eval` writes there alone.
-            and (command == "evaluate" or "out" not in step.options)
+            and (command == "evaluate" or "out" not in dict(step.words))
         ]
         if not steps and not any(step.name in self.wrong for step in self.study.steps if not step.makes_run):
             helps = [f"add a step such as `tested: {{command: {command}, on: {made.name}}}`"]
@@ -303,29 +288,39 @@ def _load(rules: str, params: Pairs) -> Ruleset:
 
 
 def _task(name: str, knobs: Pairs = (), params: Pairs = (), packs: tuple[str, ...] = ()) -> Task:
-    path = Path(name)
-    task = _load_task(name, knobs, params, packs, path.stat().st_mtime_ns if path.is_file() else 0)
-    if isinstance(task, CompileError):
-        raise task
-    return task
+    return _load_task(str(Path(name).absolute()) if is_path(name) else name, knobs, params, packs)
 
 
 @lru_cache(maxsize=64)
-def _load_task(
-    name: str, knobs: Pairs, params: Pairs, packs: tuple[str, ...], stamp: int
-) -> Task | CompileError:
-    """A task, or what is wrong with it; `stamp` tells versions of a file apart."""
-    try:
-        return load_task(name, knobs=dict(knobs), params=dict(params), packs=packs)
-    except CompileError as error:
-        return error
+def _load_task(name: str, knobs: Pairs, params: Pairs, packs: tuple[str, ...]) -> Task:
+    return load_task(name, knobs=dict(knobs), params=dict(params), packs=packs)
+
+
+def _blamed(
+    mistake: Diagnostic, words: Sequence[tuple[tuple[str, Scalar], Sequence[Diagnostic]]], point: Point
+) -> tuple[str, Scalar | None]:
+    """The option and the word without which a mistake is gone; no word if there are several such options.
+
+    Args:
+        words: options and their words, with the mistakes that are there without each. What the step works on comes last:
+            nothing else is known without it.
+    """
+    gone: dict[bool, list[tuple[int, str, Scalar]]] = {True: [], False: []}
+    for (name, word), others in words:
+        is_there = (mistake.code, mistake.message) in [(other.code, other.message) for other in others]
+        is_named = point.filled(word) in mistake.message or (name != "on" and name in mistake.message)
+        may_be = is_named or name != "on" or mistake.code != "PD806"
+        if may_be and not is_there:
+            gone[is_named].append((len(others) + LAST * (name == "on"), name, word))
+    likely = gone[True] or gone[False]
+    least = min((left for left, _, _ in likely), default=0)
+    best = [(name, word) for left, name, word in likely if left == least]
+    return best[-1] if len({name for name, _ in best}) == 1 else ("", None)
 
 
 def without(step: StudyStep, word: Scalar) -> StudyStep:
     """A step without one of its words."""
-    options = {name: tuple(one for one in words if one is not word) for name, words in step.options.items()}
-    on = None if step.on is word else step.on
-    return replace(step, on=on, options={name: words for name, words in options.items() if words})
+    return replace(step, words=tuple(pair for pair in step.words if pair[1] is not word))
 
 
 def agent_keys(

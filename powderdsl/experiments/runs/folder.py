@@ -6,8 +6,8 @@ import json
 import os
 import platform
 import sys
-from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
@@ -24,6 +24,7 @@ from powderdsl.system.writing import failure, not_writable, write_text
 
 ABOUT = "run.json"
 PACKAGES = ("torch", "numpy", "gymnasium", "stable-baselines3")
+MAX_SLOTS = 256
 
 
 @dataclass(frozen=True)
@@ -207,17 +208,15 @@ def no_run(folder: Path, why: str, helps: tuple[str, ...] = ()) -> CompileError:
 
 def versions() -> dict[str, str]:
     """Versions that a run's numbers may depend on: Python, the system, and installed packages."""
-    found = {
+    known = {
         "powderdsl": str(sys.modules["powderdsl"].__version__),  # our own package, so it has been imported
         "python": platform.python_version(),
         "system": f"{platform.system()} {platform.machine()}",
     }
     for name in PACKAGES:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
-    return found
+        with suppress(metadata.PackageNotFoundError):
+            known[name] = metadata.version(name)
+    return known
 
 
 def write_json(path: Path, value: Any, *, follow: bool = False) -> Path:
@@ -244,3 +243,34 @@ def _flat(config: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, st
             yield from _flat(value, f"{within}{name}.")
         else:
             yield within + name, json.dumps(value)
+
+
+# Palettes: the qualified name of the element of each slot of a run's network, or None for a free slot
+
+
+def recorded_palette(run: RunFolder) -> tuple[str | None, ...]:
+    """The palette of a run. Raises CompileError (PD620) if it is damaged."""
+    palette = run.config.get("palette")
+    if not isinstance(palette, list) or not 1 <= len(palette) <= MAX_SLOTS:
+        raise no_run(run.path, "it has no palette that a network can have")
+    return tuple(None if name is None else str(name) for name in palette)
+
+
+def check_palette(
+    folder: Path, palette: Sequence[str | None], elements: Mapping[int, str], *helps: str
+) -> None:
+    """Compare the slots of a run's network with the elements of some rules, qualified names by id.
+
+    Raises:
+        CompileError: PD623, with every element that has no slot, or whose slot is another's. `helps` are for the first.
+    """
+    why, lacking = [], 0
+    for number, name in elements.items():
+        if number >= len(palette):
+            lacking += 1
+            why.append(f"there is no free slot for `{name}`: the network has {len(palette)}")
+        elif palette[number] not in (None, name):
+            why.append(f"id {number} is `{palette[number]}` there, `{name}` here")
+    if why:
+        more = f"train with `--slots {len(palette) + lacking}` to leave room for packs that come later"
+        raise does_not_fit(folder, *why, helps=(more, *helps) if lacking else ())

@@ -6,7 +6,6 @@ Ray repeats the task of a node that dies; a new driver repeats what is not done.
 from __future__ import annotations
 
 import logging
-import os
 import platform
 import signal
 import socket
@@ -15,8 +14,6 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -24,20 +21,19 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.experiments.studies.run import ABOUT_STUDY, Outcome, Report, StudyRun, run_all
 from powderdsl.experiments.studies.study import Point, Study
 from powderdsl.system.interrupts import SIGNALS
+from powderdsl.system.packages import require
 from powderdsl.system.reading import read_json
 from powderdsl.system.writing import failure
 
 RETRIES = 20
 """How often Ray repeats the task of a node or process that died."""
-QUIET = {"RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0", "RAY_NUM_REDIS_GET_RETRIES": "2"}
-"""Environment of the driver, where the user has not set it: fewer warnings, and fewer attempts to connect."""
 AHEAD = 1000
 """Tasks that are submitted at a time."""
 
 
 def resources(study: Study, point: Point, threads: int) -> dict[str, float]:
     """What Ray reserves for a point: a CPU core per thread, and a GPU if a step's `device` is a CUDA device."""
-    devices = [point.filled(word) for step in study.steps for word in step.options.get("device", ())]
+    devices = [point.filled(word) for step in study.steps for name, word in step.words if name == "device"]
     return {"num_cpus": threads, "num_gpus": int(any(name.startswith("cuda") for name in devices))}
 
 
@@ -50,7 +46,7 @@ def run_on_ray(
         address: of the cluster, as `ray.init` takes it. jobs: how many tasks there are at a time; None: as many as fit.
 
     Raises:
-        CompileError: PD626 if the connection to the cluster cannot be made, or is lost.
+        CompileError: PD626 if the connection to the cluster cannot be made.
     """
     # Commands run elsewhere, in other working directories.
     study, folder = replace(run.study, folder=run.study.folder.resolve()), str(run.folder.resolve())
@@ -65,9 +61,6 @@ def run_on_ray(
             try:
                 outcome: Outcome = ray.get(task)
                 return outcome
-            except ray.exceptions.LocalRayletDiedError:  # no task will ever end
-                helps = ("start it again with `ray start`; the same command then resumes here",)
-                raise _no_cluster(address, "the Ray node of this machine has ended", helps) from None
             except Exception as error:  # Ray's messages end with the exception, after a traceback
                 last = (str(error).strip().splitlines() or [""])[-1][:400]
                 return Outcome(point, {}, f"{type(error).__name__}: {last}")
@@ -98,9 +91,7 @@ def run_point(study: Study, folder: str, size: str, threads: int, point: Point, 
 @contextmanager
 def _connected(address: str) -> Iterator[Any]:
     """The module `ray`, connected to a cluster. Raises CompileError (PD626)."""
-    for name, value in QUIET.items():
-        os.environ.setdefault(name, value)
-    ray = import_module("ray")
+    ray = _ray()
     handlers = {number: signal.getsignal(number) for number in SIGNALS}
     try:
         ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
@@ -121,28 +112,23 @@ def check_cluster(address: str) -> None:
 
     Ray itself would try to connect for minutes.
     """
-    if find_spec("ray") is None:
-        raise failure(
-            "PD612",
-            "running a study on a cluster needs Ray, which is not installed",
-            helps=("pip install 'powderdsl[ray]'", "or split the study: `--shard 1/4` to `--shard 4/4`"),
-        )
-    if address in ("auto", "local"):
+    _ray()
+    if address == "auto":
         return
     host, _, port = address.removeprefix("ray://").rpartition(":")
     try:
         socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()
-    except OSError as error:
-        raise _no_cluster(address, error.strerror or str(error)) from None
-    except (OverflowError, ValueError):
-        raise _no_cluster(address, "an address is `auto` or HOST:PORT") from None
+    except (OSError, OverflowError, ValueError) as error:
+        raise _no_cluster(address, str(error)) from None
 
 
-def _no_cluster(
-    address: str,
-    reason: str,
-    helps: tuple[str, ...] = ("start one with `ray start --head`, which prints its address",),
-) -> CompileError:
+def _ray() -> Any:
+    helps = "pip install 'powderdsl[ray]'", "or split the study: `--shard 1/4` to `--shard 4/4`"
+    return require("ray", "running a study on a cluster", *helps)
+
+
+def _no_cluster(address: str, reason: str) -> CompileError:
+    helps = ("start one with `ray start --head`, which prints its address",)
     return failure("PD626", f"no Ray cluster at `{address[:80]}`", notes=(reason,), helps=helps)
 
 

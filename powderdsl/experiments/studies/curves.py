@@ -9,15 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from powderdsl.experiments.runs import RunFolder
-from powderdsl.experiments.runs.intervals import mean_and_interval
-from powderdsl.experiments.runs.metrics import read_metrics
-from powderdsl.experiments.studies.results import interval, markdown
-from powderdsl.system.packages import require_matplotlib
+from powderdsl.experiments.runs.metrics import mean_and_interval, read_metrics
+from powderdsl.experiments.studies.results import Line, Panel, draw, markdown
 from powderdsl.system.reading import read_json
-from powderdsl.system.writing import replacing
 
 BASELINES = ("expert", "random", "nothing")
 EVALUATION = "evaluation.json"
+DERIVED = ("fingerprint", "palette", "channels")
+"""Ends of the names of settings that follow from the task and its rules."""
 
 
 @dataclass(frozen=True)
@@ -42,35 +41,28 @@ def curves_of(runs: Sequence[RunFolder], metric: str) -> list[Curve]:
         )
         groups.setdefault(key, []).append(run)
     settings = [json.loads(key) for key in groups]
-    names = sorted({name for one in settings for name in one})
-    differ = [name for name in names if len({json.dumps(one.get(name)) for one in settings}) > 1]
-    found = []
-    for one, members in zip(settings, groups.values(), strict=True):
-        lines = {
-            int(run.config.get("seed", 0)): {
-                line["step"]: line[metric] for line in read_metrics(run.path) if metric in line
-            }
-            for run in members
-        }
-        lines = {seed: line for seed, line in lines.items() if line}
+    names = sorted({name for config in settings for name in config if not name.endswith(DERIVED)})
+    differ = [name for name in names if len({json.dumps(config.get(name)) for config in settings}) > 1]
+    curves = []
+    for config, members in zip(settings, groups.values(), strict=True):
+        lines = {}
+        for run in members:
+            line = {line["step"]: line[metric] for line in read_metrics(run.path) if metric in line}
+            if line:
+                lines[int(run.config.get("seed", 0))] = line
         if lines:
-            steps = tuple(sorted(set.intersection(*(set(line) for line in lines.values()))))
+            steps = tuple(sorted(set.intersection(*map(set, lines.values()))))
             values = tuple(tuple(line[step] for step in steps) for line in lines.values())
-            found.append(Curve(_label(one, differ), tuple(lines), steps, values))
-    return found
+            # Settings at their defaults are not recorded.
+            label = ", ".join(
+                f"{name} {_shown(config[name])}" for name in differ if config.get(name) is not None
+            )
+            curves.append(Curve(label, tuple(lines), steps, values))
+    return curves
 
 
-def _label(config: Mapping[str, Any], differ: Sequence[str]) -> str:
-    shown = [
-        name for name in differ if not name.endswith("fingerprint") and name not in ("palette", "channels")
-    ]
-    words = []
-    for name in shown:
-        value = config.get(name)
-        if value is None:  # settings at their defaults are not recorded
-            continue
-        words.append(f"{name} {Path(value).name if isinstance(value, str) and '/' in value else value}")
-    return ", ".join(words)
+def _shown(value: Any) -> Any:
+    return Path(value).name if isinstance(value, str) and "/" in value else value
 
 
 def baselines_of(runs: Sequence[RunFolder]) -> dict[str, float]:
@@ -89,8 +81,8 @@ def as_table(curves: Sequence[Curve]) -> str:
     """The curves as Markdown: the mean over seeds and its 95 % interval at each step."""
     rows = [["runs", "seeds", "steps", "mean", "interval"]]
     for curve in curves:
-        for place, step in enumerate(curve.steps):
-            mean, half = mean_and_interval([values[place] for values in curve.values])
+        for step, samples in zip(curve.steps, zip(*curve.values, strict=True), strict=True):
+            mean, half = mean_and_interval(samples)
             words = [curve.label or "all", str(len(curve.seeds)), f"{step:,}", f"{mean:.4g}"]
             rows.append([*words, "" if half is None else f"{half:.2g}"])
     return markdown(rows)
@@ -99,35 +91,7 @@ def as_table(curves: Sequence[Curve]) -> str:
 def write_curves(
     path: Path, curves: Sequence[Curve], metric: str, baselines: Mapping[str, float], title: str = ""
 ) -> None:
-    """Draw means with their 95 % intervals over seeds, each seed's own line, and baselines as dashed lines.
-
-    Raises:
-        CompileError: PD612 without matplotlib, PD613 if the file cannot be written.
-    """
-    require_matplotlib()
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6.5, 4.2), layout="constrained")
-    axes = figure.subplots()
-    for number, curve in enumerate(curves):
-        color = f"C{number}"
-        found = [interval([one[place] for one in curve.values]) for place in range(len(curve.steps))]
-        axes.plot(curve.steps, [one.mean for one in found], color=color, label=curve.label or None)
-        if len(curve.seeds) > 1:
-            low, high = [one.low for one in found], [one.high for one in found]
-            axes.fill_between(curve.steps, low, high, color=color, alpha=0.2, linewidth=0)
-            for values in curve.values:
-                axes.plot(curve.steps, values, color=color, linewidth=0.5, alpha=0.5)
-    for number, (name, value) in enumerate(baselines.items()):
-        axes.axhline(value, color=f"{0.2 + 0.25 * number}", linestyle="--", linewidth=1)
-        axes.annotate(
-            name, (1, value), xycoords=("axes fraction", "data"), fontsize=8, ha="right", va="bottom"
-        )
-    axes.set_xlabel("interactions" if metric.startswith(("held_out/", "rollout/")) else "steps")
-    axes.set_ylabel(metric)
-    axes.grid(linewidth=0.3)
-    axes.set_title(title, fontsize=8)
-    if any(curve.label for curve in curves):
-        figure.legend(fontsize=8, loc="outside lower center")
-    with replacing(path, follow=True) as temporary:
-        figure.savefig(temporary, dpi=150)
+    """Draw means with their 95 % intervals over seeds, and baselines as dashed lines. Raises as `draw`."""
+    lines = [Line(curve.label, curve.steps, [*zip(*curve.values, strict=True)]) for curve in curves]
+    across = "interactions" if metric.startswith(("held_out/", "rollout/")) else "steps"
+    draw(path, [Panel(across, metric, lines, baselines=baselines)], title, follow=True)

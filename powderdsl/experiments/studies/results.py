@@ -5,18 +5,15 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from powderdsl.experiments.runs.intervals import mean_and_interval
+from powderdsl.experiments.runs.metrics import mean_and_interval
 from powderdsl.experiments.studies.run import Outcome
 from powderdsl.experiments.studies.study import Measure, Study
 from powderdsl.system.packages import require_matplotlib
 from powderdsl.system.writing import replacing
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True)
@@ -140,12 +137,12 @@ def _lines(cells: Sequence[Cell]) -> dict[str, list[Cell]]:
 
 
 def as_data(study: Study, size: str, outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    """All results, for JSON."""
+    """All results, for JSON, which has no numbers that are not finite."""
     points = [
         {
             "values": dict(outcome.point.values),
             "seed": outcome.point.seed,
-            "measures": dict(outcome.values),
+            "measures": outcome.values,
             "problem": outcome.problem,
         }
         for outcome in outcomes
@@ -154,21 +151,17 @@ def as_data(study: Study, size: str, outcomes: Sequence[Outcome]) -> dict[str, A
         {
             "measure": finding.measure.name,
             "verdict": finding.verdict,
-            "cells": [
-                {
-                    "values": dict(cell.values),
-                    **{
-                        name: number if math.isfinite(number) else None
-                        for name, number in asdict(cell.over_seeds).items()
-                    },
-                    "samples": [*cell.by_seed.values()],
-                }
-                for cell in finding.cells
-            ],
+            "cells": [_cell_data(cell) for cell in finding.cells],
         }
         for finding in findings(study, outcomes)
     ]
     return {"study": study.name, "size": size, "points": points, "findings": found}
+
+
+def _cell_data(cell: Cell) -> dict[str, Any]:
+    numbers = asdict(cell.over_seeds)
+    finite = {name: number if math.isfinite(number) else None for name, number in numbers.items()}
+    return {"values": dict(cell.values), **finite, "samples": [*cell.by_seed.values()]}
 
 
 def as_markdown(study: Study, size: str, outcomes: Sequence[Outcome]) -> str:
@@ -210,10 +203,56 @@ def shown(number: Interval, scale: str = "linear") -> str:
     return f"{number.mean:.{places}f} ± {half:.{places}f}"
 
 
-def write_figure(path: Path, study: Study, size: str, outcomes: Sequence[Outcome]) -> None:
-    """Draw each measure along the first setting, a line for each combination of the others.
+@dataclass(frozen=True)
+class Line:
+    """Samples at places along an axis."""
 
-    Bars are 95 % intervals over seeds. The suffix of the path says which format is written.
+    label: str
+    places: Sequence[float]
+    samples: Sequence[Sequence[float]]
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A part of a figure: lines with 95 % intervals.
+
+    `across` and `up` name the axes, `ticks` the places 0, 1, … unless these are numbers; `baselines` are dashed.
+    """
+
+    across: str
+    up: str
+    lines: Sequence[Line]
+    scale: str = "linear"
+    ticks: Sequence[str] = ()
+    baselines: Mapping[str, float] = field(default_factory=dict)
+
+
+def write_figure(path: Path, study: Study, size: str, outcomes: Sequence[Outcome]) -> None:
+    """Draw each measure along the first setting, a line for each combination of the others. Raises as `draw`."""
+    found = [finding for finding in findings(study, outcomes) if finding.cells]
+    if not found:
+        return
+    ticks = [word.text for word in study.axes[0].values[size]]
+    panels = []
+    for finding in found:
+        lines = [
+            Line(
+                label,
+                [ticks.index(cell.values[0][1]) for cell in cells],
+                [[*cell.by_seed.values()] for cell in cells],
+            )
+            for label, cells in _lines(finding.cells).items()
+        ]
+        panels.append(Panel(study.axes[0].about, finding.measure.about, lines, finding.measure.scale, ticks))
+    seeds = max(len(cell.by_seed) for finding in found for cell in finding.cells)
+    draw(path, panels, f"{study.about} ({size}, {seeds} seeds)")
+
+
+def draw(path: Path, panels: Sequence[Panel], title: str, *, follow: bool = False) -> None:
+    """Draw panels side by side, with all samples as dots. The suffix of the path says which format is written.
+
+    Args:
+        follow: write to where a link leads.
 
     Raises:
         CompileError: PD612 without matplotlib, PD613 if the file cannot be written.
@@ -221,43 +260,32 @@ def write_figure(path: Path, study: Study, size: str, outcomes: Sequence[Outcome
     require_matplotlib()
     from matplotlib.figure import Figure
 
-    found = [finding for finding in findings(study, outcomes) if finding.cells]
-    if not found:
-        return
-    figure = Figure(figsize=(5.5 * len(found), 4.2), layout="constrained")
-    for axes, finding in zip(figure.subplots(1, len(found), squeeze=False)[0], found, strict=True):
-        _draw(axes, study, size, finding)
-    seeds = max(len(cell.by_seed) for finding in found for cell in finding.cells)
-    figure.suptitle(f"{study.about} ({size}, {seeds} seeds)", fontsize=8, wrap=True)
-    with replacing(path) as temporary:
+    figure = Figure(figsize=(max(5.5 * len(panels), 6.5), 4.2), layout="constrained")
+    for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
+        for line in panel.lines:
+            intervals = [interval(samples, panel.scale) for samples in line.samples]
+            # A single value has no interval.
+            bars = [
+                (one.mean - one.low, one.high - one.mean) if math.isfinite(one.high) else (0.0, 0.0)
+                for one in intervals
+            ]
+            means, ends = [one.mean for one in intervals], list(zip(*bars, strict=True))
+            axes.errorbar(line.places, means, ends, fmt="o-", capsize=3, label=line.label or None)
+            for place, samples in zip(line.places, line.samples, strict=True):
+                axes.plot([place] * len(samples), samples, "k.", markersize=3, alpha=0.4)
+        for name, value in panel.baselines.items():
+            axes.axhline(value, color="0.4", linestyle="--", linewidth=1)
+            axes.annotate(name, (1, value), xycoords=("axes fraction", "data"), fontsize=8, ha="right")
+        if panel.ticks:
+            axes.set_xticks(range(len(panel.ticks)), panel.ticks)
+        if sum(map(len, panel.ticks)) > 40:
+            axes.tick_params("x", labelrotation=25)
+        axes.set_yscale(panel.scale)
+        axes.set_xlabel(panel.across)
+        axes.set_ylabel(panel.up)
+        axes.grid(linewidth=0.3)
+        if any(line.label for line in panel.lines):
+            axes.legend(fontsize=8)
+    figure.suptitle(title, fontsize=8, wrap=True)
+    with replacing(path, follow=follow) as temporary:
         figure.savefig(temporary, dpi=150)
-
-
-def _draw(axes: Axes, study: Study, size: str, finding: Finding) -> None:
-    """Draw a measure. The values of the first setting are at equal distances."""
-    ticks = [word.text for word in study.axes[0].values[size]]
-    lines = _lines(finding.cells)
-    for label, cells in lines.items():
-        across = [ticks.index(cell.values[0][1]) for cell in cells]
-        intervals = [cell.over_seeds for cell in cells]
-        means = [interval.mean for interval in intervals]
-        # A single value has no interval.
-        bars = [
-            (interval.mean - interval.low, interval.high - interval.mean)
-            if math.isfinite(interval.high)
-            else (0.0, 0.0)
-            for interval in intervals
-        ]
-        axes.errorbar(across, means, list(zip(*bars, strict=True)), fmt="o", capsize=3, label=label or None)
-        for place, cell in zip(across, cells, strict=True):
-            axes.plot([place] * len(cell.by_seed), [*cell.by_seed.values()], "k.", markersize=3, alpha=0.4)
-    axes.set_xticks(range(len(ticks)), ticks)
-    if sum(map(len, ticks)) > 40:
-        axes.tick_params("x", labelrotation=25)
-    if finding.measure.scale == "log":
-        axes.set_yscale("log")
-    axes.set_xlabel(study.axes[0].about)
-    axes.set_ylabel(finding.measure.about)
-    axes.grid(linewidth=0.3)
-    if any(lines):
-        axes.legend(fontsize=8)

@@ -61,15 +61,14 @@ STUDY_KEYS: dict[str, dict[str, Key]] = {
 class StudyStep:
     """A call of a command, in whose words ``$NAME`` stands for a value; `means` has their meanings.
 
-    `on` is the command's argument; with `on_step` it names an earlier step, whose run is meant. `is_wrong`: it has a
-    mistake, which is reported, and nothing follows from it.
+    `words` has the command's argument, called ``on``, and the words of its options. With `on_step` the argument names an
+    earlier step, whose run is meant. `is_wrong`: it has a mistake, which is reported, and nothing follows from it.
     """
 
     key: Scalar
     command: tuple[str, ...]
-    on: Scalar | None
+    words: tuple[tuple[str, Scalar], ...]
     on_step: bool
-    options: Mapping[str, tuple[Scalar, ...]]
     means: Mapping[str, str]
     is_wrong: bool = False
 
@@ -84,10 +83,8 @@ class StudyStep:
         return "run" in self.means
 
     @property
-    def words(self) -> list[tuple[str, Scalar]]:
-        """What it works on (``on``), and the words of its options."""
-        on = [("on", self.on)] if self.on is not None else []
-        return [*on, *((name, word) for name, words in self.options.items() for word in words)]
+    def on(self) -> Scalar | None:
+        return dict(self.words).get("on")
 
 
 @dataclass(frozen=True)
@@ -220,14 +217,14 @@ def confined(means: str, text: str, folder: Path, results: Path) -> str:
     """
     if "\0" in text:
         raise ValueError("it has control characters")
+    if means in (TEXT, FLAG):
+        return text
     if means == FILE:
         return str(inside(results, text))
     if means == RULES:
         return "+".join(_pack(part, folder) for part in text.split("+"))
-    if means == RUN_OR_TASK:
-        is_shipped = not is_path(text) and (shipped("tasks") / f"{text}.yaml").is_file()
-        means = TASK if is_shipped else RUN
-    if means == RUN or (means == TASK and is_path(text)):
+    is_shipped = (shipped("tasks") / f"{text}.yaml").is_file()
+    if is_path(text) or means == RUN or (means == RUN_OR_TASK and not is_shipped):
         return str(inside(folder, text))
     return text
 
@@ -402,30 +399,31 @@ class _StudyReader:
             self.error("PD806" if word is named else "PD109", message, word.span, helps=helps)
             self.is_hidden = True
             return
-        means, on = self.commands[command], node.get("on")
-        options: dict[str, tuple[Scalar, ...]] = {}
+        means = self.commands[command]
+        words: list[tuple[str, Scalar]] = []
+        is_right = True
         for name, value in node.entries:
-            words = self.reader.words(value)
-            known = tuple(word for word in words if self.names_are_known(word))
-            if name.text in ("command", "on"):
+            if name.text == "command":
                 continue
-            if name.text not in means or name.text == "run":
+            scalars = self.reader.words(value)
+            known = [word for word in scalars if self.names_are_known(word)]
+            if name.text == "run" or name.text not in {*means, "on"}:
                 helps = suggest(name.text, means.keys() - {"on", "run"}, "options")
                 message = f"`{' '.join(command)}` has no option `{name.text}` for a study"
                 self.error("PD806", message, name.span, helps=helps)
-            elif not words:
+            elif name.text == "on" and not isinstance(value, Scalar):
+                self.reader.shape(value, "a word")
+            elif not scalars:
                 self.error("PD806", f"`{name.text}` has no value", name.span)
-            elif known:
-                options[name.text] = known
-        is_right = on is None or (isinstance(on, Scalar) and self.names_are_known(on))
-        if isinstance(on, Scalar) and on.text.startswith("-"):
-            self.error("PD806", "what a step works on cannot begin with `-`", on.span)
-            is_right = False
-        elif on is not None and not isinstance(on, Scalar):
-            self.reader.shape(on, "a word")
-            on = None
-        on_step = on is not None and on.text in self.steps
-        self.steps[key.text] = StudyStep(key, command, on, on_step, options, means, not is_right)
+            elif name.text == "on" and scalars[0].text.startswith("-"):
+                self.error("PD806", "what a step works on cannot begin with `-`", scalars[0].span)
+                is_right = False
+            else:
+                words += [(name.text, word) for word in known]
+                is_right &= name.text != "on" or bool(known)
+        words.sort(key=lambda pair: pair[0] != "on")
+        on_step = any(name == "on" and word.text in self.steps for name, word in words)
+        self.steps[key.text] = StudyStep(key, command, tuple(words), on_step, means, not is_right)
 
     def measure(self, key: Scalar, node: Node) -> Measure | None:
         values = self.reader.read(node, "measure", "a measure")
