@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import re
 from dataclasses import dataclass
+from itertools import takewhile
 
 from powderdsl.diagnostics import Source, Span
 from powderdsl.syntax import yaml_tree
@@ -15,20 +16,13 @@ Path = tuple[tuple[Container, int], ...]
 
 
 @dataclass(frozen=True)
-class Edit:
-    """Characters `start` to `end` (exclusive) of a file become `text`."""
+class Change:
+    """A mistake: the kind of it (see `OPERATORS`), and characters `start` to `end` (exclusive) that become `text`."""
 
+    operator: str
     start: int
     end: int
     text: str
-
-
-@dataclass(frozen=True)
-class Change:
-    """A mistake: the kind of it (see `OPERATORS`), and the edits that make it, which do not overlap."""
-
-    operator: str
-    edits: tuple[Edit, ...]
 
 
 @dataclass(frozen=True)
@@ -37,28 +31,32 @@ class Mutant:
 
     source: Source
     pack: str
-    operator: str
-    edits: tuple[Edit, ...]
+    change: Change
+
+    @property
+    def operator(self) -> str:
+        """The kind of the mistake."""
+        return self.change.operator
 
     @property
     def text(self) -> str:
         """The whole file with the mistake."""
-        return applied(self.source.text, self.edits)
+        text = self.source.text
+        return text[: self.change.start] + self.change.text + text[self.change.end :]
 
     @property
     def place(self) -> str:
-        """`file:line:column` of the first edit."""
-        first = min(self.edits, key=lambda edit: edit.start)
-        start = first.start
-        text = self.source.text
-        while start < min(first.end, len(text) - 1) and text[start].isspace():
+        """`file:line:column` of what is replaced."""
+        start, text = self.change.start, self.source.text
+        while start < min(self.change.end, len(text) - 1) and text[start].isspace():
             start += 1  # what is cut out may begin with the blanks before it
         return Span(self.source, start, start).place
 
     @property
     def diff(self) -> str:
         """The lines that differ, before and after, each on one line; `(nothing)` where there are none."""
-        before, after = changed_lines(self.source.text, self.text)
+        old, new = self.source.text.splitlines(), self.text.splitlines()
+        before, after = (" ".join(" ".join(lines).split()) for lines in unlike(old, new)[1:])
         return f"{before or '(nothing)'}  ⇒  {after or '(nothing)'}"
 
     @property
@@ -97,69 +95,78 @@ OPERATORS: dict[str, str] = {
 """Kinds of mistakes, and a line about each."""
 
 
-def applied(text: str, edits: Iterable[Edit]) -> str:
-    """A text with edits that do not overlap."""
-    for edit in sorted(edits, key=lambda edit: edit.start, reverse=True):
-        text = text[: edit.start] + edit.text + text[edit.end :]
-    return text
+def unlike(old: list[str], new: list[str]) -> tuple[list[str], list[str], list[str]]:
+    """What two lists begin with, and what each has between that and what both end with."""
+    head = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(old, new, strict=False)))
+    ends = zip(reversed(old[head:]), reversed(new[head:]), strict=False)
+    tail = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], ends))
+    return old[:head], old[head : len(old) - tail], new[head : len(new) - tail]
 
 
-def changed_lines(before: str, after: str) -> tuple[str, str]:
-    """The lines of two texts that differ, each text's joined to one line without the blanks around them."""
-    old, new = before.splitlines(), after.splitlines()
-    head = 0
-    while head < min(len(old), len(new)) and old[head] == new[head]:
-        head += 1
-    tail = 0
-    while tail < min(len(old), len(new)) - head and old[-1 - tail] == new[-1 - tail]:
-        tail += 1
-    return tuple(" ".join(" ".join(lines[head : len(lines) - tail]).split()) for lines in (old, new))  # type: ignore[return-value]
+def written(operator: str, span: Span, text: str) -> Change:
+    """Another text at a place; words that stay the same at its ends are left alone."""
+    old, new = (re.findall(r"[\w.%]+|\s+|[^\w\s.%]+", words) for words in (span.text, text))
+    head, before, after = ("".join(words) for words in unlike(old, new))
+    start = span.start + len(head)
+    return Change(operator, start, start + len(before), after)
+
+
+def exchanged(operator: str, first: Span, second: Span) -> Change:
+    """Two texts in each other's place."""
+    between = first.source.text[first.end : second.start]
+    return written(operator, first.to(second), f"{second.text}{between}{first.text}")
 
 
 # Cutting entries out of located YAML, and putting some in: the rest of the file stays as it is
 
 
-def removed(path: Path) -> Edit:
+def removed(operator: str, path: Path) -> Change:
     """The entry at the end of a path cut out; the whole container where it was the only one."""
     container, number = path[-1]
     spans = entry_spans(container)
     if len(spans) == 1 and len(path) > 1:
-        return removed(path[:-1])
+        return removed(operator, path[:-1])
     text = container.span.source.text
     start, end = spans[number].start, spans[number].end
     if text[container.span.start] in "[{":
-        if number + 1 < len(spans):
-            return Edit(start, spans[number + 1].start, "")
-        return Edit(spans[number - 1].end, end, "")
+        return without(operator, spans, number)
     line = text.rfind("\n", 0, start) + 1
-    stop = text.find("\n", end)
-    stop = len(text) if stop < 0 else stop + 1
-    before = text[line:start]
-    if isinstance(container, yaml_tree.Mapping) and before.strip():
+    if isinstance(container, yaml_tree.Mapping) and text[line:start].strip():
         # The first key of a list's item stands beside the dash, which stays.
-        return Edit(start, spans[number + 1].start, "") if number + 1 < len(spans) else Edit(start, end, "")
-    return Edit(line, stop, "")
+        return Change(operator, start, spans[number + 1].start if number + 1 < len(spans) else end, "")
+    stop = text.find("\n", end)
+    return Change(operator, line, len(text) if stop < 0 else stop + 1, "")
 
 
-def without_action(path: Path) -> tuple[Edit, ...]:
+def without(operator: str, items: list[Span], number: int) -> Change:
+    """An item of a list cut out with the comma beside it."""
+    if number + 1 < len(items):
+        return Change(operator, items[number].start, items[number + 1].start, "")
+    return Change(operator, items[number - 1].end, items[number].end, "")
+
+
+def without_action(operator: str, path: Path) -> Change:
     """A block without its action: what stood under `then` comes at once, or the block goes."""
     block = path[-1][0]
     assert isinstance(block, yaml_tree.Mapping)
     then = next((key for key, _ in block.entries if key.text == "then"), None)
     if then is None:
-        return _without_block(path[:-1])
-    return (removed(path), Edit(then.span.start, then.span.end, "do"))
+        return _without_block(operator, path[:-1])
+    cut = removed(operator, path)
+    return Change(
+        operator, cut.start, then.span.end, f"{block.span.source.text[cut.end : then.span.start]}do"
+    )
 
 
-def _without_block(path: Path) -> tuple[Edit, ...]:
+def _without_block(operator: str, path: Path) -> Change:
     """The block at the end of a path cut out; with its action where it is all that the action does."""
     container, number = path[-1]
     if isinstance(container, Sequence) and len(container.items) == 1:
-        return _without_block(path[:-1])
+        return _without_block(operator, path[:-1])
     inside = len(path) > 2  # a pass or block, not the list of all passes
     if isinstance(container, yaml_tree.Mapping) and inside and is_action(container.entries[number][0]):
-        return without_action(path)
-    return (removed(path),)
+        return without_action(operator, path)
+    return removed(operator, path)
 
 
 def is_action(key: Scalar) -> bool:
@@ -167,16 +174,15 @@ def is_action(key: Scalar) -> bool:
     return key.text == "do" or key.text.startswith(("for ", "repeat "))
 
 
-def inserted(path: Path, entry: str) -> Edit:
+def inserted(operator: str, path: Path, entry: str) -> Change:
     """A new entry after one of a mapping's, written as the mapping is: with a comma, or on a line of its own."""
     node, number = path[-1]
     assert isinstance(node, yaml_tree.Mapping)
     end = entry_spans(node)[number].end
     source = node.span.source
-    if source.text[node.span.start] == "{":
-        return Edit(end, end, f", {entry}")
     column = source.position(node.entries[0][0].span.start)[1]
-    return Edit(end, end, "\n" + " " * (column - 1) + entry)
+    before = ", " if source.text[node.span.start] == "{" else "\n" + " " * (column - 1)
+    return Change(operator, end, end, before + entry)
 
 
 def entry_spans(container: Container) -> list[Span]:

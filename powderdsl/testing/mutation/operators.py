@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from collections.abc import Sequence as Sequence_
 from dataclasses import dataclass, replace
 
-from powderdsl.diagnostics import Reporter
+from powderdsl.diagnostics import Reporter, Span
 from powderdsl.model.builtins import DIRECTION_SETS, KERNEL_SHAPES
 from powderdsl.model.declarations import PackDecl
 from powderdsl.syntax import yaml_tree
@@ -17,13 +17,15 @@ from powderdsl.syntax.parse import parse_scalar
 from powderdsl.syntax.yaml_tree import Node, Scalar, Sequence, parse_yaml
 from powderdsl.testing.mutation.mutants import (
     Change,
-    Edit,
     Mutant,
     Path,
+    exchanged,
     inserted,
     is_action,
     removed,
+    without,
     without_action,
+    written,
 )
 from powderdsl.testing.mutation.names import Names, names_of
 
@@ -41,6 +43,40 @@ SIMILAR = {
 """Words and signs of the language: the kind of mistake, and what stands for them. A neighbor: the opposite, and one around
 the corner."""
 
+TEMPLATES: dict[str, tuple[str, ...]] = {
+    "and_": ("connective", "{0}", "{1}", "{0} or {1}"),
+    "or_": ("connective", "{0}", "{1}", "{0} and {1}"),
+    "any_of": ("connective", "all({0} for {1})"),
+    "all_of": ("connective", "any({0} for {1})"),
+    "not_": ("negation", "{0}"),
+    "is_": ("comparison", "{0} is not {1}"),
+    "is_not": ("comparison", "{0} is {1}"),
+    "in_": ("comparison", "{0} not in {1}"),
+    "not_in": ("comparison", "{0} in {1}"),
+    "in_kernel": ("kernel", "{0}"),
+    "any_but": ("set", "{0}"),
+    "add": ("arithmetic", "{0} - {1}"),
+    "subtract": ("arithmetic", "{0} + {1}"),
+    "multiply": ("arithmetic", "{0} / {1}"),
+    "divide": ("arithmetic", "{0} * {1}"),
+    "quotient": ("arithmetic", "{0} * {1}"),
+    "choose": ("arithmetic", "{2} if {1} else {0}"),
+    "min": ("arithmetic", "max({*})"),
+    "max": ("arithmetic", "min({*})"),
+    "abs": ("arithmetic", "({*})"),
+    "clamp": ("arithmetic", "({0})"),
+    "opposite": ("neighbor", "{0}"),
+    "clockwise": ("neighbor", "{0}"),
+    "counterclockwise": ("neighbor", "{0}"),
+    "negate": ("constant", "{0}"),
+    "yes": ("constant", "no"),
+    "no": ("constant", "yes"),
+    **{
+        shape: ("kernel", *(f"{other}({{*}})" for other in KERNEL_SHAPES if other != shape)) for shape in KERNEL_SHAPES
+    },
+}  # fmt: skip
+"""The kind of mistake in each kind of syntax or call, and what is written instead: `{0}` is the first operand, `{*}` all."""
+
 LOOSER_THAN_IN = ("compare", "is_", "is_not", "in_", "not_in", "not_", "and_", "or_")
 """Kinds of conditions that stand in parentheses before `in`."""
 
@@ -55,120 +91,64 @@ def mutants_of(pack: PackDecl, packs: Sequence_[PackDecl]) -> list[Mutant]:
         packs: all packs of the composition in which it is mutated.
     """
     root = parse_yaml(pack.source, Reporter())
-    if not isinstance(root, yaml_tree.Mapping):
-        return []
     mutants: dict[str, Mutant] = {}
-    for section in entries_of(root, (), names_of(packs, pack)):
+    for section in entries_of(root, (), names_of(packs, pack)) if root is not None else ():
         for entry in section.entries():
             for change in SECTIONS.get(section.key.text, nothing)(entry):
-                mutant = Mutant(pack.source, pack.name.text, change.operator, change.edits)
+                mutant = Mutant(pack.source, pack.name.text, change)
                 if mutant.text != pack.source.text:
                     mutants.setdefault(mutant.text, mutant)
-    return sorted(mutants.values(), key=lambda mutant: min(edit.start for edit in mutant.edits))
+    return sorted(mutants.values(), key=lambda mutant: mutant.change.start)
 
 
 # Lines
 
-
-@dataclass(frozen=True)
-class Part:
-    """A part of a line: its syntax, what it is a part of, and the names that may stand there by mistake."""
-
-    node: Syntax
-    parent: Syntax | None
-    names: Names
-
-    def instead(self, operator: str, text: str) -> Change:
-        """Another text in its place."""
-        return Change(operator, (Edit(self.node.span.start, self.node.span.end, text),))
-
-    def only(self, operator: str, number: int) -> Change:
-        """One of its operands in its place."""
-        return self.instead(operator, cut(self.node, extent(self.node.children[number], self.node)))
-
-    def between(self, operator: str, word: str, other: str, number: int = 0) -> Change:
-        """Another word between an operand and the next one."""
-        first, second = self.node.children[number : number + 2]
-        begin, end = extent(first, self.node)[1], extent(second, self.node)[0]
-        text = cut(self.node, (begin, end))
-        found = re.search(re.escape(word).replace(r"\ ", r"\s+"), text)
-        assert found is not None, f"`{word}` is not in `{text}`"
-        return Change(operator, (Edit(begin + found.start(), begin + found.end(), other),))
-
-    def exchanged(self, operator: str, first: int, second: int) -> Change:
-        """Two operands in each other's place."""
-        (a, b), (c, d) = (extent(self.node.children[number], self.node) for number in (first, second))
-        edits = Edit(a, b, cut(self.node, (c, d))), Edit(c, d, cut(self.node, (a, b)))
-        return Change(operator, edits)
-
-    def without(self, operator: str, number: int) -> Change:
-        """An item of a list cut out with the comma beside it."""
-        if number + 1 < len(self.node.children):
-            return Change(operator, (Edit(self.item(number)[0], self.item(number + 1)[0], ""),))
-        return Change(operator, (Edit(self.item(number - 1)[1], self.item(number)[1], ""),))
-
-    def item(self, number: int) -> tuple[int, int]:
-        """An item of a list with its own parentheses, but not those of the list."""
-        child = self.node.children[number]
-        start, end = extent(child, self.node)
-        return (start, end) if start > self.node.span.start else (child.span.start, child.span.end)
-
-
 Changes = Iterator[Change]
-Mistake = Callable[[Part], Iterable[Change]]
 
 
-def line_changes(node: Syntax, names: Names, parent: Syntax | None = None) -> Changes:
+def line_changes(node: Syntax, names: Names) -> Changes:
     """All mistakes in a line or a part of it, in the order in which it is read."""
-    part = Part(node, parent, names)
-    for mistake in MISTAKES.get(node.kind, ()):
-        yield from mistake(part)
+    kind = node.text.split()[0] if node.kind == "call" else node.kind
+    if node.kind == "in_" and names.kind(node.children[1].text) == "kernel":
+        kind = "in_kernel"
+    operator, *templates = TEMPLATES.get(kind, ("",))
+    for template in templates:
+        if (
+            template != "{1}" or node.children[0].kind != node.kind
+        ):  # else the same as a part's second operand
+            yield written(operator, node.span, filled(template, node))
+    yield from MISTAKES.get(node.kind, no_mistakes)(node, names)
     for child in node.children:
         if node.kind != "binding" or child is not node.children[0]:  # the variable's own name
-            yield from line_changes(child, names, node)
+            yield from line_changes(child, names)
 
 
-def cut(node: Syntax, place: tuple[int, int]) -> str:
-    """The text at a place of the line."""
-    return node.span.source.text[place[0] : place[1]]
+def filled(template: str, node: Syntax) -> str:
+    """A template with a node's operands."""
+    operands = [span.text for span in extents(node)]
+    return re.sub(
+        r"\{(.)\}",
+        lambda hole: ", ".join(operands) if hole[1] == "*" else operands[int(hole[1])],
+        template,
+    )
 
 
-def extent(child: Syntax, parent: Syntax) -> tuple[int, int]:
-    """Where an operand stands with the parentheses around it, which its own span leaves out."""
-    text = child.span.source.text
-    start, end = child.span.start, child.span.end
-    while True:
-        left, right = start - 1, end
-        while left >= parent.span.start and text[left].isspace():
-            left -= 1
-        while right < parent.span.end and text[right].isspace():
-            right += 1
-        inside = left >= parent.span.start and right < parent.span.end
-        if not (inside and text[left] == "(" and text[right] == ")"):
-            return start, end
-        start, end = left, right + 1
-
-
-def only(operator: str) -> Mistake:
-    """Its operand in its place."""
-    return lambda part: [part.only(operator, 0)]
-
-
-def between(operator: str, word: str, other: str) -> Mistake:
-    """Another word between its operands."""
-    return lambda part: [part.between(operator, word, other)]
-
-
-def beginning(operator: str, word: str, other: str) -> Mistake:
-    """Another first word."""
-    return lambda part: [
-        Change(operator, (Edit(part.node.span.start, part.node.span.start + len(word), other),))
-    ]
-
-
-def values(operator: str, others: Callable[[str], Iterable[str]]) -> Mistake:
-    """Other values in its place."""
-    return lambda part: [part.instead(operator, other) for other in others(part.node.text)]
+def extents(node: Syntax) -> list[Span]:
+    """Where operands stand with the parentheses around them, which their own spans leave out."""
+    text = node.span.source.text
+    first, last = node.span.start, node.span.end
+    if node.kind in ("call", "tuple"):
+        first, last = text.index("(", first) + 1, last - 1
+    found = []
+    for child in node.children:
+        start, end = child.span.start, child.span.end
+        while True:
+            before, after = text[first:start].rstrip(), text[end:last].lstrip()
+            if before[-1:] != "(" or after[:1] != ")":
+                break
+            start, end = first + len(before) - 1, last - len(after) + 1
+        found.append(Span(node.span.source, start, end))
+    return found
 
 
 def near_integers(text: str) -> Iterator[str]:
@@ -191,135 +171,131 @@ def near_decimals(text: str) -> Iterator[str]:
     """Half of it, and twice as far from 1 or from 0."""
     number = float(text)
     for other in (number / 2, 1 - (1 - number) / 2 if number < 1 else number * 2):
-        written = f"{other:.6g}"
-        yield written if re.search(r"[.e]", written) else f"{written}.0"
+        digits = f"{other:.6g}"
+        yield digits if re.search(r"[.e]", digits) else f"{digits}.0"
 
 
 def near_chances(text: str) -> Iterator[str]:
     """A percentage ten times as large or small, and half as large again; nothing above 100 %."""
     number = float(text.rstrip("%"))
     for other in (min(number * 10, 100.0), number / 10, min(number * 1.5, 100.0)) if number else (10.0,):
-        if other != number:
-            yield f"{other:.10g}%"
+        yield f"{other:.10g}%"
 
 
-def _operands(part: Part) -> Changes:
-    yield part.only("connective", 0)
-    if part.node.children[0].kind != part.node.kind:
-        yield part.only("connective", 1)
+Mistake = Callable[[Syntax, Names], Iterable[Change]]
 
 
-def _membership(part: Part) -> Changes:
-    is_kernel = _names_kernel(part.node, part.parent, part.names)
-    yield part.only("kernel", 0) if is_kernel else part.between("comparison", "in", "not in")
+def no_mistakes(node: Syntax, names: Names) -> Iterable[Change]:
+    """None besides templates."""
+    return ()
 
 
-def _names_kernel(node: Syntax, parent: Syntax | None, names: Names) -> bool:
-    """Whether `a in b` says where to count, or is a question."""
-    in_call = parent is not None and parent.kind == "call" and parent.text in ("count", "sum")
-    return in_call and node.kind == "in_" and names.kind(node.children[1].text) == "kernel"
+def values(operator: str, others: Callable[[str], Iterable[str]]) -> Mistake:
+    """Other values in its place."""
+    return lambda node, names: [written(operator, node.span, other) for other in others(node.text)]
 
 
-def _name(part: Part) -> Changes:
-    names = part.names
-    name = part.node.text or part.node.span.text
-    mark = "?" if part.node.kind == "optional_name" else ""
+def _name(node: Syntax, names: Names) -> Changes:
+    name = node.text or node.span.text
+    mark = "?" if node.kind == "optional_name" else ""
     operator, *others = SIMILAR.get(name, ("",))
     for other in others:
-        yield part.instead(operator, other)
+        yield written(operator, node.span, other)
     for other in names.others(name):
-        yield part.instead(names.kind(name), other + mark)
+        yield written(names.kind(name), node.span, other + mark)
     if name in names.local:
-        yield part.instead("let", f"({names.local[name]})")
+        yield written("let", node.span, f"({names.local[name]})")
 
 
-def _attribute(part: Part) -> Changes:
-    node, names = part.node, part.names
-    start, end, before = node.span.end - len(node.text), node.span.end, node.children[0].span.text
-    kind = names.kind(node.text)
+def _attribute(node: Syntax, names: Names) -> Changes:
+    """Another value of the neighbor, the neighbor alone, the value here."""
+    kind, before = names.kind(node.text), node.children[0].span.text
     operator, *others = SIMILAR.get(node.text, ("",))
     for other in others if node.text != "step" else ():
-        yield Change(operator, (Edit(start, end, other),))
+        yield written(operator, node.span, filled(f"{{0}}.{other}", node))
     if not (kind or operator == "coordinate"):
-        yield part.instead("neighbor", before)
+        yield written("neighbor", node.span, before)
     if operator == "" or (operator == "neighbor" and SIMILAR.get(before, ("",))[0] == "neighbor"):
-        yield part.instead("neighbor", node.text)
+        yield written("neighbor", node.span, node.text)
     for other in names.others(node.text) if kind in ("property", "field", "stream", "let") else ():
-        yield Change(kind, (Edit(start, end, other),))
+        yield written(kind, node.span, filled(f"{{0}}.{other}", node))
 
 
-def _signs(part: Part) -> Changes:
+def _signs(node: Syntax, names: Names) -> Changes:
     """Other comparisons, another update."""
-    for number, sign in enumerate(part.node.text.split()):
+    signs = node.text.split()
+    for number, sign in enumerate(signs):
         operator, *others = SIMILAR[sign]
         for other in others:
-            yield part.between(operator, sign, other, number)
+            changed = [*signs[:number], other, *signs[number + 1 :]]
+            parts = [f" {word} {{{place}}}" for place, word in enumerate(changed, 1)]
+            yield written(operator, node.span, filled("{0}" + "".join(parts), node))
 
 
-def _call(part: Part) -> Changes:
-    node, names = part.node, part.names
-    name = node.text.split()[0]
-    if name in ("count", "sum") and not any(_names_kernel(child, node, names) for child in node.children):
-        last, end = node.children[-1], node.span.end - 1
-        is_open = last.kind in LOOSER_THAN_IN and last.span.text[:1] != "("
-        opened = (Edit(last.span.start, last.span.start, "("),) if is_open else ()
+def _call(node: Syntax, names: Names) -> Changes:
+    """Another neighborhood to count in, a missing argument."""
+    name, operands = node.text.split()[0], extents(node)
+    in_kernel = any(
+        child.kind == "in_" and names.kind(child.children[1].text) == "kernel" for child in node.children
+    )
+    if name in ("count", "sum") and not in_kernel:
+        last = operands[-1]
+        is_open = node.children[-1].kind in LOOSER_THAN_IN and last == node.children[-1].span
         for kernel in ("ring", "cross"):
-            yield Change("kernel", (*opened, Edit(end, end, f"{')' if is_open else ''} in {kernel}")))
-    if name in ("min", "max"):
-        yield from beginning("arithmetic", name, "max" if name == "min" else "min")(part)
-    inner = node.children[0].span.text if node.children else ""
-    if name in ("abs", "clamp"):
-        yield part.instead("arithmetic", f"({inner})")
-    if name in ("opposite", "clockwise", "counterclockwise"):
-        yield part.instead("neighbor", inner)
-    for shape in KERNEL_SHAPES if name in KERNEL_SHAPES else ():
-        if shape != name:
-            yield from beginning("kernel", name, shape)(part)
-    if name in ("count", "min", "max") and len(node.children) > 1:
-        for number in range(len(node.children)):
-            yield part.without("set" if name == "count" else "arithmetic", number)
+            yield written(
+                "kernel", last, f"({last.text}) in {kernel}" if is_open else f"{last.text} in {kernel}"
+            )
+    if name in ("count", "min", "max") and len(operands) > 1:
+        for number in range(len(operands)):
+            yield without("set" if name == "count" else "arithmetic", operands, number)
 
 
-def _tuple(part: Part) -> Changes:
-    children = part.node.children
-    is_loop = part.parent is not None and part.parent.kind == "binding"
-    operator = "side" if is_loop and SIMILAR.get(children[0].text, ("",))[0] == "neighbor" else "set"
-    for number in range(len(children)):
-        if len(children) == 2:
-            yield part.instead(operator, f"({cut(part.node, part.item(1 - number))})")
-        else:
-            yield part.without(operator, number)
-    if is_loop:
-        yield part.exchanged("order", 0, len(children) - 1)
+def _tuple(node: Syntax, names: Names) -> Changes:
+    """A missing member."""
+    for number in range(len(node.children)):
+        yield without("set", extents(node), number)
 
 
-def _repeat(part: Part) -> Changes:
-    found = re.search(r"\d+", part.node.span.text)
-    assert found is not None
-    start = part.node.span.start + found.start()
-    for count in (int(found[0]) + 1, int(found[0]) - 1):
+def _binding(node: Syntax, names: Names) -> Changes:
+    """A loop over fewer neighbors, or in another order."""
+    domain = node.children[1]
+    if domain.kind == "tuple":
+        for change in _tuple(domain, names):
+            yield (
+                replace(change, operator="side")
+                if SIMILAR.get(domain.children[0].text, ("",))[0] == "neighbor"
+                else change
+            )
+        yield exchanged("order", extents(domain)[0], extents(domain)[-1])
+
+
+def _loops(node: Syntax, names: Names) -> Changes:
+    if len(node.children) > 1:
+        yield exchanged("order", node.children[0].span, node.children[1].span)
+
+
+def _repeat(node: Syntax, names: Names) -> Changes:
+    for count in (int(node.text) + 1, int(node.text) - 1):
         if count > 0:
-            yield Change("constant", (Edit(start, start + len(found[0]), str(count)),))
+            yield written("constant", node.span, f"repeat {count}")
 
 
-def _rule(part: Part) -> Changes:
+def _rule(node: Syntax, names: Names) -> Changes:
     """A rule without its condition or its chance, or the other way round, or with a draw that others share."""
-    node, names = part.node, part.names
     condition, chance = node.child("condition"), node.child("chance")
     stream = next((name for name, kind in names.kinds.items() if kind == "stream"), None)
     if condition is not None and chance is not None and stream is not None:
-        drawn = f" and {stream} < {chance.children[0].span.text}"
-        end = condition.span.end
-        yield Change("stream", (Edit(end, end, drawn), Edit(chance.span.start, chance.span.end, "")))
+        text = f"{condition.span.text} and {stream} < {chance.children[0].span.text}"
+        yield written("stream", condition.span.to(chance.span), text)
     if node.kind == "transform" and {child.kind for child in node.children[:2]} <= {"name", "optional_name"}:
-        yield part.exchanged("element", 0, 1)
+        yield exchanged("element", node.children[0].span, node.children[1].span)
     for clause in node.children:
         if clause.kind in ("condition", "where", "chance"):
-            yield replace(part, node=clause).instead("guard", "")
+            yield written("guard", clause.span, "")
         if clause.kind in ("condition", "where"):
             for conjunct in _conjuncts(clause.children[0]):
                 if conjunct.kind in ("name", "optional_name", "attribute", "any_of", "all_of"):
-                    yield replace(part, node=conjunct).instead("negation", f"not {conjunct.span.text}")
+                    yield written("negation", conjunct.span, f"not {conjunct.span.text}")
 
 
 def _conjuncts(node: Syntax) -> Iterator[Syntax]:
@@ -330,54 +306,35 @@ def _conjuncts(node: Syntax) -> Iterator[Syntax]:
         yield node
 
 
-def _effects(part: Part) -> Changes:
-    updates = [child for child in part.node.children if child.kind == "update"]
+def _effects(node: Syntax, names: Names) -> Changes:
+    updates = [child.span for child in node.children]
     if len(updates) == 1:
-        yield part.instead("effect", "")
-        return
-    for number in range(len(updates)):
-        yield part.without("effect", number)
+        yield written("effect", node.span, "")
+    for number in range(len(updates) if len(updates) > 1 else 0):
+        yield without("effect", updates, number)
 
 
-MISTAKES: dict[str, tuple[Mistake, ...]] = {
-    "and_": (_operands, between("connective", "and", "or")),
-    "or_": (_operands, between("connective", "or", "and")),
-    "not_": (only("negation"),),
-    "is_": (between("comparison", "is", "is not"),),
-    "is_not": (between("comparison", "is not", "is"),),
-    "in_": (_membership,),
-    "not_in": (between("comparison", "not in", "in"),),
-    "compare": (_signs,),
-    "any_of": (beginning("connective", "any", "all"),),
-    "all_of": (beginning("connective", "all", "any"),),
-    "any_but": (only("set"),),
-    "add": (between("arithmetic", "+", "-"),),
-    "subtract": (between("arithmetic", "-", "+"),),
-    "multiply": (between("arithmetic", "*", "/"),),
-    "divide": (between("arithmetic", "/", "*"),),
-    "quotient": (between("arithmetic", "div", "*"),),
-    "negate": (only("constant"),),
-    "choose": (lambda part: [part.exchanged("arithmetic", 0, 2)],),
-    "call": (_call,),
-    "integer": (values("constant", near_integers),),
-    "decimal": (values("constant", near_decimals),),
-    "percent": (values("chance", near_chances),),
-    "yes": (values("constant", lambda text: ("no",)),),
-    "no": (values("constant", lambda text: ("yes",)),),
-    "name": (_name,),
-    "optional_name": (_name,),
-    "attribute": (_attribute,),
-    "tuple": (_tuple,),
-    "repeat": (_repeat,),
-    "for_": (lambda part: [part.exchanged("order", 0, 1)] if len(part.node.children) > 1 else [],),
-    "transform": (_rule,),
-    "swap": (_rule,),
-    "move": (_rule,),
-    "assign": (_rule,),
-    "then": (_effects,),
-    "update": (_signs,),
+MISTAKES: dict[str, Mistake] = {
+    "compare": _signs,
+    "update": _signs,
+    "call": _call,
+    "integer": values("constant", near_integers),
+    "decimal": values("constant", near_decimals),
+    "percent": values("chance", near_chances),
+    "name": _name,
+    "optional_name": _name,
+    "attribute": _attribute,
+    "tuple": _tuple,
+    "binding": _binding,
+    "repeat": _repeat,
+    "for_": _loops,
+    "transform": _rule,
+    "swap": _rule,
+    "move": _rule,
+    "assign": _rule,
+    "then": _effects,
 }
-"""The mistakes that are made in each kind of syntax. Mistakes in its parts come on top."""
+"""The mistakes in each kind of syntax besides its templates. Mistakes in its parts come on top."""
 
 
 # Entries of the file
@@ -425,18 +382,17 @@ class Entry:
 
     def lost(self, operator: str) -> Change:
         """The file without it."""
-        return Change(operator, (removed(self.path),))
+        return removed(operator, self.path)
 
     def instead(self, operator: str, text: str) -> Change:
         """Another value for its scalar."""
         assert isinstance(self.node, Scalar)
-        return Change(operator, (Edit(self.node.content.start, self.node.content.end, text),))
+        return written(operator, self.node.content, text)
 
     def added(self, operator: str, line: str) -> Change:
         """One more entry at the end of its mapping."""
         assert isinstance(self.node, yaml_tree.Mapping)
-        last = (*self.path, (self.node, len(self.node.entries) - 1))
-        return Change(operator, (inserted(last, line),))
+        return inserted(operator, (*self.path, (self.node, len(self.node.entries) - 1)), line)
 
 
 EntryMistake = Callable[[Entry], Iterable[Change]]
@@ -451,12 +407,9 @@ def entries_of(node: Node, path: Path, names: Names) -> Iterator[Entry]:
 
 def by_key(table: Mapping[str, EntryMistake], otherwise: EntryMistake) -> EntryMistake:
     """Mistakes in the entries of a mapping, by key."""
-
-    def changes(entry: Entry) -> Changes:
-        for part in entry.entries():
-            yield from table.get(part.key.text, otherwise)(part)
-
-    return changes
+    return lambda entry: itertools.chain.from_iterable(
+        table.get(part.key.text, otherwise)(part) for part in entry.entries()
+    )
 
 
 def nothing(entry: Entry) -> Iterable[Change]:
@@ -464,18 +417,18 @@ def nothing(entry: Entry) -> Iterable[Change]:
     return ()
 
 
+def _numbers(operator: str, span: Span, pattern: str, others: Callable[[str], Iterable[str]]) -> Changes:
+    """Other values for each number in a text."""
+    for found in re.finditer(pattern, span.text):
+        place = Span(span.source, span.start + found.start(), span.start + found.end())
+        for other in others(found[0]):
+            yield written(operator, place, other)
+
+
 def _bounds(entry: Entry) -> Changes:
     """Other bounds of a declared kind."""
-
-    def integers(node: Syntax) -> Iterator[Syntax]:
-        if node.kind == "integer":
-            yield node
-        for child in node.children:
-            yield from integers(child)
-
-    tree = entry.parsed()
-    for node in integers(tree) if tree is not None else ():
-        yield from values("field", near_bounds)(Part(node, None, entry.names))
+    if isinstance(entry.node, Scalar):
+        yield from _numbers("field", entry.node.content, r"(?<!\d\.)(?<!\w)\d+(?!\d|\.\d)", near_bounds)
 
 
 def _value(entry: Entry, name: str) -> Changes:
@@ -483,26 +436,19 @@ def _value(entry: Entry, name: str) -> Changes:
     tree = entry.parsed()
     if tree is None:
         return
-    whole = Part(tree, None, entry.names)
-    sign, inner = (-1, tree.children[0]) if tree.kind == "negate" else (1, tree)
-    if inner.kind == "integer":
+    if re.fullmatch(r"-?\d+", tree.span.text):
         low, high = entry.names.ranges.get(name, (-(10**6), 10**6))
-        number = sign * int(inner.text)
+        number = int(tree.span.text)
         for other in (number - 1, number + 1, number - 2, number + 2):
             if low <= other <= high:
-                yield whole.instead("property", str(other))
-    elif inner.kind == "percent":
-        yield from values("chance", near_chances)(replace(whole, node=inner))
-    elif inner.kind in ("yes", "no"):
-        yield replace(whole, node=inner).instead("property", "no" if inner.kind == "yes" else "yes")
+                yield entry.instead("property", str(other))
     else:
         yield from line_changes(tree, entry.names)
     yield entry.lost("property")
 
 
 def _property(entry: Entry) -> Changes:
-    if isinstance(entry.node, Scalar):
-        yield from _bounds(entry)
+    yield from _bounds(entry)
     for part in entry.entries():
         if part.key.text == "type":
             yield from _bounds(part)
@@ -514,7 +460,7 @@ def _at(entry: Entry) -> Changes:
     assert isinstance(entry.node, Scalar)
     yield entry.instead("field", "place" if entry.node.text == "element" else "element")
     if "resets" not in entry.siblings:
-        yield Change("field", (inserted(entry.path, "resets: step"),))
+        yield inserted("field", entry.path, "resets: step")
 
 
 def _default(entry: Entry) -> Changes:
@@ -525,11 +471,8 @@ def _default(entry: Entry) -> Changes:
 
 
 def _param(entry: Entry) -> Changes:
-    if isinstance(entry.node, Scalar):
-        yield from entry.line()
-    for part in entry.entries():
-        if part.key.text == "default":
-            yield from part.line()
+    yield from entry.line()
+    yield from by_key({"default": Entry.line}, nothing)(entry)
 
 
 def _kernel(entry: Entry) -> Changes:
@@ -539,22 +482,20 @@ def _kernel(entry: Entry) -> Changes:
         yield from parts["shape"].line()
     rows = parts.get("rows") if isinstance(node, yaml_tree.Mapping) else entry
     for row in rows.items() if rows is not None else ():
-        if not isinstance(row.node, Scalar):
-            continue
-        content = row.node.content
-        for found in re.finditer(r"-?\d+", content.text):
-            weight, (start, end) = int(found[0]), found.span()
-            for other in (1,) if weight == 0 else (0, 2 * weight):
-                yield Change("kernel", (Edit(content.start + start, content.start + end, str(other)),))
-    if isinstance(node, yaml_tree.Mapping):
-        edges = parts["edges"].node if "edges" in parts else None
-        if isinstance(edges, Scalar):
-            yield parts["edges"].instead("kernel", "nothing" if edges.text == "wrap" else "wrap")
-        else:
-            yield entry.added("kernel", "edges: wrap")
+        if isinstance(row.node, Scalar):
+            yield from _numbers("kernel", row.node.content, r"-?\d+", near_weights)
+    if "edges" in parts:
+        edges = parts["edges"].node
+        yield parts["edges"].instead("kernel", "nothing" if edges.span.text == "wrap" else "wrap")
+    elif parts:
+        yield entry.added("kernel", "edges: wrap")
     elif node.span.text[:1] == "[":
-        text = f"{{rows: {node.span.text}, edges: wrap}}"
-        yield Change("kernel", (Edit(node.span.start, node.span.end, text),))
+        yield written("kernel", node.span, f"{{rows: {node.span.text}, edges: wrap}}")
+
+
+def near_weights(text: str) -> tuple[str, ...]:
+    """None where there was one, or twice as much; one where there was none."""
+    return ("0", str(2 * int(text))) if int(text) else ("1",)
 
 
 def _element(entry: Entry) -> Changes:
@@ -593,11 +534,10 @@ def _tags(entry: Entry) -> Changes:
         other = next((name for name in entry.names.others(word.word) if name not in listed), None)
         if other is not None:
             yield item.instead("tag", f"{other}?")
-            start, end = node.span.start, node.span.end
             if isinstance(node, Scalar):
-                yield Change("tag", (Edit(start, end, f"[{node.text}, {other}?]"),))
+                yield written("tag", node.span, f"[{node.text}, {other}?]")
             elif number == 0 and node.span.text[0] == "[":
-                yield Change("tag", (Edit(start + 1, start + 1, f"{other}?, "),))
+                yield written("tag", node.span, f"[{other}?, {node.span.text[1:]}")
 
 
 # Passes
@@ -632,11 +572,10 @@ def _block(entry: Entry) -> Changes:
         first_rules, second_rules = lines_of(first.node), lines_of(second.node)
         keys = first.key.text, second.key.text
         if keys == ("do", "then") and first_rules and second_rules:
-            start = first.key.span.start
-            indent = " " * (entry.key.span.source.position(start)[1] - 1)
+            span = first.key.span.to(second.node.span)
+            indent = " " * (span.source.position(span.start)[1] - 1)
             rules = [" ".join(rule.span.text.split()) for rule in (*first_rules, *second_rules)]
-            listed = "".join(f"\n{indent}  - {rule}" for rule in rules)
-            yield Change("order", (Edit(start, second.node.span.end, f"do:{listed}"),))
+            yield written("order", span, "do:" + "".join(f"\n{indent}  - {rule}" for rule in rules))
 
 
 def _option(operator: str, *words: str) -> EntryMistake:
@@ -657,13 +596,13 @@ def _order(entry: Entry) -> Changes:
         yield item.lost("order")
     other = "before" if entry.key.text == "after" else "after"
     if other not in entry.siblings:
-        yield Change("order", (Edit(entry.key.span.start, entry.key.span.end, other),))
+        yield written("order", entry.key.span, other)
 
 
 def _action(entry: Entry) -> Changes:
     if entry.key.text != "do":
         yield from replace(entry, node=entry.key).line("header")
-    yield Change("rule", without_action(entry.path))
+    yield without_action("rule", entry.path)
     yield from _body(entry)
 
 
@@ -686,11 +625,17 @@ def _body(entry: Entry) -> Changes:
     if len(items) == 1 or any(rule.style == "block" for rule in rules):
         return
     for first, second in itertools.pairwise(rule.span for rule in rules):  # neighbors exchanged
-        edits = Edit(first.start, first.end, second.text), Edit(second.start, second.end, first.text)
-        yield Change("order", edits)
+        yield exchanged("order", first, second)
     if rules and entry.node.span.text[:1] != "[":  # one after the other instead of at once
-        texts = [(rule.span, " ".join(rule.span.text.split())) for rule in rules]
-        yield Change("order", tuple(Edit(span.start, span.end, f"do: {text}") for span, text in texts))
+        yield written("order", rules[0].span.to(rules[-1].span), _in_turn([rule.span for rule in rules]))
+
+
+def _in_turn(rules: list[Span]) -> str:
+    """The text from the first to the last of some rules, each of which is a block of its own."""
+    text = rules[0].source.text
+    gaps = [text[first.end : second.start] for first, second in itertools.pairwise(rules)]
+    blocks = [f"do: {' '.join(rule.text.split())}" for rule in rules]
+    return "".join(itertools.chain.from_iterable(zip(blocks, [*gaps, ""], strict=True)))
 
 
 BLOCK: dict[str, EntryMistake] = {

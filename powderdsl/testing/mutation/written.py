@@ -119,8 +119,7 @@ def _digest(key: str) -> str:
 
 def _where(mutant: Mutant) -> str:
     """The words that were changed, as far as a name of a test can hold them."""
-    edit = mutant.edits[0]
-    old = " ".join(mutant.source.text[edit.start : edit.end].split())
+    old = " ".join(mutant.source.text[mutant.change.start : mutant.change.end].split())
     words = re.sub(r"[^A-Za-z0-9_ .<>=+*/()%-]", " ", old or mutant.pack)
     return " ".join(words.split())[:40].strip(" -") or mutant.pack
 
