@@ -59,14 +59,14 @@ def count(rules: str, packs: Sequence[str], jobs: int, worlds: bool = False) -> 
 
     `worlds`: also look for worlds that show survivors, which takes longer.
     """
-    from powderdsl.testing.mutation.judging import Original, Outcome, run_campaign, tally
+    from powderdsl.testing.mutation.judging import Original, Verdict, run_campaign, tally
 
     mutants = Original.of(rules).mutants(frozenset(packs))
     left = Counter(mutant.pack for mutant in mutants)
-    found: dict[str, list[Outcome]] = {pack: [] for pack in packs}
-    for outcome in run_campaign(rules, tuple(packs), list(range(len(mutants))), jobs, 0, worlds):
-        pack = mutants[outcome.number].pack
-        found[pack].append(outcome)
+    found: dict[str, list[Verdict]] = {pack: [] for pack in packs}
+    for number, verdict in run_campaign(rules, tuple(packs), list(range(len(mutants))), jobs, 0, worlds):
+        pack = mutants[number].pack
+        found[pack].append(verdict)
         left[pack] -= 1
         if sys.stderr.isatty():
             print(f"\r{rules}: {left.total()} left", end=" ", file=sys.stderr, flush=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
@@ -15,7 +15,7 @@ from powderdsl.cli.exits import FAILED, OK, BadInput
 from powderdsl.cli.output import counted, print_json, progress
 
 if TYPE_CHECKING:
-    from powderdsl.testing.mutation.judging import Outcome
+    from powderdsl.testing.mutation.judging import Verdict
     from powderdsl.testing.mutation.mutants import Mutant
     from powderdsl.testing.mutation.written import GeneratedTest
 
@@ -47,7 +47,7 @@ def report_mutants(names: Sequence[str], plan: MutationPlan) -> int:
 
 
 def _report(name: str, plan: MutationPlan) -> dict[str, Any]:
-    from powderdsl.testing.mutation.judging import Original, run_campaign, sampled
+    from powderdsl.testing.mutation.judging import Original, run_campaign, sampled, tally
 
     began = monotonic()
     settings = tuple(plan.settings.items())
@@ -58,56 +58,74 @@ def _report(name: str, plan: MutationPlan) -> dict[str, Any]:
         raise BadInput(f"--pack {unknown[0]}: {name} consists of {', '.join(loaded)}")
     mutants = original.mutants(frozenset(plan.packs))
     numbers = sampled(mutants, plan.mutants, plan.seed)
-    outcomes: dict[int, Outcome] = {}
+    verdicts: dict[int, Verdict] = {}
     jobs = plan.jobs or os.cpu_count() or 1
     events = run_campaign(name, plan.packs, numbers, jobs, plan.seed, settings=settings)
     interrupt: KeyboardInterrupt | None = None
     with progress(name, len(numbers), lines=True) as show:
         try:
-            for outcome in events:
-                outcomes[outcome.number] = outcome
-                alive = sum(one.verdict.status == "survived" for one in outcomes.values())
-                show(len(outcomes), f"{alive} survived")
+            for number, verdict in events:
+                verdicts[number] = verdict
+                alive = sum(one.status == "survived" for one in verdicts.values())
+                show(len(verdicts), f"{alive} survived")
         except KeyboardInterrupt as caught:
             interrupt = caught
         finally:
             events.close()  # its processes end
-    found = [(mutants[number], outcomes[number]) for number in sorted(outcomes)]
+    judged = [(mutants[number], verdicts[number]) for number in sorted(verdicts)]
+    packs = {
+        pack: [verdict for mutant, verdict in judged if mutant.pack == pack]
+        for pack in dict.fromkeys(mutant.pack for mutant, _ in judged)
+    }
     if not plan.as_json:
-        _tell(name, found, monotonic() - began, len(numbers), interrupt is not None)
+        click.echo("".join(f"{line}\n" for line in _survivors(judged)), nl=False)
+        if interrupt is not None:
+            click.echo(f"interrupted after {len(judged)} of {counted(len(numbers), 'mutant')}")
+        for pack, own in packs.items():
+            click.echo(f"{pack}: {summary(own)}")
+        click.echo(f"{name}: {summary(list(verdicts.values()))} in {monotonic() - began:.0f} s")
     if plan.write:
-        _write(found)
+        _write(judged)
     if interrupt is not None:
         raise interrupt
-    return _data(found)
+    return {
+        **tally(verdicts.values()),
+        "packs": {pack: tally(own) for pack, own in packs.items()},
+        "list": [_row(mutant, verdict) for mutant, verdict in judged if verdict.status != "invalid"],
+    }
 
 
-def _tell(
-    name: str, found: list[tuple[Mutant, Outcome]], seconds: float, planned: int, interrupted: bool
-) -> None:
-    for mutant, outcome in found:
-        if outcome.verdict.status != "survived":
-            continue
-        click.echo(f"survived  {mutant.place}: {mutant.operator}")
-        click.echo(f"      {mutant.diff}")
-        if outcome.size is None:
-            reason = f" ({outcome.verdict.detail})" if outcome.verdict.detail else ""
-            click.echo(f"      no world was found on which it differs{reason}")
-        elif outcome.test is not None:
-            click.echo("".join(f"        {line}\n" for line in outcome.test.text.splitlines()), nl=False)
-    if interrupted:
-        click.echo(f"interrupted after {len(found)} of {counted(planned, 'mutant')}")
-    for pack in dict.fromkeys(mutant.pack for mutant, _ in found):
-        own = [(mutant, outcome) for mutant, outcome in found if mutant.pack == pack]
-        click.echo(f"{pack}: {summary(own)}")
-    click.echo(f"{name}: {summary(found)} in {seconds:.0f} s")
+def _survivors(judged: Sequence[tuple[Mutant, Verdict]]) -> Iterator[str]:
+    """Each mutant that nothing noticed, with a test that would."""
+    for mutant, verdict in judged:
+        if verdict.status == "survived":
+            yield f"survived  {mutant.place}: {mutant.operator}"
+            yield f"      {mutant.diff}"
+            if verdict.test is None:
+                yield "      no world was found on which it differs"
+            else:
+                yield from (f"        {line}" for line in verdict.test.text.splitlines())
 
 
-def summary(found: Sequence[tuple[Mutant, Outcome]]) -> str:
+def _row(mutant: Mutant, verdict: Verdict) -> dict[str, Any]:
+    return {
+        "place": mutant.place,
+        "pack": mutant.pack,
+        "operator": mutant.operator,
+        "change": mutant.diff,
+        "status": verdict.status,
+        "by": verdict.by,
+        "detail": verdict.detail,
+        "test": verdict.test and verdict.test.text,
+        "differs_in": verdict.differs_in,
+    }
+
+
+def summary(verdicts: Sequence[Verdict]) -> str:
     """The number of mutants, and what noticed them."""
     from powderdsl.testing.mutation.judging import noticed_share, tally
 
-    counts = tally(outcome for _, outcome in found)
+    counts = tally(verdicts)
     by = ", ".join(f"{counts[key]} by {words}" for key, words in WORDS.items())
     return (
         f"{counted(counts['mutants'], 'mutant')}, {counts['equivalent']} equivalent,"
@@ -118,42 +136,17 @@ def summary(found: Sequence[tuple[Mutant, Outcome]]) -> str:
 WORDS = {"check": "`check`", "invariant": "invariants", "test": "tests", "generated": "generated tests"}
 
 
-def _write(found: list[tuple[Mutant, Outcome]]) -> None:
+def _write(judged: Sequence[tuple[Mutant, Verdict]]) -> None:
     from powderdsl.testing.mutation.written import add_tests
 
     tests: dict[Path, dict[str, GeneratedTest]] = {}
-    for mutant, outcome in found:
-        if outcome.test is not None:
-            body = outcome.test.text.split("\n", 1)[1]  # several mutants may be told apart by one world
-            tests.setdefault(Path(mutant.source.name), {}).setdefault(body, outcome.test)
+    for mutant, verdict in judged:
+        if verdict.test is not None:
+            body = verdict.test.text.split("\n", 1)[1]  # several mutants may be told apart by one world
+            tests.setdefault(Path(mutant.source.name), {}).setdefault(body, verdict.test)
     for path, some in tests.items():
         try:
             add_tests(path, list(some.values()))
         except ValueError as error:
             raise BadInput(str(error)) from None
         click.echo(f"{path}: {counted(len(some), 'generated test')} added", err=True)
-
-
-def _data(found: list[tuple[Mutant, Outcome]]) -> dict[str, Any]:
-    from powderdsl.testing.mutation.judging import tally
-
-    packs = dict.fromkeys(mutant.pack for mutant, _ in found)
-    return {
-        **tally(outcome for _, outcome in found),
-        "packs": {pack: tally(outcome for mutant, outcome in found if mutant.pack == pack) for pack in packs},
-        "list": [
-            {
-                "place": mutant.place,
-                "pack": mutant.pack,
-                "operator": mutant.operator,
-                "change": mutant.diff,
-                "status": outcome.verdict.status,
-                "by": outcome.verdict.by,
-                "detail": outcome.verdict.detail,
-                "test": outcome.test.text if outcome.test else None,
-                "differs_in": outcome.slot or None,
-            }
-            for mutant, outcome in found
-            if outcome.verdict.status != "invalid"
-        ],
-    }

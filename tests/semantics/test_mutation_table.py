@@ -64,16 +64,15 @@ def test_the_counts_of_a_pack_are_kept_when_others_are_counted_again():
 
 
 def test_each_pack_is_told_as_soon_as_it_is_counted(monkeypatch):
-    from powderdsl.testing.mutation import run
-    from powderdsl.testing.mutation.judging import Outcome, Verdict
+    from powderdsl.testing.mutation import judging
 
     def judged(rules, packs, numbers, jobs, seed, worlds):
         for number in numbers:
             if number > 12:  # in the middle of gas
                 raise KeyboardInterrupt
-            yield Outcome(number, Verdict("killed", "test"))
+            yield number, judging.Verdict("killed", "test")
 
-    monkeypatch.setattr(run, "run_campaign", judged)
+    monkeypatch.setattr(judging, "run_campaign", judged)
     found = table().count("powderworld", ["sand", "gas"], 1)
     assert next(found)["sand"]["killed"] == 10
     with pytest.raises(KeyboardInterrupt):

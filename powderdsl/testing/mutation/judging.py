@@ -13,7 +13,8 @@ from collections.abc import Generator, Iterable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
+from itertools import groupby
 from multiprocessing import Pipe, get_context
 from multiprocessing.connection import Connection, wait
 from threading import Thread
@@ -201,12 +202,15 @@ class Verdict:
     """The verdict on a mutant.
 
     `status` is ``killed``, ``survived``, ``equivalent`` (proven) or ``invalid`` (not a rule file); `by` is one of NOTICED
-    or how it was proven; `detail` is a code, an invariant's words or a test's name.
+    or how it was proven; `detail` is a code, an invariant's words or a test's name. `test` shows a survivor, by a world
+    that differs in the slot `differs_in`.
     """
 
     status: str
     by: str = ""
     detail: str = ""
+    differs_in: str | None = None
+    test: GeneratedTest | None = None
 
 
 def judge(original: Original, mutant: Mutant) -> Verdict:
@@ -248,32 +252,27 @@ def judge(original: Original, mutant: Mutant) -> Verdict:
 def failed_test(original: Original, sim: Simulator, pack: str, *, quick: bool) -> Example | None:
     """A test that the original passes and the mutant fails: one written by hand, if there is one.
 
-    `quick`: only tests that cost less than invariants; otherwise only the others.
+    `quick`: only tests that cost less than invariants; otherwise only the others. Tests run in groups: by hand before
+    generated, exact before counted, each of which runs many worlds, those of the mutated pack, short ones.
     """
-    for some in _portions(sim.ruleset, pack, quick):
-        # Without a scope: which added packs make a test fail does not matter here.
-        known = tuple(replace(one, scope=()) for one in some if one.name not in original.failing)
-        if known:
-            results = run_examples(replace(sim.ruleset, tests=known), sim=sim)
-            failed = next((one.example for one in results if not one.passed), None)
-            if failed is not None:
-                return failed
+
+    def group(example: Example) -> tuple[bool, str, bool, bool]:
+        counted = example.name if example.often else ""
+        return is_generated(example), counted, example.pack != pack, example.steps > FEW_STEPS
+
+    def is_quick(example: Example) -> bool:
+        return not (is_generated(example) or example.often or example.steps > FEW_STEPS)
+
+    tests = [
+        replace(example, scope=())  # which added packs make a test fail does not matter here
+        for example in sim.ruleset.tests
+        if is_quick(example) == quick and example.name not in original.failing
+    ]
+    for _, some in groupby(sorted(tests, key=group), group):
+        for result in run_examples(replace(sim.ruleset, tests=tuple(some)), sim=sim):
+            if not result.passed:
+                return result.example
     return None
-
-
-def _portions(ruleset: Ruleset, pack: str, quick: bool) -> Iterator[list[Example]]:
-    """Tests in portions: by hand before generated, exact before counted, those of the mutated pack, short ones."""
-    portions: dict[tuple[bool, bool, bool, bool], list[Example]] = {}
-    for one in ruleset.tests:
-        key = is_generated(one), bool(one.often), one.pack != pack, one.steps > FEW_STEPS
-        if quick != (not key[0] and not key[1] and not key[3]):
-            continue
-        portions.setdefault(key, []).append(one)
-    for (_, counted, _, _), some in sorted(portions.items(), key=lambda portion: portion[0]):
-        if counted:  # each of them runs many worlds: one is enough
-            yield from ([one] for one in some)
-        else:
-            yield some
 
 
 # Invariants
@@ -291,6 +290,9 @@ class _Mutated:
 
     def states(self, sample: Start, steps: int, random: Mapping[str, Array] | None = None) -> list[State]:
         return run_sample(self.sim, sample, steps, random)[0]
+
+    def of(self, ruleset: Ruleset) -> _Mutated:
+        return _Mutated(compile(ruleset, backend=AT_ONCE))
 
 
 def broken_invariant(original: Original, sim: Simulator) -> tuple[Invariant | None, bool]:
@@ -389,29 +391,6 @@ COUNTED = ("mutants", "equivalent", "killed", *NOTICED, "survived")
 """Keys of a tally. `killed` is the sum of what noticed them; texts that are not rule files are not counted."""
 
 
-@dataclass(frozen=True)
-class Task:
-    """A mutant by its place among all of a composition."""
-
-    rules: str
-    settings: Settings
-    packs: tuple[str, ...]
-    number: int
-    seed: int
-    worlds: bool
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """The verdict on a mutant. `size` is that of a world that shows a survivor: (rows, columns, steps)."""
-
-    number: int
-    verdict: Verdict
-    size: tuple[int, int, int] | None = None
-    slot: str = ""
-    test: GeneratedTest | None = None
-
-
 def sampled(mutants: list[Mutant], most: int | None, seed: int) -> list[int]:
     """Places of at most `most` mutants, each pack and kind of mistake in proportion, the same for the same seed."""
     everything = list(range(len(mutants)))
@@ -423,11 +402,9 @@ def sampled(mutants: list[Mutant], most: int | None, seed: int) -> list[int]:
     random = np.random.default_rng(seed)
     ranked: list[tuple[float, int]] = []
     for numbers in strata.values():
-        order = random.permutation(len(numbers))
         start = random.random()
-        ranked += [
-            ((rank + start) / len(numbers), numbers[place]) for rank, place in enumerate(order.tolist())
-        ]
+        shares = (np.arange(len(numbers)) + start) / len(numbers)
+        ranked += zip(shares.tolist(), random.permutation(numbers).tolist(), strict=True)
     return sorted(number for _, number in sorted(ranked)[:most])
 
 
@@ -439,10 +416,10 @@ def run_campaign(
     seed: int,
     worlds: bool = True,
     settings: Settings = (),
-) -> Generator[Outcome]:
-    """Outcomes of mutants in the order in which they come.
+) -> Generator[tuple[int, Verdict]]:
+    """Numbers of mutants with their verdicts, in the order in which they come.
 
-    Nothing is cut short by a clock: `check`, proofs and searches end by work, worlds and tests have a size. So outcomes
+    Nothing is cut short by a clock: `check`, proofs and searches end by work, worlds and tests have a size. So verdicts
     are the same on a slow or busy machine.
 
     Args:
@@ -454,15 +431,15 @@ def run_campaign(
         OSError: a process was killed, as where memory is short.
     """
     _loaded.cache_clear()  # files may have changed since
-    tasks = [Task(rules, settings, packs, number, seed, worlds) for number in numbers]
+    judged = partial(work, rules, settings, packs, seed, worlds)
     if jobs == 1:
-        yield from map(work, tasks)
+        yield from map(judged, numbers)
         return
     lifeline, ours = Pipe(duplex=False)
     # A fork of a process with threads of torch's may hang.
     pool = ProcessPoolExecutor(jobs, get_context("spawn"), _begin_process, (lifeline,))
     try:
-        for done in as_completed([pool.submit(work, task) for task in tasks]):
+        for done in as_completed([pool.submit(judged, number) for number in numbers]):
             yield done.result()
     except BrokenProcessPool:
         raise OSError("a process that judged mutants was killed; fewer `--jobs` need less memory") from None
@@ -488,21 +465,22 @@ def _loaded(rules: str, settings: Settings, packs: tuple[str, ...]) -> tuple[Ori
     return original, original.mutants(frozenset(packs))
 
 
-def work(task: Task) -> Outcome:
-    """Judge one mutant."""
-    original, mutants = _loaded(task.rules, task.settings, task.packs)
-    mutant = mutants[task.number]
+def work(
+    rules: str, settings: Settings, packs: tuple[str, ...], seed: int, worlds: bool, number: int
+) -> tuple[int, Verdict]:
+    """Judge the mutant of this number among all of a composition."""
+    original, mutants = _loaded(rules, settings, packs)
+    mutant = mutants[number]
     verdict = judge(original, mutant)
-    if verdict.status != "survived" or not task.worlds:
-        return Outcome(task.number, verdict)
+    if verdict.status != "survived" or not worlds:
+        return number, verdict
     ruleset, _ = original.mutated(mutant)
-    focus = focused(original, mutant)
-    found = distinguish(original.sim, compile(ruleset, backend=starting_backend("cpu")), focus, task.seed)
-    if found is None:
-        return Outcome(task.number, verdict)
-    rows, columns = found.sample.shape
-    test = written_test(mutant, found, original.sim, original.packs)
-    return Outcome(task.number, verdict, (rows, columns, found.steps), found.slot, test)
+    sim = compile(ruleset, backend=starting_backend("cpu"))
+    world = distinguish(original.sim, sim, focused(original, mutant), seed)
+    if world is None:
+        return number, verdict
+    test = written_test(mutant, world, original.sim, original.packs)
+    return number, replace(verdict, differs_in=world.slot, test=test)
 
 
 def focused(original: Original, mutant: Mutant) -> tuple[int, ...]:
@@ -517,16 +495,12 @@ def focused(original: Original, mutant: Mutant) -> tuple[int, ...]:
     )
 
 
-def tally(outcomes: Iterable[Outcome]) -> dict[str, int]:
+def tally(verdicts: Iterable[Verdict]) -> dict[str, int]:
     """Numbers of mutants by COUNTED."""
-    counts: Counter[str] = Counter()
-    for outcome in outcomes:
-        verdict = outcome.verdict
-        if verdict.status != "invalid":
-            counts["mutants"] += 1
-            counts[verdict.status] += 1
-            counts[verdict.by if verdict.status == "killed" else ""] += 1
-    return {key: counts[key] for key in COUNTED}
+    valid = [verdict for verdict in verdicts if verdict.status != "invalid"]
+    counts = Counter(verdict.status for verdict in valid)
+    counts += Counter(verdict.by for verdict in valid if verdict.status == "killed")
+    return {key: counts[key] for key in COUNTED} | {"mutants": len(valid)}
 
 
 def noticed_share(counts: dict[str, int]) -> float:
