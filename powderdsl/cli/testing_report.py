@@ -31,13 +31,7 @@ from powderdsl.testing.properties.outcomes import (
     write_example,
 )
 from powderdsl.testing.properties.running import Runner
-from powderdsl.testing.properties.search import (
-    InvariantSearch,
-    SearchPlan,
-    as_it_is,
-    find_property,
-    told_apart,
-)
+from powderdsl.testing.properties.search import InvariantSearch, SearchPlan, counterexample
 
 
 @dataclass
@@ -98,7 +92,7 @@ class TestingReport:
 
     def _properties(self, name: str, runner: Runner) -> list[Result]:
         search = InvariantSearch.of(runner, self.plan)
-        properties = {trial.prop.text: trial.prop for trial in search.trials}
+        properties = {trial.prop.text: trial.prop for trial in search.waiting}
         if self.keep:
             for prop, sample, steps in kept_examples(runner.ruleset, properties, name):
                 search.try_sample(sample, steps)
@@ -132,15 +126,15 @@ class TestingReport:
     def replay(self, name: str, ruleset: Ruleset, path: Path) -> None:
         """Try one counterexample again, as it is."""
         text, sample, steps = read_example(path, ruleset)
-        prop = find_property(ruleset, text)
+        runner = Runner(ruleset, self.backend)
+        search = InvariantSearch.of(runner, self.plan)
+        prop = next((trial.prop for trial in search.trials if trial.prop.text == text), None)
         if prop is None:
             raise BadInput(f"{path}: {ruleset.name} has no invariant `{text}`")
-        runner = Runner(ruleset, self.backend)
-        broken = bool(breaks(prop.claim, runner, sample, steps).first.any())
-        found = as_it_is(prop.claim, runner, sample, steps) if broken else None
-        result = Result(prop, "broken" if broken else "tested", 1, "", found)
-        if broken:
-            (result,) = told_apart([result], runner, self.plan)
+        result = Result(prop, "tested", 1, "")
+        if breaks(prop.claim, runner, sample, steps).first.any():
+            example = counterexample(prop.claim, runner, sample, steps)
+            (result,) = search.told_apart([Result(prop, "broken", 1, "", example)])
         self._tell(result, ruleset)
         self.failed |= not result.holds
         self.data[name] = {"properties": [result_data(result)]}

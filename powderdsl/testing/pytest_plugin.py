@@ -151,7 +151,7 @@ class PackItem(pytest.Item):
         from powderdsl.testing.properties.outcomes import counterexample_lines
 
         whole = search_of(self.ruleset, self.config.getoption("--powderdsl-worlds"))
-        search = whole.only(" ".join(self.subject.span.text.split()))
+        search = whole.only([" ".join(self.subject.span.text.split())])
         if search.trials:
             search.try_random()
             for outcome in search.finish():

@@ -156,26 +156,19 @@ class Session:
     def invariants(self) -> list[dict[str, Any]]:
         """Each invariant: `proven` and why, `tried` on worlds, or `broken` with a small world that breaks it."""
         from powderdsl.analysis.ledger import ledger
-        from powderdsl.testing.properties.blame import Oracle
         from powderdsl.testing.properties.outcomes import counterexample_lines
-        from powderdsl.testing.properties.refute import broken_invariants
-        from powderdsl.testing.properties.search import InvariantSearch, SearchPlan
+        from powderdsl.testing.properties.refute import quick_results
 
         rules = self._rules()
-        book = ledger(rules)
-        search = InvariantSearch.of(
-            Oracle(rules, rules.passes), SearchPlan(), declared_only=True, ledger=book
-        )
-        found = {text: ("proven", one.reason, one.prop.owner) for text, one in search.results.items()}
-        found |= {one.prop.text: ("tried", "", one.prop.owner) for one in search.trials}
-        for one in broken_invariants(rules, book):
-            assert one.counterexample is not None
-            lines = "\n".join(counterexample_lines(one.counterexample, rules))
-            found[one.prop.text] = (one.status, lines, one.prop.owner)
-        return [
-            {"text": text, "status": status, "note": note, "owner": owner}
-            for text, (status, note, owner) in found.items()
-        ]
+        rows = []
+        for one in quick_results(rules, ledger(rules)):
+            status, note = one.status, one.reason
+            if one.counterexample is not None:
+                note = "\n".join(counterexample_lines(one.counterexample, rules))
+            elif status != "proven":
+                status, note = "tried", ""
+            rows.append({"text": one.prop.text, "status": status, "note": note, "owner": one.prop.owner})
+        return rows
 
     def tests(self, pack: str) -> list[dict[str, Any]]:
         """Each test of a pack: its place, and what failed, with the world then."""

@@ -16,7 +16,7 @@ from powderdsl.diagnostics import CompileError, Diagnostic, Severity
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Ruleset
 from powderdsl.testing.pack_tests.runner import run_examples
-from powderdsl.testing.properties.refute import broken_invariants
+from powderdsl.testing.properties.refute import quick_results
 
 ROOT = Path(__file__).resolve().parents[2]
 RULES = ROOT / "rules"
@@ -88,9 +88,9 @@ def try_mutation(mutation: Mutation, folder: Path) -> Caught:
         results = run_examples(replace(ruleset, tests=named))
         return Caught((), tuple(result.example.name for result in results if not result.passed))
     some = tuple(one for one in ruleset.invariants if not statement or one_line(one.span) == statement)
-    broken = broken_invariants(replace(ruleset, invariants=some), ledger(ruleset))
+    broken = quick_results(replace(ruleset, invariants=some), ledger(ruleset))
     worlds = [one.counterexample for one in broken if one.counterexample and not one.holds]
-    sizes = [(*world.before.shape, world.steps) for world in worlds]
+    sizes = [(*world.sample.shape, world.steps) for world in worlds]
     return Caught(("PD512",), (), sizes[0]) if sizes else Caught()
 
 

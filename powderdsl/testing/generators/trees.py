@@ -1,9 +1,10 @@
-"""YAML as plain Python values, written and read, with arrays that people can read: the last axis a line of numbers."""
+"""Start worlds as YAML that people can read: plain Python values, the last axis of an array a line of numbers."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,13 @@ import yaml
 
 from powderdsl.arrays import NDArray, np
 from powderdsl.diagnostics import CompileError, Reporter
+from powderdsl.model.state import slots
 from powderdsl.model.text import show_single
+from powderdsl.model.types import Ruleset
 from powderdsl.syntax.sources import read_source
 from powderdsl.syntax.yaml_tree import Mapping, Node, Scalar, parse_yaml
 from powderdsl.system.writing import failure
+from powderdsl.testing.generators.cases import Start
 
 Array = NDArray[Any]
 
@@ -68,10 +72,41 @@ def line_of(tree: Tree) -> str:
     return tree
 
 
-def entries_of(tree: Tree | None) -> list[tuple[str, Tree]]:
-    """The entries of a mapping; no entries for None. Raises AssertionError for anything else."""
-    assert tree is None or isinstance(tree, dict)
-    return list((tree or {}).items())
+def start_tree(start: Start) -> dict[str, Tree]:
+    """Start worlds as a tree."""
+    tree: dict[str, Tree] = {
+        "seed": str(start.seed[0]),
+        "step": str(start.step[0]),
+        "worlds": write_array(start.ids),
+    }
+    if (start.index != np.arange(len(start))).any():
+        tree["index"] = write_array(start.index)
+    for name, arrays in (("fields", start.fields), ("params", start.params)):
+        if arrays:
+            tree[name] = {key: write_array(values) for key, values in arrays.items()}
+    return tree
+
+
+def read_start(tree: Tree, ruleset: Ruleset) -> Start:
+    """The start worlds of a tree, without parameters that the rules do not have. Raises as `read_array` for others."""
+    assert isinstance(tree, dict)
+    ids = read_array(tree["worlds"], "uint8")
+    if ids.ndim != 3 or not ids.size or not np.isin(ids, [element.id for element in ruleset.elements]).all():
+        raise ValueError("cells of elements that the rules do not have")
+    types = {slot.name: slot.dtype for slot in slots(ruleset)}
+    fields, params = tree.get("fields", {}), tree.get("params", {})
+    assert isinstance(fields, dict)
+    assert isinstance(params, dict)
+    planes = {name: read_array(rows, types[name]) for name, rows in fields.items()}
+    if any((len(values), *values.shape[-2:]) != ids.shape for values in planes.values()):
+        raise ValueError("a field of another size than the world")
+    known = {param.name for param in ruleset.params}
+    numbers = {name: read_array(row, "float64") for name, row in params.items() if name in known}
+    seed, step = int(line_of(tree["seed"])), int(line_of(tree["step"]))
+    if min(seed, step) < 0:
+        raise ValueError("a seed or a step below 0")
+    start = Start.fresh(ids, seed, step, planes, numbers)
+    return replace(start, index=read_array(tree["index"], "int64")) if "index" in tree else start
 
 
 @contextmanager

@@ -38,6 +38,10 @@ class Oracle:
     ruleset: Ruleset
     last: tuple[Pass, ...]
 
+    def of(self, ruleset: Ruleset) -> Oracle:
+        """Runs other rules in the same way."""
+        return Oracle(ruleset, ruleset.passes)
+
     def states(self, sample: Start, steps: int, random: Mapping[str, Array] | None = None) -> list[State]:
         states = reference_states(self.ruleset, sample, steps - 1, random)
         cut = replace(self.ruleset, passes=self.last)
@@ -137,7 +141,9 @@ def difference(prop: Property, ruleset: Ruleset, found: Counterexample) -> Diffe
         return Difference(tuple(pack for pack in added if pack in named), tuple(causes))
     names = {element.id: element.name for element in ruleset.elements}
     near = frozenset(
-        names[number] for ids in (found.before, found.after) for number in np.unique(ids).tolist()
+        names[number]
+        for state in (found.before, found.after)
+        for number in np.unique(state["element"]).tolist()
     )
     return Difference(packs, tuple(cause for pack in packs for cause in doings(pack, ruleset, near)[:3]))
 
@@ -179,7 +185,7 @@ def pack_of_line(ruleset: Ruleset) -> dict[Span, str]:
 def _elements(found: Counterexample, ruleset: Ruleset, added: tuple[str, ...]) -> Iterator[Cause]:
     """The elements of added packs that the world holds."""
     names = {slot.name for slot in slots(ruleset) if slot.kind.name == "element"}
-    arrays = [found.before, found.after]
+    arrays = [found.before["element"], found.after["element"]]
     arrays += [values for name, values in found.sample.fields.items() if name in names]
     there = {int(number) for values in arrays for number in np.unique(values)}
     for element in ruleset.elements:

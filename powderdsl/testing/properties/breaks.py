@@ -58,6 +58,8 @@ class Runs(Protocol):
 
     def states(self, sample: Start, steps: int, random: Mapping[str, Array] | None = None) -> list[State]: ...
 
+    def of(self, ruleset: Ruleset) -> Runs: ...
+
 
 @dataclass(frozen=True)
 class Breaks:

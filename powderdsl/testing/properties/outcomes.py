@@ -22,12 +22,11 @@ from powderdsl.system.writing import failure, replacing
 from powderdsl.testing.generators.cases import Array, Start, fresh
 from powderdsl.testing.generators.trees import (
     Tree,
-    entries_of,
     line_of,
-    read_array,
+    read_start,
     read_yaml,
     reading,
-    write_array,
+    start_tree,
     write_yaml,
 )
 from powderdsl.testing.properties.breaks import Tested
@@ -65,18 +64,16 @@ class Property:
 class Counterexample:
     """A small world that breaks a property after some steps.
 
-    `before` and `after` are ids [H, W] at the start and after the last step, `cell` is where it is broken.
-    `culprits` are the lines of rules without which the last step would not have broken it. `shown` are the fields
-    [H, W] that colors follow, by name, before and after.
+    `before` and `after` are states at the start and after the last step: ids [H, W] and the fields that colors follow.
+    `cell` is where it is broken, `culprits` are the lines of rules without which the last step would not have broken it.
     """
 
     sample: Start
     steps: int
-    before: Array
-    after: Array
+    before: Mapping[str, Array]
+    after: Mapping[str, Array]
     cell: tuple[int, int]
     culprits: tuple[Span, ...]
-    shown: tuple[Mapping[str, Array], Mapping[str, Array]]
 
 
 @dataclass(frozen=True)
@@ -130,13 +127,13 @@ def counterexample_lines(found: Counterexample, ruleset: Ruleset) -> Iterator[st
     glyphs = {element.id: element.glyph for element in ruleset.elements}
     columns = [
         [title, *(" ".join(glyphs.get(number, "?") for number in row) for row in ids[:MAX_DRAWN, :MAX_DRAWN].tolist())]
-        for title, ids in (("before", found.before), ("after", found.after))
+        for title, ids in (("before", found.before["element"]), ("after", found.after["element"]))
     ]  # fmt: skip
     width = max(len(line) for lines in columns for line in lines) + 3
     for lines in zip(*columns, strict=True):
         yield "".join(line.ljust(width) for line in lines).rstrip()
     names = {element.id: element.name for element in ruleset.elements}
-    there = np.unique([*found.before.reshape(-1), *found.after.reshape(-1)]).tolist()
+    there = np.unique([found.before["element"], found.after["element"]]).tolist()
     yield ", ".join(f"{glyphs[number]} {names[number]}" for number in there if number in names)
     yield from _field_lines(found, ruleset, names)
     for name, values in found.sample.params.items():
@@ -176,10 +173,10 @@ def picture(found: Counterexample, ruleset: Ruleset) -> Array:
     from powderdsl.simulation.draw import contact_sheet
 
     colors, ramped, tinted = palette(ruleset.elements), ramps(ruleset.elements), tints(ruleset.fields)
-    factor = max(1, min(32, 512 // max(found.before.shape)))
+    factor = max(1, min(32, 512 // max(found.sample.shape)))
     images = [
-        scale(rgb(ids, colors, ramps=ramped, tints=tinted, fields=fields), factor)
-        for ids, fields in zip((found.before, found.after), found.shown, strict=True)
+        scale(rgb(state["element"], colors, ramps=ramped, tints=tinted, fields=state), factor)
+        for state in (found.before, found.after)
     ]
     return contact_sheet(images, columns=2, gap=8)
 
@@ -199,8 +196,8 @@ def result_data(result: Result) -> dict[str, Any]:
     found = result.counterexample
     if found is not None:
         data["counterexample"] = {
-            "before": found.before.tolist(),
-            "after": found.after.tolist(),
+            "before": found.before["element"].tolist(),
+            "after": found.after["element"].tolist(),
             "steps": found.steps,
             "row": found.cell[0],
             "column": found.cell[1],
@@ -247,19 +244,8 @@ def write_example(path: Path, rules: str, prop: Property, found: Counterexample)
     Raises:
         CompileError: PD613, the file cannot be written.
     """
-    sample = found.sample
-    tree: dict[str, Tree] = {
-        "rules": rules,
-        "property": prop.text,
-        "steps": str(found.steps),
-        "seed": str(int(sample.seed[0])),
-        "clock": str(int(sample.step[0])),
-        "world": write_array(sample.ids[0]),
-    }
-    if sample.fields:
-        tree["fields"] = {name: write_array(values[0]) for name, values in sample.fields.items()}
-    if sample.params:
-        tree["params"] = {name: repr(float(values[0])) for name, values in sample.params.items()}
+    tree: dict[str, Tree] = {"rules": rules, "property": prop.text, "steps": str(found.steps)}
+    tree |= start_tree(found.sample)
     head = f"# Breaks `{prop.text}` ({prop.place or prop.owner})\n"
     head += f"# Again: powderdsl test {rules} --replay {path}\n"
     if not path.resolve().is_relative_to(Path.cwd()) and not path.is_absolute():
@@ -279,21 +265,10 @@ def read_example(path: Path, ruleset: Ruleset) -> tuple[str, Start, int]:
     problem = f"{path} is not a counterexample for {ruleset.name}"
     with reading(problem, "a counterexample is written by `powderdsl test`"):
         assert isinstance(tree, dict)
-        dtypes = {slot.name: slot.dtype for slot in slots(ruleset)}
-        ids = read_array(tree["world"], "uint8")
-        known = [element.id for element in ruleset.elements]
-        if ids.ndim != 2 or not ids.size or not np.isin(ids, known).all():
-            raise ValueError("cells of elements that the rules do not have")
-        fields = {name: read_array(rows, dtypes[name])[None] for name, rows in entries_of(tree.get("fields"))}
-        if any(values.shape[-2:] != ids.shape for values in fields.values()):
-            raise ValueError("a field of another size than the world")
-        names = {param.name for param in ruleset.params}
-        given = [(name, text) for name, text in entries_of(tree.get("params")) if name in names]
-        params = {name: np.array([float(line_of(text))]) for name, text in given}
-        steps, seed, clock = (int(line_of(tree[key])) for key in ("steps", "seed", "clock"))
-        if not 1 <= steps <= 100_000 or min(seed, clock) < 0:
-            raise ValueError("a number of steps that no test has")
-        return line_of(tree["property"]), Start.fresh(ids, seed, clock, fields, params), steps
+        start, steps = read_start(tree, ruleset), int(line_of(tree["steps"]))
+        if len(start) != 1 or not 1 <= steps <= 100_000:
+            raise ValueError("more than one world, or a number of steps that no test has")
+        return line_of(tree["property"]), start, steps
 
 
 def kept_examples(

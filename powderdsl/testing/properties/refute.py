@@ -6,8 +6,9 @@ breaks an invariant refutes it. If no world does, nothing is proven; `powderdsl 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import ClassVar
 
 from powderdsl.analysis.changes import RuleLine
 from powderdsl.analysis.ledger import Ledger
@@ -16,18 +17,11 @@ from powderdsl.diagnostics import Diagnostic, Label, Reporter
 from powderdsl.model.restrict import Cause, Difference
 from powderdsl.model.text import place_of
 from powderdsl.model.types import Ruleset
-from powderdsl.testing.generators.cases import Start
 from powderdsl.testing.properties.blame import Oracle
 from powderdsl.testing.properties.breaks import Alike
 from powderdsl.testing.properties.outcomes import Result, counterexample_lines
 from powderdsl.testing.properties.running import random_samples
-from powderdsl.testing.properties.search import (
-    InvariantSearch,
-    SearchPlan,
-    counterexample,
-    told_apart,
-)
-from powderdsl.testing.properties.shrink import Work
+from powderdsl.testing.properties.search import InvariantSearch, SearchPlan
 
 WORLDS = 256
 """Small worlds that are tried, and a few larger ones: enough for frequent mistakes."""
@@ -40,9 +34,6 @@ FOCUSED = 2
 FEW = 4
 """A set of this many elements or more does not show what a line is about."""
 
-WORK = 200_000_000
-"""Work for making all the worlds that were found smaller: some seconds."""
-
 
 def refuted(ruleset: Ruleset, ledger: Ledger) -> tuple[Diagnostic, ...]:
     """An error for each invariant that a world breaks, a note for each that only added packs break.
@@ -50,8 +41,9 @@ def refuted(ruleset: Ruleset, ledger: Ledger) -> tuple[Diagnostic, ...]:
     The same rules give the same worlds.
     """
     reporter = Reporter()
-    for one in broken_invariants(ruleset, ledger):
-        assert one.counterexample is not None
+    for one in quick_results(ruleset, ledger):
+        if one.counterexample is None:
+            continue
         world = [line for line in counterexample_lines(one.counterexample, ruleset) if line[:3] != "by "]
         if one.difference is not None:
             _report_difference(one, one.difference, world, reporter)
@@ -93,41 +85,31 @@ def _report_difference(one: Result, found: Difference, world: Sequence[str], rep
     )
 
 
-def broken_invariants(ruleset: Ruleset, ledger: Ledger) -> list[Result]:
-    """The invariants that a few worlds break, each with a world that was made small."""
-    oracle = Oracle(ruleset, ruleset.passes)
-    search = InvariantSearch.of(oracle, SearchPlan(), declared_only=True, ledger=ledger)
-    _try_worlds(search)
-    broken = [trial for trial in search.trials if trial.sample is not None]
-    found = []
-    for trial in broken:
-        assert trial.sample is not None
-        work, gone = Work(ruleset, WORK // len(broken)), trial.prop.without
-        small = counterexample(trial.claim, oracle, trial.sample, trial.steps, work, gone)
-        found.append(Result(trial.prop, "broken", trial.worlds, "", small))
-    return told_apart(found, oracle, SearchPlan(), _try_worlds)
+class QuickSearch(InvariantSearch):
+    """Tries a few worlds, and the first of them once more with few elements."""
+
+    # Where mirrored numbers are used in another way only frequencies can tell: thousands of worlds.
+    few: ClassVar[Mapping[type, int]] = {**InvariantSearch.few, Alike: 0}
+    work: ClassVar[int] = 200_000_000  # for all the worlds that were found: some seconds
+
+    def try_random(self) -> None:
+        """Run a few worlds."""
+        for number, sample in enumerate(random_samples(self.runner.ruleset, 0, WORLDS)):
+            if not self.waiting:
+                return
+            self.try_sample(sample, STEPS)
+            for trial in self.waiting if number < FOCUSED else ():
+                kinds = _concerned(self, trial.doubts)
+                if kinds:
+                    ids = np.array(kinds, np.uint8)[sample.ids % len(kinds)]
+                    replace(self, trials=[trial]).try_sample(replace(sample, ids=ids, fields={}), STEPS)
 
 
-def _try_worlds(search: InvariantSearch) -> None:
-    """Run a few worlds."""
-    for number, sample in enumerate(random_samples(search.runner.ruleset, 0, WORLDS)):
-        # Where mirrored numbers are used in another way only frequencies can tell: thousands of worlds.
-        search.trials = [trial for trial in search.trials if not isinstance(trial.claim, Alike)]
-        if not search.trials:
-            break
-        search.try_sample(sample, STEPS)
-        if number < FOCUSED:
-            _try_focused(search, sample)
-
-
-def _try_focused(search: InvariantSearch, sample: Start) -> None:
-    """Try the same worlds with only those elements that the lines in the way of a proof are about."""
-    for trial in search.trials:
-        kinds = _concerned(search, trial.doubts)
-        if kinds and trial.sample is None:
-            ids = np.array(kinds, np.uint8)[sample.ids % len(kinds)]
-            few = replace(sample, ids=ids, fields={})
-            InvariantSearch(search.runner, search.plan, search.ledger, {}, [trial]).try_sample(few, STEPS)
+def quick_results(ruleset: Ruleset, ledger: Ledger) -> list[Result]:
+    """What a proof or a few worlds say of each invariant; a world that breaks one is made small."""
+    search = QuickSearch.of(Oracle(ruleset, ruleset.passes), SearchPlan(), declared_only=True, ledger=ledger)
+    search.try_random()
+    return search.finish()
 
 
 def _concerned(search: InvariantSearch, lines: tuple[RuleLine, ...]) -> list[int]:

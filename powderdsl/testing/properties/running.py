@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from powderdsl.analysis.reactions import unchanging_ids
@@ -34,7 +35,15 @@ class Runner:
         self.lines = rule_spans(ruleset)
         self.happened: set[Span] = set()
         self.worlds_run = 0
-        self.sim = compile_any(marked(ruleset), self.backend)
+
+    @cached_property
+    def sim(self) -> AnySimulator[Any]:
+        """Runs the rules and sets flags for the lines that happen."""
+        return compile_any(marked(self.ruleset), self.backend)
+
+    def of(self, ruleset: Ruleset) -> Runner:
+        """Runs other rules in the same way."""
+        return Runner(ruleset, self.backend)
 
     def states(self, sample: Start, steps: int, random: Mapping[str, Array] | None = None) -> list[State]:
         """The state at the start and after each step, in storage dtypes. `random`: draws for all streams."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from time import monotonic
+from typing import ClassVar, Self
 
 from powderdsl.analysis.changes import RuleLine
-from powderdsl.analysis.ledger import Ledger, NotProven, Proven
+from powderdsl.analysis.ledger import Ledger, Proven
 from powderdsl.analysis.ledger import ledger as make_ledger
 from powderdsl.analysis.proofs import prove
 from powderdsl.arrays import np
@@ -17,7 +18,7 @@ from powderdsl.model.text import one_line
 from powderdsl.model.types import Never, Ruleset, Symmetric, Total
 from powderdsl.simulation.draw import shown_fields
 from powderdsl.testing.generators.cases import Start
-from powderdsl.testing.properties.blame import Oracle, culprits, difference, translated
+from powderdsl.testing.properties.blame import culprits, difference, translated
 from powderdsl.testing.properties.breaks import (
     Agreement,
     Alike,
@@ -31,8 +32,8 @@ from powderdsl.testing.properties.breaks import (
     steps_for,
 )
 from powderdsl.testing.properties.outcomes import Counterexample, Property, Result
-from powderdsl.testing.properties.running import LARGE, Runner, random_samples
-from powderdsl.testing.properties.shrink import Work, shrink
+from powderdsl.testing.properties.running import LARGE, random_samples
+from powderdsl.testing.properties.shrink import WORK, Work, shrink
 
 AUTOMATIC = "automatic"
 
@@ -41,9 +42,6 @@ STEPS = (3, 3, 3, 10)
 
 COPIES = 1024
 """How often a world runs where only frequencies can be compared."""
-
-FEW = {Agreement: 2, Alike: 2, Never: 8}
-"""Batches for claims that are expensive to check: by the oracle, in many copies, over many steps."""
 
 
 @dataclass(frozen=True)
@@ -56,11 +54,12 @@ class SearchPlan:
 
 
 @dataclass
-class _Trial:
-    """A property that is being tested."""
+class Trial:
+    """A property that is proven or tested. `reason` is the proof, or what the test is about."""
 
     prop: Property
-    note: str
+    is_proven: bool
+    reason: str = ""
     doubts: tuple[RuleLine, ...] = ()
     """The lines that stand in the way of a proof."""
     worlds: int = 0
@@ -80,35 +79,43 @@ class InvariantSearch:
     runner: Runs
     plan: SearchPlan
     ledger: Ledger
-    results: dict[str, Result] = field(default_factory=dict)
-    trials: list[_Trial] = field(default_factory=list)
+    trials: list[Trial] = field(default_factory=list)
+
+    few: ClassVar[Mapping[type, int]] = {Agreement: 2, Alike: 2, Never: 8}
+    """Batches for claims that are expensive to check: by the oracle, in many copies, over many steps."""
+    work: ClassVar[int] = WORK
+    """Work for making a world small."""
 
     @classmethod
     def of(
         cls, runner: Runs, plan: SearchPlan, declared_only: bool = False, ledger: Ledger | None = None
-    ) -> InvariantSearch:
+    ) -> Self:
         """Prove what can be proven; the rest is to be tried. `declared_only`: leave out what no pack claims.
 
         `ledger`: that of the rules, if it is known already.
         """
         ledger = ledger or make_ledger(runner.ruleset)
         search = cls(runner, plan, ledger)
-        for one in properties_of(runner.ruleset, ledger):
-            declared = one.owner != AUTOMATIC
-            if declared_only and not declared:
+        for prop in properties_of(runner.ruleset, ledger):
+            if prop.owner == AUTOMATIC:
+                search.trials += [] if declared_only else [Trial(prop, False)]
                 continue
-            verdict = prove(one.claim, runner.ruleset, ledger, one.without) if declared else NotProven("")  # type: ignore[arg-type]
+            verdict = prove(prop.claim, runner.ruleset, ledger, prop.without)  # type: ignore[arg-type]
             if isinstance(verdict, Proven):
                 given = f", given {verdict.given}" if verdict.given else ""
-                search.results[one.text] = Result(one, "proven", 0, verdict.reason + given)
+                search.trials.append(Trial(prop, True, verdict.reason + given))
             else:
-                search.trials.append(_Trial(one, "", verdict.rules))
+                search.trials.append(Trial(prop, False, doubts=verdict.rules))
         return search
 
-    def only(self, text: str) -> InvariantSearch:
-        """The same search for one property alone; for none if it is proven."""
-        trials = [replace(trial) for trial in self.trials if trial.prop.text == text]
-        return InvariantSearch(self.runner, self.plan, self.ledger, {}, trials)
+    @property
+    def waiting(self) -> list[Trial]:
+        """What is neither proven nor broken."""
+        return [trial for trial in self.trials if not trial.is_proven and trial.sample is None]
+
+    def only(self, texts: Collection[str]) -> Self:
+        """The same search for some properties alone that are not proven."""
+        return replace(self, trials=[replace(trial) for trial in self.waiting if trial.prop.text in texts])
 
     def try_random(self) -> None:
         """Try random worlds until there are enough of them, or time is up."""
@@ -116,20 +123,19 @@ class InvariantSearch:
         for number, sample in enumerate(
             random_samples(self.runner.ruleset, self.plan.seed, self.plan.examples)
         ):
-            if monotonic() > until:
+            if monotonic() > until or not self.waiting:
                 return
             self.try_sample(sample, STEPS[number % len(STEPS)])
 
     def try_sample(self, sample: Start, steps: int) -> None:
         """Check all properties that are not broken yet on some worlds."""
-        waiting: dict[frozenset[int], list[_Trial]] = {}
-        for trial in self.trials:
-            if trial.sample is None:
-                waiting.setdefault(trial.prop.without, []).append(trial)
+        waiting: dict[frozenset[int], list[Trial]] = {}
+        for trial in self.waiting:
+            waiting.setdefault(trial.prop.without, []).append(trial)
         for without, trials in waiting.items():
             self._try_without(trials, sample.without(without, self.runner.ruleset), steps)
 
-    def _try_without(self, trials: list[_Trial], sample: Start, steps: int) -> None:
+    def _try_without(self, trials: list[Trial], sample: Start, steps: int) -> None:
         """Properties that demand the same of a start world: one run does for most of them."""
         shared = [t for t in trials if not is_paired(t.claim) and steps_for(t.claim, steps) == steps]
         if shared:
@@ -139,7 +145,7 @@ class InvariantSearch:
         for trial in trials:
             if trial in shared:
                 continue
-            most = FEW.get(type(trial.claim))
+            most = self.few.get(type(trial.claim))
             large = isinstance(trial.claim, Agreement) and sample.shape == LARGE
             if most is not None and trial.batches >= most and not large:
                 continue
@@ -147,7 +153,7 @@ class InvariantSearch:
             ran = steps_for(trial.claim, min(steps, 3))
             self._note(trial, some, breaks(trial.claim, self.runner, some, ran))
 
-    def _note(self, trial: _Trial, sample: Start, found: Breaks) -> None:
+    def _note(self, trial: Trial, sample: Start, found: Breaks) -> None:
         trial.batches += 1
         trial.worlds += int(found.counts.sum())
         broken = np.nonzero(found.first)[0]
@@ -158,108 +164,69 @@ class InvariantSearch:
             # The same numbers may be used in another way: then worlds agree in how often things happen.
             turn = trial.claim.turn
             trial.prop = replace(trial.prop, claim=Alike(turn, COPIES))
-            trial.note, trial.batches, trial.worlds = "in how often things happen", 0, 0
+            trial.reason, trial.batches, trial.worlds = "in how often things happen", 0, 0
             return
         trial.sample, trial.steps = sample.one(first), int(found.first[first])
 
     def finish(self) -> list[Result]:
         """Make what was found small and name the rules; the results in the order of the properties."""
-        for trial in self.trials:
-            if trial.sample is None:
-                status = "tested" if trial.worlds else "untested"
-                note = trial.note if trial.worlds else "no random world starts as it demands"
-                self.results[trial.prop.text] = Result(trial.prop, status, trial.worlds, note)
-            else:
-                gone = trial.prop.without
-                example = counterexample(trial.claim, self.runner, trial.sample, trial.steps, without=gone)
-                self.results[trial.prop.text] = Result(
-                    trial.prop, "broken", trial.worlds, trial.note, example
-                )
-        broken = [result for result in self.results.values() if result.status == "broken"]
-        for result in told_apart(broken, self.runner, self.plan):
-            self.results[result.prop.text] = result
-        order = [one.text for one in properties_of(self.runner.ruleset, self.ledger)]
-        return sorted(self.results.values(), key=lambda result: order.index(result.prop.text))
+        broken = sum(trial.sample is not None for trial in self.trials)
+        return self.told_apart([self._result(trial, broken) for trial in self.trials])
+
+    def _result(self, trial: Trial, broken: int) -> Result:
+        if trial.is_proven:
+            return Result(trial.prop, "proven", 0, trial.reason)
+        if trial.sample is None:
+            if not trial.worlds:
+                return Result(trial.prop, "untested", 0, "no random world starts as it demands")
+            return Result(trial.prop, "tested", trial.worlds, trial.reason)
+        work = Work(self.runner.ruleset, self.work // broken)
+        small = shrink(trial.claim, self.runner, trial.sample, trial.steps, work, trial.prop.without)
+        example = counterexample(trial.claim, self.runner, *small)
+        return Result(trial.prop, "broken", trial.worlds, trial.reason, example)
+
+    def told_apart(self, results: Sequence[Result]) -> list[Result]:
+        """The same results; an invariant that holds in its scope, without added packs, is marked as different."""
+        ruleset = self.runner.ruleset
+        scopes: dict[tuple[str, ...], dict[str, Counterexample]] = {}
+        for result in results:
+            scope = result.prop.scope
+            if result.counterexample is not None and scope and ruleset.added_to(scope):
+                scopes.setdefault(scope, {})[result.prop.text] = result.counterexample
+        differ = {
+            text
+            for scope, worlds in scopes.items()
+            for text in worlds.keys() - self._broken_in(scope, worlds)
+        }
+        return [
+            replace(one, status="differs", difference=difference(one.prop, ruleset, one.counterexample))
+            if one.prop.text in differ and one.counterexample is not None
+            else one
+            for one in results
+        ]
+
+    def _broken_in(self, scope: tuple[str, ...], worlds: Mapping[str, Counterexample]) -> Set[str]:
+        """Which invariants some world breaks with the packs of a scope alone; `worlds` break them with more packs."""
+        alone = restricted(self.runner.ruleset, scope)
+        if alone is None:
+            return worlds.keys()
+        search = self.of(self.runner.of(alone), self.plan, declared_only=True).only(worlds)
+        for world in worlds.values():
+            sample = translated(world.sample, self.runner.ruleset, alone)
+            if sample is not None:
+                search.try_sample(sample, world.steps)
+        search.try_random()
+        return {trial.prop.text for trial in search.trials if trial.sample is not None}
 
 
-def told_apart(
-    broken: Sequence[Result],
-    runner: Runs,
-    plan: SearchPlan,
-    attempt: Callable[[InvariantSearch], object] = InvariantSearch.try_random,
-) -> list[Result]:
-    """The same results; an invariant that holds in its scope, without added packs, is marked as different.
-
-    Args:
-        attempt: runs worlds in a search on the rules of a scope.
-    """
-    ruleset = runner.ruleset
-    scopes: dict[tuple[str, ...], list[Result]] = {}
-    for result in broken:
-        if result.prop.scope and ruleset.added_to(result.prop.scope):
-            scopes.setdefault(result.prop.scope, []).append(result)
-    differ: set[str] = set()
-    for scope, results in scopes.items():
-        alone = restricted(ruleset, scope)
-        if alone is not None:
-            search = trials_alone(alone, ruleset, results, plan, runner)
-            if search.trials:
-                attempt(search)
-            false = {trial.prop.text for trial in search.trials if trial.sample is not None}
-            differ |= {one.prop.text for one in results} - false
-    return [
-        replace(one, status="differs", difference=difference(one.prop, ruleset, one.counterexample))
-        if one.prop.text in differ and one.counterexample is not None
-        else one
-        for one in broken
-    ]
-
-
-def trials_alone(
-    alone: Ruleset, ruleset: Ruleset, results: Sequence[Result], plan: SearchPlan, runner: Runs
-) -> InvariantSearch:
-    """A search for what breaks some invariants on the rules of their scope; the worlds that were found come first."""
-    search = InvariantSearch.of(Oracle(alone, alone.passes), plan, declared_only=True)
-    texts = {result.prop.text for result in results}
-    trials = [trial for trial in search.trials if trial.prop.text in texts]
-    if trials and isinstance(runner, Runner):
-        search = replace(search, runner=Runner(alone, runner.backend))
-    search = replace(search, trials=trials)
-    for result in results if trials else ():
-        found = result.counterexample
-        sample = translated(found.sample, ruleset, alone) if found else None
-        if found is not None and sample is not None:
-            search.try_sample(sample, found.steps)
-    return search
-
-
-def counterexample(
-    claim: Tested,
-    runner: Runs,
-    sample: Start,
-    steps: int,
-    work: Work | None = None,
-    without: frozenset[int] = frozenset(),
-) -> Counterexample:
-    """A world that breaks a claim, as small as the work allows. It starts without the elements `without`."""
-    return as_it_is(claim, runner, *shrink(claim, runner, sample, steps, work, without))
-
-
-def as_it_is(claim: Tested, runner: Runs, small: Start, steps: int) -> Counterexample:
-    """A world that breaks a claim, and the rules that did it."""
-    cell = breaks(claim, runner, small, steps).cell[0]
-    states = runner.states(small, steps)
-    names = shown_fields(runner.ruleset)
+def counterexample(claim: Tested, runner: Runs, sample: Start, steps: int) -> Counterexample:
+    """A world that breaks a claim, as it is, and the rules that did it."""
+    cell = breaks(claim, runner, sample, steps).cell[0]
+    states = runner.states(sample, steps)
+    names = ("element", *shown_fields(runner.ruleset))
     before, after = ({name: state[name][0] for name in names} for state in (states[0], states[-1]))
-    return Counterexample(
-        small,
-        steps,
-        states[0]["element"][0],
-        states[-1]["element"][0],
-        (int(cell[0]), int(cell[1])),
-        culprits(claim, runner.ruleset, small, steps),
-        (before, after),
-    )
+    lines = culprits(claim, runner.ruleset, sample, steps)
+    return Counterexample(sample, steps, before, after, (int(cell[0]), int(cell[1])), lines)
 
 
 def properties_of(ruleset: Ruleset, ledger: Ledger) -> list[Property]:
@@ -277,11 +244,6 @@ def properties_of(ruleset: Ruleset, ledger: Ledger) -> list[Property]:
         if one.text not in unique or len(one.scope) > len(unique[one.text].scope):
             unique[one.text] = one
     return [one for one in found if unique[one.text] is one]
-
-
-def find_property(ruleset: Ruleset, text: str) -> Property | None:
-    """The property that is known by these words."""
-    return next((one for one in properties_of(ruleset, make_ledger(ruleset)) if one.text == text), None)
 
 
 def _ledger_claims(ruleset: Ruleset, ledger: Ledger) -> Iterator[tuple[Total, str]]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 from powderdsl.arrays import np
@@ -22,7 +23,7 @@ SEEDS = 24
 MAX_BATCH = 1024
 
 WORK = 500_000_000
-"""Work for one world, ten seconds or so: most need a hundredth of it."""
+"""Work for all the worlds of a search, ten seconds or so: most need a hundredth of it."""
 
 RULE = 15_000
 """The cost of a rule in each step of a batch, in cells."""
@@ -33,7 +34,7 @@ class Work:
     """Work that is left, counted in cells that rules look at: a limit in seconds would end elsewhere in each run."""
 
     ruleset: Ruleset
-    left: int = WORK
+    left: int
 
     def spend(self, batch: Start, steps: int) -> None:
         rules = 1 + sum(len(moment.rules) for one in self.ruleset.passes for moment in one.moments)
@@ -52,8 +53,8 @@ def shrink(
     runs: Runs,
     sample: Start,
     steps: int,
-    work: Work | None = None,
-    without: frozenset[int] = frozenset(),
+    work: Work,
+    without: frozenset[int],
 ) -> tuple[Start, int]:
     """The smallest world found that still breaks the claim, and after how many steps. `sample` is one world.
 
@@ -63,11 +64,7 @@ def shrink(
     tries = 1 if isinstance(claim, Agreement | Alike) or not runs.ruleset.streams else SEEDS
     sample, steps = _later(claim, runs, sample, steps, without)
     sample, steps = shrink_while(
-        lambda some, most: breaks(claim, runs, some, most).first,
-        sample,
-        steps,
-        tries,
-        work or Work(runs.ruleset),
+        lambda some, most: breaks(claim, runs, some, most).first, sample, steps, tries, work
     )
     if not runs.ruleset.streams:
         sample = replace(sample, seed=np.zeros_like(sample.seed))
@@ -163,25 +160,16 @@ def _single(sample: Start) -> list[Start]:
     return [sample.one(world) for world in range(len(sample))] if len(sample) > 1 else []
 
 
-def _usual(*parts: str) -> Group:
-    """With fields, parameters or the clock as in fresh worlds."""
-
-    def group(sample: Start) -> list[Start]:
-        usual: dict[str, Any] = {"fields": {}, "params": {}, "step": np.zeros_like(sample.step)}
-        given = {"fields": sample.fields, "params": sample.params, "step": sample.step.any()}
-        return (
-            [replace(sample, **{part: usual[part] for part in parts})] if any(given[p] for p in parts) else []
-        )
-
-    return group
-
-
-def _absent_fields(sample: Start) -> list[Start]:
-    """With one field as in fresh cells."""
-    return [
-        replace(sample, fields={name: values for name, values in sample.fields.items() if name != gone})
-        for gone in sample.fields
-    ]
+def _fresh(sample: Start) -> list[Start]:
+    """With fields, parameters and the clock as in fresh worlds; with one of them, if not with all."""
+    parts: dict[str, Any] = {"fields": {}, "params": {}, "step": np.zeros_like(sample.step)}
+    given = {"fields": sample.fields, "params": sample.params, "step": sample.step.any()}
+    parts = {name: usual for name, usual in parts.items() if given[name]}
+    return (
+        [replace(sample, **parts), *(replace(sample, **{name: usual}) for name, usual in parts.items())]
+        if parts
+        else []
+    )
 
 
 def _fewer_fields(sample: Start) -> list[Start]:
@@ -193,6 +181,14 @@ def _fewer_fields(sample: Start) -> list[Start]:
     ]
 
 
+def _absent_fields(sample: Start) -> list[Start]:
+    """With one field as in fresh cells."""
+    return [
+        replace(sample, fields={name: values for name, values in sample.fields.items() if name != gone})
+        for gone in sample.fields
+    ]
+
+
 def _plain_seed(sample: Start) -> list[Start]:
     """With a seed that is easy to write."""
     if 0 <= int(sample.seed[0]) < SEEDS:
@@ -200,31 +196,26 @@ def _plain_seed(sample: Start) -> list[Start]:
     return [replace(sample, seed=np.array([number])) for number in range(SEEDS)]
 
 
-def _parts(axis: int, halves: bool) -> Group:
+def _parts(axis: int, halves: bool, sample: Start) -> list[Start]:
     """Worlds with half of the rows (axis 0) or columns (axis 1), or with one less."""
-
-    def group(sample: Start) -> list[Start]:
-        size = sample.shape[axis]
-        if size < 2 or (halves and size < 4):
-            return []
-        if halves:
-            half = size // 2
-            kept = [[*range(at, at + half)] for at in range(size - half + 1)]
-        else:
-            kept = [[at for at in range(size) if at != gone] for gone in range(size - 1, -1, -1)]
-        return [_cut(sample, axis, keep) for keep in kept]
-
-    return group
-
-
-def _cut(sample: Start, axis: int, keep: list[int]) -> Start:
+    size = sample.shape[axis]
+    if size < (4 if halves else 2):
+        return []
+    half = size // 2
+    if halves:
+        kept = [[*range(at, at + half)] for at in range(size - half + 1)]
+    else:
+        kept = [[at for at in range(size) if at != gone] for gone in range(size - 1, -1, -1)]
     # Rows and columns are the last axes of every array.
-    cells = (..., keep, slice(None)) if axis == 0 else (..., keep)
-    return replace(
-        sample,
-        ids=sample.ids[cells],
-        fields={name: values[cells] for name, values in sample.fields.items()},
-    )
+    places = [(..., keep, slice(None)) if axis == 0 else (..., keep) for keep in kept]
+    return [
+        replace(
+            sample,
+            ids=sample.ids[cells],
+            fields={name: values[cells] for name, values in sample.fields.items()},
+        )
+        for cells in places
+    ]
 
 
 def _fewer_kinds(sample: Start) -> list[Start]:
@@ -253,14 +244,11 @@ def _fewer_values(sample: Start) -> list[Start]:
 
 _GROUPS: tuple[Group, ...] = (
     _single,
-    _usual("fields", "params", "step"),
-    _parts(0, True),
-    _parts(1, True),
-    _parts(0, False),
-    _parts(1, False),
-    _usual("fields"),
-    _usual("params"),
-    _usual("step"),
+    _fresh,
+    partial(_parts, 0, True),
+    partial(_parts, 1, True),
+    partial(_parts, 0, False),
+    partial(_parts, 1, False),
     _fewer_fields,
     _fewer_kinds,
     _fewer_values,
