@@ -99,7 +99,11 @@ class Watch:
             for dy, dx in footprint(rule):
                 explained |= reference.look(mask, (-dy, -dx))
             if isinstance(rule, Transform):
-                self._changes(line, before[mask], after[mask], np.nonzero(mask)[0])
+                alone = mask.copy()
+                for other in moment.rules:
+                    if other is not rule and not isinstance(other, Assign):
+                        alone &= ~self._claimed(other, masks[id(other)])
+                self._changes(line, before[mask], after[mask], np.nonzero(mask)[0], alone[mask])
             else:
                 self._moves(rule, line, mask, before, after)
                 if isinstance(rule, Move) and rule.leaving is not None:
@@ -120,7 +124,8 @@ class Watch:
             has = self.existing[:, ids].any(1)
             self._expect(bool((has | ~worlds).all()), f"{line} happens without any of {names}")
 
-    def _changes(self, line: RuleLine, before: Array, after: Array, worlds: Array) -> None:
+    def _changes(self, line: RuleLine, before: Array, after: Array, worlds: Array, alone: Array) -> None:
+        """Look at the cells that a line changes. Where it is not `alone`, another rule may have made what is there."""
         entry = self.entries[line]
         assert self.existing is not None
         for a, b in {*zip(before.tolist(), after.tolist(), strict=True)}:
@@ -130,7 +135,7 @@ class Watch:
             self.changed.add((line, *pair))
             self._expect(pair in entry.changes, f"{line} turns {pair[0]} into {pair[1]}")
             if pair[1] in entry.copies:
-                at = worlds[(before == a) & (after == b)]
+                at = worlds[(before == a) & (after == b) & alone]
                 self._expect(bool(self.existing[at, b].all()), f"{line} makes {pair[1]} from nothing")
 
     def _moves(self, rule: Swap | Move, line: RuleLine, mask: Array, before: Array, after: Array) -> None:
@@ -153,7 +158,7 @@ class Watch:
         lost = reference.look(masks[id(rule)], (-dy, -dx)) & ~leaves
         assert rule.leaving is not None
         fresh = np.full(int(lost.sum()), rule.leaving.value)
-        self._changes(line, before[lost], fresh, np.nonzero(lost)[0])
+        self._changes(line, before[lost], fresh, np.nonzero(lost)[0], np.ones(len(fresh), bool))
 
     def _meet(self, moment: Moment, pass_: Pass, wanted: Any) -> None:
         """Rules that claim one cell must be known to do so."""
