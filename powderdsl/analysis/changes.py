@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
-from powderdsl.analysis.reactions import facts_of
+from powderdsl.diagnostics import Span
 from powderdsl.model.expressions.operands import ELEMENT_HERE, member, negation
 from powderdsl.model.logic.satisfy import Budget, Facts, satisfiable
 from powderdsl.model.text import one_line
@@ -124,6 +124,18 @@ def is_not(number: int, at: Offset = HERE) -> Condition:
     return negation(member(ELEMENT_HERE, (number,))), at
 
 
+def facts_of(ruleset: Ruleset) -> Facts:
+    """Facts about cells, for questions to `model.logic.satisfy`."""
+    limited = {f.name: f for f in ruleset.fields if f.of is not None}
+    return Facts(
+        tuple(element.id for element in ruleset.elements),
+        {prop.name: prop for prop in ruleset.properties},
+        {name: f.of for name, f in limited.items() if f.of is not None},
+        {name: f.default for name, f in limited.items()},
+        ruleset.side_multiple,
+    )
+
+
 def ledger_facts(ruleset: Ruleset) -> Facts:
     """Facts about cells, with work for all questions of one part of a ledger."""
     return replace(facts_of(ruleset), budget=Budget(BUDGET))
@@ -158,22 +170,16 @@ def _look_at(rule: Rule, asked: Asked, found: Found) -> None:
             return
         case Transform():
             found.pairs |= set(becomes(rule, asked, found.pairs))
-        case Swap():
-            found.moves |= {a for a in _left(asked, found.moves) if _pushed(rule, a, asked)}
+        case Swap() | Move(leaving=None):
+            found.moves |= _pushed(rule, asked, found.moves)
             found.moves |= {
                 a for a in _left(asked, found.moves) if asked.may(rule, is_(a), is_not(a, rule.offset))
             }
-        case Move(leaving=None):
-            found.moves |= {a for a in _left(asked, found.moves) if _pushed(rule, a, asked)}
-            found.moves |= {
-                a for a in _left(asked, found.moves) if asked.may(rule, is_(a), is_not(a, rule.offset))
-            }
-            targets = overwritten(rule, asked)  # of a row one is lost, and one is there twice
-            found.pairs |= {(x, y) for x in targets for y in targets if x != y}
-        case Move():
-            assert rule.leaving is not None
-            left = rule.leaving.value
-            found.moves |= {a for a in _left(asked, found.moves) if _pushed(rule, a, asked)}
+            if isinstance(rule, Move):  # of a row one is lost, and one is there twice
+                targets = overwritten(rule, asked)
+                found.pairs |= {(x, y) for x in targets for y in targets if x != y}
+        case Move(leaving=Expr(value=left)):
+            found.moves |= _pushed(rule, asked, found.moves)
             found.moves |= {a for a in _left(asked, found.moves) if a != left and asked.may(rule, is_(a))}
             found.pairs |= {(x, left) for x in overwritten(rule, asked) if x != left}
     found.writes += rule.effects
@@ -184,9 +190,9 @@ def _left(asked: Asked, known: set[int]) -> Iterable[int]:
     return [number for number in asked.facts.ids if number not in known]
 
 
-def _pushed(rule: Swap | Move, number: int, asked: Asked) -> bool:
-    """Whether an element may be at the place where another element goes."""
-    return asked.may(rule, is_(number, rule.offset), is_not(number))
+def _pushed(rule: Swap | Move, asked: Asked, known: set[int]) -> set[int]:
+    """Elements that may be at the place where another element goes."""
+    return {a for a in _left(asked, known) if asked.may(rule, is_(a, rule.offset), is_not(a))}
 
 
 def overwritten(rule: Move, asked: Asked) -> list[int]:
@@ -248,3 +254,83 @@ def _overwritten(asked: Asked) -> list[tuple[Rule, Pairs]]:
     made |= {int(rule.leaving.value) for rule in live if isinstance(rule, Move) and rule.leaving is not None}
     pairs = {(before, after) for before in there for after in there | made if before != after}
     return [(rule, pairs) for rule in live]
+
+
+# Effects without budgets and policies
+
+
+@dataclass(frozen=True)
+class Reaction:
+    """A rule that may turn elements into others. `before` and `after` are ids, ascending.
+
+    The rules that one line was unrolled into are one reaction.
+    """
+
+    before: tuple[int, ...]
+    after: tuple[int, ...]
+    pass_name: str
+    pack: str
+    span: Span
+
+
+def reactions(ruleset: Ruleset) -> tuple[Reaction, ...]:
+    """Every line that turns elements into others, in the order they run."""
+    facts = facts_of(ruleset)
+    found: dict[Span, Reaction] = {}
+    for pass_, moment in ruleset.substeps():
+        lets = {let.name: let.value for let in moment.lets}
+        for rule in moment.rules:
+            if isinstance(rule, Transform):
+                known = found.get(rule.span)
+                before = set(known.before if known else ()) | _before(rule, facts, lets)
+                after = set(known.after if known else ()) | _after(rule, facts, lets)
+                ids = tuple(sorted(before)), tuple(sorted(after))
+                found[rule.span] = Reaction(*ids, pass_.name, pass_.pack, rule.span)
+    return tuple(found.values())
+
+
+def _before(rule: Transform, facts: Facts, lets: dict[str, Expr]) -> set[int]:
+    """The elements that the rule may change; one that becomes itself is not changed."""
+    same = rule.target.value if rule.target.op == "const" else None
+    return {
+        number
+        for number in facts.ids
+        if number != same and satisfiable(facts, [is_(number), (rule.mask, HERE)], lets)
+    }
+
+
+def _after(rule: Transform, facts: Facts, lets: dict[str, Expr]) -> set[int]:
+    if rule.target.op == "const":
+        return {int(rule.target.value)}
+    return {
+        number
+        for number in facts.ids
+        if satisfiable(facts, [(rule.mask, HERE), (member(rule.target, (number,)), HERE)], lets)
+    }
+
+
+def moved_ids(ruleset: Ruleset) -> frozenset[int]:
+    """The elements that some rule may move or push aside."""
+    facts = facts_of(ruleset)
+    found: set[int] = set()
+    for _, moment in ruleset.substeps():
+        lets = {let.name: let.value for let in moment.lets}
+        for rule in moment.rules:
+            if isinstance(rule, (Swap, Move)):
+                found |= {
+                    number
+                    for number in facts.ids
+                    if number not in found
+                    and any(
+                        satisfiable(facts, [is_(number, at), (rule.mask, HERE)], lets)
+                        for at in footprint(rule)
+                    )
+                }
+    return frozenset(found)
+
+
+def unchanging_ids(ruleset: Ruleset) -> frozenset[int]:
+    """The elements that no rule moves or turns into anything: they stay in place permanently."""
+    changed = {number for reaction in reactions(ruleset) for number in reaction.before}
+    everything = frozenset(element.id for element in ruleset.elements)
+    return everything - moved_ids(ruleset) - changed

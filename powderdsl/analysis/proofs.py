@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+from powderdsl.analysis.changes import facts_of
 from powderdsl.analysis.ledger import Ledger, NotProven, Proven, Verdict
-from powderdsl.analysis.reactions import facts_of
 from powderdsl.model.logic.satisfy import satisfiable
 from powderdsl.model.types import (
     Assign,

@@ -57,6 +57,12 @@ def storage(kind: Kind) -> str:
     return "int32"
 
 
+def stored_range(kind: Kind) -> tuple[float, float]:
+    """The smallest and the largest number in which values of a kind are stored."""
+    known = {"flag": (0, 1), "direction": (0, 7), "element": (0, 255)}
+    return known.get(kind.name, (kind.lo, kind.hi))
+
+
 def slots(ruleset: Ruleset) -> tuple[Slot, ...]:
     """All slots of a ruleset's worlds: the element, then stored properties and fields in the order of the ruleset."""
     found = [Slot("element", ELEMENT, 0, travels=True)]

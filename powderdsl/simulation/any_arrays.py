@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar
 
 from powderdsl.model.state import Slot, check_sides, property_values, slots
 from powderdsl.model.types import Ruleset
-from powderdsl.simulation.parameters import Parameters
 from powderdsl.simulation.state_checks import (
+    Parameters,
     check_ids,
     checked_floats,
     checked_integers,

@@ -1,10 +1,28 @@
-"""Backends by name: makes the program of a checked model, a `Runnable`."""
+"""Backends by name: makes the program of a checked model, a `Runnable`; native code by the width of grids.
+
+Each width has a library of its own, or shares one with others (`known_width`). A library is made when the first grid of
+its width is stepped, so that nobody waits for code that is not needed. If the same model was compiled before, its code
+comes from the cache and nothing is lowered. The cache's key depends on the model, on every source file that turns models
+into C++, on the compiler, the processor and the width. Values of parameters are inputs of a step, so they take no part.
+
+The backend `auto` starts on WebAssembly, or on torch where wasmtime has no wheel. Once the work done and asked for is
+worth it, a thread compiles. The change comes between two steps, with the same worlds: long calls are cut into slices for
+it. Short scripts never start a compiler.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import threading
+import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
+from contextvars import copy_context
+from dataclasses import replace
 from functools import cache
+from math import prod
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -12,12 +30,39 @@ from torch import Tensor
 from powderdsl.compiler import has_webassembly, lower, starting_backend
 from powderdsl.diagnostics import CompileError
 from powderdsl.ir.ops import Program
+from powderdsl.ir.segments import segments
+from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.reference_program import ReferenceProgram
 from powderdsl.system.writing import failure
-from powderdsl.targets.cpp.compilers import INSTALL, NoCompiler
-from powderdsl.targets.job import Job, Runnable
+from powderdsl.targets.cache import turn
+from powderdsl.targets.cpp.build import building, cache_key, current
+from powderdsl.targets.cpp.code import NativeCode, compile_program, recall, remember
+from powderdsl.targets.cpp.compilers import (
+    INSTALL,
+    MISSING,
+    NoCompiler,
+    NoCompilerWarning,
+    find_compiler,
+    flags_for,
+)
+from powderdsl.targets.cpp.program import NativeProgram
+from powderdsl.targets.cpp.source import known_width
+from powderdsl.targets.job import Job, Runnable, shape_of
 from powderdsl.targets.tensor_kind import Tensors
+from powderdsl.targets.torch.mixed import mixed_program, packed_program
+
+Lowered = Callable[[], Program]
+"""Returns a ruleset in IR; the first call does the work."""
+
+SOURCES = ("compiler.py", "simulation/programs.py", "model", "analysis", "ir", "schedule", "targets")
+
+WORTH = 2.0
+"""Native code is compiled once work on the first backend, done or expected in the current call, exceeds this many seconds.
+Compiling takes longer, but runs in another thread, and its result is cached."""
+
+SLICE = 0.25
+"""Seconds on the first backend between two checks for native code."""
 
 
 def find_device(name: str | torch.device) -> torch.device:
@@ -68,8 +113,6 @@ def make_program(ruleset: Ruleset, backend: str, device: torch.device, threads: 
         with suppress(CompileError) if backend == "auto" else nullcontext():
             return CompiledProgram(cuda_program(lowered(), device), cells, "cuda")
     if backend == "auto" and device.type == "cpu":
-        from powderdsl.simulation.native import auto_by_width
-
         first = starting_backend(device.type)
         begin = cache(lambda: _wasm_program(lowered(), device)) if first == "wasm" else cells
         return auto_by_width(ruleset, lowered, threads, (first, begin), cells)
@@ -89,7 +132,6 @@ def _wasm_program(program: Program, device: torch.device) -> Runnable:
     if not has_webassembly():
         problem = "the package `wasmtime` is missing, or does not run on this machine"
         raise _refusal("wasm", problem, "`pip install wasmtime`, or run on the backend `torch` or `native`")
-    from powderdsl.targets.torch.mixed import packed_program
     from powderdsl.targets.wasm.program import WasmProgram
 
     kind = Tensors(device)
@@ -98,13 +140,10 @@ def _wasm_program(program: Program, device: torch.device) -> Runnable:
 
 def _native(ruleset: Ruleset, lowered: Callable[[], Program], device: torch.device, threads: int) -> Runnable:
     """Native code for the width of each grid. Without a compiler, there is an error at once."""
-    from powderdsl.simulation.native import ByWidth, latest_width, native_program
-
     if device.type != "cpu":
         raise _refusal("native", "native code runs on the CPU", _ELSEWHERE.format(device))
     with _compiler_needed():
-        if latest_width(ruleset) is None:
-            lowered()  # what cannot be lowered is reported before the first step
+        latest_width(ruleset, lowered)
 
     def make(width: int) -> Runnable:
         with _compiler_needed():
@@ -128,3 +167,329 @@ _ELSEWHERE = "run on the device `cpu`, or on the backend `torch` or `auto` on `{
 def _refusal(backend: str, problem: str, help: str) -> CompileError:
     message = f"the {backend} backend is not available"
     return failure("PD701", message, notes=tuple(problem.splitlines()), helps=(help,))
+
+
+# Native code
+
+
+def start_key(ruleset: Ruleset, width: int | None = None) -> str:
+    """The cache's key for the native code of a ruleset; without `width`, for the code compiled last.
+
+    Raises NoCompiler if there is no compiler.
+    """
+    compiler = find_compiler()
+    params = tuple(replace(param, default=0, about="") for param in ruleset.params)
+    said = fingerprint(replace(ruleset, params=params))
+    return cache_key(f"{said}{generator()} {width}", compiler, flags_for(compiler, current().level))
+
+
+@cache
+def generator() -> str:
+    """A hash of the source files that generate C++."""
+    here = Path(__file__).resolve().parents[1]
+    found = hashlib.sha256()
+    for name in SOURCES:
+        files = sorted(p for p in (here / name).rglob("*") if p.suffix in (".py", ".hpp")) or [here / name]
+        for path in files:
+            found.update(path.read_bytes())
+    return found.hexdigest()
+
+
+def latest_width(ruleset: Ruleset, lowered: Lowered) -> int:
+    """What the code compiled last is for, or 0. Without any, what cannot be lowered is reported here.
+
+    Raises NoCompiler if there is no compiler.
+    """
+    code = recall(start_key(ruleset))
+    if code is None:
+        lowered()
+    return 0 if code is None else code.width
+
+
+def ready_program(ruleset: Ruleset, lowered: Lowered, threads: int, width: int) -> Runnable | None:
+    """A program that was compiled before, or None. Raises NoCompiler if there is no compiler."""
+    code = recall(start_key(ruleset, width))
+    return None if code is None else _recalled(code, lowered, threads, width)
+
+
+def native_program(ruleset: Ruleset, lowered: Lowered, threads: int, width: int) -> Runnable:
+    """A program, from the cache or compiled now; passes that do not fit bit planes run on cells.
+
+    Raises:
+        NoCompiler: there is no C++ compiler, or it failed.
+    """
+    key = start_key(ruleset, width)
+    code = recall(key)
+    if code is None:
+        with turn(current().place(), key):
+            code = recall(key)  # from another process, while this one waited
+            if code is None:
+                found = segments(lowered())
+                if len(found) > 1 or found[0].planes is None:
+                    return mixed_program(
+                        found,
+                        torch.device("cpu"),
+                        lambda cells, planes: _compiled(cells, planes, threads, width),
+                    )
+                code = compile_program(found[0].program, found[0].planes, width)
+                remember(key, code)
+                remember(start_key(ruleset), code)
+    return _recalled(code, lowered, threads, width)
+
+
+def _recalled(code: NativeCode, lowered: Lowered, threads: int, width: int) -> Runnable:
+    """The program of code for a whole ruleset, which is only lowered if its passes are timed."""
+
+    def with_clocks() -> NativeCode:
+        (segment,) = segments(lowered())
+        assert segment.planes is not None
+        return compile_program(segment.program, segment.planes, width, clocks=True)
+
+    return NativeProgram(code, threads, with_clocks)
+
+
+def _compiled(cells: Program, planes: Program, threads: int, width: int) -> Runnable:
+    code = compile_program(cells, planes, width)
+    return NativeProgram(code, threads, lambda: compile_program(cells, planes, width, clocks=True))
+
+
+class ByWidth:
+    """A program for each known width of grids, and one for all others (`known_width`), made when the first such grid comes.
+
+    It is built with the settings that are in effect now. What it tells is about the width stepped last.
+    """
+
+    def __init__(self, make: Callable[[int], Runnable], width: int | None = None):
+        """`width`: the program for it is made at once."""
+        self._make, self._how = make, current()
+        self._programs: dict[int, Runnable] = {}
+        self._latest = None if width is None else self.of(width)
+
+    def of(self, width: int) -> Runnable:
+        """The program for a known width; 0 for all others."""
+        program = self._programs.get(width)
+        if program is None:
+            with building(self._how):
+                program = self._programs.setdefault(width, self._make(width))
+        return program
+
+    @property
+    def running(self) -> str:
+        """What the next step runs on: ``wasm``, ``torch`` or ``native``."""
+        return str(getattr(self._latest, "running", "native"))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences about which backend ran, and why."""
+        return tuple(getattr(self._latest, "notes", ()))
+
+    def run(self, job: Job) -> Mapping[str, Tensor]:
+        """The state `job.steps` later."""
+        self._latest = program = self.of(known_width(shape_of(job.state)[-1]))
+        return program.run(job)
+
+
+def auto_by_width(
+    ruleset: Ruleset,
+    lowered: Lowered,
+    threads: int,
+    first: tuple[str, Callable[[], Runnable]],
+    asked: Callable[[], Runnable],
+) -> ByWidth:
+    """`AutoProgram` for every width."""
+    try:
+        latest = latest_width(ruleset, lowered)
+    except NoCompiler:
+        latest = 0
+        lowered()
+
+    def make(width: int) -> AutoProgram:
+        return AutoProgram(
+            first,
+            asked,
+            lambda: ready_program(ruleset, lowered, threads, width),
+            lambda: native_program(ruleset, lowered, threads, width),
+        )
+
+    return ByWidth(make, latest)
+
+
+class Build:
+    """Native code being compiled, in a thread that waits for the compiler and ends with the process."""
+
+    def __init__(self, make: Callable[[], Runnable]):
+        self._make = make
+        self._began = time.perf_counter()
+        self._took: float | None = None
+        self.program: Runnable | None = None
+        self.problem = ""
+        self._thread = threading.Thread(target=copy_context().run, args=(self._run,), daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self.program = self._make()
+        except NoCompiler as error:
+            self.problem = str(error)
+        except Exception as error:  # what runs continues; `--backend native` shows what is wrong
+            self.problem = f"{type(error).__name__}: {error}"
+        self._took = time.perf_counter() - self._began
+
+    def wait(self) -> None:
+        """Return when the build has ended."""
+        self._thread.join()
+
+    @property
+    def seconds(self) -> float:
+        """How long the build took, or has taken so far."""
+        return time.perf_counter() - self._began if self._took is None else self._took
+
+    @property
+    def lost(self) -> bool:
+        """Whether the build's thread is gone: a fork has its parent's memory, but not its threads."""
+        return self._took is None and not self._thread.is_alive()
+
+
+class AutoProgram:
+    """Runs on a backend that starts at once until native code has been compiled.
+
+    Args:
+        first: the name of that backend, and a function that gives its program, the same at each call.
+        asked: gives the program for jobs with given draws or chosen passes.
+        ready: native code that was compiled before, or None; raises NoCompiler if none could be made.
+        make: native code, compiled; raises NoCompiler.
+    """
+
+    def __init__(
+        self,
+        first: tuple[str, Callable[[], Runnable]],
+        asked: Callable[[], Runnable],
+        ready: Callable[[], Runnable | None],
+        make: Callable[[], Runnable],
+    ):
+        (self._name, self._first), self._asked, self._make = first, asked, make
+        self._build: Build | None = None
+        self._native: Runnable | None = None
+        self._problem = ""
+        self._beginning = threading.Lock()
+        self._spent = 0.0
+        self._pace: tuple[int, float] | None = None  # cells of a batch, seconds a step on the first backend
+        self._steps = {"first": 0, "native": 0, "asked": 0}
+        try:
+            self._native = ready()
+        except NoCompiler as error:
+            self._problem = str(error)
+
+    @property
+    def running(self) -> str:
+        """What the next step runs on: ``wasm``, ``torch`` or ``native``."""
+        return self._name if self._arrived() is None else "native"
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences about which backend ran, and why."""
+        native, steps, build, first = self._arrived(), self._steps, self._build, self._name
+        found = []
+        if native is not None and build is None:
+            found.append("native: it was compiled before")
+        elif native is not None and build is not None:
+            found.append(
+                f"{first} for {steps['first']} steps while native was made ready ({build.seconds:.0f} s), "
+                f"then native for {steps['native']}"
+            )
+        elif self._problem:
+            found.append(f"{first}: {self._problem}")
+            found.append(f"native code is faster: {INSTALL}")
+        elif build is not None and not build.lost:
+            found.append(
+                f"{first} for {steps['first']} steps; native is being made ready ({build.seconds:.0f} s)"
+            )
+        else:
+            found.append(f"{first}: native is compiled from {WORTH:g} s of work, or by --backend native")
+        if steps["asked"]:
+            found.append(f"torch for {steps['asked']} steps with given draws or chosen passes")
+        return tuple(found)
+
+    def run(self, job: Job) -> Mapping[str, Tensor]:
+        """The state `job.steps` later."""
+        if job.draws or job.passes is not None:
+            self._steps["asked"] += job.steps
+            return self._asked().run(job)
+        if job.timing is not None:
+            return (self._arrived() or self._first()).run(job)
+        clock, part, done, cells = job.clock, job, 0, prod(shape_of(job.state))
+        while True:
+            native = self._arrived()
+            if native is not None:
+                self._steps["native"] += part.steps
+                return native.run(part)
+            count = self._slice(cells, job.steps - done)
+            began = time.perf_counter()
+            try:
+                state = self._first().run(part._replace(steps=count))
+            except MemoryError:
+                return self._large(part)
+            done += count
+            later = clock._replace(since=clock.since + done)
+            part = part._replace(state=state, clock=later, steps=job.steps - done)
+            self._account(cells, count, job.steps - done, time.perf_counter() - began)
+            if done == job.steps:
+                return state
+
+    def _large(self, job: Job) -> Mapping[str, Tensor]:
+        """Worlds that do not fit into WebAssembly's memory: native code is waited for, without a compiler torch runs."""
+        self._begin()
+        if self._build is not None:
+            self._build.wait()
+        self._steps["native"] += job.steps
+        return (self._arrived() or self._asked()).run(job)
+
+    def _slice(self, cells: int, left: int) -> int:
+        """The number of steps to run on the first backend before the next check: one until their speed is known."""
+        if self._problem:
+            return left
+        if self._pace is None or self._pace[0] != cells:
+            return min(left, 1)
+        return min(left, max(1, int(SLICE / max(self._pace[1], 1e-9))))
+
+    def _account(self, cells: int, count: int, left: int, seconds: float) -> None:
+        """Count steps that ran on the first backend, and start to compile once that is worth it."""
+        if count == 0:
+            return
+        self._steps["first"] += count
+        self._spent += seconds
+        # The first step makes what later ones reuse: its duration does not predict theirs.
+        first = self._pace is None or self._pace[0] != cells
+        self._pace = (cells, seconds / count)
+        expected = 0.0 if first else left * self._pace[1]
+        if self._spent + expected >= WORTH:
+            self._begin()
+
+    def _begin(self) -> None:
+        """Start to compile, unless a build has started. Concurrent callers do not wait."""
+        if self._problem:
+            _tell_of_compilers(self._problem)
+            return
+        if not self._beginning.acquire(blocking=False):
+            return
+        try:
+            if self._native is None and (self._build is None or self._build.lost):
+                self._build = Build(self._make)
+        finally:
+            self._beginning.release()
+
+    def _arrived(self) -> Runnable | None:
+        """The native program, or None until it has been compiled."""
+        build = self._build
+        if self._native is None and build is not None:
+            self._native, self._problem = build.program, build.problem or self._problem
+        return self._native
+
+
+@cache
+def _tell_of_compilers(problem: str) -> None:
+    """Warn once in a process if work that is worth compiling meets no compiler. Other problems stand in `notes`."""
+    if problem.startswith(MISSING):
+        warnings.warn(
+            f"{problem}; native code is many times faster: {INSTALL}", NoCompilerWarning, stacklevel=2
+        )

@@ -7,9 +7,18 @@ from typing import Any
 
 from powderdsl.compiler import lower, parts
 from powderdsl.ir.segments import carry
-from powderdsl.model.state import SNAP, Slot, qualified_slots, size_problem, slots, storage
-from powderdsl.model.state import fits as sides_fit
-from powderdsl.model.types import Param, Ruleset, Tint
+from powderdsl.model.state import (
+    SNAP,
+    Slot,
+    fits,
+    property_values,
+    qualified_slots,
+    size_problem,
+    slots,
+    storage,
+    stored_range,
+)
+from powderdsl.model.types import Param, Ruleset
 from powderdsl.system.memo import Memo
 from powderdsl.system.writing import failure
 from powderdsl.targets.codec import Piece, pieces
@@ -33,7 +42,7 @@ def standalone_module(ruleset: Ruleset, size: tuple[int, int], memo: Memo | None
         CompileError: PD607 if the world is too large or its sides do not fit the rules, PD702 if the rules have a pass
             that WebAssembly cannot run.
     """
-    if not sides_fit(ruleset, size):
+    if not fits(ruleset, size):
         raise failure("PD607", size_problem(ruleset, size))
     if size[0] * size[1] > MAX_CELLS:
         helps = (f"a module holds at most {MAX_CELLS:,} cells",)
@@ -67,15 +76,11 @@ def _stored(slot: Slot, ruleset: Ruleset, parts: tuple[Piece, ...]) -> Stored:
     if slot.name == "element":
         usual: list[Any] = [0.0]
     elif prop is not None:
-        defaults = {param.name: param.default for param in ruleset.params}
-        usual = [defaults[one] if isinstance(one, str) else one for one in prop.values]
-        usual += [0] * (256 - len(usual))
+        usual = property_values(ruleset, slot.name)
     else:
         usual = [slot.fresh(identity) for identity in range(256)]
     by_component = zip(*usual, strict=True) if slot.planes == 2 else [usual]
-    low, high = {"flag": (0, 1), "direction": (0, 7), "element": (0, 255)}.get(
-        slot.kind.name, (slot.kind.lo, slot.kind.hi)
-    )
+    low, high = stored_range(slot.kind)
     return Stored(
         slot.name,
         parts,
@@ -98,46 +103,30 @@ def _knob(param: Param) -> Knob:
     return Knob(param.name, float(param.default), *_range(param), param.kind.name in ("int", "flag"))
 
 
-def _tint(tint: Tint) -> dict[str, Any]:
-    return {"color": tint.color, "full": tint.full, "most": tint.most}
-
-
 def _about(ruleset: Ruleset, size: tuple[int, int]) -> dict[str, Any]:
     """What a page needs to know, in the order of the numbers that functions take."""
     elements = []
-    for one in sorted(ruleset.elements, key=lambda one: one.id):
-        row = {
-            "id": one.id,
-            "name": one.name,
-            "qualified": one.qualified,
-            "color": one.color,
-            "glyph": one.glyph,
-        }
-        if one.ramp is not None:
-            ramp = one.ramp
-            row["ramp"] = {
-                "field": ramp.field,
-                "start": ramp.start,
-                "end": ramp.end,
-                "low": ramp.lo,
-                "high": ramp.hi,
-            }
+    for element in sorted(ruleset.elements, key=lambda element: element.id):
+        row = _picked(element, "id", "name", "qualified", "color", "glyph")
+        if (ramp := element.ramp) is not None:
+            row["ramp"] = {**_picked(ramp, "field", "start", "end"), "low": ramp.lo, "high": ramp.hi}
         elements.append(row)
     qualified = qualified_slots(ruleset)
-    tinted = {one.name: one.tint for one in ruleset.fields if one.tint is not None}
-    fields = [
-        {"name": slot.name, "qualified": qualified.get(slot.name, slot.name), "kind": slot.kind.name}
-        | {"type": storage(slot.kind), "components": slot.planes}
-        | ({"tint": _tint(tinted[slot.name])} if slot.name in tinted else {})
-        for slot in slots(ruleset)
-        if slot.name != "element"
-    ]
-    parameters = [
-        {"name": one.name, "kind": one.kind.name, "value": float(one.default)}
-        | dict(zip(("low", "high"), _range(one), strict=True))
-        | {"about": one.about}
-        for one in ruleset.params
-    ]
+    tints = {field.name: field.tint for field in ruleset.fields}
+    fields = []
+    for slot in slots(ruleset):
+        if slot.name != "element":
+            kind, word = slot.kind, qualified.get(slot.name, slot.name)
+            row = {"name": slot.name, "qualified": word, "kind": kind.name, "type": storage(kind)}
+            row["components"] = slot.planes
+            if (tint := tints.get(slot.name)) is not None:
+                row["tint"] = _picked(tint, "color", "full", "most")
+            fields.append(row)
+    parameters = []
+    for param in ruleset.params:
+        low, high = _range(param)
+        row = {"name": param.name, "kind": param.kind.name, "value": float(param.default)}
+        parameters.append(row | {"low": low, "high": high, "about": param.about})
     return {
         "format": FORMAT,
         "ruleset": ruleset.name,
@@ -147,3 +136,7 @@ def _about(ruleset: Ruleset, size: tuple[int, int]) -> dict[str, Any]:
         "fields": fields,
         "parameters": parameters,
     }
+
+
+def _picked(value: object, *names: str) -> dict[str, Any]:
+    return {name: getattr(value, name) for name in names}

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from random import Random
 from typing import Any
 
-from powderdsl.analysis.reactions import unchanging_ids
+from powderdsl.analysis.changes import unchanging_ids
 from powderdsl.arrays import np
 from powderdsl.diagnostics import CompileError
 from powderdsl.model.types import Ruleset

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from random import Random
 
-from powderdsl.analysis.reactions import moved_ids, unchanging_ids
+from powderdsl.analysis.changes import moved_ids, unchanging_ids
 from powderdsl.arrays import NDArray, np
 from powderdsl.model.types import Ruleset
 from powderdsl.system.writing import failure

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 import powderdsl as package
-from powderdsl.analysis.reactions import unchanging_ids
+from powderdsl.analysis.changes import unchanging_ids
 from powderdsl.cli.start_worlds import start_drawn
 from powderdsl.compiler import shipped_rules, shipped_tests
 from powderdsl.diagnostics import CompileError

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import powderdsl as package
-from powderdsl.analysis.reactions import moved_ids, reactions, unchanging_ids
+from powderdsl.analysis.changes import moved_ids, reactions, unchanging_ids
 from powderdsl.model.text import print_model, show_number, show_set
 from tests.cli.commands import PACK, ROOT, powderdsl
 from tests.semantics.test_differential import compositions

@@ -24,8 +24,8 @@ from powderdsl.compiler import lower
 from powderdsl.ir.text import print_program
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
-from powderdsl.simulation import native
-from powderdsl.simulation.native import AutoProgram, start_key
+from powderdsl.simulation import programs
+from powderdsl.simulation.programs import AutoProgram, start_key
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.targets.cpp.build import Building, building
 from powderdsl.targets.cpp.compilers import NoCompiler, NoCompilerWarning
@@ -120,7 +120,7 @@ def test_little_work_starts_no_compiler() -> None:
 
 def test_long_calls_change_over_between_two_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """It compiles as soon as the pace shows what is to come, and changes over within the call."""
-    monkeypatch.setattr(native, "SLICE", 0.02)
+    monkeypatch.setattr(programs, "SLICE", 0.02)
     program, compiler, log = made(0.005)
     threading.Timer(0.3, compiler.go.set).start()
     state = program.run(job(5000))  # 25 s on the first backend
@@ -138,7 +138,7 @@ def test_long_calls_change_over_between_two_steps(monkeypatch: pytest.MonkeyPatc
 
 
 def test_many_short_calls_are_worth_it_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(native, "WORTH", 0.05)
+    monkeypatch.setattr(programs, "WORTH", 0.05)
     program, compiler, _ = made(0.005)
     for start in range(30):
         program.run(job(1, start))
@@ -190,7 +190,7 @@ def test_given_draws_and_chosen_passes_stay_with_torch() -> None:
 def test_without_native_code_the_first_backend_continues(
     problem: Exception, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(native, "WORTH", 0.0)
+    monkeypatch.setattr(programs, "WORTH", 0.0)
     log: list[tuple[str, int, int]] = []
     asked = []
 
@@ -201,7 +201,7 @@ def test_without_native_code_the_first_backend_continues(
     program = AutoProgram(
         ("wasm", lambda: Counter("wasm", 0.001, log)), lambda: Counter("torch", 0, log), lambda: None, fails
     )
-    native._tell_of_compilers.cache_clear()
+    programs._tell_of_compilers.cache_clear()
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         for start in range(50):
@@ -215,7 +215,7 @@ def test_without_native_code_the_first_backend_continues(
 
 
 def test_threads_share_one_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(native, "WORTH", 0.0)
+    monkeypatch.setattr(programs, "WORTH", 0.0)
     program, compiler, _ = made(0.0001)
     results = []
 
@@ -276,7 +276,7 @@ def test_every_compiler_gives_the_oracles_worlds(
 def test_auto_changes_over_to_the_same_worlds_and_remembers(
     rules: Ruleset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(native, "WORTH", 0.0)
+    monkeypatch.setattr(programs, "WORTH", 0.0)
     with building(Building("-O0", tmp_path)):
         sims = [powderdsl.compile(rules) for _ in range(3)]
         assert [sim.running for sim in sims] == ["wasm"] * 3

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from powderdsl.analysis.reactions import reactions
+from powderdsl.analysis.changes import reactions
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput
 from powderdsl.cli.output import color_wanted, print_json

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from powderdsl.analysis.reactions import moved_ids
+from powderdsl.analysis.changes import moved_ids
 from powderdsl.compiler import BACKENDS
 from powderdsl.diagnostics import suggest
 from powderdsl.experiments.bench.programs import Program

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from powderdsl.analysis.reactions import facts_of
+from powderdsl.analysis.changes import facts_of
 from powderdsl.ir.build import Builder
 from powderdsl.ir.lower.expressions import Inputs, Pair, lower_expression, node
 from powderdsl.ir.ops import (

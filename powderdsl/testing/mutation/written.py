@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from powderdsl.analysis.reactions import unchanging_ids
+from powderdsl.analysis.changes import unchanging_ids
 from powderdsl.diagnostics import Reporter, Source
 from powderdsl.model.composition.names import needs_of
 from powderdsl.model.declarations import PackDecl

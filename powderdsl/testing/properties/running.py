@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from powderdsl.analysis.reactions import unchanging_ids
+from powderdsl.analysis.changes import unchanging_ids
 from powderdsl.arrays import np
 from powderdsl.compiler import starting_backend
 from powderdsl.diagnostics import Span
