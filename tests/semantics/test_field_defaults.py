@@ -101,7 +101,7 @@ def test_the_ledger_and_traces_know_them(rules):
     assert "fox as 7" in fields["energy"].default
     world = package.compile(rules, backend="reference").world(np.array([[[1, 0]]], np.uint8))
     found = trace(world, 0, 0, 1, of=["energy"])
-    assert 7 in [cause.write.after for cause in found.causes]
+    assert 7 in [write.after for write in found.writes]
 
 
 @pytest.mark.parametrize(

@@ -76,42 +76,40 @@ def test_a_swap_names_its_rule_and_both_sources():
     body = "do:\n  - swap below if rock and weight > below.weight and below is void"
     for row, source in ((1, (0, 0)), (0, (1, 0))):
         found = traced(body, "o/.", row, 0)
-        (cause,) = found.causes
-        assert cause.write.how == "arrive"
-        assert cause.write.source == source
-        assert cause.write.cell == (0, 0)
-        assert cause.write.rule is not None
-        assert cause.write.rule.span.line == line_of(lab(body), "swap below")
-        assert values(cause.parts) == {"element": "rock", "weight": 5, "below.weight": 1, "below": "void"}
-    assert found.writer() is cause.write.rule
+        (write,) = found.writes
+        assert write.how == "arrive"
+        assert write.source == source
+        assert write.cell == (0, 0)
+        assert write.rule is not None
+        assert write.rule.span.line == line_of(lab(body), "swap below")
+        assert values(write.parts) == {"element": "rock", "weight": 5, "below.weight": 1, "below": "void"}
+    assert found.writer() is write.rule
 
 
 def test_content_that_moves_brings_its_fields_as_assignments_left_them():
     body = "do:\n  - heat := 7 where rock\n  - rock moves right leaving moth if right is void"
     found = traced(body, "o.m", 0, 1, "heat")
-    (cause,) = found.causes
-    assert (cause.write.source, int(cause.write.before), int(cause.write.after)) == ((0, 0), 0, 7)
+    (write,) = found.writes
+    assert (write.source, int(write.before), int(write.after)) == ((0, 0), 0, 7)
     left = traced(body, "o.m", 0, 0, "heat")
-    assert [(one.write.how, int(one.write.after)) for one in left.causes] == [("assign", 7), ("leave", 0)]
+    assert [(one.how, int(one.after)) for one in left.writes] == [("assign", 7), ("leave", 0)]
 
 
 def test_writes_stand_in_order_across_moments_and_passes():
     body = "do: void -> rock\nthen:\n  do: rock -> bomb\n  then: bomb -> moth"
     found = traced(body, ".", 0, 0)
-    ids = [(int(one.write.before), int(one.write.after)) for one in found.causes]
+    ids = [(int(one.before), int(one.after)) for one in found.writes]
     assert ids == [(0, 1), (1, 2), (2, 3)]
-    assert [one.write.rule.moment for one in found.causes if one.write.rule] == [0, 1, 2]
+    assert [one.rule.moment for one in found.writes if one.rule] == [0, 1, 2]
 
 
 def test_a_push_and_an_effect_name_the_cell_whose_condition_held():
     found = traced("do: push gale by 3 away from bomb", ".b.", 0, 0, "gale")
-    (cause,) = found.causes
-    assert cause.write.cell == (0, 1)
-    assert cause.write.after.tolist() == [0, -3]
+    (write,) = found.writes
+    assert write.cell == (0, 1)
+    assert write.after.tolist() == [0, -3]
     found = traced("do: rock -> void, then right.mark += 2", "o.", 0, 1, "mark")
-    assert [(one.write.how, one.write.cell, int(one.write.after)) for one in found.causes] == [
-        ("effect", (0, 0), 2)
-    ]
+    assert [(one.how, one.cell, int(one.after)) for one in found.writes] == [("effect", (0, 0), 2)]
 
 
 def test_what_no_rule_does_is_told_too():
@@ -119,7 +117,7 @@ def test_what_no_rule_does_is_told_too():
     start = replace(world_of(ruleset, "o"))
     start = start.sim.replace(start, mark=4)
     found = trace(start, 0, 0)
-    assert [(one.write.slot.name, one.write.how) for one in found.causes] == [
+    assert [(one.slot.name, one.how) for one in found.writes] == [
         ("mark", "reset"),
         ("heat", "assign"),
     ]
@@ -148,13 +146,13 @@ def test_a_count_names_the_neighbors_it_found():
     assert (read.value, read.counted) == (2, ((0, 0), (1, 2)))
     found = traced("do: rock -> moth if count(bomb) > 2", "b../bob/...", 1, 1)
     assert not found.misses
-    assert found.causes[0].parts[1].reads[0].counted == ((0, 0), (1, 0), (1, 2))
+    assert found.writes[0].parts[1].reads[0].counted == ((0, 0), (1, 0), (1, 2))
 
 
 def test_a_let_is_taken_apart_as_it_was_fixed():
     body = "let: {ready: rock and count(bomb) > 0 and below is void}\ndo: bomb -> void\nthen: rock -> moth if ready"
     found = traced(body, "ob/..", 0, 0)
-    assert {part.of for part in found.causes[0].parts} == {
+    assert {part.of for part in found.writes[0].parts} == {
         "",
         "ready",
     }  # the bomb was still there when it was fixed
@@ -243,8 +241,8 @@ def test_whatever_happens_can_be_printed(first):
         world = replace(random_start(ruleset, Choices.seeded(seed), (1, 3, 4)), params={}).world(sim)
         found = trace(world, seed % 3, seed % 4, 2, every_rule=True)
         data = json.loads(json.dumps(trace_data(found), allow_nan=False))
-        assert len(data["writes"]) == len(found.causes)
-        assert all(part.holds for cause in found.causes for part in cause.parts)
+        assert len(data["writes"]) == len(found.writes)
+        assert all(part.holds for write in found.writes for part in write.parts)
         text = trace_text(found, every_rule=True)
         assert text.startswith(f"cell {seed % 3},{seed % 4} in step")
         assert text.count("but for") == len(found.misses)

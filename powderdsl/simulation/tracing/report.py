@@ -12,7 +12,7 @@ from powderdsl.model.state import Slot
 from powderdsl.model.text import one_line, place_of
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.provenance import NumberedRule
-from powderdsl.simulation.tracing.trace import HOW, Cause, Cell, Miss, Part, Read, Trace, plain, show_at_cell
+from powderdsl.simulation.tracing.trace import HOW, Cell, Miss, Part, Read, Trace, Write, plain, show_at_cell
 
 SCHEMA = 1
 """The version of the plain data. It increases when a key changes its meaning or is removed."""
@@ -27,13 +27,13 @@ MAX_CELLS = 9
 def trace_text(trace: Trace, *, color: bool = False, every_rule: bool = False) -> str:
     """The whole trace, without a line break at its end."""
     blocks, again = [_head(trace)], []
-    for _, group in groupby(trace.causes, key=_event):
-        causes = list(group)
-        rule = causes[0].write.rule
-        if any(one.write.changed for one in causes):
-            blocks.append(_cause_text(trace, causes, color))
+    for _, group in groupby(trace.writes, key=_event):
+        writes = list(group)
+        rule = writes[0].rule
+        if any(write.changed for write in writes):
+            blocks.append(_writes_text(trace, writes, color))
         elif rule is not None:
-            names = ", ".join(dict.fromkeys(one.write.slot.name for one in causes))
+            names = ", ".join(dict.fromkeys(write.slot.name for write in writes))
             again.append(printable(f"  {names}: {rule.place}, pass {rule.pass_name}"))
     if again:
         blocks.append("\n".join(["written again, as it was:", *again]))
@@ -44,9 +44,8 @@ def trace_text(trace: Trace, *, color: bool = False, every_rule: bool = False) -
     return "\n\n".join(blocks)
 
 
-def _event(cause: Cause) -> tuple[int, int, object]:
+def _event(write: Write) -> tuple[int, int, object]:
     """A key that is equal for all writes of one rule in one substep."""
-    write = cause.write
     if write.rule is None:
         return id(write.substep), 0, write.how
     return id(write.substep), write.rule.number, write.cell
@@ -65,23 +64,22 @@ def _head(trace: Trace) -> str:
             if before != after
             else f"  {slot.name}: {after}, as before"
         )
-    if not any(one.write.rule for one in trace.causes):
+    if not any(write.rule for write in trace.writes):
         lines.append("  no rule wrote it")
     return "\n".join(map(printable, lines))
 
 
-def _cause_text(trace: Trace, causes: list[Cause], color: bool) -> str:
+def _writes_text(trace: Trace, writes: list[Write], color: bool) -> str:
     lines = []
-    for one in causes:
-        write = one.write
+    for write in writes:
         if write.changed:
             before, after = _values(trace, write.slot, write.before, write.after)
             moved = f", moved here from {_at(write.source)}" if write.source else ""
             lines.append(_painted(f"{write.slot.name}: {before} -> {after}", "32;1", color) + moved)
-    first = causes[0]
-    rule, cell = first.write.rule, first.write.cell
+    first = writes[0]
+    rule, cell = first.rule, first.cell
     if rule is None or cell is None:
-        return "\n".join([*lines, f"  = {HOW[first.write.how]}"])
+        return "\n".join([*lines, f"  = {HOW[first.how]}"])
     notes = [_rule_note(rule, cell, trace.cell), *(_part_text(part, cell) for part in first.parts)]
     return "\n".join([*lines, *_source(notes, Label(rule.span))])
 
@@ -166,13 +164,12 @@ def trace_data(trace: Trace) -> dict[str, Any]:
             for slot in trace.slots
             if slot.name in trace.after
         },
-        "writes": [_cause_data(trace.ruleset, one) for one in trace.causes],
+        "writes": [_write_data(trace.ruleset, write) for write in trace.writes],
         "almost": [_miss_data(one) for one in trace.misses],
     }
 
 
-def _cause_data(ruleset: Ruleset, cause: Cause) -> dict[str, Any]:
-    write = cause.write
+def _write_data(ruleset: Ruleset, write: Write) -> dict[str, Any]:
     return {
         "slot": write.slot.name,
         "before": plain(ruleset, write.slot.kind, write.before),
@@ -181,7 +178,7 @@ def _cause_data(ruleset: Ruleset, cause: Cause) -> dict[str, Any]:
         "rule": _rule_data(write.rule),
         "cell": write.cell,
         "source": write.source,
-        "parts": [_part_data(part) for part in cause.parts],
+        "parts": [_part_data(part) for part in write.parts],
     }
 
 

@@ -102,6 +102,13 @@ class Write:
     def changed(self) -> bool:
         return not np.array_equal(self.before, self.after)
 
+    @cached_property
+    def parts(self) -> tuple[Part, ...]:
+        """The parts of the condition that let its rule happen; none without a rule."""
+        if self.rule is None or self.substep is None or self.cell is None:
+            return ()
+        return _parts(self.rule.rule, self.substep, self.cell)
+
 
 @dataclass
 class RecordedStep:
@@ -242,14 +249,6 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Cause:
-    """A write, and the parts of the condition that let its rule happen; no parts for a write without a rule."""
-
-    write: Write
-    parts: tuple[Part, ...]
-
-
-@dataclass(frozen=True)
 class Miss:
     """A rule that would have written the cell, and did not. `cell` is where its condition was asked.
 
@@ -277,12 +276,12 @@ class Trace:
     slots: tuple[Slot, ...]
     before: dict[str, Any]
     after: dict[str, Any]
-    causes: tuple[Cause, ...]
+    writes: tuple[Write, ...]
     misses: tuple[Miss, ...]
 
     def writer(self, slot: str = "element") -> NumberedRule | None:
         """The rule that last wrote a slot; None if no rule did."""
-        rules = [one.write.rule for one in self.causes if one.write.slot.name == slot and one.write.rule]
+        rules = [write.rule for write in self.writes if write.slot.name == slot and write.rule]
         return rules[-1] if rules else None
 
 
@@ -334,7 +333,7 @@ def trace(
         tuple(wanted),
         {name: pick(array, cell) for name, array in recorded.begin.items() if name in names},
         {name: pick(array, cell) for name, array in recorded.end.items() if name in names},
-        tuple(_cause(write) for write in writes),
+        tuple(writes),
         tuple(misses),
     )
 
@@ -354,12 +353,6 @@ def _slots(world: AnyWorld, names: Iterable[str] | None) -> list[Slot]:
             raise KeyError("; ".join([f"no field `{name}`", *suggest(name, known, "fields")]))
         found.append(known[name])
     return found
-
-
-def _cause(write: Write) -> Cause:
-    if write.rule is None or write.substep is None or write.cell is None:
-        return Cause(write, ())
-    return Cause(write, _parts(write.rule.rule, write.substep, write.cell))
 
 
 def _misses(step: RecordedStep, names: Sequence[str], every_rule: bool) -> list[Miss]:
