@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from powderdsl.arrays import np
 from powderdsl.model import float_operations as floats
@@ -137,8 +137,7 @@ def neighborhood(value: Array, kernel: Kernel) -> Array:
 # Expressions
 
 
-@dataclass(frozen=True)
-class Change:
+class Change(NamedTuple):
     """How a slot is written: by a rule, or as every step does it.
 
     `asked` is the way from a written cell to the one in which the rule's condition holds, `source` the way to the one
