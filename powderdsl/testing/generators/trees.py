@@ -91,8 +91,8 @@ def read_start(tree: Tree, ruleset: Ruleset) -> Start:
     """The start worlds of a tree, without parameters that the rules do not have. Raises as `read_array` for others."""
     assert isinstance(tree, dict)
     ids = read_array(tree["worlds"], "uint8")
-    if ids.ndim != 3 or not ids.size or not np.isin(ids, [element.id for element in ruleset.elements]).all():
-        raise ValueError("cells of elements that the rules do not have")
+    if ids.ndim != 3 or not ids.size:
+        raise ValueError("no world")
     types = {slot.name: slot.dtype for slot in slots(ruleset)}
     fields, params = tree.get("fields", {}), tree.get("params", {})
     assert isinstance(fields, dict)

@@ -266,6 +266,8 @@ def read_example(path: Path, ruleset: Ruleset) -> tuple[str, Start, int]:
     with reading(problem, "a counterexample is written by `powderdsl test`"):
         assert isinstance(tree, dict)
         start, steps = read_start(tree, ruleset), int(line_of(tree["steps"]))
+        if not np.isin(start.ids, [element.id for element in ruleset.elements]).all():
+            raise ValueError("cells of elements that the rules do not have")
         if len(start) != 1 or not 1 <= steps <= 100_000:
             raise ValueError("more than one world, or a number of steps that no test has")
         return line_of(tree["property"]), start, steps
