@@ -256,9 +256,10 @@ def failed_test(original: Original, sim: Simulator, pack: str, *, quick: bool) -
     generated, exact before counted, each of which runs many worlds, those of the mutated pack, short ones.
     """
 
-    def group(example: Example) -> tuple[bool, str, bool, bool]:
-        counted = example.name if example.often else ""
-        return is_generated(example), counted, example.pack != pack, example.steps > FEW_STEPS
+    def group(example: Example) -> tuple[bool, bool, bool, bool, str]:
+        is_counted, is_long = bool(example.often), example.steps > FEW_STEPS
+        alone = example.name if is_counted else ""
+        return is_generated(example), is_counted, example.pack != pack, is_long, alone
 
     def is_quick(example: Example) -> bool:
         return not (is_generated(example) or example.often or example.steps > FEW_STEPS)

@@ -6,6 +6,7 @@ import hashlib
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -248,53 +249,32 @@ def distinguish(
         focus: ids of elements that are likely to matter: they are in most of the worlds.
         seed: other worlds for another seed, the same for the same.
     """
-    names = _shared(first, second)
-    only_fields: tuple[Start, int] | None = None
-    for sample, steps in fresh_samples(first.ruleset, focus, seed):
-        one, other = (run_sample(sim, sample, steps)[0] for sim in (first, second))
-        found = _soonest(first_difference(one, other, ("element",)))
-        if found is not None:
-            return _small(first, second, sample.one(found[0]), found[1], ("element",))
-        found = _soonest(first_difference(one, other, names))
-        if found is not None and only_fields is None:
-            only_fields = sample.one(found[0]), found[1]
-    if only_fields is None and len(names) > 1 and set(first.slots) == set(second.slots):
-        only_fields = _with_fields(first, second, names, seed)
-    return None if only_fields is None else _small(first, second, *only_fields, names)
-
-
-def _shared(first: Simulator, second: Simulator) -> tuple[str, ...]:
-    """The slots that both have, elements first."""
     known = {slot.name for slot in second.slots}
-    return tuple(slot.name for slot in first.slots if slot.name in known)
-
-
-def _soonest(when: Array) -> tuple[int, int] | None:
-    """The world that differs soonest, and after how many steps."""
-    found = np.nonzero(when)[0]
-    if not len(found):
-        return None
-    best = int(found[when[found].argmin()])
-    return best, int(when[best])
-
-
-def _with_fields(
-    first: Simulator, second: Simulator, names: tuple[str, ...], seed: int
-) -> tuple[Start, int] | None:
-    """A world that differs, of those whose fields hold anything that they can, with the usual parameters."""
-    for drawn in random_samples(first.ruleset, seed, FIELDED):
-        sample = replace(drawn, params={}, step=np.zeros_like(drawn.step))
-        found = _soonest(differs_after(first, second, sample, 2, names))
-        if found is not None:
-            return sample.one(found[0]), found[1]
-    return None
+    names = tuple(slot.name for slot in first.slots if slot.name in known)
+    # Worlds whose fields hold anything that they can, with the usual parameters.
+    fielded = random_samples(first.ruleset, seed, FIELDED) if set(first.slots) == set(second.slots) else ()
+    plain = ((replace(drawn, params={}, step=np.zeros_like(drawn.step)), 2) for drawn in fielded)
+    only_fields: tuple[Start, int] | None = None
+    for sample, steps in chain(fresh_samples(first.ruleset, focus, seed), plain):
+        one, other = (run_sample(sim, sample, steps)[0] for sim in (first, second))
+        for compared in (names[:1], names):
+            when = first_difference(one, other, compared)
+            if not when.any():
+                continue
+            soonest = int(np.where(when > 0, when, steps + 1).argmin())
+            smaller = sample.one(soonest), int(when[soonest])
+            if compared == ("element",):
+                return _small(first, second, *smaller, compared)
+            only_fields = only_fields or smaller
+    return None if only_fields is None else _small(first, second, *only_fields, names)
 
 
 def _small(
     first: Simulator, second: Simulator, sample: Start, steps: int, names: tuple[str, ...]
 ) -> Distinction:
     def judge(some: Start, most: int) -> Array:
-        return differs_after(first, second, some, most, names)
+        one, other = (run_sample(sim, some, most)[0] for sim in (first, second))
+        return first_difference(one, other, names)
 
     tries = TRIED_SEEDS if first.ruleset.streams or second.ruleset.streams else 1
     small, steps = shrink_while(judge, sample, steps, tries, Work(first.ruleset, WORK))
@@ -303,14 +283,6 @@ def _small(
     one, other = (run_sample(sim, small, steps)[0][-1] for sim in (first, second))
     slot = next(name for name in names if (one[name] != other[name]).any())
     return Distinction(small, steps, slot, one, other)
-
-
-def differs_after(
-    first: Simulator, second: Simulator, sample: Start, steps: int, names: Sequence[str]
-) -> Array:
-    """After which step each world differs in one of these slots, 0 if it does not: int [B]."""
-    one, other = (run_sample(sim, sample, steps)[0] for sim in (first, second))
-    return first_difference(one, other, names)
 
 
 def fresh_samples(ruleset: Ruleset, focus: Sequence[int], seed: int) -> Iterator[tuple[Start, int]]:

@@ -310,13 +310,17 @@ def field_rows(name: str, world: AnyWorld, index: int) -> tuple[str, ...]:
     """A field of one world as tests draw it: rows of words, in columns. Floats with all their digits."""
     kind = next(slot.kind for slot in world.sim.slots if slot.name == name)
     values = world.sim.kind.to_numpy(world.state[name])[index]
-    height, width = values.shape[-2:]
-    words = [
-        [_word(world.sim.ruleset, kind, values[..., row, column]) for column in range(width)]
-        for row in range(height)
-    ]
-    wide = [max(len(row[column]) for row in words) for column in range(width)]
+    words = field_words(world.sim.ruleset, kind, values)
+    wide = [max(len(row[column]) for row in words) for column in range(len(words[0]))]
     return tuple(" ".join(word.rjust(size) for word, size in zip(row, wide, strict=True)) for row in words)
+
+
+def field_words(rules: Ruleset, kind: Kind, values: NDArray[Any]) -> list[list[str]]:
+    """The values [H, W] or [2, H, W] of a field, as drawings have them."""
+    height, width = values.shape[-2:]
+    return [
+        [_word(rules, kind, values[..., row, column]) for column in range(width)] for row in range(height)
+    ]
 
 
 def _word(rules: Ruleset, kind: Kind, value: NDArray[Any]) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -12,11 +11,10 @@ from typing import Any
 
 from powderdsl.arrays import np
 from powderdsl.diagnostics import CompileError, Span
-from powderdsl.model.fields.words import direction_word
 from powderdsl.model.restrict import Difference
 from powderdsl.model.state import slots
 from powderdsl.model.text import one_line, place_of
-from powderdsl.model.types import Kind, Ruleset
+from powderdsl.model.types import Ruleset
 from powderdsl.simulation.draw import palette, ramps, rgb, scale, tints
 from powderdsl.system.writing import failure, replacing
 from powderdsl.testing.generators.cases import Array, Start, fresh
@@ -29,10 +27,8 @@ from powderdsl.testing.generators.trees import (
     start_tree,
     write_yaml,
 )
+from powderdsl.testing.pack_tests.runner import field_words
 from powderdsl.testing.properties.breaks import Tested
-
-STATUSES = ("proven", "tested", "untested", "differs", "broken")
-"""``differs``: a world breaks it because packs are loaded that it does not speak of."""
 
 MAX_DRAWN = 40
 """Rows and columns that are drawn in full."""
@@ -78,7 +74,11 @@ class Counterexample:
 
 @dataclass(frozen=True)
 class Result:
-    """One of STATUSES, on how many worlds, and why. `reason` is a proof, or what prevents one."""
+    """What became of a property, on how many worlds, and why. `reason` is a proof, or what prevents one.
+
+    `status` is ``proven``, ``tested``, ``untested``, ``broken``, or ``differs``: a world breaks it because packs are
+    loaded that it does not speak of.
+    """
 
     prop: Property
     status: str
@@ -135,37 +135,21 @@ def counterexample_lines(found: Counterexample, ruleset: Ruleset) -> Iterator[st
     names = {element.id: element.name for element in ruleset.elements}
     there = np.unique([found.before["element"], found.after["element"]]).tolist()
     yield ", ".join(f"{glyphs[number]} {names[number]}" for number in there if number in names)
-    yield from _field_lines(found, ruleset, names)
+    yield from _field_lines(found, ruleset)
     for name, values in found.sample.params.items():
         yield f"{name} = {float(values[0]):g}"
     if found.sample.step.any():
         yield f"the clock says {int(found.sample.step[0])}"
 
 
-def _field_lines(found: Counterexample, ruleset: Ruleset, names: Mapping[int, str]) -> Iterator[str]:
+def _field_lines(found: Counterexample, ruleset: Ruleset) -> Iterator[str]:
     """The fields that are not as in fresh cells, row by row, each value as a word."""
     for slot in slots(ruleset):
         values = found.sample.fields.get(slot.name)
         if values is None or np.array_equal(values, fresh(ruleset, slot, found.sample.ids)):
             continue
-        cells = values[0] if slot.planes == 1 else np.moveaxis(values[0], 0, -1)
-        rows = (" ".join(_word(value, slot.kind, names) for value in row) for row in cells)
-        text = " / ".join(rows)
+        text = " / ".join(" ".join(row) for row in field_words(ruleset, slot.kind, values[0]))
         yield f"{slot.name}: {text if len(text) <= MAX_TEXT else f'{text[:MAX_TEXT]} …'}"
-
-
-def _word(value: Any, kind: Kind, names: Mapping[int, str]) -> str:
-    """A value of a field as tests write it."""
-    match kind.name:
-        case "flag":
-            return "yes" if value else "no"
-        case "element":
-            return names.get(int(value), "?")
-        case "direction":
-            return direction_word(int(value))
-        case "vec2":
-            return ",".join(f"{float(part):g}" for part in value)
-    return f"{float(value):g}"
 
 
 def picture(found: Counterexample, ruleset: Ruleset) -> Array:
@@ -192,7 +176,13 @@ def result_data(result: Result) -> dict[str, Any]:
         "reason": result.reason,
     }
     if result.difference is not None:
-        data["difference"] = difference_data(result.difference)
+        data["difference"] = {
+            "packs": list(result.difference.packs),
+            "causes": [
+                {"pack": cause.pack, "place": place_of(cause.span), "text": cause.does}
+                for cause in result.difference.causes
+            ],
+        }
     found = result.counterexample
     if found is not None:
         data["counterexample"] = {
@@ -203,32 +193,15 @@ def result_data(result: Result) -> dict[str, Any]:
             "column": found.cell[1],
             "seed": int(found.sample.seed[0]),
             "clock": int(found.sample.step[0]),
-            "fields": _plain(found.sample.fields),
-            "params": _plain(found.sample.params),
+            "fields": {name: values[0].tolist() for name, values in found.sample.fields.items()},
+            "params": {name: values[0].tolist() for name, values in found.sample.params.items()},
             "rules": [{"place": place_of(span), "text": one_line(span)} for span in found.culprits],
         }
     return data
 
 
-def difference_data(found: Difference) -> dict[str, Any]:
-    """Plain data for JSON."""
-    causes = [
-        {"pack": cause.pack, "place": place_of(cause.span), "text": cause.does} for cause in found.causes
-    ]
-    return {"packs": list(found.packs), "causes": causes}
-
-
-def _plain(arrays: Mapping[str, Array]) -> dict[str, Any]:
-    return {name: values[0].tolist() for name, values in arrays.items()}
-
-
 FOLDER = ".powderdsl"
 """Where counterexamples are kept, under the working directory."""
-
-
-def is_kept() -> bool:
-    """Whether counterexamples are kept: not on machines that run tests and are thrown away."""
-    return not os.environ.get("CI")
 
 
 def file_of(rules: str, prop: Property, folder: Path = Path(FOLDER)) -> Path:
