@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,11 +17,13 @@ from powderdsl.experiments.runs import RunFolder, find_run
 from powderdsl.experiments.runs.metrics import mean_and_interval
 from powderdsl.rl.config import BASELINES, TrainConfig, chosen_policies
 from powderdsl.rl.policies import TrainedPolicy, config_of, load_policy, task_of
-from powderdsl.simulation.simulator import World
 from powderdsl.tasks.episodes import TaskProgram, compile_task
 from powderdsl.tasks.players import ExpertPlayer
 from powderdsl.tasks.shipped import check_split
 from powderdsl.tasks.task import Task
+
+if TYPE_CHECKING:
+    from powderdsl.rl.films import Film
 
 EVALUATION = "evaluation.json"
 BATCH = 256
@@ -114,9 +116,7 @@ def play(
     observation: str = "ids",
     numbers: Tensor | None = None,
     seed: int = 0,
-    begun: Callable[[Any], None] | None = None,
-    seen: Callable[[World], None] | None = None,
-    acted: Callable[[Tensor | None, Tensor, Tensor], None] | None = None,
+    recorder: Film | None = None,
 ) -> Played:
     """One episode in each of some worlds.
 
@@ -124,8 +124,7 @@ def play(
         policy: an expert sees the episodes themselves. None does nothing at all: the worlds run by themselves.
         worlds: which, int64 [n]. numbers: of the episodes, int64 [n], which a policy's random numbers depend on together
             with `seed`; 0, 1, … otherwise.
-        begun: called with the episodes at their start. seen: with the worlds after each action and step, see
-            `TaskProgram.act`. acted: after each action, with the actions, the returns so far and which episodes are over.
+        recorder: is shown all worlds and actions.
     """
     sight = observation_of(observation, program.simulator, program.task.size)
     episodes = program.start(worlds)
@@ -135,8 +134,8 @@ def play(
     returns = torch.zeros(len(worlds), dtype=torch.float64, device=device)
     lengths, going = torch.zeros_like(episodes.seed), torch.ones_like(episodes.failed)
     succeeded = torch.zeros_like(going)
-    if begun is not None:
-        begun(episodes)
+    if recorder is not None:
+        recorder.begin(episodes)
     stack = FrameStack(getattr(policy, "frames", 1))
     for step in range(program.task.agent.actions):
         keys = action_keys(seed, numbers, step)
@@ -146,13 +145,14 @@ def play(
         elif policy is not None:
             actions = policy(stack.push(sight.of(episodes.world)), keys)
         # Episodes that are over run on, and no longer count.
+        seen = None if recorder is None else recorder.see
         episodes, reward, success, over = program.act(episodes, actions, reuse=seen is None, seen=seen)
         returns += torch.where(going, reward.double(), 0.0)
         lengths += going
         succeeded |= success & going
         going = going & ~over
-        if acted is not None:
-            acted(actions, returns, ~going)
+        if recorder is not None:
+            recorder.act(actions, returns, ~going)
         if not bool(going.any()):
             break
     return Played(returns.cpu(), lengths.cpu(), succeeded.cpu())

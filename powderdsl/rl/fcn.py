@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Self
+from dataclasses import dataclass
+from typing import Any
 
 import torch
-from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import Schedule
 from torch import Tensor, nn
@@ -53,21 +53,12 @@ class Trunk(nn.Module):
         return found
 
 
-class BinDistribution(Distribution):
+@dataclass(frozen=True)
+class BinDistribution:
     """One choice among the values of a ``discrete`` form of actions. Actions are (x, y, choice, vx, vy), int64 [B, 5]."""
 
+    form: ActionForm
     distribution: Categorical
-
-    def __init__(self, form: ActionForm):
-        super().__init__()
-        self.form = form
-
-    def proba_distribution_net(self, *args: Any, **kwargs: Any) -> nn.Module:
-        raise NotImplementedError("BinPolicy has its own layers")
-
-    def proba_distribution(self, scores: Tensor) -> Self:
-        self.distribution = Categorical(logits=scores)
-        return self
 
     def action(self, values: Tensor) -> Tensor:
         """The five numbers of values, int64 [B, 5]."""
@@ -77,22 +68,11 @@ class BinDistribution(Distribution):
         found: Tensor = self.distribution.log_prob(self.form.encode(actions.long()).to(actions.device))
         return found
 
-    def entropy(self) -> Tensor:
-        found: Tensor = self.distribution.entropy()
-        return found
-
-    def sample(self) -> Tensor:
-        return self.action(self.distribution.sample())
-
     def mode(self) -> Tensor:
         return self.action(self.distribution.probs.argmax(1))
 
-    def actions_from_params(self, scores: Tensor, deterministic: bool = False) -> Tensor:
-        return self.proba_distribution(scores).get_actions(deterministic)
-
-    def log_prob_from_params(self, scores: Tensor) -> tuple[Tensor, Tensor]:
-        actions = self.actions_from_params(scores)
-        return actions, self.log_prob(actions)
+    def get_actions(self, deterministic: bool = False) -> Tensor:
+        return self.mode() if deterministic else self.action(self.distribution.sample())
 
 
 class BinPolicy(ActorCriticPolicy):
@@ -147,7 +127,7 @@ class BinPolicy(ActorCriticPolicy):
         for last in (self.scores, self.idle):
             if last is not None:
                 nn.init.orthogonal_(last.weight, 0.01)  # all actions about equally likely
-        self.bins = BinDistribution(form)
+        self.form = form
         make: Any = self.optimizer_class
         self.optimizer = make(self.parameters(), lr=lr_schedule(1), eps=1e-5)
 
@@ -162,7 +142,7 @@ class BinPolicy(ActorCriticPolicy):
         scores = self.scores(found).flatten(1)
         if self.idle is not None:
             scores = torch.cat([scores, self.idle(found.mean((2, 3)))], 1)
-        return self.bins.proba_distribution(scores)
+        return BinDistribution(self.form, Categorical(logits=scores))
 
     def _value(self, seen: Tensor) -> Tensor:
         value: Tensor = self.judge(seen)
@@ -177,9 +157,9 @@ class BinPolicy(ActorCriticPolicy):
     def evaluate_actions(self, observed: Any, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         seen = self._seen(observed)
         distribution = self._distribution(seen)
-        return self._value(seen), distribution.log_prob(actions), distribution.entropy()
+        return self._value(seen), distribution.log_prob(actions), distribution.distribution.entropy()
 
-    def get_distribution(self, observed: Any) -> BinDistribution:
+    def get_distribution(self, observed: Any) -> Any:
         return self._distribution(self._seen(observed))
 
     def predict_values(self, observed: Any) -> Tensor:

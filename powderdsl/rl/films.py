@@ -28,6 +28,7 @@ from powderdsl.simulation.simulator import World
 from powderdsl.tasks.episodes import Episodes, TaskProgram
 from powderdsl.tasks.players import ExpertPlayer
 from powderdsl.tasks.task import BLOW, Task
+from powderdsl.tasks.tensors.actions import cells_of
 
 LINE = 14
 """Pixels below each world, for the return."""
@@ -63,21 +64,12 @@ def film(
     There is a picture of the start, and one after each action and each step, free steps included. Worlds whose
     episode is over no longer change.
     """
-    recorder = _Film(program.task, len(worlds), factor)
-    played = play(
-        program,
-        policy,
-        worlds,
-        observation=observation,
-        seed=seed,
-        begun=recorder.begun,
-        seen=recorder.seen,
-        acted=recorder.acted,
-    )
+    recorder = Film(program.task, len(worlds), factor)
+    played = play(program, policy, worlds, observation=observation, seed=seed, recorder=recorder)
     return played, recorder.pictures()
 
 
-class _Film:
+class Film:
     """Keeps the scenes of `play`, and draws them with cells of `factor`² pixels."""
 
     def __init__(self, task: Task, count: int, factor: int) -> None:
@@ -91,18 +83,18 @@ class _Film:
         self._colors, self._font = palette(task.ruleset.elements), ImageFont.load_default()
         self._looks: Any = {"ramps": ramps(task.ruleset.elements), "tints": tints(task.ruleset.fields)}
 
-    def begun(self, episodes: Episodes) -> None:
+    def begin(self, episodes: Episodes) -> None:
         """The worlds at their start."""
         self.regions = {name: value.cpu().numpy() for name, value in episodes.regions.items()}
-        self.seen(episodes.world)
-        self.acted(None, self._returns, self._over)
+        self.see(episodes.world)
+        self.act(None, self._returns, self._over)
 
-    def seen(self, world: World) -> None:
+    def see(self, world: World) -> None:
         """The worlds after an action, or a step."""
         fields = {name: world[name].cpu().numpy().copy() for name in self._fields}
         self._pending.append((world.ids.cpu().numpy().copy(), fields))
 
-    def acted(self, actions: Tensor | None, returns: Tensor, over: Tensor) -> None:
+    def act(self, actions: Tensor | None, returns: Tensor, over: Tensor) -> None:
         """Assign the worlds seen since the last call to these actions; the last of them shows the new returns."""
         *earlier, last = self._pending
         self.scenes += [FilmScene(*seen, actions, self._returns, self._over) for seen in earlier]
@@ -131,25 +123,18 @@ class _Film:
             outline(picture, masks[world % len(masks)], factor, OUTLINES[number % len(OUTLINES)])
         words = ""
         if scene.actions is not None:
-            x, y, choice, *blow = scene.actions[world].tolist()
+            action = scene.actions[world].cpu()
+            choice, *blow = action[2:].tolist()
             words = _words(task, choice, blow)
             if words:
-                outline(picture, _block(task, y, x), factor, HAND)
+                block = cells_of(task.agent, task.size, action[1:2], action[:1])[0]
+                outline(picture, block.numpy(), factor, HAND)
         image = Image.new("RGB", (picture.shape[1], picture.shape[0] + LINE), PAPER)
         image.paste(Image.fromarray(picture), (0, 0))
         mark = "over" if scene.over[world] else words
         text = f"{float(scene.returns[world]):.2f}  {mark}"
         ImageDraw.Draw(image).text((2, picture.shape[0] + 1), text, fill=INK, font=self._font)
         return np.array(image)
-
-
-def _block(task: Task, row: int, column: int) -> NDArray[np.bool_]:
-    """The cells that an action at a bin changes: bool [H, W]."""
-    lines = []
-    for axis, (place, side) in enumerate(zip((row, column), task.size, strict=True)):
-        first = task.agent.first_line(axis, place, side)
-        lines.append((np.arange(side) >= first) & (np.arange(side) < first + task.agent.brush[axis]))
-    return lines[0][:, None] & lines[1]
 
 
 def _words(task: Task, choice: int, blow: list[int]) -> str:

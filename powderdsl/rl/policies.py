@@ -16,7 +16,7 @@ from torch import Tensor
 from powderdsl.envs.acting import uniforms
 from powderdsl.envs.features import paper_policy, small_policy
 from powderdsl.envs.tensor_env import TensorEnv
-from powderdsl.experiments.runs import RunFolder, does_not_fit, find_run
+from powderdsl.experiments.runs import RunFolder, does_not_fit, find_run, fitting
 from powderdsl.experiments.runs.folder import check_palette, recorded_palette
 from powderdsl.rl.config import TrainConfig, from_json
 from powderdsl.rl.fcn import BinDistribution, BinPolicy, fcn_policy
@@ -104,11 +104,8 @@ def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: b
         )
     actions, rate = MultiDiscrete(np.array(own.action_nvec)), config.learning_rate
     network = kind(space, actions, lambda _: rate, **how | {"optimizer_class": _NoOptimizer})
-    try:
+    with fitting(found.path, "its network is another"):
         network.load_state_dict(checkpoint.state["policy"])
-    except (RuntimeError, TypeError, AttributeError, KeyError) as error:
-        why = " ".join(str(error).split())[:300]
-        raise does_not_fit(found.path, f"its network is another: {why}") from None
     network.to(env.device).set_training_mode(False)
     channels = len(own.observation.channels)
     return TrainedPolicy(network, config.observation, channels, checkpoint.step, deterministic, config.frames)

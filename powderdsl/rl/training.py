@@ -18,20 +18,22 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
 
 from powderdsl.compiler import whole_palette
+from powderdsl.datasets.dataset import Dataset, Transitions, drawn
 from powderdsl.datasets.recorder import record
 from powderdsl.envs.observations import channels_of
 from powderdsl.envs.sb3 import PowderVecEnv
 from powderdsl.envs.tensor_env import check_cells
-from powderdsl.experiments.runs import Metrics, RunFolder, does_not_fit, open_run
+from powderdsl.experiments.runs import Metrics, RunFolder, fitting, open_run
 from powderdsl.experiments.runs.metrics import mean_and_interval
 from powderdsl.model.fingerprint import fingerprint
-from powderdsl.rl.cloning import clone, open_demonstrations
 from powderdsl.rl.config import TrainConfig, check_config, check_task
 from powderdsl.rl.evaluation import play
 from powderdsl.rl.policies import TrainedPolicy, policy_of
@@ -46,6 +48,8 @@ ASKED = "asked.json"
 """The settings of the latest call, with those that may change."""
 DEMONSTRATIONS = "demonstrations"
 """The dataset of `init_expert`."""
+CLONING_RATE, CLONING_BATCH = 3e-3, 256
+"""Of Adam, in behavior cloning; transitions of a gradient."""
 
 Progress = Callable[[int, float | None], None]
 """Called after every action with the interactions so far, and the mean return of the last 100 episodes."""
@@ -96,25 +100,21 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
         with run.metrics(step) as metrics:
             learner.model.set_logger(Logger(None, [_MetricsWriter(metrics)]))
             if checkpoint is not None:
-                try:
+                with fitting(checkpoint.path, "its state is that of another run"):
                     learner.restore(checkpoint.state)
-                except (RuntimeError, TypeError, ValueError, AttributeError, LookupError) as error:
-                    why = " ".join(str(error).split())[:300]
-                    raise does_not_fit(checkpoint.path, f"its state is that of another run: {why}") from None
             elif config.init_from or config.init_expert:
                 _clone(learner, run, config, metrics)
             held_out = None
             if config.eval_every:
-                unseen = TaskProgram(task, config.eval_split, program.simulator)
-                held_out = _HeldOut(unseen, learner, metrics, -1 if checkpoint is None else step)
-            keeper = _Keeper(run, learner, progress, held_out)
+                held_out = TaskProgram(task, config.eval_split, program.simulator)
+            played = -1 if checkpoint is None else step
+            keeper = _Keeper(run, learner, metrics, progress, held_out, played)
             try:
                 learner.model.learn(config.steps - step, keeper, reset_num_timesteps=checkpoint is None)
             except KeyboardInterrupt:
                 keeper.save_latest()
                 raise
-            if held_out is not None:
-                held_out.after(learner.step)
+            keeper.play_held_out(learner.step)
             run.save_checkpoint(learner.step, learner.state())
     return run
 
@@ -253,56 +253,92 @@ def _clone(learner: _Learner, run: RunFolder, config: TrainConfig, metrics: Metr
             envs=config.envs,
             worlds=config.worlds,
         )
-    numbers = clone(learner.model.policy, open_demonstrations(folder, env), config)
+    dataset = Dataset.open(folder)
+    dataset.require(env)
+    numbers = clone(learner.model.policy, dataset, config)
     metrics.write(0, {f"clone/{name}": value for name, value in numbers.items()})
 
 
-class _HeldOut:
-    """Plays the policy in held-out worlds: ``held_out/return`` of the metrics. Training does not depend on it.
+def clone(policy: ActorCriticPolicy, dataset: Dataset, config: TrainConfig) -> dict[str, float]:
+    """Behavior cloning: fit a policy to a dataset, its likelihood of the actions, and its values to the discounted returns.
 
-    Args:
-        done: the interactions up to which this has been done; -1 for a run that begins.
+    `config.init_epochs` times as many transitions are drawn as there are; which ones depends on `config.seed` alone. The
+    learning rate falls to zero.
+
+    Returns:
+        means over the last hundred updates at most: the loss, the accuracy (the share of transitions whose recorded
+        action is the policy's likeliest) and the error of values.
     """
+    rows, returns = Transitions(dataset), _returns(dataset, config.gamma)
+    updates = max(1, config.init_epochs * len(rows) // CLONING_BATCH)
+    spread = max(float(returns.var()), 1e-6)  # so that values do not outweigh actions
+    optimizer = torch.optim.Adam(policy.parameters(), lr=CLONING_RATE)
+    policy.set_training_mode(True)
+    figures = []
+    for number in range(updates):
+        for group in optimizer.param_groups:
+            group["lr"] = CLONING_RATE * (1 - number / updates)
+        numbers = drawn(config.seed, number, CLONING_BATCH, len(rows))
+        batch = rows[numbers]
+        observed = batch.observation.to(policy.device)
+        actions = batch.action.long().to(policy.device)
+        wanted = torch.from_numpy(returns[numbers]).to(policy.device)
+        values, likelihood, _ = policy.evaluate_actions(observed, actions)
+        error = (values.flatten() - wanted).square().mean()
+        loss = -likelihood.mean() + config.vf_coef * error / spread
+        optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(policy.parameters(), config.max_grad_norm)
+        optimizer.step()
+        if number >= (updates - 1) // 100 * 100:
+            with torch.no_grad():
+                likeliest: Any = policy.get_distribution(observed).mode()
+            agree = (likeliest == actions).all(1).float().mean()
+            figures.append([-float(likelihood.detach().mean()), float(agree), float(error.detach())])
+    policy.set_training_mode(False)
+    return dict(zip(("loss", "accuracy", "value_error"), np.mean(figures, 0).tolist(), strict=True))
 
-    def __init__(self, program: TaskProgram, learner: _Learner, metrics: Metrics, done: int):
-        self.program, self.learner, self.metrics, self.done = program, learner, metrics, done
 
-    def after(self, step: int) -> None:
-        """Play after some interactions, if a multiple of `eval_every` lies in the last rollout, and before the first."""
-        config = self.learner.config
-        before = step - config.rollout * config.envs
-        if step > self.done and (not step or step // config.eval_every > before // config.eval_every):
-            self._play(step)
-        self.done = step
-
-    def _play(self, step: int) -> None:
-        config, policy = self.learner.config, self.learner.model.policy
-        channels = len(self.learner.worlds.tensors.observation.channels)
-        trained = TrainedPolicy(policy, config.observation, channels, step, frames=config.frames)
-        policy.set_training_mode(False)
-        worlds = torch.arange(config.eval_episodes)
-        returns = play(self.program, trained, worlds, observation=config.observation).returns
-        mean, half = mean_and_interval(returns.tolist())
-        interval = {} if half is None else {"held_out/interval": half}
-        self.metrics.write(step, {"held_out/return": mean, **interval})
+def _returns(dataset: Dataset, gamma: float) -> NDArray[np.float32]:
+    """The discounted return from each transition on, float32 [transitions], in the order of the dataset."""
+    parts = []
+    for number in range(len(dataset)):
+        reward = dataset.episode(number).reward.double().numpy()
+        total, found = 0.0, np.empty(len(reward), np.float32)
+        for step in reversed(range(len(reward))):
+            total = reward[step] + gamma * total
+            found[step] = total
+        parts.append(found)
+    return np.concatenate(parts)
 
 
 class _Keeper(BaseCallback):
-    """Saves between rollouts, and keeps the latest unsaved state in memory."""
+    """Between rollouts, saves or keeps the latest state in memory, and plays the policy in held-out worlds.
+
+    Args:
+        held_out: these worlds, if any: ``held_out/return`` of the metrics. Training does not depend on them.
+        played: the interactions up to which they have been played; -1 for a run that begins.
+    """
 
     def __init__(
-        self, run: RunFolder, learner: _Learner, progress: Progress | None, held_out: _HeldOut | None
+        self,
+        run: RunFolder,
+        learner: _Learner,
+        metrics: Metrics,
+        progress: Progress | None,
+        held_out: TaskProgram | None,
+        played: int,
     ):
         super().__init__()
-        self.run, self.learner, self.progress, self.held_out = run, learner, progress, held_out
+        self.run, self.learner, self.metrics, self.progress = run, learner, metrics, progress
+        self.held_out, self.played = held_out, played
         self.saved_at = time.monotonic()
         self.latest: tuple[int, dict[str, Any]] | None = None
         self.mean: float | None = None
 
     def _on_rollout_start(self) -> None:
         step, state = self.learner.step, self.learner.state()
-        if self.held_out is not None:
-            self.held_out.after(step)
+        self.play_held_out(step)
         if step and time.monotonic() - self.saved_at >= 60 * self.learner.config.checkpoint_minutes:
             self.run.save_checkpoint(step, state)
             self.saved_at, self.latest = time.monotonic(), None
@@ -315,6 +351,24 @@ class _Keeper(BaseCallback):
         if self.progress is not None:
             self.progress(self.learner.step, self.mean)
         return True
+
+    def play_held_out(self, step: int) -> None:
+        """Play after some interactions, if a multiple of `eval_every` lies in the last rollout, and before the first."""
+        config, policy = self.learner.config, self.learner.model.policy
+        before, played = step - config.rollout * config.envs, self.played
+        self.played = step
+        if self.held_out is None or step <= played:
+            return
+        if step and step // config.eval_every <= before // config.eval_every:
+            return
+        channels = len(self.learner.worlds.tensors.observation.channels)
+        trained = TrainedPolicy(policy, config.observation, channels, step, frames=config.frames)
+        policy.set_training_mode(False)
+        worlds = torch.arange(config.eval_episodes)
+        returns = play(self.held_out, trained, worlds, observation=config.observation).returns
+        mean, half = mean_and_interval(returns.tolist())
+        interval = {} if half is None else {"held_out/interval": half}
+        self.metrics.write(step, {"held_out/return": mean, **interval})
 
     def save_latest(self) -> None:
         """Save the state before the rollout that is in progress, unless that has been done."""

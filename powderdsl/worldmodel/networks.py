@@ -22,9 +22,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from powderdsl.diagnostics import CompileError, suggest
-from powderdsl.experiments.runs import Checkpoint, does_not_fit
+from powderdsl.experiments.runs import Checkpoint, fitting
 from powderdsl.system.writing import failure
-from powderdsl.worldmodel.config import is_network_name
+from powderdsl.worldmodel.config import TrainConfig, is_network_name
 
 SIDES = 4
 """Rows and columns are padded to a multiple of this: two poolings halve them twice."""
@@ -291,7 +291,26 @@ def _invalid(name: str, what: str, *notes: str, helps: tuple[str, ...] = ()) -> 
     return failure("PD625", f"the network `{name}` {what}", notes=notes, helps=helps)
 
 
-# Weights
+# Networks of runs
+
+
+def encoder_of(config: TrainConfig, slots: int) -> Encoder:
+    """What makes channels of the inputs."""
+    if config.recorded is None:
+        return OneHot(slots)
+    return ActionChannels(slots, len(config.recorded.channels), config.recorded.actions)
+
+
+def network_of(config: TrainConfig, slots: int, given: nn.Module | CustomNetwork | None) -> nn.Module:
+    """The network that is given, or the paper's, which encodes worlds without actions by itself."""
+    encoder = encoder_of(config, slots)
+    if isinstance(given, CustomNetwork):
+        return given.build(encoder, slots, config.seed)
+    if given is not None:
+        return given
+    if isinstance(encoder, OneHot):
+        return fresh_unet(slots, config.width, config.seed)
+    return Encoded(encoder, fresh_unet(slots, config.width, config.seed, encoder.channels))
 
 
 def fit_weights(model: nn.Module, checkpoint: Checkpoint, *, grow: bool = False) -> None:
@@ -303,12 +322,9 @@ def fit_weights(model: nn.Module, checkpoint: Checkpoint, *, grow: bool = False)
     Raises:
         CompileError: PD623 if they are those of another network.
     """
-    try:
+    with fitting(checkpoint.path, "its weights are those of another network"):
         weights = dict(checkpoint.state["model"])
         model.load_state_dict(_grown(weights, model) if grow else weights)
-    except (RuntimeError, TypeError, ValueError, AttributeError, LookupError) as error:
-        words = [line.strip()[:200] for line in str(error).splitlines()[:4]]
-        raise does_not_fit(checkpoint.path, "its weights are those of another network", *words) from None
 
 
 def _grown(state: dict[str, Any], model: nn.Module) -> dict[str, Any]:

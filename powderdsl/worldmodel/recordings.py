@@ -21,6 +21,7 @@ from powderdsl.model.fingerprint import fingerprint
 from powderdsl.system.writing import failure
 from powderdsl.tasks.shipped import load_task, shipped_tasks
 from powderdsl.tasks.task import BLOW, NO_CHANGE, Task
+from powderdsl.tasks.tensors.actions import cells_of
 from powderdsl.worldmodel.config import DataConfig, Recorded, TrainConfig
 from powderdsl.worldmodel.networks import NO_ELEMENT
 from powderdsl.worldmodel.worlds import Pairs
@@ -94,12 +95,7 @@ class Recording:
     def painted(self, actions: Tensor) -> Tensor:
         """What actions, integers [B, 5], do to each cell: uint8 [B, 3, H, W]."""
         agent, actions = self.task.agent, actions.long()
-        inside = []
-        for axis, side in enumerate(self.size):
-            first = agent.first_line(axis, actions[:, 1 - axis], side)[:, None]
-            line = torch.arange(side)
-            inside.append((first <= line) & (line < first + agent.brush[axis]))
-        block = inside[0][:, :, None] & inside[1][:, None, :]
+        block = cells_of(agent, self.size, actions[:, 1], actions[:, 0])
         choice = torch.tensor(agent.choices)[actions[:, 2]][:, None, None]
         placed = torch.where(block & (choice >= 0), choice, NO_ELEMENT)
         blown = block & (choice == BLOW)

@@ -1,23 +1,27 @@
-"""Networks that have been trained: read from their runs, and taught packs that they have not seen."""
+"""Networks that have been trained: read from their runs, and taught packs that they have not seen.
+
+Rules are as written on the command line, with packs added and left out: ``ruleset-pack+pack``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from torch import nn
 
+from powderdsl.compiler import load, read, split_names
+from powderdsl.diagnostics import Reporter
 from powderdsl.experiments.runs import Checkpoint, RunFolder, does_not_fit, find_run, no_run
 from powderdsl.experiments.runs.folder import recorded_palette
 from powderdsl.model.composition.palette import Palette
 from powderdsl.model.types import Ruleset
 from powderdsl.tasks.shipped import load_task
 from powderdsl.worldmodel.config import DataConfig, TrainConfig
-from powderdsl.worldmodel.networks import CustomNetwork, Encoded, OneHot, UNet, fit_weights
-from powderdsl.worldmodel.rule_words import add, pack_names
-from powderdsl.worldmodel.training import KIND, encoder_of, load_rules_of, network_missing
+from powderdsl.worldmodel.networks import CustomNetwork, fit_weights, network_of
+from powderdsl.worldmodel.training import KIND, load_rules_of, network_missing
 
 
 @dataclass(frozen=True)
@@ -52,21 +56,12 @@ def load_trained(
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise no_run(run.path, str(error)) from None
     palette = recorded_palette(run)
-    slots = len(palette)
     if network is None and config.network is not None:
         raise network_missing(run.path, config.network)
     if isinstance(network, CustomNetwork) and network.name != config.network:
         there = "the paper's U-net" if config.network is None else f"`{config.network}`"
         raise does_not_fit(run.path, f"it was trained with {there}, not with `{network.name}`")
-    checkpoint, encoder = run.checkpoint(), encoder_of(config, slots)
-    if isinstance(network, CustomNetwork):
-        model: nn.Module = network.build(encoder, slots, config.seed)
-    elif network is not None:
-        model = network
-    elif isinstance(encoder, OneHot):
-        model = UNet(slots, config.width)
-    else:
-        model = Encoded(encoder, UNet(slots, config.width, encoder.channels))
+    checkpoint, model = run.checkpoint(), network_of(config, len(palette), network)
     fit_weights(model, checkpoint)
     return Trained(run, config, palette, model.to(device).eval(), checkpoint)
 
@@ -116,3 +111,64 @@ def extended_palette(palette: Palette, rules: Ruleset) -> tuple[str | None, ...]
     for element in rules.elements:
         found[element.id] = element.qualified
     return tuple(found)
+
+
+# Rules with packs added and left out
+
+
+def pack_names(rules: str, words: Iterable[str]) -> tuple[str, ...]:
+    """The names of packs that are given by name or as files. Raises CompileError for a file that is not a pack.
+
+    A name of a pack of the rules, left out or not, stands for that pack.
+    """
+    known = _known(rules)
+    found: dict[str, None] = {}
+    for word in words:
+        found |= dict.fromkeys([word] if word in known else _names_of(word))
+    return tuple(found)
+
+
+def leave_out(rules: str, packs: Iterable[str]) -> str:
+    """The rules without some packs, which are given by name or as files."""
+    plus, minus = split_names(rules)
+    return _written(plus, [*minus, *pack_names(rules, packs)])
+
+
+def add(rules: str, packs: Iterable[str]) -> str:
+    """The rules with some packs, by name or as files: those that were left out come back, others are added."""
+    plus, minus = split_names(rules)
+    known = _known(rules)
+    for word in packs:
+        names = [word] if word in known else _names_of(word)
+        minus = [name for name in minus if name not in names]
+        if not all(name in known for name in names):
+            plus.append(word)
+    return _written(plus, minus)
+
+
+def keep(rules: str, packs: Sequence[str]) -> str:
+    """The rules with these packs alone. Those that the rules do not have are added."""
+    kept = pack_names(rules, packs)
+    gone = [pack for pack in load(rules).packs if pack not in kept]
+    return add(leave_out(rules, gone), packs)
+
+
+def _known(rules: str) -> tuple[str, ...]:
+    """The packs that rules name, including those that are left out."""
+    return _names_of(*split_names(rules)[0])
+
+
+def _names_of(*words: str) -> tuple[str, ...]:
+    reporter = Reporter()
+    packs, _ = read(words, reporter)
+    reporter.raise_if_errors()
+    return tuple(pack.name.text for pack in packs)
+
+
+def _written(plus: Sequence[str], minus: Iterable[str]) -> str:
+    """Names joined by ``+``. What is left out stands behind a name, for a file's name may have a ``-`` of its own."""
+    names = list(plus)
+    plain = [number for number, name in enumerate(names) if not name.endswith((".yaml", ".yml"))]
+    place = plain[0] if plain else len(names) - 1
+    names[place] += "".join(f"-{name}" for name in dict.fromkeys(minus))
+    return "+".join(names)

@@ -16,7 +16,7 @@ from torch.nn import functional as F
 
 from powderdsl.compiler import load, whole_palette
 from powderdsl.diagnostics import CompileError
-from powderdsl.experiments.runs import Checkpoint, RunFolder, does_not_fit, open_run, read_run
+from powderdsl.experiments.runs import Checkpoint, RunFolder, does_not_fit, fitting, open_run, read_run
 from powderdsl.experiments.runs.folder import ABOUT, check_palette, recorded_palette
 from powderdsl.model.composition.palette import Palette
 from powderdsl.model.fingerprint import fingerprint
@@ -26,15 +26,7 @@ from powderdsl.system.random import base_keys, mix
 from powderdsl.system.writing import failure
 from powderdsl.tasks.shipped import load_task
 from powderdsl.worldmodel.config import HERE, DataConfig, Machine, TrainConfig
-from powderdsl.worldmodel.networks import (
-    ActionChannels,
-    CustomNetwork,
-    Encoded,
-    Encoder,
-    OneHot,
-    fit_weights,
-    fresh_unet,
-)
+from powderdsl.worldmodel.networks import CustomNetwork, encoder_of, fit_weights, network_of
 from powderdsl.worldmodel.replay import Replay
 from powderdsl.worldmodel.scores import Network, score
 from powderdsl.worldmodel.worlds import Pairs, Worlds, task_worlds, validation_pairs
@@ -125,14 +117,13 @@ def train(
     given: Any = recording or worlds
     check_slots(path, palette, given.rules)
     identity |= {"palette": palette, "rules_fingerprint": fingerprint(given.rules)}
-    slots, encoder = len(palette), encoder_of(config, len(palette))
+    slots = len(palette)
     if isinstance(network, CustomNetwork):
+        encoder = encoder_of(config, slots)
         network.check(encoder, slots, encoder.example(given.size), config.seed)
     run = open_run(path, KIND, {**config.plain, **identity}, note=note)
     with run.locked():
-        if isinstance(network, CustomNetwork):
-            network = network.build(encoder, slots, config.seed)
-        model = network or _fresh(config, encoder, slots)
+        model = network_of(config, slots, network)
         trainer = _Trainer(config, machine, run, model.to(machine.device), slots)
         trainer.restore(parent)
         if trainer.done == config.iterations:
@@ -153,20 +144,6 @@ def train(
         with _random_numbers_kept(torch.device(machine.device)):
             trainer.train(tell, save_seconds)
     return run
-
-
-def encoder_of(config: TrainConfig, slots: int) -> Encoder:
-    """What makes channels of the inputs."""
-    if config.recorded is None:
-        return OneHot(slots)
-    return ActionChannels(slots, len(config.recorded.channels), config.recorded.actions)
-
-
-def _fresh(config: TrainConfig, encoder: Encoder, slots: int) -> nn.Module:
-    """The paper's network with random weights. It encodes worlds without actions by itself."""
-    if isinstance(encoder, OneHot):
-        return fresh_unet(slots, config.width, config.seed)
-    return Encoded(encoder, fresh_unet(slots, config.width, config.seed, encoder.channels))
 
 
 def _random_numbers_kept(device: torch.device) -> AbstractContextManager[None]:
@@ -197,12 +174,9 @@ class _Trainer:
                 fit_weights(self.model, parent, grow=True)
             return
         fit_weights(self.model, found)
-        try:
+        with fitting(found.path, "its state is that of another run"):
             self.optimizer.load_state_dict(found.state["optimizer"])
             self.done, self.recent = found.step, [float(one) for one in found.state["recent"]]
-        except (RuntimeError, TypeError, ValueError, AttributeError, LookupError) as error:
-            why = " ".join(str(error).split())[:300]
-            raise does_not_fit(found.path, f"its state is that of another run: {why}") from None
 
     def train(self, tell: Tell, save_seconds: float) -> None:
         """Train to the end. A signal is raised once a checkpoint is written, a second one at once."""

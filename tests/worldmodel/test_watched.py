@@ -10,7 +10,7 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.tasks.episodes import compile_task
 from powderdsl.tasks.shipped import load_task
 from powderdsl.worldmodel import DataConfig, task_worlds
-from powderdsl.worldmodel.rule_words import add, keep, leave_out
+from powderdsl.worldmodel.trained import add, keep, leave_out
 from powderdsl.worldmodel.training import palette_of
 from powderdsl.worldmodel.worlds import watch
 

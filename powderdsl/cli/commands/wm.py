@@ -19,9 +19,9 @@ from powderdsl.worldmodel.config import PRESETS, DataConfig, TrainConfig, Variet
 if TYPE_CHECKING:
     from powderdsl.model.types import Ruleset
     from powderdsl.worldmodel.config import Machine
+    from powderdsl.worldmodel.evaluation import Strip
     from powderdsl.worldmodel.networks import CustomNetwork
     from powderdsl.worldmodel.recordings import Recording
-    from powderdsl.worldmodel.strips import Strip
     from powderdsl.worldmodel.trained import Trained
     from powderdsl.worldmodel.training import TrainingProgress
 
@@ -229,8 +229,7 @@ def show_command(run: str, out: Path, curve: bool, scale: int, **values: Any) ->
 
         write_curve(find_run(run, KIND), out)
         return
-    from powderdsl.worldmodel.evaluation import unseen_worlds
-    from powderdsl.worldmodel.strips import recorded_strips, strips
+    from powderdsl.worldmodel.evaluation import recorded_strips, strips, unseen_worlds
 
     trained, recording, machine = _loaded(run, values)
     if recording is not None:
@@ -252,7 +251,7 @@ def show_command(run: str, out: Path, curve: bool, scale: int, **values: Any) ->
 def _show(found: list[Strip], rules: Ruleset, out: Path, scale: int) -> None:
     """Draw strips, and count what is wrong in each."""
     from powderdsl.simulation.media import write_png
-    from powderdsl.worldmodel.strips import sheet
+    from powderdsl.worldmodel.evaluation import sheet
 
     write_png(out, sheet(found, rules, factor=scale))
     for number, strip in enumerate(found, 1):
@@ -336,7 +335,7 @@ def _own_network(name: str | None) -> CustomNetwork | None:
 def rules_of(rules: str, task: str, packs: tuple[str, ...], held_out: tuple[str, ...]) -> str:
     """Rules, or those of a task, with some packs alone or without others."""
     from powderdsl.tasks.shipped import load_task
-    from powderdsl.worldmodel.rule_words import keep, leave_out
+    from powderdsl.worldmodel.trained import keep, leave_out
 
     base = rules or "+".join(load_task(task).rules)
     return keep(base, packs) if packs else leave_out(base, held_out)

@@ -201,6 +201,15 @@ def does_not_fit(folder: Path, *why: str, helps: tuple[str, ...] = ()) -> Compil
     return failure("PD623", f"{folder} does not fit", notes=why, helps=helps)
 
 
+@contextmanager
+def fitting(path: Path, what: str) -> Iterator[None]:
+    """Report what raises where a checkpoint, which may hold anything, is given to a model (PD623)."""
+    try:
+        yield
+    except (RuntimeError, TypeError, ValueError, AttributeError, LookupError) as error:
+        raise does_not_fit(path, f"{what}: {' '.join(str(error).split())[:300]}") from None
+
+
 def no_run(folder: Path, why: str, helps: tuple[str, ...] = ()) -> CompileError:
     """The error for a folder that is not a run, or one that cannot be used (PD620)."""
     return failure("PD620", f"{folder} is not a run that can be used here", notes=(why,), helps=helps)

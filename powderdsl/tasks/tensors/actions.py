@@ -43,6 +43,15 @@ def put_rows(rows: Tensor, places: Tensor, part: Tensor, reuse: bool) -> Tensor:
     return (rows if reuse else rows.clone()).index_copy_(0, places, part)
 
 
+def cells_of(agent: Agent, size: Size, rows: Tensor, columns: Tensor) -> Tensor:
+    """The cells that actions at bins, int64 [B], change: bool [B, H, W]."""
+    covered = []
+    for axis, (bins, side) in enumerate(zip((rows, columns), size, strict=True)):
+        first, line = agent.first_line(axis, bins, side)[:, None], torch.arange(side)
+        covered.append((first <= line) & (line < first + agent.brush[axis]))
+    return covered[0][:, :, None] & covered[1][:, None, :]
+
+
 class Blocks:
     """Blocks of cells in the worlds of one simulator and size.
 
