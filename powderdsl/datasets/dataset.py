@@ -21,7 +21,6 @@ from torch.utils.data import IterableDataset, get_worker_info
 from powderdsl.datasets.manifest import (
     Manifest,
     Recipe,
-    check_count,
     damaged,
     differences,
     many_damaged,
@@ -32,6 +31,7 @@ from powderdsl.datasets.shards import DTYPES, Shard, knows_ids, open_shard, read
 from powderdsl.diagnostics import CompileError, Diagnostic
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.system.random import MASK, base_keys, mix
+from powderdsl.system.settings import check_count
 from powderdsl.system.writing import failure
 
 Array = NDArray[Any]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from datetime import UTC, datetime
 from math import prod
@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 from powderdsl.diagnostics import CompileError, Diagnostic, Label
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.system.reading import check_links, parse_json, read_bytes
-from powderdsl.system.settings import Limits, read_record
+from powderdsl.system.settings import Limits, check_count, read_record
 from powderdsl.system.writing import failure, write_text
-from powderdsl.tasks.task import BLOW, NO_CHANGE
+from powderdsl.tasks.task import BLOW, NO_CHANGE, Task
 
 if TYPE_CHECKING:
     from powderdsl.envs.tensor_env import TensorEnv
@@ -159,8 +159,7 @@ def read_manifest(folder: Path) -> Manifest:
     problems: list[str] = []
     manifest = read_record(Manifest, data, problems)
     if manifest is not None:
-        problems += _misfits(manifest.recipe)
-        problems += _misfits_of_shards(manifest)
+        problems += _misfits(manifest.recipe, manifest.shards)
     if manifest is None or problems:
         raise many_damaged(path, problems)
     return replace(manifest, shards=tuple(sorted(manifest.shards, key=lambda shard: shard.number)))
@@ -220,10 +219,21 @@ def differences(old: Recipe, new: Recipe) -> list[str]:
     return found
 
 
-def check_count(name: str, value: Any, most: int, *, least: int = 1) -> None:
-    """Raises ValueError if a value is not an integer from `least` to `most`."""
-    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-        raise ValueError(f"{name} must be an integer from {least} to {most}, found {value!r}")
+def choice_names(task: Task) -> tuple[str, ...]:
+    """What the values of an action's third number are."""
+    names = {element.id: element.qualified for element in task.ruleset.elements}
+    names |= {BLOW: "blow", NO_CHANGE: "nothing"}
+    return tuple(names[choice] for choice in task.agent.choices)
+
+
+def changed_params(recipe: Recipe, task: Task) -> dict[str, Any]:
+    """The parameters of a recipe that differ from those of the task's rules."""
+    own = {param.name: param.default for param in task.ruleset.params}
+    return {
+        name: int(value) if isinstance(own[name], int) else value
+        for name, value in recipe.params.items()
+        if name in own and float(own[name]) != value
+    }
 
 
 def recipe_of(
@@ -241,8 +251,6 @@ def recipe_of(
         ValueError: a shard may become too large.
     """
     task, ruleset = env.task, env.task.ruleset
-    names = {element.id: element.qualified for element in ruleset.elements}
-    names |= {BLOW: "blow", NO_CHANGE: "nothing"}
     recipe = Recipe(
         task=task.name,
         split=env.split,
@@ -263,7 +271,7 @@ def recipe_of(
         shape=tuple(int(one) for one in env.observation.space.shape),
         palette={str(element.id): element.qualified for element in ruleset.elements},
         action_nvec=env.program.action_nvec,  # data have all five numbers, whatever form the environment takes
-        choices=tuple(names[choice] for choice in task.agent.choices),
+        choices=choice_names(task),
         actions=env.max_episode_steps,
         last_action="terminates" if env.last_action_terminates else "truncates",
     )
@@ -299,9 +307,9 @@ def episode_bytes(recipe: Recipe) -> int:
     return (recipe.actions + 1) * (prod(recipe.shape) + 32)
 
 
-def _misfits(recipe: Recipe) -> list[str]:
-    """Contradictions between the values of a recipe."""
-    found = []
+def _misfits(recipe: Recipe, shards: Sequence[ShardRow] = ()) -> list[str]:
+    """Contradictions between the values of a recipe, and with the rows of shards."""
+    found, numbers = [], set()
     if len(recipe.channels) != recipe.shape[0]:
         found.append(f"{len(recipe.channels)} channels, but observations of the shape {list(recipe.shape)}")
     if len(recipe.choices) != recipe.action_nvec[2]:
@@ -310,13 +318,7 @@ def _misfits(recipe: Recipe) -> list[str]:
         )
     if recipe.shards > MAX_SHARDS:
         found.append(f"{recipe.shards:,} shards, more than {MAX_SHARDS:,}")
-    return found
-
-
-def _misfits_of_shards(manifest: Manifest) -> list[str]:
-    """Contradictions between the rows of shards and the recipe."""
-    recipe, found, numbers = manifest.recipe, [], set()
-    for place, row in enumerate(manifest.shards):
+    for place, row in enumerate(shards):
         count = len(recipe.episodes_of(row.number))
         unpacked = (row.transitions + count) * prod(recipe.shape)
         if row.number in numbers or row.number >= recipe.shards:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from powderdsl.datasets.dataset import Dataset
-from powderdsl.datasets.manifest import Recipe, damaged, read_recipe, recipe_of
+from powderdsl.datasets.manifest import Recipe, changed_params, damaged, read_recipe, recipe_of
 from powderdsl.datasets.recorder import add_shard, begun, held_place
 from powderdsl.datasets.shards import DTYPES, check_episodes, knows_ids, row_shape
 from powderdsl.diagnostics import CompileError
@@ -147,8 +147,7 @@ def _spec(recipe: Recipe) -> Any:
     if recipe.task not in shipped_tasks():
         return None
     try:
-        usual = {one.name: float(one.default) for one in load_task(recipe.task).ruleset.params}
-        params = {name: value for name, value in recipe.params.items() if usual.get(name) != value}
+        params = changed_params(recipe, load_task(recipe.task))
         task = load_task(recipe.task, knobs=recipe.knobs, params=params)
     except (CompileError, ValueError, KeyError):  # its knobs or parameters have changed
         return None

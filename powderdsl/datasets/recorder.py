@@ -20,7 +20,6 @@ from powderdsl.datasets.manifest import (
     MAX_EPISODES,
     Manifest,
     Recipe,
-    check_count,
     check_place,
     differences,
     episode_bytes,
@@ -34,6 +33,7 @@ from powderdsl.envs.acting import FrameStack, Policy, action_keys, random_policy
 from powderdsl.envs.observations import Observation, observation_of
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.experiments.runs.folder import held
+from powderdsl.system.settings import check_count
 from powderdsl.system.writing import failure, not_writable
 from powderdsl.tasks.episodes import TaskProgram
 from powderdsl.tasks.players import ExpertPlayer

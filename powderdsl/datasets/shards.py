@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from powderdsl.datasets.manifest import Recipe, ShardRow, damaged, shard_file
-from powderdsl.system.archives import BadArchive, open_archive
+from powderdsl.system.archives import BadArchive, Parts, open_archive, write_archive
 from powderdsl.system.reading import open_regular
 from powderdsl.system.writing import not_writable, replacing
 
@@ -62,19 +62,16 @@ def write_shard(
         CompileError: PD613 if the place cannot be written, or the disk is full.
     """
     path = folder / shard_file(number)
+    arrays: dict[str, Array | Parts | str] = {}
+    for name, dtype in DTYPES.items():
+        rows = [np.asarray(part, dtype) for part in parts[name]]
+        arrays[name] = Parts(dtype, (sum(map(len, rows)), *rows[0].shape[1:]), rows)
     with replacing(path) as temporary:
         try:
-            form = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
-            with zipfile.ZipFile(temporary, "w", form, compresslevel=LEVEL) as archive:
-                for name, dtype in DTYPES.items():
-                    values = [np.ascontiguousarray(part, dtype) for part in parts[name]]
-                    shape = (sum(map(len, values)), *values[0].shape[1:])
-                    header = {"descr": dtype, "fortran_order": False, "shape": shape}
-                    with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                        np.lib.format.write_array_header_1_0(member, header)
-                        for value in values:
-                            member.write(value.data)
-            with temporary.open("rb") as file:
+            with temporary.open("w+b") as file:
+                write_archive(file, arrays, LEVEL if compress else 0)
+                file.flush()
+                file.seek(0)
                 os.fsync(file.fileno())
                 digest = hashlib.file_digest(file, "sha256").hexdigest()
             size = temporary.stat().st_size

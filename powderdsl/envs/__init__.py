@@ -14,13 +14,12 @@ from powderdsl.system.lazy import importing
 from powderdsl.tasks.shipped import shipped_tasks
 
 if TYPE_CHECKING:
-    from powderdsl.envs.goal_env import GoalEnv
-    from powderdsl.envs.gym import PowderEnv, PowderVectorEnv
+    from powderdsl.envs.gym import GoalEnv, PowderEnv, PowderVectorEnv
     from powderdsl.envs.tensor_env import TensorEnv
 
 __all__ = ["GoalEnv", "PowderEnv", "PowderVectorEnv", "TensorEnv"]
 
-_HOMES = {"GoalEnv": "goal_env", "PowderEnv": "gym", "PowderVectorEnv": "gym", "TensorEnv": "tensor_env"}
+_HOMES = {"GoalEnv": "gym", "PowderEnv": "gym", "PowderVectorEnv": "gym", "TensorEnv": "tensor_env"}
 
 
 def env_id(task: str) -> str:

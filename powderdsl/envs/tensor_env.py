@@ -16,6 +16,7 @@ from powderdsl.envs.actions import action_form
 from powderdsl.envs.observations import observation_of
 from powderdsl.simulation.simulator import MAX_CELLS
 from powderdsl.system.random import MASK, mix
+from powderdsl.system.settings import check_count
 from powderdsl.tasks.episodes import (
     Episodes,
     TaskProgram,
@@ -31,6 +32,9 @@ Info = dict[str, Any]
 OPTIONS = ("params", "worlds", "reset_mask")
 ROWS = ("base", "episode", "returned", "ended")
 """Attributes, with `_` before them, that `TensorEnv.state` saves: one number for each environment."""
+
+MAX_SEED = (1 << 62) - 1
+"""The largest seed, and number of a world."""
 
 LAST_ACTIONS = ("auto", "truncates", "terminates")
 
@@ -90,11 +94,8 @@ class TensorEnv:
         device: str | torch.device = "cpu",
         threads: int | None = None,
     ):
-        steps = 1 if max_episode_steps is None else max_episode_steps
-        counts: dict[str, Any] = {"num_envs": num_envs, "worlds": worlds, "max_episode_steps": steps}
-        for name, value in counts.items():
-            if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
-                raise ValueError(f"{name} must be an integer from 1, found {value!r}")
+        check_count("worlds", worlds, MAX_SEED)
+        check_count("max_episode_steps", 1 if max_episode_steps is None else max_episode_steps, MAX_SEED)
         if last_action not in LAST_ACTIONS:
             raise ValueError(f"last_action is one of {', '.join(LAST_ACTIONS)}; found {last_action!r}")
         if isinstance(task, Task) and (knobs or params):
@@ -216,7 +217,7 @@ class TensorEnv:
         if len(seeds) != self.num_envs:
             raise ValueError(f"seed has {len(seeds)} numbers for {self.num_envs} environments")
         new = integer_tensor("seed", [0 if one is None else one for one in seeds], self.device)
-        if bool(((new < 0) | (new >= 1 << 62)).any()):
+        if bool(((new < 0) | (new > MAX_SEED)).any()):
             raise ValueError(f"a seed lies in 0..2⁶²−1, found {seed}")
         given = torch.tensor([one is not None for one in seeds], device=self.device)
         return torch.where(given, new, old), given
@@ -371,10 +372,8 @@ class TensorEnv:
 
 
 def check_cells(num_envs: int, size: tuple[int, int]) -> None:
-    """Raises ValueError for more worlds than a simulator takes."""
-    most = MAX_CELLS // (size[0] * size[1])
-    if num_envs > most:
-        raise ValueError(f"num_envs must be an integer from 1 to {most:,} here, found {num_envs:,}")
+    """Raises ValueError for no worlds, or more than a simulator takes."""
+    check_count("num_envs", num_envs, MAX_CELLS // (size[0] * size[1]))
 
 
 def mode_of(value: AutoresetMode | str) -> AutoresetMode:

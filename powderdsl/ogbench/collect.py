@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -21,12 +20,12 @@ from numpy.typing import NDArray
 from powderdsl.experiments.runs.folder import held
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.ogbench.datasets import FAMILY, VERSION
-from powderdsl.ogbench.draws import keyed
+from powderdsl.ogbench.episodes import keyed
 from powderdsl.ogbench.levels import Level
 from powderdsl.ogbench.program import LevelProgram
-from powderdsl.system.archives import BadArchive, open_archive
+from powderdsl.system.archives import BadArchive, Parts, open_archive, write_archive
 from powderdsl.system.reading import read_json
-from powderdsl.system.writing import failure, replacing, write_text
+from powderdsl.system.writing import failure, not_writable, replacing, write_text
 
 Array = NDArray[Any]
 Numbers = NDArray[np.int64]
@@ -107,10 +106,7 @@ def collect(
         place / f"{name}.npz": Recipe(level.name, rules, seed, 0, train, level.play.steps),
         place / f"{name}-val.npz": Recipe(level.name, rules, seed, VALIDATION, few, level.play.steps),
     }
-    try:
-        place.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise failure("PD613", f"cannot write {place}", notes=(error.strerror or str(error),)) from None
+    _make_folder(place)
     done = 0.0
 
     def report(more: float) -> None:
@@ -123,6 +119,13 @@ def collect(
         for path, recipe in recipes.items():
             _write(program, path, recipe, report)
     return list(recipes)
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise not_writable(folder, error) from None
 
 
 def _write(program: LevelProgram, path: Path, recipe: Recipe, report: Callable[[float], None]) -> None:
@@ -140,70 +143,47 @@ def _write(program: LevelProgram, path: Path, recipe: Recipe, report: Callable[[
             raise ValueError(f"{path} is there already, and {about.name} is not: choose another folder")
         report(recipe.count)
         return
-    try:
-        parts.mkdir(exist_ok=True)
-    except OSError as error:
-        raise failure("PD613", f"cannot write {parts}", notes=(error.strerror or str(error),)) from None
+    _make_folder(parts)
     write_text(about, json.dumps(asdict(recipe), indent=2) + "\n")
     for first in range(0, recipe.count, PART):
         file, count = parts / f"{first:09}.npz", min(PART, recipe.count - first)
         if _read_part(file, recipe, program.level, count) is None:
             frames = _played(program, recipe, first, count)
-            with (
-                replacing(file) as temporary,
-                _archive(temporary) as archive,
-                archive.open("frames.npy", "w", force_zip64=True) as member,
-            ):
-                _write_header(member, frames.dtype, frames.shape)
-                for one in frames:
-                    member.write(one.tobytes())
+            with replacing(file) as temporary, temporary.open("wb") as part:
+                write_archive(part, {"frames": frames}, COMPRESSION)
         report(PLAYED * count)
-    with replacing(path) as temporary, _archive(temporary) as archive:
-        _write_arrays(archive, program, parts, recipe, report)
+    rows, side = recipe.count * recipe.rows, program.level.side
+    terminals = np.zeros((recipe.count, recipe.rows), dtype=np.int32)
+    terminals[:, -1] = 1
+    arrays: dict[str, Array | Parts | str] = {
+        "observations": Parts("|u1", (rows, side, side, 6), _observations(program, parts, recipe, report)),
+        "actions": Parts("<i4", (rows,), _action_rows(program.level, recipe)),
+        "terminals": terminals.reshape(-1),
+    }
+    with replacing(path) as temporary, temporary.open("wb") as whole:
+        write_archive(whole, arrays, COMPRESSION)
     shutil.rmtree(parts, ignore_errors=True)
 
 
-def _write_arrays(
-    archive: zipfile.ZipFile,
-    program: LevelProgram,
-    parts: Path,
-    recipe: Recipe,
-    report: Callable[[float], None],
-) -> None:
-    level, rows = program.level, recipe.count * recipe.rows
-    shape = (rows, level.side, level.side, 6)
-    with archive.open("observations.npy", "w", force_zip64=True) as member:
-        _write_header(member, np.dtype(np.uint8), shape)
-        for first in range(0, recipe.count, PART):
-            count = min(PART, recipe.count - first)
-            frames = _read_part(parts / f"{first:09}.npz", recipe, level, count)
-            if frames is None:
-                raise failure("PD613", f"cannot write the data set: {parts} was changed meanwhile")
-            actions = _actions(level, recipe, first, count)
-            for at in range(0, count, WRITTEN):
-                some = slice(at, min(at + WRITTEN, count))
-                member.write(rows_of(program, frames[some], actions[some], recipe.rows).tobytes())
-                report((1 - PLAYED) * (some.stop - some.start))
-    with archive.open("actions.npy", "w") as member:
-        _write_header(member, np.dtype(np.int32), (rows,))
-        for first in range(0, recipe.count, PART):
-            actions = _actions(level, recipe, first, min(PART, recipe.count - first))
-            flat = actions.reshape(len(actions), -1)[:, : recipe.rows]
-            member.write(flat.astype(np.int32).tobytes())
-    terminals = np.zeros((recipe.count, recipe.rows), dtype=np.int32)
-    terminals[:, -1] = 1
-    with archive.open("terminals.npy", "w") as member:
-        _write_header(member, terminals.dtype, (rows,))
-        member.write(terminals.tobytes())
+def _observations(
+    program: LevelProgram, parts: Path, recipe: Recipe, report: Callable[[float], None]
+) -> Iterator[Frames]:
+    for first in range(0, recipe.count, PART):
+        count = min(PART, recipe.count - first)
+        frames = _read_part(parts / f"{first:09}.npz", recipe, program.level, count)
+        if frames is None:
+            raise failure("PD613", f"cannot write the data set: {parts} was changed meanwhile")
+        actions = _actions(program.level, recipe, first, count)
+        for at in range(0, count, WRITTEN):
+            some = slice(at, min(at + WRITTEN, count))
+            yield rows_of(program, frames[some], actions[some], recipe.rows)
+            report((1 - PLAYED) * (some.stop - some.start))
 
 
-def _archive(path: Path) -> zipfile.ZipFile:
-    return zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=COMPRESSION)
-
-
-def _write_header(member: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
-    values = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
-    np.lib.format.write_array_header_1_0(member, values)
+def _action_rows(level: Level, recipe: Recipe) -> Iterator[NDArray[np.int32]]:
+    for first in range(0, recipe.count, PART):
+        actions = _actions(level, recipe, first, min(PART, recipe.count - first))
+        yield actions.reshape(len(actions), -1)[:, : recipe.rows].astype(np.int32)
 
 
 def _actions(level: Level, recipe: Recipe, first: int, count: int) -> NDArray[np.int16]:
@@ -215,22 +195,14 @@ def _actions(level: Level, recipe: Recipe, first: int, count: int) -> NDArray[np
 def _played(program: LevelProgram, recipe: Recipe, first: int, count: int) -> Frames:
     """The worlds' pictures at the start and after each whole action: uint8 [count, painted + 1, H, W, 3]."""
     actions = _actions(program.level, recipe, first, count).astype(np.int64)
-    side = program.level.side
-    frames = np.empty((count, recipe.painted + 1, side, side, 3), dtype=np.uint8)
-    for number, pictures in enumerate(worlds(program, recipe, first, actions)):
-        frames[:, number] = pictures
-    return frames
-
-
-def worlds(program: LevelProgram, recipe: Recipe, first: int, actions: NDArray[np.int64]) -> Iterator[Frames]:
-    """The pictures of a batch's worlds at the start and after each whole action: uint8 [B, H, W, 3]."""
-    count = len(actions)
-    seeds = np.full(count, recipe.seed, dtype=np.int64)
-    world = program.start(seeds, np.arange(recipe.first + first, recipe.first + first + count))
-    yield world.rgb().cpu().numpy()
+    numbers = np.arange(recipe.first + first, recipe.first + first + count)
+    world = program.start(np.full(count, recipe.seed, dtype=np.int64), numbers)
+    frames = np.empty((count, recipe.painted + 1, *world.ids.shape[1:], 3), dtype=np.uint8)
+    frames[:, 0] = world.rgb().cpu().numpy()
     for number in range(recipe.painted):
         world = program.act(world, actions[:, number])
-        yield world.rgb().cpu().numpy()
+        frames[:, number + 1] = world.rgb().cpu().numpy()
+    return frames
 
 
 def rows_of(program: LevelProgram, frames: Frames, actions: NDArray[np.int16], rows: int) -> Frames:

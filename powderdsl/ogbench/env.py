@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from operator import index
 from pathlib import Path
 from typing import Any
 
@@ -16,22 +17,28 @@ from gymnasium.utils import EzPickle
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
-from torch import Tensor
 
-from powderdsl.envs.gym import objects
-from powderdsl.envs.tensor_env import check_cells, mode_of
-from powderdsl.ogbench.draws import FIRST_ELEMENT, FIRST_X, FIRST_Y, RANDOMNESS, keyed
-from powderdsl.ogbench.episodes import MODES, Episodes, task_of
+from powderdsl.envs.gym import array, objects
+from powderdsl.envs.tensor_env import MAX_SEED, check_cells, mode_of
+from powderdsl.ogbench.episodes import (
+    FIRST_ELEMENT,
+    FIRST_X,
+    FIRST_Y,
+    MODES,
+    RANDOMNESS,
+    Episodes,
+    keyed,
+    task_of,
+)
 from powderdsl.ogbench.levels import GoalTask, Level, find_level
 from powderdsl.ogbench.program import LevelProgram
+from powderdsl.system.settings import check_count, check_settings, setting
 
 Array = NDArray[Any]
 
 OPTIONS = ("task_id", "task_info", "render_goal")
 BATCH_OPTIONS = ("task_id", "task_info", "reset_mask")
 """Options of `reset`."""
-
-MAX_SEED = (1 << 62) - 1
 
 
 @dataclass(frozen=True)
@@ -51,9 +58,9 @@ class EnvOptions:
         TypeError, ValueError: a value is wrong.
     """
 
-    mode: str = "task"
+    mode: str = setting("task", choices=MODES)
     seed: int = 0
-    randomness: str = "counter"
+    randomness: str = setting("counter", choices=RANDOMNESS)
     render_mode: str | None = None
     width: int = 192
     height: int = 192
@@ -63,15 +70,9 @@ class EnvOptions:
 
     def __post_init__(self) -> None:
         seed_number(self.seed)
-        for name, choices in (
-            ("mode", MODES),
-            ("randomness", RANDOMNESS),
-            ("render_mode", (None, "rgb_array")),
-        ):
-            if getattr(self, name) not in choices:
-                raise ValueError(
-                    f"{name} is one of {', '.join(map(str, choices))}; found {getattr(self, name)!r}"
-                )
+        check_settings(self)
+        if self.render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode is None or rgb_array; found {self.render_mode!r}")
 
     def program(self, level: str | Path | Level | LevelProgram) -> LevelProgram:
         """The program of a level; environments of one process share it."""
@@ -79,6 +80,10 @@ class EnvOptions:
             return level
         as_ogbench = self.randomness == "ogbench"
         return _program(find_level(level), as_ogbench, self.backend, str(self.device), self.threads)
+
+    def episodes(self, program: LevelProgram, count: int) -> Episodes:
+        """Episodes of environments whose seeds are `seed`, `seed` + 1, …."""
+        return Episodes(program, np.arange(count) + self.seed, randomness=self.randomness, mode=self.mode)
 
     def picture(self, observation: Array) -> Array:
         """The world's part of an observation, by its nearest pixels: uint8 [height, width, 3]."""
@@ -99,11 +104,9 @@ def spaces_of(level: Level) -> tuple[Box, Discrete[Any]]:
 
 def seed_number(seed: Any) -> int:
     """A seed. Raises TypeError, ValueError."""
-    if not hasattr(seed, "__index__") or isinstance(seed, bool):
-        raise TypeError(f"a seed is an integer, found {seed!r}")
-    if not 0 <= int(seed) <= MAX_SEED:
-        raise ValueError(f"a seed lies in 0..2⁶²−1, found {seed}")
-    return int(seed)
+    number = index(seed)
+    check_count("seed", number, MAX_SEED, least=0)
+    return number
 
 
 def check_options(options: Mapping[str, Any], known: Sequence[str]) -> None:
@@ -130,11 +133,7 @@ class PowderworldEnv(gymnasium.Env[Array, Any], EzPickle):
         EzPickle.__init__(self, level, **options)
         self._options = EnvOptions(**options)
         program = self._options.program(level)
-        seeds, how = (
-            [self._options.seed],
-            {"randomness": self._options.randomness, "mode": self._options.mode},
-        )
-        self.episodes = Episodes(program, seeds, **how)
+        self.episodes = self._options.episodes(program, 1)
         """The same episode in a batch of one."""
         self.level, self.render_mode = program.level, self._options.render_mode
         self.observation_space, self.action_space = spaces_of(self.level)
@@ -181,7 +180,7 @@ class PowderworldEnv(gymnasium.Env[Array, Any], EzPickle):
         number = int(self.episodes.task_number[0])
         self.cur_task_id = number or None
         self.cur_task_info = self.task_infos[number - 1] if number else dict(given["task_info"])
-        info = {"goal": _array(self.episodes.goals()[0])}
+        info = {"goal": array(self.episodes.goals()[0])}
         if given.get("render_goal"):
             info["goal_rendered"] = self._options.picture(info["goal"])
         return self._observation(), info
@@ -195,7 +194,7 @@ class PowderworldEnv(gymnasium.Env[Array, Any], EzPickle):
         return self._observation(), float(success), success, False, info
 
     def _observation(self) -> Array:
-        return _array(self.episodes.observations()[0])
+        return array(self.episodes.observations()[0])
 
     def render(self) -> Any:
         """The world's picture, uint8 [height, width, 3]."""
@@ -242,15 +241,11 @@ class PowderworldVectorEnv(VectorEnv[Any, Any, Any]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         **options: Any,
     ):
-        if not hasattr(num_envs, "__index__") or num_envs < 1:
-            raise ValueError(f"num_envs must be an integer from 1, found {num_envs!r}")
         self._options = EnvOptions(**options)
         program = self._options.program(level)
         self.level = program.level
         check_cells(num_envs, (self.level.side, self.level.side))
-        seeds = [self._options.seed + number for number in range(num_envs)]
-        how = {"randomness": self._options.randomness, "mode": self._options.mode}
-        self.episodes = Episodes(program, seeds, **how)
+        self.episodes = self._options.episodes(program, num_envs)
         """The same episodes on tensors."""
         self.num_envs, self.autoreset_mode = num_envs, mode_of(autoreset_mode)
         self.max_episode_steps = max_episode_steps or self.level.steps
@@ -369,7 +364,7 @@ class PowderworldVectorEnv(VectorEnv[Any, Any, Any]):
         """What is known of episodes that begin where `mask` is set."""
         if self.episodes.mode != "task":
             return {}
-        goals = _array(self.episodes.goals())
+        goals = array(self.episodes.goals())
         return {
             "goal": goals,
             "_goal": mask.copy(),
@@ -378,15 +373,10 @@ class PowderworldVectorEnv(VectorEnv[Any, Any, Any]):
         }
 
     def _observations(self) -> Array:
-        return _array(self.episodes.observations())
+        return array(self.episodes.observations())
 
     def render(self) -> tuple[Any, ...] | None:
         """Each world's picture, uint8 [height, width, 3]."""
         if self.render_mode is None:
             return None
         return tuple(self._options.picture(world) for world in self._observations())
-
-
-def _array(tensor: Tensor) -> Array:
-    found: Array = tensor.cpu().numpy()
-    return found

@@ -10,7 +10,7 @@ import re
 import struct
 import zipfile
 from ast import literal_eval
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from math import prod
@@ -98,14 +98,29 @@ class Archive:
         return memoryview(data)[header.start :]
 
 
-def write_archive(file: BinaryIO, arrays: Mapping[str, NDArray[Any] | str]) -> None:
-    """Write an .npz, compressed: the bytes that `numpy.savez_compressed` writes."""
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+@dataclass(frozen=True)
+class Parts:
+    """An array in parts, whose rows follow one another. `dtype` is NumPy's text, such as ``|u1``."""
+
+    dtype: str
+    shape: tuple[int, ...]
+    parts: Iterable[NDArray[Any]]
+
+
+def write_archive(file: BinaryIO, arrays: Mapping[str, NDArray[Any] | Parts | str], level: int = 6) -> None:
+    """Write an .npz: with the default level of deflate, the bytes that `numpy.savez_compressed` writes; 0 stores them."""
+    form = zipfile.ZIP_DEFLATED if level else zipfile.ZIP_STORED
+    with zipfile.ZipFile(file, "w", form, compresslevel=level) as archive:
         for name, value in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 if isinstance(value, str):
                     _write_header(member, f"<U{len(value)}", ())
                     member.write(value.encode("utf-32-le"))
+                    continue
+                if isinstance(value, Parts):
+                    _write_header(member, value.dtype, value.shape)
+                    for part in value.parts:
+                        member.write(part.tobytes())
                     continue
                 shape = tuple(value.shape)
                 _write_header(member, value.dtype.str, shape)

@@ -67,6 +67,12 @@ def setting(
     return field(default=default, metadata=metadata)
 
 
+def check_count(name: str, value: Any, most: int, *, least: int = 1) -> None:
+    """Raise ValueError if an argument is not an integer from `least` to `most`."""
+    if isinstance(value, bool) or not hasattr(value, "__index__") or not least <= value <= most:
+        raise ValueError(f"{name} must be an integer from {least:,} to {most:,}, found {value!r}")
+
+
 def mistakes(config: Any) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Yield a sentence and suggestions for each setting whose value it does not take."""
     hints = get_type_hints(type(config))

@@ -12,15 +12,16 @@ import json
 from dataclasses import asdict, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from powderdsl.datasets.manifest import changed_params, choice_names
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.system.writing import failure
 from powderdsl.tasks.shipped import load_task, shipped_tasks
-from powderdsl.tasks.task import BLOW, NO_CHANGE, Task
+from powderdsl.tasks.task import BLOW, Task
 from powderdsl.tasks.tensors.actions import cells_of
 from powderdsl.worldmodel.config import DataConfig, Recorded, TrainConfig
 from powderdsl.worldmodel.networks import NO_ELEMENT
@@ -71,7 +72,7 @@ class Recording:
             task=self.name,
             split=recipe.split,
             knobs=dict(recipe.knobs),
-            params=_changed_params(recipe, load_task(self.name)),
+            params=changed_params(recipe, load_task(self.name)),
             steps=self.task.agent.steps_per_action,
         )
         slots = (*self.palette, *[None] * (config.slots - len(self.palette)))
@@ -143,7 +144,7 @@ def open_recording(folder: str | Path, task: str | None = None) -> Recording:
     name = task or recipe.task
     ids = {int(number): element for number, element in recipe.palette.items()}
     palette = tuple(ids.get(number) for number in range(max(ids) + 1))
-    params = _changed_params(recipe, load_task(name))
+    params = changed_params(recipe, load_task(name))
     found = load_task(name, knobs=recipe.knobs, params=params, palette=palette)
     notes = _differences(recipe, found)
     if notes:
@@ -151,24 +152,12 @@ def open_recording(folder: str | Path, task: str | None = None) -> Recording:
     return Recording(dataset, name, found, palette)
 
 
-def _changed_params(recipe: Recipe, task: Task) -> dict[str, Any]:
-    """The parameters of a recipe that differ from the rules' own."""
-    own = {param.name: param.default for param in task.ruleset.params}
-    return {
-        name: int(value) if isinstance(own[name], int) else value
-        for name, value in recipe.params.items()
-        if name in own and float(own[name]) != value
-    }
-
-
 def _differences(recipe: Recipe, task: Task) -> list[str]:
     """Why a recipe is not one of a task."""
-    names = {element.id: element.qualified for element in task.ruleset.elements}
-    names |= {BLOW: "blow", NO_CHANGE: "nothing"}
     compared = {
         "size": (recipe.shape[1:], task.size),
         "actions": (recipe.action_nvec, task.agent.action_nvec),
-        "choices": (recipe.choices, [names[choice] for choice in task.agent.choices]),
+        "choices": (recipe.choices, choice_names(task)),
     }
     found = [
         f"{key}: {list(there)}, not {list(here)}"

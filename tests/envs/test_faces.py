@@ -19,8 +19,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from powderdsl.envs.actions import KINDS as ACTIONS
 from powderdsl.envs.features import Expand, paper_policy
-from powderdsl.envs.goal_env import GoalEnv
-from powderdsl.envs.gym import PowderEnv, PowderVectorEnv
+from powderdsl.envs.gym import GoalEnv, PowderEnv, PowderVectorEnv
 from powderdsl.envs.observations import KINDS
 from powderdsl.envs.sb3 import PowderVecEnv
 from powderdsl.envs.tensor_env import TensorEnv

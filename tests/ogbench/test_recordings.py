@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 import powderdsl
-from powderdsl.ogbench.draws import LegacyDraws
 from powderdsl.ogbench.env import EnvOptions, PowderworldEnv
-from powderdsl.ogbench.episodes import Episodes
+from powderdsl.ogbench.episodes import Episodes, LegacyDraws
 
 EXCERPTS = Path(__file__).resolve().parents[1] / "data" / "second" / "ogbench"
 WHOLE = "POWDERDSL_RECORDINGS"
