@@ -13,13 +13,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Dataset", "Transitions", "from_minari", "record", "split", "to_minari"]
 
-_HOMES = {
-    "Dataset": "dataset",
-    "Transitions": "dataset",
-    "from_minari": "minari",
-    "record": "recorder",
-    "split": "dataset",
-    "to_minari": "minari",
-}
-
-__getattr__ = importing("powderdsl.datasets", _HOMES)
+__getattr__ = importing(
+    "powderdsl.datasets",
+    dataset="Dataset Transitions split",
+    minari="from_minari to_minari",
+    recorder="record",
+)

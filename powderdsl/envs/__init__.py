@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
 __all__ = ["GoalEnv", "PowderEnv", "PowderVectorEnv", "TensorEnv"]
 
-_HOMES = {"GoalEnv": "gym", "PowderEnv": "gym", "PowderVectorEnv": "gym", "TensorEnv": "tensor_env"}
-
 
 def env_id(task: str) -> str:
     """The id of a shipped task: ``some-task`` becomes ``powderdsl/SomeTask-v0``."""
@@ -39,4 +37,4 @@ for _task in shipped_tasks():
         )
 
 
-__getattr__ = importing("powderdsl.envs", _HOMES)
+__getattr__ = importing("powderdsl.envs", gym="GoalEnv PowderEnv PowderVectorEnv", tensor_env="TensorEnv")

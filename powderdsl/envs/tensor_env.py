@@ -206,19 +206,8 @@ class TensorEnv:
         if old is None:
             first = int(np.random.SeedSequence().generate_state(1, np.uint32)[0])
             old = torch.arange(first, first + self.num_envs, device=self.device)
-        if seed is None:
-            return old, torch.zeros_like(self._ended)
-        if isinstance(seed, int | np.integer) and not isinstance(seed, bool):
-            seeds: Sequence[int | None] = [int(seed) + number for number in range(self.num_envs)]
-        elif isinstance(seed, Sequence) and not isinstance(seed, str):
-            seeds = seed
-        else:
-            raise TypeError(f"seed takes an integer, a list of them, or None; found {seed!r}")
-        if len(seeds) != self.num_envs:
-            raise ValueError(f"seed has {len(seeds)} numbers for {self.num_envs} environments")
-        new = integer_tensor("seed", [0 if one is None else one for one in seeds], self.device)
-        if bool(((new < 0) | (new > MAX_SEED)).any()):
-            raise ValueError(f"a seed lies in 0..2⁶²−1, found {seed}")
+        seeds = seeds_of(seed, self.num_envs)
+        new = torch.tensor([one or 0 for one in seeds], device=self.device)
         given = torch.tensor([one is not None for one in seeds], device=self.device)
         return torch.where(given, new, old), given
 
@@ -369,6 +358,28 @@ class TensorEnv:
         fresh = self.program.start(world_seeds(self._base, self._episode, self.worlds)[places])
         self.episodes = self.program.put(self.episodes, places, fresh, reuse=True)
         observed[places] = self.observation.of(fresh.world)
+
+
+def seeds_of(seed: Any, count: int) -> list[int | None]:
+    """The seeds of environments: s gives environment i the seed s + i; a list gives each its own, or None.
+
+    Raises:
+        TypeError, ValueError: it is neither, or has another length, or a seed is out of range.
+    """
+    if seed is None:
+        return [None] * count
+    if hasattr(seed, "__index__") and not isinstance(seed, bool):
+        seeds: list[Any] = [int(seed) + number for number in range(count)]
+    elif isinstance(seed, Sequence) and not isinstance(seed, str):
+        seeds = list(seed)
+    else:
+        raise TypeError(f"seed takes an integer, a list of them, or None; found {seed!r}")
+    if len(seeds) != count:
+        raise ValueError(f"seed has {len(seeds)} numbers for {count} environments")
+    for one in seeds:
+        if one is not None:
+            check_count("seed", one, MAX_SEED, least=0)
+    return seeds
 
 
 def check_cells(num_envs: int, size: tuple[int, int]) -> None:

@@ -20,13 +20,6 @@ if TYPE_CHECKING:
 
 __all__ = ["PowderworldEnv", "PowderworldVectorEnv", "load_dataset", "make_env_and_datasets"]
 
-_HOMES = {
-    "PowderworldEnv": "env",
-    "PowderworldVectorEnv": "env",
-    "load_dataset": "datasets",
-    "make_env_and_datasets": "datasets",
-}
-
 
 def _register() -> None:
     for name in shipped_levels():
@@ -43,4 +36,8 @@ def _register() -> None:
 
 _register()
 
-__getattr__ = importing("powderdsl.ogbench", _HOMES)
+__getattr__ = importing(
+    "powderdsl.ogbench",
+    env="PowderworldEnv PowderworldVectorEnv",
+    datasets="load_dataset make_env_and_datasets",
+)

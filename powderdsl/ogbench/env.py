@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from operator import index
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from powderdsl.envs.gym import array, objects
-from powderdsl.envs.tensor_env import MAX_SEED, check_cells, mode_of
+from powderdsl.envs.tensor_env import check_cells, mode_of, seeds_of
 from powderdsl.ogbench.episodes import (
     FIRST_ELEMENT,
     FIRST_X,
@@ -32,7 +31,7 @@ from powderdsl.ogbench.episodes import (
 )
 from powderdsl.ogbench.levels import GoalTask, Level, find_level
 from powderdsl.ogbench.program import LevelProgram
-from powderdsl.system.settings import check_count, check_settings, setting
+from powderdsl.system.settings import check_settings, setting
 
 Array = NDArray[Any]
 
@@ -69,7 +68,7 @@ class EnvOptions:
     threads: int = 1
 
     def __post_init__(self) -> None:
-        seed_number(self.seed)
+        seeds_of(self.seed, 1)
         check_settings(self)
         if self.render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode is None or rgb_array; found {self.render_mode!r}")
@@ -100,13 +99,6 @@ def _program(level: Level, as_ogbench: bool, backend: str, device: str, threads:
 def spaces_of(level: Level) -> tuple[Box, Discrete[Any]]:
     """The spaces of one world's observations and actions."""
     return Box(0, 255, (level.side, level.side, 6), np.uint8), Discrete(level.actions)
-
-
-def seed_number(seed: Any) -> int:
-    """A seed. Raises TypeError, ValueError."""
-    number = index(seed)
-    check_count("seed", number, MAX_SEED, least=0)
-    return number
 
 
 def check_options(options: Mapping[str, Any], known: Sequence[str]) -> None:
@@ -171,9 +163,8 @@ class PowderworldEnv(gymnasium.Env[Array, Any], EzPickle):
         task = task_of(self.level, given) if self.episodes.mode == "task" else None
         here = np.zeros(1, dtype=np.int64)
         if seed is not None:
-            number = seed_number(seed)
-            super().reset(seed=number)
-            self.episodes.seed(here, np.array([number]))
+            self.episodes.seed(here, np.array(seeds_of(seed, 1)))
+            super().reset(seed=int(seed))
         self.episodes.begin(here, [task])
         if self.episodes.mode != "task":
             return self._observation(), {}
@@ -298,16 +289,9 @@ class PowderworldVectorEnv(VectorEnv[Any, Any, Any]):
         return [task_of(self.level, {**given, "task_id": one}) for one in ids.tolist()]
 
     def _seed(self, seed: int | Sequence[int | None] | None, mask: NDArray[np.bool_]) -> None:
-        if seed is None:
-            return
-        if hasattr(seed, "__index__"):
-            first = seed_number(seed)
-            seeds: list[int | None] = [first + number for number in range(self.num_envs)]
-            super().reset(seed=first)
-        else:
-            seeds = [None if one is None else seed_number(one) for one in seed]
-        if len(seeds) != self.num_envs:
-            raise ValueError(f"seed has {len(seeds)} numbers for {self.num_envs} environments")
+        seeds = seeds_of(seed, self.num_envs)
+        if isinstance(seed, int):
+            super().reset(seed=seed)
         which = np.array([at for at, one in enumerate(seeds) if one is not None and mask[at]], dtype=np.int64)
         self.episodes.seed(which, np.array([seeds[at] for at in which], dtype=np.int64))
 

@@ -17,7 +17,4 @@ if TYPE_CHECKING:
 
 __all__ = ["TrainConfig", "evaluate", "load_policy", "preset", "train"]
 
-_HOMES = {"train": "training", "evaluate": "evaluation", "load_policy": "policies"}
-
-
-__getattr__ = importing("powderdsl.rl", _HOMES)
+__getattr__ = importing("powderdsl.rl", training="train", evaluation="evaluate", policies="load_policy")

@@ -29,23 +29,15 @@ if TYPE_CHECKING:
     from powderdsl.worldmodel.worlds import task_worlds as task_worlds
     from powderdsl.worldmodel.worlds import unseen_seeds as unseen_seeds
 
-_HOMES = {
-    "DataConfig": "config",
-    "Machine": "config",
-    "Replay": "replay",
-    "TrainConfig": "config",
-    "UNet": "networks",
-    "custom_network": "networks",
-    "evaluate": "evaluation",
-    "evaluate_recording": "evaluation",
-    "finetuned": "trained",
-    "load_trained": "trained",
-    "open_recording": "recordings",
-    "pairs_of": "worlds",
-    "score": "scores",
-    "task_worlds": "worlds",
-    "train": "training",
-    "unseen_seeds": "worlds",
-}
-
-__getattr__ = importing("powderdsl.worldmodel", _HOMES)
+__getattr__ = importing(
+    "powderdsl.worldmodel",
+    config="DataConfig Machine TrainConfig",
+    replay="Replay",
+    networks="UNet custom_network",
+    evaluation="evaluate evaluate_recording",
+    trained="finetuned load_trained",
+    recordings="open_recording",
+    worlds="pairs_of task_worlds unseen_seeds",
+    scores="score",
+    training="train",
+)

@@ -53,8 +53,7 @@ class OneHot:
 
     def example(self, size: tuple[int, int]) -> Tensor:
         """Two inputs: uint8 [2, H, W]."""
-        cells = torch.arange(2 * size[0] * size[1]) % self.slots
-        return cells.to(torch.uint8).view(2, *size)
+        return torch.zeros(2, *size, dtype=torch.uint8)
 
 
 @dataclass(frozen=True)
@@ -86,8 +85,7 @@ class ActionChannels:
 
     def example(self, size: tuple[int, int]) -> Tensor:
         """Two inputs: uint8 [2, observed + 3, H, W]."""
-        ids = OneHot(self.slots).example(size)[:, None]
-        return torch.cat([ids, torch.zeros(2, self.observed + 2, *size, dtype=torch.uint8)], 1)
+        return torch.zeros(2, self.observed + 3, *size, dtype=torch.uint8)
 
 
 def without_actions(inputs: Tensor) -> Tensor:

@@ -75,21 +75,41 @@ class MixedWorld:
 
 
 class TaskWorlds:
-    """The worlds of a task's split under some rules. Made by `task_worlds`.
+    """The worlds of a configuration, ready to run: those of a task's split under some rules.
 
     World s runs under ruleset s mod the number of `rulesets`. Rulesets of one structure are compiled once and run
     together; their chances are parameters of each world.
+
+    Args:
+        partly: leave out worlds that the rules cannot have; `missing` says which.
+        palette: the ids of a network's slots, as `compiler.load` takes them.
+
+    Raises:
+        CompileError: with all that is wrong in the task, the rules, the knobs or the parameters; PD604 where worlds need
+            elements that the rules do not have; PD701 for a backend or device that is not there.
     """
 
     def __init__(
         self,
-        task: Task,
         config: DataConfig,
-        rules: Ruleset,
-        source: RulesetSource | None,
-        machine: Mapping[str, Any],
-        partly: bool,
+        *,
+        device: str = "cpu",
+        threads: int = 1,
+        backend: str = "auto",
+        partly: bool = False,
+        palette: Palette | None = None,
     ):
+        params = None if config.rules else config.params
+        task = load_task(config.task, knobs=config.knobs, params=params, palette=palette)
+        source = None
+        if config.rulesets:
+            source = RulesetSource(config.rules or task.rules, config.variety, config.params, palette)
+            rules = source.base
+        elif config.rules:
+            rules = load(config.rules, params=config.params, palette=palette)
+        else:
+            rules = task.ruleset
+        check_data(config, task, rules)
         watched = watch(task, config.split, rules, config.only, partly=partly)
         self.config, self.rules, self.size = config, rules, task.size
         self.missing = watched.missing
@@ -97,9 +117,10 @@ class TaskWorlds:
         """The names of the variants: seed s gives variant s mod their number."""
         self.fingerprint = fingerprint(watched.task.splits)
         """A name for how these worlds start, besides their rules: another if the task's file has been changed."""
-        self.device = torch.device(machine["device"])
+        self.device = torch.device(device)
         """Where worlds are run."""
-        self._task, self._source, self._machine = task, source, dict(machine)
+        self._task, self._source = task, source
+        self._machine: dict[str, Any] = {"backend": backend, "device": device, "threads": threads}
         self._programs: dict[tuple[Any, ...], TaskProgram] = {}
         if source is None:
             self.rulesets = [Drawn(0)]
@@ -107,8 +128,8 @@ class TaskWorlds:
             return
         numbers = range(config.first_ruleset, config.first_ruleset + config.rulesets)
         self.rulesets = [source.draw(number) for number in numbers]
-        if machine["backend"] == "auto":  # compiling many rulesets would take longer than running them
-            self._machine["backend"] = starting_backend(machine["device"])
+        if backend == "auto":  # compiling many rulesets would take longer than running them
+            self._machine["backend"] = starting_backend(device)
 
     def start(self, seeds: Tensor) -> MixedWorld:
         """The worlds of seeds, int64 [B]."""
@@ -149,36 +170,8 @@ class TaskWorlds:
         return compile_task(task, split=self.config.split, **self._machine)
 
 
-def task_worlds(
-    config: DataConfig,
-    *,
-    device: str = "cpu",
-    threads: int = 1,
-    backend: str = "auto",
-    partly: bool = False,
-    palette: Palette | None = None,
-) -> TaskWorlds:
-    """The worlds of a configuration, ready to run.
-
-    Args:
-        partly: leave out worlds that the rules cannot have; `TaskWorlds.missing` says which.
-        palette: the ids of a network's slots, as `compiler.load` takes them.
-
-    Raises:
-        CompileError: with all that is wrong in the task, the rules, the knobs or the parameters; PD604 where worlds need
-            elements that the rules do not have; PD701 for a backend or device that is not there.
-    """
-    own = not config.rules
-    task = load_task(config.task, knobs=config.knobs, params=config.params if own else None, palette=palette)
-    source = None
-    if config.rulesets:
-        source = RulesetSource(config.rules or task.rules, config.variety, config.params, palette)
-        rules = source.base
-    else:
-        rules = task.ruleset if own else load(config.rules, params=config.params, palette=palette)
-    check_data(config, task, rules)
-    machine = {"backend": backend, "device": device, "threads": threads}
-    return TaskWorlds(task, config, rules, source, machine, partly)
+task_worlds = TaskWorlds
+"""The function that makes them."""
 
 
 def check_data(config: DataConfig, task: Task, rules: Ruleset) -> None:
