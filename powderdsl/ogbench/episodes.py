@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -41,21 +41,6 @@ FIRST_TASK, FIRST_ELEMENT, FIRST_X, FIRST_Y, REPLACED = (
 """What is drawn."""
 
 
-class Draws(Protocol):
-    """The random numbers of a batch of environments. `which`, int64 [n], are environments."""
-
-    fixes_goals: bool
-    """Whether a goal depends on the seed and its task alone."""
-
-    def integers(self, which: Numbers, what: str, episode: Numbers, time: Numbers, count: int) -> Numbers:
-        """A number in 0..count − 1 for each: int64 [n]. `episode` and `time` are int64 [n]."""
-        ...
-
-    def planes(self, which: Numbers) -> NDArray[np.float64] | None:
-        """Draws for one step of their worlds, [streams, n, H, W] in [0, 1); None: the simulator's own."""
-        ...
-
-
 def keyed(parts: Sequence[Any], what: str, count: int) -> NDArray[np.float64]:
     """Numbers in [0, 1), float64 [n, count], hashed from integers [n] of at least 0 and what they are for.
 
@@ -71,27 +56,30 @@ def keyed(parts: Sequence[Any], what: str, count: int) -> NDArray[np.float64]:
     return np.asarray(drawn / float(1 << 32), dtype=np.float64)
 
 
-class CounterDraws:
-    """Hashes of the seed of an environment, the number of its episode and the environment step in it.
-
-    Args:
-        seeds: int64 [B].
-    """
+class Draws:
+    """Random numbers of environments `which`, int64 [n]: hashes of their seeds, the number of the episode and its step."""
 
     fixes_goals = True
+    """Whether a goal depends on the seed and its task alone."""
 
     def __init__(self, seeds: Numbers):
         self._seeds = seeds
 
     def integers(self, which: Numbers, what: str, episode: Numbers, time: Numbers, count: int) -> Numbers:
+        """A number in 0..count − 1 for each: int64 [n]. `episode` and `time` are int64 [n]."""
         drawn = keyed((self._seeds[which], episode, time), what, 1)[:, 0]
         return (drawn * count).astype(np.int64)
 
-    def planes(self, which: Numbers) -> None:
+    def planes(self, which: Numbers) -> NDArray[np.float64] | None:
+        """Draws for one step of their worlds, [streams, n, H, W] in [0, 1); None: the simulator's own."""
         return None
 
+    def seed(self, which: Numbers, seeds: Numbers) -> None:
+        """Start the draws of environments again, from their seeds, int64 [n]."""
+        self._seeds[which] = seeds
 
-class LegacyDraws:
+
+class LegacyDraws(Draws):
     """OGBench's order of draws: `numpy.random.RandomState` of its own for each environment, instead of the global one."""
 
     fixes_goals = False
@@ -101,7 +89,6 @@ class LegacyDraws:
         self._streams, self._side = streams, side
 
     def seed(self, which: Numbers, seeds: Numbers) -> None:
-        """Start the generators of environments again, from their seeds, int64 [n]."""
         for one, seed in zip(which, seeds, strict=True):
             self._states[one] = np.random.RandomState(int(seed) & MASK)
 
@@ -169,14 +156,13 @@ class Episodes:
         if not isinstance(randomness, str):
             return randomness
         if randomness == "counter":
-            return CounterDraws(self.seeds)
+            return Draws(self.seeds)
         return LegacyDraws(self.seeds, len(self.program.streams), self.level.side)
 
     def seed(self, which: Numbers, seeds: Numbers) -> None:
         """Give environments new seeds, int64 [n]; their next episode has the number 0."""
         self.seeds[which], self.episode[which] = seeds, -1
-        if isinstance(self._draws, LegacyDraws):
-            self._draws.seed(which, seeds)
+        self._draws.seed(which, seeds)
 
     # Beginning
 
