@@ -19,8 +19,9 @@ from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.experiments.runs import RunFolder
 from powderdsl.rl import evaluate, load_policy, train
 from powderdsl.rl.evaluation import play
-from powderdsl.rl.films import HAND, film
+from powderdsl.rl.films import HAND, Film, film
 from powderdsl.simulation.draw import OUTLINES
+from powderdsl.simulation.simulator import World
 from powderdsl.tasks.episodes import TaskProgram, compile_task
 from powderdsl.tasks.shipped import load_task
 from tests.rl.tiny_tasks import quick, write_task
@@ -112,7 +113,13 @@ def test_doing_nothing_is_what_the_rules_do_alone(program: TaskProgram) -> None:
     episodes = program.start(worlds)
     alone = program.simulator.step(episodes.world, 4 * 2 + 3)
     last = []
-    play(program, None, worlds, seen=last.append)
+
+    class Seen(Film):
+        def see(self, world: World) -> None:
+            last.append(world)
+            super().see(world)
+
+    play(program, None, worlds, recorder=Seen(program.task, len(worlds), 1))
     assert torch.equal(last[-1].ids, alone.ids)
     assert torch.equal(last[-1]["velocity"], alone["velocity"])
 
