@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 from powderdsl.cli.commands.curves import command
 from powderdsl.experiments.runs import RunFolder, open_run
-from powderdsl.experiments.studies.curves import as_table, baselines_of, curves_of
+from powderdsl.experiments.studies.results import as_table, baselines_of, curves_of
 
 
 def written(folder: Path, seed: int, rate: float, lines: dict[int, float]) -> RunFolder:

@@ -7,9 +7,9 @@ from pathlib import Path
 import click
 import pytest
 
-from powderdsl.cli.commands.study import CALLED, MEANS, NOT_FOR_STUDIES, commands
+from powderdsl.cli.commands.study import CALLED, NOT_FOR_STUDIES, commands
 from powderdsl.diagnostics import CompileError
-from powderdsl.experiments.studies.study import FILE, RULES, RUN_OR_TASK, TASK, confined, load_study
+from powderdsl.experiments.studies.study import FILE, READ, RULES, RUN_OR_TASK, TASK, confined, load_study
 from tests.cli.commands import powderdsl
 
 STUDY = """
@@ -154,8 +154,8 @@ def test_every_word_that_stands_for_a_value_is_known():
             offered = {name[2:] for name in one.opts} & found[words].keys()
             assert not offered or not {*one.opts} & {*NOT_FOR_STUDIES}
             if offered or isinstance(one, click.Argument):
-                assert (one.metavar or "") in {*MEANS, *plain}, one.name
+                assert (one.metavar or "") in {"FILE", "FILE.json", *READ, *plain}, one.name
         paths = [one for one in command.params if isinstance(one.type, click.Path)]
         for one in paths:
             name = one.opts[0][2:]
-            assert name == "run" or found[words].get(name, FILE) == FILE
+            assert name == "run" or found[words].get(name, FILE).startswith(FILE)

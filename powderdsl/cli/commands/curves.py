@@ -22,7 +22,7 @@ def command(runs: tuple[str, ...], metric: str, out: Path | None) -> None:
     """
     from powderdsl.experiments.runs import find_run
     from powderdsl.experiments.runs.metrics import read_metrics
-    from powderdsl.experiments.studies.curves import as_table, baselines_of, curves_of, write_curves
+    from powderdsl.experiments.studies.results import as_table, baselines_of, curves_of, write_curves
 
     found = [find_run(name) for name in runs]
     curves = curves_of(found, metric)

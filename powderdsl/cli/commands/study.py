@@ -22,14 +22,9 @@ from powderdsl.diagnostics.printable import printable
 from powderdsl.experiments.studies.cluster import check_cluster, run_on_ray
 from powderdsl.experiments.studies.run import Outcome, StudyRun, collected, read_folders
 from powderdsl.experiments.studies.study import (
-    FILE,
     FLAG,
-    RULES,
-    RUN,
-    RUN_OR_TASK,
     SIZE,
     SIZES,
-    TASK,
     TEXT,
     Point,
     Study,
@@ -45,42 +40,22 @@ MAX_SHARDS = 1_000_000
 CALLED = (("train",), ("evaluate",), ("wm", "train"), ("wm", "finetune"), ("wm", "eval"))
 """Commands that steps of a study may call: those that write runs and evaluate them."""
 
-MEANS = {
-    "TASK": TASK,
-    "RUN": RUN,
-    "RUN|TASK": RUN_OR_TASK,
-    "RULES": RULES,
-    "PACK…": RULES,
-    "FILE": FILE,
-    "FILE.json": FILE,
-}
-"""The meaning of arguments and options, by their metavar."""
-
-NOT_FOR_STUDIES = ("MODULE:CLASS", "--ignore-actions")
-"""Options without a use in studies, by their metavar or name. Modules would be imported, and a study may come from a
-stranger."""
+NOT_FOR_STUDIES = ("DIR", "DATASET", "MODULE:CLASS", "--ignore-actions")
+"""Options that studies do not have, by their metavar or name: folders, which the study chooses, and modules, which would be
+imported, while a study may come from a stranger."""
 
 
 def commands() -> Mapping[tuple[str, ...], Mapping[str, str]]:
-    """The commands of `CALLED`, with the meaning of their options and of their argument (``on``).
-
-    Options that name folders are left out, but for `run`, which the study gives: a step writes where the study says.
-    """
-    known: dict[tuple[str, ...], dict[str, str]] = {}
-    for words in CALLED:
-        known[words] = {}
+    """The commands of `CALLED`, with the meaning of their options, of ``run``, and of their argument (``on``)."""
+    known: dict[tuple[str, ...], dict[str, str]] = {words: {} for words in CALLED}
+    for words, meanings in known.items():
         for parameter in called(words).params:
-            means = MEANS.get(parameter.metavar or "", TEXT)
+            names = [name[2:] for name in parameter.opts if name.startswith("--")]
             if isinstance(parameter, click.Argument):
-                known[words]["on"] = means
-                continue
-            is_folder = (
-                isinstance(parameter.type, click.Path) and means != FILE and "--run" not in parameter.opts
-            )
-            if is_folder or {parameter.metavar, *parameter.opts} & {*NOT_FOR_STUDIES}:
-                continue
-            means = FLAG if getattr(parameter, "is_flag", False) else means
-            known[words] |= {name[2:]: means for name in parameter.opts if name.startswith("--")}
+                names = ["on"]
+            if names == ["run"] or not {parameter.metavar, *parameter.opts} & {*NOT_FOR_STUDIES}:
+                means = FLAG if getattr(parameter, "is_flag", False) else parameter.metavar or TEXT
+                meanings.update(dict.fromkeys(names, means))
     return known
 
 

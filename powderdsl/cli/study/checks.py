@@ -23,7 +23,7 @@ from powderdsl.cli.options import find_played
 from powderdsl.compiler import load
 from powderdsl.diagnostics import CompileError, Diagnostic, Label, Reporter, suggest
 from powderdsl.experiments.runs import find_run
-from powderdsl.experiments.studies.study import FLAG, SIZES, TEXT, Measure, Point, Study, StudyStep
+from powderdsl.experiments.studies.study import FLAG, READ, SIZES, Measure, Point, Study, StudyStep
 from powderdsl.model.types import Ruleset
 from powderdsl.rl.config import BASELINES, TrainConfig, check_task, chosen_policies
 from powderdsl.syntax.yaml_tree import Scalar
@@ -138,7 +138,7 @@ class _StudyCheck:
         if word is None:
             self.reporter.add(replace(mistake, primary=Label(step.key.span)))
             return
-        if mistake.primary.span is not None and step.means.get(name) not in (TEXT, FLAG):
+        if mistake.primary.span is not None and step.means.get(name) in READ:
             self.reporter.add(mistake)  # in the file that the word names
             return
         if mistake.code == "PD620":

@@ -237,7 +237,7 @@ def write_json(path: Path, value: Any, *, follow: bool = False) -> Path:
 def _differences(found: RunFolder, kind: str, config: Mapping[str, Any]) -> tuple[str, ...]:
     if found.kind != kind:
         return (f"it is of the kind `{found.kind}`, not `{kind}`",)
-    there, here = dict(_flat(found.config)), dict(_flat(config))
+    there, here = _flat(found.config), _flat(config)
     return tuple(
         f"`{name}` is {there.get(name, 'not set')} there, {here.get(name, 'not set')} here"
         for name in sorted({*there, *here})
@@ -245,13 +245,13 @@ def _differences(found: RunFolder, kind: str, config: Mapping[str, Any]) -> tupl
     )
 
 
-def _flat(config: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, str]]:
+def _flat(config: Mapping[str, Any], within: str = "") -> dict[str, str]:
     """Each setting by its dotted name, as JSON."""
+    settings: dict[str, str] = {}
     for name, value in config.items():
-        if isinstance(value, Mapping) and value:
-            yield from _flat(value, f"{within}{name}.")
-        else:
-            yield within + name, json.dumps(value)
+        is_group = isinstance(value, Mapping) and value
+        settings |= _flat(value, f"{within}{name}.") if is_group else {within + name: json.dumps(value)}
+    return settings
 
 
 # Palettes: the qualified name of the element of each slot of a run's network, or None for a free slot

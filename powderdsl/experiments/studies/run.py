@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
@@ -61,9 +60,6 @@ class StudyRun:
     def __init__(self, study: Study, folder: Path, size: str, threads: int = 1):
         self.study, self.folder, self.size, self.threads = study, folder, size, threads
         self._running: set[subprocess.Popen[bytes]] = set()
-        self._stopped = False
-        self._starting = threading.Lock()
-        """Held while a process is started or all are ended, so that none escapes."""
 
     def prepare(self) -> None:
         """Make the folder, or resume in it. Values, seeds and measures may have changed, but no step.
@@ -106,21 +102,25 @@ class StudyRun:
         Args:
             report: called with each outcome. patient: wait for points that other processes work on.
         """
-        return run_all(lambda point: self._point(point, patient), points, jobs, report, self._end_all)
+        read, write = os.pipe()
+        # Processes end when their stdin is closed: by us, or because we are killed.
+        with os.fdopen(read) as self._stdin, os.fdopen(write, "w") as self._lifeline:
+            return run_all(lambda point: self._point(point, patient), points, jobs, report, self._end_all)
 
     def finished(self, point: Point) -> Outcome | None:
         """The outcome of a point whose steps are done here; None if they are not."""
-        path = self.folder / "done" / f"{point.name}.json"
+        path = self._done(point)
         evaluations = read_json(path)
         if not isinstance(evaluations, dict):
             return None
         try:
-            return Outcome(
-                point,
-                {measure.name: _value(measure, evaluations, point) for measure in self.study.measures},
-            )
+            values = {measure.name: _value(measure, evaluations, point) for measure in self.study.measures}
         except ValueError as error:
             return Outcome(point, {}, f"{path}: {error}")
+        return Outcome(point, values)
+
+    def _done(self, point: Point) -> Path:
+        return self.folder / "done" / f"{point.name}.json"
 
     def _point(self, point: Point, patient: bool) -> Outcome:
         place = self.folder / "runs" / point.name
@@ -131,10 +131,11 @@ class StudyRun:
                 if outcome is None:
                     for step in self.study.steps:
                         self._step(step, point, place)
-                    (self.folder / "done").mkdir(exist_ok=True)
+                    self._done(point).parent.mkdir(exist_ok=True)
                     runs = [step.name for step in self.study.steps if step.makes_run]
-                    evaluations = {name: read_json(place / name / EVALUATION) for name in runs}
-                    write_json(self.folder / "done" / f"{point.name}.json", evaluations)
+                    write_json(
+                        self._done(point), {name: read_json(place / name / EVALUATION) for name in runs}
+                    )
                     outcome = self.finished(point)
                     assert outcome is not None
                 return outcome
@@ -154,20 +155,16 @@ class StudyRun:
             with suppress(CompileError), held(place / step.name, GRACE):
                 pass
         with log.open("ab") as file:
-            with self._starting:
-                if self._stopped:
-                    raise ValueError("stopped")
-                process = subprocess.Popen(
-                    words,
-                    stdin=subprocess.PIPE,  # it ends when this is closed, also because we are killed
-                    stdout=file,
-                    stderr=file,
-                    env={**environment, LIFELINE: "1"},
-                    start_new_session=True,  # Ctrl-C is sent to us alone
-                )
-                self._running.add(process)
-            with process:
-                status = process.wait()
+            process = subprocess.Popen(
+                words,
+                stdin=self._stdin,
+                stdout=file,
+                stderr=file,
+                env={**environment, LIFELINE: "1"},
+                start_new_session=True,  # Ctrl-C is sent to us alone
+            )
+            self._running.add(process)
+            status = process.wait()
             self._running.discard(process)
         if status != 0:
             last = log.read_text(encoding="utf-8", errors="replace").splitlines()[-LOG_LINES:]
@@ -175,18 +172,13 @@ class StudyRun:
 
     def _end_all(self) -> None:
         """End all processes and wait for their last checkpoints. A second signal does not wait."""
-        with self._starting:
-            self._stopped = True
-            processes = list(self._running)
-        for process in processes:
-            assert process.stdin is not None
-            process.stdin.close()
+        self._lifeline.close()
         try:
             end = time.monotonic() + GRACE
             while self._running and time.monotonic() < end:
                 time.sleep(0.05)
         finally:
-            for process in processes:
+            for process in [*self._running]:
                 process.kill()
 
 

@@ -25,8 +25,11 @@ SIZES = ("small", "paper")
 SEED, SIZE = "seed", "size"
 MAX_POINTS = 10_000
 
-TEXT, FLAG, FILE, TASK, RUN, RUN_OR_TASK, RULES = "text", "flag", "file", "task", "run", "run|task", "rules"
-"""The meaning of an argument or option of a command: text, a flag, a file to write, a task, a run, either, or rules."""
+TEXT, FLAG, FILE = "text", "flag", "FILE"
+TASK, RUN, RUN_OR_TASK, RULES, PACKS = "TASK", "RUN", "RUN|TASK", "RULES", "PACK…"
+READ = (TASK, RUN, RUN_OR_TASK, RULES, PACKS)
+"""What words of commands mean: FLAG, or what the help calls them. Words that begin with FILE name a file to write, those of
+READ something to read. All others are text."""
 
 Commands = Mapping[tuple[str, ...], Mapping[str, str]]
 """Commands that steps may call, with the meaning of each option (without dashes) and of the argument (``on``)."""
@@ -217,11 +220,11 @@ def confined(means: str, text: str, folder: Path, results: Path) -> str:
     """
     if "\0" in text:
         raise ValueError("it has control characters")
-    if means in (TEXT, FLAG):
-        return text
-    if means == FILE:
+    if means.startswith(FILE):
         return str(inside(results, text))
-    if means == RULES:
+    if means not in READ:
+        return text
+    if means in (RULES, PACKS):
         return "+".join(_pack(part, folder) for part in text.split("+"))
     is_shipped = (shipped("tasks") / f"{text}.yaml").is_file()
     if is_path(text) or means == RUN or (means == RUN_OR_TASK and not is_shipped):
