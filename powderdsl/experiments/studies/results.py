@@ -45,46 +45,18 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Trend:
-    """A measure along the first setting, with the values of the others that `label` names.
-
-    `change` compares the last value with the first, seed by seed: their difference, on the scale ``log`` their ratio.
-    `agreeing`: in how many seeds it changes as expected, and how many seeds have both. `ordered`: all means do.
-    """
-
-    label: str
-    change: Interval
-    ordered: bool
-    agreeing: tuple[int, int]
-
-    def verdict(self, measure: Measure) -> str:
-        """A sentence: whether the measure changed as expected."""
-        sign = 1 if measure.expect == "rises" else -1
-        log = measure.scale == "log"
-        same = 1.0 if log else 0.0
-        plus = "+" if not log and self.change.mean > 0 else ""
-        ends = f"last {'/' if log else '−'} first: {plus}{shown(self.change, measure.scale)}"
-        label = f"{self.label}: " if self.label else ""
-        if sign * (self.change.mean - same) <= 0:
-            return f"{label}does not {str(measure.expect)[:-1]} ({ends})"
-        sure = f", but the interval holds {same:.0f}" if self.change.low <= same <= self.change.high else ""
-        every = "at every point" if self.ordered else "not at every point"
-        seeds = "{} of {} seeds".format(*self.agreeing)
-        return f"{label}{measure.expect} {every}, in {seeds}{sure} ({ends})"
-
-
-@dataclass(frozen=True)
 class Finding:
-    """A measure at all combinations, and its trends, one for each combination of all settings but the first."""
+    """A measure at all combinations. `verdicts` say whether it changed as expected along the first setting, a sentence for
+    each combination of the others; none if nothing is expected.
+    """
 
     measure: Measure
     cells: tuple[Cell, ...]
-    trends: tuple[Trend, ...]
+    verdicts: tuple[str, ...]
 
     @property
     def verdict(self) -> str:
-        """Sentences about whether the measure changed as expected; empty if nothing is expected."""
-        return "; ".join(trend.verdict(self.measure) for trend in self.trends)
+        return "; ".join(self.verdicts)
 
 
 def interval(samples: Sequence[float], scale: str = "linear") -> Interval:
@@ -111,23 +83,35 @@ def _finding(measure: Measure, outcomes: Sequence[Outcome]) -> Finding:
         Cell(values, by_seed, interval([*by_seed.values()], measure.scale))
         for values, by_seed in by_values.items()
     ]
-    trends = [_trend(measure, label, line) for label, line in _lines(cells).items()]
-    return Finding(measure, tuple(cells), tuple(trend for trend in trends if trend is not None))
+    verdicts = [_verdict(measure, label, line) for label, line in _lines(cells).items()]
+    return Finding(measure, tuple(cells), tuple(filter(None, verdicts)))
 
 
-def _trend(measure: Measure, label: str, cells: Sequence[Cell]) -> Trend | None:
-    """How a measure changes along some cells, if something is expected and seeds have both ends."""
+def _verdict(measure: Measure, label: str, cells: Sequence[Cell]) -> str:
+    """Whether a measure changes along some cells as expected; empty if nothing is expected, or no seed has both ends.
+
+    The last value is compared with the first, seed by seed: by their difference, on the scale ``log`` by their ratio.
+    """
     first, last = cells[0].by_seed, cells[-1].by_seed
     both = sorted(first.keys() & last.keys())
     if measure.expect is None or len(cells) < 2 or not both:
-        return None
-    sign = 1 if measure.expect == "rises" else -1
-    agreeing = sum(sign * (last[seed] - first[seed]) > 0 for seed in both), len(both)
-    log = measure.scale == "log"
-    change = [last[seed] / first[seed] if log else last[seed] - first[seed] for seed in both]
+        return ""
+    sign, log = 1 if measure.expect == "rises" else -1, measure.scale == "log"
+    same = 1.0 if log else 0.0
+    change = interval(
+        [last[seed] / first[seed] if log else last[seed] - first[seed] for seed in both], measure.scale
+    )
+    plus = "+" if not log and change.mean > 0 else ""
+    ends = f"last {'/' if log else '−'} first: {plus}{shown(change, measure.scale)}"
+    start = f"{label}: " if label else ""
+    if sign * (change.mean - same) <= 0:
+        return f"{start}does not {measure.expect[:-1]} ({ends})"
     means = [sign * cell.over_seeds.mean for cell in cells]
-    ordered = all(mean < after for mean, after in itertools.pairwise(means))
-    return Trend(label, interval(change, measure.scale), ordered, agreeing)
+    is_ordered = all(mean < after for mean, after in itertools.pairwise(means))
+    every = "at every point" if is_ordered else "not at every point"
+    agreeing = sum(sign * (last[seed] - first[seed]) > 0 for seed in both)
+    sure = f", but the interval holds {same:.0f}" if change.low <= same <= change.high else ""
+    return f"{start}{measure.expect} {every}, in {agreeing} of {len(both)} seeds{sure} ({ends})"
 
 
 def _lines(cells: Sequence[Cell]) -> dict[str, list[Cell]]:
@@ -181,11 +165,7 @@ def as_markdown(study: Study, size: str, outcomes: Sequence[Outcome]) -> str:
         ]
         rows.append([*(value for _, value in cells[0].values), *numbers, str(len(cells[0].by_seed))])
     text = f"{study.about} Size: {size}.\n\n{markdown(rows)}"
-    verdicts = [
-        f"- {finding.measure.about}: {trend.verdict(finding.measure)}"
-        for finding in found
-        for trend in finding.trends
-    ]
+    verdicts = [f"- {finding.measure.about}: {verdict}" for finding in found for verdict in finding.verdicts]
     failed = [f"- {outcome.point.name}: {outcome.problem}" for outcome in outcomes if outcome.problem]
     for lines in (verdicts, ["Not finished:", "", *failed] if failed else []):
         text += "\n" + "\n".join(lines) + "\n" if lines else ""
