@@ -42,7 +42,7 @@ def user_values() -> Iterator[None]:
     """Turn errors that the Python API raises for bad values into one line, where the values come from the user."""
     try:
         yield
-    except (ValueError, TypeError, KeyError) as error:
+    except (ValueError, TypeError, LookupError) as error:
         # str() of a KeyError is the repr of its message.
         words = error.args[0] if isinstance(error, KeyError) and error.args else error
         raise BadInput(" ".join(str(words).split())) from error

@@ -78,6 +78,17 @@ SIZE = Parsed("HxW", _size)
 """`48x64`: rows and columns; `64`: as many of both."""
 
 
+def _names(text: str) -> tuple[str, ...]:
+    names = tuple(name.strip() for name in text.split(","))
+    if not all(names):
+        raise ValueError("is not a list of names: write NAME,NAME")
+    return names
+
+
+NAMES = Parsed("NAME,NAME", _names)
+"""`one,another`."""
+
+
 def _settings(ctx: click.Context, param: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
     """`pack.param=VALUE` options as a mapping; names and values are checked later, with the model."""
     found = {}

@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import IO, TYPE_CHECKING, Any, Protocol
+from pathlib import Path
+from shlex import quote
+from typing import IO, TYPE_CHECKING, Any
 
 import click
 
@@ -47,34 +49,37 @@ SECONDS = 30
 """Time between two lines where there is no terminal."""
 
 
-class Show(Protocol):
-    """Shows how much is done, with words beside it."""
-
-    def __call__(self, done: float, words: str = "") -> None: ...
+Show = Callable[..., None]
+"""``show(done, words="")`` shows how much is done, with words beside it."""
 
 
 @contextmanager
-def progress(title: str, total: float | None = None, *, lines: bool = False) -> Iterator[Show]:
+def progress(title: str, total: float, *, lines: bool = False, resumes: Path | None = None) -> Iterator[Show]:
     """A bar that disappears at the end; other output appears above it.
 
     Args:
-        total: the final value of `done`. Without it the bar only shows that work continues, and for how long.
+        total: the final value of `done`.
         lines: where stderr is not a terminal, write a line every `SECONDS`; otherwise nothing.
+        resumes: the folder in which the same command continues after an interruption, which says so.
     """
+    try:
+        with _bar(title, total, lines) as show:
+            yield show
+    except KeyboardInterrupt:
+        if resumes is not None:
+            click.echo(f"interrupted; the same command continues in {quote(str(resumes))}", err=True)
+        raise
+
+
+@contextmanager
+def _bar(title: str, total: float, lines: bool) -> Iterator[Show]:
     if not sys.stderr.isatty() or os.environ.get("TERM") == "dumb":
-        yield _lines(total) if lines else _silent
+        yield _lines(total) if lines else lambda done, words="": None
         return
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    clock = TimeElapsedColumn() if total is None else TimeRemainingColumn(elapsed_when_finished=True)
+    clock = TimeRemainingColumn(elapsed_when_finished=True)
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), clock)
     console = Console(file=unguarded(sys.stderr), highlight=False, soft_wrap=True)
     shown = TextColumn("{task.fields[words]}", markup=False)
@@ -88,17 +93,13 @@ def progress(title: str, total: float | None = None, *, lines: bool = False) -> 
         yield show
 
 
-def _silent(done: float, words: str = "") -> None:
-    pass
-
-
-def _lines(total: float | None) -> Show:
-    last, of = time.monotonic(), "" if total is None else f" of {total:,.0f}"
+def _lines(total: float) -> Show:
+    last = time.monotonic()
 
     def show(done: float, words: str = "") -> None:
         nonlocal last
         if time.monotonic() - last > SECONDS:
             last = time.monotonic()
-            click.echo(f"{done:,.0f}{of}  {words}".rstrip(), err=True)
+            click.echo(f"{done:,.0f} of {total:,.0f}  {words}".rstrip(), err=True)
 
     return show

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,27 +38,12 @@ def told(tested: Tested, plain: Mapping[str, Any]) -> Iterator[str]:
         errors = (_number(one[name]) for name in ("ece", "changed_ece", "change_ece"))
         rows.append([who, *shares, *errors])
     yield from table(rows)
-    yield ""
-    yield from table(_reliability(plain["reliability"]))
     for name, lacking in plain["left_out"].items():
         yield f"left out: {name}, which needs {', '.join(lacking)}"
 
 
 def _figures(one: Mapping[str, Any]) -> str:
     return f"{one['loss']:.4f} ({_share(one['accuracy'])}; {_share(one['changed_accuracy'])})"
-
-
-def _reliability(tables: Mapping[str, Any]) -> list[list[str]]:
-    """Rows by probability: what was predicted of all and of changed cells, and how likely a change was."""
-    rows = [["probability", "cells", "right", "changed", "right", "of change", "changed"]]
-    by_low = {name: {one["low"]: one for one in bins} for name, bins in tables.items()}
-    for low, high in sorted({(one["low"], one["high"]) for bins in tables.values() for one in bins}):
-        cells = []
-        for name in ("all", "changed", "change"):
-            one = by_low[name].get(low)
-            cells += ["", ""] if one is None else [f"{one['cells']:,}", _share(one["observed"])]
-        rows.append([f"{low:.2f} to {high:.2f}", *cells])
-    return rows
 
 
 def _number(value: float | None) -> str:
@@ -74,29 +60,11 @@ def write_curve(run: RunFolder, out: Path) -> None:
     Raises:
         BadInput: the run has no losses yet. CompileError: PD612 without matplotlib, PD613 if the file cannot be written.
     """
-    from powderdsl.experiments.runs.metrics import read_metrics
-    from powderdsl.system.packages import require_matplotlib
-    from powderdsl.system.writing import replacing
+    from powderdsl.experiments.studies.results import curves_of, write_curves
 
-    require_matplotlib()
-    from matplotlib.figure import Figure
-
-    lines = list(read_metrics(run.path))
-    found = {
-        name: [(one["step"], one[name]) for one in lines if isinstance(one.get(name), float)]
-        for name in CURVES
-    }
-    if not any(found.values()):
+    curves = [
+        replace(curve, label=label) for metric, label in CURVES.items() for curve in curves_of([run], metric)
+    ]
+    if not curves:
         raise BadInput(f"{run.path} has no losses yet")
-    figure = Figure(figsize=(6, 4), layout="constrained")
-    axes = figure.subplots()
-    for name, points in found.items():
-        if points:
-            axes.plot(*zip(*points, strict=True), marker="" if len(points) > 40 else ".", label=CURVES[name])
-    axes.set_yscale("log")
-    axes.set_xlabel("iterations")
-    axes.set_ylabel("cross-entropy per cell (nats)")
-    axes.grid(linewidth=0.3)
-    axes.legend(fontsize=8)
-    with replacing(out) as temporary:
-        figure.savefig(temporary, dpi=150)
+    write_curves(out, curves, "loss", {}, run.path.name)

@@ -1,4 +1,4 @@
-"""The checked model as text: one line a definition and a rule, each with its place."""
+"""Rules as text, as parsed and as checked: one line a definition and a rule, each with its place."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from fractions import Fraction
 
 from powderdsl.diagnostics import Span
 from powderdsl.model.builtins import DIRECTIONS, OCTANTS
+from powderdsl.model.declarations import Block, PackDecl, PassDecl
 from powderdsl.model.expressions.operands import TRUE
 from powderdsl.model.types import (
     Assign,
@@ -26,6 +27,7 @@ from powderdsl.model.types import (
     Transform,
     Value,
 )
+from powderdsl.syntax.ast import Syntax
 
 _INFIX: dict[str, tuple[str, int, int]] = {
     # operation: (sign, how tightly it binds, how tightly its right side must bind without parentheses)
@@ -54,6 +56,55 @@ def print_model(ruleset: Ruleset, passes: Iterable[str] | None = None) -> str:
     text = "\n".join(lines) + ("\n" if lines else "") + "\n\n".join(blocks)
     kernels = printer.kernel_lines() if chosen is None else []
     return text.rstrip("\n") + "\n" + ("\n" + "\n".join(kernels) + "\n" if kernels else "")
+
+
+def print_tree(packs: Iterable[PackDecl], pass_name: str | None = None) -> str:
+    """Packs as parsed, or only a pass of them: each line as written, with its place, above its syntax tree."""
+    return "\n".join(line for pack in packs for line in _pack_lines(pack, pass_name))
+
+
+def _pack_lines(pack: PackDecl, pass_name: str | None) -> Iterator[str]:
+    chosen = [decl for decl in pack.passes if pass_name in (None, decl.name.text)]
+    if chosen or pass_name is None:
+        yield f"pack {pack.name.text}  # {place_of(pack.name.span)}"
+    for named_set in pack.sets if pass_name is None else ():
+        yield from _syntax_lines(f"set {named_set.name.text}", named_set.members, "  ")
+    for decl in chosen:
+        yield from _pass_lines(decl)
+
+
+def _pass_lines(decl: PassDecl) -> Iterator[str]:
+    yield f"  pass {decl.name.text}  # {place_of(decl.name.span)}"
+    for item in decl.scratch:
+        if item.type is not None:
+            yield from _syntax_lines(f"scratch {item.name.text}", item.type, "    ")
+    yield from _block_lines(decl.block, "    ")
+
+
+def _block_lines(block: Block, indent: str) -> Iterator[str]:
+    for name, syntax in block.lets:
+        yield from _syntax_lines(f"let {name.text}", syntax, indent)
+    inner = indent
+    if block.header is not None:
+        yield from _syntax_lines("loop", block.header, indent)
+        inner += "  "
+    for key, value in (("symmetry", block.symmetry), ("conflicts", block.conflicts)):
+        if value:
+            yield f"{inner}{key} {value}"
+    for syntax in block.rules:
+        yield from _syntax_lines("rule", syntax, inner)
+    for child in block.blocks:
+        yield f"{inner}block"
+        yield from _block_lines(child, inner + "  ")
+    for child in block.then:
+        yield f"{indent}then"
+        yield from _block_lines(child, indent + "  ")
+
+
+def _syntax_lines(what: str, syntax: Syntax, indent: str) -> Iterator[str]:
+    """A heading with the line as written, below it the tree."""
+    yield f"{indent}{what}: {one_line(syntax.span)}  # {place_of(syntax.span)}"
+    yield syntax.dump(indent + "  ")
 
 
 def place_of(span: Span) -> str:

@@ -100,5 +100,5 @@ def test_an_interrupted_run_says_how_to_go_on(tmp_path: Path) -> None:
         child.send_signal(signal.SIGINT)
         _, said = child.communicate(timeout=240)
     assert child.returncode == 130, said
-    assert f"powderdsl train --resume {tmp_path / 'run'}" in said
+    assert f"the same command continues in {tmp_path / 'run'}" in said
     assert list((tmp_path / "run" / "checkpoints").glob("*.safetensors"))

@@ -192,7 +192,7 @@ def _campaign(
     events = run_campaign(plan, tally, iter(left), jobs, folder, until)
     interrupt: KeyboardInterrupt | None = None
     done = 0
-    with progress(_title(seconds), len(left) if seconds is None else None) as show:
+    with progress(_title(seconds), len(left)) as show:
         try:
             for event in events:
                 if isinstance(event, Path):
@@ -246,7 +246,7 @@ def _front_end(seeds: range | None, seconds: int | None, folder: Path, jobs: int
     kinds: Counter[str] = Counter()
     accepted, slowest, largest, found = 0, 0.0, 0.0, []
     interrupt: KeyboardInterrupt | None = None
-    with progress(_title(seconds), len(wanted) if seconds is None else None) as show:
+    with progress(_title(seconds), len(wanted)) as show:
         try:
             for trial in trials:
                 kinds[trial.kind] += 1

@@ -81,7 +81,7 @@ def test_the_curve_of_a_training(dunes: str, tmp_path: Path) -> None:
     assert run(*begin(dunes, folder, "--iterations", 20, "--validate-every", 5)).exit_code == 0
     shown = run("wm", "show", folder, "--curve", "--out", out)
     assert shown.exit_code == 0, shown.output
-    assert np.asarray(Image.open(out)).shape[:2] == (600, 900)
+    assert np.asarray(Image.open(out)).shape[:2] == (630, 975)
     lines = folder / "metrics.jsonl"
     lines.write_text(
         lines.read_text() + '{"step": 30, "loss/train": "x", "loss/validation": null}\n', encoding="utf-8"
@@ -152,6 +152,6 @@ def test_ctrl_c_saves_and_says_how_to_go_on(dunes: str, tmp_path: Path) -> None:
         process.send_signal(signal.SIGINT)
         _, told = process.communicate(timeout=240)
     assert process.returncode == 130, told
-    assert f"interrupted; the same command resumes {folder}" in told
+    assert f"interrupted; the same command continues in {folder}" in told
     assert "Traceback" not in told
     assert len(list((folder / "checkpoints").glob("*.safetensors"))) == 1

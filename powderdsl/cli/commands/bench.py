@@ -23,13 +23,6 @@ from powderdsl.targets.cpp.compilers import NoCompiler, find_compiler
 MAX_SECONDS = 3600
 
 
-def _names(text: str) -> tuple[str, ...]:
-    names = tuple(name.strip() for name in text.split(","))
-    if not all(names):
-        raise ValueError("is not a list of elements: write NAME,NAME")
-    return names
-
-
 def _seconds(text: str) -> float:
     seconds = float(text)
     if not 0 < seconds <= MAX_SECONDS:  # false for NaN
@@ -37,7 +30,7 @@ def _seconds(text: str) -> float:
     return seconds
 
 
-NAMES, SECONDS = opt.Parsed("NAME,NAME", _names), opt.Parsed("FLOAT", _seconds)
+SECONDS = opt.Parsed("FLOAT", _seconds)
 EPILOG = "\b\nWorkloads:\n" + "\n".join(f"  {name:<7} {about}" for name, about in WORKLOADS.items())
 
 
@@ -52,7 +45,7 @@ EPILOG = "\b\nWorkloads:\n" + "\n".join(f"  {name:<7} {about}" for name, about i
 )
 @opt.option("--batch", (1, 1 << 20), "Number of worlds in a batch.", (1, 32), to="batches", multiple=True)
 @opt.option("--size", opt.SIZE, "Rows and columns.  [default: 64]", to="sizes", multiple=True)
-@opt.option("--only", NAMES, "Use only these elements in the worlds.", ())
+@opt.option("--only", opt.NAMES, "Use only these elements in the worlds.", ())
 @opt.option("--threads", (1, 1024), "CPU threads.", (1,), multiple=True)
 @opt.option(
     "--beside",

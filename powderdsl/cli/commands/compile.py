@@ -12,10 +12,8 @@ from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput
 from powderdsl.compiler import lower, read
 from powderdsl.diagnostics import Reporter, suggest
-from powderdsl.model.declarations import Block, PackDecl, PassDecl
-from powderdsl.model.text import one_line, place_of, print_model
+from powderdsl.model.text import print_model, print_tree
 from powderdsl.model.types import Ruleset
-from powderdsl.syntax.ast import Syntax
 from powderdsl.system.writing import write_text
 
 if TYPE_CHECKING:
@@ -149,57 +147,11 @@ def _check_known(what: str, name: str, known: Sequence[str], plural: str) -> Non
         raise BadInput("; ".join([f"no {what} `{name}`", *suggest(name, known, plural)]))
 
 
-# Syntax trees
-
-
 def _tree(rules: str, pass_name: str | None) -> str:
+    """The packs as parsed, before they are checked."""
     reporter = Reporter()
     packs, _ = read([rules], reporter)
     reporter.raise_if_errors()
     if pass_name is not None:
         _check_known("pass", pass_name, [decl.name.text for pack in packs for decl in pack.passes], "passes")
-    return "\n".join(line for pack in packs for line in _pack_lines(pack, pass_name))
-
-
-def _pack_lines(pack: PackDecl, pass_name: str | None) -> Iterator[str]:
-    chosen = [decl for decl in pack.passes if pass_name in (None, decl.name.text)]
-    if chosen or pass_name is None:
-        yield f"pack {pack.name.text}  # {place_of(pack.name.span)}"
-    for named_set in pack.sets if pass_name is None else ():
-        yield from _syntax_lines(f"set {named_set.name.text}", named_set.members, "  ")
-    for decl in chosen:
-        yield from _pass_lines(decl)
-
-
-def _pass_lines(decl: PassDecl) -> Iterator[str]:
-    yield f"  pass {decl.name.text}  # {place_of(decl.name.span)}"
-    for item in decl.scratch:
-        if item.type is not None:
-            yield from _syntax_lines(f"scratch {item.name.text}", item.type, "    ")
-    yield from _block_lines(decl.block, "    ")
-
-
-def _block_lines(block: Block, indent: str) -> Iterator[str]:
-    for name, syntax in block.lets:
-        yield from _syntax_lines(f"let {name.text}", syntax, indent)
-    inner = indent
-    if block.header is not None:
-        yield from _syntax_lines("loop", block.header, indent)
-        inner += "  "
-    for key, value in (("symmetry", block.symmetry), ("conflicts", block.conflicts)):
-        if value:
-            yield f"{inner}{key} {value}"
-    for syntax in block.rules:
-        yield from _syntax_lines("rule", syntax, inner)
-    for child in block.blocks:
-        yield f"{inner}block"
-        yield from _block_lines(child, inner + "  ")
-    for child in block.then:
-        yield f"{indent}then"
-        yield from _block_lines(child, indent + "  ")
-
-
-def _syntax_lines(what: str, syntax: Syntax, indent: str) -> Iterator[str]:
-    """A heading with the line as written, below it the tree."""
-    yield f"{indent}{what}: {one_line(syntax.span)}  # {place_of(syntax.span)}"
-    yield syntax.dump(indent + "  ")
+    return print_tree(packs, pass_name)

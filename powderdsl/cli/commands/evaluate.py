@@ -18,25 +18,13 @@ if TYPE_CHECKING:
     from powderdsl.rl.evaluation import Evaluation, Score
 
 
-def _names(ctx: click.Context, param: click.Parameter, value: str | None) -> list[str] | None:
-    if value is None:
-        return None
-    return [one.strip() for one in value.split(",") if one.strip()]
-
-
 @click.command("evaluate", cls=opt.ManyWords)
 @click.argument("run", metavar="RUN|TASK")
-@click.option(
-    "--splits",
-    callback=_names,
-    metavar="A,B",
-    help="Splits: sets of worlds.  [default: all splits of the task]",
-)
-@click.option(
+@opt.option("--splits", opt.NAMES, "Splits: sets of worlds.  [default: all splits of the task]")
+@opt.option(
     "--policies",
-    callback=_names,
-    metavar="A,B",
-    help="Policies among trained, expert, random, nothing.  [default: all; an expert that searches only if named]",
+    opt.NAMES,
+    "Policies among trained, expert, random, nothing.  [default: all; an expert that searches only if named]",
 )
 @opt.option("--episodes", (1, 10**6), "Episodes per split and policy.", 256)
 @click.option(

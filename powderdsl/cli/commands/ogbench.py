@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 
 import click
@@ -48,19 +47,18 @@ def command(
     from powderdsl.ogbench.collect import collect
     from powderdsl.ogbench.program import LevelProgram
 
-    try:
-        with user_values(), progress(found.name, episodes or found.play.episodes, lines=True) as show:
-            files = collect(
-                LevelProgram(found, backend=backend, device=device, threads=threads),
-                out,
-                episodes=episodes,
-                validation=validation,
-                seed=seed,
-                progress=lambda done, total: show(done, "episodes"),
-            )
-    except KeyboardInterrupt:
-        click.echo(f"stopped: the same command continues in {shlex.quote(str(out))}", err=True)
-        raise
+    with (
+        user_values(),
+        progress(found.name, episodes or found.play.episodes, lines=True, resumes=out) as show,
+    ):
+        files = collect(
+            LevelProgram(found, backend=backend, device=device, threads=threads),
+            out,
+            episodes=episodes,
+            validation=validation,
+            seed=seed,
+            progress=lambda done, total: show(done, "episodes"),
+        )
     size = sum(path.stat().st_size for path in files)
     names = ", ".join(path.name for path in files)
     click.echo(f"{out}: {names}, {counted(len(files), 'file')}, {size / 1e6:,.1f} MB", err=True)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import click
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BAD_INPUT, OK, BadInput, user_values
 from powderdsl.cli.output import counted, progress, write_diagnostics
-from powderdsl.datasets.manifest import check_place, read_manifest
+from powderdsl.datasets.manifest import check_place
 from powderdsl.diagnostics import CompileError, Diagnostic
 from powderdsl.tasks.shipped import check_split, load_task
 from powderdsl.tasks.task import Task, still_action
@@ -85,20 +84,16 @@ def command(
     require_gymnasium()
     from powderdsl.datasets.recorder import record
 
-    try:
-        with user_values(), progress(found.name, episodes, lines=True) as show:
-            acting = {"policy": policy} if policy in SCRIPTED else _trained(policy, found, how)
-            dataset = record(
-                found,
-                folder=out,
-                episodes=episodes,
-                progress=lambda done, total: show(done, "episodes"),
-                **acting,
-                **how,
-            )
-    except KeyboardInterrupt:
-        _report_interrupted(out, episodes)
-        raise
+    with user_values(), progress(found.name, episodes, lines=True, resumes=out) as show:
+        acting = {"policy": policy} if policy in SCRIPTED else _trained(policy, found, how)
+        dataset = record(
+            found,
+            folder=out,
+            episodes=episodes,
+            progress=lambda done, total: show(done, "episodes"),
+            **acting,
+            **how,
+        )
     size = sum(row.bytes for row in dataset.manifest.shards)
     click.echo(
         f"{out}: {counted(len(dataset), 'episode')}, {dataset.steps:,} transitions, "
@@ -234,14 +229,3 @@ def _exchanged(
     counts = f"{counted(len(dataset), 'episode')}, {dataset.steps:,} transitions"
     click.echo(f"{to_minari or out}: {counts}", err=True)
     return OK
-
-
-def _report_interrupted(out: Path, episodes: int) -> None:
-    done = 0
-    with suppress(CompileError):  # interrupted before anything was written
-        manifest = read_manifest(out)
-        done = sum(len(manifest.recipe.episodes_of(row.number)) for row in manifest.shards)
-    click.echo(
-        f"stopped with {done:,} of {episodes:,} episodes in {shlex.quote(str(out))}: the same command continues",
-        err=True,
-    )

@@ -18,7 +18,7 @@ from powderdsl.cli.output import color_wanted, print_json
 from powderdsl.diagnostics import Span
 from powderdsl.diagnostics.printable import printable, write_styled
 from powderdsl.model.text import element_name, one_line, place_of, show_set, show_value
-from powderdsl.model.types import Element, Pass, Property, Ruleset, Value
+from powderdsl.model.types import ColorRamp, Element, Pass, Property, Ruleset, Value
 from powderdsl.system.reports import Painted, table
 from powderdsl.tasks.shipped import is_task
 
@@ -148,56 +148,53 @@ def _data(ruleset: Ruleset) -> dict[str, Any]:
     return {
         "name": ruleset.name,
         "about": ruleset.about,
-        "packs": list(ruleset.packs),
+        "packs": ruleset.packs,
         "slots": ruleset.slots,
-        "elements": [_element_data(ruleset, element) for element in ruleset.elements],
-        "properties": [_described(prop, "name", "kind", "pack") for prop in ruleset.properties],
-        "fields": [_described(field, "name", "kind", "at", "pack") for field in ruleset.fields],
+        "elements": [
+            _described(
+                element,
+                *("id", "name", "pack", "glyph", "color", "about", "tags"),
+                color_by=_ramp_data(element.ramp),
+                properties={prop.name: _plain(prop.values[element.id]) for prop in ruleset.properties},
+            )
+            for element in ruleset.elements
+        ],
+        "properties": [_described(prop, "name", "pack", kind=str(prop.kind)) for prop in ruleset.properties],
+        "fields": [_described(field, "name", "at", "pack", kind=str(field.kind)) for field in ruleset.fields],
         "reactions": [
             {
-                "from": [element_name(ruleset, number) for number in one.before],
-                "to": [element_name(ruleset, number) for number in one.after],
-                "pass": one.pass_name,
-                "rule": one_line(one.span),
-                **_described(one, "pack"),
+                "from": [element_name(ruleset, number) for number in reaction.before],
+                "to": [element_name(ruleset, number) for number in reaction.after],
+                "pass": reaction.pass_name,
+                **_described(reaction, "pack", rule=one_line(reaction.span)),
             }
-            for one in reactions(ruleset)
+            for reaction in reactions(ruleset)
         ],
         "passes": [
-            {
-                "moments": len(one.moments),
-                "rules": [{"rule": one_line(span), "where": place_of(span)} for span in rule_spans(one)],
-                **_described(one, "name", "pack"),
-            }
-            for one in ruleset.passes
+            _described(
+                pass_,
+                *("name", "pack"),
+                moments=len(pass_.moments),
+                rules=[{"rule": one_line(span), "where": place_of(span)} for span in rule_spans(pass_)],
+            )
+            for pass_ in ruleset.passes
         ],
         "params": [
-            {"value": _plain(one.default), **_described(one, "name", "kind", "about")}
-            for one in ruleset.params
+            _described(param, "name", "about", kind=str(param.kind), value=_plain(param.default))
+            for param in ruleset.params
         ],
     }
 
 
-def _described(one: Any, *names: str) -> dict[str, str]:
-    """Some attributes of a part of the model as text, and its place."""
-    return {**{name: str(getattr(one, name)) for name in names}, "where": place_of(one.span)}
+def _described(part: Any, *names: str, **more: Any) -> dict[str, Any]:
+    """Some attributes of a part of the model, and its place."""
+    return {**{name: getattr(part, name) for name in names}, **more, "where": place_of(part.span)}
 
 
-def _element_data(ruleset: Ruleset, element: Element) -> dict[str, Any]:
-    ramp = element.ramp
-    return {
-        "id": element.id,
-        "name": element.name,
-        "pack": element.pack,
-        "glyph": element.glyph,
-        "color": element.color,
-        "color_by": ramp
-        and {"field": ramp.field, "from": ramp.start, "to": ramp.end, "over": [ramp.lo, ramp.hi]},
-        "about": element.about,
-        "tags": sorted(element.tags),
-        "properties": {prop.name: _plain(prop.values[element.id]) for prop in ruleset.properties},
-        "where": place_of(element.span),
-    }
+def _ramp_data(ramp: ColorRamp | None) -> dict[str, Any] | None:
+    if ramp is None:
+        return None
+    return {"field": ramp.field, "from": ramp.start, "to": ramp.end, "over": (ramp.lo, ramp.hi)}
 
 
 # Tasks

@@ -8,7 +8,7 @@ import sys
 import click
 
 from powderdsl.cli import options as opt
-from powderdsl.cli.exits import BadInput, user_values
+from powderdsl.cli.exits import user_values
 from powderdsl.cli.output import color_wanted, print_json
 from powderdsl.diagnostics.printable import write_styled
 
@@ -65,10 +65,7 @@ def command(
 
     begun = start(ruleset, world, size, None, seed, backend=backend)
     with user_values():
-        try:
-            found = trace(begun, *cell, step, number=number, of=names or None, every_rule=every_rule)
-        except IndexError as error:
-            raise BadInput(str(error)) from error
+        found = trace(begun, *cell, step, number=number, of=names or None, every_rule=every_rule)
     if as_json:
         print_json(trace_data(found))
     else:

@@ -53,16 +53,12 @@ def command(
         folder = folder or Path("runs") / f"{Path(config.task).stem}-seed{config.seed}"
     from powderdsl.rl.training import train
 
-    try:
-        with progress(Path(config.task).stem, config.steps, lines=True) as show:
+    with progress(Path(config.task).stem, config.steps, lines=True, resumes=folder) as show:
 
-            def tell(step: int, mean: float | None) -> None:
-                show(min(step, config.steps), "" if mean is None else f"return {mean:.3f}")
+        def tell(step: int, mean: float | None) -> None:
+            show(min(step, config.steps), "" if mean is None else f"return {mean:.3f}")
 
-            run = train(config, folder, progress=tell)
-    except KeyboardInterrupt:
-        click.echo(f"\ninterrupted; resume with: powderdsl train --resume {folder}", err=True)
-        raise
+        run = train(config, folder, progress=tell)
     found = run.checkpoint()
     click.echo(f"{folder}: {found.step:,} interactions")
     click.echo(f"powderdsl evaluate {folder}; powderdsl watch {folder}", err=True)

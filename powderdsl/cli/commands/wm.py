@@ -347,26 +347,22 @@ def _run(config: TrainConfig, folder: Path, values: dict[str, Any], **more: Any)
 
     machine, network = _machine(values), _own_network(values["network_name"])
     began = time.monotonic()
-    with progress("wm", config.iterations, lines=True) as show:
+    with progress("wm", config.iterations, lines=True, resumes=folder) as show:
 
         def tell(now: TrainingProgress) -> None:
             said = [("loss", now.loss), ("held out", now.validation)]
             show(now.done, ", ".join(f"{name} {one:.4f}" for name, one in said if one is not None))
 
-        try:
-            run = train(
-                config,
-                folder,
-                machine=machine,
-                network=network,
-                tell=tell,
-                save_seconds=values["save_every"],
-                validate_every=values["validate_every"],
-                **more,
-            )
-        except KeyboardInterrupt:
-            click.echo(f"interrupted; the same command resumes {folder}", err=True)
-            raise
+        run = train(
+            config,
+            folder,
+            machine=machine,
+            network=network,
+            tell=tell,
+            save_seconds=values["save_every"],
+            validate_every=values["validate_every"],
+            **more,
+        )
     took = time.monotonic() - began
     click.echo(
         f"{run.path}: {config.iterations:,} iterations, {took:.0f} s here; powderdsl wm eval {run.path}"

@@ -309,7 +309,11 @@ def curves_of(runs: Sequence[RunFolder], metric: str) -> list[Curve]:
     for config, members in zip(settings, groups.values(), strict=True):
         lines = {}
         for run in members:
-            line = {line["step"]: line[metric] for line in read_metrics(run.path) if metric in line}
+            line = {
+                line["step"]: line[metric]
+                for line in read_metrics(run.path)
+                if isinstance(line.get(metric), int | float)
+            }
             if line:
                 lines[int(run.config.get("seed", 0))] = line
         if lines:
@@ -353,7 +357,10 @@ def as_table(curves: Sequence[Curve]) -> str:
 def write_curves(
     path: Path, curves: Sequence[Curve], metric: str, baselines: Mapping[str, float], title: str = ""
 ) -> None:
-    """Draw means with their 95 % intervals over seeds, and baselines as dashed lines. Raises as `draw`."""
+    """Draw means with their 95 % intervals over seeds, and baselines as dashed lines; losses on a
+    logarithmic scale. Raises as `draw`."""
     lines = [Line(curve.label, curve.steps, [*zip(*curve.values, strict=True)]) for curve in curves]
     across = "interactions" if metric.startswith(("held_out/", "rollout/")) else "steps"
-    draw(path, [Panel(across, metric, lines, baselines=baselines)], title, follow=True)
+    positive = all(value > 0 for curve in curves for values in curve.values for value in values)
+    scale = "log" if metric.startswith("loss") and positive else "linear"
+    draw(path, [Panel(across, metric, lines, scale, baselines=baselines)], title, follow=True)
