@@ -92,7 +92,7 @@ COMMANDS = {
         ),
         "model/checkpoints/[0-9]*.safetensors",
     ),
-    "bench": Endless(("bench", "life", "--backend", "wasm", "--seconds", "3600", "--out", "x.json"), ""),
+    "bench": Endless(("bench", "life", "--backend", "wasm", "--seconds", "3600"), ""),
     "fuzz": Endless(
         ("fuzz", "--jobs", "2", "--seeds", "0..900000", "--backends", "torch,native", "--save", "found"),
         "tmp/.powderdsl-*/*",

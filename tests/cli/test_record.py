@@ -138,7 +138,7 @@ def test_killed_and_interrupted_recordings_go_on(task: Path, tmp_path: Path) -> 
     program = compile_task(str(task), backend="wasm")
     for folder in (out, other):
         record(program, "random", folder, episodes=EPISODES, shard=3)
-    names = sorted(path.name for path in out.glob("*shard*"))
+    names = sorted(path.name for path in out.glob("shard-*"))
     assert len(names) == 200
     assert [(out / name).read_bytes() for name in names] == [(other / name).read_bytes() for name in names]
 
