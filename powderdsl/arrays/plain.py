@@ -294,10 +294,10 @@ def asarray(values: Any, dtype: Any = None) -> ndarray:
     if isinstance(values, ndarray):
         return values if dtype is None or dtype is values.dtype else values.astype(dtype)
     shape, leaves = _nested(values)
-    types = {*map(type, leaves)}
+    types = dict.fromkeys(map(type, leaves))
     arrays = [one for one in leaves if isinstance(one, ndarray)] if ndarray in types else []
     if dtype is None:
-        kinds = [one.dtype for one in arrays] + [_dtype(one) for one in types - {ndarray}]
+        kinds = [one.dtype for one in arrays] + [_dtype(one) for one in types if one is not ndarray]
         kind = reduce(numbers.promoted, kinds) if kinds else float64
     else:
         kind = _dtype(dtype)
@@ -410,7 +410,7 @@ def concatenate(arrays: Sequence[ndarray], axis: int = 0) -> ndarray:
     rests = {(one.shape[:at], one.shape[at + 1 :]) for one in arrays}
     if len(rests) > 1:
         raise ValueError("arrays of different shapes cannot be joined")
-    before, after = rests.pop()
+    before, after = arrays[0].shape[:at], arrays[0].shape[at + 1 :]
     parts = numbers.alike([numbers.converted(one.full, one.dtype, kind) for one in arrays], kind)
     lengths = [prod(one.shape[at:]) for one in arrays]
     blocks = [

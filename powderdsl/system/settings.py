@@ -104,7 +104,7 @@ def read_record(kind: type[Record], data: Any, problems: list[str], path: str = 
             values[name] = _read(hint, data[name], start + name, problems)
         elif required:
             problems.append(f"`{start}{name}` is missing")
-    for key in sorted(map(str, data.keys() - declared.keys())):
+    for key in sorted(str(key) for key in data if key not in declared):
         helps = suggest(key, declared, "keys here")
         problems.append("; ".join([f"unknown key `{start}{key[:80]}`", *helps]))
     return None if len(problems) > before else kind(**values)

@@ -142,7 +142,7 @@ def tidy(folder: Path, limit: int = LIMIT, keep: str = "") -> None:
         total += entry.about.size
         if total > limit and entry.key != keep:
             _discard(folder / entry.key)
-    for place in {*folder.iterdir()} - {folder / entry.key for entry in libraries}:
+    for place in sorted({*folder.iterdir()} - {folder / entry.key for entry in libraries}):
         with suppress(OSError):
             if time.time() - place.stat().st_mtime > UNUSED and not _needed(folder, place):
                 _discard(place)

@@ -255,7 +255,7 @@ def _store() -> Path:
     if version.is_file() and version.read_text(encoding="utf-8") == code_version():
         return MADE
     folder = cache_folder("play") / code_version()
-    for other in folder.parent.iterdir():
+    for other in sorted(folder.parent.iterdir()):
         if other != folder:
             shutil.rmtree(other, ignore_errors=True)
     return folder
@@ -275,7 +275,7 @@ def code_version() -> str:
     found = hashlib.sha256()
     code = {*HERE.parent.rglob("*.py"), *HERE.parent.rglob("*.lark")}
     folders = shipped("rules"), shipped("tasks"), examples_folder()
-    texts = [path for folder in folders for path in folder.rglob("*.yaml")]
+    texts = [path for folder in folders for path in sorted(folder.rglob("*.yaml"))]
     for path in sorted(code) + sorted(texts):
         found.update(path.read_bytes())
     return found.hexdigest()[:16]

@@ -356,7 +356,7 @@ def test_forks_run_native_code_too(rules: Ruleset, tmp_path: Path) -> None:
     program = """
 import os, sys, time
 from pathlib import Path
-from powderdsl.simulation import native as auto_program
+from powderdsl.simulation import programs as auto_program
 from powderdsl.targets.cpp.build import Building, building
 from powderdsl.testing.generators.cases import load_text
 from powderdsl.simulation.simulator import compile
@@ -402,7 +402,7 @@ def test_the_end_does_not_wait_for_the_compiler(tmp_path: Path) -> None:
     program = """
 import sys, time
 from pathlib import Path
-from powderdsl.simulation import native as auto_program
+from powderdsl.simulation import programs as auto_program
 from powderdsl.targets.cpp.build import Building, building
 from powderdsl.testing.generators.cases import load_text
 from powderdsl.simulation.simulator import compile

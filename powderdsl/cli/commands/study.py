@@ -90,7 +90,7 @@ def selected(study: Study, size: str, seeds: int | None, only: Sequence[str]) ->
         name, _, values = text.partition("=")
         if (not values and "=" not in text) or name not in known:
             raise BadInput(f"`--only {text}`: write NAME=VALUE,… with one of {', '.join(known)} as NAME")
-        for value in {*values.split(",")} - known[name]:
+        for value in sorted({*values.split(",")} - known[name]):
             there = suggest(value, known[name]) or (f"it has {', '.join(sorted(known[name])[:20])}",)
             raise BadInput(f"`--only {text}`: `{name}` has no value `{value}` here; {there[0]}")
         wanted.setdefault(name, set()).update(values.split(","))

@@ -147,8 +147,8 @@ class _StudyCheck:
             mistake = replace(
                 mistake, code="PD806", message=message, helps=suggest(word.text, steps, "steps")
             )
-        names = {*Template(word.text).get_identifiers()}
-        span = point.spans.get(names.pop()) if len(names) == 1 else None
+        names = Template(word.text).get_identifiers()
+        span = point.spans.get(names[0]) if len(names) == 1 else None
         used = () if span is None else (Label(word.span, f"as `{point.filled(word)}`"),)
         self.reporter.add(replace(mistake, primary=Label(span or word.span), secondary=used))
 

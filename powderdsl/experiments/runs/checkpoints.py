@@ -129,5 +129,5 @@ def _digest(data: bytes) -> str:
 
 def _named(folder: Path) -> list[tuple[int, str, Path]]:
     """Step, digest and path of all checkpoints, the newest first."""
-    matches = [(NAME.fullmatch(path.name), path) for path in folder.glob("*")]
+    matches = [(NAME.fullmatch(path.name), path) for path in sorted(folder.glob("*"))]
     return sorted(((int(match[1]), match[2], path) for match, path in matches if match), reverse=True)

@@ -377,7 +377,7 @@ class _StudyReader:
             sets[value.text] = {name.text: word for name, word in words if isinstance(word, Scalar)}
             names = {name.text: name for name, _ in words} | names
         for value, _ in entries:
-            for name in names.keys() - sets[value.text].keys():
+            for name in sorted(names.keys() - sets[value.text].keys()):
                 self.error("PD109", f"`{value.text}` does not set `{name}`", value.span, "others do")
         for scalar in names.values():
             self.add_name(scalar)
@@ -453,7 +453,7 @@ class _StudyReader:
             self.error("PD806", "`$` begins the name of a setting", word.span, label)
         self.used |= {*template.get_identifiers()}
         unknown = {*template.get_identifiers()} - {*self.known}
-        for name in unknown:
+        for name in sorted(unknown):
             helps = suggest(name, self.known, "settings")
             self.error("PD806", f"no setting `{name}` is varied", word.span, helps=helps)
         self.is_hidden |= bool(unknown)
