@@ -269,7 +269,7 @@ def test_a_world_never_starts_with_what_the_claim_excludes() -> None:
     found = result.counterexample
     assert found is not None
     assert found.steps > 1
-    assert not (found.before == water).any()
+    assert not (found.before["element"] == water).any()
     assert result.difference is not None
     lines = [place_of(cause.span).rpartition("/")[2] for cause in result.difference.causes]
     assert set(lines) <= {"steam.yaml:18", "steam.yaml:19"}
