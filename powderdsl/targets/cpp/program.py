@@ -38,13 +38,13 @@ class PackedState(Mapping[str, Tensor]):
     __slots__ = ("_handle", "_tensors", "like", "program")
 
     def __init__(self, program: NativeProgram, handle: int, like: Like):
-        self._handle: int | None = handle
         self._tensors: dict[str, Tensor] = {}
         self.program, self.like = program, like
+        self._handle: int | None = handle
 
     def __del__(self) -> None:
-        # Not a weakref.finalize, which takes as long as a quiet step.
-        if self._handle is not None:
+        # Not a weakref.finalize, which takes as long as a quiet step. A signal may have ended `__init__` before its end.
+        if getattr(self, "_handle", None) is not None:
             self.program.library.pd_free(self._handle)
 
     def __copy__(self) -> PackedState:

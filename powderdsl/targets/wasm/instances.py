@@ -190,9 +190,11 @@ class Instance:
 class WasmState(Mapping[str, Array]):
     """A batch's state in the memory of an instance. Slots are unpacked into arrays one by one, on first access."""
 
+    _batch: int | None = None  # of the class: a signal may end `__init__` before its first line
+
     def __init__(self, instance: Instance, batch: int, like: Like):
         self.instance, self.like = instance, like
-        self._batch: int | None = batch
+        self._batch = batch
         self._arrays: dict[str, Array] = {}
 
     def __del__(self) -> None:
