@@ -76,11 +76,9 @@ def test_a_node_without_the_folder_runs_nothing(tmp_path: Path) -> None:
     study = read(STUDY.format(seeds=1, steps=[12]))
     (point,) = study.points("small")
     folder = tmp_path / "elsewhere"
-    found = on_cluster.run_point(study, str(folder), "small", 1, point, on_cluster._version())
+    found = on_cluster.run_point(study, folder, "small", 1, point)
     assert "it must be on storage that all nodes share" in str(found.problem)
     assert not folder.exists()
-    found = on_cluster.run_point(study, str(folder), "small", 1, point, "0.0.1")
-    assert "0.0.1 is needed" in str(found.problem)
 
 
 def test_what_a_node_refuses_is_a_problem_of_the_run(tmp_path: Path) -> None:
@@ -91,7 +89,7 @@ def test_what_a_node_refuses_is_a_problem_of_the_run(tmp_path: Path) -> None:
     (point,) = study.points("small")
     run = StudyRun(study, tmp_path / "out", "small")
     run.prepare()
-    found = on_cluster.run_point(study, str(tmp_path / "out"), "small", 1, point, on_cluster._version())
+    found = on_cluster.run_point(study, tmp_path / "out", "small", 1, point)
     assert "the path `dig.yaml` leaves the study's folder" in str(found.problem)
 
 

@@ -11,6 +11,7 @@ from dataclasses import replace
 from fnmatch import fnmatchcase
 from functools import cache, lru_cache
 from importlib import import_module
+from itertools import product
 from pathlib import Path
 from string import Template
 from typing import TYPE_CHECKING, Any
@@ -24,7 +25,6 @@ from powderdsl.compiler import load
 from powderdsl.diagnostics import CompileError, Diagnostic, Label, Reporter, suggest
 from powderdsl.experiments.runs import find_run
 from powderdsl.experiments.studies.study import FLAG, READ, SIZES, Measure, Point, Study, StudyStep
-from powderdsl.model.types import Ruleset
 from powderdsl.rl.config import BASELINES, TrainConfig, check_task, chosen_policies
 from powderdsl.syntax.yaml_tree import Scalar
 from powderdsl.system.reading import is_path
@@ -33,17 +33,13 @@ from powderdsl.tasks.task import Task
 
 if TYPE_CHECKING:
     from powderdsl.worldmodel.config import DataConfig
-    from powderdsl.worldmodel.config import TrainConfig as ModelConfig
 
 AGENT, NETWORK = "an agent", "a world model"
 MAKES = {("train",): AGENT, ("wm", "train"): NETWORK, ("wm", "finetune"): NETWORK}
 """What the runs of commands train."""
 WORKS_ON = {("evaluate",): AGENT, ("wm", "finetune"): NETWORK, ("wm", "eval"): NETWORK}
 """What the runs that commands work on have trained."""
-LAST = 1000
 EVALUATES = {AGENT: "evaluate", NETWORK: "wm eval"}
-
-Pairs = tuple[tuple[str, Any], ...]
 
 
 def called(words: tuple[str, ...]) -> click.Command:
@@ -62,9 +58,8 @@ def check_study(study: Study, reporter: Reporter, *, devices: bool = True) -> No
         devices: whether the study runs on this machine, with its devices.
     """
     check = _StudyCheck(study, reporter, devices)
-    for step in study.steps:
-        for point in check.points:
-            check.result(step, point)
+    for step, point in product(study.steps, check.points):
+        check.result(step, point)
     for measure in study.measures:
         check.measure(measure)
 
@@ -80,7 +75,10 @@ class _StudyCheck:
         """Words that are to blame for mistakes, by step and option."""
         self.wrong = {step.name for step in study.steps if step.is_wrong}
         """Steps with mistakes, whose consequences are not reported."""
-        self.load, self.rules_of = cache(_load), cache(self.changed_rules)
+        self.rules = cache(lambda rules, params: load(rules, params=dict(params)))
+        self.changed_rules = cache(
+            lambda rules, task, *packs: wm.rules_of(rules or _rules_of(task), task, *packs)
+        )
 
     def result(self, step: StudyStep, point: Point) -> Any:
         """What a step makes: the settings of its run, or patterns of keys of its results; None if that is not known."""
@@ -173,87 +171,43 @@ class _StudyCheck:
             from powderdsl.simulation.programs import find_device  # imports torch
 
             find_device(context.params["device"])
-        match step.command:
+        return self.made(step.command, context, run)
+
+    def made(self, command: tuple[str, ...], context: click.Context, run: Any) -> Any:
+        """What a command makes of options that it takes. Raises what it would raise before it begins to work."""
+        values = context.params
+        match command:
             case ("train",):
-                return self.agent(train.new_config(context))
+                config = train.new_config(context)
+                check_task(config, _task(config.task, config.knobs, config.params, config.packs))
+                return config
             case ("evaluate",):
-                return self.evaluation(context.params, run)
+                return _evaluation(values, run)
             case ("wm", "train"):
-                return self.model(wm.new_config(context.params, self.rules_of))
-            case ("wm", "finetune"):
-                return self.finetuned(context.params, run)
-            case _:
-                return self.test(context.params, run)
-
-    # What commands would refuse. Knobs within their ranges do not change what is loaded
-
-    def task(
-        self, name: str, knobs: Mapping[str, int], params: Mapping[str, Any], packs: Sequence[str]
-    ) -> Task:
-        more = tuple(params.items()), tuple(packs)
-        task = _task(name, (), *more)
-        ranges = {knob.name: range(knob.lo, knob.hi + 1) for knob in task.knobs}
-        wrong = tuple((knob, value) for knob, value in knobs.items() if value not in ranges.get(knob, ()))
-        return _task(name, wrong, *more) if wrong else task
-
-    def agent(self, config: TrainConfig) -> TrainConfig:
-        check_task(config, self.task(config.task, config.knobs, config.params, config.packs))
-        return config
-
-    def evaluation(self, values: Mapping[str, Any], run: TrainConfig | None) -> Sequence[str] | None:
-        if run is None:
-            task = find_played(values["run"], values["knobs"], values["settings"], values["packs"])
-            if not isinstance(task, Task):
-                return None
-        elif values["knobs"] or values["settings"]:
-            raise BadInput("--knob and --set go with a task: a run has its own")
-        else:
-            task = self.task(run.task, run.knobs, run.params, (*run.packs, *values["packs"]))
-        for split in values["splits"] or ():
-            check_split(task, split)
-        policies = chosen_policies(values["policies"], task, trained=run is not None)
-        splits = values["splits"] or [split.name for split in task.splits]
-        return agent_keys(
-            splits,
-            policies,
-            trained_on="train" if run is None else run.split,
-            success=task.goal.success is not None,
-            intervals=values["episodes"] > 1,
-        )
-
-    def model(self, config: ModelConfig) -> ModelConfig:
-        self.check_data(config.data)
-        return config
-
-    def changed_rules(self, rules: str, task: str, *packs: tuple[str, ...]) -> str:
-        return wm.rules_of(rules or "+".join(_task(task).rules), task, *packs)
-
-    def finetuned(self, values: Mapping[str, Any], run: ModelConfig | None) -> ModelConfig | None:
+                model = wm.new_config(values, self.changed_rules)
+                self.check_data(model.data)
+                return model
+        from powderdsl.worldmodel.evaluation import unseen_data
         from powderdsl.worldmodel.trained import with_packs
         from powderdsl.worldmodel.training import KIND
 
         if run is None:
             find_run(values["run"], KIND)
             return None
-        own = run.data.rules or "+".join(_task(run.data.task).rules)
-        return self.model(replace(run, data=with_packs(run.data, own, values["packs"])))
-
-    def test(self, values: Mapping[str, Any], run: ModelConfig | None) -> Sequence[str] | None:
-        from powderdsl.worldmodel.evaluation import unseen_data
-        from powderdsl.worldmodel.training import KIND
-
-        if run is None:
-            find_run(values["run"], KIND)
-            return None
+        if command == ("wm", "finetune"):
+            own = run.data.rules or _rules_of(run.data.task)
+            run = replace(run, data=with_packs(run.data, own, values["packs"]))
+            self.check_data(run.data)
+            return run
         self.check_data(unseen_data(run.data, **wm.tested_on(values)))
         return model_keys()
 
     def check_data(self, data: DataConfig) -> None:
         from powderdsl.worldmodel.worlds import check_data
 
-        params = tuple(data.params.items())
-        task = self.task(data.task, data.knobs, {} if data.rules else data.params, ())
-        check_data(data, task, self.load(data.rules, params) if data.rules else task.ruleset)
+        task = _task(data.task, data.knobs, {} if data.rules else data.params, ())
+        own = self.rules(data.rules, tuple(data.params.items())) if data.rules else task.ruleset
+        check_data(data, task, own)
 
     # Measures
 
@@ -283,17 +237,46 @@ class _StudyCheck:
                 self.reporter.error("PD806", message, measure.keys.span, helps=close)
 
 
-def _load(rules: str, params: Pairs) -> Ruleset:
-    return load(rules, params=dict(params))
+def _evaluation(values: Mapping[str, Any], run: TrainConfig | None) -> Sequence[str] | None:
+    """The keys of what `evaluate` writes; None for a run that the study does not make."""
+    if run is None:
+        task = find_played(values["run"], values["knobs"], values["settings"], values["packs"])
+        if not isinstance(task, Task):
+            return None
+    elif values["knobs"] or values["settings"]:
+        raise BadInput("--knob and --set go with a task: a run has its own")
+    else:
+        task = _task(run.task, run.knobs, run.params, (*run.packs, *values["packs"]))
+    splits = values["splits"] or [split.name for split in task.splits]
+    for split in splits:
+        check_split(task, split)
+    return agent_keys(
+        splits,
+        chosen_policies(values["policies"], task, trained=run is not None),
+        trained_on="train" if run is None else run.split,
+        success=task.goal.success is not None,
+        intervals=values["episodes"] > 1,
+    )
 
 
-def _task(name: str, knobs: Pairs = (), params: Pairs = (), packs: tuple[str, ...] = ()) -> Task:
-    return _load_task(str(Path(name).absolute()) if is_path(name) else name, knobs, params, packs)
+def _task(name: str, knobs: Mapping[str, int], params: Mapping[str, Any], packs: Sequence[str]) -> Task:
+    """A task. Knobs within their ranges do not change what is checked, so that it is loaded once for all of them."""
+    more = str(Path(name).absolute()) if is_path(name) else name, tuple(params.items()), tuple(packs)
+    task = _load_task((), *more)
+    ranges = {knob.name: range(knob.lo, knob.hi + 1) for knob in task.knobs}
+    wrong = tuple((knob, value) for knob, value in knobs.items() if value not in ranges.get(knob, ()))
+    return _load_task(wrong, *more) if wrong else task
 
 
 @lru_cache(maxsize=64)
-def _load_task(name: str, knobs: Pairs, params: Pairs, packs: tuple[str, ...]) -> Task:
+def _load_task(
+    knobs: tuple[tuple[str, int], ...], name: str, params: tuple[tuple[str, Any], ...], packs: tuple[str, ...]
+) -> Task:
     return load_task(name, knobs=dict(knobs), params=dict(params), packs=packs)
+
+
+def _rules_of(task: str) -> str:
+    return "+".join(_task(task, {}, {}, ()).rules)
 
 
 def _blamed(
@@ -305,16 +288,14 @@ def _blamed(
         words: options and their words, with the mistakes that are there without each. What the step works on comes last:
             nothing else is known without it.
     """
-    gone: dict[bool, list[tuple[int, str, Scalar]]] = {True: [], False: []}
+    suspects: list[tuple[tuple[bool, bool, int], str, Scalar]] = []
     for (name, word), others in words:
         is_there = (mistake.code, mistake.message) in [(other.code, other.message) for other in others]
         is_named = point.filled(word) in mistake.message or (name != "on" and name in mistake.message)
-        may_be = is_named or name != "on" or mistake.code != "PD806"
-        if may_be and not is_there:
-            gone[is_named].append((len(others) + LAST * (name == "on"), name, word))
-    likely = gone[True] or gone[False]
-    least = min((left for left, _, _ in likely), default=0)
-    best = [(name, word) for left, name, word in likely if left == least]
+        if not is_there and (is_named or name != "on" or mistake.code != "PD806"):
+            suspects.append(((not is_named, name == "on", len(others)), name, word))
+    least = min((rank for rank, _, _ in suspects), default=None)
+    best = [(name, word) for rank, name, word in suspects if rank == least]
     return best[-1] if len({name for name, _ in best}) == 1 else ("", None)
 
 
@@ -328,17 +309,17 @@ def agent_keys(
 ) -> list[str]:
     """The keys of numbers that `evaluate` writes. A test compares them with real ones."""
     means = ("mean", "interval") if intervals else ("mean",)
+    normalized = ["normalized"] if {"expert", "nothing"} <= {*policies} else []
     keys = ["seed", *(["step"] if "trained" in policies else [])]
     for split in splits:
         for policy in policies:
-            numbers = ["episodes", "length", *means, *(["success"] if success else [])]
-            others = [f"above/{other}" for other in BASELINES if other != policy and other in policies]
-            others += ["normalized"] if {"expert", "nothing"} <= {*policies} else []
-            numbers += [f"{other}/{mean}" for other in others for mean in means]
+            above = [f"above/{other}" for other in BASELINES if other != policy and other in policies]
+            scales = [f"{scale}/{mean}" for scale in (*above, *normalized) for mean in means]
+            numbers = ["episodes", "length", *means, *(["success"] if success else []), *scales]
             keys += [f"splits/{split}/{policy}/{number}" for number in numbers]
-            if split != trained_on:
-                keys += [f"seen/{split}/without/{policy}/{mean}" for mean in means]
-        keys += [f"seen/{split}/worlds"] if split != trained_on else []
+        if split != trained_on:
+            keys += [f"seen/{split}/without/{policy}/{mean}" for policy in policies for mean in means]
+            keys += [f"seen/{split}/worlds"]
         keys += [f"unchanged/{split}"] if len(policies) > 1 else []
     return keys
 
@@ -348,13 +329,7 @@ def model_keys() -> list[str]:
     from powderdsl.worldmodel.evaluation import FREQUENT, MODEL, STILL
     from powderdsl.worldmodel.scores import MEASURES
 
-    groups = [
-        f"{group}/{predictor}" for group in ("mean", "tests/*") for predictor in (MODEL, STILL, FREQUENT)
-    ]
-    keys = [f"{group}/{measure}" for group in groups for measure in MEASURES]
-    return [
-        "worlds_each",
-        "iterations",
-        *keys,
-        *(f"elements/*/{name}" for name in ("cells", "recall", "precision")),
-    ]
+    predictors = [f"{group}/{name}" for group in ("mean", "tests/*") for name in (MODEL, STILL, FREQUENT)]
+    keys = [f"{predictor}/{measure}" for predictor in predictors for measure in MEASURES]
+    elements = [f"elements/*/{name}" for name in ("cells", "recall", "precision")]
+    return ["worlds_each", "iterations", *keys, *elements]

@@ -9,7 +9,6 @@ import logging
 import platform
 import signal
 import socket
-import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -18,11 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from powderdsl.diagnostics import CompileError
-from powderdsl.experiments.studies.run import ABOUT_STUDY, Outcome, Report, StudyRun, run_all
+from powderdsl.experiments.studies.run import Outcome, Report, StudyRun, run_all
 from powderdsl.experiments.studies.study import Point, Study
 from powderdsl.system.interrupts import SIGNALS
 from powderdsl.system.packages import require
-from powderdsl.system.reading import read_json
 from powderdsl.system.writing import failure
 
 RETRIES = 20
@@ -49,15 +47,16 @@ def run_on_ray(
         CompileError: PD626 if the connection to the cluster cannot be made.
     """
     # Commands run elsewhere, in other working directories.
-    study, folder = replace(run.study, folder=run.study.folder.resolve()), str(run.folder.resolve())
+    study, folder = replace(run.study, folder=run.study.folder.resolve()), run.folder.resolve()
     with _connected(address) as ray:
         remote = ray.remote(max_retries=RETRIES, scheduling_strategy="SPREAD")(run_point)
         tasks: list[Any] = []
 
         def wait_for(point: Point) -> Outcome:
             options = {"name": f"{study.name} {point.name}", **resources(study, point, run.threads)}
-            task = remote.options(**options).remote(study, folder, run.size, run.threads, point, _version())
-            tasks.append(task)
+            tasks.append(
+                task := remote.options(**options).remote(study, folder, run.size, run.threads, point)
+            )
             try:
                 outcome: Outcome = ray.get(task)
                 return outcome
@@ -73,18 +72,15 @@ def run_on_ray(
         return run_all(wait_for, points, jobs or max(1, min(len(points), AHEAD)), report, cancel_all)
 
 
-def run_point(study: Study, folder: str, size: str, threads: int, point: Point, version: str) -> Outcome:
+def run_point(study: Study, folder: Path, size: str, threads: int, point: Point) -> Outcome:
     """Run a point on a node of the cluster. If a process of a dead driver still works on it, wait for its end."""
-    host, run = platform.node(), StudyRun(study, Path(folder), size, threads)
-    if version != _version():
-        return Outcome(point, {}, f"{host} has powderdsl {_version()}; {version} is needed")
-    about = read_json(run.folder / ABOUT_STUDY)
-    if not isinstance(about, dict) or about.get("text") != study.source.text or not run.is_prepared():
+    host, run = platform.node(), StudyRun(study, folder, size, threads)
+    if not run.is_prepared():
         return Outcome(point, {}, f"{host} does not see {folder}: it must be on storage that all nodes share")
     try:
         (outcome,) = run.run([point], 1, patient=True)
     except CompileError as error:
-        return Outcome(point, {}, f"{host}: {'; '.join(one.message for one in error.diagnostics)}")
+        return Outcome(point, {}, f"{host}: {'; '.join(mistake.message for mistake in error.diagnostics)}")
     return outcome
 
 
@@ -96,7 +92,7 @@ def _connected(address: str) -> Iterator[Any]:
     try:
         ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
     except Exception as error:
-        raise _no_cluster(address, " ".join(str(error).split())[:400]) from None
+        raise _no_cluster(address, error) from None
     finally:
         if threading.current_thread() is threading.main_thread():
             for number, handler in handlers.items():  # Ray's own abort the process
@@ -113,13 +109,12 @@ def check_cluster(address: str) -> None:
     Ray itself would try to connect for minutes.
     """
     _ray()
-    if address == "auto":
-        return
     host, _, port = address.removeprefix("ray://").rpartition(":")
     try:
-        socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()
+        if address != "auto":
+            socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()
     except (OSError, OverflowError, ValueError) as error:
-        raise _no_cluster(address, str(error)) from None
+        raise _no_cluster(address, error) from None
 
 
 def _ray() -> Any:
@@ -127,11 +122,6 @@ def _ray() -> Any:
     return require("ray", "running a study on a cluster", *helps)
 
 
-def _no_cluster(address: str, reason: str) -> CompileError:
-    helps = ("start one with `ray start --head`, which prints its address",)
-    return failure("PD626", f"no Ray cluster at `{address[:80]}`", notes=(reason,), helps=helps)
-
-
-def _version() -> str:
-    version: str = sys.modules["powderdsl"].__version__  # our own package, so it has been imported
-    return version
+def _no_cluster(address: str, error: Exception) -> CompileError:
+    notes, helps = (str(error)[:400],), ("start one with `ray start --head`, which prints its address",)
+    return failure("PD626", f"no Ray cluster at `{address[:80]}`", notes=notes, helps=helps)

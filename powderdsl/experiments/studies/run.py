@@ -17,15 +17,7 @@ from filelock import FileLock, Timeout
 
 from powderdsl.diagnostics import CompileError, Reporter, Source
 from powderdsl.experiments.runs.folder import ABOUT, check_folder, held, new_folder, no_run, write_json
-from powderdsl.experiments.studies.study import (
-    SIZES,
-    Commands,
-    Measure,
-    Point,
-    Study,
-    StudyStep,
-    read_study,
-)
+from powderdsl.experiments.studies.study import SIZES, Commands, Measure, Point, Study, StudyStep, read_study
 from powderdsl.system.interrupts import GRACE, LIFELINE
 from powderdsl.system.reading import read_json
 from powderdsl.system.writing import failure
@@ -68,14 +60,14 @@ class StudyRun:
             CompileError: PD621 where the folder holds another study or other files; PD613 where it cannot be written.
         """
         path = self.folder / ABOUT_STUDY
-        if not path.exists():
-            if self.folder.is_dir():
-                check_folder(self.folder)
-            try:
+        if self.folder.is_dir():
+            check_folder(self.folder)
+        try:
+            if not path.exists():
                 new_folder(self.folder)
-            except CompileError:
-                if not path.exists():  # else another process has just begun the same study
-                    raise
+        except CompileError:
+            if not path.exists():  # else another process has just begun the same study
+                raise
         with held(self.folder, GRACE):
             if path.exists() and not self.is_prepared():
                 what = "another study, or this one as it was before its steps changed"
@@ -86,8 +78,7 @@ class StudyRun:
     def is_prepared(self) -> bool:
         """Return True if the folder holds this study."""
         about = read_json(self.folder / ABOUT_STUDY)
-        identity = self.study.identity(self.size)
-        return isinstance(about, dict) and all(about.get(key) == value for key, value in identity.items())
+        return isinstance(about, dict) and about == about | self.study.identity(self.size)
 
     def run(
         self,
@@ -114,10 +105,11 @@ class StudyRun:
         if not isinstance(evaluations, dict):
             return None
         try:
-            values = {measure.name: _value(measure, evaluations, point) for measure in self.study.measures}
+            return Outcome(
+                point, {item.name: _value(item, evaluations, point) for item in self.study.measures}
+            )
         except ValueError as error:
             return Outcome(point, {}, f"{path}: {error}")
-        return Outcome(point, values)
 
     def _done(self, point: Point) -> Path:
         return self.folder / "done" / f"{point.name}.json"
@@ -127,17 +119,15 @@ class StudyRun:
         try:
             place.mkdir(parents=True, exist_ok=True)
             with FileLock(place / ".lock").acquire(timeout=-1 if patient else 0):
-                outcome = self.finished(point)
-                if outcome is None:
+                if self.finished(point) is None:
                     for step in self.study.steps:
                         self._step(step, point, place)
-                    self._done(point).parent.mkdir(exist_ok=True)
                     runs = [step.name for step in self.study.steps if step.makes_run]
-                    write_json(
-                        self._done(point), {name: read_json(place / name / EVALUATION) for name in runs}
-                    )
-                    outcome = self.finished(point)
-                    assert outcome is not None
+                    evaluations = {name: read_json(place / name / EVALUATION) for name in runs}
+                    self._done(point).parent.mkdir(exist_ok=True)
+                    write_json(self._done(point), evaluations)
+                outcome = self.finished(point)
+                assert outcome is not None
                 return outcome
         except Timeout:
             return Outcome(point, {}, "another process works on it", held=True)
@@ -148,8 +138,7 @@ class StudyRun:
         """Run a step. Raises ValueError if it fails."""
         log = place / f"{step.name}.log"
         words = [sys.executable, "-m", "powderdsl", *self.study.command(step, point, place)]
-        threads = str(self.threads)
-        environment = {**os.environ, "OMP_NUM_THREADS": threads, "PYTHONUNBUFFERED": "1", "NO_COLOR": "1"}
+        own = {"OMP_NUM_THREADS": str(self.threads), "PYTHONUNBUFFERED": "1", "NO_COLOR": "1", LIFELINE: "1"}
         if (place / step.name / ABOUT).exists():
             # The process of a study that was killed may still be saving its last checkpoint.
             with suppress(CompileError), held(place / step.name, GRACE):
@@ -160,7 +149,7 @@ class StudyRun:
                 stdin=self._stdin,
                 stdout=file,
                 stderr=file,
-                env={**environment, LIFELINE: "1"},
+                env=os.environ | own,
                 start_new_session=True,  # Ctrl-C is sent to us alone
             )
             self._running.add(process)
@@ -215,8 +204,7 @@ def _value(measure: Measure, evaluations: Any, point: Point) -> float:
     value, keys = evaluations, [measure.of.text, *point.filled(measure.keys).split("/")]
     for key in keys:
         value = value.get(key) if isinstance(value, dict) else None
-    largest = sys.float_info.max
-    if not isinstance(value, int | float) or isinstance(value, bool) or not -largest <= value <= largest:
+    if type(value) not in (int, float) or not abs(value) <= sys.float_info.max:
         raise ValueError(f"the measure `{measure.name}` is not a finite number: {'/'.join(keys)}")
     if measure.scale == "log" and not value > 0:
         raise ValueError(f"the measure `{measure.name}` is {value}; the scale `log` needs numbers above 0")
@@ -233,10 +221,9 @@ def read_folders(folders: Sequence[Path], commands: Commands) -> list[StudyRun]:
         CompileError: PD620 if a folder has no results, PD621 if they are not results of one study, PD112 if it has links
             that lead out of it, and all that is wrong with the study's text.
     """
-    runs = [_read(folder, commands) for folder in folders]
-    first = runs[0]
-    for run in runs[1:]:
-        if run.size != first.size or run.study.source.text != first.study.source.text:
+    first, *others = runs = [_read(folder, commands) for folder in folders]
+    for run in others:
+        if (run.size, run.study.source.text) != (first.size, first.study.source.text):
             raise failure(
                 "PD621",
                 f"{run.folder} and {first.folder} hold results of different studies",
@@ -274,10 +261,9 @@ def _read(folder: Path, commands: Commands) -> StudyRun:
         why = f"it has no {ABOUT_STUDY}" if folder.is_dir() else "there is no such folder"
         raise no_run(folder, why, ("give folders of results, those that `powderdsl study --out` named",))
     check_folder(folder)
-    about = read_json(path)
-    text, size = (about.get("text"), about.get("size")) if isinstance(about, dict) else (None, None)
-    if isinstance(text, str) and size in SIZES:
-        run = StudyRun(read_study(Source(str(path), text), Reporter(), commands), folder, str(size))
-        if run.is_prepared():
-            return run
+    match read_json(path):
+        case {"text": str(text), "size": str(size)} if size in SIZES:
+            run = StudyRun(read_study(Source(str(path), text), Reporter(), commands), folder, size)
+            if run.is_prepared():
+                return run
     raise no_run(folder, f"its {ABOUT_STUDY} is damaged")
