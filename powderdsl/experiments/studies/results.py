@@ -39,7 +39,7 @@ class Interval:
 class Cell:
     """A measure at one combination of values, for each seed and over seeds."""
 
-    values: tuple[tuple[str, str], ...]
+    values: Mapping[str, str]
     by_seed: Mapping[int, float]
     over_seeds: Interval
 
@@ -71,20 +71,22 @@ def interval(samples: Sequence[float], scale: str = "linear") -> Interval:
 
 def findings(study: Study, outcomes: Sequence[Outcome]) -> list[Finding]:
     """The findings from finished points. Combinations are in the order in which values were written."""
-    good = [outcome for outcome in outcomes if outcome.problem is None]
-    return [_finding(measure, good) for measure in study.measures]
+    finished = sorted(
+        (outcome for outcome in outcomes if outcome.problem is None), key=lambda outcome: outcome.point.seed
+    )
+    return [_finding(measure, finished) for measure in study.measures]
 
 
 def _finding(measure: Measure, outcomes: Sequence[Outcome]) -> Finding:
     by_values: dict[tuple[tuple[str, str], ...], dict[int, float]] = {}
-    for outcome in sorted(outcomes, key=lambda outcome: outcome.point.seed):
+    for outcome in outcomes:
         by_values.setdefault(outcome.point.values, {})[outcome.point.seed] = outcome.values[measure.name]
-    cells = [
-        Cell(values, by_seed, interval([*by_seed.values()], measure.scale))
+    cells = tuple(
+        Cell(dict(values), by_seed, interval([*by_seed.values()], measure.scale))
         for values, by_seed in by_values.items()
-    ]
+    )
     verdicts = [_verdict(measure, label, line) for label, line in _lines(cells).items()]
-    return Finding(measure, tuple(cells), tuple(filter(None, verdicts)))
+    return Finding(measure, cells, tuple(filter(None, verdicts)))
 
 
 def _verdict(measure: Measure, label: str, cells: Sequence[Cell]) -> str:
@@ -97,32 +99,28 @@ def _verdict(measure: Measure, label: str, cells: Sequence[Cell]) -> str:
     if measure.expect is None or len(cells) < 2 or not both:
         return ""
     sign, log = 1 if measure.expect == "rises" else -1, measure.scale == "log"
-    same = 1.0 if log else 0.0
-    change = interval(
-        [last[seed] / first[seed] if log else last[seed] - first[seed] for seed in both], measure.scale
-    )
+    changes = [last[seed] / first[seed] if log else last[seed] - first[seed] for seed in both]
+    change, same = interval(changes, measure.scale), 1 if log else 0
     plus = "+" if not log and change.mean > 0 else ""
-    ends = f"last {'/' if log else '−'} first: {plus}{shown(change, measure.scale)}"
+    ends = f"(last {'/' if log else '−'} first: {plus}{shown(change, measure.scale)})"
     start = f"{label}: " if label else ""
     if sign * (change.mean - same) <= 0:
-        return f"{start}does not {measure.expect[:-1]} ({ends})"
+        return f"{start}does not {measure.expect[:-1]} {ends}"
     means = [sign * cell.over_seeds.mean for cell in cells]
     is_ordered = all(mean < after for mean, after in itertools.pairwise(means))
     every = "at every point" if is_ordered else "not at every point"
-    agreeing = sum(sign * (last[seed] - first[seed]) > 0 for seed in both)
-    sure = f", but the interval holds {same:.0f}" if change.low <= same <= change.high else ""
-    return f"{start}{measure.expect} {every}, in {agreeing} of {len(both)} seeds{sure} ({ends})"
+    agreeing = sum(sign * (number - same) > 0 for number in changes)
+    sure = f", but the interval holds {same}" if change.low <= same <= change.high else ""
+    return f"{start}{measure.expect} {every}, in {agreeing} of {len(both)} seeds{sure} {ends}"
 
 
 def _lines(cells: Sequence[Cell]) -> dict[str, list[Cell]]:
     """The cells of each combination of all settings but the first, labeled with the settings that vary."""
-    values = {pair for cell in cells for pair in cell.values[1:]}
-    varied = {
-        name for name, value in values if any(name == other and value != another for other, another in values)
-    }
+    settings = [*cells[0].values] if cells else []
+    varied = [name for name in settings[1:] if len({cell.values[name] for cell in cells}) > 1]
     lines: dict[str, list[Cell]] = {}
     for cell in cells:
-        label = ", ".join(f"{name} {value}" for name, value in cell.values[1:] if name in varied)
+        label = ", ".join(f"{name} {cell.values[name]}" for name in varied)
         lines.setdefault(label, []).append(cell)
     return lines
 
@@ -138,21 +136,18 @@ def as_data(study: Study, size: str, outcomes: Sequence[Outcome]) -> dict[str, A
         }
         for outcome in outcomes
     ]
-    found = [
-        {
-            "measure": finding.measure.name,
-            "verdict": finding.verdict,
-            "cells": [_cell_data(cell) for cell in finding.cells],
-        }
-        for finding in findings(study, outcomes)
-    ]
-    return {"study": study.name, "size": size, "points": points, "findings": found}
+    described = []
+    for finding in findings(study, outcomes):
+        cells = [
+            {"values": cell.values, **_finite(cell.over_seeds), "samples": [*cell.by_seed.values()]}
+            for cell in finding.cells
+        ]
+        described.append({"measure": finding.measure.name, "verdict": finding.verdict, "cells": cells})
+    return {"study": study.name, "size": size, "points": points, "findings": described}
 
 
-def _cell_data(cell: Cell) -> dict[str, Any]:
-    numbers = asdict(cell.over_seeds)
-    finite = {name: number if math.isfinite(number) else None for name, number in numbers.items()}
-    return {"values": dict(cell.values), **finite, "samples": [*cell.by_seed.values()]}
+def _finite(numbers: Interval) -> dict[str, float | None]:
+    return {name: number if math.isfinite(number) else None for name, number in asdict(numbers).items()}
 
 
 def as_markdown(study: Study, size: str, outcomes: Sequence[Outcome]) -> str:
@@ -163,7 +158,7 @@ def as_markdown(study: Study, size: str, outcomes: Sequence[Outcome]) -> str:
         numbers = [
             shown(cell.over_seeds, measure.scale) for cell, measure in zip(cells, study.measures, strict=True)
         ]
-        rows.append([*(value for _, value in cells[0].values), *numbers, str(len(cells[0].by_seed))])
+        rows.append([*cells[0].values.values(), *numbers, str(len(cells[0].by_seed))])
     text = f"{study.about} Size: {size}.\n\n{markdown(rows)}"
     verdicts = [f"- {finding.measure.about}: {verdict}" for finding in found for verdict in finding.verdicts]
     failed = [f"- {outcome.point.name}: {outcome.problem}" for outcome in outcomes if outcome.problem]
@@ -192,10 +187,10 @@ def shown(number: Interval, scale: str = "linear") -> str:
 
 @dataclass(frozen=True)
 class Line:
-    """Samples at places along an axis."""
+    """Samples at each of some places along an axis, in the order of their seeds. The label may be empty."""
 
     label: str
-    places: Sequence[float]
+    places: Sequence[int]
     samples: Sequence[Sequence[float]]
 
 
@@ -216,23 +211,17 @@ class Panel:
 
 def write_figure(path: Path, study: Study, size: str, outcomes: Sequence[Outcome]) -> None:
     """Draw each measure along the first setting, a line for each combination of the others. Raises as `draw`."""
-    found = [finding for finding in findings(study, outcomes) if finding.cells]
-    if not found:
-        return
-    ticks = [word.text for word in study.axes[0].values[size]]
-    panels = []
-    for finding in found:
-        lines = [
-            Line(
-                label,
-                [ticks.index(cell.values[0][1]) for cell in cells],
-                [[*cell.by_seed.values()] for cell in cells],
-            )
-            for label, cells in _lines(finding.cells).items()
-        ]
-        panels.append(Panel(study.axes[0].about, finding.measure.about, lines, finding.measure.scale, ticks))
-    seeds = max(len(cell.by_seed) for finding in found for cell in finding.cells)
-    draw(path, panels, f"{study.about} ({size}, {seeds} seeds)")
+    first, panels, seeds = study.axes[0], [], 0
+    ticks = [word.text for word in first.values[size]]
+    for finding in findings(study, outcomes):
+        lines = []
+        for label, cells in _lines(finding.cells).items():
+            samples = [[*cell.by_seed.values()] for cell in cells]
+            lines.append(Line(label, [ticks.index(cell.values[first.name]) for cell in cells], samples))
+            seeds = max(seeds, *map(len, samples))
+        panels.append(Panel(first.about, finding.measure.about, lines, finding.measure.scale, ticks))
+    if seeds:
+        draw(path, panels, f"{study.about} ({size}, {seeds} seeds)")
 
 
 def draw(path: Path, panels: Sequence[Panel], title: str, *, follow: bool = False) -> None:
@@ -251,13 +240,12 @@ def draw(path: Path, panels: Sequence[Panel], title: str, *, follow: bool = Fals
     for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
         for line in panel.lines:
             intervals = [interval(samples, panel.scale) for samples in line.samples]
+            means = [found.mean for found in intervals]
             # A single value has no interval.
-            bars = [
-                (one.mean - one.low, one.high - one.mean) if math.isfinite(one.high) else (0.0, 0.0)
-                for one in intervals
-            ]
-            means, ends = [one.mean for one in intervals], list(zip(*bars, strict=True))
-            axes.errorbar(line.places, means, ends, fmt="o-", capsize=3, label=line.label or None)
+            bars = [(i.mean - i.low, i.high - i.mean) if i.high < math.inf else (0, 0) for i in intervals]
+            axes.errorbar(
+                line.places, means, [*zip(*bars, strict=True)], fmt="o-", capsize=3, label=line.label or None
+            )
             for place, samples in zip(line.places, line.samples, strict=True):
                 axes.plot([place] * len(samples), samples, "k.", markersize=3, alpha=0.4)
         for name, value in panel.baselines.items():
@@ -281,50 +269,36 @@ def draw(path: Path, panels: Sequence[Panel], title: str, *, follow: bool = Fals
 # Learning curves of runs that differ only in their seed, against what they have learned from
 
 
-@dataclass(frozen=True)
-class Curve:
-    """A metric of runs that differ only in their seed. `values` has those of each run, in the order of `seeds`."""
-
-    label: str
-    seeds: tuple[int, ...]
-    steps: tuple[int, ...]
-    values: tuple[tuple[float, ...], ...]
-
-
-def curves_of(runs: Sequence[RunFolder], metric: str) -> list[Curve]:
+def curves_of(runs: Sequence[RunFolder], metric: str) -> list[Line]:
     """A curve for each group of runs that differ only in their seed, at the steps that all of a group have.
 
     A label names the settings in which the groups differ. Runs without the metric are left out.
     """
     groups: dict[str, list[RunFolder]] = {}
     for run in runs:
-        key = json.dumps(
-            {name: value for name, value in run.config.items() if name != "seed"}, sort_keys=True
-        )
-        groups.setdefault(key, []).append(run)
-    settings = [json.loads(key) for key in groups]
-    names = sorted({name for config in settings for name in config if not name.endswith(DERIVED)})
-    differ = [name for name in names if len({json.dumps(config.get(name)) for config in settings}) > 1]
+        settings = {name: value for name, value in run.config.items() if name != "seed"}
+        groups.setdefault(json.dumps(settings, sort_keys=True), []).append(run)
+    configs = [json.loads(key) for key in groups]
+    names = sorted({name for config in configs for name in config if not name.endswith(DERIVED)})
+    differ = [name for name in names if len({json.dumps(config.get(name)) for config in configs}) > 1]
     curves = []
-    for config, members in zip(settings, groups.values(), strict=True):
-        lines = {}
-        for run in members:
-            line = {
-                line["step"]: line[metric]
-                for line in read_metrics(run.path)
-                if isinstance(line.get(metric), int | float)
-            }
-            if line:
-                lines[int(run.config.get("seed", 0))] = line
-        if lines:
-            steps = tuple(sorted(set.intersection(*map(set, lines.values()))))
-            values = tuple(tuple(line[step] for step in steps) for line in lines.values())
+    for config, members in zip(configs, groups.values(), strict=True):
+        by_seed = {str(run.config.get("seed")): _numbers(run, metric) for run in members}
+        numbers = [by_step for by_step in by_seed.values() if by_step]
+        if numbers:
+            steps = sorted(set.intersection(*map(set, numbers)))
             # Settings at their defaults are not recorded.
             label = ", ".join(
                 f"{name} {_shown(config[name])}" for name in differ if config.get(name) is not None
             )
-            curves.append(Curve(label, tuple(lines), steps, values))
+            curves.append(Line(label, steps, [[by_step[step] for by_step in numbers] for step in steps]))
     return curves
+
+
+def _numbers(run: RunFolder, metric: str) -> dict[int, float]:
+    """A metric of a run by step."""
+    lines = [line for line in read_metrics(run.path) if isinstance(line.get(metric), int | float)]
+    return {line["step"]: line[metric] for line in lines}
 
 
 def _shown(value: Any) -> Any:
@@ -334,33 +308,32 @@ def _shown(value: Any) -> Any:
 def baselines_of(runs: Sequence[RunFolder]) -> dict[str, float]:
     """The mean returns of policies that need no training, in the held-out worlds: from the first run that was evaluated."""
     for run in runs:
-        found = read_json(run.path / EVALUATION)
+        evaluation = read_json(run.path / EVALUATION)
         split = (run.read_json("asked.json") or {}).get("eval_split", "test")
-        scores = found.get("splits", {}).get(split, {}) if isinstance(found, dict) else {}
-        lines = {name: scores[name]["mean"] for name in BASELINES if name in scores}
-        if lines:
-            return lines
+        scores = evaluation.get("splits", {}).get(split, {}) if isinstance(evaluation, dict) else {}
+        means = {name: scores[name]["mean"] for name in BASELINES if name in scores}
+        if means:
+            return means
     return {}
 
 
-def as_table(curves: Sequence[Curve]) -> str:
+def as_table(curves: Sequence[Line]) -> str:
     """The curves as Markdown: the mean over seeds and its 95 % interval at each step."""
     rows = [["runs", "seeds", "steps", "mean", "interval"]]
     for curve in curves:
-        for step, samples in zip(curve.steps, zip(*curve.values, strict=True), strict=True):
+        for step, samples in zip(curve.places, curve.samples, strict=True):
             mean, half = mean_and_interval(samples)
-            words = [curve.label or "all", str(len(curve.seeds)), f"{step:,}", f"{mean:.4g}"]
+            words = [curve.label or "all", str(len(samples)), f"{step:,}", f"{mean:.4g}"]
             rows.append([*words, "" if half is None else f"{half:.2g}"])
     return markdown(rows)
 
 
 def write_curves(
-    path: Path, curves: Sequence[Curve], metric: str, baselines: Mapping[str, float], title: str = ""
+    path: Path, curves: Sequence[Line], metric: str, baselines: Mapping[str, float], title: str = ""
 ) -> None:
     """Draw means with their 95 % intervals over seeds, and baselines as dashed lines; losses on a
     logarithmic scale. Raises as `draw`."""
-    lines = [Line(curve.label, curve.steps, [*zip(*curve.values, strict=True)]) for curve in curves]
     across = "interactions" if metric.startswith(("held_out/", "rollout/")) else "steps"
-    positive = all(value > 0 for curve in curves for values in curve.values for value in values)
+    positive = all(min(samples) > 0 for curve in curves for samples in curve.samples)
     scale = "log" if metric.startswith("loss") and positive else "linear"
-    draw(path, [Panel(across, metric, lines, scale, baselines=baselines)], title, follow=True)
+    draw(path, [Panel(across, metric, curves, scale, baselines=baselines)], title, follow=True)

@@ -218,18 +218,13 @@ def confined(means: str, text: str, folder: Path, results: Path) -> str:
     Raises:
         ValueError: it names a path that leads out of `folder`, or of `results` for a file to write.
     """
-    if "\0" in text:
-        raise ValueError("it has control characters")
     if means.startswith(FILE):
         return str(inside(results, text))
-    if means not in READ:
-        return text
     if means in (RULES, PACKS):
         return "+".join(_pack(part, folder) for part in text.split("+"))
     is_shipped = (shipped("tasks") / f"{text}.yaml").is_file()
-    if is_path(text) or means == RUN or (means == RUN_OR_TASK and not is_shipped):
-        return str(inside(folder, text))
-    return text
+    may_be_path = means == RUN or (means == RUN_OR_TASK and not is_shipped) or is_path(text)
+    return str(inside(folder, text)) if means in READ and may_be_path else text
 
 
 def _pack(text: str, folder: Path) -> str:
@@ -324,17 +319,10 @@ class _StudyReader:
             if seeds > 1 and SEED not in self.used:
                 helps = ("write `seed: $seed` in a step that trains, or `seeds: 1`",)
                 self.error("PD806", "no step uses `$seed`", entries["seeds"][1].span, helps=helps)
-        source = tree.span.source
-        return Study(
-            "" if name is None else name.text,
-            values.get("about", ""),
-            seeds,
-            tuple(axes),
-            tuple(self.steps.values()),
-            tuple(measures),
-            source,
-            Path(source.name).parent,
-        )
+        steps, folder = tuple(self.steps.values()), Path(tree.span.source.name).parent
+        about, source = values.get("about", ""), tree.span.source
+        word = "" if name is None else name.text
+        return Study(word, about, seeds, tuple(axes), steps, tuple(measures), source, folder)
 
     def check_unused(self, axes: list[Axis]) -> None:
         """Report settings and names that make no difference."""
@@ -351,9 +339,8 @@ class _StudyReader:
 
     def axis(self, key: Scalar, node: Node) -> Axis:
         self.add_name(key)
-        values: dict[str, Any] = dict.fromkeys(SIZES, ())
         if isinstance(node, Mapping_):
-            values |= self.reader.read(node, "axis", "a setting")
+            values = dict.fromkeys(SIZES, ()) | self.reader.read(node, "axis", "a setting")
         else:  # one list for every size
             values = dict.fromkeys(SIZES, self.reader.words(node))
         words = {size: values[size] for size in SIZES}
@@ -396,37 +383,42 @@ class _StudyReader:
         command = tuple(named.text.split()) if isinstance(named, Scalar) else ()
         if not isinstance(node, Mapping_) or command not in self.commands:
             names = [" ".join(words) for words in self.commands]
-            word = named if isinstance(named, Scalar) else key
-            message = f"no command `{named.text}` for a step" if word is named else "a step lacks `command`"
             helps = suggest(" ".join(command), names) or (f"commands: {', '.join(names)}",)
-            self.error("PD806" if word is named else "PD109", message, word.span, helps=helps)
+            if isinstance(named, Scalar):
+                self.error("PD806", f"no command `{named.text}` for a step", named.span, helps=helps)
+            else:
+                self.error("PD109", "a step lacks `command`", key.span, helps=helps)
             self.is_hidden = True
             return
         means = self.commands[command]
-        words: list[tuple[str, Scalar]] = []
-        is_right = True
-        for name, value in node.entries:
-            if name.text == "command":
-                continue
-            scalars = self.reader.words(value)
-            known = [word for word in scalars if self.names_are_known(word)]
-            if name.text == "run" or name.text not in {*means, "on"}:
-                helps = suggest(name.text, means.keys() - {"on", "run"}, "options")
-                message = f"`{' '.join(command)}` has no option `{name.text}` for a study"
-                self.error("PD806", message, name.span, helps=helps)
-            elif name.text == "on" and not isinstance(value, Scalar):
-                self.reader.shape(value, "a word")
-            elif not scalars:
-                self.error("PD806", f"`{name.text}` has no value", name.span)
-            elif name.text == "on" and scalars[0].text.startswith("-"):
-                self.error("PD806", "what a step works on cannot begin with `-`", scalars[0].span)
-                is_right = False
-            else:
-                words += [(name.text, word) for word in known]
-                is_right &= name.text != "on" or bool(known)
+        words = [
+            (name.text, word)
+            for name, value in node.entries
+            if name.text != "command"
+            for word in self.step_words(command, name, value)
+        ]
         words.sort(key=lambda pair: pair[0] != "on")
+        is_wrong = node.get("on") is not None and "on" not in dict(words)
         on_step = any(name == "on" and word.text in self.steps for name, word in words)
-        self.steps[key.text] = StudyStep(key, command, tuple(words), on_step, means, not is_right)
+        self.steps[key.text] = StudyStep(key, command, tuple(words), on_step, means, is_wrong)
+
+    def step_words(self, command: tuple[str, ...], name: Scalar, value: Node) -> list[Scalar]:
+        """The words of an option of a step, or of what it works on; what is wrong is reported and left out."""
+        means, words = self.commands[command], self.reader.words(value)
+        known = [word for word in words if self.names_are_known(word)]
+        if name.text == "run" or name.text not in {*means, "on"}:
+            helps = suggest(name.text, means.keys() - {"on", "run"}, "options")
+            message = f"`{' '.join(command)}` has no option `{name.text}` for a study"
+            self.error("PD806", message, name.span, helps=helps)
+        elif name.text == "on" and not isinstance(value, Scalar):
+            self.reader.shape(value, "a word")
+        elif not words:
+            self.error("PD806", f"`{name.text}` has no value", name.span)
+        elif name.text == "on" and words[0].text.startswith("-"):
+            self.error("PD806", "what a step works on cannot begin with `-`", words[0].span)
+        else:
+            return known
+        return []
 
     def measure(self, key: Scalar, node: Node) -> Measure | None:
         values = self.reader.read(node, "measure", "a measure")
@@ -451,9 +443,10 @@ class _StudyReader:
         if not template.is_valid():
             label = "no name follows: write `$NAME`, or `$$` for a dollar sign"
             self.error("PD806", "`$` begins the name of a setting", word.span, label)
-        self.used |= {*template.get_identifiers()}
-        unknown = {*template.get_identifiers()} - {*self.known}
-        for name in sorted(unknown):
+        names = {*template.get_identifiers()}
+        self.used |= names
+        unknown = sorted(names - {*self.known})
+        for name in unknown:
             helps = suggest(name, self.known, "settings")
             self.error("PD806", f"no setting `{name}` is varied", word.span, helps=helps)
         self.is_hidden |= bool(unknown)
