@@ -15,8 +15,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache, partial
 from itertools import groupby
-from multiprocessing import Pipe, get_context
-from multiprocessing.connection import Connection, wait
+from multiprocessing import active_children, get_context, parent_process
 from threading import Thread
 
 import numpy as np
@@ -34,6 +33,7 @@ from powderdsl.model.state import slots
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Example, Invariant, Local, Ruleset, Symmetric
 from powderdsl.simulation.simulator import Simulator, compile
+from powderdsl.system.interrupts import held_back
 from powderdsl.testing.generators.cases import Array, Start
 from powderdsl.testing.mutation.equivalence import proven_equal
 from powderdsl.testing.mutation.mutants import Mutant
@@ -436,28 +436,32 @@ def run_campaign(
     if jobs == 1:
         yield from map(judged, numbers)
         return
-    lifeline, ours = Pipe(duplex=False)
     # A fork of a process with threads of torch's may hang.
-    pool = ProcessPoolExecutor(jobs, get_context("spawn"), _begin_process, (lifeline,))
+    pool = ProcessPoolExecutor(jobs, get_context("spawn"), _begin_process)
     try:
-        for done in as_completed([pool.submit(judged, number) for number in numbers]):
-            yield done.result()
+        with held_back():  # a process whose start is cut short ends with a traceback
+            results = [pool.submit(judged, number) for number in numbers]
+        for result in as_completed(results):
+            yield result.result()
     except BrokenProcessPool:
         raise OSError("a process that judged mutants was killed; fewer `--jobs` need less memory") from None
     finally:
-        ours.close()
+        for process in active_children():
+            process.terminate()
         pool.shutdown(cancel_futures=True)
 
 
-def _begin_process(lifeline: Connection) -> None:
-    """Ignore Ctrl-C, which is for the process that started this one, and end when that ends or closes the pipe."""
+def _begin_process() -> None:
+    """Ignore Ctrl-C, which is for the process that started this one, and end when that ends."""
+    parent = parent_process()
+    assert parent is not None
 
-    def watch() -> None:
-        wait([lifeline])
+    def end_with_parent() -> None:
+        parent.join()
         os._exit(1)
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    Thread(target=watch, daemon=True).start()
+    Thread(target=end_with_parent, daemon=True).start()
 
 
 @lru_cache(maxsize=1)
