@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 
 import powderdsl
-from powderdsl.experiments.bench.machine import peak_growth, this_machine
-from powderdsl.experiments.bench.measure import measuring
-from powderdsl.experiments.bench.plan import Plan, start_worlds
-from powderdsl.experiments.bench.programs import Program
+from powderdsl.experiments.bench.measure import measuring, peak_growth, this_machine
+from powderdsl.experiments.bench.plan import Plan, Program, start_worlds
 from powderdsl.experiments.bench.report import CellFigures, Report, number, report_data, report_text
 from powderdsl.system.reports import as_json
 from powderdsl.targets.cpp.build import Building, building

@@ -1,16 +1,19 @@
-"""What is measured: the cells of a cross product, as values, and the worlds that they start from.
+"""What is measured: the cells of a cross product, the worlds that they start from, and programs of the user.
 
 Worlds are made from a ruleset's tables alone: no element has a name here.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import runpy
+import traceback
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
+from pathlib import Path
 from random import Random
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +21,6 @@ from numpy.typing import NDArray
 from powderdsl.analysis.changes import moved_ids
 from powderdsl.compiler import BACKENDS
 from powderdsl.diagnostics import suggest
-from powderdsl.experiments.bench.programs import Program
 from powderdsl.model.state import check_sides
 from powderdsl.model.types import Element, Field, Ruleset
 from powderdsl.worlds.raster import Size, mask
@@ -34,6 +36,19 @@ WORKLOADS: dict[str, str] = {
     "few": "shapes of two elements: by default the first two that move",
 }
 """Worlds to start from, for any ruleset."""
+
+State = dict[str, NDArray[Any]]
+"""The state of a batch: `element` as uint8 [N, H, W], fields as [N, H, W] or, vectors, [N, 2, H, W], by name."""
+Run = Callable[[int], object]
+"""Makes so many steps; the next call continues from there."""
+
+
+@dataclass(frozen=True)
+class Program:
+    """A program that is measured beside the backends. `load` is not timed; what it returns is."""
+
+    name: str
+    load: Callable[[State], Run]
 
 
 class Cell(NamedTuple):
@@ -184,3 +199,48 @@ def _field(field: Field, cell: Cell, workload: str, random: np.random.Generator)
 def _scaled(count: int, cell: Cell) -> int:
     """A number for `PER_CELLS` cells, for the worlds of a cell of the plan."""
     return max(1, round(count * cell.world_cells / PER_CELLS))
+
+
+# Programs
+
+
+def read_program(path: Path) -> Program:
+    """Run a Python file that defines `load(state)`, which returns `run(steps)`. Its name is the file's.
+
+    The file is run as `python` would run it, so it has to be trusted.
+
+    Raises:
+        ValueError: the file cannot be run, or does not define `load`.
+    """
+    load = _located(path, runpy.run_path)(str(path), run_name=f"beside_{path.stem}").get("load")
+    if not callable(load):
+        raise ValueError(f"{path}: does not define `load(state)`, which returns `run(steps)`")
+
+    def start(state: State) -> Run:
+        run = _located(path, load)(state)
+        if not callable(run):
+            raise ValueError(f"{path}: `load(state)` does not return a function `run(steps)`")
+        return _located(path, run)
+
+    return Program(path.stem, start)
+
+
+def _located(path: Path, function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function whose exceptions name the line of the file that led to them."""
+
+    def call(*values: Any, **named: Any) -> Any:
+        try:
+            return function(*values, **named)
+        except Exception as error:
+            frames = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
+            words = str(error)
+            if isinstance(error, SyntaxError):
+                frames, words = (
+                    [(error.filename or "", error.lineno)],
+                    error.msg,
+                )  # str() repeats file and line
+            lines = [line for file, line in frames if Path(file).resolve() == path.resolve()]
+            place = f"{path}:{lines[-1]}" if lines else str(path)
+            raise ValueError(f"{place}: {type(error).__name__}: {words}") from error
+
+    return call

@@ -14,7 +14,7 @@ from powderdsl.system.reports import table
 MEGABYTE = 1 << 20
 
 
-@dataclass(frozen=True)
+@dataclass
 class CellFigures:
     """What was measured of a cell. `round_seconds` and `round_processor_seconds` get one value a round.
 
@@ -25,10 +25,10 @@ class CellFigures:
 
     cell: Cell
     compile_seconds: float
-    first_step_seconds: float
-    peak_memory_bytes: int | None
-    steps_per_call: int
-    calls_per_round: int
+    first_step_seconds: float = 0.0
+    peak_memory_bytes: int | None = None
+    steps_per_call: int = 1
+    calls_per_round: int = 1
     round_seconds: list[float] = field(default_factory=list)
     round_processor_seconds: list[float] = field(default_factory=list)
     passes: dict[str, float] = field(default_factory=dict)
@@ -77,15 +77,13 @@ class Report:
 def report_data(report: Report) -> dict[str, Any]:
     """A report for `as_json`: every figure, and the seconds of every round."""
     plan = report.plan
-    cells = [
-        {
-            **figures.cell._asdict(),
-            **{key: value for key, value in vars(figures).items() if key != "cell"},
-            "world_steps_per_second": median(figures.rates),
-            "beside": {name: report.ratio(figures, name) for name in report.programs},
-        }
-        for figures in report.cells
-    ]
+    cells = []
+    for figures in report.cells:
+        values = figures.cell._asdict() | vars(figures)
+        del values["cell"]
+        values["world_steps_per_second"] = median(figures.rates)
+        values["beside"] = {name: report.ratio(figures, name) for name in report.programs}
+        cells.append(values)
     return {
         "machine": report.machine,
         "rules": plan.ruleset.name,
@@ -118,8 +116,6 @@ def _header(report: Report) -> Iterator[str]:
     yield f"{plan.ruleset.name}, worlds of {plan.workload}: {WORKLOADS[plan.workload]}"
     yield "powderdsl {powderdsl}, torch {torch}, Python {python}, C++: {compiler}".format_map(machine)
     yield "{processor}, {cpus} CPUs, {system}, device {device}".format_map(machine)
-    if machine["load"] is not None:
-        yield f"load average before: {machine['load']:.1f}"
 
 
 def _cell_table(report: Report) -> str:
