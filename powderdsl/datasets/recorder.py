@@ -32,7 +32,7 @@ from powderdsl.datasets.shards import DTYPES, is_whole, row_shape, write_shard
 from powderdsl.envs.acting import FrameStack, Policy, action_keys, random_policy
 from powderdsl.envs.observations import Observation, observation_of
 from powderdsl.envs.tensor_env import TensorEnv
-from powderdsl.experiments.runs.folder import held
+from powderdsl.experiments.runs import held
 from powderdsl.system.settings import check_count
 from powderdsl.system.writing import failure, not_writable
 from powderdsl.tasks.episodes import TaskProgram

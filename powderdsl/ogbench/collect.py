@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from powderdsl.experiments.runs.folder import held
+from powderdsl.experiments.runs import held
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.ogbench.datasets import FAMILY, VERSION
 from powderdsl.ogbench.episodes import keyed

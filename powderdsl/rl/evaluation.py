@@ -13,8 +13,7 @@ from torch import Tensor
 from powderdsl.envs.acting import FrameStack, Policy, action_keys, random_policy
 from powderdsl.envs.observations import observation_of
 from powderdsl.envs.tensor_env import TensorEnv
-from powderdsl.experiments.runs import RunFolder, find_run
-from powderdsl.experiments.runs.metrics import mean_and_interval
+from powderdsl.experiments.runs import RunFolder, find_run, mean_and_interval
 from powderdsl.rl.config import BASELINES, TrainConfig, chosen_policies
 from powderdsl.rl.policies import TrainedPolicy, config_of, load_policy, task_of
 from powderdsl.tasks.episodes import TaskProgram, compile_task

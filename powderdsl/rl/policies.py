@@ -16,8 +16,14 @@ from torch import Tensor
 from powderdsl.envs.acting import uniforms
 from powderdsl.envs.features import paper_policy, small_policy
 from powderdsl.envs.tensor_env import TensorEnv
-from powderdsl.experiments.runs import RunFolder, does_not_fit, find_run, fitting
-from powderdsl.experiments.runs.folder import check_palette, recorded_palette
+from powderdsl.experiments.runs import (
+    RunFolder,
+    check_palette,
+    does_not_fit,
+    find_run,
+    fitting,
+    recorded_palette,
+)
 from powderdsl.rl.config import TrainConfig, from_json
 from powderdsl.rl.fcn import BinDistribution, BinPolicy, fcn_policy
 from powderdsl.tasks.episodes import compile_task

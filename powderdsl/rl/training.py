@@ -31,8 +31,7 @@ from powderdsl.datasets.recorder import record
 from powderdsl.envs.observations import channels_of
 from powderdsl.envs.sb3 import PowderVecEnv
 from powderdsl.envs.tensor_env import check_cells
-from powderdsl.experiments.runs import Metrics, RunFolder, fitting, open_run
-from powderdsl.experiments.runs.metrics import mean_and_interval
+from powderdsl.experiments.runs import Metrics, RunFolder, fitting, mean_and_interval, open_run
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.rl.config import TrainConfig, check_config, check_task
 from powderdsl.rl.evaluation import play

@@ -14,8 +14,7 @@ from torch import nn
 
 from powderdsl.compiler import load, read, split_names
 from powderdsl.diagnostics import Reporter
-from powderdsl.experiments.runs import Checkpoint, RunFolder, does_not_fit, find_run, no_run
-from powderdsl.experiments.runs.folder import recorded_palette
+from powderdsl.experiments.runs import Checkpoint, RunFolder, does_not_fit, find_run, no_run, recorded_palette
 from powderdsl.model.composition.palette import Palette
 from powderdsl.model.types import Ruleset
 from powderdsl.tasks.shipped import load_task

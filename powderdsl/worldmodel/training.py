@@ -16,8 +16,17 @@ from torch.nn import functional as F
 
 from powderdsl.compiler import load, whole_palette
 from powderdsl.diagnostics import CompileError
-from powderdsl.experiments.runs import Checkpoint, RunFolder, does_not_fit, fitting, open_run, read_run
-from powderdsl.experiments.runs.folder import ABOUT, check_palette, recorded_palette
+from powderdsl.experiments.runs import (
+    ABOUT,
+    Checkpoint,
+    RunFolder,
+    check_palette,
+    does_not_fit,
+    fitting,
+    open_run,
+    read_run,
+    recorded_palette,
+)
 from powderdsl.model.composition.palette import Palette
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset

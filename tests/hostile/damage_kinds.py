@@ -22,7 +22,7 @@ import torch
 from safetensors.torch import load, save
 
 from powderdsl.cli.commands.study import commands
-from powderdsl.experiments.runs.checkpoints import STATE
+from powderdsl.experiments.runs import STATE
 from powderdsl.experiments.studies.run import StudyRun
 from powderdsl.experiments.studies.study import load_study
 from powderdsl.targets.cache import signed

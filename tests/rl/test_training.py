@@ -17,8 +17,7 @@ import pytest
 import torch
 
 from powderdsl.diagnostics import CompileError
-from powderdsl.experiments.runs import RunFolder, read_run
-from powderdsl.experiments.runs.metrics import read_metrics
+from powderdsl.experiments.runs import RunFolder, read_metrics, read_run
 from powderdsl.rl import evaluate, preset, train
 from powderdsl.rl.config import HOW, from_json
 from tests.processes import started

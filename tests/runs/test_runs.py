@@ -14,8 +14,7 @@ import pytest
 import torch
 
 from powderdsl.diagnostics import CompileError
-from powderdsl.experiments.runs import find_run, open_run, read_run
-from powderdsl.experiments.runs.metrics import read_metrics
+from powderdsl.experiments.runs import find_run, open_run, read_metrics, read_run
 from tests.processes import waited
 
 

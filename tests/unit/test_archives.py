@@ -16,7 +16,7 @@ from safetensors.torch import save
 
 import powderdsl
 from powderdsl.diagnostics import CompileError
-from powderdsl.experiments.runs.checkpoints import STATE, latest_checkpoint, save_checkpoint
+from powderdsl.experiments.runs import STATE, RunFolder
 from powderdsl.system.archives import BadArchive, open_archive, write_archive
 from powderdsl.worlds.raster import MAX_CELLS
 
@@ -124,8 +124,9 @@ def test_what_training_saves_is_read(tmp_path):
         a=shared, b=torch.ones(4)[1:3], c=shared, d=shared.T, e=torch.tensor(0.5), f=torch.zeros(0, 3)
     )
     state = {"model": weights, "recent": [1.0, None, "x", (1, True)], "optimizer": {0: {}, 1: {"step": 1}}}
-    save_checkpoint(tmp_path, 3, state)
-    found = latest_checkpoint(tmp_path)
+    run = RunFolder(tmp_path, "toy", {}, {})
+    run.save_checkpoint(3, state)
+    found = run.latest_checkpoint()
     assert found is not None
     model = found.state.pop("model")
     assert found.state == {"recent": state["recent"], "optimizer": state["optimizer"]}
@@ -137,6 +138,7 @@ def test_what_training_saves_is_read(tmp_path):
 
 
 def crafted(folder: Path, data: bytes) -> None:
+    folder.mkdir()
     (folder / f"{3:012d}-{hashlib.sha256(data).hexdigest()[:16]}.safetensors").write_bytes(data)
 
 
@@ -172,7 +174,7 @@ CRAFTED = {
 
 @pytest.mark.parametrize("name", CRAFTED)
 def test_a_crafted_checkpoint_is_refused(name, tmp_path):
-    crafted(tmp_path, CRAFTED[name])
+    crafted(tmp_path / "checkpoints", CRAFTED[name])
     with pytest.raises(CompileError) as caught:
-        latest_checkpoint(tmp_path)
+        RunFolder(tmp_path, "toy", {}, {}).latest_checkpoint()
     assert [one.code for one in caught.value.diagnostics] == ["PD620"]

@@ -14,8 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from powderdsl.diagnostics import CompileError
-from powderdsl.experiments.runs import RunFolder
-from powderdsl.experiments.runs.metrics import read_metrics
+from powderdsl.experiments.runs import RunFolder, read_metrics
 from powderdsl.worldmodel import (
     DataConfig,
     Machine,

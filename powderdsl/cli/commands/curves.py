@@ -20,8 +20,7 @@ def command(runs: tuple[str, ...], metric: str, out: Path | None) -> None:
     Runs that differ only in their seed make one curve: the mean, with its 95 % interval. For agents, train with
     --eval-every and evaluate one run: its expert, random and do-nothing policies become lines.
     """
-    from powderdsl.experiments.runs import find_run
-    from powderdsl.experiments.runs.metrics import read_metrics
+    from powderdsl.experiments.runs import find_run, read_metrics
     from powderdsl.experiments.studies.results import as_table, baselines_of, curves_of, write_curves
 
     found = [find_run(name) for name in runs]

@@ -53,7 +53,7 @@ def command(
     policies that need no training are compared.
     """
     played = find_played(run, knobs, settings, packs)
-    from powderdsl.experiments.runs.folder import write_json
+    from powderdsl.experiments.runs import write_json
     from powderdsl.rl.evaluation import evaluate
 
     with user_values():

@@ -136,8 +136,7 @@ def _checked(
             check_place(out)
     palette = None
     if policy not in SCRIPTED:
-        from powderdsl.experiments.runs import find_run
-        from powderdsl.experiments.runs.folder import recorded_palette
+        from powderdsl.experiments.runs import find_run, recorded_palette
 
         with collected():
             palette = recorded_palette(find_run(policy, "ppo"))

@@ -227,7 +227,7 @@ def _with_progress(run: StudyRun, points: list[Point], jobs: int | None, ray: st
 
 def _report(study: Study, size: str, folder: Path, outcomes: list[Outcome]) -> int:
     """Write the results, and return the exit status."""
-    from powderdsl.experiments.runs.folder import write_json
+    from powderdsl.experiments.runs import write_json
     from powderdsl.experiments.studies.results import as_data, as_markdown, write_figure
     from powderdsl.system.writing import write_text
 

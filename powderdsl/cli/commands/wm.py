@@ -191,7 +191,7 @@ def eval_command(run: str, as_json: bool, out: Path | None, **values: Any) -> No
     that no training takes. A network that learned from a dataset is tested on its test worlds, or on another dataset,
     and also with its actions hidden. What is found is also written to the run's evaluation.json.
     """
-    from powderdsl.experiments.runs.folder import write_json
+    from powderdsl.experiments.runs import write_json
     from powderdsl.worldmodel.evaluation import evaluate, evaluate_recording
 
     trained, recording, machine = _loaded(run, values)

@@ -10,8 +10,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from powderdsl.experiments.runs import RunFolder
-from powderdsl.experiments.runs.metrics import mean_and_interval, read_metrics
+from powderdsl.experiments.runs import RunFolder, mean_and_interval, read_metrics
 from powderdsl.experiments.studies.run import EVALUATION, Outcome
 from powderdsl.experiments.studies.study import Measure, Study
 from powderdsl.system.packages import require_matplotlib

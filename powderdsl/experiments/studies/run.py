@@ -16,7 +16,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from powderdsl.diagnostics import CompileError, Reporter, Source
-from powderdsl.experiments.runs.folder import ABOUT, check_folder, held, new_folder, no_run, write_json
+from powderdsl.experiments.runs import ABOUT, check_folder, held, new_folder, no_run, write_json
 from powderdsl.experiments.studies.study import SIZES, Commands, Measure, Point, Study, StudyStep, read_study
 from powderdsl.system.interrupts import GRACE, LIFELINE
 from powderdsl.system.reading import read_json

@@ -1,0 +1,451 @@
+"""Folders of training runs: `run.json` describes the run; checkpoints and metrics have its progress.
+
+A killed process leaves a readable folder: checkpoints are written whole or not at all, with their digest in their names.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import platform
+import re
+import statistics
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from filelock import FileLock, Timeout
+
+from powderdsl.diagnostics import CompileError, suggest
+from powderdsl.system.reading import check_links, open_regular, parse_json, read_bytes, read_json
+from powderdsl.system.writing import failure, not_writable, replacing, write_text
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+ABOUT = "run.json"
+PACKAGES = ("powderdsl", "torch", "numpy", "gymnasium", "stable-baselines3")
+MAX_SLOTS = 256
+
+
+# Checkpoints
+
+NAME = re.compile(r"([0-9]{12})-([0-9a-f]{16})\.safetensors")
+STATE = "state"
+"""The tensor whose bytes are the state as JSON, with the names of the other tensors in their places."""
+
+MAX_BYTES = 1 << 33
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """What was saved after `step` steps: nested dicts, lists and tuples of tensors, numbers, text and None."""
+
+    step: int
+    state: Any
+    path: Path
+
+
+def _encoded(state: Any) -> bytes:
+    import torch
+    from safetensors.torch import save
+
+    tensors: dict[str, Tensor] = {}
+    text = json.dumps(_packed(state, tensors)).encode()
+    return save({**tensors, STATE: torch.frombuffer(bytearray(text), dtype=torch.uint8)})
+
+
+def _decoded(data: bytes) -> Any:
+    from safetensors.torch import load
+
+    tensors = load(data)
+    return _unpacked(parse_json(bytes(tensors[STATE].numpy())), tensors)
+
+
+def _packed(value: Any, tensors: dict[str, Tensor]) -> Any:
+    """A state as JSON has it: what is neither a list nor a plain value becomes a pair of its kind and contents."""
+    import torch
+
+    match value:
+        case torch.Tensor():
+            name = str(len(tensors))
+            # safetensors takes no tensors that share memory, as those of a network may.
+            tensors[name] = value.detach().cpu().clone(memory_format=torch.contiguous_format)
+            return {"tensor": name}
+        case dict():
+            return {"dict": [[key, _packed(item, tensors)] for key, item in value.items()]}
+        case tuple():
+            return {"tuple": [_packed(item, tensors) for item in value]}
+        case list():
+            return [_packed(item, tensors) for item in value]
+    return value
+
+
+def _unpacked(value: Any, tensors: dict[str, Tensor]) -> Any:
+    match value:
+        case {"tensor": name}:
+            return tensors[name]
+        case {"dict": pairs}:
+            return {key: _unpacked(item, tensors) for key, item in pairs}
+        case {"tuple": items}:
+            return tuple(_unpacked(item, tensors) for item in items)
+        case list():
+            return [_unpacked(item, tensors) for item in value]
+    return value
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()[:16]
+
+
+# Metrics
+
+LINES = "metrics.jsonl"
+EVENTS = "tensorboard"
+MAX_LINE = 1 << 16
+"""Bytes of a line."""
+T_975 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228)
+"""97.5 % quantiles of Student's t for 1 to 10 degrees of freedom, for which no short formula is exact enough."""
+
+
+class Metrics:
+    """Writes numbers by step. A context manager.
+
+    Args:
+        folder: the run's. step: where the run continues; what was written for later steps is dropped, so that a run that
+            was killed after its last checkpoint writes nothing twice.
+    """
+
+    def __init__(self, folder: Path, step: int = 0):
+        self._lines = folder / LINES
+        kept = [json.dumps(line) for line in read_metrics(folder) if line["step"] <= step]
+        with replacing(self._lines) as temporary:
+            temporary.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
+        self._file = self._lines.open("a", encoding="utf-8")
+        self._events = None
+        with suppress(ImportError):  # without TensorBoard, the lines hold the same
+            from torch.utils.tensorboard import SummaryWriter
+
+            self._events = SummaryWriter(str(folder / EVENTS), purge_step=step + 1 if step else None)
+
+    def write(self, step: int, values: Mapping[str, float]) -> None:
+        """Numbers by name, such as ``loss/train``, after `step` steps. What is not finite is left out of the lines."""
+        numbers = {name: float(value) for name, value in values.items()}
+        finite = {name: value for name, value in numbers.items() if math.isfinite(value)}
+        self._file.write(json.dumps({"step": step, **finite}) + "\n")
+        self._file.flush()
+        if self._events is not None:
+            for name, value in numbers.items():
+                self._events.add_scalar(name, value, step)
+
+    def __enter__(self) -> Metrics:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._file.close()
+        if self._events is not None:
+            self._events.close()
+
+
+def read_metrics(folder: Path) -> Iterator[dict[str, Any]]:
+    """The lines of a run, each with ``step``. A last line that a kill cut short is left out."""
+    with suppress(FileNotFoundError), open_regular(folder / LINES) as file:
+        for text in iter(lambda: file.readline(MAX_LINE), b""):
+            with suppress(ValueError):
+                line = parse_json(text)
+                if isinstance(line, dict) and isinstance(line.get("step"), int):
+                    yield line
+
+
+def mean_and_interval(values: Sequence[float]) -> tuple[float, float | None]:
+    """The mean, and half of its 95 % interval by Student's t; None for a single value."""
+    mean, freedom = statistics.fmean(values), len(values) - 1
+    if freedom < 1:
+        return mean, None
+    # Beyond the table: the expansion of Cornish and Fisher, exact to four digits.
+    expansion = 1.95996 + 2.37227 / freedom + 2.8225 / freedom**2 + 2.5557 / freedom**3
+    quantile = T_975[freedom - 1] if freedom <= len(T_975) else expansion
+    return mean, quantile * statistics.stdev(values) / math.sqrt(len(values))
+
+
+# Folders
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A folder of one training run.
+
+    `kind` is what was trained; `config` all that decides how, as JSON has it; `about` the whole of ``run.json``: also
+    versions.
+    """
+
+    path: Path
+    kind: str
+    config: Mapping[str, Any]
+    about: Mapping[str, Any]
+
+    def locked(self) -> AbstractContextManager[None]:
+        """Keep other processes from training here, which get a CompileError (PD622)."""
+        return held(self.path)
+
+    def latest_checkpoint(self) -> Checkpoint | None:
+        """The newest checkpoint whose digest is right, with its tensors on the CPU, or None. Damaged ones are passed over.
+
+        Loading executes nothing: only tensors and plain values are read, and they take no more memory than the file.
+
+        Raises:
+            CompileError: PD620 for a file that is whole and holds something else.
+        """
+        for step, digest, path in self._checkpoints():
+            try:
+                data = read_bytes(path, MAX_BYTES)
+            except OSError:
+                continue
+            if _digest(data) == digest:
+                try:
+                    return Checkpoint(step, _decoded(data), path)
+                except Exception as error:  # a crafted file raises whatever it likes
+                    why = (str(error).strip().partition("\n")[0] or type(error).__name__)[:300]
+                    raise failure("PD620", f"{path} is not a checkpoint of a run", notes=(why,)) from None
+        return None
+
+    def checkpoint(self) -> Checkpoint:
+        """The newest intact checkpoint. Raises CompileError (PD620) if there is none."""
+        checkpoint = self.latest_checkpoint()
+        if checkpoint is None:
+            raise no_run(self.path, "it has no checkpoint that can be read")
+        return checkpoint
+
+    def save_checkpoint(self, step: int, state: Any) -> Path:
+        """Save nested dicts, lists and tuples of tensors, numbers, text and None, and remove older checkpoints but one.
+
+        Raises:
+            CompileError: PD613 if the folder cannot be written to, or the disk is full.
+        """
+        data = _encoded(state)
+        path = self.path / "checkpoints" / f"{step:012d}-{_digest(data)}.safetensors"
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with replacing(path) as temporary:
+                temporary.write_bytes(data)
+        except OSError as error:
+            raise not_writable(path, error) from None
+        others = [(number, other) for number, _, other in self._checkpoints() if other != path]
+        before = next((other for number, other in others if number < step), None)
+        for _, other in others:
+            # Later ones are left by a run that had to go back; they must not be taken for newer.
+            if other != before:
+                other.unlink(missing_ok=True)
+        return path
+
+    def _checkpoints(self) -> list[tuple[int, str, Path]]:
+        """Step, digest and path of all checkpoints, the newest first."""
+        paths = sorted((self.path / "checkpoints").glob("*"), reverse=True)
+        matches = [(NAME.fullmatch(path.name), path) for path in paths]
+        return [(int(match[1]), match[2], path) for match, path in matches if match]
+
+    def metrics(self, step: int = 0) -> Metrics:
+        """Where to write numbers from `step` on; those of later steps are dropped."""
+        return Metrics(self.path, step)
+
+    def write_json(self, name: str, value: Any) -> Path:
+        """Write a file of the folder whole or not at all."""
+        return write_json(self.path / name, value)
+
+    def read_json(self, name: str) -> Any:
+        """A file of the folder; None if there is none or it is damaged."""
+        return read_json(self.path / name)
+
+
+def open_run(
+    path: str | Path, kind: str, config: Mapping[str, Any], *, note: Mapping[str, Any] | None = None
+) -> RunFolder:
+    """Begin a run, or resume it with the same configuration.
+
+    Args:
+        config: what JSON can hold. note: more to keep in ``run.json``, which takes no part in the comparison.
+
+    Raises:
+        CompileError: PD621 where the folder holds another run, or other files; PD620 where its ``run.json`` is damaged;
+            PD613 where nothing can be written.
+    """
+    folder, plain = Path(path), json.loads(json.dumps(config))
+    if (folder / ABOUT).exists():
+        run = read_run(folder)
+        if differences := _differences(run, kind, plain):
+            helps = ("choose another folder with `--run`, or continue with that run's own settings",)
+            raise failure("PD621", f"{folder} holds another run", notes=differences, helps=helps)
+        return run
+    new_folder(folder)
+    about = {"kind": kind, "config": plain, **(note or {}), "versions": versions()}
+    write_json(folder / ABOUT, about)
+    return read_run(folder, kind)
+
+
+@contextmanager
+def held(folder: Path, patience: float = 0.0) -> Iterator[None]:
+    """Keep other processes from writing to a folder. The lock of a process that dies is gone with it.
+
+    Args:
+        patience: seconds to wait for another process.
+
+    Raises:
+        CompileError: PD622 if another one does; PD613 if the folder cannot be written to.
+    """
+    check_folder(folder)
+    lock = FileLock(folder / ".lock")
+    try:
+        lock.acquire(timeout=patience)
+    except Timeout:
+        helps = ("wait for it, or choose another folder",)
+        raise failure("PD622", f"another process works on {folder}", helps=helps) from None
+    except OSError as error:
+        raise not_writable(folder, error) from None
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def new_folder(folder: Path) -> None:
+    """Make a folder for something that will be written there, unless it is there and empty.
+
+    Raises:
+        CompileError: PD621 where it holds files; PD613 where it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        others = sorted(name for name in os.listdir(folder) if not name.startswith("."))
+    except OSError as error:
+        raise not_writable(folder, error) from None
+    if others:
+        notes, helps = (f"such as {others[0]}",), ("choose a folder that is empty or not there yet",)
+        raise failure("PD621", f"{folder} holds other files", notes=notes, helps=helps)
+
+
+def read_run(path: str | Path, kind: str | None = None) -> RunFolder:
+    """An existing run.
+
+    Raises:
+        CompileError: PD620 if there is none, it is damaged, or of another kind than `kind`.
+    """
+    folder = Path(path)
+    if not (folder / ABOUT).exists():
+        raise no_run(folder, f"it has no {ABOUT}" if folder.is_dir() else "there is no such folder")
+    check_folder(folder)
+    match about := read_json(folder / ABOUT):
+        case {"kind": str(found), "config": dict(config)}:
+            if kind not in (None, found):
+                raise no_run(folder, f"it is a run of the kind `{found}`; `{kind}` is needed here")
+            return RunFolder(folder, found, config, about)
+    raise no_run(folder, f"its {ABOUT} is damaged")
+
+
+def find_run(text: str | Path, kind: str | None = None) -> RunFolder:
+    """A run by the path of its folder, or by its name in ``runs/``. Raises CompileError (PD620)."""
+    folder, kept = Path(text), Path("runs")
+    if not folder.exists() and folder.name == str(text) and kept.is_dir():
+        if (kept / text / ABOUT).exists():
+            return read_run(kept / text, kind)
+        names = sorted(one.parent.name for one in kept.glob(f"*/{ABOUT}"))
+        raise no_run(folder, "there is no such folder", suggest(str(text), names, "runs"))
+    return read_run(folder, kind)
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse a folder that may come from a stranger and has links that lead out of it. Raises CompileError (PD112)."""
+    try:
+        check_links(folder)
+    except OSError as error:
+        helps = ("move what it leads to into the folder; the folder itself may be a link",)
+        raise failure("PD112", f"{error.filename}: {error.strerror}", helps=helps) from None
+
+
+def does_not_fit(folder: Path, *why: str, helps: tuple[str, ...] = ()) -> CompileError:
+    """The error for a run whose model or data was made for something else (PD623)."""
+    return failure("PD623", f"{folder} does not fit", notes=why, helps=helps)
+
+
+@contextmanager
+def fitting(path: Path, what: str) -> Iterator[None]:
+    """Report what raises where a checkpoint, which may hold anything, is given to a model (PD623)."""
+    try:
+        yield
+    except (RuntimeError, TypeError, ValueError, AttributeError, LookupError) as error:
+        raise does_not_fit(path, f"{what}: {' '.join(str(error).split())[:300]}") from None
+
+
+def no_run(folder: Path, why: str, helps: tuple[str, ...] = ()) -> CompileError:
+    """The error for a folder that is not a run, or one that cannot be used (PD620)."""
+    return failure("PD620", f"{folder} is not a run that can be used here", notes=(why,), helps=helps)
+
+
+def versions() -> dict[str, str]:
+    """Versions that a run's numbers may depend on: Python, the system, and installed packages."""
+    known = {"python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}"}
+    for name in PACKAGES:
+        with suppress(metadata.PackageNotFoundError):
+            known[name] = metadata.version(name)
+    return known
+
+
+def write_json(path: Path, value: Any, *, follow: bool = False) -> Path:
+    """Write a file whole or not at all. `follow`: write to where a link leads. Raises CompileError (PD613)."""
+    write_text(path, json.dumps(value, indent=1, ensure_ascii=False) + "\n", follow=follow)
+    return path
+
+
+def _differences(run: RunFolder, kind: str, config: Mapping[str, Any]) -> tuple[str, ...]:
+    if run.kind != kind:
+        return (f"it is of the kind `{run.kind}`, not `{kind}`",)
+    there, here = _flat(run.config), _flat(config)
+    return tuple(
+        f"`{name}` is {there.get(name, 'not set')} there, {here.get(name, 'not set')} here"
+        for name in sorted({*there, *here})
+        if there.get(name) != here.get(name)
+    )
+
+
+def _flat(config: Mapping[str, Any], within: str = "") -> dict[str, str]:
+    """Each setting by its dotted name, as JSON."""
+    settings: dict[str, str] = {}
+    for name, value in config.items():
+        is_group = isinstance(value, Mapping) and value
+        settings |= _flat(value, f"{within}{name}.") if is_group else {within + name: json.dumps(value)}
+    return settings
+
+
+# Palettes: the qualified name of the element of each slot of a run's network, or None for a free slot
+
+
+def recorded_palette(run: RunFolder) -> tuple[str | None, ...]:
+    """The palette of a run. Raises CompileError (PD620) if it is damaged."""
+    palette = run.config.get("palette")
+    if not isinstance(palette, list) or not 1 <= len(palette) <= MAX_SLOTS:
+        raise no_run(run.path, "it has no palette that a network can have")
+    return tuple(None if name is None else str(name) for name in palette)
+
+
+def check_palette(
+    folder: Path, palette: Sequence[str | None], elements: Mapping[int, str], *helps: str
+) -> None:
+    """Compare the slots of a run's network with the elements of some rules, qualified names by id.
+
+    Raises:
+        CompileError: PD623, with every element that has no slot, or whose slot is another's. `helps` are for the first.
+    """
+    why, lacking = [], 0
+    for number, name in elements.items():
+        if number >= len(palette):
+            lacking += 1
+            why.append(f"there is no free slot for `{name}`: the network has {len(palette)}")
+        elif palette[number] not in (None, name):
+            why.append(f"id {number} is `{palette[number]}` there, `{name}` here")
+    if why:
+        more = f"train with `--slots {len(palette) + lacking}` to leave room for packs that come later"
+        raise does_not_fit(folder, *why, helps=(more, *helps) if lacking else ())
