@@ -73,19 +73,8 @@ def _type(name: str, code: str) -> Type:
     return Type(name, code, kind, size, -(1 << bits - 1) if signed else 0, (1 << bits - signed) - 1)
 
 
-_NAMES = (
-    "bool",
-    "int8",
-    "uint8",
-    "int16",
-    "uint16",
-    "int32",
-    "uint32",
-    "int64",
-    "uint64",
-    "float32",
-    "float64",
-)
+_INTEGERS = (f"{sign}int{bits}" for bits in (8, 16, 32, 64) for sign in ("", "u"))
+_NAMES = ("bool", *_INTEGERS, "float32", "float64")
 _TYPES = {name: _type(name, code) for name, code in zip(_NAMES, "BbBhHiIqQfd", strict=True)}
 bool_, float32, float64 = _TYPES["bool"], _TYPES["float32"], _TYPES["float64"]
 
@@ -104,12 +93,6 @@ def promoted(a: Type, b: Type) -> Type:
     if large.kind != small.kind and (large.kind == "u" or large.itemsize == small.itemsize):
         raise TypeError(f"{a} with {b} is not there without NumPy")
     return large
-
-
-def adapted(number: bool | int | float, kind: Type) -> Type:
-    """The type of results of a number of Python with an array of some type."""
-    own = dtype(type(number))
-    return own if "biuf".index(kind.kind) < "biuf".index(own.kind) else kind
 
 
 # Values
@@ -154,7 +137,7 @@ def converted(values: Values, old: Type, new: Type) -> Values:
     if old is new or (isinstance(values, bytes) and new.kind in "iu" and new.high > 254):
         return values
     if new is bool_:
-        return flags_of(values)
+        return values.translate(_NONZERO) if isinstance(values, bytes) else bytes(map(bool, values))
     if old.kind == "f":
         return array(new.code, values) if new.kind == "f" else checked(map(int, values), new)
     if new.kind != "f":
@@ -189,11 +172,6 @@ def alike(several: Sequence[Values], kind: Type) -> list[Values]:
     if len({type(values) for values in several}) == 1:
         return list(several)
     return [unpacked(raw_of(one, kind), kind.code) if isinstance(one, bytes) else one for one in several]
-
-
-def flags_of(values: Values) -> bytes:
-    """A byte of 1 for each value that is not 0, and of 0 for others."""
-    return values.translate(_NONZERO) if isinstance(values, bytes) else bytes(map(bool, values))
 
 
 _NONZERO = bytes([0]) + bytes([1]) * 255
@@ -345,16 +323,11 @@ def rolled(values: Values, outer: int, count: int, inner: int, shift: int) -> Va
     if len(values) == 1 or not values or shift % count == 0:
         return values
     block, cut = count * inner, shift % count * inner
-    left = block - cut
-    held: Any = values
+    cut -= block if 2 * cut > block else 0
     # All move at once; then those that leave their block return at its other end.
-    if cut <= left:
-        moved, places = held[-cut:] + held[:-cut], range(cut)
-    else:
-        moved, places = held[left:] + held[:left], range(cut, block)
-    if outer == 1:
-        return moved
-    changed: Any = bytearray(moved) if isinstance(moved, bytes) else moved
-    for place in places:
+    held: Any = values
+    moved = held[-cut:] + held[:-cut]
+    changed: Any = bytearray(moved) if isinstance(values, bytes) else moved
+    for place in range(cut) if cut > 0 else range(block + cut, block):
         changed[place::block] = values[(place - cut) % block :: block]
     return bytes(changed) if isinstance(values, bytes) else changed

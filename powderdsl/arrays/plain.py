@@ -155,15 +155,6 @@ class ndarray:
         steps = numbers.strides(self.shape)
         return [range(0, side * step, step or 1) for side, step in zip(self.shape, steps, strict=True)]
 
-    def transposed(self, order: Sequence[int]) -> ndarray:
-        """A view with the axes in another order."""
-        axes, shape = self.offsets(), tuple(self.shape[axis] for axis in order)
-        return ndarray(shape, self.dtype, numbers.gathered(self.values, [axes[axis] for axis in order]), self)
-
-    @property
-    def T(self) -> ndarray:
-        return self.transposed(range(self.ndim)[::-1])
-
     # Indexing
 
     def __getitem__(self, key: Any) -> ndarray:
@@ -234,11 +225,6 @@ class ndarray:
     def __abs__(self) -> ndarray:
         _check("abs", self, "if")
         return _mapped(operator.abs, self)
-
-    def __pow__(self, power: int) -> ndarray:
-        if power != 2:
-            raise TypeError(f"power {power} is not there without NumPy")
-        return _binary("mul", self, self)
 
 
 def _check(op: str, array: ndarray, kinds: str) -> None:
@@ -383,17 +369,14 @@ def broadcast_to(values: Any, shape: Any) -> ndarray:
     return ndarray(target, array.dtype, numbers.gathered(array.values, axes), array)
 
 
-def swapaxes(values: ndarray, first: int, second: int) -> ndarray:
-    order = [*range(values.ndim)]
-    order[first], order[second] = order[second], order[first]
-    return values.transposed(order)
-
-
 def moveaxis(values: ndarray, source: int, destination: int) -> ndarray:
     moved = range(values.ndim)[source]
     order = [axis for axis in range(values.ndim) if axis != moved]
     order.insert(range(values.ndim)[destination], moved)
-    return values.transposed(order)
+    axes, shape = values.offsets(), tuple(values.shape[axis] for axis in order)
+    return ndarray(
+        shape, values.dtype, numbers.gathered(values.values, [axes[axis] for axis in order]), values
+    )
 
 
 def roll(values: ndarray, shift: Any, axis: Any) -> ndarray:
@@ -457,7 +440,8 @@ def _matched(x: Any, y: Any) -> tuple[Values, Values, Type, Shape]:
         kind, shape = numbers.promoted(x.dtype, y.dtype), _together(x.shape, y.shape)
     else:
         array, number = (x, y) if type(x) is ndarray else (y, x)
-        kind, shape = numbers.adapted(number, array.dtype), array.shape
+        kind, shape, own = array.dtype, array.shape, dtype(type(number))
+        kind = own if "biuf".index(kind.kind) < "biuf".index(own.kind) else kind
     return _operand(x, kind, shape), _operand(y, kind, shape), kind, shape
 
 
@@ -489,21 +473,10 @@ def _operator(call: Callable[[str, Any, Any], ndarray], op: str, swapped: bool =
     return operator
 
 
-def _in_place(op: str) -> Any:
-    def operator(self: ndarray, other: Any) -> ndarray:
-        result = _binary(op, self, other)
-        if result.shape != self.shape or result.dtype is not self.dtype:
-            raise TypeError(f"{result.dtype} {result.shape} into {self.dtype} is not there without NumPy")
-        self[...] = result
-        return self
-
-    return operator
-
-
 for _op in ("add", "sub", "mul", "truediv", "floordiv", "mod", "and_", "or_", "xor", "lshift", "rshift"):
     setattr(ndarray, f"__{_op.strip('_')}__", _operator(_binary, _op))
     setattr(ndarray, f"__r{_op.strip('_')}__", _operator(_binary, _op, swapped=True))
-    setattr(ndarray, f"__i{_op.strip('_')}__", _in_place(_op))
+    setattr(ndarray, f"__i{_op.strip('_')}__", None)  # `+=` is an error: views would see it in NumPy
 for _op in ("eq", "ne", "lt", "le", "gt", "ge"):
     setattr(ndarray, f"__{_op}__", _operator(_compare, _op))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from powderdsl.system.lazy import importing
+from powderdsl.system.packages import importing
 
 if TYPE_CHECKING:
     from powderdsl.datasets.dataset import Dataset, Transitions, split

@@ -158,8 +158,7 @@ def _read(path: Path, expected: dict[str, tuple[int, ...]], only: tuple[str, ...
             raise BadArchive(f"it must hold {', '.join(expected)}, and nothing else")
         for name in only:
             header, shape, dtype = archive.headers[name], expected[name], np.dtype(DTYPES[name])
-            form = (header.shape, header.dtype, header.fortran)
-            if form != (shape, dtype.name, False):
+            if (header.shape, header.dtype) != (shape, dtype.name):
                 raise BadArchive(
                     f"`{name}` is {header.dtype} {list(header.shape)}, not {dtype} {list(shape)}"
                 )

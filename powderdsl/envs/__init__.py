@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import gymnasium
 
-from powderdsl.system.lazy import importing
+from powderdsl.system.packages import importing
 from powderdsl.tasks.shipped import shipped_tasks
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import gymnasium
 
 from powderdsl.ogbench.levels import find_level, shipped_levels
-from powderdsl.system.lazy import importing
+from powderdsl.system.packages import importing
 
 if TYPE_CHECKING:
     from powderdsl.ogbench.datasets import load_dataset, make_env_and_datasets

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from powderdsl.rl.config import TrainConfig, preset
-from powderdsl.system.lazy import importing
+from powderdsl.system.packages import importing
 
 if TYPE_CHECKING:
     from powderdsl.rl.evaluation import evaluate

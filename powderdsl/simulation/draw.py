@@ -82,19 +82,14 @@ def tint_cells(image: Array, vectors: Array, tint: CellTint) -> None:
     if here and not bool((vectors != 0).any()):
         return
     row, column = vectors[..., 0, :, :], vectors[..., 1, :, :]
-    share = row * row
-    share += column * column
-    share = share.sqrt() if _is_tensor(share) else np.sqrt(share)
-    share /= tint.full
+    share = row * row + column * column
+    share = (share.sqrt() if _is_tensor(share) else np.sqrt(share)) / tint.full
     share = share.clip(max=tint.most) if _is_tensor(share) else np.minimum(share, np.float32(tint.most))
     rest = 1 - share
     for channel, color in enumerate(tint.color):
         part = image[..., channel]
         part = part.float() if _is_tensor(part) else part.astype(np.float32)
-        part /= 255
-        part *= rest
-        part += share * color
-        part *= 255
+        part = (part / 255 * rest + share * color) * 255
         image[..., channel] = part if _is_tensor(part) else part.astype(np.uint8)
 
 

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
-from typing import IO, Any, BinaryIO
+from typing import Any, BinaryIO
 
 from powderdsl.arrays import NDArray, np
 from powderdsl.system.reading import open_regular
@@ -26,10 +26,8 @@ MAX_DIRECTORY = 1 << 20
 """Maximum bytes of its list of contents."""
 MAX_HEADER = 10_000
 """Maximum bytes of an array's header."""
-CHUNK = 1 << 24
-"""Bytes of an array that are written together."""
-_MAGIC, _ALIGNMENT, _SHAPE_ROOM = b"\x93NUMPY", 64, 21
-"""How arrays begin; the multiple of bytes at which their values begin; characters that may hold the first side."""
+_MAGIC, _ALIGNMENT, _SHAPE_ROOM = b"\x93NUMPY\1\0", 64, 21
+"""How arrays begin, in version 1.0; the multiple of bytes at which their values begin; characters that may hold the first side."""
 _TYPES = {"b": "bool", "i": "int", "u": "uint", "f": "float", "U": "str"}
 _END, _LOCATOR, _END64 = struct.Struct("<4s4H2LH"), 20, struct.Struct("<4sQ2H2L4Q")
 """The end of a zip file; before it, where it is large, bytes of a pointer and another end."""
@@ -49,7 +47,6 @@ class Header:
     shape: tuple[int, ...]
     dtype: str
     itemsize: int
-    fortran: bool
     start: int
     entry: zipfile.ZipInfo
 
@@ -76,10 +73,7 @@ class Archive:
         header = self.headers[name]
         if header.dtype == "str":
             raise BadArchive(f"`{name}` is not an array of numbers")
-        flat = np.frombuffer(self._bytes(name), header.dtype)
-        if header.fortran:
-            return flat.reshape(header.shape[::-1]).T
-        return flat.reshape(header.shape)
+        return np.frombuffer(self._bytes(name), header.dtype).reshape(header.shape)
 
     def text(self, name: str) -> str:
         """Read a text. Raises BadArchive."""
@@ -112,30 +106,22 @@ def write_archive(file: BinaryIO, arrays: Mapping[str, NDArray[Any] | Parts | st
     form = zipfile.ZIP_DEFLATED if level else zipfile.ZIP_STORED
     with zipfile.ZipFile(file, "w", form, compresslevel=level) as archive:
         for name, value in arrays.items():
+            if isinstance(value, str):
+                value = Parts(f"<U{len(value)}", (), [np.frombuffer(value.encode("utf-32-le"), np.uint8)])
+            elif not isinstance(value, Parts):
+                value = Parts(value.dtype.str, tuple(value.shape), [value])
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                if isinstance(value, str):
-                    _write_header(member, f"<U{len(value)}", ())
-                    member.write(value.encode("utf-32-le"))
-                    continue
-                if isinstance(value, Parts):
-                    _write_header(member, value.dtype, value.shape)
-                    for part in value.parts:
-                        member.write(part.tobytes())
-                    continue
-                shape = tuple(value.shape)
-                _write_header(member, value.dtype.str, shape)
-                step = max(1, CHUNK // max(1, prod(shape[1:]) * value.dtype.itemsize))
-                for start in range(0, shape[0], step):
-                    member.write(value[start : start + step].tobytes())
+                member.write(_header_bytes(value.dtype, value.shape))
+                for part in value.parts:
+                    member.write(part.tobytes())
 
 
-def _write_header(member: IO[bytes], descr: str, shape: tuple[int, ...]) -> None:
-    """The header of an array in C order, of version 1.0, with room for a longer first side."""
+def _header_bytes(descr: str, shape: tuple[int, ...]) -> bytes:
+    """The header of an array in C order, with room for a longer first side."""
     text = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}"
     text += " " * (_SHAPE_ROOM - len(str(shape[0]))) if shape else ""
-    before = len(_MAGIC) + 4
-    text += " " * (_ALIGNMENT - (before + len(text) + 1) % _ALIGNMENT) + "\n"
-    member.write(_MAGIC + b"\1\0" + struct.pack("<H", len(text)) + text.encode("latin-1"))
+    text += " " * (_ALIGNMENT - (len(_MAGIC) + 2 + len(text) + 1) % _ALIGNMENT) + "\n"
+    return _MAGIC + struct.pack("<H", len(text)) + text.encode("latin-1")
 
 
 @contextmanager
@@ -189,11 +175,9 @@ def _header(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> tuple[str, Head
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise BadArchive(f"`{name}` is packed in another way than .npz files are")
     with archive.open(entry) as member:
-        magic, version = member.read(len(_MAGIC)), member.read(2)
-        if magic != _MAGIC or version not in (b"\1\0", b"\2\0"):
+        if member.read(len(_MAGIC)) != _MAGIC:
             raise BadArchive(f"`{name}` is not an array")
-        length = struct.Struct("<H" if version == b"\1\0" else "<I")
-        (count,) = length.unpack(member.read(length.size))
+        (count,) = struct.unpack("<H", member.read(2))
         if count > MAX_HEADER:
             raise BadArchive(f"`{name}` has a header of {count:,} bytes")
         values = literal_eval(member.read(count).decode("latin-1").strip())
@@ -202,10 +186,12 @@ def _header(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> tuple[str, Head
     match = re.fullmatch(r"[<|](?:(b)(1)|([iu])([1248])|(f)([248])|(U)([0-9]{1,9}))", descr)
     if match is None or any(type(side) is not int or side < 0 for side in shape):
         raise BadArchive(f"`{name}` is not an array of numbers")
+    if fortran:
+        raise BadArchive(f"`{name}` is not in C order: save `numpy.ascontiguousarray` of it")
     letter, digits = filter(None, match.groups())
     itemsize = int(digits) * (4 if letter == "U" else 1)
     dtype = _TYPES[letter] if letter in "bU" else f"{_TYPES[letter]}{8 * itemsize}"
-    header = Header(tuple(shape), dtype, itemsize, bool(fortran), start, entry)
+    header = Header(tuple(shape), dtype, itemsize, start, entry)
     if entry.file_size != header.start + header.size:
         raise BadArchive(f"`{name}` has {entry.file_size - header.start:,} bytes, not {header.size:,}")
     return name, header

@@ -1,7 +1,8 @@
-"""Packages that only some work needs."""
+"""Imports that wait until they are needed: of packages that only some work needs, and of our own modules."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
@@ -24,6 +25,13 @@ def require(module: str, work: str, *helps: str) -> Any:
         raise failure("PD612", f"{work} needs {missing}, which is not installed", helps=helps) from None
 
 
-def require_matplotlib() -> None:
-    """Raise CompileError (PD612) if matplotlib is not installed: before long work, not after it."""
-    require("matplotlib", "drawing a plot", "pip install 'powderdsl[plot]'")
+def importing(package: str, **homes: str) -> Callable[[str], Any]:
+    """The ``__getattr__`` of a package; `homes` are its modules, each with the public names that are in it."""
+
+    def import_name(name: str) -> Any:
+        for module, names in homes.items():
+            if name in names.split():
+                return getattr(import_module(f"{package}.{module}"), name)
+        raise AttributeError(f"module {package!r} has no attribute {name!r}")
+
+    return import_name

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from powderdsl.system.lazy import importing
+from powderdsl.system.packages import importing
 
 if TYPE_CHECKING:
     from powderdsl.worldmodel.config import DataConfig as DataConfig

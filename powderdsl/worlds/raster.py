@@ -166,7 +166,8 @@ def _line(xp: Any, column: Any, n: Sequence[Any], size: Size) -> Rows:
 def _disk(xp: Any, column: Any, n: Sequence[Any], size: Size) -> Rows:
     """The cells nearer to the center than the radius: a disk of radius 1 is one cell."""
     row, center, radius = n
-    left = radius * radius - 1 - (column - center) ** 2
+    aside = column - center
+    left = radius * radius - 1 - aside * aside
     reach = root(xp, xp.clip(left, 0, MOST))
     return xp.where(left < 0, FAR, row - reach), row + reach + 1
 
@@ -241,4 +242,4 @@ def root(xp: Any, x: Any) -> Any:
         return isqrt(x)
     found = xp.asarray(xp.sqrt(xp.asarray(x, dtype=xp.float64)), dtype=xp.int64)
     found = found - (found * found > x) * 1
-    return found + ((found + 1) ** 2 <= x) * 1
+    return found + ((found + 1) * (found + 1) <= x) * 1

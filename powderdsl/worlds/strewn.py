@@ -44,7 +44,8 @@ def strew(ruleset: Ruleset, size: Size, batch: int, seed: int) -> NDArray[np.uin
             cells = mask(random_shape(random, size, max(min(size) // 8, 1)), size)
             element = random.choice(others)
             if random.random() < 0.5:
-                cells &= np.frombuffer(random.randbytes(height * width), np.uint8).reshape(size) < 128
+                half = np.frombuffer(random.randbytes(height * width), np.uint8).reshape(size) < 128
+                cells = cells & half
             world[cells] = element
         if frame is not None:
             world[edge] = frame

@@ -166,7 +166,6 @@ BINARY: dict[str, Callable[..., Any]] = {
     "where_flag": lambda np, a, b: np.where(a.astype(bool), b, a),
     "shift": lambda np, a, b: (a >> (b % 70), a << (b % 70)),
     "array_equal": lambda np, a, b: np.array_equal(a, b),
-    "power": lambda np, a, b: a**2,
     "clip": lambda np, a, b: np.clip(a, b, b) + a.dtype.type(0),
 }
 
@@ -194,25 +193,6 @@ def test_operations_with_numbers(name: str, pair: Any, number: Any, swapped: boo
     compare(call, (pair[0],), (pair[1],))
 
 
-IN_PLACE: dict[str, Callable[[Any, Any], Any]] = {
-    "+=": lambda a, b: a.__iadd__(b),
-    "-=": lambda a, b: a.__isub__(b),
-    "*=": lambda a, b: a.__imul__(b),
-    "|=": lambda a, b: a.__ior__(b),
-    "&=": lambda a, b: a.__iand__(b),
-}
-
-
-@settings(max_examples=100, deadline=None, derandomize=True)
-@given(st.sampled_from(sorted(IN_PLACE)), pairs(((4, 5), (3,), (1,))), pairs(((4, 5), (1, 5), (), (3,))))
-def test_operations_in_place(name: str, first: Any, second: Any) -> None:
-    def call(np: Any, a: Any, b: Any) -> Any:
-        changed = a.copy()
-        return IN_PLACE[name](changed, b), changed, a
-
-    compare(call, (first[0], second[0]), (first[1], second[1]))
-
-
 UNARY: dict[str, Callable[..., Any]] = {
     "neg": lambda np, a: -a,
     "invert": lambda np, a: ~a,
@@ -237,7 +217,7 @@ UNARY: dict[str, Callable[..., Any]] = {
     "concatenate": lambda np, a: (np.concatenate([a, a[:1]]), np.concatenate([a, a], -1), np.concatenate([a, np.arange(2)])),
     "repeat": lambda np, a: (np.repeat(a, 3, 0), np.repeat(a, 2, -1)),
     "reshape": lambda np, a: (a.reshape(-1), a.reshape(len(a), -1), a.reshape(-1, 1)),
-    "axes": lambda np, a: (np.moveaxis(a, -1, 0), np.moveaxis(a, 0, -1), np.swapaxes(a, 0, -1), a.T),
+    "axes": lambda np, a: (np.moveaxis(a, -1, 0), np.moveaxis(a, 0, -1)),
     "roll": lambda np, a: (np.roll(a, (1, -2), (-2, -1)), np.roll(a, 3, 0)),
     "isin": lambda np, a: (np.isin(a, [1, 5, 300, -1]), np.isin(a, [])),
     "broadcast": lambda np, a: np.broadcast_to(a, (3, 4, 5)),
@@ -351,8 +331,9 @@ def test_views_are_not_written_through() -> None:
     with pytest.raises(ValueError, match="writing to a view is not there without NumPy"):
         row[0] = 1
     array[0, 0] = 1
-    array += 1
-    assert array.tolist()[0] == [2, 1, 1, 1]
+    assert array.tolist()[0] == [1, 0, 0, 0]
+    with pytest.raises(TypeError):  # in NumPy every view of the array would see it
+        array += 1
     with pytest.raises(ValueError, match="view of an array that was written to is not there without NumPy"):
         row.tolist()
     with pytest.raises(ValueError, match="writing to a view"):

@@ -102,9 +102,12 @@ def test_archives_are_those_of_numpy(tmp_path):
             assert (found.dtype, found.shape, found.tobytes()) == (value.dtype, value.shape, value.tobytes())
 
 
-def test_arrays_in_other_orders_are_read(tmp_path):
+def test_what_numpy_saves_is_read(tmp_path):
     value = np.arange(24, dtype="i4").reshape(2, 3, 4)
-    np.savez(tmp_path / "a.npz", a=np.asfortranarray(value), c=np.array("x", "U3"))
+    np.savez(tmp_path / "a.npz", b=np.asfortranarray(value))
+    with pytest.raises(BadArchive, match="`b` is not in C order"), open_archive(tmp_path / "a.npz"):
+        pass
+    np.savez(tmp_path / "a.npz", a=value, c=np.array("x", "U3"))
     with open_archive(tmp_path / "a.npz") as archive:
         assert archive.headers["a"].dtype == "int32"
         assert (archive.read("a") == value).all()

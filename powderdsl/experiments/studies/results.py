@@ -13,7 +13,7 @@ from typing import Any
 from powderdsl.experiments.runs import RunFolder, mean_and_interval, read_metrics
 from powderdsl.experiments.studies.run import EVALUATION, Outcome
 from powderdsl.experiments.studies.study import Measure, Study
-from powderdsl.system.packages import require_matplotlib
+from powderdsl.system.packages import require
 from powderdsl.system.reading import read_json
 from powderdsl.system.writing import replacing
 
@@ -232,7 +232,7 @@ def draw(path: Path, panels: Sequence[Panel], title: str, *, follow: bool = Fals
     Raises:
         CompileError: PD612 without matplotlib, PD613 if the file cannot be written.
     """
-    require_matplotlib()
+    require("matplotlib", "drawing a plot", "pip install 'powderdsl[plot]'")
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(max(5.5 * len(panels), 6.5), 4.2), layout="constrained")

@@ -47,7 +47,7 @@ def pack(kind: ArrayKind, cells: Array) -> Array:
     missing = kind.zeros("uint8", (*batch, 64 * number - height, width))
     padded = xp.concatenate([xp.asarray(cells, dtype=xp.uint8), missing], axis=-2)
     bits = xp.asarray(padded.reshape(*batch, number, 64, width), dtype=xp.int64)
-    return kind.contiguous(xp.swapaxes((bits << kind.arange(64)[:, None]).sum(-2), -1, -2))
+    return kind.contiguous(xp.moveaxis((bits << kind.arange(64)[:, None]).sum(-2), -1, -2))
 
 
 def unpack(kind: ArrayKind, planes: Sequence[Array] | Array, height: int) -> Array:
@@ -61,7 +61,7 @@ def unpack(kind: ArrayKind, planes: Sequence[Array] | Array, height: int) -> Arr
     assert found is not None
     *batch, width, number = planes[0].shape
     columns = kind.as_bytes(found).reshape(*batch, width, 64 * number)
-    return kind.contiguous(kind.xp.swapaxes(columns[..., :height], -1, -2))
+    return kind.contiguous(kind.xp.moveaxis(columns[..., :height], -1, -2))
 
 
 @cache

@@ -302,7 +302,7 @@ def field_problem(grid: FieldGrid, world: AnyWorld) -> tuple[int, str] | None:
 
 def _ends(cell: Cell, vector: bool) -> NDArray[Any]:
     """The lowest and the highest value that a cell allows, [2], or [2, components] of a vector."""
-    ends = np.array(cell, float).T
+    ends = np.moveaxis(np.array(cell, float), 0, -1)
     return ends if vector else ends[:, 0]
 
 

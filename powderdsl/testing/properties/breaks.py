@@ -131,7 +131,7 @@ def _breaks_of(masks: Array, counts: Array | None = None) -> Breaks:
     batch, _, width = masks.shape[1:]
     broken = masks.reshape(len(masks), batch, -1).any(2)
     if counts is not None:
-        broken &= counts
+        broken = broken & counts
     first = np.where(broken.any(0), broken.argmax(0) + 1, 0)
     at_first = masks[np.maximum(first - 1, 0), np.arange(batch)].reshape(batch, -1)
     flat = at_first.argmax(1)
@@ -216,7 +216,7 @@ def differences(first: State, second: State) -> Array:
     wrong = np.zeros(first["element"].shape, bool)
     for name, values in first.items():
         unequal = values != second[name]
-        wrong |= unequal.any(1) if unequal.ndim == 4 else unequal
+        wrong = wrong | (unequal.any(1) if unequal.ndim == 4 else unequal)
     return wrong
 
 
@@ -266,7 +266,8 @@ def _alike(claim: Alike, runs: Runs, sample: Start) -> Array:
             a = turned_cells(first == element.id, claim.turn).sum(0) / claim.copies
             b = (second == element.id).sum(0) / claim.copies
             mean = (a + b) / 2
-            mask |= np.abs(a - b) > SIGMAS * np.sqrt(2 * mean * (1 - mean) / claim.copies) + 1e-9
+            margin = SIGMAS * np.sqrt(2 * mean * (1 - mean) / claim.copies) + 1e-9
+            mask = mask | (np.abs(a - b) > margin)
         masks.append(turned_back(mask, claim.turn))
     return np.stack(masks)
 

@@ -262,14 +262,14 @@ def turned_cells(values: Array, turn: str) -> Array:
     """An array [..., H, W]: left and right exchanged (``mirrored``), or a quarter turn clockwise (``rotated``)."""
     if turn == "mirrored":
         return values[..., ::-1].copy()
-    return np.swapaxes(values, -2, -1)[..., ::-1].copy()
+    return np.moveaxis(values, -1, -2)[..., ::-1].copy()
 
 
 def turned_back(values: Array, turn: str) -> Array:
     """The inverse of `turned_cells`."""
     if turn == "mirrored":
         return turned_cells(values, turn)
-    return np.swapaxes(values, -2, -1)[..., ::-1, :].copy()
+    return np.moveaxis(values, -1, -2)[..., ::-1, :].copy()
 
 
 def turned_values(slot: Slot, values: Array, turn: str) -> Array:

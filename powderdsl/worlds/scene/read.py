@@ -350,7 +350,7 @@ def draw_start(scene: Scene, ruleset: Ruleset, *, size: Size | None = None) -> S
             continue
         limited = _limited(held[one.name], ruleset)
         if limited is not None:
-            cells &= np.isin(now, sorted(limited))
+            cells = cells & np.isin(now, sorted(limited))
         if not cells.any():
             names = ", ".join(f"`{e.name}`" for e in ruleset.elements if e.id in (limited or ()))
             label, fix = (
