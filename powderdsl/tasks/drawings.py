@@ -429,8 +429,7 @@ def _drawn(
     try:
         return parse_ascii(art.content, [*elements, hole], reader.reporter, {"?": "?", **legend})
     except CompileError as error:
-        for one in error.diagnostics:
-            reader.reporter.error(one.code, one.message, one.primary.span or art.span, helps=one.helps)
+        pass_on(error, reader.reporter, art.span)
     except ValueError as error:
         reader.reporter.error("PD110", str(error), art.span)
     return None
@@ -462,6 +461,12 @@ def _named(word: yaml_tree.Scalar, reader: Reader, ruleset: Ruleset) -> NDArray[
             return None
         return draw_scene(found, ruleset)
     except CompileError as error:
-        for one in error.diagnostics:
-            reader.reporter.error(one.code, one.message, word.span, notes=one.notes, helps=one.helps)
+        pass_on(error, reader.reporter, word.span)
     return None
+
+
+def pass_on(error: CompileError, reporter: Reporter, place: Span) -> None:
+    """Report what is wrong with something that a task names, there if it has no place of its own."""
+    for mistake in error.diagnostics:
+        span, label = mistake.primary.span or place, mistake.primary.text
+        reporter.error(mistake.code, mistake.message, span, label, notes=mistake.notes, helps=mistake.helps)

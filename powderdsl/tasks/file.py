@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from powderdsl.compiler import load_with_diagnostics, names_in_file, read
-from powderdsl.diagnostics import CompileError, Reporter, Source, Span, suggest
+from powderdsl.diagnostics import CompileError, Reporter, Source, suggest
 from powderdsl.model.builtins import FUNCTIONS as RULE_FUNCTIONS
 from powderdsl.model.check import resolve_names
 from powderdsl.model.composition.palette import Palette
@@ -16,7 +16,6 @@ from powderdsl.model.schema import Entries, Key, Reader, first_line
 from powderdsl.model.state import fits, size_problem
 from powderdsl.model.types import Expr, Ruleset
 from powderdsl.syntax import yaml_tree
-from powderdsl.syntax.parse import parse_scalar
 from powderdsl.syntax.parse import reserved_words as rule_words
 from powderdsl.tasks.agents import read_agent, read_expert
 from powderdsl.tasks.drawings import (
@@ -24,6 +23,7 @@ from powderdsl.tasks.drawings import (
     Drawer,
     DrawingPlan,
     element_ids,
+    pass_on,
     read_items,
     read_lets,
     read_stamp,
@@ -42,6 +42,9 @@ from powderdsl.worlds.scene.statements import (
     reserved_words,
     text_span,
 )
+
+MAX_ACTIONS, MAX_STEPS, MAX_PLANS = 1_000_000, 100_000, 10_000
+"""The most actions of an episode, steps after one, and plans of a search."""
 
 _VARIANT = {
     "knobs": Key("mapping", "other values for knobs"),
@@ -86,13 +89,15 @@ TASK_KEYS: dict[str, dict[str, Key]] = {
     },
     "agent": {
         "may": Key("words", "elements it may place, `any`, `blow`, `nothing`", True),
-        "speed": Key("number", "the speed that blowing gives to cells"),
+        "speed": Key("word", "the speed that blowing gives to cells"),
         "speed_field": Key("word", "the field that blowing sets; the ruleset's only vector, if it has one"),
         "brush": Key("any", "cells that an action changes: a number, or [rows, columns]; 10 by default"),
         "bins": Key("any", "places that it can act at: a number, or [rows, columns]; 16 by default"),
-        "actions": Key("number", "how many actions an episode has", True),
-        "steps_per_action": Key("number", "steps after each action; 1 by default"),
-        "free_steps": Key("number", "steps after the last action, besides; 0 by default"),
+        "actions": Key("number", "how many actions an episode has", True, bounds=(1, MAX_ACTIONS)),
+        "steps_per_action": Key("number", "steps after each action; 1 by default", bounds=(0, MAX_STEPS)),
+        "free_steps": Key(
+            "number", "steps after the last action, besides; 0 by default", bounds=(0, MAX_STEPS)
+        ),
     },
     "reward": {
         "each": Key("line", "given after every action"),
@@ -105,15 +110,22 @@ TASK_KEYS: dict[str, dict[str, Key]] = {
     },
     "expert": {
         "search": Key(
-            "number", "random plans that are simulated in each world; the best one is played", True
+            "number",
+            "random plans that are simulated in each world; the best one is played",
+            True,
+            bounds=(1, MAX_PLANS),
         ),
     },
     "move": {
         "choose": Key("word", "what it does: an element, `blow` or `nothing`", True),
         "toward": Key("word", "where it blows: `left`, `right`, `above`, `below`, or both as `above.right`"),
         "at": Key("any", "where: `[row, column]`, or `most(CELLS)`, the block with most of these cells"),
-        "within": Key("line", "a shape: only its cells count for `most`"),
-        "least": Key("number", "how many cells `most` must find for the move to apply; 1 by default"),
+        "within": Key("word", "a shape: only its cells count for `most`"),
+        "least": Key(
+            "number",
+            "how many cells `most` must find for the move to apply; 1 by default",
+            bounds=(1, MAX_SIDE * MAX_SIDE),
+        ),
         "if": Key("line", "when: a condition; the first move whose condition holds is played"),
     },
     "split": {
@@ -157,52 +169,37 @@ def read_task(
     assert tree is not None
     reader = Reader(reporter, TASK_KEYS)
     entries = reader.mapping(tree, "task", "a task")
-    rules = _read_rules(reader, entries, source, params, packs, palette)
-    if rules is None:
+    values = reader.values(entries, "task")
+    word = values.get("rules")
+    names = None
+    if word is not None and word.text:
+        written = _written_params(reader, values.get("params"))
+        names = names_in_file(word.text, word.span, reporter)
+    if names is None:
         reporter.raise_if_errors()
         raise AssertionError("a task without rules was not reported")
-    return _TaskReader(reader, entries, *rules, knobs or {}).task()
-
-
-def _read_rules(
-    reader: Reader,
-    entries: Entries,
-    source: Source,
-    params: Mapping[str, Any] | None,
-    packs: Sequence[str],
-    palette: Palette | None,
-) -> tuple[Ruleset, Typer, tuple[str, ...]] | None:
-    """The ruleset, what checks expressions against it, and what was loaded.
-
-    Mistakes in the rules are reported here.
-    """
-    word = reader.scalar(entries, "rules")
-    if word is None or not word.text:
-        return None
-    written: dict[str, Any] = {}
-    node = entries["params"][1] if "params" in entries else None
-    for key, value in node.entries if isinstance(node, yaml_tree.Mapping) else ():
-        if isinstance(value, yaml_tree.Scalar):
-            written[key.text] = value.text
-        else:
-            reader.shape(value, "a single value")
-    names = names_in_file(word.text, word.span, reader.reporter)
-    if names is None:
-        return None
     rules = (*names, *packs)
     try:
         ruleset, _ = load_with_diagnostics(*rules, params={**written, **(params or {})}, palette=palette)
     except CompileError as error:
-        for one in error.diagnostics:
-            place = one.primary.span or word.span
-            reader.reporter.error(
-                one.code, one.message, place, one.primary.text, notes=one.notes, helps=one.helps
-            )
-        return None
+        pass_on(error, reporter, word.span)
+        reporter.raise_if_errors()
+        raise
     loaded, decl = read(rules, Reporter())
     typer, _ = resolve_names(loaded, decl, Reporter(), palette)
-    typer.reporter = typer.unknown.reporter = reader.reporter
-    return ruleset, typer, rules
+    typer.reporter = typer.unknown.reporter = reporter
+    return _TaskReader(reader, entries, values, ruleset, typer, rules, knobs or {}).task()
+
+
+def _written_params(reader: Reader, node: yaml_tree.Node | None) -> dict[str, str]:
+    """The text of each parameter of the rules that the file sets."""
+    params = {}
+    for key, value in node.entries if isinstance(node, yaml_tree.Mapping) else ():
+        if isinstance(value, yaml_tree.Scalar):
+            params[key.text] = value.text
+        else:
+            reader.shape(value, "a single value")
+    return params
 
 
 class _TaskReader:
@@ -212,67 +209,76 @@ class _TaskReader:
         self,
         reader: Reader,
         entries: Entries,
+        values: dict[str, Any],
         ruleset: Ruleset,
         typer: Typer,
         rules: tuple[str, ...],
         given: Mapping[str, int],
     ):
-        self.reader, self.reporter, self.entries = reader, reader.reporter, entries
-        self.ruleset, self.typer, self.given = ruleset, typer, given
-        self.rules = rules
+        self.reader, self.reporter, self.entries, self.values = reader, reader.reporter, entries, values
+        self.ruleset, self.typer, self.rules, self.given = ruleset, typer, rules, given
         own, _ = read(rules[:1], Reporter())
         self.own = {pack.name.text for pack in own}
         """The packs of the task's own rules: it does not know the names of added ones."""
-        self.taken: dict[str, Span] = {}
+        self.taken: set[str] = set()
         self.broken: set[str] = set()
 
     def task(self) -> Task:
-        name = self.reader.scalar(self.entries, "task")
+        name, family = self.values.get("task"), self.values.get("family")
         if name is not None:
             can_be_called(name, "a task", self.reporter)
-        size = self.size()
-        fill = self.fill()
-        knobs = self.knobs()
-        values = {knob.name: knob.value for knob in knobs}
+        size, fill, knobs = self.size(), self.fill(), self.knobs()
+        lets = read_lets(self.values.get("let"), self.reader)
+        for word, _ in lets:
+            self.take(word)
         plan = DrawingPlan(
             "train",
             fill,
-            values,
-            self.names(read_lets(self.node("let"), self.reader)),
+            {knob.name: knob.value for knob in knobs},
+            lets,
             self.regions(),
             self.stamps(),
             self.lists("parts", "a part"),
             self.lists("targets", "a target"),
-            read_items(self.node("generate"), self.reader),
+            read_items(self.values.get("generate"), self.reader),
             frozenset(self.broken),
         )
         splits, used = self.splits(plan, size)
-        agent = read_agent(self.reader, self.entries.get("agent"), self.ruleset, size)
         checker = GoalChecker(self.typer, frozenset(plan.regions), frozenset(plan.targets), plan.knobs)
+        agent = expert = None
+        if "agent" in self.entries:
+            agent = read_agent(self.reader, *self.entries["agent"], self.ruleset, size)
         goal = self.goal(checker)
-        node = self.node("expert")
-        expert = (
-            read_expert(self.reader, node, agent, size, self.ruleset, checker) if node and agent else None
-        )
-        self.unused(plan, used)
+        if agent is not None and agent.choices and "expert" in self.values:
+            node = self.values["expert"]
+            expert = read_expert(self.reader, node, agent, size, self.ruleset, checker)
+        parts = self.values.get("parts")
+        for key, _ in parts.entries if isinstance(parts, yaml_tree.Mapping) else ():
+            if key.text in plan.parts and key.text not in used:
+                message = f"the part `{key.text}` is never used"
+                self.reporter.report("PD507", message, key.span, "no list has it", helps=["remove it"])
         self.typer.unknown.report()
         self.reporter.raise_if_errors()
         assert name is not None
         assert agent is not None
-        about = self.reader.text(self.entries, "about")
-        family = self.reader.scalar(self.entries, "family")
-        word = family.text if family else ""
         return Task(
-            name.text, about, self.ruleset, size, knobs, agent, goal, splits, expert, self.rules, word
+            name.text,
+            self.values.get("about", ""),
+            self.ruleset,
+            size,
+            knobs,
+            agent,
+            goal,
+            splits,
+            expert,
+            self.rules,
+            family.text if family else "",
         )
-
-    def node(self, key: str) -> yaml_tree.Node | None:
-        return self.entries[key][1] if key in self.entries else None
 
     # What worlds are made of
 
     def size(self) -> Size:
-        node = self.node("size")
+        node = self.values.get("size")
         if node is None:
             return 64, 64
         size = two_integers(node)
@@ -286,10 +292,8 @@ class _TaskReader:
         return size
 
     def fill(self) -> int:
-        scalar = self.reader.scalar(self.entries, "fill")
-        if scalar is None:
-            return 0
-        ids = element_ids(Word(scalar.text, scalar.span), self.ruleset, self.reporter)
+        name = self.values.get("fill")
+        ids = element_ids(Word(name.text, name.span), self.ruleset, self.reporter) if name else ()
         return ids[0] if ids else 0
 
     def take(self, word: yaml_tree.Scalar | Word) -> None:
@@ -299,12 +303,12 @@ class _TaskReader:
         elif word.text in self.taken:
             message = f"`{word.text}` already means something"
             self.reporter.error("PD308", message, word.span, "second meaning")
-        elif self._is_name(word.text):
+        elif self.is_name(word.text):
             label = "the rules use this word"
             self.reporter.error("PD308", f"`{word.text}` hides another `{word.text}`", word.span, label)
-        self.taken[word.text] = word.span
+        self.taken.add(word.text)
 
-    def _is_name(self, word: str) -> bool:
+    def is_name(self, word: str) -> bool:
         """Whether a word means something in the task's own rules."""
         symbols = self.typer.symbols
         owner = symbols.composition.names.owners.get(word)
@@ -312,14 +316,9 @@ class _TaskReader:
             self.ruleset.element(word) or symbols.constants.get(word)
         )
 
-    def names(self, lets: list[tuple[Word, Any]]) -> list[tuple[Word, Any]]:
-        for word, _ in lets:
-            self.take(word)
-        return lets
-
     def knobs(self) -> tuple[Knob, ...]:
         found: dict[str, Knob] = {}
-        for key, node in self.reader.named(self.node("knobs"), "a knob"):
+        for key, node in self.reader.named(self.values.get("knobs"), "a knob"):
             self.take(key)
             self.broken.add(key.text)
             knob = self.knob(key, self.reader.mapping(node, "knob", "a knob"), found)
@@ -360,7 +359,7 @@ class _TaskReader:
 
     def regions(self) -> dict[str, tuple[Statement, ...]]:
         found = {}
-        for key, node in self.reader.named(self.node("regions"), "a region"):
+        for key, node in self.reader.named(self.values.get("regions"), "a region"):
             self.take(key)
             shapes = []
             for item in node.items if isinstance(node, yaml_tree.Sequence) else (node,):
@@ -374,24 +373,21 @@ class _TaskReader:
 
     def stamps(self) -> dict[str, Stamp]:
         found = {}
-        for key, node in self.reader.named(self.node("stamps"), "a stamp"):
+        for key, node in self.reader.named(self.values.get("stamps"), "a stamp"):
             stamp = read_stamp(key, node, self.reader, self.ruleset)
             found[key.text] = stamp or Stamp(key.text, ((255,),))
         return found
 
     def lists(self, section: str, what: str) -> dict[str, Any]:
-        return {
-            key.text: read_items(node, self.reader)
-            for key, node in self.reader.named(self.node(section), what)
-        }
+        named = self.reader.named(self.values.get(section), what)
+        return {key.text: read_items(node, self.reader) for key, node in named}
 
     # Splits
 
     def splits(self, plan: DrawingPlan, size: Size) -> tuple[tuple[Split, ...], set[str]]:
         """All splits, and the parts that any of them uses."""
-        about = self.reader.text(self.entries, "about")
-        plans = [("train", about, [plan])]
-        for key, node in self.reader.named(self.node("splits"), "a split"):
+        plans = [("train", self.values.get("about", ""), [plan])]
+        for key, node in self.reader.named(self.values.get("splits"), "a split"):
             entries = self.reader.mapping(node, "split", "a split")
             base = self.varied(plan, entries, key.text)
             variants = self.stands(base, entries["stands"][1]) if "stands" in entries else [base]
@@ -425,61 +421,39 @@ class _TaskReader:
 
     def varied(self, plan: DrawingPlan, entries: Entries, name: str) -> DrawingPlan:
         """The plan with what a split or stand changes."""
-        changes: dict[str, Any] = {"name": name}
-        if "knobs" in entries:
-            values = dict(plan.knobs)
-            for word, amount in read_lets(entries["knobs"][1], self.reader):
-                self.known(word, plan.knobs, "knob")
-                if amount is BROKEN:
-                    continue
-                filled = filled_in(amount, plan.knobs)
-                if filled.is_number:
-                    values[word.text] = filled.integer
-                else:
-                    self.reporter.error("PD803", "a knob is one number", amount.span, "not an integer")
-            changes["knobs"] = values
-        if "let" in entries:
-            here = dict.fromkeys(word.text for word, _ in plan.lets)
-            other = {}
-            for word, amount in read_lets(entries["let"][1], self.reader):
-                self.known(word, here, "number")
-                other[word.text] = amount
-            changes["lets"] = [(word, other.get(word.text, amount)) for word, amount in plan.lets]
-        if "parts" in entries:
-            parts = dict(plan.parts)
-            for key, node in self.reader.named(entries["parts"][1], "a part"):
-                self.known(key, plan.parts, "part")
-                parts[key.text] = read_items(node, self.reader)
-            changes["parts"] = parts
-        if "generate" in entries:
-            changes["items"] = read_items(entries["generate"][1], self.reader)
-        return replace(plan, **changes)
+        nodes = {key: node for key, (_, node) in entries.items()}
+        knobs = dict(plan.knobs)
+        for word, amount in read_lets(nodes.get("knobs"), self.reader):
+            self.known(word, plan.knobs, "knob")
+            filled = filled_in(amount, plan.knobs)
+            if filled.is_number:
+                knobs[word.text] = filled.integer
+            elif amount is not BROKEN:
+                self.reporter.error("PD803", "a knob is one number", amount.span, "not an integer")
+        lets = {word.text: (word, amount) for word, amount in plan.lets}
+        for word, amount in read_lets(nodes.get("let"), self.reader):
+            self.known(word, lets, "number")
+            if word.text in lets:
+                lets[word.text] = lets[word.text][0], amount
+        parts = dict(plan.parts)
+        for key, node in self.reader.named(nodes.get("parts"), "a part"):
+            self.known(key, plan.parts, "part")
+            parts[key.text] = read_items(node, self.reader)
+        items = read_items(nodes["generate"], self.reader) if "generate" in nodes else plan.items
+        return replace(plan, name=name, knobs=knobs, lets=list(lets.values()), parts=parts, items=items)
 
     def known(self, word: Word | yaml_tree.Scalar, known: Mapping[str, object], what: str) -> None:
         if word.text not in known:
             report_unknown(what, Word(word.text, word.span), known, self.reporter)
 
-    def unused(self, plan: DrawingPlan, used: set[str]) -> None:
-        """Warn of parts that nothing uses."""
-        node = self.node("parts")
-        for key, _ in node.entries if isinstance(node, yaml_tree.Mapping) else ():
-            if key.text in plan.parts and key.text not in used:
-                message = f"the part `{key.text}` is never used"
-                self.reporter.report("PD507", message, key.span, "no list has it", helps=["remove it"])
-
-    # What counts
-
     def goal(self, checker: GoalChecker) -> Goal:
-        found: dict[str, Expr | None] = {}
-        for section in ("reward", "end"):
-            node = self.node(section)
-            entries = self.reader.mapping(node, section, f"`{section}`") if node is not None else {}
+        expressions: dict[str, Expr | None] = {}
+        for section, check in (("reward", checker.number), ("end", checker.condition)):
+            node = self.values.get(section)
             if isinstance(node, yaml_tree.Mapping) and not node.entries:
                 helps = [", ".join(f"`{key}`: {row.about}" for key, row in TASK_KEYS[section].items())]
                 self.reporter.error("PD109", f"`{section}` says nothing", node.span, "empty", helps=helps)
-            for key in TASK_KEYS[section]:
-                scalar = self.reader.scalar(entries, key)
-                syntax = parse_scalar(scalar, "expression", self.reporter) if scalar else None
-                if syntax is not None:
-                    found[key] = checker.number(syntax) if section == "reward" else checker.condition(syntax)
-        return Goal(*(found.get(name) for name in ("each", "final", "success", "failure", "shaped")))
+            elif node is not None:
+                lines = self.reader.read(node, section, f"`{section}`")
+                expressions |= {key: check(syntax) for key, syntax in lines.items()}
+        return Goal(*(expressions.get(key) for key in ("each", "final", "success", "failure", "shaped")))
