@@ -102,7 +102,8 @@ class LevelProgram:
             ids, x, y, where = (torch.from_numpy(part).to(self.device) for part in (ids, x, y, where))
         values = self.blocks.fresh_cells(stepped.state, ids)
         reuse = reuse or packed  # a step makes a packed state of its own
-        return stepped.with_state(self.blocks.filled(stepped.state, y, x, where, values, reuse=reuse))
+        cells = self.blocks.cells(stepped.state, y, x)
+        return stepped.with_state(self.blocks.filled(stepped.state, cells, where, values, reuse=reuse))
 
     def errors(self, ids: Tensor, goals: Tensor) -> Numbers:
         """Cells of goals, uint8 [B, H, W], whose element is neither there in `ids` nor beside it: int64 [B]."""

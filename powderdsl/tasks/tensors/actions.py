@@ -85,31 +85,28 @@ class Blocks:
         tables: Mapping[str, Any] = self._arrays if isinstance(state, PackedState) else self.fresh
         return {name: table[ids] for name, table in tables.items()}
 
+    def cells(self, state: Mapping[str, Tensor], rows: Numbers, columns: Numbers) -> Any:
+        """The blocks at bins of rows and columns, as `filled` takes them: boxes for a packed state, else numbers of cells."""
+        if isinstance(state, PackedState):
+            return np.concatenate([self._edges[0][rows], self._edges[1][columns]], 1)
+        lines, across = self._lines[0][rows], self._lines[1][columns]
+        return (lines[:, :, None] * self.size[1] + across[:, None]).flatten(1)
+
     def filled(
-        self,
-        state: Mapping[str, Tensor],
-        rows: Numbers,
-        columns: Numbers,
-        where: Any,
-        values: Mapping[str, Any],
-        *,
-        reuse: bool,
+        self, state: Mapping[str, Tensor], cells: Any, where: Any, values: Mapping[str, Any], *, reuse: bool
     ) -> Mapping[str, Tensor]:
-        """A state with the block at bins `rows` and `columns` filled in the worlds of `where`, bool [B].
+        """A state with blocks, which `cells` gave, filled in the worlds of `where`, bool [B].
 
         Args:
             values: a value a world, [B] or [B, 2]. All are arrays for a packed state, and tensors for others.
             reuse: write into the tensors of `state`.
         """
         if isinstance(state, PackedState):  # only the blocks are written, nothing is unpacked
-            boxes = np.concatenate([self._edges[0][rows], self._edges[1][columns]], 1) * where[:, None]
             numbers = {
                 name: torch.from_numpy(value if value.dtype == np.float32 else value.astype(np.int64))
                 for name, value in values.items()
             }
-            return state.fill(torch.from_numpy(boxes), numbers, reuse=reuse)
-        lines, across = self._lines[0][rows], self._lines[1][columns]
-        cells = (lines[:, :, None] * self.size[1] + across[:, None]).flatten(1)
+            return state.fill(torch.from_numpy(cells * where[:, None]), numbers, reuse=reuse)
         found = dict(state)
         for name, value in values.items():
             slot = state[name] if reuse else state[name].clone()
@@ -165,12 +162,13 @@ class Hands:
         state, packed = world.state, isinstance(world.state, PackedState)
         numbers: Any = actions.numpy() if packed else actions
         choice = (self._choices if packed else self.choices)[numbers[:, 2]]
-        rows, columns, blown, placed = numbers[:, 1], numbers[:, 0], choice == BLOW, choice >= 0
+        blown, placed = choice == BLOW, choice >= 0
+        cells = self.blocks.cells(state, numbers[:, 1], numbers[:, 0])
         painted = torch.zeros(len(choice), dtype=torch.int64, device=self.device)
         if self.places_elements:
             before = state["element"].clone() if self.counts else None
             values = self.blocks.fresh_cells(state, choice.clip(0))
-            state = self.blocks.filled(state, rows, columns, placed, values, reuse=reuse)
+            state = self.blocks.filled(state, cells, placed, values, reuse=reuse)
             if before is not None:
                 painted = (before != state["element"]).sum((1, 2))
         if self.agent.speed_field is not None:
@@ -179,6 +177,6 @@ class Hands:
             speed = speed.astype(np.float32) if packed else speed.float()
             values = {self.agent.speed_field: speed}
             own = reuse or (packed and state is not world.state)
-            state = self.blocks.filled(state, rows, columns, blown, values, reuse=own)
+            state = self.blocks.filled(state, cells, blown, values, reuse=own)
         done = {"placed": torch.as_tensor(placed).long(), "blown": torch.as_tensor(blown).long()}
         return world.with_state(state), {"painted": painted, **done}
