@@ -6,7 +6,7 @@ Worlds that are packed in native memory are read from there; all others are tens
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -56,6 +56,7 @@ class Observer:
         self.device = torch.empty(0, device=device).device  # with its number
         self.slots: dict[str, Slot] = {slot.name: slot for slot in slots(ruleset)}
         self._tables: dict[str, Tensor] = {}
+        self._tints = tints(ruleset.fields)
 
     @torch.no_grad()
     def read(self, state: State, name: str, out: Any = None) -> Tensor:
@@ -82,8 +83,13 @@ class Observer:
     @torch.no_grad()
     def rgb(self, state: State, out: Any = None) -> Tensor:
         """Pictures uint8 [B, H, W, 3], a pixel a cell, in the elements' colors, which may follow fields; then tints."""
-        out = self._buffer(out, (*shape_of(state), 3), torch.uint8)
-        _write_rgb(state, self._palette, out)
+        out, colors = self._buffer(out, (*shape_of(state), 3), torch.uint8), self._palette
+        if isinstance(state, PackedState):
+            library, (slot, bits, _) = state.program.library, state.program.planes_of("element")
+            library.pd_rgb(state.handle, slot, bits, address(colors), address(out), out.stride(0))
+        else:
+            ids = state["element"].flatten().int()
+            out.copy_(colors[:, :3].index_select(0, ids).view(out.shape))  # faster than an index
         for ramp in self._ramps:
             _write_ramp(state, ramp, out)
         for tint in self._tints:
@@ -96,7 +102,30 @@ class Observer:
         batch, height, width = shape_of(state)
         channels, tables = self._channels
         out = self._buffer(out, (batch, len(channels), height, width), torch.float32)
-        _write_channels(state, channels, tables, out)
+        if isinstance(state, PackedState):
+            wanted = torch.tensor([_native_channel(one, state) for one in channels], dtype=torch.int32)
+            state.program.library.pd_channels(
+                state.handle, len(channels), address(wanted), address(tables), address(out), out.stride(0)
+            )
+            return out
+        at = 0
+        while at < len(channels):
+            channel, end = channels[at], at + 1
+            if channel.kind == "one_hot":  # consecutive numbers together
+                while end < len(channels) and channels[end] == replace(
+                    channel, value=channel.value + end - at
+                ):
+                    end += 1
+                last = channel.value + end - at
+                numbers = torch.arange(channel.value, last, device=out.device, dtype=torch.uint8)
+                out[:, at:end] = state[channel.slot][:, None] == numbers[:, None, None]
+            elif channel.kind == "table":
+                out[:, at] = tables[channel.value][state[channel.slot].int()]
+            elif channel.kind == "slot":
+                out[:, at] = _component(state, channel.slot)
+            else:
+                out[:, at] = 0
+            at = end
         return out
 
     @torch.no_grad()
@@ -113,7 +142,14 @@ class Observer:
         """Packed planes int64 [B, P, H, ⌈W/64⌉], in the order of `plane_names`."""
         batch, height, width = shape_of(state)
         out = self._buffer(out, (batch, len(self._bits), height, word_count(width)), torch.int64)
-        _write_planes(state, self._bits, out)
+        if isinstance(state, PackedState):
+            program = state.program
+            slots = [program.planes_of(name)[0] + bit for name, bit in self._bits]
+            numbers = torch.tensor(slots, dtype=torch.int32)
+            program.library.pd_planes(state.handle, len(slots), address(numbers), address(out), out.stride(0))
+            return out
+        for place, (name, bit) in enumerate(self._bits):
+            out[:, place] = pack((state[name] >> bit) & 1 != 0)
         return out
 
     @cached_property
@@ -192,19 +228,11 @@ class Observer:
     @cached_property
     def _ramps(self) -> tuple[Ramp, ...]:
         """As tensors, with four bytes a color."""
-        found = ramps(self.ruleset.elements)
-        return tuple(
-            replace(
-                ramp,
-                starts=torch.from_numpy(ramp.starts).to(self.device),
-                colors=self._colors(ramp.colors, len(ramp.colors)),
-            )
-            for ramp in found
-        )
-
-    @cached_property
-    def _tints(self) -> tuple[CellTint, ...]:
-        return tints(self.ruleset.fields)
+        found = []
+        for ramp in ramps(self.ruleset.elements):
+            starts = torch.from_numpy(ramp.starts).to(self.device)
+            found.append(replace(ramp, starts=starts, colors=self._colors(ramp.colors, len(ramp.colors))))
+        return tuple(found)
 
     def _colors(self, colors: Any, count: int) -> Tensor:
         """Colors uint8 [n, 3] with a fourth byte, and black up to `count` of them."""
@@ -257,16 +285,6 @@ def _write_slot(state: State, name: str, out: Tensor) -> Tensor:
     return out.copy_(state[name])
 
 
-def _write_rgb(state: State, colors: Tensor, out: Tensor) -> None:
-    """Write the elements' colors uint8 [B, H, W, 3]. `colors` is uint8 [256, 4]."""
-    if isinstance(state, PackedState):
-        slot, bits, _ = state.program.planes_of("element")
-        state.program.library.pd_rgb(state.handle, slot, bits, address(colors), address(out), out.stride(0))
-    else:
-        ids = state["element"].flatten().int()
-        out.copy_(colors[:, :3].index_select(0, ids).view(out.shape))  # faster than an index
-
-
 def _write_ramp(state: State, ramp: Ramp, out: Tensor) -> None:
     """Color the cells of a ramp's element in pictures uint8 [B, H, W, 3]; others stay."""
     if isinstance(state, PackedState):
@@ -293,33 +311,6 @@ def _write_tint(state: State, tint: CellTint, out: Tensor) -> None:
         program.library.pd_tint(state.handle, row, column, address(numbers), address(out), out.stride(0))
     else:
         tint_cells(out, state[tint.field], tint)
-
-
-def _write_channels(state: State, channels: Sequence[Channel], tables: Tensor, out: Tensor) -> None:
-    """Write channels float32 [B, C, H, W]. `tables` is float32 [n, 256]."""
-    if isinstance(state, PackedState):
-        wanted = torch.tensor([_native_channel(c, state) for c in channels], dtype=torch.int32)
-        state.program.library.pd_channels(
-            state.handle, len(channels), address(wanted), address(tables), address(out), out.stride(0)
-        )
-        return
-    at = 0
-    while at < len(channels):
-        channel, end = channels[at], at + 1
-        if channel.kind == "one_hot":  # consecutive numbers together
-            while end < len(channels) and channels[end] == replace(channel, value=channel.value + end - at):
-                end += 1
-            numbers = torch.arange(
-                channel.value, channel.value + end - at, device=out.device, dtype=torch.uint8
-            )
-            out[:, at:end] = state[channel.slot][:, None] == numbers[:, None, None]
-        elif channel.kind == "table":
-            out[:, at] = tables[channel.value][state[channel.slot].int()]
-        elif channel.kind == "slot":
-            out[:, at] = _component(state, channel.slot)
-        else:
-            out[:, at] = 0
-        at = end
 
 
 def _component(state: State, name: str) -> Tensor:
@@ -383,14 +374,3 @@ def _floor(slot: Slot) -> float:
 def _is_small(slot: Slot) -> bool:
     """Whether eight bits hold every value."""
     return slot.dtype in ("uint8", "int8")
-
-
-def _write_planes(state: State, names: Sequence[tuple[str, int]], out: Tensor) -> None:
-    """Write packed planes int64 [B, P, H, ⌈W/64⌉], slots and bits by `names`; bits beyond the width are zero."""
-    if isinstance(state, PackedState):
-        program = state.program
-        slots = torch.tensor([program.planes_of(name)[0] + bit for name, bit in names], dtype=torch.int32)
-        program.library.pd_planes(state.handle, len(names), address(slots), address(out), out.stride(0))
-        return
-    for i, (name, bit) in enumerate(names):
-        out[:, i] = pack((state[name] >> bit) & 1 != 0)

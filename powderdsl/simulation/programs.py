@@ -96,11 +96,13 @@ def make_program(ruleset: Ruleset, backend: str, device: torch.device, threads: 
     Raises:
         CompileError: PD701 if the backend is not available.
     """
+    from powderdsl.targets.torch.program import TorchProgram
+
     if backend == "reference":
         return ReferenceProgram(ruleset, Tensors(device))
     # Both are made when first needed: code that was compiled before needs neither.
     lowered = cache(lambda: lower(ruleset))
-    cells = cache(lambda: _torch_program(lowered(), device))
+    cells = cache(lambda: TorchProgram(lowered(), device))
     if backend == "torch":
         return cells()
     if backend == "wasm":
@@ -117,12 +119,6 @@ def make_program(ruleset: Ruleset, backend: str, device: torch.device, threads: 
         begin = cache(lambda: _wasm_program(lowered(), device)) if first == "wasm" else cells
         return auto_by_width(ruleset, lowered, threads, (first, begin), cells)
     return cells()
-
-
-def _torch_program(program: Program, device: torch.device) -> Runnable:
-    from powderdsl.targets.torch.program import TorchProgram
-
-    return TorchProgram(program, device)
 
 
 def _wasm_program(program: Program, device: torch.device) -> Runnable:
@@ -204,12 +200,6 @@ def latest_width(ruleset: Ruleset, lowered: Lowered) -> int:
     if code is None:
         lowered()
     return 0 if code is None else code.width
-
-
-def ready_program(ruleset: Ruleset, lowered: Lowered, threads: int, width: int) -> Runnable | None:
-    """A program that was compiled before, or None. Raises NoCompiler if there is no compiler."""
-    code = recall(start_key(ruleset, width))
-    return None if code is None else _recalled(code, lowered, threads, width)
 
 
 def native_program(ruleset: Ruleset, lowered: Lowered, threads: int, width: int) -> Runnable:
@@ -304,50 +294,13 @@ def auto_by_width(
         lowered()
 
     def make(width: int) -> AutoProgram:
-        return AutoProgram(
-            first,
-            asked,
-            lambda: ready_program(ruleset, lowered, threads, width),
-            lambda: native_program(ruleset, lowered, threads, width),
-        )
+        def ready() -> Runnable | None:
+            code = recall(start_key(ruleset, width))
+            return None if code is None else _recalled(code, lowered, threads, width)
+
+        return AutoProgram(first, asked, ready, lambda: native_program(ruleset, lowered, threads, width))
 
     return ByWidth(make, latest)
-
-
-class Build:
-    """Native code being compiled, in a thread that waits for the compiler and ends with the process."""
-
-    def __init__(self, make: Callable[[], Runnable]):
-        self._make = make
-        self._began = time.perf_counter()
-        self._took: float | None = None
-        self.program: Runnable | None = None
-        self.problem = ""
-        self._thread = threading.Thread(target=copy_context().run, args=(self._run,), daemon=True)
-        self._thread.start()
-
-    def _run(self) -> None:
-        try:
-            self.program = self._make()
-        except NoCompiler as error:
-            self.problem = str(error)
-        except Exception as error:  # what runs continues; `--backend native` shows what is wrong
-            self.problem = f"{type(error).__name__}: {error}"
-        self._took = time.perf_counter() - self._began
-
-    def wait(self) -> None:
-        """Return when the build has ended."""
-        self._thread.join()
-
-    @property
-    def seconds(self) -> float:
-        """How long the build took, or has taken so far."""
-        return time.perf_counter() - self._began if self._took is None else self._took
-
-    @property
-    def lost(self) -> bool:
-        """Whether the build's thread is gone: a fork has its parent's memory, but not its threads."""
-        return self._took is None and not self._thread.is_alive()
 
 
 class AutoProgram:
@@ -368,7 +321,9 @@ class AutoProgram:
         make: Callable[[], Runnable],
     ):
         (self._name, self._first), self._asked, self._make = first, asked, make
-        self._build: Build | None = None
+        self._thread: threading.Thread | None = None
+        self._began = 0.0
+        self._took: float | None = None
         self._native: Runnable | None = None
         self._problem = ""
         self._beginning = threading.Lock()
@@ -383,32 +338,28 @@ class AutoProgram:
     @property
     def running(self) -> str:
         """What the next step runs on: ``wasm``, ``torch`` or ``native``."""
-        return self._name if self._arrived() is None else "native"
+        return self._name if self._native is None else "native"
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Sentences about which backend ran, and why."""
-        native, steps, build, first = self._arrived(), self._steps, self._build, self._name
-        found = []
-        if native is not None and build is None:
-            found.append("native: it was compiled before")
-        elif native is not None and build is not None:
-            found.append(
-                f"{first} for {steps['first']} steps while native was made ready ({build.seconds:.0f} s), "
-                f"then native for {steps['native']}"
-            )
+        thread, steps, first = self._thread, self._steps, self._name
+        seconds = time.perf_counter() - self._began if self._took is None else self._took
+        if self._native is not None and thread is None:
+            sentences = ["native: it was compiled before"]
+        elif self._native is not None:
+            ready = f"while native was made ready ({seconds:.0f} s), then native for {steps['native']}"
+            sentences = [f"{first} for {steps['first']} steps {ready}"]
         elif self._problem:
-            found.append(f"{first}: {self._problem}")
-            found.append(f"native code is faster: {INSTALL}")
-        elif build is not None and not build.lost:
-            found.append(
-                f"{first} for {steps['first']} steps; native is being made ready ({build.seconds:.0f} s)"
-            )
+            sentences = [f"{first}: {self._problem}", f"native code is faster: {INSTALL}"]
+        elif thread is not None and thread.is_alive():
+            ready = f"native is being made ready ({seconds:.0f} s)"
+            sentences = [f"{first} for {steps['first']} steps; {ready}"]
         else:
-            found.append(f"{first}: native is compiled from {WORTH:g} s of work, or by --backend native")
+            sentences = [f"{first}: native is compiled from {WORTH:g} s of work, or by --backend native"]
         if steps["asked"]:
-            found.append(f"torch for {steps['asked']} steps with given draws or chosen passes")
-        return tuple(found)
+            sentences.append(f"torch for {steps['asked']} steps with given draws or chosen passes")
+        return tuple(sentences)
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
         """The state `job.steps` later."""
@@ -416,10 +367,10 @@ class AutoProgram:
             self._steps["asked"] += job.steps
             return self._asked().run(job)
         if job.timing is not None:
-            return (self._arrived() or self._first()).run(job)
+            return (self._native or self._first()).run(job)
         clock, part, done, cells = job.clock, job, 0, prod(shape_of(job.state))
         while True:
-            native = self._arrived()
+            native = self._native
             if native is not None:
                 self._steps["native"] += part.steps
                 return native.run(part)
@@ -439,10 +390,10 @@ class AutoProgram:
     def _large(self, job: Job) -> Mapping[str, Tensor]:
         """Worlds that do not fit into WebAssembly's memory: native code is waited for, without a compiler torch runs."""
         self._begin()
-        if self._build is not None:
-            self._build.wait()
+        if self._thread is not None:
+            self._thread.join()
         self._steps["native"] += job.steps
-        return (self._arrived() or self._asked()).run(job)
+        return (self._native or self._asked()).run(job)
 
     def _slice(self, cells: int, left: int) -> int:
         """The number of steps to run on the first backend before the next check: one until their speed is known."""
@@ -473,17 +424,24 @@ class AutoProgram:
         if not self._beginning.acquire(blocking=False):
             return
         try:
-            if self._native is None and (self._build is None or self._build.lost):
-                self._build = Build(self._make)
+            # A fork has its parent's memory, but not its threads: there the thread is lost.
+            lost = self._thread is not None and self._took is None and not self._thread.is_alive()
+            if self._native is None and (self._thread is None or lost):
+                self._began = time.perf_counter()
+                context = copy_context()
+                self._thread = threading.Thread(target=context.run, args=(self._compile,), daemon=True)
+                self._thread.start()
         finally:
             self._beginning.release()
 
-    def _arrived(self) -> Runnable | None:
-        """The native program, or None until it has been compiled."""
-        build = self._build
-        if self._native is None and build is not None:
-            self._native, self._problem = build.program, build.problem or self._problem
-        return self._native
+    def _compile(self) -> None:
+        try:
+            self._native = self._make()
+        except NoCompiler as error:
+            self._problem = str(error)
+        except Exception as error:  # what runs continues; `--backend native` shows what is wrong
+            self._problem = f"{type(error).__name__}: {error}"
+        self._took = time.perf_counter() - self._began
 
 
 @cache

@@ -171,11 +171,9 @@ def read_task(
     entries = reader.mapping(tree, "task", "a task")
     values = reader.values(entries, "task")
     word = values.get("rules")
-    names = None
-    if word is not None and word.text:
-        written = _written_params(reader, values.get("params"))
-        names = names_in_file(word.text, word.span, reporter)
-    if names is None:
+    written = _written_params(reader, values.get("params"))
+    names = names_in_file(word.text, word.span, reporter) if word is not None and word.text else None
+    if word is None or names is None:
         reporter.raise_if_errors()
         raise AssertionError("a task without rules was not reported")
     rules = (*names, *packs)
