@@ -32,27 +32,6 @@ Array = NDArray[Any]
 RENDER_MODES = ("rgb_array", "ansi")
 
 
-def check_render_mode(mode: str | None) -> str | None:
-    """The same render mode. Raises ValueError if it is unknown."""
-    if mode is not None and mode not in RENDER_MODES:
-        raise ValueError(f"render_mode is one of {', '.join(RENDER_MODES)}; found {mode!r}")
-    return mode
-
-
-def frames(env: TensorEnv, mode: str, factor: int) -> tuple[Any, ...]:
-    """A picture of each world, uint8 [H·factor, W·factor, 3], or its rows as text."""
-    if env.episodes is None:
-        raise ResetNeeded("reset the environment before rendering it")
-    world = env.episodes.world
-    if mode == "rgb_array":
-        return tuple(scale(world.rgb().cpu().numpy(), factor))
-    glyphs = {element.id: element.glyph for element in env.simulator.ruleset.elements}
-    return tuple(
-        "".join("".join(glyphs.get(number, "?") for number in row) + "\n" for row in rows)
-        for rows in world.ids.tolist()
-    )
-
-
 def array(tensor: Tensor) -> Array:
     """A tensor as an array; from a device it is copied."""
     found: Array = tensor.cpu().numpy()
@@ -72,28 +51,23 @@ def objects(rows: Array, mask: Array) -> Array:
     return found
 
 
-def spec_of(env: TensorEnv, task: Any, how: Mapping[str, Any]) -> EnvSpec:
-    """The spec of an environment that was made directly; `how` are its arguments."""
-    return EnvSpec(
-        env_id(env.task.name),
-        entry_point="powderdsl.envs.gym:PowderEnv",
-        vector_entry_point="powderdsl.envs.gym:PowderVectorEnv",
-        max_episode_steps=env.max_episode_steps,
-        kwargs={"task": task, **how},
-    )
-
-
-class _Limited:
-    """An environment whose spec says how many actions an episode has.
-
-    Gymnasium sets the spec of an environment that it has made, and knows no limit there: none is set from outside.
-    """
+class Face:
+    """The base of environments that show a `TensorEnv` to a library: their pictures and their spec."""
 
     tensors: TensorEnv
+    """The same environment for tensors."""
+    render_mode: str | None
+    render_scale: int
     _spec: EnvSpec | None = None
+
+    def _show(self, mode: str | None, factor: int) -> None:
+        if mode is not None and mode not in RENDER_MODES:
+            raise ValueError(f"render_mode is one of {', '.join(RENDER_MODES)}; found {mode!r}")
+        self.render_mode, self.render_scale = mode, factor
 
     @property
     def spec(self) -> EnvSpec | None:
+        """How `gymnasium.make` makes it. No limit is set from outside, but the spec says how many actions an episode has."""
         return self._spec
 
     @spec.setter
@@ -101,8 +75,30 @@ class _Limited:
         limit = self.tensors.max_episode_steps
         self._spec = None if value is None else replace(value, max_episode_steps=limit)
 
+    def spec_of(self, task: Any, how: Mapping[str, Any]) -> EnvSpec:
+        """The spec of an environment that was made directly; `how` are its arguments."""
+        return EnvSpec(
+            env_id(self.tensors.task.name),
+            entry_point="powderdsl.envs.gym:PowderEnv",
+            vector_entry_point="powderdsl.envs.gym:PowderVectorEnv",
+            kwargs={"task": task, **how},
+        )
 
-class PowderVectorEnv(_Limited, VectorEnv[Any, Any, Any]):
+    def frames(self, mode: str) -> tuple[Any, ...]:
+        """A picture of each world, uint8 [H·factor, W·factor, 3], or its rows as text."""
+        if self.tensors.episodes is None:
+            raise ResetNeeded("reset the environment before rendering it")
+        world = self.tensors.episodes.world
+        if mode == "rgb_array":
+            return tuple(scale(world.rgb().cpu().numpy(), self.render_scale))
+        glyphs = {element.id: element.glyph for element in self.tensors.simulator.ruleset.elements}
+        return tuple(
+            "".join("".join(glyphs.get(number, "?") for number in row) + "\n" for row in rows)
+            for rows in world.ids.tolist()
+        )
+
+
+class PowderVectorEnv(Face, VectorEnv[Any, Any, Any]):
     """Many worlds of a task, stepped together. Rewards are float32; arrays are never written to after they are returned.
 
     Args:
@@ -124,10 +120,9 @@ class PowderVectorEnv(_Limited, VectorEnv[Any, Any, Any]):
         actions: str = "multidiscrete",
         **how: Any,
     ):
-        self.render_mode, self.render_scale = check_render_mode(render_mode), render_scale
+        self._show(render_mode, render_scale)
         how |= {"autoreset_mode": autoreset_mode, "actions": actions}
         self.tensors = TensorEnv(task, num_envs, **how)
-        """The same environment for tensors."""
         self.num_envs = num_envs
         self.autoreset_mode = self.tensors.autoreset_mode
         self.metadata = {
@@ -140,7 +135,7 @@ class PowderVectorEnv(_Limited, VectorEnv[Any, Any, Any]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         shown = {"render_mode": render_mode, "render_scale": render_scale}
-        self.spec = spec_of(self.tensors, task, {"num_envs": num_envs, **shown, **how})
+        self.spec = self.spec_of(task, {"num_envs": num_envs, **shown, **how})
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -165,12 +160,10 @@ class PowderVectorEnv(_Limited, VectorEnv[Any, Any, Any]):
 
     def render(self) -> tuple[Any, ...] | None:
         """A picture or text of each world, in the mode that was chosen."""
-        if self.render_mode is None:
-            return None
-        return frames(self.tensors, self.render_mode, self.render_scale)
+        return None if self.render_mode is None else self.frames(self.render_mode)
 
 
-class PowderEnv(_Limited, gymnasium.Env[Array, Any], EzPickle):
+class PowderEnv(Face, gymnasium.Env[Array, Any], EzPickle):
     """One world: the same episodes as environment 0 of a `PowderVectorEnv` with the same seed.
 
     Pickling keeps what it was made with, not the world in it.
@@ -195,12 +188,11 @@ class PowderEnv(_Limited, gymnasium.Env[Array, Any], EzPickle):
         how["actions"] = actions
         shown = {"render_mode": render_mode, "render_scale": render_scale}
         EzPickle.__init__(self, task, **shown, **how)
-        self.render_mode, self.render_scale = check_render_mode(render_mode), render_scale
+        self._show(render_mode, render_scale)
         self.tensors = TensorEnv(task, 1, autoreset_mode="disabled", **how)
-        """The same environment for tensors."""
         self.observation_space = self.tensors.observation.space
         self.action_space = self.tensors.single_action_space
-        self.spec = spec_of(self.tensors, task, {**shown, **how})
+        self.spec = self.spec_of(task, {**shown, **how})
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -235,9 +227,7 @@ class PowderEnv(_Limited, gymnasium.Env[Array, Any], EzPickle):
 
     def render(self) -> Any:
         """A picture uint8 [H, W, 3], or text, in the mode that was chosen."""
-        return (
-            None if self.render_mode is None else frames(self.tensors, self.render_mode, self.render_scale)[0]
-        )
+        return None if self.render_mode is None else self.frames(self.render_mode)[0]
 
 
 class GoalEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):

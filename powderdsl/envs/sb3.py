@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
-from powderdsl.envs.gym import array, arrays, check_render_mode, frames, spec_of
+from powderdsl.envs.gym import Face, array, arrays
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.tasks.episodes import TaskProgram
 from powderdsl.tasks.task import Task
@@ -20,7 +20,7 @@ from powderdsl.tasks.task import Task
 Array = NDArray[Any]
 
 
-class PowderVecEnv(VecEnv):
+class PowderVecEnv(Face, VecEnv):
     """Many worlds of a task, stepped together: ``PPO("CnnPolicy", PowderVecEnv("some-task", 32))``.
 
     Infos are made for worlds whose episode ended, and empty for others: ``terminal_observation``,
@@ -43,13 +43,12 @@ class PowderVecEnv(VecEnv):
         actions: str = "multidiscrete",
         **how: Any,
     ):
-        self.render_mode, self.render_scale = check_render_mode(render_mode), render_scale
+        self._show(render_mode, render_scale)
         self.tensors = TensorEnv(task, num_envs, autoreset_mode="same_step", actions=actions, **how)
-        """The same environment for tensors."""
         self._actions: Any = None
         self._began = time.time()
         how["actions"] = actions
-        self.spec = spec_of(self.tensors, task, how)
+        self.spec = self.spec_of(task, how)
         super().__init__(num_envs, self.tensors.observation.space, self.tensors.single_action_space)
 
     def reset(self) -> Array:
@@ -103,7 +102,7 @@ class PowderVecEnv(VecEnv):
 
     def get_images(self) -> Sequence[Array | None]:
         """A picture of each world, uint8 [H, W, 3]."""
-        return frames(self.tensors, "rgb_array", self.render_scale)
+        return self.frames("rgb_array")
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """An attribute, once a world: of this, or of its `TensorEnv`."""

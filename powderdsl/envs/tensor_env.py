@@ -153,9 +153,8 @@ class TensorEnv:
             TypeError, ValueError, KeyError: something is wrong with a seed or an option. Nothing has changed then.
         """
         given = dict(options or {})
-        if unknown := given.keys() - {*OPTIONS}:
-            raise KeyError(f"no option `{min(unknown)}`: there are {', '.join(OPTIONS)}")
-        mask = self._mask(given.get("reset_mask"))
+        check_options(given, OPTIONS)
+        mask = reset_mask(given.get("reset_mask"), self.num_envs, self.episodes is not None, self.device)
         base, seeded = self._bases(seed)
         params = self._new_params(given.get("params"), mask)
         episode = torch.where(mask, torch.where(seeded, 0, self._episode + 1), self._episode)
@@ -210,19 +209,6 @@ class TensorEnv:
         new = torch.tensor([one or 0 for one in seeds], device=self.device)
         given = torch.tensor([one is not None for one in seeds], device=self.device)
         return torch.where(given, new, old), given
-
-    def _mask(self, value: Any) -> Tensor:
-        if value is None:
-            return torch.ones_like(self._ended)
-        mask = torch.as_tensor(value, device=self.device)
-        if mask.dtype != torch.bool or mask.shape != self._ended.shape or not bool(mask.any()):
-            found = f"{mask.dtype} {list(mask.shape)}"
-            raise ValueError(
-                f"reset_mask must be bool [{self.num_envs}], True for some environments; found {found}"
-            )
-        if self.episodes is None and not bool(mask.all()):
-            raise ResetNeeded("the first reset begins all episodes: reset_mask must be True everywhere")
-        return mask
 
     def _worlds(self, value: Any) -> Tensor:
         tensor = integer_tensor("worlds", value, self.device)
@@ -303,11 +289,8 @@ class TensorEnv:
         if checked.shape[0] != self.num_envs:
             raise ValueError(f"{len(checked)} actions for {self.num_envs} environments")
         waiting = self._ended
-        if self.autoreset_mode is AutoresetMode.DISABLED and bool(waiting.any()):
-            over = waiting.nonzero()[:, 0].tolist()
-            raise ResetNeeded(
-                f"the episodes of environments {over[:8]} are over: reset them with a reset_mask"
-            )
+        if self.autoreset_mode is AutoresetMode.DISABLED:
+            check_going(waiting)
         after, reward, success, _ = self.program.act(
             self.episodes, checked, reuse=True, params=self.params or None
         )
@@ -380,6 +363,32 @@ def seeds_of(seed: Any, count: int) -> list[int | None]:
         if one is not None:
             check_count("seed", one, MAX_SEED, least=0)
     return seeds
+
+
+def check_options(options: Mapping[str, Any], known: Sequence[str]) -> None:
+    """Raises KeyError for an option of `reset` that does not exist."""
+    if unknown := sorted(options.keys() - {*known}):
+        raise KeyError(f"no option `{unknown[0]}`: there are {', '.join(known)}")
+
+
+def reset_mask(value: Any, count: int, begun: bool, device: torch.device) -> Tensor:
+    """Which of `count` environments an option of `reset` says, bool [B]; None: all. Raises ValueError or ResetNeeded."""
+    if value is None:
+        return torch.ones(count, dtype=torch.bool, device=device)
+    mask = torch.as_tensor(value, device=device)
+    if mask.dtype != torch.bool or mask.shape != (count,) or not bool(mask.any()):
+        found = f"{mask.dtype} {list(mask.shape)}"
+        raise ValueError(f"reset_mask must be bool [{count}], True for some environments; found {found}")
+    if not begun and not bool(mask.all()):
+        raise ResetNeeded("the first reset begins all episodes: reset_mask must be True everywhere")
+    return mask
+
+
+def check_going(waiting: Tensor) -> None:
+    """Raises ResetNeeded where episodes, bool [B], are over."""
+    if bool(waiting.any()):
+        over = waiting.nonzero()[:8, 0].tolist()
+        raise ResetNeeded(f"the episodes of environments {over} are over: reset them with a reset_mask")
 
 
 def check_cells(num_envs: int, size: tuple[int, int]) -> None:

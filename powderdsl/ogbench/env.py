@@ -10,6 +10,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import torch
 from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box, Discrete
 from gymnasium.utils import EzPickle
@@ -18,7 +19,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from powderdsl.envs.gym import array, objects
-from powderdsl.envs.tensor_env import check_cells, mode_of, seeds_of
+from powderdsl.envs.tensor_env import check_cells, check_going, check_options, mode_of, reset_mask, seeds_of
 from powderdsl.ogbench.episodes import (
     FIRST_ELEMENT,
     FIRST_X,
@@ -99,13 +100,6 @@ def _program(level: Level, as_ogbench: bool, backend: str, device: str, threads:
 def spaces_of(level: Level) -> tuple[Box, Discrete[Any]]:
     """The spaces of one world's observations and actions."""
     return Box(0, 255, (level.side, level.side, 6), np.uint8), Discrete(level.actions)
-
-
-def check_options(options: Mapping[str, Any], known: Sequence[str]) -> None:
-    """Raise KeyError for an option of `reset` that does not exist."""
-    for name in options:
-        if name not in known:
-            raise KeyError(f"no option `{name}`: there are {', '.join(known)}")
 
 
 class PowderworldEnv(gymnasium.Env[Array, Any], EzPickle):
@@ -268,14 +262,14 @@ class PowderworldVectorEnv(VectorEnv[Any, Any, Any]):
         """
         given = dict(options or {})
         check_options(given, BATCH_OPTIONS)
-        mask = np.asarray(given.get("reset_mask", np.ones(self.num_envs, dtype=bool)))
-        if mask.dtype != bool or mask.shape != (self.num_envs,) or not mask.any():
-            raise ValueError(f"reset_mask must be bool [{self.num_envs}], True somewhere")
-        if self.episodes.world is None and not mask.all():
-            raise ResetNeeded("the first reset begins all episodes: reset_mask must be True everywhere")
-        tasks = self._tasks(given)
+        begun, cpu = self.episodes.world is not None, torch.device("cpu")
+        mask = reset_mask(given.get("reset_mask"), self.num_envs, begun, cpu).numpy()
+        tasks, seeds = self._tasks(given), seeds_of(seed, self.num_envs)
+        if isinstance(seed, int):
+            super().reset(seed=seed)
         which = np.flatnonzero(mask)
-        self._seed(seed, mask)
+        seeded = np.array([at for at in which if seeds[at] is not None], dtype=np.int64)
+        self.episodes.seed(seeded, np.array([seeds[at] for at in seeded], dtype=np.int64))
         self.episodes.begin(which, [tasks[at] for at in which])
         self._over[mask] = False
         return self._observations(), self._begun(mask)
@@ -287,13 +281,6 @@ class PowderworldVectorEnv(VectorEnv[Any, Any, Any]):
         if len(ids) != self.num_envs:
             raise ValueError(f"task_id has {len(ids)} numbers for {self.num_envs} environments")
         return [task_of(self.level, {**given, "task_id": one}) for one in ids.tolist()]
-
-    def _seed(self, seed: int | Sequence[int | None] | None, mask: NDArray[np.bool_]) -> None:
-        seeds = seeds_of(seed, self.num_envs)
-        if isinstance(seed, int):
-            super().reset(seed=seed)
-        which = np.array([at for at, one in enumerate(seeds) if one is not None and mask[at]], dtype=np.int64)
-        self.episodes.seed(which, np.array([seeds[at] for at in which], dtype=np.int64))
 
     def step(self, actions: Any) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """One choice in every episode: integers [B]. Those that are not valid are replaced by random valid ones.
@@ -315,11 +302,8 @@ class PowderworldVectorEnv(VectorEnv[Any, Any, Any]):
         if self.episodes.world is None:
             raise ResetNeeded("reset the environment before its first step")
         waiting = self._over.copy()
-        if self.autoreset_mode is AutoresetMode.DISABLED and waiting.any():
-            over = np.flatnonzero(waiting).tolist()
-            raise ResetNeeded(
-                f"the episodes of environments {over[:8]} are over: reset them with a reset_mask"
-            )
+        if self.autoreset_mode is AutoresetMode.DISABLED:
+            check_going(torch.from_numpy(waiting))
         success = self.episodes.step(given.astype(np.int64), ~waiting) & ~waiting
         truncated = (self.episodes.elapsed >= self.max_episode_steps) & ~success & ~waiting
         ended = success | truncated
