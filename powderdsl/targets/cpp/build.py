@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import hashlib
-import json
 import os
 import shutil
+import signal
 import subprocess
-import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -21,7 +21,6 @@ from tempfile import TemporaryFile
 from powderdsl.system.user_cache import cache_folder
 from powderdsl.system.writing import scratch_folder
 from powderdsl.targets import cache
-from powderdsl.targets.cpp import compiler_guard
 from powderdsl.targets.cpp.compilers import Compiler, NoCompiler, find_compiler, flags_for, processor
 
 TIMEOUT = 600
@@ -123,43 +122,63 @@ def _compile(
 
 def _call(commands: list[list[str]], scratch: Path) -> None:
     """Run compilers side by side. Raises NoCompiler if one fails."""
-    status, said = run_guarded(scratch, *commands)
+    status, said = run_compilers(scratch, *commands)
     if status:
         raise NoCompiler("\n".join([f"{commands[0][0]} failed:", *said.splitlines()[:8]]))
 
 
-def run_guarded(scratch: Path, *commands: list[str]) -> tuple[int, str]:
-    """Exit code and messages of commands that run side by side and never outlive this process.
+def run_compilers(scratch: Path, *commands: list[str]) -> tuple[int, str]:
+    """Exit code and messages of compilers that run side by side. They end if this process is interrupted or exits.
 
     Args:
-        scratch: a folder for their temporary files, removed if this process ends early.
+        scratch: a folder for their temporary files.
 
     Raises:
         NoCompiler: one cannot be started, or they take longer than TIMEOUT.
     """
-    guarded = [sys.executable, "-I", "-S", compiler_guard.__file__, str(scratch), json.dumps(commands)]
-    with TemporaryFile() as said:
+    environment = {**os.environ, "TMPDIR": str(scratch), "LC_ALL": "C"}
+    processes: list[subprocess.Popen[bytes]] = []
+    with TemporaryFile() as messages:
         try:
-            process = subprocess.Popen(
-                guarded,
-                stdin=subprocess.PIPE,  # nothing is written: the guard waits until our end is closed
-                stdout=subprocess.DEVNULL,
-                stderr=said,
-                env={**os.environ, "TMPDIR": str(scratch), "LC_ALL": "C"},
-                start_new_session=True,
-            )
+            for command in commands:
+                # A session of its own: g++ starts other programs, which are ended with it.
+                process = subprocess.Popen(
+                    command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    stderr=messages,
+                    env=environment,
+                    start_new_session=True,
+                )
+                processes.append(process)
+                _running.add(process)
+            end = time.monotonic() + TIMEOUT
+            codes = [process.wait(max(0.0, end - time.monotonic())) for process in processes]
         except OSError as error:
             raise NoCompiler(f"{commands[0][0]} could not be run: {error}") from None
-        assert process.stdin is not None
-        try:
-            status = process.wait(TIMEOUT)
         except subprocess.TimeoutExpired:
             raise NoCompiler(f"{commands[0][0]} took longer than {TIMEOUT} s") from None
         finally:
-            process.stdin.close()
+            _end(processes)
+        messages.seek(0)
+        return next(filter(None, codes), 0), messages.read().decode(errors="replace")
+
+
+_running: set[subprocess.Popen[bytes]] = set()
+"""Compilers of all threads."""
+
+
+def _end(processes: Iterable[subprocess.Popen[bytes]]) -> None:
+    for process in processes:
+        if process.poll() is None:  # in a fork, the parent's compilers count as ended
+            os.killpg(process.pid, signal.SIGTERM)
             process.wait()
-        said.seek(0)
-        return status, said.read().decode(errors="replace")
+        _running.discard(process)
+
+
+@atexit.register
+def _end_all() -> None:
+    _end(sorted(_running, key=lambda process: process.pid))
 
 
 def open_library(source: str, ruleset: str = "", units: int = 1) -> tuple[Path, ctypes.CDLL]:
