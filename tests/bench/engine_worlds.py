@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from powderdsl.experiments.bench.plan import Plan, start_worlds
+from powderdsl.experiments.bench import Plan, start_worlds
 from tests.bench.beside_engine import State, load, stepped
 from tests.bench.rounds import microseconds
 from tests.recordings import STREAMS

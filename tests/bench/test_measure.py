@@ -9,9 +9,19 @@ import numpy as np
 import pytest
 
 import powderdsl
-from powderdsl.experiments.bench.measure import measuring, peak_growth, this_machine
-from powderdsl.experiments.bench.plan import Plan, Program, start_worlds
-from powderdsl.experiments.bench.report import CellFigures, Report, number, report_data, report_text
+from powderdsl.experiments.bench import (
+    CellFigures,
+    Plan,
+    Program,
+    Report,
+    measuring,
+    number,
+    peak_growth,
+    report_data,
+    report_text,
+    start_worlds,
+    this_machine,
+)
 from powderdsl.system.reports import as_json
 from powderdsl.targets.cpp.build import Building, building
 

@@ -8,7 +8,7 @@ import pytest
 
 from powderdsl.cli import exits
 from powderdsl.cli.commands import bench as bench_command
-from powderdsl.experiments.bench.measure import measuring
+from powderdsl.experiments.bench import measuring
 from tests.cli.commands import powderdsl
 
 QUICK = ("bench", "life", "--size", "6x8", "--rounds", "2", "--seconds", "0.001", "--steps", "2")

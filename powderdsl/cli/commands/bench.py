@@ -12,9 +12,17 @@ from powderdsl.cli import options as opt
 from powderdsl.cli.exits import OK, user_values
 from powderdsl.cli.output import print_json, progress
 from powderdsl.compiler import starting_backend
-from powderdsl.experiments.bench.measure import measuring, this_machine
-from powderdsl.experiments.bench.plan import WORKLOADS, Plan, read_program
-from powderdsl.experiments.bench.report import CellFigures, Report, report_data, report_text
+from powderdsl.experiments.bench import (
+    WORKLOADS,
+    CellFigures,
+    Plan,
+    Report,
+    measuring,
+    read_program,
+    report_data,
+    report_text,
+    this_machine,
+)
 from powderdsl.model.state import fitting
 from powderdsl.targets.cpp.compilers import NoCompiler, find_compiler
 

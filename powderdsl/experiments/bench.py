@@ -1,0 +1,612 @@
+"""How fast rules run: the plan of a measurement, its worlds, rounds of measuring, and reports as text and JSON.
+
+Worlds are made from a ruleset's tables alone: no element has a name here. Rounds are interleaved, so that a machine that
+is slow for a while is slow for all combinations alike.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+import platform
+import re
+import runpy
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import cache, cached_property, partial
+from itertools import product
+from pathlib import Path
+from random import Random
+from statistics import median
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from powderdsl.analysis.changes import moved_ids
+from powderdsl.compiler import BACKENDS
+from powderdsl.diagnostics import suggest
+from powderdsl.model.state import check_sides
+from powderdsl.model.types import Element, Field, Ruleset
+from powderdsl.system.reports import table
+from powderdsl.worlds.raster import Size, mask
+from powderdsl.worlds.strewn import check_cells, random_shape
+
+if TYPE_CHECKING:
+    from powderdsl.simulation.simulator import Simulator, World
+
+WORKLOADS: dict[str, str] = {
+    "gusts": "shapes, and rectangles of ±20 in every vector field that stays in its place: busy worlds",
+    "shapes": "shapes of all elements at random places, everything else at rest",
+    "noise": "every cell a random element, every field of floats random: more than worlds ever do",
+    "few": "shapes of two elements: by default the first two that move",
+}
+"""Worlds to start from, for any ruleset."""
+
+State = dict[str, NDArray[Any]]
+"""The state of a batch: `element` as uint8 [N, H, W], fields as [N, H, W] or, vectors, [N, 2, H, W], by name."""
+Run = Callable[[int], object]
+"""Makes so many steps; the next call continues from there."""
+
+
+@dataclass(frozen=True)
+class Program:
+    """A program that is measured beside the backends. `load` is not timed; what it returns is."""
+
+    name: str
+    load: Callable[[State], Run]
+
+
+class Cell(NamedTuple):
+    """One combination of the cross product. `size` is (rows, columns) of a world.
+
+    `backend` may be the name of a program that is measured beside the backends.
+    """
+
+    backend: str
+    size: Size
+    threads: int
+    batch: int
+
+    @property
+    def world_cells(self) -> int:
+        """Cells of one world."""
+        return self.size[0] * self.size[1]
+
+    def __str__(self) -> str:
+        threads = f", {self.threads} threads" if self.threads > 1 else ""
+        return f"{self.backend}, {self.batch} of {self.size[0]}×{self.size[1]}{threads}"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All that a measurement depends on: the cross product of backends and programs, sizes, threads and batches.
+
+    A sample is as many calls of `Simulator.step` as fit into ``seconds / rounds``, each of up to `steps` steps
+    from the same worlds. `workload` is one of `WORKLOADS`, `only` names the elements on the ground, and `profile`
+    times each pass too.
+
+    Raises:
+        ValueError: an unknown element, a size that the rules do not take, or a program's name that is taken.
+        CompileError: PD607 for worlds of more cells than fit.
+    """
+
+    ruleset: Ruleset
+    backends: Sequence[str] = ("wasm",)
+    sizes: Sequence[Size] = ((64, 64),)
+    threads: Sequence[int] = (1,)
+    batches: Sequence[int] = (1, 32)
+    only: Sequence[str] = ()
+    workload: str = "gusts"
+    device: str = "cpu"
+    seed: int = 0
+    steps: int = 16
+    seconds: float = 2.0
+    rounds: int = 5
+    profile: bool = False
+    programs: Sequence[Program] = ()
+
+    def __post_init__(self) -> None:
+        names = [program.name for program in self.programs]
+        for name in names:
+            if name in BACKENDS or names.count(name) > 1:
+                raise ValueError(f"programs: `{name}` is the name of another program or of a backend")
+        for size in self.sizes:
+            check_sides(self.ruleset, size)
+            check_cells(max(self.batches), size)
+        known = [element.name for element in self.ruleset.elements]
+        for name in self.only:
+            if self.ruleset.element(name) is None:
+                raise ValueError("; ".join([f"no element `{name}`", *suggest(name, known, "elements")]))
+
+    @cached_property
+    def cells(self) -> tuple[Cell, ...]:
+        """Each combination once."""
+        names = [*self.backends, *(program.name for program in self.programs)]
+        return tuple(dict.fromkeys(map(Cell._make, product(names, self.sizes, self.threads, self.batches))))
+
+    @property
+    def elements(self) -> list[Element]:
+        """The elements that worlds have."""
+        if self.only:
+            return [element for element in map(self.ruleset.element, self.only) if element is not None]
+        if self.workload == "few":
+            moved = moved_ids(self.ruleset)
+            return sorted(self.ruleset.elements[1:], key=lambda element: element.id not in moved)[:2]
+        return list(self.ruleset.elements)
+
+    def program(self, cell: Cell) -> Program | None:
+        """The program that a cell measures; None for a backend."""
+        return next((program for program in self.programs if program.name == cell.backend), None)
+
+
+# Worlds
+
+SHAPES, GUSTS = 26, 4
+"""Numbers of shapes and gusts in 64×64 cells; larger worlds have proportionally more."""
+PER_CELLS = 64 * 64
+REACH = 7
+"""Size of the shapes in cells. They cover about a quarter of the world."""
+GUST_SIDE, GUST_SPEED = 10, 20.0
+NOISE = 3.0
+"""Standard deviation of noisy floats."""
+
+
+def start_worlds(sim: Simulator, plan: Plan, cell: Cell) -> World:
+    """The worlds of a cell: world i depends on the plan, its size and i alone."""
+    streams = [np.random.default_rng([plan.seed, index]) for index in range(cell.batch)]
+    ids = np.stack([_ids(plan, cell, random) for random in streams])
+    moving = {"noise": ("real", "vec2"), "gusts": ("vec2",)}.get(plan.workload, ())
+    fields = {
+        field.name: np.stack([_field(field, cell, plan.workload, random) for random in streams])
+        for field in sim.ruleset.fields
+        if field.kind.name in moving and not field.resets and field.of is None
+        if plan.workload == "noise" or field.at == "place"
+    }
+    return sim.replace(sim.world(ids, seed=plan.seed), **fields)
+
+
+def _ids(plan: Plan, cell: Cell, random: np.random.Generator) -> NDArray[np.uint8]:
+    """One world: uint8 [H, W]."""
+    ids = [element.id for element in plan.elements]
+    if plan.workload == "noise":
+        return random.choice(np.array(ids, dtype=np.uint8), cell.size)
+    ground = plan.ruleset.elements[0].id
+    world = np.full(cell.size, ground, dtype=np.uint8)
+    others = [number for number in ids if number != ground]
+    shapes = Random(int(random.integers(1 << 32)))
+    for i in range(_scaled(SHAPES, cell) if others else 0):
+        world[mask(random_shape(shapes, cell.size, REACH), cell.size)] = others[i % len(others)]
+    return world
+
+
+def _field(field: Field, cell: Cell, workload: str, random: np.random.Generator) -> NDArray[np.float32]:
+    """A field of one world: float32 [H, W], or [2, H, W] of a vector."""
+    shape = (2, *cell.size) if field.kind.name == "vec2" else cell.size
+    if workload == "noise":
+        values = NOISE * random.standard_normal(shape, dtype=np.float32)
+    else:
+        values = np.zeros(shape, dtype=np.float32)
+        for _ in range(_scaled(GUSTS, cell)):
+            top, left = (int(random.integers(max(side - GUST_SIDE, 1))) for side in cell.size)
+            speed = GUST_SPEED * random.integers(-1, 2, 2)
+            values[:, top : top + GUST_SIDE, left : left + GUST_SIDE] = speed[:, None, None]
+    bounded = field.kind.hi > field.kind.lo
+    return np.clip(values, field.kind.lo, field.kind.hi) if bounded else values
+
+
+def _scaled(count: int, cell: Cell) -> int:
+    """A number for `PER_CELLS` cells, for the worlds of a cell of the plan."""
+    return max(1, round(count * cell.world_cells / PER_CELLS))
+
+
+# Programs
+
+
+def read_program(path: Path) -> Program:
+    """Run a Python file that defines `load(state)`, which returns `run(steps)`. Its name is the file's.
+
+    The file is run as `python` would run it, so it has to be trusted.
+
+    Raises:
+        ValueError: the file cannot be run, or does not define `load`.
+    """
+    load = _located(path, runpy.run_path)(str(path), run_name=f"beside_{path.stem}").get("load")
+    if not callable(load):
+        raise ValueError(f"{path}: does not define `load(state)`, which returns `run(steps)`")
+
+    def start(state: State) -> Run:
+        run = _located(path, load)(state)
+        if not callable(run):
+            raise ValueError(f"{path}: `load(state)` does not return a function `run(steps)`")
+        return _located(path, run)
+
+    return Program(path.stem, start)
+
+
+def _located(path: Path, function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function whose exceptions name the line of the file that led to them."""
+
+    def call(*values: Any, **named: Any) -> Any:
+        try:
+            return function(*values, **named)
+        except Exception as error:
+            frames = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
+            words = str(error)
+            if isinstance(error, SyntaxError):
+                frames, words = (
+                    [(error.filename or "", error.lineno)],
+                    error.msg,
+                )  # str() repeats file and line
+            lines = [line for file, line in frames if Path(file).resolve() == path.resolve()]
+            place = f"{path}:{lines[-1]}" if lines else str(path)
+            raise ValueError(f"{place}: {type(error).__name__}: {words}") from error
+
+    return call
+
+
+# Measuring
+
+
+@dataclass
+class CellFigures:
+    """What was measured of a cell. `round_seconds` and `round_processor_seconds` get one value a round.
+
+    `compile_seconds` are its backend's, shared by all cells that have it. `peak_memory_bytes` is None where the system
+    does not report it. `passes` has the microseconds a world and step of each pass, in the order they run; it is empty
+    if passes were not profiled. Processor times count all threads together; other processes hardly affect them.
+    """
+
+    cell: Cell
+    compile_seconds: float
+    first_step_seconds: float = 0.0
+    peak_memory_bytes: int | None = None
+    steps_per_call: int = 1
+    calls_per_round: int = 1
+    round_seconds: list[float] = field(default_factory=list)
+    round_processor_seconds: list[float] = field(default_factory=list)
+    passes: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def world_steps(self) -> int:
+        """Steps of single worlds in a round."""
+        return self.cell.batch * self.steps_per_call * self.calls_per_round
+
+    @property
+    def rates(self) -> list[float]:
+        """World-steps per second of each round, the slowest first."""
+        return sorted(self.world_steps / seconds for seconds in self.round_seconds)
+
+    @property
+    def world_step_microseconds(self) -> float:
+        return 1e6 * median(self.round_seconds) / self.world_steps
+
+    @property
+    def processor_microseconds(self) -> float:
+        """Processor time of a world and step."""
+        return 1e6 * median(self.round_processor_seconds) / self.world_steps
+
+
+@dataclass(frozen=True)
+class Report:
+    """A plan and the figures of the cells that at least one round has reached."""
+
+    plan: Plan
+    machine: Mapping[str, Any]
+    cells: tuple[CellFigures, ...]
+    interrupted: bool = False
+
+    @property
+    def programs(self) -> list[str]:
+        """The names of the programs that were measured beside the backends."""
+        return [program.name for program in self.plan.programs]
+
+    def ratio(self, figures: CellFigures, program: str) -> float | None:
+        """The processor time of a cell divided by that of a program for the same worlds; None if it is unknown."""
+        same = figures.cell._replace(backend=program)
+        times = [other.processor_microseconds for other in self.cells if other.cell == same]
+        return figures.processor_microseconds / times[0] if times and times[0] else None
+
+
+def measuring(plan: Plan, cells: list[CellFigures]) -> Iterator[tuple[str, Cell]]:
+    """Measure a plan part by part; yields the kind of part and its cell.
+
+    Parts are ``compile`` and ``profile``, which begin now, and ``measure``, a sample that is done. Figures of each
+    cell are added to `cells`, so a caller who stops early has what was measured so far. Torch's number of threads is that of
+    each cell while this runs.
+
+    Raises:
+        CompileError: PD701 for a backend or device that is not available.
+    """
+    import torch
+
+    from powderdsl.simulation.simulator import compile
+
+    @cache
+    def compiled(backend: str, device: str, threads: int) -> tuple[Simulator, float]:
+        began = time.perf_counter()
+        return compile(plan.ruleset, backend, device, threads), time.perf_counter() - began
+
+    threads = torch.get_num_threads()
+    subjects: list[_Subject] = []
+    try:
+        for cell in plan.cells:
+            yield "compile", cell
+            torch.set_num_threads(cell.threads)
+            program = plan.program(cell)
+            if program is None:
+                sim, seconds = compiled(cell.backend, plan.device, cell.threads)
+            else:
+                sim, seconds = compiled("reference", "cpu", 1)[0], 0.0
+            subject = _Subject(sim, start_worlds(sim, plan, cell), program, CellFigures(cell, seconds))
+            subject.figures.peak_memory_bytes = peak_growth(partial(subject.begin, plan), sim.device.type)
+            subjects.append(subject)
+            cells.append(subject.figures)
+        for _ in range(plan.rounds):
+            for subject in subjects:
+                subject.measure()
+                yield "measure", subject.figures.cell
+        for subject in subjects if plan.profile else ():
+            yield "profile", subject.figures.cell
+            subject.profile()
+    finally:
+        torch.set_num_threads(threads)
+
+
+@dataclass
+class _Subject:
+    """What a cell measures: a simulator, or a program that loads the simulator's worlds.
+
+    A round makes some calls of some steps, each from the same worlds.
+    """
+
+    sim: Simulator
+    world: World
+    program: Program | None
+    figures: CellFigures
+
+    def begin(self, plan: Plan) -> None:
+        """Make the first step, and find out how many calls fit into a round, loading included."""
+        figures, budget = self.figures, plan.seconds / plan.rounds
+        figures.first_step_seconds = self.timed(1, 1)[0]
+        if self.program is None:
+            self.world = self.sim.step(self.world)  # from now on in the backend's own form
+        figures.steps_per_call = max(1, min(plan.steps, int(budget / max(self.timed(1, 1)[0], 1e-9))))
+        began = time.perf_counter()
+        self.timed(figures.steps_per_call, 1)
+        figures.calls_per_round = max(1, int(budget / max(time.perf_counter() - began, 1e-9)))
+
+    def measure(self) -> None:
+        """Measure a round."""
+        import torch
+
+        torch.set_num_threads(self.figures.cell.threads)
+        seconds, processor_seconds = self.timed(self.figures.steps_per_call, self.figures.calls_per_round)
+        self.figures.round_seconds.append(seconds)
+        self.figures.round_processor_seconds.append(processor_seconds)
+
+    def timed(self, steps: int, calls: int) -> tuple[float, float]:
+        """Seconds, and processor seconds, of some calls. A program loads its worlds before each call, untimed."""
+        loads = 1 if self.program is None else calls
+        seconds = processor_seconds = 0.0
+        for _ in range(loads):
+            run = self._load()
+            began, busy = time.perf_counter(), time.process_time()
+            for _ in range(calls // loads):
+                run(steps)
+            self._wait()
+            seconds += time.perf_counter() - began
+            processor_seconds += time.process_time() - busy
+        return seconds, processor_seconds
+
+    def _load(self) -> Run:
+        self._wait()
+        if self.program is None:
+            return lambda steps: self.sim.step(self.world, steps)
+        return self.program.load({name: values.numpy().copy() for name, values in self.world.state.items()})
+
+    def _wait(self) -> None:
+        """Wait for what a GPU still has to do."""
+        if self.sim.device.type == "cuda":
+            import torch
+
+            torch.cuda.synchronize(self.sim.device)
+
+    def profile(self) -> None:
+        """Measure the microseconds a world and step of each pass, if the backend can report them."""
+        import torch
+
+        figures = self.figures
+        torch.set_num_threads(figures.cell.threads)
+        if self.program is not None or not self.sim.profile(self.world, 1):  # compiles what profiling needs
+            return
+        samples = [
+            self.sim.profile(self.world, figures.steps_per_call) for _ in range(figures.calls_per_round)
+        ]
+        totals = {name: sum(sample.get(name, 0.0) for sample in samples) for name in self.sim.passes}
+        if any(totals.values()):
+            figures.passes = {name: 1e6 * spent / figures.world_steps for name, spent in totals.items()}
+
+
+# The machine
+
+
+def this_machine(device: str) -> dict[str, Any]:
+    """This machine, the name of a torch device, and the versions of what runs on it: what results depend on.
+
+    Raises CompileError (PD701) without such a device.
+    """
+    import torch
+
+    from powderdsl.simulation.programs import find_device
+    from powderdsl.targets.cpp.compilers import NoCompiler, find_compiler
+
+    kind = find_device(device)
+    try:
+        compiler = find_compiler().version
+    except NoCompiler:
+        compiler = "none"
+    processor = platform.processor() or platform.machine()
+    with suppress(OSError):
+        if model := re.search(r"^model name\s*: (.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE):
+            processor = model[1]
+    return {
+        "system": f"{platform.system()} {platform.machine()}",
+        "processor": processor,
+        "cpus": os.cpu_count(),
+        "device": torch.cuda.get_device_name(kind) if kind.type == "cuda" else device,
+        "python": platform.python_version(),
+        "torch": str(torch.__version__),
+        "compiler": compiler,
+        "powderdsl": sys.modules["powderdsl"].__version__,
+    }
+
+
+def peak_growth(work: Callable[[], None], device: str) -> int | None:
+    """Do some work; returns by how many bytes the peak of memory exceeded the memory in use before.
+
+    None where the system does not report it. On Linux the process' own peak is reset first. What freed memory still
+    belongs to the process is handed back before, so that the work cannot hide in it.
+    """
+    import torch
+
+    if torch.device(device).type == "cuda":
+        torch.cuda.synchronize(device)
+        torch.cuda.reset_peak_memory_stats(device)
+        before = torch.cuda.memory_allocated(device)
+        work()
+        torch.cuda.synchronize(device)
+        return torch.cuda.max_memory_allocated(device) - before
+    gc.collect()
+    with suppress(OSError, AttributeError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)  # glibc only
+    try:
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # resets the peak
+    except OSError:
+        work()
+        return None
+    resident = _status("VmRSS")
+    work()
+    return max(0, _status("VmHWM") - resident)
+
+
+def _status(name: str) -> int:
+    """A line of /proc/self/status in bytes."""
+    line = re.search(rf"^{name}:\s+(\d+) kB", Path("/proc/self/status").read_text(), re.MULTILINE)
+    return int(line[1]) * 1024 if line else 0
+
+
+# Reports
+
+MEGABYTE = 1 << 20
+
+
+def report_data(report: Report) -> dict[str, Any]:
+    """A report for `as_json`: every figure, and the seconds of every round."""
+    plan = report.plan
+    cells = []
+    for figures in report.cells:
+        values = figures.cell._asdict() | vars(figures)
+        del values["cell"]
+        values["world_steps_per_second"] = median(figures.rates)
+        values["beside"] = {name: report.ratio(figures, name) for name in report.programs}
+        cells.append(values)
+    return {
+        "machine": report.machine,
+        "rules": plan.ruleset.name,
+        "elements": [element.name for element in plan.elements],
+        **{name: getattr(plan, name) for name in ("workload", "device", "seed", "rounds")},
+        "interrupted": report.interrupted,
+        "cells": cells,
+    }
+
+
+def report_text(report: Report) -> str:
+    """The whole report, without a newline at its end."""
+    plan, machine = report.plan, report.machine
+    header = [
+        f"{plan.ruleset.name}, worlds of {plan.workload}: {WORKLOADS[plan.workload]}",
+        "powderdsl {powderdsl}, torch {torch}, Python {python}, C++: {compiler}".format_map(machine),
+        "{processor}, {cpus} CPUs, {system}, device {device}".format_map(machine),
+    ]
+    parts = ["\n".join(header)]
+    if report.cells:
+        steps = sorted({figures.steps_per_call for figures in report.cells})
+        shown = str(steps[0]) if len(steps) == 1 else f"{steps[0]} to {steps[-1]}"
+        notes = [
+            f"medians of {plan.rounds} interleaved rounds; a call makes {shown} steps, always from the same worlds",
+            "CPUs: processor time by time; less than the threads means that others were at work",
+            "to first step: compiling, which all lines of a backend share, and the first step",
+            "memory: the peak during the first calls, less what was in use before",
+        ]
+        if report.programs:
+            notes.append("÷: processor time divided by that of another program, from the same worlds")
+        parts += [_cell_table(report), "\n".join(notes)]
+    if profiled := [figures for figures in report.cells if figures.passes]:
+        parts.append(_pass_table(profiled))
+    if report.interrupted:
+        rounds = max((len(figures.round_seconds) for figures in report.cells), default=0)
+        parts.append(f"interrupted: {rounds} of {plan.rounds} rounds were begun")
+    return "\n\n".join(parts)
+
+
+def _cell_table(report: Report) -> str:
+    """One line per cell, and a column for each program beside the backends."""
+    columns: dict[str, Callable[[CellFigures], str]] = {
+        "backend": lambda figures: figures.cell.backend,
+        "batch": lambda figures: f"{figures.cell.batch:,}",
+        "size": lambda figures: "{}×{}".format(*figures.cell.size),
+        "threads": lambda figures: str(figures.cell.threads),
+        "world-steps/s": lambda figures: number(median(figures.rates)),
+        "slowest..fastest": lambda figures: f"{number(figures.rates[0])}..{number(figures.rates[-1])}",
+        "µs/world-step": lambda figures: number(figures.world_step_microseconds),
+        "CPUs": lambda figures: f"{figures.processor_microseconds / figures.world_step_microseconds:.2f}",
+        "to first step": lambda figures: f"{figures.compile_seconds + figures.first_step_seconds:.2f} s",
+        "memory": _memory,
+        **{f"÷ {name}": partial(_times, report, name) for name in report.programs},
+    }
+    rows = [[show(figures) for show in columns.values()] for figures in report.cells]
+    return "\n".join(table([[*columns], *rows], indent=""))
+
+
+def _memory(figures: CellFigures) -> str:
+    growth, cells = figures.peak_memory_bytes, figures.cell.batch * figures.cell.world_cells
+    return "?" if growth is None else f"{growth / MEGABYTE:.1f} MiB, {growth / cells:.0f} B/cell"
+
+
+def _times(report: Report, program: str, figures: CellFigures) -> str:
+    times = report.ratio(figures, program)
+    if times is None:
+        return "?"
+    return number(times) if times >= 0.1 else f"1/{number(1 / times)}"
+
+
+def _pass_table(profiled: Sequence[CellFigures]) -> str:
+    """µs a world and step of each pass, and its share, for each cell that was profiled."""
+    totals = [sum(figures.passes.values()) for figures in profiled]
+    rows = [["µs/world-step", *(str(figures.cell) for figures in profiled)]]
+    for name in profiled[0].passes:
+        shares = zip((figures.passes[name] for figures in profiled), totals, strict=True)
+        rows.append([name, *(f"{number(part)} {part / total:4.0%}" for part, total in shares)])
+    wholes = {
+        "all passes": totals,
+        "whole step": [figures.world_step_microseconds for figures in profiled],
+        "of that, processor time": [figures.processor_microseconds for figures in profiled],
+    }
+    for name, values in wholes.items():
+        rows.append([name, *(f"{number(value)}     " for value in values)])
+    return "\n".join(table(rows, indent=""))
+
+
+def number(value: float) -> str:
+    """Three significant digits: 0.0123, 1.23, 12.3, 1,234, 12.3 million as 12.3M."""
+    if value >= 1e9:
+        return f"{value / 1e9:.3g}G"
+    if value >= 1e6:
+        return f"{value / 1e6:.3g}M"
+    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
