@@ -6,8 +6,7 @@ is slow for a while is slow for all combinations alike.
 
 from __future__ import annotations
 
-import ctypes
-import gc
+import math
 import os
 import platform
 import re
@@ -72,11 +71,6 @@ class Cell(NamedTuple):
     size: Size
     threads: int
     batch: int
-
-    @property
-    def world_cells(self) -> int:
-        """Cells of one world."""
-        return self.size[0] * self.size[1]
 
     def __str__(self) -> str:
         threads = f", {self.threads} threads" if self.threads > 1 else ""
@@ -202,7 +196,7 @@ def _field(field: Field, cell: Cell, workload: str, random: np.random.Generator)
 
 def _scaled(count: int, cell: Cell) -> int:
     """A number for `PER_CELLS` cells, for the worlds of a cell of the plan."""
-    return max(1, round(count * cell.world_cells / PER_CELLS))
+    return max(1, round(count * math.prod(cell.size) / PER_CELLS))
 
 
 # Programs
@@ -257,15 +251,14 @@ def _located(path: Path, function: Callable[..., Any]) -> Callable[..., Any]:
 class CellFigures:
     """What was measured of a cell. `round_seconds` and `round_processor_seconds` get one value a round.
 
-    `compile_seconds` are its backend's, shared by all cells that have it. `peak_memory_bytes` is None where the system
-    does not report it. `passes` has the microseconds a world and step of each pass, in the order they run; it is empty
-    if passes were not profiled. Processor times count all threads together; other processes hardly affect them.
+    `compile_seconds` are its backend's, shared by all cells that have it. `passes` has the microseconds a world and step
+    of each pass, in the order they run; it is empty if passes were not profiled. Processor times count all threads
+    together; other processes hardly affect them.
     """
 
     cell: Cell
     compile_seconds: float
     first_step_seconds: float = 0.0
-    peak_memory_bytes: int | None = None
     steps_per_call: int = 1
     calls_per_round: int = 1
     round_seconds: list[float] = field(default_factory=list)
@@ -344,7 +337,7 @@ def measuring(plan: Plan, cells: list[CellFigures]) -> Iterator[tuple[str, Cell]
             else:
                 sim, seconds = compiled("reference", "cpu", 1)[0], 0.0
             subject = _Subject(sim, start_worlds(sim, plan, cell), program, CellFigures(cell, seconds))
-            subject.figures.peak_memory_bytes = peak_growth(partial(subject.begin, plan), sim.device.type)
+            subject.begin(plan)
             subjects.append(subject)
             cells.append(subject.figures)
         for _ in range(plan.rounds):
@@ -467,43 +460,7 @@ def this_machine(device: str) -> dict[str, Any]:
     }
 
 
-def peak_growth(work: Callable[[], None], device: str) -> int | None:
-    """Do some work; returns by how many bytes the peak of memory exceeded the memory in use before.
-
-    None where the system does not report it. On Linux the process' own peak is reset first. What freed memory still
-    belongs to the process is handed back before, so that the work cannot hide in it.
-    """
-    import torch
-
-    if torch.device(device).type == "cuda":
-        torch.cuda.synchronize(device)
-        torch.cuda.reset_peak_memory_stats(device)
-        before = torch.cuda.memory_allocated(device)
-        work()
-        torch.cuda.synchronize(device)
-        return torch.cuda.max_memory_allocated(device) - before
-    gc.collect()
-    with suppress(OSError, AttributeError, TypeError):
-        ctypes.CDLL(None).malloc_trim(0)  # glibc only
-    try:
-        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # resets the peak
-    except OSError:
-        work()
-        return None
-    resident = _status("VmRSS")
-    work()
-    return max(0, _status("VmHWM") - resident)
-
-
-def _status(name: str) -> int:
-    """A line of /proc/self/status in bytes."""
-    line = re.search(rf"^{name}:\s+(\d+) kB", Path("/proc/self/status").read_text(), re.MULTILINE)
-    return int(line[1]) * 1024 if line else 0
-
-
 # Reports
-
-MEGABYTE = 1 << 20
 
 
 def report_data(report: Report) -> dict[str, Any]:
@@ -542,7 +499,6 @@ def report_text(report: Report) -> str:
             f"medians of {plan.rounds} interleaved rounds; a call makes {shown} steps, always from the same worlds",
             "CPUs: processor time by time; less than the threads means that others were at work",
             "to first step: compiling, which all lines of a backend share, and the first step",
-            "memory: the peak during the first calls, less what was in use before",
         ]
         if report.programs:
             notes.append("÷: processor time divided by that of another program, from the same worlds")
@@ -567,16 +523,10 @@ def _cell_table(report: Report) -> str:
         "µs/world-step": lambda figures: number(figures.world_step_microseconds),
         "CPUs": lambda figures: f"{figures.processor_microseconds / figures.world_step_microseconds:.2f}",
         "to first step": lambda figures: f"{figures.compile_seconds + figures.first_step_seconds:.2f} s",
-        "memory": _memory,
         **{f"÷ {name}": partial(_times, report, name) for name in report.programs},
     }
     rows = [[show(figures) for show in columns.values()] for figures in report.cells]
     return "\n".join(table([[*columns], *rows], indent=""))
-
-
-def _memory(figures: CellFigures) -> str:
-    growth, cells = figures.peak_memory_bytes, figures.cell.batch * figures.cell.world_cells
-    return "?" if growth is None else f"{growth / MEGABYTE:.1f} MiB, {growth / cells:.0f} B/cell"
 
 
 def _times(report: Report, program: str, figures: CellFigures) -> str:

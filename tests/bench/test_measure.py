@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import time
 
-import numpy as np
 import pytest
 
 import powderdsl
@@ -16,7 +15,6 @@ from powderdsl.experiments.bench import (
     Report,
     measuring,
     number,
-    peak_growth,
     report_data,
     report_text,
     start_worlds,
@@ -193,23 +191,11 @@ def test_numbers_have_three_figures(value, shown):
 
 def test_half_a_measurement_is_reported(rules):
     plan = Plan(rules, rounds=3)
-    figures = CellFigures(plan.cells[0], 1.0, 1.0, None, 2, 5, [2.0], [1.0])
+    figures = CellFigures(plan.cells[0], 1.0, 1.0, 2, 5, [2.0], [1.0])
     assert figures.rates == [5 * plan.cells[0].batch]
     assert figures.processor_microseconds == figures.world_step_microseconds / 2
     text = report_text(Report(plan, this_machine("cpu"), (figures,), interrupted=True))
     assert "interrupted: 1 of 3 rounds" in text
-    (line,) = [line for line in text.splitlines() if line.startswith("wasm ")]
-    assert line.endswith("  ?")  # memory, which the system does not report
-
-
-def test_peak_memory_sees_what_was_freed():
-    size = 1 << 25
-
-    def work():
-        np.ones(size, dtype=np.uint8)
-
-    growth = peak_growth(work, "cpu")
-    assert growth is None or growth > 0.9 * size
 
 
 # What passes cost
