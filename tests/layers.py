@@ -195,5 +195,5 @@ THIRD_PARTIES: dict[str, Home] = {
     "pyodide": Home(("targets.wasm.browser_host",), ()),
     "click": Home(("cli",), ("cli",)),
     "matplotlib": Home(("experiments.studies", "cli"), ()),
-    "ray": Home(("experiments.studies.cluster",), ()),
+    "ray": Home(("experiments.studies.run",), ()),
 }

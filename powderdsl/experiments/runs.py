@@ -15,6 +15,7 @@ import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -64,7 +65,7 @@ def _decoded(data: bytes) -> Any:
     from safetensors.torch import load
 
     tensors = load(data)
-    return _unpacked(parse_json(bytes(tensors[STATE].numpy())), tensors)
+    return parse_json(bytes(tensors[STATE].numpy()), hook=partial(_unpacked, tensors=tensors))
 
 
 def _packed(value: Any, tensors: dict[str, Tensor]) -> Any:
@@ -86,17 +87,16 @@ def _packed(value: Any, tensors: dict[str, Tensor]) -> Any:
     return value
 
 
-def _unpacked(value: Any, tensors: dict[str, Tensor]) -> Any:
+def _unpacked(value: dict[str, Any], tensors: Mapping[str, Tensor]) -> Any:
+    """What a pair of a kind and contents stands for, whose contents are unpacked already."""
     match value:
         case {"tensor": name}:
             return tensors[name]
         case {"dict": pairs}:
-            return {key: _unpacked(item, tensors) for key, item in pairs}
+            return dict(pairs)
         case {"tuple": items}:
-            return tuple(_unpacked(item, tensors) for item in items)
-        case list():
-            return [_unpacked(item, tensors) for item in value]
-    return value
+            return tuple(items)
+    raise ValueError(f"a value of an unknown kind: {value!r:.80}")
 
 
 def _digest(data: bytes) -> str:
@@ -277,12 +277,24 @@ def open_run(
     folder, plain = Path(path), json.loads(json.dumps(config))
     if (folder / ABOUT).exists():
         run = read_run(folder)
-        if differences := _differences(run, kind, plain):
+        there, here = _flat(run.config), _flat(plain)
+        differences = tuple(
+            f"`{name}` is {there.get(name, 'not set')} there, {here.get(name, 'not set')} here"
+            for name in sorted({*there, *here})
+            if there.get(name) != here.get(name)
+        )
+        if run.kind != kind:
+            differences = (f"it is of the kind `{run.kind}`, not `{kind}`",)
+        if differences:
             helps = ("choose another folder with `--run`, or continue with that run's own settings",)
             raise failure("PD621", f"{folder} holds another run", notes=differences, helps=helps)
         return run
     new_folder(folder)
-    about = {"kind": kind, "config": plain, **(note or {}), "versions": versions()}
+    versions = {"python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}"}
+    for name in PACKAGES:
+        with suppress(metadata.PackageNotFoundError):
+            versions[name] = metadata.version(name)
+    about = {"kind": kind, "config": plain, **(note or {}), "versions": versions}
     write_json(folder / ABOUT, about)
     return read_run(folder, kind)
 
@@ -385,30 +397,10 @@ def no_run(folder: Path, why: str, helps: tuple[str, ...] = ()) -> CompileError:
     return failure("PD620", f"{folder} is not a run that can be used here", notes=(why,), helps=helps)
 
 
-def versions() -> dict[str, str]:
-    """Versions that a run's numbers may depend on: Python, the system, and installed packages."""
-    known = {"python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}"}
-    for name in PACKAGES:
-        with suppress(metadata.PackageNotFoundError):
-            known[name] = metadata.version(name)
-    return known
-
-
 def write_json(path: Path, value: Any, *, follow: bool = False) -> Path:
     """Write a file whole or not at all. `follow`: write to where a link leads. Raises CompileError (PD613)."""
     write_text(path, json.dumps(value, indent=1, ensure_ascii=False) + "\n", follow=follow)
     return path
-
-
-def _differences(run: RunFolder, kind: str, config: Mapping[str, Any]) -> tuple[str, ...]:
-    if run.kind != kind:
-        return (f"it is of the kind `{run.kind}`, not `{kind}`",)
-    there, here = _flat(run.config), _flat(config)
-    return tuple(
-        f"`{name}` is {there.get(name, 'not set')} there, {here.get(name, 'not set')} here"
-        for name in sorted({*there, *here})
-        if there.get(name) != here.get(name)
-    )
 
 
 def _flat(config: Mapping[str, Any], within: str = "") -> dict[str, str]:

@@ -10,6 +10,7 @@ import errno
 import json
 import os
 import stat
+from collections.abc import Callable
 from io import BufferedReader
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
@@ -52,11 +53,14 @@ def read_bytes(path: str | Path, limit: int) -> bytes:
     return data
 
 
-def parse_json(data: bytes, values: int = 1 << 19) -> Any:
+def parse_json(
+    data: bytes, values: int = 1 << 19, hook: Callable[[dict[str, Any]], Any] | None = None
+) -> Any:
     """The value of a JSON text.
 
     Args:
         values: how many values it may hold: a value takes up to a hundred times as much memory as text.
+        hook: makes a value of each object, as `json.loads` takes it.
 
     Raises:
         ValueError: it is not JSON, holds more values, or is nested too deep.
@@ -64,7 +68,7 @@ def parse_json(data: bytes, values: int = 1 << 19) -> Any:
     if data.count(b",") + data.count(b"[") + data.count(b"{") > values:
         raise ValueError(f"it has more than {values:,} values")
     try:
-        return json.loads(data.decode("utf-8"))
+        return json.loads(data.decode("utf-8"), object_hook=hook)
     except RecursionError:
         raise ValueError("it is nested too deep") from None
 

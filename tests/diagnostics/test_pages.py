@@ -32,8 +32,7 @@ from powderdsl.diagnostics import CODES, CompileError, Diagnostic, Reporter, Sev
 from powderdsl.diagnostics.codes import page
 from powderdsl.diagnostics.render import render_text
 from powderdsl.experiments.runs import does_not_fit, find_run, open_run
-from powderdsl.experiments.studies.cluster import check_cluster
-from powderdsl.experiments.studies.run import StudyRun, collected, read_folders
+from powderdsl.experiments.studies.run import StudyRun, check_cluster, collected, read_folders
 from powderdsl.experiments.studies.study import TEXT, load_study, read_study
 from powderdsl.rl import preset
 from powderdsl.simulation.standalone import standalone_module

@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from powderdsl.diagnostics import Reporter, Source
-from powderdsl.experiments.studies import cluster as on_cluster
+from powderdsl.experiments.studies import run as on_cluster
 from powderdsl.experiments.studies.run import StudyRun
 from powderdsl.experiments.studies.study import TASK, TEXT, Study, read_study
 from powderdsl.system.writing import MARK

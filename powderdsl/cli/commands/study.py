@@ -19,8 +19,14 @@ from powderdsl.cli.output import counted, progress
 from powderdsl.cli.study.checks import called, check_study
 from powderdsl.diagnostics import suggest
 from powderdsl.diagnostics.printable import printable
-from powderdsl.experiments.studies.cluster import check_cluster, run_on_ray
-from powderdsl.experiments.studies.run import Outcome, StudyRun, collected, read_folders
+from powderdsl.experiments.studies.run import (
+    Outcome,
+    StudyRun,
+    check_cluster,
+    collected,
+    read_folders,
+    run_on_ray,
+)
 from powderdsl.experiments.studies.study import (
     FLAG,
     SIZE,
