@@ -70,22 +70,20 @@ def interval(samples: Sequence[float], scale: str = "linear") -> Interval:
 
 def findings(study: Study, outcomes: Sequence[Outcome]) -> list[Finding]:
     """The findings from finished points. Combinations are in the order in which values were written."""
-    finished = sorted(
-        (outcome for outcome in outcomes if outcome.problem is None), key=lambda outcome: outcome.point.seed
-    )
-    return [_finding(measure, finished) for measure in study.measures]
-
-
-def _finding(measure: Measure, outcomes: Sequence[Outcome]) -> Finding:
-    by_values: dict[tuple[tuple[str, str], ...], dict[int, float]] = {}
-    for outcome in outcomes:
-        by_values.setdefault(outcome.point.values, {})[outcome.point.seed] = outcome.values[measure.name]
-    cells = tuple(
-        Cell(dict(values), by_seed, interval([*by_seed.values()], measure.scale))
-        for values, by_seed in by_values.items()
-    )
-    verdicts = [_verdict(measure, label, line) for label, line in _lines(cells).items()]
-    return Finding(measure, cells, tuple(filter(None, verdicts)))
+    finished = [outcome for outcome in outcomes if outcome.problem is None]
+    finished.sort(key=lambda outcome: outcome.point.seed)
+    all_findings = []
+    for measure in study.measures:
+        by_values: dict[tuple[tuple[str, str], ...], dict[int, float]] = {}
+        for outcome in finished:
+            by_values.setdefault(outcome.point.values, {})[outcome.point.seed] = outcome.values[measure.name]
+        cells = tuple(
+            Cell(dict(values), by_seed, interval([*by_seed.values()], measure.scale))
+            for values, by_seed in by_values.items()
+        )
+        verdicts = [_verdict(measure, label, line) for label, line in _lines(cells).items()]
+        all_findings.append(Finding(measure, cells, tuple(filter(None, verdicts))))
+    return all_findings
 
 
 def _verdict(measure: Measure, label: str, cells: Sequence[Cell]) -> str:
@@ -137,16 +135,13 @@ def as_data(study: Study, size: str, outcomes: Sequence[Outcome]) -> dict[str, A
     ]
     described = []
     for finding in findings(study, outcomes):
-        cells = [
-            {"values": cell.values, **_finite(cell.over_seeds), "samples": [*cell.by_seed.values()]}
-            for cell in finding.cells
-        ]
+        cells = []
+        for cell in finding.cells:
+            numbers = asdict(cell.over_seeds)
+            finite = {name: number if math.isfinite(number) else None for name, number in numbers.items()}
+            cells.append({"values": cell.values, **finite, "samples": [*cell.by_seed.values()]})
         described.append({"measure": finding.measure.name, "verdict": finding.verdict, "cells": cells})
     return {"study": study.name, "size": size, "points": points, "findings": described}
-
-
-def _finite(numbers: Interval) -> dict[str, float | None]:
-    return {name: number if math.isfinite(number) else None for name, number in asdict(numbers).items()}
 
 
 def as_markdown(study: Study, size: str, outcomes: Sequence[Outcome]) -> str:
@@ -158,12 +153,11 @@ def as_markdown(study: Study, size: str, outcomes: Sequence[Outcome]) -> str:
             shown(cell.over_seeds, measure.scale) for cell, measure in zip(cells, study.measures, strict=True)
         ]
         rows.append([*cells[0].values.values(), *numbers, str(len(cells[0].by_seed))])
-    text = f"{study.about} Size: {size}.\n\n{markdown(rows)}"
     verdicts = [f"- {finding.measure.about}: {verdict}" for finding in found for verdict in finding.verdicts]
     failed = [f"- {outcome.point.name}: {outcome.problem}" for outcome in outcomes if outcome.problem]
-    for lines in (verdicts, ["Not finished:", "", *failed] if failed else []):
-        text += "\n" + "\n".join(lines) + "\n" if lines else ""
-    return text
+    parts = [f"{study.about} Size: {size}.", markdown(rows).rstrip(), "\n".join(verdicts)]
+    parts += ["Not finished:", "\n".join(failed)] if failed else []
+    return "\n\n".join(filter(None, parts)) + "\n"
 
 
 def markdown(rows: Sequence[Sequence[str]]) -> str:
@@ -286,9 +280,11 @@ def curves_of(runs: Sequence[RunFolder], metric: str) -> list[Line]:
         numbers = [by_step for by_step in by_seed.values() if by_step]
         if numbers:
             steps = sorted(set.intersection(*map(set, numbers)))
-            # Settings at their defaults are not recorded.
+            # Settings at their defaults are not recorded; files are shown by their names.
+            values = {name: config[name] for name in differ if config.get(name) is not None}
             label = ", ".join(
-                f"{name} {_shown(config[name])}" for name in differ if config.get(name) is not None
+                f"{name} {Path(value).name if isinstance(value, str) and '/' in value else value}"
+                for name, value in values.items()
             )
             curves.append(Line(label, steps, [[by_step[step] for by_step in numbers] for step in steps]))
     return curves
@@ -298,10 +294,6 @@ def _numbers(run: RunFolder, metric: str) -> dict[int, float]:
     """A metric of a run by step."""
     lines = [line for line in read_metrics(run.path) if isinstance(line.get(metric), int | float)]
     return {line["step"]: line[metric] for line in lines}
-
-
-def _shown(value: Any) -> Any:
-    return Path(value).name if isinstance(value, str) and "/" in value else value
 
 
 def baselines_of(runs: Sequence[RunFolder]) -> dict[str, float]:

@@ -327,15 +327,11 @@ class _StudyReader:
     def check_unused(self, axes: list[Axis]) -> None:
         """Report settings and names that make no difference."""
         for axis in axes:
-            names = {name: word for words in [*axis.sets.values()][::-1] for name, word in words.items()}
-            unused = {name: word for name, word in names.items() if name not in self.used}
-            if axis.name not in self.used and unused == names:
-                helps = (f"write `${next(iter(names), axis.name)}` in a step, or leave the setting out",)
-                self.error("PD806", f"no step uses the setting `{axis.name}`", axis.key.span, helps=helps)
-                continue
-            for name, word in unused.items():
-                helps = (f"write `${name}` in a step, or leave it out",)
-                self.error("PD806", f"no step uses `{name}`", word.span, helps=helps)
+            names = next(iter(axis.sets.values()), {}) or {axis.name: axis.key}
+            for name, word in names.items():
+                if name not in self.used:
+                    helps = (f"write `${name}` in a step, or leave it out",)
+                    self.error("PD806", f"no step uses `{name}`", word.span, helps=helps)
 
     def axis(self, key: Scalar, node: Node) -> Axis:
         self.add_name(key)
