@@ -134,10 +134,6 @@ class Plan:
             return sorted(self.ruleset.elements[1:], key=lambda element: element.id not in moved)[:2]
         return list(self.ruleset.elements)
 
-    def program(self, cell: Cell) -> Program | None:
-        """The program that a cell measures; None for a backend."""
-        return next((program for program in self.programs if program.name == cell.backend), None)
-
 
 # Worlds
 
@@ -205,10 +201,7 @@ def _scaled(count: int, cell: Cell) -> int:
 def read_program(path: Path) -> Program:
     """Run a Python file that defines `load(state)`, which returns `run(steps)`. Its name is the file's.
 
-    The file is run as `python` would run it, so it has to be trusted.
-
-    Raises:
-        ValueError: the file cannot be run, or does not define `load`.
+    The file is run as `python` would run it, so it has to be trusted. Raises ValueError if that is not possible.
     """
     load = _located(path, runpy.run_path)(str(path), run_name=f"beside_{path.stem}").get("load")
     if not callable(load):
@@ -232,11 +225,8 @@ def _located(path: Path, function: Callable[..., Any]) -> Callable[..., Any]:
         except Exception as error:
             frames = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
             words = str(error)
-            if isinstance(error, SyntaxError):
-                frames, words = (
-                    [(error.filename or "", error.lineno)],
-                    error.msg,
-                )  # str() repeats file and line
+            if isinstance(error, SyntaxError):  # its text repeats file and line
+                frames, words = [(error.filename or "", error.lineno)], error.msg
             lines = [line for file, line in frames if Path(file).resolve() == path.resolve()]
             place = f"{path}:{lines[-1]}" if lines else str(path)
             raise ValueError(f"{place}: {type(error).__name__}: {words}") from error
@@ -311,10 +301,7 @@ def measuring(plan: Plan, cells: list[CellFigures]) -> Iterator[tuple[str, Cell]
 
     Parts are ``compile`` and ``profile``, which begin now, and ``measure``, a sample that is done. Figures of each
     cell are added to `cells`, so a caller who stops early has what was measured so far. Torch's number of threads is that of
-    each cell while this runs.
-
-    Raises:
-        CompileError: PD701 for a backend or device that is not available.
+    each cell while this runs. Raises CompileError (PD701) for a backend or device that is not available.
     """
     import torch
 
@@ -325,13 +312,13 @@ def measuring(plan: Plan, cells: list[CellFigures]) -> Iterator[tuple[str, Cell]
         began = time.perf_counter()
         return compile(plan.ruleset, backend, device, threads), time.perf_counter() - began
 
-    threads = torch.get_num_threads()
+    threads, programs = torch.get_num_threads(), {program.name: program for program in plan.programs}
     subjects: list[_Subject] = []
     try:
         for cell in plan.cells:
             yield "compile", cell
             torch.set_num_threads(cell.threads)
-            program = plan.program(cell)
+            program = programs.get(cell.backend)
             if program is None:
                 sim, seconds = compiled(cell.backend, plan.device, cell.threads)
             else:
@@ -342,10 +329,12 @@ def measuring(plan: Plan, cells: list[CellFigures]) -> Iterator[tuple[str, Cell]
             cells.append(subject.figures)
         for _ in range(plan.rounds):
             for subject in subjects:
+                torch.set_num_threads(subject.figures.cell.threads)
                 subject.measure()
                 yield "measure", subject.figures.cell
         for subject in subjects if plan.profile else ():
             yield "profile", subject.figures.cell
+            torch.set_num_threads(subject.figures.cell.threads)
             subject.profile()
     finally:
         torch.set_num_threads(threads)
@@ -376,9 +365,6 @@ class _Subject:
 
     def measure(self) -> None:
         """Measure a round."""
-        import torch
-
-        torch.set_num_threads(self.figures.cell.threads)
         seconds, processor_seconds = self.timed(self.figures.steps_per_call, self.figures.calls_per_round)
         self.figures.round_seconds.append(seconds)
         self.figures.round_processor_seconds.append(processor_seconds)
@@ -412,15 +398,11 @@ class _Subject:
 
     def profile(self) -> None:
         """Measure the microseconds a world and step of each pass, if the backend can report them."""
-        import torch
-
         figures = self.figures
-        torch.set_num_threads(figures.cell.threads)
         if self.program is not None or not self.sim.profile(self.world, 1):  # compiles what profiling needs
             return
-        samples = [
-            self.sim.profile(self.world, figures.steps_per_call) for _ in range(figures.calls_per_round)
-        ]
+        steps, calls = figures.steps_per_call, figures.calls_per_round
+        samples = [self.sim.profile(self.world, steps) for _ in range(calls)]
         totals = {name: sum(sample.get(name, 0.0) for sample in samples) for name in self.sim.passes}
         if any(totals.values()):
             figures.passes = {name: 1e6 * spent / figures.world_steps for name, spent in totals.items()}
@@ -430,10 +412,7 @@ class _Subject:
 
 
 def this_machine(device: str) -> dict[str, Any]:
-    """This machine, the name of a torch device, and the versions of what runs on it: what results depend on.
-
-    Raises CompileError (PD701) without such a device.
-    """
+    """This machine, and the versions of what runs on it. Raises CompileError (PD701) without such a torch device."""
     import torch
 
     from powderdsl.simulation.programs import find_device

@@ -116,9 +116,8 @@ T_975 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228)
 class Metrics:
     """Writes numbers by step. A context manager.
 
-    Args:
-        folder: the run's. step: where the run continues; what was written for later steps is dropped, so that a run that
-            was killed after its last checkpoint writes nothing twice.
+    The run continues at `step`; what was written for later steps is dropped, so that a run that was killed after its last
+    checkpoint writes nothing twice.
     """
 
     def __init__(self, folder: Path, step: int = 0):
@@ -197,9 +196,7 @@ class RunFolder:
         """The newest checkpoint whose digest is right, with its tensors on the CPU, or None. Damaged ones are passed over.
 
         Loading executes nothing: only tensors and plain values are read, and they take no more memory than the file.
-
-        Raises:
-            CompileError: PD620 for a file that is whole and holds something else.
+        Raises CompileError (PD620) for a file that is whole and holds something else.
         """
         for step, digest, path in self._checkpoints():
             try:
@@ -224,8 +221,7 @@ class RunFolder:
     def save_checkpoint(self, step: int, state: Any) -> Path:
         """Save nested dicts, lists and tuples of tensors, numbers, text and None, and remove older checkpoints but one.
 
-        Raises:
-            CompileError: PD613 if the folder cannot be written to, or the disk is full.
+        Raises CompileError (PD613) if the folder cannot be written to, or the disk is full.
         """
         data = _encoded(state)
         path = self.path / "checkpoints" / f"{step:012d}-{_digest(data)}.safetensors"
@@ -253,14 +249,6 @@ class RunFolder:
         """Where to write numbers from `step` on; those of later steps are dropped."""
         return Metrics(self.path, step)
 
-    def write_json(self, name: str, value: Any) -> Path:
-        """Write a file of the folder whole or not at all."""
-        return write_json(self.path / name, value)
-
-    def read_json(self, name: str) -> Any:
-        """A file of the folder; None if there is none or it is damaged."""
-        return read_json(self.path / name)
-
 
 def open_run(
     path: str | Path, kind: str, config: Mapping[str, Any], *, note: Mapping[str, Any] | None = None
@@ -278,16 +266,16 @@ def open_run(
     if (folder / ABOUT).exists():
         run = read_run(folder)
         there, here = _flat(run.config), _flat(plain)
-        differences = tuple(
+        notes = [
             f"`{name}` is {there.get(name, 'not set')} there, {here.get(name, 'not set')} here"
             for name in sorted({*there, *here})
             if there.get(name) != here.get(name)
-        )
+        ]
         if run.kind != kind:
-            differences = (f"it is of the kind `{run.kind}`, not `{kind}`",)
-        if differences:
+            notes = [f"it is of the kind `{run.kind}`, not `{kind}`"]
+        if notes:
             helps = ("choose another folder with `--run`, or continue with that run's own settings",)
-            raise failure("PD621", f"{folder} holds another run", notes=differences, helps=helps)
+            raise failure("PD621", f"{folder} holds another run", notes=tuple(notes), helps=helps)
         return run
     new_folder(folder)
     versions = {"python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}"}
@@ -301,13 +289,10 @@ def open_run(
 
 @contextmanager
 def held(folder: Path, patience: float = 0.0) -> Iterator[None]:
-    """Keep other processes from writing to a folder. The lock of a process that dies is gone with it.
+    """Keep other processes from writing to a folder, after waiting for them for `patience` seconds.
 
-    Args:
-        patience: seconds to wait for another process.
-
-    Raises:
-        CompileError: PD622 if another one does; PD613 if the folder cannot be written to.
+    The lock of a process that dies is gone with it. Raises CompileError: PD622 if another process has it, PD613 if the
+    folder cannot be written to.
     """
     check_folder(folder)
     lock = FileLock(folder / ".lock")
@@ -327,8 +312,7 @@ def held(folder: Path, patience: float = 0.0) -> Iterator[None]:
 def new_folder(folder: Path) -> None:
     """Make a folder for something that will be written there, unless it is there and empty.
 
-    Raises:
-        CompileError: PD621 where it holds files; PD613 where it cannot be made.
+    Raises CompileError: PD621 where it holds files, PD613 where it cannot be made.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -341,11 +325,7 @@ def new_folder(folder: Path) -> None:
 
 
 def read_run(path: str | Path, kind: str | None = None) -> RunFolder:
-    """An existing run.
-
-    Raises:
-        CompileError: PD620 if there is none, it is damaged, or of another kind than `kind`.
-    """
+    """An existing run. Raises CompileError (PD620) if there is none, it is damaged, or of another kind than `kind`."""
     folder = Path(path)
     if not (folder / ABOUT).exists():
         raise no_run(folder, f"it has no {ABOUT}" if folder.is_dir() else "there is no such folder")

@@ -13,7 +13,7 @@ from torch import Tensor
 from powderdsl.envs.acting import FrameStack, Policy, action_keys, random_policy
 from powderdsl.envs.observations import observation_of
 from powderdsl.envs.tensor_env import TensorEnv
-from powderdsl.experiments.runs import RunFolder, find_run, mean_and_interval
+from powderdsl.experiments.runs import RunFolder, find_run, mean_and_interval, write_json
 from powderdsl.rl.config import BASELINES, TrainConfig, chosen_policies
 from powderdsl.rl.policies import TrainedPolicy, config_of, load_policy, task_of
 from powderdsl.tasks.episodes import TaskProgram, compile_task
@@ -235,7 +235,7 @@ def evaluate(
                 said(scores[-1])
     found = Evaluation(task.name, step, deterministic, seed, tuple(scores), unchanged, seen)
     if run is not None:
-        run.write_json(EVALUATION, found.as_json())
+        write_json(run.path / EVALUATION, found.as_json())
     return found
 
 

@@ -31,7 +31,7 @@ from powderdsl.datasets.recorder import record
 from powderdsl.envs.observations import channels_of
 from powderdsl.envs.sb3 import PowderVecEnv
 from powderdsl.envs.tensor_env import check_cells
-from powderdsl.experiments.runs import Metrics, RunFolder, fitting, mean_and_interval, open_run
+from powderdsl.experiments.runs import Metrics, RunFolder, fitting, mean_and_interval, open_run, write_json
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.rl.config import TrainConfig, check_config, check_task
 from powderdsl.rl.evaluation import play
@@ -83,7 +83,7 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
         plain["shaped_fingerprint"] = fingerprint(trained_on)
     run = open_run(folder, KIND, plain)
     with run.locked(), _own_random_numbers(config.threads):
-        run.write_json(ASKED, config.as_json())
+        write_json(run.path / ASKED, config.as_json())
         checkpoint = run.latest_checkpoint()
         step = 0 if checkpoint is None else checkpoint.step
         if step >= config.steps:

@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from powderdsl.cli.commands.curves import command
-from powderdsl.experiments.runs import RunFolder, open_run
+from powderdsl.experiments.runs import RunFolder, open_run, write_json
 from powderdsl.experiments.studies.results import as_table, baselines_of, curves_of
 
 
@@ -50,7 +50,7 @@ def test_runs_that_differ_in_their_seed_make_one_curve(runs: list[RunFolder]) ->
 def test_policies_that_need_no_training_are_lines(runs: list[RunFolder]) -> None:
     assert baselines_of(runs) == {}
     scores = {name: {"mean": number} for number, name in enumerate(("nothing", "trained", "expert"))}
-    runs[1].write_json("evaluation.json", {"splits": {"test": scores, "train": {}}})
+    write_json(runs[1].path / "evaluation.json", {"splits": {"test": scores, "train": {}}})
     assert baselines_of(runs) == {"expert": 2, "nothing": 0}
 
 

@@ -13,6 +13,7 @@ from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput
 from powderdsl.cli.output import progress
 from powderdsl.rl.config import PRESETS, TrainConfig, from_json, preset
+from powderdsl.system.reading import read_json
 
 
 @click.command("train", cls=opt.ManyWords)
@@ -100,6 +101,6 @@ def _config_of(folder: Path, ctx: click.Context) -> TrainConfig:
     if any(name not in HOW for name in given) or _given(ctx, WHAT):
         raise BadInput(f"--resume keeps what is trained; only {', '.join(HOW)} may change")
     run = find_run(folder, KIND)
-    latest = run.read_json(ASKED) or {}
+    latest = read_json(run.path / ASKED) or {}
     how = {name: latest[name] for name in HOW if name in latest}
     return from_json({**config_of(run).as_json(), **how, **given})

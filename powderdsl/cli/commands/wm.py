@@ -203,7 +203,7 @@ def eval_command(run: str, as_json: bool, out: Path | None, **values: Any) -> No
     if out is not None:
         write_json(out, plain, follow=True)
     else:
-        trained.run.write_json("evaluation.json", plain)
+        write_json(trained.run.path / "evaluation.json", plain)
     if as_json:
         print_json(plain)
     else:

@@ -54,8 +54,7 @@ def called(words: tuple[str, ...]) -> click.Command:
 def check_study(study: Study, reporter: Reporter, *, devices: bool = True) -> None:
     """Report what a study's commands would refuse, and measures that lead to no number.
 
-    Args:
-        devices: whether the study runs on this machine, with its devices.
+    `devices`: whether the study runs on this machine, with its devices.
     """
     check = _StudyCheck(study, reporter, devices)
     for step, point in product(study.steps, check.points):
@@ -76,9 +75,7 @@ class _StudyCheck:
         self.wrong = {step.name for step in study.steps if step.is_wrong}
         """Steps with mistakes, whose consequences are not reported."""
         self.rules = cache(lambda rules, params: load(rules, params=dict(params)))
-        self.changed_rules = cache(
-            lambda rules, task, *packs: wm.rules_of(rules or _rules_of(task), task, *packs)
-        )
+        self.changed_rules = cache(lambda rules, *more: wm.rules_of(rules or _rules_of(more[0]), *more))
 
     def result(self, step: StudyStep, point: Point) -> Any:
         """What a step makes: the settings of its run, or patterns of keys of its results; None if that is not known."""
@@ -153,15 +150,15 @@ class _StudyCheck:
     def call(self, step: StudyStep, point: Point, run: Any) -> Any:
         """The result of a step. Raises what its command would raise before it begins to work."""
         command, arguments = called(step.command), self.study.command(step, point, self.study.folder)
-        parameters = {name[2:]: parameter for parameter in command.params for name in parameter.opts}
-        given: dict[str, int] = {}
+        several = {name[2:] for option in command.params if option.multiple for name in option.opts}
+        given = set[str]()
         for name, word in step.words:
-            given[name] = given.get(name, 0) + 1
             text = point.filled(word)
             if step.means.get(name) == FLAG and text not in ("yes", "no"):
                 raise ValueError(f"`{name}` is `yes` or `no`, found `{text}`")
-            if given[name] > 1 and not getattr(parameters[name], "multiple", False):
+            if name in given - several:
                 raise ValueError(f"`{name}` takes one value, found `{text}` too")
+            given.add(name)
         maker, needs = self.study.works_on(step), WORKS_ON.get(step.command)
         if step.on is not None and step.on_step and (maker is None or MAKES[maker.command] != needs):
             works_on = f"the run of {needs}" if needs else "no run"
@@ -284,9 +281,8 @@ def _blamed(
 ) -> tuple[str, Scalar | None]:
     """The option and the word without which a mistake is gone; no word if there are several such options.
 
-    Args:
-        words: options and their words, with the mistakes that are there without each. What the step works on comes last:
-            nothing else is known without it.
+    `words` are options and their words, with the mistakes that are there without each. What the step works on comes last:
+    nothing else is known without it.
     """
     suspects: list[tuple[tuple[bool, bool, int], str, Scalar]] = []
     for (name, word), others in words:

@@ -220,11 +220,8 @@ def write_figure(path: Path, study: Study, size: str, outcomes: Sequence[Outcome
 def draw(path: Path, panels: Sequence[Panel], title: str, *, follow: bool = False) -> None:
     """Draw panels side by side, with all samples as dots. The suffix of the path says which format is written.
 
-    Args:
-        follow: write to where a link leads.
-
-    Raises:
-        CompileError: PD612 without matplotlib, PD613 if the file cannot be written.
+    `follow`: write to where a link leads. Raises CompileError: PD612 without matplotlib, PD613 if the file cannot be
+    written.
     """
     require("matplotlib", "drawing a plot", "pip install 'powderdsl[plot]'")
     from matplotlib.figure import Figure
@@ -300,7 +297,7 @@ def baselines_of(runs: Sequence[RunFolder]) -> dict[str, float]:
     """The mean returns of policies that need no training, in the held-out worlds: from the first run that was evaluated."""
     for run in runs:
         evaluation = read_json(run.path / EVALUATION)
-        split = (run.read_json("asked.json") or {}).get("eval_split", "test")
+        split = (read_json(run.path / "asked.json") or {}).get("eval_split", "test")
         scores = evaluation.get("splits", {}).get(split, {}) if isinstance(evaluation, dict) else {}
         means = {name: scores[name]["mean"] for name in BASELINES if name in scores}
         if means:

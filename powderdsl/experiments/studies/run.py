@@ -70,8 +70,7 @@ class StudyRun:
     def prepare(self) -> None:
         """Make the folder, or resume in it. Values, seeds and measures may have changed, but no step.
 
-        Raises:
-            CompileError: PD621 where the folder holds another study or other files; PD613 where it cannot be written.
+        Raises CompileError: PD621 where the folder holds another study or other files, PD613 where it cannot be written.
         """
         path = self.folder / ABOUT_STUDY
         if self.folder.is_dir():
@@ -104,8 +103,7 @@ class StudyRun:
     ) -> list[Outcome]:
         """Run points to their end, `jobs` at a time. Signals end all processes; the same call resumes them.
 
-        Args:
-            report: called with each outcome. patient: wait for points that other processes work on.
+        `report` is called with each outcome. `patient`: wait for points that other processes work on.
         """
         read, write = os.pipe()
         # Processes end when their stdin is closed: by us, or because we are killed.
@@ -194,8 +192,7 @@ def run_all(
 ) -> list[Outcome]:
     """The outcomes of points, each computed in a thread, `jobs` at a time.
 
-    Args:
-        end_all: called after a signal or an error; it makes `run_point` return early in all threads.
+    `end_all` is called after a signal or an error; it makes `run_point` return early in all threads.
     """
     with ThreadPoolExecutor(jobs) as pool:
         futures = [pool.submit(run_point, point) for point in points]
@@ -250,8 +247,7 @@ def read_folders(folders: Sequence[Path], commands: Commands) -> list[StudyRun]:
 def collected(runs: Sequence[StudyRun], point: Point) -> Outcome:
     """The outcome of a point, from the folders that have it; the problem where none has it.
 
-    Raises:
-        CompileError: PD627 if folders have different results.
+    Raises CompileError (PD627) if folders have different results.
     """
     outcomes = {run.folder: outcome for run in runs if (outcome := run.finished(point)) is not None}
     good = {folder: outcome for folder, outcome in outcomes.items() if outcome.problem is None}
@@ -297,11 +293,8 @@ def run_on_ray(
 ) -> list[Outcome]:
     """Run points to their end as Ray tasks. Signals end all of them; the same call resumes them.
 
-    Args:
-        address: of the cluster, as `ray.init` takes it. jobs: how many tasks there are at a time; None: as many as fit.
-
-    Raises:
-        CompileError: PD626 if the connection to the cluster cannot be made.
+    `jobs`: how many tasks there are at a time; None: as many as fit. Raises CompileError (PD626) if the connection to the
+    cluster at `address`, which is what `ray.init` takes, cannot be made.
     """
     # Commands run elsewhere, in other working directories.
     study, folder = replace(run.study, folder=run.study.folder.resolve()), run.folder.resolve()
@@ -311,9 +304,8 @@ def run_on_ray(
 
         def wait_for(point: Point) -> Outcome:
             options = {"name": f"{study.name} {point.name}", **resources(study, point, run.threads)}
-            tasks.append(
-                task := remote.options(**options).remote(study, folder, run.size, run.threads, point)
-            )
+            task = remote.options(**options).remote(study, folder, run.size, run.threads, point)
+            tasks.append(task)
             try:
                 outcome: Outcome = ray.get(task)
                 return outcome

@@ -180,8 +180,7 @@ class Study:
     def command(self, step: StudyStep, point: Point, place: Path) -> list[str]:
         """The words of a step's command, whose runs and files lie in `place`.
 
-        Raises:
-            CompileError: PD112 if a word names a path that leads out of the study's folder, or out of `place`.
+        Raises CompileError (PD112) if a word names a path that leads out of the study's folder, or out of `place`.
         """
         words, run = list(step.command), self.works_on(step)
         for name, word in step.words:
@@ -210,13 +209,9 @@ class Study:
 
 
 def confined(means: str, text: str, folder: Path, results: Path) -> str:
-    """A word for a command, from an untrusted study.
+    """A word for a command, from an untrusted study: paths are in `folder`, those of files to write in `results`.
 
-    Args:
-        means: its meaning. folder: that of the study's file. results: where files that it names are written.
-
-    Raises:
-        ValueError: it names a path that leads out of `folder`, or of `results` for a file to write.
+    Raises ValueError for a path that leads out of there.
     """
     if means.startswith(FILE):
         return str(inside(results, text))
@@ -271,8 +266,7 @@ def load_study(name_or_path: str, commands: Commands, check: Check = check_paths
 def read_study(source: Source, reporter: Reporter, commands: Commands, check: Check = check_paths) -> Study:
     """The checked study of a file's text. Raises CompileError with everything that is wrong.
 
-    Args:
-        check: of words and measures. It reads no file that lies out of the study's folder.
+    `check`, of words and measures, reads no file that lies out of the study's folder.
     """
     tree = parse_yaml(source, reporter)
     if tree is None and not reporter.has_errors:
