@@ -156,7 +156,7 @@ class _StudyCheck:
             text = point.filled(word)
             if step.means.get(name) == FLAG and text not in ("yes", "no"):
                 raise ValueError(f"`{name}` is `yes` or `no`, found `{text}`")
-            if name in given - several:
+            if name in given and name not in several:
                 raise ValueError(f"`{name}` takes one value, found `{text}` too")
             given.add(name)
         maker, needs = self.study.works_on(step), WORKS_ON.get(step.command)
