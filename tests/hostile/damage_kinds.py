@@ -25,7 +25,6 @@ from powderdsl.cli.commands.study import commands
 from powderdsl.experiments.runs import STATE
 from powderdsl.experiments.studies.run import StudyRun
 from powderdsl.experiments.studies.study import load_study
-from powderdsl.targets.cache import signed
 
 TEXTS = (
     "\x1b]0;owned\x07",
@@ -338,8 +337,6 @@ KINDS = (
     Kind("agent's checkpoint", 80, ("evaluate", "ppo", "--episodes", "1", "--policies", "trained"), (("ppo/checkpoints/*.safetensors", checkpoint_damaged),), _renamed),
     Kind("world model", 50, ("wm", "eval", "wm", "--worlds", "1", "--split", "test"), (("wm/run.json", json_damaged),)),
     Kind("its checkpoint", 50, ("wm", "eval", "wm", "--worlds", "1", "--split", "test"), (("wm/checkpoints/*.safetensors", checkpoint_damaged),), _renamed),
-    Kind("cache", 80, ("cache", "list"), (("cache/powderdsl/native/" + "a" * 32 + "/about.json", json_damaged),)),
-    Kind("cache to clear", 40, ("cache", "clear"), (("cache/powderdsl/native/" + "a" * 32 + "/about.json", json_damaged),)),
 )  # fmt: skip
 
 
@@ -406,14 +403,6 @@ def make_valid(folder: Path, run: Callable[..., None]) -> None:
         shutil.rmtree(folder / run_folder / "tensorboard", ignore_errors=True)
         about = folder / run_folder / "run.json"
         about.write_text(about.read_text().replace(str(folder) + "/", ""))
-    entry = folder / "cache" / "powderdsl" / "native" / ("a" * 32)
-    entry.mkdir(parents=True)
-    for one in (entry, *list(entry.parents)[:3]):
-        one.chmod(0o700)
-    (entry / "program").write_bytes(b"x")
-    digest = hashlib.sha256(b"x").hexdigest()
-    about = {"ruleset": "grit", "backend": "native", "compiler": "g++ 1", "created": 1.0, "seconds": 2.0, "size": 1, "sha256": digest}  # fmt: skip
-    (entry / "about.json").write_text(signed(about))
 
 
 GRIT = """\

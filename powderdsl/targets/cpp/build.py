@@ -96,8 +96,6 @@ def build(source: str, ruleset: str = "", units: int = 1) -> Path:
 def _compile(
     source: str, units: int, ruleset: str, compiler: Compiler, flags: tuple[str, ...], folder: Path, key: str
 ) -> Path:
-    cache.tidy(folder)
-    began = time.time()
     with scratch_folder(folder) as scratch:
         text, library = scratch / "program.cpp", scratch / "library"
         text.write_text(source, encoding="utf-8")
@@ -115,9 +113,7 @@ def _compile(
             )
             _call([[*command, "-o", str(library), *objects]], scratch)
         code = library.read_bytes()
-    return cache.add(
-        folder, key, code, ruleset=ruleset, backend="native", compiler=compiler.version, began=began
-    )
+    return cache.add(folder, key, code, ruleset)
 
 
 def _call(commands: list[list[str]], scratch: Path) -> None:

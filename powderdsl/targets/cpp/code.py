@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from powderdsl.diagnostics import CompileError
 from powderdsl.ir.ops import Program, Threshold, Type
-from powderdsl.system.writing import write_text
+from powderdsl.system.reading import read_json
 from powderdsl.targets import cache
 from powderdsl.targets.codec import Piece, pieces
 from powderdsl.targets.cpp.build import current, open_library
@@ -50,15 +50,17 @@ def compile_program(program: Program, planes: Program, width: int, *, clocks: bo
 def recall(key: str) -> NativeCode | None:
     """The code stored under a key, if its library still exists. Raises NoCompiler if there is no cache folder."""
     folder = current().place()
-    kept = cache.read_signed(folder / f"{key}.json")
-    library = None if kept is None else cache.find(folder, kept["library"])
-    return None if kept is None or library is None else _decode(kept, library)
+    path = cache.find(folder, key)
+    facts = {} if path is None else read_json(path)
+    library = cache.find(folder, facts["library"]) if facts else None
+    return None if library is None else _decode(facts, library)
 
 
 def remember(key: str, code: NativeCode) -> None:
     """Store the rest of a compiled program under a key. A cache that cannot be written only costs time."""
-    with suppress(CompileError):
-        write_text(current().place() / f"{key}.json", cache.signed(_encode(code)))
+    _, name = cache.key_and_name(code.library)
+    with suppress(OSError):
+        cache.add(current().place(), key, json.dumps(_encode(code)).encode(), f"{name}.json")
 
 
 def _encode(code: NativeCode) -> dict[str, Any]:
@@ -70,7 +72,7 @@ def _encode(code: NativeCode) -> dict[str, Any]:
         for (name, threshold, bit), number in code.layout.param_planes.items()
     ]
     return {
-        "library": code.library.parent.name,
+        "library": cache.key_and_name(code.library)[0],
         "width": code.width,
         "layout": tables,
         "pieces": [asdict(piece) for parts in code.pieces.values() for piece in parts],
@@ -78,20 +80,20 @@ def _encode(code: NativeCode) -> dict[str, Any]:
     }
 
 
-def _decode(kept: dict[str, Any], library: Path) -> NativeCode:
+def _decode(facts: dict[str, Any], library: Path) -> NativeCode:
     tables: dict[str, Any] = {
         name: {_key(key): number for key, number in value} if isinstance(value, list) else value
-        for name, value in kept["layout"].items()
+        for name, value in facts["layout"].items()
     }
     tables["param_planes"] = {
         (name, threshold and Threshold(*threshold), bit): number
-        for (name, threshold, bit), number in kept["layout"]["param_planes"]
+        for (name, threshold, bit), number in facts["layout"]["param_planes"]
     }
     found: dict[str, tuple[Piece, ...]] = {}
-    for row in kept["pieces"]:
+    for row in facts["pieces"]:
         piece = Piece(**row | {"type": Type(**row["type"])})
         found[piece.state] = (*found.get(piece.state, ()), piece)
-    return NativeCode(library, int(kept["width"]), Layout(**tables), found, tuple(kept["passes"]))
+    return NativeCode(library, int(facts["width"]), Layout(**tables), found, tuple(facts["passes"]))
 
 
 def _key(key: Any) -> Any:

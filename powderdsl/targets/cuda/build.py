@@ -10,7 +10,6 @@ import ctypes
 import glob
 import hashlib
 import sys
-import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cache
@@ -122,13 +121,9 @@ def machine_code(source: KernelSource, architecture: str, version: str) -> bytes
     found = native_cache.find(folder, name)
     if found is not None:
         return found.read_bytes()
-    began = time.time()
     code = compile_text(compiler, source.text, options)
-    made_by = f"NVRTC {major.value}.{minor.value} for {architecture}"
     with suppress(OSError):
-        native_cache.add(
-            folder, name, code, ruleset=source.name, backend="cuda", compiler=made_by, began=began
-        )
+        native_cache.add(folder, name, code, f"{source.name}.cuda")
     return code
 
 
