@@ -17,7 +17,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cache, cached_property, partial
+from functools import cache, cached_property
 from itertools import product
 from pathlib import Path
 from random import Random
@@ -428,7 +428,6 @@ def this_machine(device: str) -> dict[str, Any]:
         if model := re.search(r"^model name\s*: (.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE):
             processor = model[1]
     return {
-        "system": f"{platform.system()} {platform.machine()}",
         "processor": processor,
         "cpus": os.cpu_count(),
         "device": torch.cuda.get_device_name(kind) if kind.type == "cuda" else device,
@@ -468,7 +467,7 @@ def report_text(report: Report) -> str:
     header = [
         f"{plan.ruleset.name}, worlds of {plan.workload}: {WORKLOADS[plan.workload]}",
         "powderdsl {powderdsl}, torch {torch}, Python {python}, C++: {compiler}".format_map(machine),
-        "{processor}, {cpus} CPUs, {system}, device {device}".format_map(machine),
+        "{processor}, {cpus} CPUs, device {device}".format_map(machine),
     ]
     parts = ["\n".join(header)]
     if report.cells:
@@ -502,17 +501,15 @@ def _cell_table(report: Report) -> str:
         "µs/world-step": lambda figures: number(figures.world_step_microseconds),
         "CPUs": lambda figures: f"{figures.processor_microseconds / figures.world_step_microseconds:.2f}",
         "to first step": lambda figures: f"{figures.compile_seconds + figures.first_step_seconds:.2f} s",
-        **{f"÷ {name}": partial(_times, report, name) for name in report.programs},
     }
-    rows = [[show(figures) for show in columns.values()] for figures in report.cells]
-    return "\n".join(table([[*columns], *rows], indent=""))
-
-
-def _times(report: Report, program: str, figures: CellFigures) -> str:
-    times = report.ratio(figures, program)
-    if times is None:
-        return "?"
-    return number(times) if times >= 0.1 else f"1/{number(1 / times)}"
+    rows = [[*columns, *(f"÷ {name}" for name in report.programs)]]
+    for figures in report.cells:
+        ratios = [report.ratio(figures, name) for name in report.programs]
+        rows.append(
+            [show(figures) for show in columns.values()]
+            + ["?" if ratio is None else number(ratio) for ratio in ratios]
+        )
+    return "\n".join(table(rows, indent=""))
 
 
 def _pass_table(profiled: Sequence[CellFigures]) -> str:

@@ -13,7 +13,7 @@ import platform
 import re
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
@@ -295,18 +295,15 @@ def held(folder: Path, patience: float = 0.0) -> Iterator[None]:
     folder cannot be written to.
     """
     check_folder(folder)
-    lock = FileLock(folder / ".lock")
-    try:
-        lock.acquire(timeout=patience)
-    except Timeout:
-        helps = ("wait for it, or choose another folder",)
-        raise failure("PD622", f"another process works on {folder}", helps=helps) from None
-    except OSError as error:
-        raise not_writable(folder, error) from None
-    try:
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(FileLock(folder / ".lock", timeout=patience))
+        except Timeout:
+            helps = ("wait for it, or choose another folder",)
+            raise failure("PD622", f"another process works on {folder}", helps=helps) from None
+        except OSError as error:
+            raise not_writable(folder, error) from None
         yield
-    finally:
-        lock.release()
 
 
 def new_folder(folder: Path) -> None:

@@ -217,10 +217,8 @@ class _StudyCheck:
         steps = [
             step
             for step in self.study.steps
-            if " ".join(step.command) == command
-            and self.study.works_on(step) == made
-            # With `out`, `wm eval` writes there alone.
-            and (command == "evaluate" or "out" not in dict(step.words))
+            if " ".join(step.command) == command and self.study.works_on(step) == made
+            if command == "evaluate" or "out" not in dict(step.words)  # where `wm eval` writes instead
         ]
         if not steps and not any(step.name in self.wrong for step in self.study.steps if not step.makes_run):
             helps = [f"add a step such as `tested: {{command: {command}, on: {made.name}}}`"]

@@ -273,7 +273,10 @@ def curves_of(runs: Sequence[RunFolder], metric: str) -> list[Line]:
     differ = [name for name in names if len({json.dumps(config.get(name)) for config in configs}) > 1]
     curves = []
     for config, members in zip(configs, groups.values(), strict=True):
-        by_seed = {str(run.config.get("seed")): _numbers(run, metric) for run in members}
+        by_seed: dict[str, dict[int, float]] = {}
+        for run in members:
+            lines = [line for line in read_metrics(run.path) if isinstance(line.get(metric), int | float)]
+            by_seed[str(run.config.get("seed"))] = {line["step"]: line[metric] for line in lines}
         numbers = [by_step for by_step in by_seed.values() if by_step]
         if numbers:
             steps = sorted(set.intersection(*map(set, numbers)))
@@ -285,12 +288,6 @@ def curves_of(runs: Sequence[RunFolder], metric: str) -> list[Line]:
             )
             curves.append(Line(label, steps, [[by_step[step] for by_step in numbers] for step in steps]))
     return curves
-
-
-def _numbers(run: RunFolder, metric: str) -> dict[int, float]:
-    """A metric of a run by step."""
-    lines = [line for line in read_metrics(run.path) if isinstance(line.get(metric), int | float)]
-    return {line["step"]: line[metric] for line in lines}
 
 
 def baselines_of(runs: Sequence[RunFolder]) -> dict[str, float]:

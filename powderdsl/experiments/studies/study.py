@@ -309,7 +309,11 @@ class _StudyReader:
                 message = f"{points:,} combinations at the size `{size}`"
                 self.error("PD806", message, name.span, f"at most {MAX_POINTS:,}")
         if not self.is_hidden:
-            self.check_unused(axes)
+            for axis in axes:
+                names = next(iter(axis.sets.values()), {}) or {axis.name: axis.key}
+                for unused in (name for name in names if name not in self.used):
+                    helps = (f"write `${unused}` in a step, or leave it out",)
+                    self.error("PD806", f"no step uses `{unused}`", names[unused].span, helps=helps)
             if seeds > 1 and SEED not in self.used:
                 helps = ("write `seed: $seed` in a step that trains, or `seeds: 1`",)
                 self.error("PD806", "no step uses `$seed`", entries["seeds"][1].span, helps=helps)
@@ -317,15 +321,6 @@ class _StudyReader:
         about, source = values.get("about", ""), tree.span.source
         word = "" if name is None else name.text
         return Study(word, about, seeds, tuple(axes), steps, tuple(measures), source, folder)
-
-    def check_unused(self, axes: list[Axis]) -> None:
-        """Report settings and names that make no difference."""
-        for axis in axes:
-            names = next(iter(axis.sets.values()), {}) or {axis.name: axis.key}
-            for name, word in names.items():
-                if name not in self.used:
-                    helps = (f"write `${name}` in a step, or leave it out",)
-                    self.error("PD806", f"no step uses `{name}`", word.span, helps=helps)
 
     def axis(self, key: Scalar, node: Node) -> Axis:
         self.add_name(key)
