@@ -6,7 +6,6 @@ import json
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
-from datetime import UTC, datetime
 from math import prod
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -123,11 +122,6 @@ def shard_file(number: int) -> str:
 
 
 # Files
-
-
-def new_manifest(recipe: Recipe) -> Manifest:
-    """The manifest of a dataset without shards."""
-    return Manifest(recipe, datetime.now(UTC).isoformat(timespec="seconds"), ())
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,6 @@ from powderdsl.datasets.manifest import (
     check_place,
     differences,
     episode_bytes,
-    new_manifest,
     read_manifest,
     recipe_of,
     write_manifest,
@@ -142,7 +142,7 @@ def held_place(folder: Path) -> Iterator[None]:
 def begun(folder: Path, recipe: Recipe) -> Manifest:
     """The manifest to continue with: a new one, or the one of the same recipe with its intact shards."""
     if not (folder / FILE).exists():
-        manifest = new_manifest(recipe)
+        manifest = Manifest(recipe, datetime.now(UTC).isoformat(timespec="seconds"), ())
     else:
         manifest = read_manifest(folder)
         differ = differences(manifest.recipe, recipe)

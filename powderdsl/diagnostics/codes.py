@@ -161,8 +161,5 @@ def similar(word: str) -> tuple[str, ...]:
 
 
 def page(row: Code) -> str:
-    """The Markdown page of a code. A code without a page still says what it is called."""
-    path = _PAGES / f"{row.code}.md"
-    if path.is_file():
-        return path.read_text(encoding="utf-8")
-    return f"# {row.code}: {row.slug.replace('-', ' ')}\n\nThis {row.severity.value} has no page yet.\n"
+    """The Markdown page of a code."""
+    return (_PAGES / f"{row.code}.md").read_text(encoding="utf-8")

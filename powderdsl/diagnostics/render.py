@@ -7,7 +7,7 @@ from typing import Any
 from unicodedata import combining, east_asian_width
 
 from powderdsl.diagnostics.codes import Severity
-from powderdsl.diagnostics.diagnostic import Diagnostic, Label, Span
+from powderdsl.diagnostics.diagnostic import Diagnostic, Label, Source
 from powderdsl.diagnostics.printable import printable
 
 TAB_WIDTH = 4
@@ -18,11 +18,6 @@ COLORS = {Severity.ERROR: "31;1", Severity.WARNING: "33;1", Severity.NOTE: "36;1
 def _cells(text: str) -> int:
     """Terminal cells that `text` takes, tabs already expanded."""
     return sum(0 if combining(char) else 2 if east_asian_width(char) in "WF" else 1 for char in text)
-
-
-def _one_column(text: str) -> str:
-    """A piece of a source line: what cannot be printed takes one column, so that carets stay below their text."""
-    return "".join("\N{REPLACEMENT CHARACTER}" if printable(char) != char else char for char in text)
 
 
 def _snippet(label: Label, caret: str) -> tuple[str, str]:
@@ -37,21 +32,14 @@ def _snippet(label: Label, caret: str) -> tuple[str, str]:
     right = min(len(raw), left + MAX_SHOWN)
 
     def shown(piece: str) -> str:
-        return _one_column(piece.expandtabs(TAB_WIDTH))
+        # What cannot be printed takes one column, so that carets stay below their text.
+        chars = piece.expandtabs(TAB_WIDTH)
+        return "".join("\N{REPLACEMENT CHARACTER}" if printable(char) != char else char for char in chars)
 
     text = ("…" if left else "") + shown(raw[left:right]) + ("…" if right < len(raw) else "")
     before = _cells(shown(raw[left:start])) + (1 if left else 0)
     width = max(1, _cells(shown(raw[left : min(end, right)])) + (1 if left else 0) - before)
     return text, (" " * before + caret * width + (f" {printable(label.text)}" if label.text else "")).rstrip()
-
-
-def _block(label: Label, caret: str, gutter: int) -> list[str]:
-    text, carets = _snippet(label, caret)
-    assert label.span is not None
-    return [
-        f"{label.span.line:>{gutter}} | {text}".rstrip(),
-        f"{' ' * gutter} | {carets}",
-    ]
 
 
 def source_lines(labels: Sequence[Label]) -> tuple[list[str], int]:
@@ -67,7 +55,8 @@ def source_lines(labels: Sequence[Label]) -> tuple[list[str], int]:
             name = label.span.source.name
             lines.append(f"{' ' * gutter}{arrow} {printable(label.span.place)}")
             lines.append(f"{' ' * gutter} |")
-        lines.extend(_block(label, "^" if label is labels[0] else "-", gutter))
+        text, carets = _snippet(label, "^" if label is labels[0] else "-")
+        lines += [f"{label.span.line:>{gutter}} | {text}".rstrip(), f"{' ' * gutter} | {carets}"]
     return lines, gutter
 
 
@@ -97,24 +86,21 @@ def render_short(diagnostic: Diagnostic) -> str:
     return printable(f"{place}{diagnostic.severity.value}[{diagnostic.code}]: {diagnostic.message}{helps}")
 
 
-def _offset_units(text: str, utf16: bool) -> int:
-    return len(text.encode("utf-16-le")) // 2 if utf16 else len(text)
-
-
-def _span_data(span: Span, utf16: bool) -> dict[str, Any]:
-    def point(offset: int) -> dict[str, int]:
-        line, column = span.source.position(offset)
-        before = span.source.line(line)[: column - 1]
-        return {"line": line, "column": _offset_units(before, utf16) + 1}
-
-    return {"file": span.source.name, "start": point(span.start), "end": point(span.end)}
-
-
 def diagnostic_data(diagnostic: Diagnostic, *, utf16: bool = False) -> dict[str, Any]:
     """A diagnostic as plain data. `utf16` counts columns in UTF-16 units, as browser editors do."""
 
+    def point(source: Source, offset: int) -> dict[str, int]:
+        line, column = source.position(offset)
+        before = source.line(line)[: column - 1]
+        units = len(before.encode("utf-16-le")) // 2 if utf16 else len(before)
+        return {"line": line, "column": units + 1}
+
     def label_data(label: Label) -> dict[str, Any]:
-        return {"span": _span_data(label.span, utf16) if label.span else None, "text": label.text}
+        span = label.span
+        if span is None:
+            return {"span": None, "text": label.text}
+        ends = {"start": point(span.source, span.start), "end": point(span.source, span.end)}
+        return {"span": {"file": span.source.name, **ends}, "text": label.text}
 
     return {
         "code": diagnostic.code,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 from lark import Lark, Token, Tree
 from lark import __version__ as lark_version
@@ -72,30 +73,34 @@ def parse_text(source: Source, begin: int, end: int, start: str, reporter: Repor
         return None
     try:
         tree = parser().parse(TextSlice(source.text, begin, end), start=start)
-        return _convert(tree, source, Span(source, begin, max(end, begin + 1)), 0)
     except UnexpectedInput as error:
         _report_syntax_error(error, source, begin, end, reporter)
-    except _TooDeep:
+        return None
+    if depth(tree) > MAX_DEPTH:
         message = f"an expression nested more than {MAX_DEPTH} deep"
         notes = ["a long chain of `and`, `or` or `+` nests as well"]
         reporter.error("PD202", message, first, notes=notes, helps=helps)
-    return None
+        return None
+    return _convert(tree, source, Span(source, begin, max(end, begin + 1)))
 
 
-class _TooDeep(Exception):
-    pass
+def depth(tree: Tree) -> int:
+    """How many parts of a tree lie inside one another, counted without recursion."""
+    level: list[Any] = [tree]
+    count = 0
+    while level := [child for part in level for child in getattr(part, "children", ())]:
+        count += 1
+    return count
 
 
-def _convert(tree: Tree | Token, source: Source, fallback: Span, depth: int) -> Syntax:
-    if depth > MAX_DEPTH:
-        raise _TooDeep
+def _convert(tree: Tree | Token, source: Source, fallback: Span) -> Syntax:
     if isinstance(tree, Token):
         start = tree.start_pos if tree.start_pos is not None else fallback.start
         stop = tree.end_pos if tree.end_pos is not None else fallback.end
         return Syntax("token", (), str(tree), Span(source, start, stop))
     meta = tree.meta
     span = fallback if meta.empty else Span(source, meta.start_pos, meta.end_pos)
-    children = [_convert(child, source, span, depth + 1) for child in tree.children]
+    children = [_convert(child, source, span) for child in tree.children]
     text = " ".join(child.text for child in children if child.kind == "token")
     nodes = tuple(child for child in children if child.kind != "token")
     return Syntax(str(tree.data), nodes, text, span)

@@ -1,13 +1,11 @@
 """PyYAML's errors in plain words: where the mistake is, and how to fix it.
 
-PyYAML reports where its scanner gave up, in its own terms, or in libyaml's. Each row of the table below knows what
-people usually did there.
+PyYAML reports where its scanner gave up, in its own terms, or in libyaml's.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import yaml
@@ -15,7 +13,7 @@ import yaml
 from powderdsl.diagnostics import Diagnostic, Label, Reporter, Source, Span
 
 QUOTE = "put quotes around the whole value"
-Explain = Callable[["Place"], Diagnostic]
+_MEANING = "has a meaning of its own in YAML"
 _ENTRY = re.compile(r"\s*(?:- +)?(?P<key>[\w?]+): +(?P<value>[^\"'\s].*?)\s*\Z")
 
 
@@ -66,22 +64,76 @@ class Place:
         return f"put quotes around it: {entry['key']}: {quote}{entry['value']}{quote}"
 
 
-def report_character(source: Source, at: int, reporter: Reporter) -> None:
-    """Report a character that YAML does not allow as PD103."""
-    message = f"invalid YAML: the character U+{ord(source.text[at]):04X} is not allowed"
-    label = "cannot stand in a text file"
-    reporter.error("PD103", message, Span(source, at, at + 1), label, helps=["remove it"])
-
-
 def report_yaml(error: yaml.YAMLError, source: Source, reporter: Reporter) -> None:
     """Report what PyYAML raised as PD103."""
     assert isinstance(error, yaml.MarkedYAMLError), error
     mark = error.problem_mark or error.context_mark
     at = mark.index if mark else 0
     since = error.context_mark.index if error.context_mark else at
-    place, words = Place(source, at, since), f"{error.context}: {error.problem}"
-    explain = next((explain for pattern, explain in _ROWS if re.search(pattern, words)), None)
-    reporter.add(explain(place) if explain else _problem("not readable", place.span(at), words))
+    reporter.add(_explained(Place(source, at, since), f"{error.context}: {error.problem}"))
+
+
+def _explained(place: Place, words: str) -> Diagnostic:
+    """What people usually did where PyYAML or libyaml reports something in these words."""
+
+    def says(pattern: str) -> bool:
+        return re.search(pattern, words) is not None
+
+    here, start = place.span(place.at), place.span(place.since)
+    if says("directive|YAML document|duplicate tag"):
+        label, fix = "a line that starts with `%`", "remove the line"
+        return _problem("a YAML directive", place.rest(place.since), label, fix)
+    if says("an? (tag|anchor|alias):|tag handle"):
+        return _problem(_starts_with(start), start, _MEANING, place.quoted(place.since))
+    if says("mapping keys are not allowed"):
+        return _problem(_starts_with(here), here, "begins a key, to YAML", place.quoted(place.at))
+    if says("mapping values are not allowed"):
+        return _second_colon(place)
+    if says("found a tab character") or (place.char == "\t" and says("cannot start any token")):
+        return _problem("a tab in the indentation", here, "a tab", "indent with spaces")
+    if says("cannot start any token"):
+        return _problem(_starts_with(here), here, _MEANING, place.quoted(place.at))
+    if says("unexpected ':'"):
+        return _problem("a `:` inside a value", here, "only a key ends with `:`", QUOTE)
+    if says("expected ',' or '[]}]'"):
+        return _unclosed(place)
+    if says("unexpected (end of stream|document indicator|document separator)"):
+        if place.text[place.since : place.since + 1] not in "\"'":
+            return _problem("the file ends too early", here, "something is not finished")
+        return _problem("a quote that is never closed", start, "no closing quote", "write the closing quote")
+    if says("unknown escape character|hexa?decimal number|invalid Unicode"):
+        label, fix = 'in "…" a backslash starts an escape', "use '…' quotes, or no quotes"
+        backslash = place.text.rfind("\\", 0, place.at + 1)
+        return _problem("an unknown escape", place.span(backslash, 2), label, fix)
+    if says("could not find expected ':'"):
+        span, fix = (
+            place.rest(place.since),
+            "a key ends with `:`; text that continues is indented deeper than its key",
+        )
+        return _problem("a line that is neither a key nor a value", span, "no `:` after it", fix)
+    if says("sequence entries are not allowed"):
+        quoted, fix = place.quoted(place.at), "put `- …` on a line of its own"
+        fix += "" if quoted == QUOTE else f"; if it is not a list, {quoted}"
+        return _problem("a list on the line of its key", here, "a list starts on the next line", fix)
+    if says("expected (a )?comment or (a )?line break|chomping or indentation"):
+        char = place.text[place.since : place.since + 1]
+        fix = f"put the text on the next lines, indented; or {place.quoted(place.since)}"
+        label = f"`{char}` starts a block on the next lines"
+        return _problem(f"text after `{char}`", place.rest(place.at), label, fix)
+    if says("while parsing a block collection"):
+        return _indentation(place, "expected `- `, as far in as the items above")
+    if says("while parsing a block mapping"):
+        return _key(place)
+    if says("expected (the )?node content"):
+        return _nothing(place)
+    if says("expected '?<document start>"):
+        label, fix = "not part of it", "remove it, or the line before it"
+        return _problem("text after the end of the document", place.rest(place.at), label, fix)
+    return _problem("not readable", here, words)
+
+
+def _starts_with(span: Span) -> str:
+    return f"a value cannot start with `{span.text}`"
 
 
 def _problem(
@@ -90,22 +142,6 @@ def _problem(
     """A diagnostic; `label` finishes the sentence under the caret."""
     others, helps = (other,) if other else (), (fix,) if fix else ()
     return Diagnostic("PD103", f"invalid YAML: {message}", Label(span, label), others, helps=helps)
-
-
-def _fixed(message: str, label: str, fix: str, *, since: bool = False) -> Explain:
-    """A problem with one character, where a place begins or ends. Texts may use {char} and {quoted}."""
-
-    def explain(place: Place) -> Diagnostic:
-        start = place.since if since else place.at
-        values = {"char": place.span(start).text, "quoted": place.quoted(start)}
-        return _problem(message.format_map(values), place.span(start), label, fix.format_map(values))
-
-    return explain
-
-
-_TAB = _fixed("a tab in the indentation", "a tab", "indent with spaces")
-_STARTS, _MEANING = "a value cannot start with `{char}`", "has a meaning of its own in YAML"
-_INDICATOR = _fixed(_STARTS, _MEANING, "{quoted}")
 
 
 def _second_colon(place: Place) -> Diagnostic:
@@ -125,10 +161,6 @@ def _key(place: Place) -> Diagnostic:
     if place.char == ":":
         return _problem("a `:` without a key", place.span(place.at), "a key is missing before it")
     return _indentation(place, "not indented like the keys of this mapping")
-
-
-def _item(place: Place) -> Diagnostic:
-    return _indentation(place, "expected `- `, as far in as the items above")
 
 
 def _indentation(place: Place, label: str) -> Diagnostic:
@@ -175,32 +207,6 @@ def _comment(place: Place) -> int | None:
     return None
 
 
-def _open_quote(place: Place) -> Diagnostic:
-    if place.text[place.since : place.since + 1] not in "\"'":
-        return _problem("the file ends too early", place.span(place.at), "something is not finished")
-    span, fix = place.span(place.since), "write the closing quote"
-    return _problem("a quote that is never closed", span, "no closing quote", fix)
-
-
-def _escape(place: Place) -> Diagnostic:
-    label, fix = 'in "…" a backslash starts an escape', "use '…' quotes, or no quotes"
-    backslash = place.text.rfind("\\", 0, place.at + 1)
-    return _problem("an unknown escape", place.span(backslash, 2), label, fix)
-
-
-def _no_colon(place: Place) -> Diagnostic:
-    fix = "a key ends with `:`; text that continues is indented deeper than its key"
-    span = place.rest(place.since)
-    return _problem("a line that is neither a key nor a value", span, "no `:` after it", fix)
-
-
-def _list_beside_key(place: Place) -> Diagnostic:
-    quoted = place.quoted(place.at)
-    fix = "put `- …` on a line of its own" + ("" if quoted == QUOTE else f"; if it is not a list, {quoted}")
-    span, label = place.span(place.at), "a list starts on the next line"
-    return _problem("a list on the line of its key", span, label, fix)
-
-
 def _nothing(place: Place) -> Diagnostic:
     at = min(place.at, len(place.text.rstrip()))
     before = place.before(at)
@@ -211,42 +217,3 @@ def _nothing(place: Place) -> Diagnostic:
         label = "nothing is open, or a value is missing"
         return _problem(f"a `{place.char}` that closes nothing", span, label)
     return _problem("a value is missing", span, "before this", "remove one comma, or write the value")
-
-
-def _block_header(place: Place) -> Diagnostic:
-    char = place.text[place.since : place.since + 1]
-    fix = f"put the text on the next lines, indented; or {place.quoted(place.since)}"
-    label = f"`{char}` starts a block on the next lines"
-    return _problem(f"text after `{char}`", place.rest(place.at), label, fix)
-
-
-def _directive(place: Place) -> Diagnostic:
-    span, label = place.rest(place.since), "a line that starts with `%`"
-    return _problem("a YAML directive", span, label, "remove the line")
-
-
-def _after_end(place: Place) -> Diagnostic:
-    span, fix = place.rest(place.at), "remove it, or the line before it"
-    return _problem("text after the end of the document", span, "not part of it", fix)
-
-
-_ROWS: tuple[tuple[str, Explain], ...] = (
-    ("directive|YAML document|duplicate tag", _directive),
-    ("an? (tag|anchor|alias):|tag handle", _fixed(_STARTS, _MEANING, "{quoted}", since=True)),
-    ("mapping keys are not allowed", _fixed(_STARTS, "begins a key, to YAML", "{quoted}")),
-    ("mapping values are not allowed", _second_colon),
-    ("found a tab character", _TAB),
-    ("cannot start any token", lambda place: (_TAB if place.char == "\t" else _INDICATOR)(place)),
-    ("unexpected ':'", _fixed("a `:` inside a value", "only a key ends with `:`", QUOTE)),
-    ("expected ',' or '[]}]'", _unclosed),
-    ("unexpected (end of stream|document indicator|document separator)", _open_quote),
-    ("unknown escape character|hexa?decimal number|invalid Unicode", _escape),
-    ("could not find expected ':'", _no_colon),
-    ("sequence entries are not allowed", _list_beside_key),
-    ("expected (a )?comment or (a )?line break|chomping or indentation", _block_header),
-    ("while parsing a block collection", _item),
-    ("while parsing a block mapping", _key),
-    ("expected (the )?node content", _nothing),
-    ("expected '?<document start>", _after_end),
-)
-"""Patterns of what PyYAML and libyaml report, and what it means. The first match counts."""

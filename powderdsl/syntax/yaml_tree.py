@@ -14,7 +14,7 @@ import yaml
 
 from powderdsl.diagnostics import Label, Reporter, Source, Span
 from powderdsl.syntax import pure_yaml
-from powderdsl.syntax.yaml_problems import report_character, report_yaml
+from powderdsl.syntax.yaml_problems import report_yaml
 
 MAX_CHARACTERS = 1 << 20
 MAX_DEPTH = 32
@@ -78,7 +78,9 @@ def parse_yaml(source: Source, reporter: Reporter) -> Node | None:
         return None
     unprintable = _UNPRINTABLE.search(text)
     if unprintable:
-        report_character(source, unprintable.start(), reporter)
+        at, helps = unprintable.start(), ["remove it"]
+        message = f"invalid YAML: the character U+{ord(text[at]):04X} is not allowed"
+        reporter.error("PD103", message, Span(source, at, at + 1), "cannot stand in a text file", helps=helps)
         return None
     builder = _Builder(source, reporter)
     try:

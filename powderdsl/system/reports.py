@@ -25,7 +25,10 @@ def table(rows: Sequence[Sequence[str]], indent: str = "  ") -> Iterator[str]:
         return
     rows = [[cell if isinstance(cell, Painted) else printable(cell) for cell in row] for row in rows]
     widths = [max(map(_width, column)) for column in zip(*rows, strict=True)]
-    right = [all(map(_is_number, column[1:])) for column in zip(*rows, strict=True)]
+    right = [
+        all(cell[:1].isdigit() or cell in _NOT_KNOWN for cell in column[1:])
+        for column in zip(*rows, strict=True)
+    ]
     for row in rows:
         cells = []
         for cell, width, to_right in zip(row, widths, right, strict=True):
@@ -36,10 +39,6 @@ def table(rows: Sequence[Sequence[str]], indent: str = "  ") -> Iterator[str]:
 
 def _width(cell: str) -> int:
     return len(_STYLE.sub("", cell))
-
-
-def _is_number(cell: str) -> bool:
-    return cell[:1].isdigit() or cell in _NOT_KNOWN
 
 
 def as_json(value: Any) -> str:

@@ -71,7 +71,7 @@ def test_minari_shows_what_was_recorded(recorded: Dataset) -> None:
 
 def test_images_are_not_stored_as_jpeg(recorded: Dataset, tmp_path: Path) -> None:
     """An observation that Minari takes for a picture: 40 channels of 40×40 bytes."""
-    from tests.datasets.test_reading import new_manifest, write_manifest, write_shard
+    from tests.datasets.test_reading import Manifest, write_manifest, write_shard
 
     channels = tuple(f"c{i}" for i in range(40))
     palette = {str(i): f"e.{i}" for i in range(256)}
@@ -90,7 +90,7 @@ def test_images_are_not_stored_as_jpeg(recorded: Dataset, tmp_path: Path) -> Non
     }
     (tmp_path / "a").mkdir()
     row = write_shard(tmp_path / "a", 0, parts, compress=False)
-    write_manifest(tmp_path / "a", replace(new_manifest(recipe), shards=(row,)))
+    write_manifest(tmp_path / "a", Manifest(recipe, "2026-01-01T00:00:00+00:00", (row,)))
     data = Dataset.open(tmp_path / "a")
     found = to_minari(data, ID)
     assert np.array_equal(found[0].observations, noise)

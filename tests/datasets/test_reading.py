@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from powderdsl.datasets import Dataset
 from powderdsl.datasets.dataset import Batch, drawn
 from powderdsl.datasets.flat import flat
-from powderdsl.datasets.manifest import Recipe, new_manifest, write_manifest
+from powderdsl.datasets.manifest import Manifest, Recipe, write_manifest
 from powderdsl.datasets.shards import write_shard
 from powderdsl.diagnostics import CompileError
 from powderdsl.envs import TensorEnv
@@ -53,7 +53,7 @@ def numbered(folder: Path, recipe: Recipe, lengths: list[int], shard: int, *, co
             )
         arrays = {name: [part[name] for part in parts] for name in parts[0]}
         rows.append(write_shard(folder, number, arrays, compress=compress))
-    write_manifest(folder, replace(new_manifest(recipe), shards=tuple(rows)))
+    write_manifest(folder, Manifest(recipe, "2026-01-01T00:00:00+00:00", tuple(rows)))
     return Dataset.open(folder, memory=1)
 
 

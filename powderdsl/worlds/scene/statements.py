@@ -18,12 +18,12 @@ from powderdsl.diagnostics import Reporter, Source, Span, suggest
 from powderdsl.diagnostics.printable import shown_character
 from powderdsl.syntax import yaml_tree
 from powderdsl.syntax.hints import CUT, TERMINAL_WORDS, was_cut
-from powderdsl.syntax.parse import words_of
+from powderdsl.syntax.parse import depth, words_of
 from powderdsl.worlds.raster import MAX_COORDINATE
 from powderdsl.worlds.scene.amounts import Amount, number
 
 MAX_STATEMENT = 500
-MAX_DEPTH = 24
+MAX_DEPTH = 25
 
 STATEMENTS = {
     "line": "line ELEMENT from (ROW, COLUMN) to (ROW, COLUMN) width NUMBER",
@@ -191,20 +191,12 @@ def _read(start: str, span: Span, reporter: Reporter) -> Any:
     except UnexpectedInput as error:
         _report_syntax(error, span, reporter)
         return None
-    if _depth(tree) > MAX_DEPTH:
+    if depth(tree) > MAX_DEPTH:
         reporter.error("PD605", "numbers nested too deep", span, f"more than {MAX_DEPTH} deep")
         return None
     reading = _Reading(span.source, reporter)
     found = getattr(reading, start)(tree)
     return None if reading.failed else found
-
-
-def _depth(tree: Tree) -> int:
-    """How many parts of a tree lie inside one another, without recursion."""
-    depth, level = 0, [tree]
-    while level := [child for part in level for child in part.children if isinstance(child, Tree)]:
-        depth += 1
-    return depth
 
 
 class _Reading:
