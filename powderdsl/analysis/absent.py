@@ -15,7 +15,6 @@ from powderdsl.model.types import ELEMENT, Assign, Expr, Let, Move, Rule, Rulese
 
 _ZERO = Expr("const", integer(0, 0), value=0)
 
-
 MAX_NEEDS = 6
 """So many needs are kept for a line, the smallest ones."""
 
@@ -154,7 +153,10 @@ class Lacking:
     def _folded(self, expr: Expr) -> Expr:
         args = expr.args
         match expr.op:
-            case "member" if args[0].op in ("element", "field") or _is_element_at(args[0]):
+            case "member" if (args[0].args[0] if args[0].op == "look" else args[0]).op in (
+                "element",
+                "field",
+            ):
                 if not expr.value & self.ids:
                     return FALSE
                 return TRUE if expr.value >= self.ids else expr
@@ -172,8 +174,3 @@ class Lacking:
                 a, b = (arg.value for arg in args)
                 return TRUE if {"eq": a == b, "lt": a < b, "le": a <= b}[expr.op] else FALSE
         return expr
-
-
-def _is_element_at(expr: Expr) -> bool:
-    """Whether an expression is the element of a neighbor, or what a field of a neighbor names."""
-    return expr.op == "look" and expr.args[0].op in ("element", "field")

@@ -102,25 +102,18 @@ def _rules(ledger: Ledger) -> Iterator[str]:
         if not entry.fires:
             yield "    never happens: no cell of any world can fulfill it"
         elif entry.needs:
-            yield f"    never happens without {', and without '.join(_one_of(names) for names in entry.needs)}"
-
-
-def _one_of(names: tuple[str, ...]) -> str:
-    return names[0] if len(names) == 1 else f"one of ({', '.join(names)})"
+            needs = [ids[0] if len(ids) == 1 else f"one of ({', '.join(ids)})" for ids in entry.needs]
+            yield f"    never happens without {', and without '.join(needs)}"
 
 
 def _fields(ledger: Ledger) -> Iterator[str]:
     yield "fields" if ledger.fields else "fields: none"
     for entry in ledger.fields:
-        place = "travels with its element" if entry.travels else "stays in its place"
-        yield f"  {entry.name}: {entry.kind}{_bounds(entry)}, starts as {entry.default}, {place}"
+        place, bounds = "travels with its element" if entry.travels else "stays in its place", ""
+        if entry.fresh_bounds is not None and entry.fresh_bounds != entry.bounds:
+            bounds = f", within {entry.fresh_bounds[0]:g}..{entry.fresh_bounds[1]:g} unless set by hand"
+        yield f"  {entry.name}: {entry.kind}{bounds}, starts as {entry.default}, {place}"
         yield f"    written: {_listed(_place(line) for line in entry.writers)}"
-
-
-def _bounds(entry: FieldEntry) -> str:
-    if entry.fresh_bounds is None or entry.fresh_bounds == entry.bounds:
-        return ""
-    return f", within {entry.fresh_bounds[0]:g}..{entry.fresh_bounds[1]:g} unless set by hand"
 
 
 def _overlaps(ledger: Ledger) -> Iterator[str]:
@@ -150,7 +143,10 @@ def ledger_data(ledger: Ledger) -> dict[str, Any]:
         "never_rises": ledger.falling_sums,
         "elements": [_element_data(ledger, name, numbers) for name in ledger.elements],
         "rules": [_rule_data(entry) for entry in ledger.rules],
-        "fields": [_field_data(entry, numbers) for entry in ledger.fields],
+        "fields": [
+            _without(entry, "writers", "reaches") | {"written_by": [numbers[line] for line in entry.writers]}
+            for entry in ledger.fields
+        ],
         "overlaps": [
             {"outcome": o.outcome, "field": o.field or None, "rules": (numbers[o.first], numbers[o.second])}
             for o in ledger.overlaps
@@ -172,10 +168,9 @@ def _element_data(ledger: Ledger, name: str, numbers: dict[RuleLine, int]) -> di
 
 
 def _rule_data(entry: RuleEntry) -> dict[str, Any]:
-    line, effects = entry.rule, {name: value for name, value in vars(entry).items() if name != "rule"}
+    line, effects = entry.rule, _without(entry, "rule")
     return {"rule": line.text, "where": str(line), "pass": line.pass_name, "pack": line.pack, **effects}
 
 
-def _field_data(entry: FieldEntry, numbers: dict[RuleLine, int]) -> dict[str, Any]:
-    data = {name: value for name, value in vars(entry).items() if name not in ("writers", "reaches")}
-    return {**data, "written_by": [numbers[line] for line in entry.writers]}
+def _without(entry: RuleEntry | FieldEntry, *names: str) -> dict[str, Any]:
+    return {name: value for name, value in vars(entry).items() if name not in names}

@@ -7,11 +7,11 @@ Everything found here is an upper bound. What a rule is not said to do, it canno
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from powderdsl.diagnostics import Span
 from powderdsl.model.expressions.operands import ELEMENT_HERE, member, negation
-from powderdsl.model.logic.satisfy import Budget, Facts, satisfiable
+from powderdsl.model.logic.satisfy import Facts, satisfiable
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Assign, Expr, Moment, Move, Offset, Pass, Rule, Ruleset, Swap, Transform
 
@@ -134,11 +134,6 @@ def facts_of(ruleset: Ruleset) -> Facts:
         {name: f.default for name, f in limited.items()},
         ruleset.side_multiple,
     )
-
-
-def ledger_facts(ruleset: Ruleset) -> Facts:
-    """Facts about cells, with work for all questions of one part of a ledger."""
-    return replace(facts_of(ruleset), budget=Budget(BUDGET))
 
 
 def find_changes(ruleset: Ruleset, facts: Facts) -> list[Found]:

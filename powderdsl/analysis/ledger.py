@@ -8,12 +8,13 @@ contrary, for several rules may make up for each other.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 from powderdsl.analysis.absent import Wants, find_wants, named_by_fields
-from powderdsl.analysis.changes import Found, RuleLine, find_changes, ledger_facts
+from powderdsl.analysis.changes import BUDGET, Found, RuleLine, facts_of, find_changes
 from powderdsl.analysis.overlaps import Overlap, find_overlaps
+from powderdsl.model.logic.satisfy import Budget
 from powderdsl.model.text import element_name, show_value
 from powderdsl.model.types import Assign, Kind, Ruleset
 
@@ -171,15 +172,15 @@ class Ledger:
 
         Elements that are not named count 0. Raises KeyError for a name that is not an element.
         """
-        return self._weighed(weights, "changes", lambda before, after: before != after)
+        return self._weighed(weights, "alone changes", lambda before, after: before != after)
 
     def never_rises(self, what: Mapping[str, int] | Iterable[str]) -> Verdict:
         """Whether the (weighted) number of cells with these elements never rises. Raises KeyError as `conserved`."""
-        return self._weighed(_weights(what), "rises", lambda before, after: before < after)
+        return self._weighed(_weights(what), "adds to", lambda before, after: before < after)
 
     def never_falls(self, what: Mapping[str, int] | Iterable[str]) -> Verdict:
         """Whether the (weighted) number of cells with these elements never falls. Raises KeyError as `conserved`."""
-        return self._weighed(_weights(what), "falls", lambda before, after: before > after)
+        return self._weighed(_weights(what), "takes from", lambda before, after: before > after)
 
     def unchanged(self, element: str) -> Verdict:
         """Whether a cell with this element keeps it permanently. Others may still become it: see `never_rises`.
@@ -270,7 +271,10 @@ class Ledger:
             if breaks(weights.get(a, 0), weights.get(b, 0))
         }
         if not broken:
-            return Proven(f"no rule {_DOES[verb]} {_sum_text(weights)}")
+            parts = [
+                name if weight == 1 else f"{weight} {name}" for name, weight in weights.items() if weight
+            ]
+            return Proven(f"no rule {verb} " + (f"`{' + '.join(parts)}`" if parts else "nothing"))
         (before, after), _ = next(iter(broken.items()))
         lines = tuple(dict.fromkeys(line for found in broken.values() for line in found))
         more = f", and {len(broken) - 1} changes more" if len(broken) > 1 else ""
@@ -282,23 +286,15 @@ class Ledger:
                 raise KeyError(f"no element `{name}` in {self.name}")
 
 
-_DOES = {"changes": "alone changes", "rises": "adds to", "falls": "takes from"}
-
-
 def _weights(what: Mapping[str, int] | Iterable[str]) -> Mapping[str, int]:
     return what if isinstance(what, Mapping) else dict.fromkeys(what, 1)
-
-
-def _sum_text(weights: Mapping[str, int]) -> str:
-    parts = [name if weight == 1 else f"{weight} {name}" for name, weight in weights.items() if weight]
-    return f"`{' + '.join(parts)}`" if parts else "nothing"
 
 
 def ledger(ruleset: Ruleset) -> Ledger:
     """The ledger of a checked ruleset: decided from its rules, no world is run. Raises TypeError for anything else."""
     if not isinstance(ruleset, Ruleset):
         raise TypeError(f"ledger takes a Ruleset, from powderdsl.load; found {type(ruleset).__name__}")
-    parts = [ledger_facts(ruleset) for _ in range(3)]  # each with work of its own
+    parts = [replace(facts_of(ruleset), budget=Budget(BUDGET)) for _ in range(3)]
     names = {element.id: element.name for element in ruleset.elements}
     found = find_changes(ruleset, parts[0])
     wants = find_wants(ruleset, parts[1])

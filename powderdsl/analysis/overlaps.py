@@ -67,8 +67,8 @@ def _claims(asked: Asked, pass_: Pass, known: dict[Overlap, None]) -> Iterator[O
     for i, second in enumerate(movers):
         for first in movers[: i + 1]:
             one = first is second
-            if one and _in_rows(first):
-                continue
+            if one and isinstance(first, Move) and first.leaving is None:
+                continue  # cells of one rule that share a place move in rows
             what = "both dropped" if one and outcome != "overwritten" else outcome
             overlap = Overlap(what, rule_line(first, pass_), rule_line(second, pass_))
             same = what == "first wins" and _alike(first, second)
@@ -79,11 +79,6 @@ def _claims(asked: Asked, pass_: Pass, known: dict[Overlap, None]) -> Iterator[O
             )
             if any(_meet(first.mask, second.mask, at, asked) for at in shifts if not (one and at == HERE)):
                 yield overlap
-
-
-def _in_rows(rule: Rule) -> bool:
-    """Whether cells of one rule that share a place move in rows."""
-    return isinstance(rule, Move) and rule.leaving is None
 
 
 def _alike(first: Rule, second: Rule) -> bool:
@@ -129,24 +124,20 @@ def order_matters(a: Assign, b: Assign) -> str:
         return ""
     if ":=" in (a.op, b.op):
         return "last writes"
-    ways = [_ways(one) for one in (a, b)]
-    opposite = ("up" in ways[0] and "down" in ways[1]) or ("down" in ways[0] and "up" in ways[1])
+    (low, high), (other_low, other_high) = (
+        (-one.value.kind.hi, -one.value.kind.lo) if one.op == "-=" else (one.value.kind.lo, one.value.kind.hi)
+        for one in (a, b)
+    )
+    opposite = (high > 0 and other_low < 0) or (low < 0 and other_high > 0)
     return "cut off" if a.value.kind.name == "int" and opposite else ""
-
-
-def _ways(assign: Assign) -> set[str]:
-    """Whether `+=` or `-=` may raise or lower a number."""
-    low, high = assign.value.kind.lo, assign.value.kind.hi
-    if assign.op == "-=":
-        low, high = -high, -low
-    return {*(["up"] if high > 0 else []), *(["down"] if low < 0 else [])}
 
 
 def _in_turn(ruleset: Ruleset, facts: Facts, known: dict[Overlap, None]) -> Iterator[Overlap]:
     """Transforms of different substeps that could happen to one cell of one world, with different results."""
     rules = [
-        (number, pass_, rule, _renamed_lets(moment.lets, number), _renamed(rule.mask, number))
+        (number, pass_, rule, lets, _renamed(rule.mask, number))
         for number, (pass_, moment) in enumerate(ruleset.substeps())
+        for lets in [{f"{let.name}@{number}": _renamed(let.value, number) for let in moment.lets}]
         for rule in moment.rules
         if isinstance(rule, Transform)
     ]
@@ -172,7 +163,3 @@ def _renamed(expr: Expr, number: int) -> Expr:
         return replace(expr, value=f"{expr.value}@{number}")
     args = tuple(_renamed(arg, number) for arg in expr.args)
     return replace(expr, args=args) if args else expr
-
-
-def _renamed_lets(lets: tuple, number: int) -> dict[str, Expr]:
-    return {f"{let.name}@{number}": _renamed(let.value, number) for let in lets}

@@ -66,7 +66,10 @@ def _prove(claim: Claim, ruleset: Ruleset, ledger: Ledger) -> Verdict:
                 return ledger.conserved(dict.fromkeys(names, 1))
             return ledger.never_rises(names) if claim.trend == "never rises" else ledger.never_falls(names)
         case Bounded():
-            return _bounded(claim, ruleset, ledger)
+            prop = ruleset.property(claim.field)
+            if prop is not None and not prop.stored:
+                return Proven(f"no rule changes `{claim.field}`")
+            return ledger.within(claim.field, claim.lo, claim.hi)
         case Local():
             reach = horizon(ruleset)
             if reach <= claim.radius:
@@ -81,13 +84,6 @@ def _prove(claim: Claim, ruleset: Ruleset, ledger: Ledger) -> Verdict:
 def _names(ruleset: Ruleset, ids: Iterable[int]) -> list[str]:
     kept = set(ids)
     return [element.name for element in ruleset.elements if element.id in kept]
-
-
-def _bounded(claim: Bounded, ruleset: Ruleset, ledger: Ledger) -> Verdict:
-    prop = ruleset.property(claim.field)
-    if prop is not None and not prop.stored:
-        return Proven(f"no rule changes `{claim.field}`")
-    return ledger.within(claim.field, claim.lo, claim.hi)
 
 
 # How far a step sees

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache, lru_cache
 from itertools import repeat
-from math import prod
 from operator import index
 from typing import Any, TypeAlias
 
@@ -163,10 +162,6 @@ def unpacked(raw: bytes | bytearray, code: str) -> Values:
     return values
 
 
-def code_of(values: Values) -> str:
-    return "B" if isinstance(values, bytes) else values.typecode
-
-
 def alike(several: Sequence[Values], kind: Type) -> list[Values]:
     """Values of one type, all as bytes or all as an `array.array`."""
     if len({type(values) for values in several}) == 1:
@@ -256,18 +251,13 @@ def chosen(flags: bytes, a: Values, b: Values, kind: Type, count: int) -> Values
         wide[place::size] = flags
     mask = int.from_bytes(wide, "little") * 255
     x, y = int.from_bytes(memoryview(a), "little"), int.from_bytes(memoryview(b), "little")
-    return unpacked((y ^ ((x ^ y) & mask)).to_bytes(count * size, "little"), code_of(a))
+    return unpacked((y ^ ((x ^ y) & mask)).to_bytes(count * size, "little"), getattr(a, "typecode", "B"))
 
 
 # Values elsewhere
 
 Offsets = Sequence[int]
 """Where along an axis values come from, in values from the beginning."""
-
-
-def strides(shape: Sequence[int]) -> list[int]:
-    """How many values it is along each axis to the next place."""
-    return [prod(shape[at + 1 :]) for at in range(len(shape))]
 
 
 def _runs(axes: Sequence[Offsets]) -> tuple[list[int], int]:

@@ -150,10 +150,10 @@ class ndarray:
             raise ValueError(f"{self.size} values do not have the shape {sides}")
         return ndarray(tuple(sides), self.dtype, self.values, self)
 
-    def offsets(self) -> list[Offsets]:
+    def offsets(self) -> list[range]:
         """Where the values along each axis are."""
-        steps = numbers.strides(self.shape)
-        return [range(0, side * step, step or 1) for side, step in zip(self.shape, steps, strict=True)]
+        steps = [prod(self.shape[axis + 1 :]) or 1 for axis in range(self.ndim)]
+        return [range(0, side * step, step) for side, step in zip(self.shape, steps, strict=True)]
 
     # Indexing
 
@@ -193,12 +193,12 @@ class ndarray:
         axes: list[Offsets] = []
         shape: list[int] = []
         together: list[ndarray] = []
-        steps, axis = numbers.strides(self.shape), 0
+        steps, axis = [offset.step for offset in self.offsets()], 0
         for place, item in enumerate(items):
             if item is None:
                 shape.append(1)
             elif isinstance(item, slice):
-                side, step = range(*item.indices(self.shape[axis])), steps[axis] or 1
+                side, step = range(*item.indices(self.shape[axis])), steps[axis]
                 axes.append(range(side.start * step, side.stop * step, side.step * step))
                 shape.append(len(side))
             elif place not in arrays:
@@ -402,7 +402,7 @@ def concatenate(arrays: Sequence[ndarray], axis: int = 0) -> ndarray:
         for part, length in zip(parts, lengths, strict=True)
     ]
     shape = (*before, sum(one.shape[at] for one in arrays), *after)
-    return ndarray(shape, kind, numbers.unpacked(b"".join(blocks), numbers.code_of(parts[0])))
+    return ndarray(shape, kind, numbers.unpacked(b"".join(blocks), getattr(parts[0], "typecode", "B")))
 
 
 def stack(arrays: Sequence[ndarray], axis: int = 0) -> ndarray:
@@ -411,7 +411,8 @@ def stack(arrays: Sequence[ndarray], axis: int = 0) -> ndarray:
 
 
 def repeat(values: ndarray, repeats: int, axis: int) -> ndarray:
-    at, axes, shape = range(values.ndim)[axis], values.offsets(), list(values.shape)
+    at, shape = range(values.ndim)[axis], list(values.shape)
+    axes: list[Offsets] = [*values.offsets()]
     axes[at] = [offset for offset in axes[at] for _ in range(repeats)]
     shape[at] *= repeats
     return ndarray(tuple(shape), values.dtype, numbers.gathered(values.values, axes))

@@ -404,7 +404,10 @@ def split(
         raise ValueError(f"fractions must be positive and sum to 1, found {list(fractions)}")
     episodes = rows.episodes
     numbers = torch.from_numpy(np.zeros_like(episodes.number) if by == "world" else episodes.number + 1)
-    chance = _uniform(seed, torch.from_numpy(episodes.world), numbers)
+    worlds = torch.from_numpy(episodes.world)
+    keys = base_keys(worlds, torch.full_like(worlds, seed & MASK))[0]
+    key = mix((mix((keys + (seed >> 32)) & MASK) + numbers) & MASK)
+    chance = np.asarray(key.double() / float(1 << 32))
     part = np.searchsorted(np.cumsum(fractions)[:-1], chance, side="right")
     parts = []
     for number in range(len(fractions)):
@@ -415,10 +418,3 @@ def split(
             raise ValueError(f"part {number} would be empty: {count} {by}s are too few, or take another seed")
         parts.append(selected)
     return tuple(parts)
-
-
-def _uniform(seed: int, world: Tensor, number: Tensor) -> Array:
-    """Numbers in [0, 1), hashes of the seed, a world and a number: float64 [n]."""
-    keys = base_keys(world, torch.full_like(world, seed & MASK))[0]
-    key = mix((mix((keys + (seed >> 32)) & MASK) + number) & MASK)
-    return np.asarray(key.double() / float(1 << 32))

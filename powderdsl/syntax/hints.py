@@ -119,15 +119,14 @@ def was_cut(text: str, begin: int, end: int) -> bool:
 _NAME = r"([^\W\d]\w*)"
 _NOT_ELEMENTS = "|".join(_WORDS) + "|is|in|and|or|if|mod|div|not|leaving|then|with|where"
 _WITHOUT_WHERE = "an assignment says `where`: `field := value where condition`"
+_NEXT_LINE = (
+    "each rule of a list starts with `- `; a rule that continues on the next line does so with `if`, `and`, …"
+)
 _WITHOUT_LEAVING = "a move says what it leaves behind: `SET moves below leaving ELEMENT if …`"
 
 _PHRASES: tuple[tuple[str, str, str], ...] = (
     (r"\n\s*-\s.*‸", "", "an item of a list starts with `- `: this one, or the one before it, lacks it"),
-    (
-        rf"\n\s*‸{_NAME}$",
-        "",
-        "each rule of a list starts with `- `; a rule that continues on the next line does so with `if`, `and`, …",
-    ),
+    (rf"\n\s*‸{_NAME}$", "", _NEXT_LINE),
     (rf"\b(count|sum)\s*‸{_NAME}$", "", r"write `\1(\2)`"),
     (rf"\b(above|below|left|right|here)\s*‸(?!({_NOT_ELEMENTS})$){_NAME}$", "", r"write `\1 is \3`"),
     (r"\bswaps\s*‸with$", "", "write `swaps PLACE`, without `with`"),

@@ -7,7 +7,6 @@ surprises (`no` as false, `012` as ten, `1:30` as ninety) never happen.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import yaml
@@ -84,8 +83,13 @@ def parse_yaml(source: Source, reporter: Reporter) -> Node | None:
         return None
     builder = _Builder(source, reporter)
     try:
+        # PyYAML cannot decode what escapes in a tag may spell for libyaml.
+        if _LIBYAML is None or _ESCAPED_TAG.search(text):
+            events = pure_yaml.events(text)
+        else:
+            events = yaml.parse(text, Loader=_LIBYAML)
         # Events are counted before anything recursive runs: the C loader's composer can be crashed by depth.
-        root = builder.build(_events(text))
+        root = builder.build(events)
     except yaml.YAMLError as error:
         report_yaml(error, source, reporter)
         return None
@@ -93,14 +97,6 @@ def parse_yaml(source: Source, reporter: Reporter) -> Node | None:
         return None
     # A broken tree gets no further messages.
     return None if builder.failed else root
-
-
-def _events(text: str) -> Iterator[yaml.Event]:
-    """The parser's events: the same with libyaml and without. Raises yaml.YAMLError."""
-    # PyYAML cannot decode what escapes in a tag may spell for libyaml.
-    if _LIBYAML is None or _ESCAPED_TAG.search(text):
-        return pure_yaml.events(text)
-    return yaml.parse(text, Loader=_LIBYAML)
 
 
 class _Abort(Exception):

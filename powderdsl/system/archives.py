@@ -63,11 +63,6 @@ class Archive:
     headers: Mapping[str, Header]
     _zip: zipfile.ZipFile
 
-    @property
-    def size(self) -> int:
-        """Bytes of all arrays."""
-        return sum(header.size for header in self.headers.values())
-
     def read(self, name: str) -> NDArray[Any]:
         """Read an array of numbers, of the size that its header claims; it is read-only. Raises BadArchive."""
         header = self.headers[name]

@@ -43,12 +43,11 @@ def read_bytes(path: str | Path, limit: int) -> bytes:
     """The contents of a regular file of at most `limit` bytes.
 
     Raises:
-        OSError: as `open_regular`; with the number EFBIG if it has more bytes, of which no more than `limit` are read.
+        OSError: as `open_regular`; with the number EFBIG if it has more bytes, of which no more than one is read.
     """
     with open_regular(path) as file:
-        size = os.fstat(file.fileno()).st_size
-        data = b"" if size > limit else file.read(limit + 1)
-    if size > limit or len(data) > limit:
+        data = file.read(limit + 1)
+    if len(data) > limit:
         raise OSError(errno.EFBIG, f"it has more than {limit:,} bytes", os.fspath(path))
     return data
 

@@ -10,8 +10,6 @@ from typing import Any
 from powderdsl.diagnostics.printable import printable
 
 _STYLE = re.compile(r"\x1b\[[0-9;]*m")
-_NOT_KNOWN = ("", "?", "–")
-"""Cells that a column of numbers may have, too."""
 
 
 class Painted(str):
@@ -26,7 +24,7 @@ def table(rows: Sequence[Sequence[str]], indent: str = "  ") -> Iterator[str]:
     rows = [[cell if isinstance(cell, Painted) else printable(cell) for cell in row] for row in rows]
     widths = [max(map(_width, column)) for column in zip(*rows, strict=True)]
     right = [
-        all(cell[:1].isdigit() or cell in _NOT_KNOWN for cell in column[1:])
+        all(cell[:1].isdigit() or cell in ("", "?", "–") for cell in column[1:])
         for column in zip(*rows, strict=True)
     ]
     for row in rows:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import platform
 import stat
 from pathlib import Path
 
@@ -12,9 +11,12 @@ def cache_folder(name: str) -> Path:
     """A folder of the cache, made with mode 0700.
 
     Raises:
-        OSError: it cannot be made, belongs to somebody else, or others may write to it.
+        OSError: it cannot be made, belongs to somebody else, or others may write to it; or there is no home folder.
     """
-    top = _root() / "powderdsl"
+    try:
+        top = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "powderdsl"
+    except RuntimeError as error:
+        raise OSError(str(error)) from None
     for folder in (top, top / name):
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         check_private(folder)
@@ -31,16 +33,3 @@ def check_private(folder: Path) -> None:
             raise PermissionError(f"{folder} belongs to another user")
     if folder.stat().st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         raise PermissionError(f"others may write to {folder}: empty it, then `chmod 700` it")
-
-
-def _root() -> Path:
-    """Where caches of this user live. Raises OSError if there is no home folder."""
-    # What platformdirs says too, without the time its import takes; browsers have a file system of their own in memory.
-    if platform.system() in ("Linux", "Emscripten"):
-        try:
-            return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        except RuntimeError as error:
-            raise OSError(str(error)) from None
-    import platformdirs
-
-    return Path(platformdirs.user_cache_dir())

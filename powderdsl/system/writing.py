@@ -42,8 +42,10 @@ def replacing(path: Path, *, follow: bool = False) -> Iterator[Path]:
     temporary = Path(name)
     try:
         yield temporary
-        # Temporary files are private to their owner; an ordinary new file follows the umask.
-        temporary.chmod(0o666 & ~_umask())
+        # Temporary files are private to their owner; an ordinary new file follows the umask, which can only be set.
+        mask = os.umask(0)
+        os.umask(mask)
+        temporary.chmod(0o666 & ~mask)
         try:
             os.replace(temporary, target)
         except OSError as error:
@@ -91,10 +93,3 @@ def not_writable(path: Path, error: Exception) -> CompileError:
     """PD613, with the reason that the system gave."""
     reason = getattr(error, "strerror", None) or str(error)
     return failure("PD613", f"cannot write {path}", notes=(reason,))
-
-
-def _umask() -> int:
-    # There is no way to read it but to set it.
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

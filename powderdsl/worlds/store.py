@@ -134,8 +134,9 @@ def _shape(archive: Archive, sim: AnySimulator[Any], path: Path) -> tuple[int, .
     cells = prod(header.shape)
     check_saved(path, header.shape)
     a_cell = sum(max(1, slot.planes) * np.dtype(slot.dtype).itemsize for slot in sim.slots)
-    if archive.size > MORE + 2 * cells * a_cell:
-        raise _bad(path, f"is not a saved world: it has {archive.size:,} bytes of arrays for {cells:,} cells")
+    size = sum(header.size for header in archive.headers.values())
+    if size > MORE + 2 * cells * a_cell:
+        raise _bad(path, f"is not a saved world: it has {size:,} bytes of arrays for {cells:,} cells")
     return header.shape
 
 

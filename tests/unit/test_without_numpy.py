@@ -1,4 +1,4 @@
-"""The compiler runs without torch, NumPy and platformdirs, as in a browser."""
+"""The compiler runs without torch and NumPy, as in a browser."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ import sys
 
 class Blocked:
     def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in ("torch", "numpy", "platformdirs"):
+        if name.partition(".")[0] in ("torch", "numpy"):
             raise ImportError(f"{name} is blocked")
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -96,8 +97,9 @@ def _read_scene(node: yaml_tree.Node, reader: Reader) -> Scene | None:
     named = name is not None and can_be_called(name, "a scene", reporter)
     size = _read_size(entries["size"][1], reporter) if "size" in entries else None
     paints = _read_statements(entries["draw"][1], reader) if "draw" in entries else ()
-    if size:
-        _check_coverage(paints, size, reporter)
+    for one in paints if size else ():
+        if size and not mask(one.shape, size).any():
+            covers_nothing(one.span, "nothing of it lies", size, reporter)
     if not (name and named and size and fill):
         return None
     return Scene(name.text, reader.text(entries, "about"), size, fill.text, paints, name.span, fill.span)
@@ -132,12 +134,6 @@ def _read_size(node: yaml_tree.Node, reporter: Reporter) -> Size | None:
         reporter.error("PD607", message, node.span, "too small or too large", helps=[SIZE_RULE])
         return None
     return size
-
-
-def _check_coverage(paints: Iterable[Paint | Setting], size: Size, reporter: Reporter) -> None:
-    for one in paints:
-        if not mask(one.shape, size).any():
-            covers_nothing(one.span, "nothing of it lies", size, reporter)
 
 
 def covers_nothing(span: Span | None, what: str, size: Size, reporter: Reporter) -> None:
@@ -254,7 +250,7 @@ def find_scene(path_or_name: str | Path) -> Scene:
     """A scene from a file, or a shipped one by name. Raises CompileError (PD601 for an unknown name)."""
     text = str(path_or_name)
     file, _, name = text.rpartition("#") if "#" in text else (text, "", "")
-    if file.lower().endswith((".yaml", ".yml")) or _is_file(file):
+    if file.lower().endswith((".yaml", ".yml")) or os.path.isfile(file):
         scenes = {scene.name: scene for scene in read_file(Path(file))}
         if not name and len(scenes) == 1:
             return next(iter(scenes.values()))
@@ -268,13 +264,6 @@ def find_scene(path_or_name: str | Path) -> Scene:
         return shipped[text]
     helps = suggest(text, shipped) or ("shipped: " + ", ".join(shipped),)
     raise failure("PD601", f"unknown scene `{text[:80]}`", helps=helps)
-
-
-def _is_file(text: str) -> bool:
-    try:
-        return Path(text).is_file()
-    except OSError:  # a name longer than the system allows is not a file either
-        return False
 
 
 def shipped_scenes() -> tuple[Scene, ...]:
@@ -338,7 +327,11 @@ def draw_start(scene: Scene, ruleset: Ruleset, *, size: Size | None = None) -> S
     held = {slot.name: slot for slot in slots(ruleset) if slot.name != "element"}
     values = {one: _value(one, held, words, ruleset, reporter) for one in paints if isinstance(one, Setting)}
     reporter.raise_if_errors()
-    found = {one.name: _unset(held[one.name], ids.shape) for one in values}
+    found: dict[str, FieldValues] = {}
+    for name in dict.fromkeys(one.name for one in values):
+        slot = held[name]
+        unset = np.zeros((2, *ids.shape) if slot.planes == 2 else ids.shape, np.dtype(slot.dtype))
+        found[name] = FieldValues(unset, np.zeros(ids.shape, np.bool_))
     now = np.full(ids.shape, words[scene.fill], dtype=np.uint8)
     for one in paints if values else ():
         cells = mask(one.shape, ids.shape)
@@ -348,7 +341,8 @@ def draw_start(scene: Scene, ruleset: Ruleset, *, size: Size | None = None) -> S
                 if held[name].travels:
                     field.where[cells] = False
             continue
-        limited = _limited(held[one.name], ruleset)
+        prop = ruleset.property(one.name)
+        limited = held[one.name].of if prop is None else prop.stored  # None: all elements have it
         if limited is not None:
             cells = cells & np.isin(now, sorted(limited))
         if not cells.any():
@@ -381,14 +375,3 @@ def _value(
     except WordProblem as wrong:
         reporter.error(wrong.code, wrong.message, one.value_span, wrong.label, helps=wrong.helps)
         return ()
-
-
-def _unset(slot: Slot, shape: tuple[int, ...]) -> FieldValues:
-    dtype = np.dtype(slot.dtype)
-    return FieldValues(np.zeros((2, *shape) if slot.planes == 2 else shape, dtype), np.zeros(shape, np.bool_))
-
-
-def _limited(slot: Slot, ruleset: Ruleset) -> frozenset[int] | None:
-    """The elements whose cells can have the slot's field; None for all."""
-    prop = ruleset.property(slot.name)
-    return slot.of if prop is None else prop.stored
