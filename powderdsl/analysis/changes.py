@@ -17,9 +17,6 @@ from powderdsl.model.types import Assign, Expr, Moment, Move, Offset, Pass, Rule
 
 HERE: Offset = (0, 0)
 
-BUDGET = 400_000
-"""Nodes evaluated for each part of a ledger: some seconds. The largest shipped ruleset needs half of it."""
-
 MAX_QUESTION = 20_000
 """Nodes evaluated for one question, after which the answer is that it may be."""
 

@@ -12,13 +12,16 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 from powderdsl.analysis.absent import Wants, find_wants, named_by_fields
-from powderdsl.analysis.changes import BUDGET, Found, RuleLine, facts_of, find_changes
+from powderdsl.analysis.changes import Found, RuleLine, facts_of, find_changes
 from powderdsl.analysis.overlaps import Overlap, find_overlaps
 from powderdsl.model.logic.satisfy import Budget
 from powderdsl.model.text import element_name, show_value
 from powderdsl.model.types import Assign, Kind, Ruleset
 
 Bounds = tuple[float, float]
+
+BUDGET = 400_000
+"""Nodes evaluated for each part of a ledger: some seconds. The largest shipped ruleset needs half of it."""
 
 
 @dataclass(frozen=True)

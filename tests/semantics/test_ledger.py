@@ -173,7 +173,7 @@ def test_writes_whose_order_decides() -> None:
 
 
 def test_too_many_rules_are_said_to_be(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("powderdsl.analysis.changes.BUDGET", 100)
+    monkeypatch.setattr("powderdsl.analysis.ledger.BUDGET", 100)
     book = ledger(load("core+water"))
     assert not book.complete
     assert "Not decided in full" in ledger_text(book)
@@ -281,7 +281,7 @@ def watched(ruleset: Ruleset, seeds: range, shape: tuple[int, int, int] | None =
 @pytest.mark.parametrize("first", range(0, 60, 10))
 def test_random_rules_keep_to_their_ledger(first: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "powderdsl.analysis.changes.BUDGET", 50_000
+        "powderdsl.analysis.ledger.BUDGET", 50_000
     )  # some are found too large: that is sound too
     tried = 0
     for seed in range(first, first + 10):

@@ -302,7 +302,7 @@ class WorldMaker:
         for number, drawn in enumerate(region.shapes):
             draws = _Draws(hashes, _shape_number(region, number), 1, names)
             words = self.drawn_words(drawn, [draws.array(one) for one in drawn.amounts])
-            found |= self.kind.xp.broadcast_to(words, (shape[0], 1, *shape[1:]))[:, 0]
+            found = found | self.kind.xp.broadcast_to(words, (shape[0], 1, *shape[1:]))[:, 0]
         return found
 
     def drawn_words(self, drawing: Drawing, numbers: list[Array | None]) -> Array:
@@ -399,7 +399,7 @@ class _Painter:
             words = words & regions[drawing.where]
         if drawing.over is not None:
             words = words & self._holding(planes, drawing.over)
-        planes ^= (planes ^ bits) & words
+        planes[...] = planes ^ ((planes ^ bits) & words)
 
     def _holding(self, planes: Array, ids: frozenset[int]) -> Array:
         """The words of cells that hold one of some elements."""
