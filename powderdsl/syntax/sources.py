@@ -13,7 +13,7 @@ MAX_BYTES = 4 * MAX_CHARACTERS
 
 
 def read_source(path: Path, reporter: Reporter, *, limit: int = MAX_BYTES) -> Source | None:
-    """The text of a UTF-8 file with its shortest name, or None after reporting PD101 or PD102.
+    """The text of a UTF-8 file, or None after reporting PD101 or PD102. Its name is relative where it lies below here.
 
     Args:
         limit: bytes that it may have.
@@ -32,15 +32,11 @@ def read_source(path: Path, reporter: Reporter, *, limit: int = MAX_BYTES) -> So
         else:
             reporter.error("PD101", f"cannot read `{path}`", None, notes=[error.strerror or str(error)])
         return None
-    return Source(short_name(path), text)
-
-
-def short_name(path: Path) -> str:
-    """A path as messages show it: relative to the working directory where it lies there."""
     try:
-        return str(path.resolve().relative_to(Path.cwd()))
+        name = str(path.resolve().relative_to(Path.cwd()))
     except (ValueError, OSError, RuntimeError):  # it lies elsewhere; it is a loop of links
-        return str(path)
+        name = str(path)
+    return Source(name, text)
 
 
 def path_beside(name: str, span: Span, reporter: Reporter) -> Path | None:

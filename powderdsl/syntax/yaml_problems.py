@@ -13,7 +13,7 @@ import yaml
 from powderdsl.diagnostics import Diagnostic, Label, Reporter, Source, Span
 
 QUOTE = "put quotes around the whole value"
-_MEANING = "has a meaning of its own in YAML"
+_STARTS, _MEANING = "a value cannot start with `{}`", "has a meaning of its own in YAML"
 _ENTRY = re.compile(r"\s*(?:- +)?(?P<key>[\w?]+): +(?P<value>[^\"'\s].*?)\s*\Z")
 
 
@@ -84,15 +84,15 @@ def _explained(place: Place, words: str) -> Diagnostic:
         label, fix = "a line that starts with `%`", "remove the line"
         return _problem("a YAML directive", place.rest(place.since), label, fix)
     if says("an? (tag|anchor|alias):|tag handle"):
-        return _problem(_starts_with(start), start, _MEANING, place.quoted(place.since))
+        return _problem(_STARTS.format(start.text), start, _MEANING, place.quoted(place.since))
     if says("mapping keys are not allowed"):
-        return _problem(_starts_with(here), here, "begins a key, to YAML", place.quoted(place.at))
+        return _problem(_STARTS.format(here.text), here, "begins a key, to YAML", place.quoted(place.at))
     if says("mapping values are not allowed"):
         return _second_colon(place)
     if says("found a tab character") or (place.char == "\t" and says("cannot start any token")):
         return _problem("a tab in the indentation", here, "a tab", "indent with spaces")
     if says("cannot start any token"):
-        return _problem(_starts_with(here), here, _MEANING, place.quoted(place.at))
+        return _problem(_STARTS.format(here.text), here, _MEANING, place.quoted(place.at))
     if says("unexpected ':'"):
         return _problem("a `:` inside a value", here, "only a key ends with `:`", QUOTE)
     if says("expected ',' or '[]}]'"):
@@ -130,10 +130,6 @@ def _explained(place: Place, words: str) -> Diagnostic:
         label, fix = "not part of it", "remove it, or the line before it"
         return _problem("text after the end of the document", place.rest(place.at), label, fix)
     return _problem("not readable", here, words)
-
-
-def _starts_with(span: Span) -> str:
-    return f"a value cannot start with `{span.text}`"
 
 
 def _problem(
