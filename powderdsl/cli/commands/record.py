@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import click
 
 from powderdsl.cli import options as opt
-from powderdsl.cli.exits import BAD_INPUT, OK, BadInput, user_values
-from powderdsl.cli.output import counted, progress, write_diagnostics
+from powderdsl.cli.exits import OK, BadInput, user_values
+from powderdsl.cli.output import counted, progress
 from powderdsl.datasets.manifest import check_place
-from powderdsl.diagnostics import CompileError, Diagnostic
 from powderdsl.tasks.shipped import check_split, load_task
-from powderdsl.tasks.task import Task, still_action
+from powderdsl.tasks.task import Task
 
 SCRIPTED = ("expert", "random", "nothing")
 
@@ -78,16 +74,19 @@ def command(
     if to_minari is not None or from_minari is not None:
         return _exchanged(task, out, episodes, to_minari, from_minari, how)
     named = {name: how.pop(name) for name in ("knobs", "settings", "packs")}
-    found = _checked(task, out, episodes, policy, how["split"], **named)
-    if found is None or out is None or episodes is None:
-        return BAD_INPUT
+    if task is None or out is None or episodes is None:
+        required = {"TASK": task, "--out": out, "--episodes": episodes}
+        raise BadInput(f"missing {', '.join(name for name, value in required.items() if value is None)}")
+    with user_values():
+        check_place(out)
+        loaded = _loaded(task, policy, how["split"], **named)
     require_gymnasium()
     from powderdsl.datasets.recorder import record
 
-    with user_values(), progress(found.name, episodes, lines=True, resumes=out) as show:
-        acting = {"policy": policy} if policy in SCRIPTED else _trained(policy, found, how)
+    with user_values(), progress(loaded.name, episodes, lines=True, resumes=out) as show:
+        acting = {"policy": policy} if policy in SCRIPTED else _trained(policy, loaded, how)
         dataset = record(
-            found,
+            loaded,
             folder=out,
             episodes=episodes,
             progress=lambda done, total: show(done, "episodes"),
@@ -103,58 +102,24 @@ def command(
     return OK
 
 
-def _checked(
-    task: str | None,
-    out: Path | None,
-    episodes: int | None,
+def _loaded(
+    task: str,
     policy: str,
     split: str,
     *,
     knobs: dict[str, int],
     settings: dict[str, str],
     packs: tuple[str, ...],
-) -> Task | None:
-    """The task; None after reporting everything that is wrong, before any import that takes long."""
-    lines: list[str] = []
-    diagnostics: list[Diagnostic] = []
-
-    @contextmanager
-    def collected() -> Iterator[None]:
-        """Collect what the block raises, so that it can be reported together with the rest."""
-        try:
-            yield
-        except CompileError as error:
-            diagnostics.extend(error.diagnostics)
-        except (BadInput, ValueError) as error:
-            lines.append(str(error))
-
-    required = {"TASK": task, "--out": out, "--episodes": episodes}
-    if missing := [name for name, value in required.items() if value is None]:
-        lines.append(f"missing {', '.join(missing)}")
-    if out is not None:
-        with collected():
-            check_place(out)
+) -> Task:
+    """The task, checked before any import that takes long. Raises CompileError and BadInput."""
     palette = None
     if policy not in SCRIPTED:
         from powderdsl.experiments.runs import find_run, recorded_palette
 
-        with collected():
-            palette = recorded_palette(find_run(policy, "ppo"))
-    loaded = None
-    if task is not None:
-        with collected():
-            loaded = load_task(task, knobs=knobs, params=settings, packs=packs, palette=palette)
-            check_split(loaded, split)
-    if loaded is not None and policy == "nothing":
-        with collected():
-            still_action(loaded)
-    if loaded is not None and policy == "expert" and loaded.expert is None:
-        lines.append(f"the task {loaded.name} has no `expert:`")
-    if diagnostics:
-        write_diagnostics(diagnostics, sys.stderr)
-    for line in lines:
-        click.echo(f"error: {line}", err=True)
-    return None if lines or diagnostics else loaded
+        palette = recorded_palette(find_run(policy, "ppo"))
+    loaded = load_task(task, knobs=knobs, params=settings, packs=packs, palette=palette)
+    check_split(loaded, split)
+    return loaded
 
 
 def _trained(path: str, task: Task, how: dict[str, Any]) -> dict[str, Any]:
