@@ -292,9 +292,6 @@ class _Mutated:
     def states(self, sample: Start, steps: int, random: Mapping[str, Array] | None = None) -> list[State]:
         return run_sample(self.sim, sample, steps, random)[0]
 
-    def of(self, ruleset: Ruleset) -> _Mutated:
-        return _Mutated(compile(ruleset, backend=AT_ONCE))
-
 
 def broken_invariant(original: Original, sim: Simulator) -> tuple[Invariant | None, bool]:
     """An invariant of the mutant that some world breaks, and whether any world ended otherwise than before.

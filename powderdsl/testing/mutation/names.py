@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from powderdsl.model.builtins import KERNELS
 from powderdsl.model.declarations import PackDecl, TypedDecl
@@ -44,13 +44,8 @@ class Names:
 
     def with_lets(self, lets: dict[str, str]) -> Names:
         """The same names with the `let` values of a pass."""
-        return Names(
-            {**self.kinds, **dict.fromkeys(lets, "let")},
-            self.own | frozenset(lets),
-            self.ranges,
-            self.flags,
-            lets,
-        )
+        kinds = {**self.kinds, **dict.fromkeys(lets, "let")}
+        return replace(self, kinds=kinds, own=self.own | frozenset(lets), local=lets)
 
 
 def names_of(packs: Sequence[PackDecl], pack: PackDecl) -> Names:
@@ -60,12 +55,11 @@ def names_of(packs: Sequence[PackDecl], pack: PackDecl) -> Names:
     flags = set()
     own: set[str] = set()
     for one in packs:
-        found: dict[str, str] = {}
-        found |= dict.fromkeys((decl.name.text for decl in one.tags), "tag")
-        found |= dict.fromkeys((decl.name.text for decl in one.sets), "set")
-        found |= dict.fromkeys((decl.name.text for decl in one.elements), "element")
-        found |= dict.fromkeys((decl.name.text for decl in one.streams), "stream")
-        found |= dict.fromkeys((decl.name.text for decl in one.kernels), "kernel")
+        found = {
+            decl.name.text: kind
+            for kind in ("tag", "set", "element", "stream", "kernel")
+            for decl in getattr(one, f"{kind}s")
+        }
         found |= _typed(one.properties, "property") | _typed(one.fields, "field")
         if one is pack:
             found |= _typed(one.params, "parameter")

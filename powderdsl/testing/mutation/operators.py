@@ -117,7 +117,8 @@ def line_changes(node: Syntax, names: Names) -> Changes:
             template != "{1}" or node.children[0].kind != node.kind
         ):  # else the same as a part's second operand
             yield written(operator, node.span, filled(template, node))
-    yield from MISTAKES.get(node.kind, no_mistakes)(node, names)
+    if node.kind in MISTAKES:
+        yield from MISTAKES[node.kind](node, names)
     for child in node.children:
         if node.kind != "binding" or child is not node.children[0]:  # the variable's own name
             yield from line_changes(child, names)
@@ -183,11 +184,6 @@ def near_chances(text: str) -> Iterator[str]:
 
 
 Mistake = Callable[[Syntax, Names], Iterable[Change]]
-
-
-def no_mistakes(node: Syntax, names: Names) -> Iterable[Change]:
-    """None besides templates."""
-    return ()
 
 
 def values(operator: str, others: Callable[[str], Iterable[str]]) -> Mistake:
@@ -270,8 +266,9 @@ def _binding(node: Syntax, names: Names) -> Changes:
 
 
 def _loops(node: Syntax, names: Names) -> Changes:
-    if len(node.children) > 1:
-        yield exchanged("order", node.children[0].span, node.children[1].span)
+    """The first two loops exchanged."""
+    for first, second in itertools.pairwise(node.children[:2]):
+        yield exchanged("order", first.span, second.span)
 
 
 def _repeat(node: Syntax, names: Names) -> Changes:
@@ -310,7 +307,8 @@ def _effects(node: Syntax, names: Names) -> Changes:
     updates = [child.span for child in node.children]
     if len(updates) == 1:
         yield written("effect", node.span, "")
-    for number in range(len(updates) if len(updates) > 1 else 0):
+        return
+    for number in range(len(updates)):
         yield without("effect", updates, number)
 
 
@@ -470,18 +468,12 @@ def _default(entry: Entry) -> Changes:
         yield entry.lost("field")
 
 
-def _param(entry: Entry) -> Changes:
-    yield from entry.line()
-    yield from by_key({"default": Entry.line}, nothing)(entry)
-
-
 def _kernel(entry: Entry) -> Changes:
     node = entry.node
     parts = {part.key.text: part for part in entry.entries()}
     if "shape" in parts:
         yield from parts["shape"].line()
-    rows = parts.get("rows") if isinstance(node, yaml_tree.Mapping) else entry
-    for row in rows.items() if rows is not None else ():
+    for row in parts.get("rows", entry).items():
         if isinstance(row.node, Scalar):
             yield from _numbers("kernel", row.node.content, r"-?\d+", near_weights)
     if "edges" in parts:
@@ -600,19 +592,13 @@ def _order(entry: Entry) -> Changes:
 
 
 def _action(entry: Entry) -> Changes:
-    if entry.key.text != "do":
-        yield from replace(entry, node=entry.key).line("header")
-    yield without_action("rule", entry.path)
-    yield from _body(entry)
-
-
-def _then(entry: Entry) -> Changes:
-    yield entry.lost("rule")
-    yield from _body(entry)
-
-
-def _body(entry: Entry) -> Changes:
-    """A rule, a list of rules, or blocks."""
+    """What a block does, or does then: a rule, a list of rules, or blocks."""
+    if entry.key.text == "then":
+        yield entry.lost("rule")
+    else:
+        if entry.key.text != "do":
+            yield from replace(entry, node=entry.key).line("header")
+        yield without_action("rule", entry.path)
     items = entry.items()
     for item in items:
         if len(items) > 1:
@@ -645,7 +631,7 @@ BLOCK: dict[str, EntryMistake] = {
     "let": by_key({}, Entry.line),
     "symmetry": _option("side", "mirror", "rotations", "all"),
     "conflicts": _option("conflicts", "drop_both", "first_wins", "overwrite"),
-    "then": _then,
+    "then": _action,
 }
 """The mistakes in each key of a pass or block, besides its action."""
 
@@ -660,7 +646,7 @@ FIELD: dict[str, EntryMistake] = {
 SECTIONS: dict[str, EntryMistake] = {
     "properties": _property,
     "fields": by_key(FIELD, _default),
-    "params": _param,
+    "params": lambda entry: [*entry.line(), *by_key({"default": Entry.line}, nothing)(entry)],
     "kernels": _kernel,
     "sets": Entry.line,
     "elements": _element,

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
+from textwrap import indent
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from powderdsl.simulation.draw import to_numpy
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.syntax.yaml_tree import Mapping, parse_yaml
 from powderdsl.syntax.yaml_tree import Sequence as YamlSequence
+from powderdsl.system.writing import write_text
 from powderdsl.testing.generators.cases import Array, Start
 from powderdsl.testing.mutation.mutants import Mutant
 from powderdsl.testing.pack_tests.runner import ANYTHING, SEEDS, field_rows
@@ -61,14 +63,16 @@ def written_test(
     name = f"{GENERATED}{_digest(mutant.key)} against {mutant.operator} in {_where(mutant)}"
     lines = [f"- {name}:"]
     if legend:
-        items = ", ".join(f"{_quoted(glyph)}: {element}" for glyph, element in legend)
+        quoted = [(glyph if glyph.isalpha() else f'"{glyph}"', element) for glyph, element in legend]
+        items = ", ".join(f"{glyph}: {element}" for glyph, element in quoted)
         lines.append(f"    legend: {{{items}}}")
     lines += ["    given: |", *_drawn(before, glyphs)]
     needed = needs_of(packs)[mutant.pack]
     start = run_sample(sim, found.sample, 0)[1]
     usual = sim.world(found.sample.ids)
     for field in found.sample.fields:
-        words = _words(field, start, ~_unequal(start, usual, field), ".")
+        same = _same(*(to_numpy(world.state[field][0]) for world in (start, usual)))
+        words = _words(field, start, same, ".")
         if words:
             lines += ["    fields:"] if "    fields:" not in lines else []
             lines += [f"      {_known(field, ruleset, needed)}: |", *words]
@@ -77,8 +81,7 @@ def written_test(
         lines += ["    expect: |", *_drawn(wanted, glyphs)]
     else:
         end = run_sample(sim, found.sample, found.steps)[1]
-        unequal = (found.first[found.slot] != found.second[found.slot])[0]
-        same = ~(unequal.any(0) if unequal.ndim == 3 else unequal)
+        same = _same(found.first[found.slot][0], found.second[found.slot][0])
         name_ = _known(found.slot, ruleset, needed)
         lines += ["    expect_fields:", f"      {name_}: |", *_words(found.slot, end, same, ANYTHING)]
     if seed is not None:
@@ -86,10 +89,10 @@ def written_test(
     return GeneratedTest(mutant.pack, name, "\n".join(lines) + "\n")
 
 
-def _unequal(first: World, second: World, field: str) -> np.ndarray:
-    """bool [H, W]: cells in which a field of two worlds differs."""
-    unequal = to_numpy(first.state[field][0]) != to_numpy(second.state[field][0])
-    return np.asarray(unequal.any(0) if unequal.ndim == 3 else unequal)
+def _same(first: Array, second: Array) -> Array:
+    """bool [H, W]: cells in which a field of two worlds is the same."""
+    same = np.asarray(first == second)
+    return np.asarray(same.all(0)) if same.ndim == 3 else same
 
 
 def _words(field: str, world: World, same: np.ndarray, filler: str) -> list[str]:
@@ -103,11 +106,9 @@ def _words(field: str, world: World, same: np.ndarray, filler: str) -> list[str]
 
 def _known(field: str, ruleset: Ruleset, needed: frozenset[str]) -> str:
     """A field's name, with `?` if its pack may be absent."""
-    owners = {one.name: one.pack for one in ruleset.fields} | {
-        one.name: one.pack for one in ruleset.properties
-    }
-    owner = owners[field]
-    return field if owner in needed else f"{field}?"
+    declared = ruleset.property(field) or ruleset.field(field)
+    assert declared is not None
+    return field if declared.pack in needed else f"{field}?"
 
 
 def _drawn(ids: np.ndarray, glyphs: dict[int, str]) -> list[str]:
@@ -123,10 +124,6 @@ def _where(mutant: Mutant) -> str:
     old = " ".join(mutant.source.text[mutant.change.start : mutant.change.end].split())
     words = re.sub(r"[^A-Za-z0-9_ .<>=+*/()%-]", " ", old or mutant.pack)
     return " ".join(words.split())[:40].strip(" -") or mutant.pack
-
-
-def _quoted(glyph: str) -> str:
-    return glyph if glyph.isalpha() else f'"{glyph}"'
 
 
 def _legend(
@@ -169,32 +166,24 @@ def with_tests(source: Source, tests: Sequence[GeneratedTest]) -> str:
     text = source.text if source.text.endswith("\n") or not source.text else source.text + "\n"
     node = root.get("tests") if isinstance(root, Mapping) else None
     if node is None:
-        return text + "tests:\n" + "".join(_indented(test.text, 2) for test in tests)
+        return text + "tests:\n" + indent("".join(test.text for test in tests), "  ")
     if not isinstance(node, YamlSequence) or source.text[node.span.start] == "[":
         raise ValueError(f"{source.name}: `tests:` is not a list with a line for each test")
     first = source.text.rfind("\n", 0, node.span.start) + 1
-    indent = len(source.text[first : node.span.start]) - len(source.text[first : node.span.start].lstrip(" "))
+    margin = " " * (len(source.text[first:]) - len(source.text[first:].lstrip(" ")))
     # The list ends before the next key of the file, or at its end; blank lines and comments between stay below it.
     following = [key.span.start for key, _ in root.entries if key.span.start > node.span.start]  # type: ignore[union-attr]
     end = min(following, default=len(text))
     lines = text[:end].splitlines(keepends=True)
     while lines and (not lines[-1].strip() or lines[-1].startswith("#")):
         end -= len(lines.pop())
-    return text[:end] + "".join(_indented(test.text, indent) for test in tests) + text[end:]
-
-
-def _indented(text: str, indent: int) -> str:
-    return "".join(f"{' ' * indent}{line}\n" for line in text.splitlines())
+    return text[:end] + indent("".join(test.text for test in tests), margin) + text[end:]
 
 
 def add_tests(path: Path, tests: Sequence[GeneratedTest]) -> None:
     """Write more tests into a pack's file, whole or not at all."""
-    from powderdsl.system.writing import replacing
-
     path = path.resolve()
-    whole = with_tests(Source(str(path), path.read_text(encoding="utf-8")), tests)
-    with replacing(path) as temporary:
-        temporary.write_text(whole, encoding="utf-8")
+    write_text(path, with_tests(Source(str(path), path.read_text(encoding="utf-8")), tests))
 
 
 ROUNDS = (

@@ -115,14 +115,6 @@ def translated(sample: Start, ruleset: Ruleset, target: Ruleset) -> Start | None
     return replace(sample, ids=table[sample.ids].astype(np.uint8), fields=fields, params=params)
 
 
-def same_claim(prop: Property, ruleset: Ruleset) -> Property | None:
-    """The invariant of the same line as other rules have it: their elements may have other ids."""
-    for one in ruleset.invariants:
-        if one.span == prop.span:
-            return Property(one.claim, prop.text, one.pack, one.span, one.without, one.scope)
-    return None
-
-
 def difference(prop: Property, ruleset: Ruleset, found: Counterexample) -> Difference:
     """The added packs that break an invariant which holds in its scope, and how they do it."""
     added = ruleset.added_to(prop.scope)
@@ -198,10 +190,12 @@ def _still(prop: Property, ruleset: Ruleset, found: Counterexample, pack: str) -
     fewer = without(ruleset, pack)
     if fewer is None:
         return True
-    claim, sample = same_claim(prop, fewer), translated(found.sample, ruleset, fewer)
+    # The elements of other rules may have other ids: the claim is that of the same line there.
+    claim = next((invariant.claim for invariant in fewer.invariants if invariant.span == prop.span), None)
+    sample = translated(found.sample, ruleset, fewer)
     if claim is None or sample is None:
         return False
-    return bool(breaks(claim.claim, Oracle(fewer, fewer.passes), sample, found.steps).first.any())
+    return bool(breaks(claim, Oracle(fewer, fewer.passes), sample, found.steps).first.any())
 
 
 def doings(pack: str, ruleset: Ruleset, near: frozenset[str] = frozenset()) -> list[Cause]:

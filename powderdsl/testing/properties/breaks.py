@@ -51,14 +51,12 @@ SIGMAS = 6.0
 
 
 class Runs(Protocol):
-    """Runs worlds: `running.Runner`, or the oracle alone."""
+    """Runs worlds on a backend or on the oracle."""
 
     @property
     def ruleset(self) -> Ruleset: ...
 
     def states(self, sample: Start, steps: int, random: Mapping[str, Array] | None = None) -> list[State]: ...
-
-    def of(self, ruleset: Ruleset) -> Runs: ...
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,9 @@ from powderdsl.diagnostics import CompileError, Span
 from powderdsl.model.restrict import Difference
 from powderdsl.model.state import slots
 from powderdsl.model.text import one_line, place_of
-from powderdsl.model.types import Ruleset
+from powderdsl.model.types import Invariant, Ruleset
 from powderdsl.simulation.draw import palette, ramps, rgb, scale, tints
-from powderdsl.system.writing import failure, replacing
+from powderdsl.system.writing import failure, write_text
 from powderdsl.testing.generators.cases import Array, Start, fresh
 from powderdsl.testing.generators.trees import (
     Tree,
@@ -49,6 +49,12 @@ class Property:
     """Elements that a world starts without."""
     scope: tuple[str, ...] = ()
     """The packs that it speaks of."""
+
+    @classmethod
+    def of(cls, invariant: Invariant) -> Property:
+        """The property that a declared invariant claims."""
+        text = one_line(invariant.span)
+        return cls(invariant.claim, text, invariant.pack, invariant.span, invariant.without, invariant.scope)
 
     @property
     def place(self) -> str:
@@ -224,8 +230,7 @@ def write_example(path: Path, rules: str, prop: Property, found: Counterexample)
     if not path.resolve().is_relative_to(Path.cwd()) and not path.is_absolute():
         raise failure("PD112", f"{path} leaves the working directory through a link")
     path.parent.mkdir(exist_ok=True)
-    with replacing(path) as temporary:
-        temporary.write_text(head + write_yaml(tree), encoding="utf-8")
+    write_text(path, head + write_yaml(tree))
 
 
 def read_example(path: Path, ruleset: Ruleset) -> tuple[str, Start, int]:

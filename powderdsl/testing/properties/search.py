@@ -14,17 +14,15 @@ from powderdsl.analysis.proofs import prove
 from powderdsl.arrays import np
 from powderdsl.model.expressions.operands import ELEMENT_HERE, member
 from powderdsl.model.restrict import restricted
-from powderdsl.model.text import one_line
 from powderdsl.model.types import Never, Ruleset, Symmetric, Total
 from powderdsl.simulation.draw import shown_fields
 from powderdsl.testing.generators.cases import Start
-from powderdsl.testing.properties.blame import culprits, difference, translated
+from powderdsl.testing.properties.blame import Oracle, culprits, difference, translated
 from powderdsl.testing.properties.breaks import (
     Agreement,
     Alike,
     Breaks,
     KnownIds,
-    Runs,
     Tested,
     breaks,
     is_paired,
@@ -32,7 +30,7 @@ from powderdsl.testing.properties.breaks import (
     steps_for,
 )
 from powderdsl.testing.properties.outcomes import Counterexample, Property, Result
-from powderdsl.testing.properties.running import LARGE, random_samples
+from powderdsl.testing.properties.running import LARGE, Runner, random_samples
 from powderdsl.testing.properties.shrink import WORK, Work, shrink
 
 AUTOMATIC = "automatic"
@@ -76,7 +74,7 @@ class Trial:
 class InvariantSearch:
     """Tests the properties of one ruleset; worlds may be brought from outside too."""
 
-    runner: Runs
+    runner: Runner | Oracle
     plan: SearchPlan
     ledger: Ledger
     trials: list[Trial] = field(default_factory=list)
@@ -88,7 +86,11 @@ class InvariantSearch:
 
     @classmethod
     def of(
-        cls, runner: Runs, plan: SearchPlan, declared_only: bool = False, ledger: Ledger | None = None
+        cls,
+        runner: Runner | Oracle,
+        plan: SearchPlan,
+        declared_only: bool = False,
+        ledger: Ledger | None = None,
     ) -> Self:
         """Prove what can be proven; the rest is to be tried. `declared_only`: leave out what no pack claims.
 
@@ -219,7 +221,7 @@ class InvariantSearch:
         return {trial.prop.text for trial in search.trials if trial.sample is not None}
 
 
-def counterexample(claim: Tested, runner: Runs, sample: Start, steps: int) -> Counterexample:
+def counterexample(claim: Tested, runner: Runner | Oracle, sample: Start, steps: int) -> Counterexample:
     """A world that breaks a claim, as it is, and the rules that did it."""
     cell = breaks(claim, runner, sample, steps).cell[0]
     states = runner.states(sample, steps)
@@ -232,9 +234,7 @@ def counterexample(claim: Tested, runner: Runs, sample: Start, steps: int) -> Co
 def properties_of(ruleset: Ruleset, ledger: Ledger) -> list[Property]:
     """The declared invariants, then what every ruleset must fulfill."""
     found = [
-        Property(i.claim, one_line(i.span), i.pack, i.span, i.without, i.scope) for i in ruleset.invariants
-    ]
-    found += [
+        *map(Property.of, ruleset.invariants),
         Property(KnownIds(), "cells hold elements that the ruleset has", AUTOMATIC, None),
         Property(Agreement(), "the backend gives what the reference gives", AUTOMATIC, None),
     ]
