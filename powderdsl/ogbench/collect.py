@@ -106,7 +106,10 @@ def collect(
         place / f"{name}.npz": Recipe(level.name, rules, seed, 0, train, level.play.steps),
         place / f"{name}-val.npz": Recipe(level.name, rules, seed, VALIDATION, few, level.play.steps),
     }
-    _make_folder(place)
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise not_writable(place, error) from None
     done = 0.0
 
     def report(more: float) -> None:
@@ -119,13 +122,6 @@ def collect(
         for path, recipe in recipes.items():
             _write(program, path, recipe, report)
     return list(recipes)
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise not_writable(folder, error) from None
 
 
 def _write(program: LevelProgram, path: Path, recipe: Recipe, report: Callable[[float], None]) -> None:
@@ -143,7 +139,7 @@ def _write(program: LevelProgram, path: Path, recipe: Recipe, report: Callable[[
             raise ValueError(f"{path} is there already, and {about.name} is not: choose another folder")
         report(recipe.count)
         return
-    _make_folder(parts)
+    parts.mkdir(exist_ok=True)
     write_text(about, json.dumps(asdict(recipe), indent=2) + "\n")
     for first in range(0, recipe.count, PART):
         file, count = parts / f"{first:09}.npz", min(PART, recipe.count - first)
@@ -263,14 +259,10 @@ def scripted(level: Level, seed: int, episode: int) -> Iterator[tuple[int, int, 
     while True:
         drawn = keyed(([seed], [episode], [number]), "ogbench script", SCRIPT_DRAWS)[0].tolist()
         element = int(drawn[1] * len(level.elements))
-        for x, y in _script(drawn[0])(level.places, drawn[2:]):
+        script = SCRIPTS[int(drawn[0] * len(SCRIPTS))]
+        for x, y in script(level.places, drawn[2:]):
             yield element, x, y
         number += 1
-
-
-def _script(drawn: float) -> Callable[[int, list[float]], list[Place]]:
-    """Fill in one of seven cases, a line in three, a square in three."""
-    return (_fill, *[_line] * 3, *[_square] * 3)[int(drawn * 7)]
 
 
 def _fill(places: int, drawn: list[float]) -> list[Place]:
@@ -304,3 +296,7 @@ def _square(places: int, drawn: list[float]) -> list[Place]:
     ]
     turned = [side[::-1] if one < 0.5 else side for side, one in zip(sides, drawn[3:7], strict=True)]
     return [place for at in np.argsort(drawn[7:11], kind="stable") for place in turned[at]]
+
+
+SCRIPTS = (_fill, *[_line] * 3, *[_square] * 3)
+"""Scripts, as often as they are drawn."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -89,22 +89,23 @@ class Evaluation:
         """For JSON: scores by split and policy."""
         splits: dict[str, dict[str, Any]] = {}
         for score in self.scores:
-            numbers = asdict(score)
-            del numbers["split"], numbers["policy"]
-            numbers["above"] = {other: _plain(*found) for other, found in score.above.items()}
+            numbers = {name: value for name, value in vars(score).items() if name not in ("split", "policy")}
+            numbers["above"] = _plain(score.above)
             if score.normalized is not None:
-                numbers["normalized"] = _plain(*score.normalized)
+                numbers["normalized"] = dict(zip(ESTIMATE, score.normalized, strict=True))
             splits.setdefault(score.split, {})[score.policy] = numbers
-        about = {name: value for name, value in asdict(self).items() if name != "scores"}
-        about["seen"] = {
-            split: {"worlds": one.worlds, "without": {name: _plain(*of) for name, of in one.without.items()}}
-            for split, one in self.seen.items()
+        seen = {
+            split: {"worlds": one.worlds, "without": _plain(one.without)} for split, one in self.seen.items()
         }
-        return {**about, "splits": splits}
+        about = {name: value for name, value in vars(self).items() if name != "scores"}
+        return {**about, "seen": seen, "splits": splits}
 
 
-def _plain(mean: float, half: float | None) -> dict[str, float | None]:
-    return {"mean": mean, "interval": half}
+ESTIMATE = ("mean", "interval")
+
+
+def _plain(estimates: Mapping[str, tuple[float, float | None]]) -> dict[str, dict[str, float | None]]:
+    return {name: dict(zip(ESTIMATE, estimate, strict=True)) for name, estimate in estimates.items()}
 
 
 def play(

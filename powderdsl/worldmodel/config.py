@@ -20,13 +20,20 @@ MAX_CHANNELS = 256
 """Channels of recorded observations."""
 
 
+class Checked:
+    """Settings that are checked when they are made."""
+
+    def __post_init__(self) -> None:
+        check_settings(self)
+
+
 @dataclass(frozen=True)
-class Variety:
+class Variety(Checked):
     """How rulesets differ from the one that they are drawn around.
 
     `chances`: parameters that are chances are multiplied by a factor between 1/chances and chances, uniform in its
     logarithm, up to 1. `swaps`: for each of these properties, two elements exchange their values. `leave_out`: how
-    likely each pack that no other one needs is to be left out. Raises ValueError for values out of range.
+    likely each pack that no other one needs is to be left out.
     """
 
     chances: float = setting(1.0, "Factor by which chances of drawn rulesets differ, at most.", 1.0, 1e6)
@@ -35,18 +42,14 @@ class Variety:
     )
     leave_out: float = setting(0.0, "Probability that a ruleset leaves out a pack.", 0.0, 0.999)
 
-    def __post_init__(self) -> None:
-        check_settings(self)
-
 
 @dataclass(frozen=True)
-class DataConfig:
+class DataConfig(Checked):
     """Which pairs a network learns from. Plain values: ``dataclasses.asdict`` gives what a run's file keeps.
 
     The worlds are those of seeds 0 to `states` − 1. Each is run for `steps`·`pairs` steps and gives `pairs` pairs: the
     paper's 16 of 8 steps. `only` names packs: worlds draw no other pack's elements. The replay buffer holds `capacity`
     pairs, of which each iteration replaces `refresh`; if all pairs of all worlds fit in, it holds these and stays so.
-    Raises ValueError for values out of range.
     """
 
     task: str = setting(
@@ -68,9 +71,6 @@ class DataConfig:
     """The differences between the rulesets."""
     capacity: int = setting(1024 * 256, "Capacity of the buffer, in pairs.", 1, 1 << 32, option="buffer")
     refresh: int = setting(256, "Pairs that each iteration replaces in the buffer.", 1, 1 << 20)
-
-    def __post_init__(self) -> None:
-        check_settings(self)
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class Recorded:
 
 
 @dataclass(frozen=True)
-class TrainConfig:
+class TrainConfig(Checked):
     """Everything that decides the weights (on one kind of device). The defaults are the paper's.
 
     `parent` is the name of the checkpoint that a fine-tuned network starts from; without it weights are random.
@@ -102,7 +102,6 @@ class TrainConfig:
     and the data's rules. `slots` is how many there are at least: free ones are room for packs that come later.
     `network` is the name of a `CustomNetwork`, as text: what it names is imported only if the user gives it again.
     `recorded` is the dataset that is learned from; `data` then says which task it was recorded from.
-    Raises ValueError for values out of range.
     """
 
     data: DataConfig = field(default_factory=DataConfig)
@@ -118,7 +117,7 @@ class TrainConfig:
     recorded: Recorded | None = None
 
     def __post_init__(self) -> None:
-        check_settings(self)
+        super().__post_init__()
         if self.network is not None and not is_network_name(self.network):
             raise ValueError("network must have the form module:Class")
 
@@ -155,10 +154,10 @@ PRESETS = {
 
 
 @dataclass(frozen=True)
-class Machine:
+class Machine(Checked):
     """Where a run is computed. A run may continue on another machine.
 
-    `compiled` runs the network through ``torch.compile``. `store` is that of `Replay`. Raises ValueError for others.
+    `compiled` runs the network through ``torch.compile``. `store` is that of `Replay`.
     """
 
     device: str = setting("cpu", form="a name")
@@ -166,9 +165,6 @@ class Machine:
     backend: str = setting("auto", choices=tuple(BACKENDS))
     store: str = setting("auto", choices=("auto", "memory", "disk"))
     compiled: bool = False
-
-    def __post_init__(self) -> None:
-        check_settings(self)
 
     @property
     def simulation(self) -> dict[str, Any]:

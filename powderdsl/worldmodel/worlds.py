@@ -110,12 +110,11 @@ class TaskWorlds:
         else:
             rules = task.ruleset
         check_data(config, task, rules)
-        watched = watch(task, config.split, rules, config.only, partly=partly)
+        watched, self.missing = watch(task, config.split, rules, config.only, partly=partly)
         self.config, self.rules, self.size = config, rules, task.size
-        self.missing = watched.missing
-        self.names = tuple(variant.name for variant in watched.task.splits[0].variants)
+        self.names = tuple(variant.name for variant in watched.splits[0].variants)
         """The names of the variants: seed s gives variant s mod their number."""
-        self.fingerprint = fingerprint(watched.task.splits)
+        self.fingerprint = fingerprint(watched.splits)
         """A name for how these worlds start, besides their rules: another if the task's file has been changed."""
         self.device = torch.device(device)
         """Where worlds are run."""
@@ -124,7 +123,7 @@ class TaskWorlds:
         self._programs: dict[tuple[Any, ...], TaskProgram] = {}
         if source is None:
             self.rulesets = [Drawn(0)]
-            self._programs[self.rulesets[0].structure] = self._compiled(watched.task)
+            self._programs[self.rulesets[0].structure] = self._compiled(watched)
             return
         numbers = range(config.first_ruleset, config.first_ruleset + config.rulesets)
         self.rulesets = [source.draw(number) for number in numbers]
@@ -162,8 +161,8 @@ class TaskWorlds:
             assert self._source is not None
             # Rules without some packs draw from the remaining elements; worlds that need others are replaced.
             rules = self._source.model(drawn)
-            watched = watch(self._task, self.config.split, rules, self.config.only, partly=True)
-            self._programs[drawn.structure] = self._compiled(watched.task)
+            task, _ = watch(self._task, self.config.split, rules, self.config.only, partly=True)
+            self._programs[drawn.structure] = self._compiled(task)
         return self._programs[drawn.structure]
 
     def _compiled(self, task: Task) -> TaskProgram:
@@ -226,17 +225,10 @@ class Missing(NamedTuple):
     span: Span | None
 
 
-class Watched(NamedTuple):
-    """`task` has one split, of those worlds that the rules can have; `missing` are the others."""
-
-    task: Task
-    missing: tuple[Missing, ...]
-
-
 def watch(
     task: Task, split: str, rules: Ruleset, only: Collection[str] = (), *, partly: bool = False
-) -> Watched:
-    """The worlds of a split under other rules.
+) -> tuple[Task, tuple[Missing, ...]]:
+    """The worlds of a split under other rules, as a task of that split alone; and those that the rules cannot have.
 
     Elements are found by qualified name. A statement that draws one of several draws among those that the rules have,
     and also among the elements of packs that the task does not know; of these among the elements of the packs `only`,
@@ -263,7 +255,7 @@ def watch(
     agent = replace(task.agent, choices=(NO_CHANGE,), speed_field=None)
     watched = Split(given.name, given.about, tuple(variants))
     nothing = Goal(None, None, None, None)
-    return Watched(replace(task, ruleset=rules, agent=agent, goal=nothing, splits=(watched,)), tuple(missing))
+    return replace(task, ruleset=rules, agent=agent, goal=nothing, splits=(watched,)), tuple(missing)
 
 
 class _Narrowing:

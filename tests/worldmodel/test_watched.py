@@ -127,7 +127,7 @@ def test_any_pack_can_be_the_held_out_one_that_no_other_needs() -> None:
         except CompileError as error:
             refused.append((pack, error.diagnostics[0].code))
             continue
-        variant = watch(task, "train", rules).task.splits[0].variants[0]
+        variant = watch(task, "train", rules)[0].splits[0].variants[0]
         drawn = {rules_id for group in variant.groups for one in group.drawings for rules_id in one.ids}
         assert drawn == {element.id for element in task.ruleset.elements if element.pack != pack}
     assert [pack for pack, _ in refused] == ["core", "water"]

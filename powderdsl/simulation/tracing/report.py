@@ -10,7 +10,6 @@ from powderdsl.diagnostics.printable import printable
 from powderdsl.diagnostics.render import source_lines
 from powderdsl.model.state import Slot
 from powderdsl.model.text import one_line, place_of
-from powderdsl.model.types import Ruleset
 from powderdsl.simulation.provenance import NumberedRule
 from powderdsl.simulation.tracing.trace import HOW, Cell, Miss, Part, Read, Trace, Write, plain, show_at_cell
 
@@ -164,31 +163,29 @@ def trace_data(trace: Trace) -> dict[str, Any]:
             for slot in trace.slots
             if slot.name in trace.after
         },
-        "writes": [_write_data(trace.ruleset, write) for write in trace.writes],
-        "almost": [_miss_data(one) for one in trace.misses],
-    }
-
-
-def _write_data(ruleset: Ruleset, write: Write) -> dict[str, Any]:
-    return {
-        "slot": write.slot.name,
-        "before": plain(ruleset, write.slot.kind, write.before),
-        "after": plain(ruleset, write.slot.kind, write.after),
-        "how": write.how,
-        "rule": _rule_data(write.rule),
-        "cell": write.cell,
-        "source": write.source,
-        "parts": [_part_data(part) for part in write.parts],
-    }
-
-
-def _miss_data(miss: Miss) -> dict[str, Any]:
-    return {
-        "rule": _rule_data(miss.rule),
-        "cell": miss.cell,
-        "failed": [_part_data(part) for part in miss.failed],
-        "held": [_part_data(part) for part in miss.parts if part.holds],
-        "gave_way": miss.policy if not miss.failed else None,
+        "writes": [
+            {
+                "slot": write.slot.name,
+                "before": plain(trace.ruleset, write.slot.kind, write.before),
+                "after": plain(trace.ruleset, write.slot.kind, write.after),
+                "how": write.how,
+                "rule": _rule_data(write.rule),
+                "cell": write.cell,
+                "source": write.source,
+                "parts": list(map(_part_data, write.parts)),
+            }
+            for write in trace.writes
+        ],
+        "almost": [
+            {
+                "rule": _rule_data(miss.rule),
+                "cell": miss.cell,
+                "failed": list(map(_part_data, miss.failed)),
+                "held": [_part_data(part) for part in miss.parts if part.holds],
+                "gave_way": miss.policy if not miss.failed else None,
+            }
+            for miss in trace.misses
+        ],
     }
 
 

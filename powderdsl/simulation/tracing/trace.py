@@ -340,19 +340,18 @@ def trace(
 
 def _slots(world: AnyWorld, names: Iterable[str] | None) -> list[Slot]:
     """The slots of some names, or all of the state. Raises KeyError."""
-    known = {slot.name: slot for slot in world.sim.slots}
+    known, ruleset = {slot.name: slot for slot in world.sim.slots}, world.sim.ruleset
     if names is None:
         return list(known.values())
-    for pass_ in world.sim.ruleset.passes:
+    for pass_ in ruleset.passes:
         known |= scratch_slots(pass_)
-    found = []
-    for name in dict.fromkeys(slot_name(world.sim.ruleset, name) for name in names):
+    wanted = list(dict.fromkeys(slot_name(ruleset, name) for name in names))
+    for name in wanted:
+        if name not in known and ruleset.property(name) is not None:
+            raise KeyError(f"`{name}` follows from the element: ask for `element`")
         if name not in known:
-            if world.sim.ruleset.property(name) is not None:
-                raise KeyError(f"`{name}` follows from the element: ask for `element`")
             raise KeyError("; ".join([f"no field `{name}`", *suggest(name, known, "fields")]))
-        found.append(known[name])
-    return found
+    return [known[name] for name in wanted]
 
 
 def _misses(step: RecordedStep, names: Sequence[str], every_rule: bool) -> list[Miss]:
@@ -371,17 +370,12 @@ def _misses(step: RecordedStep, names: Sequence[str], every_rule: bool) -> list[
                 if key in found or substep.happened(rule.rule, place):
                     continue
                 parts = _parts(rule.rule, substep, place)
-                if every_rule or _nearly(parts):
+                failed = list(islice((part for part in parts if not part.holds), 2))
+                # Of a rule that nearly happened one part fails, which is not what element the cell is, or none.
+                nearly = len(failed) == 1 and len(parts) > 1 and not failed[0].about_itself
+                if every_rule or nearly or not failed:
                     found[key] = Miss(rule, place, parts, substep.moment.policy)
     return list(found.values())
-
-
-def _nearly(parts: Sequence[Part]) -> bool:
-    """Whether all parts but one hold, and the one does not ask which element the cell is; or all of them hold."""
-    failed = list(islice((part for part in parts if not part.holds), 2))
-    if len(failed) == 1:
-        return len(parts) > 1 and not failed[0].about_itself
-    return not failed
 
 
 # Conditions
