@@ -166,7 +166,6 @@ _TORCH = (
     "experiments.runs",
     "worldmodel",
     "rl",
-    "ogbench.program",
     "ogbench.episodes",
     "ogbench.env",
     "ogbench.collect",

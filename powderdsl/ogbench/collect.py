@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 from powderdsl.experiments.runs import held
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.ogbench.datasets import FAMILY, VERSION
-from powderdsl.ogbench.episodes import keyed
+from powderdsl.ogbench.episodes import LevelProgram, keyed
 from powderdsl.ogbench.levels import Level
-from powderdsl.ogbench.program import LevelProgram
 from powderdsl.system.archives import BadArchive, Parts, open_archive, write_archive
 from powderdsl.system.reading import read_json
 from powderdsl.system.writing import failure, not_writable, replacing, write_text

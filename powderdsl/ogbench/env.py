@@ -27,11 +27,11 @@ from powderdsl.ogbench.episodes import (
     MODES,
     RANDOMNESS,
     Episodes,
+    LevelProgram,
     keyed,
     task_of,
 )
 from powderdsl.ogbench.levels import GoalTask, Level, find_level
-from powderdsl.ogbench.program import LevelProgram
 from powderdsl.system.settings import check_settings, setting
 
 Array = NDArray[Any]

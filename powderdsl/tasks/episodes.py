@@ -17,7 +17,7 @@ from powderdsl.tasks.shipped import check_split, load_task
 from powderdsl.tasks.task import Task
 from powderdsl.tasks.tensors.actions import CLOCK, Hands, put_rows, put_worlds
 from powderdsl.tasks.tensors.generator import StartWorlds
-from powderdsl.tasks.tensors.measures import Facts, Meter, measures_of, scalar_value, scalars_of
+from powderdsl.tasks.tensors.measures import Facts, Meter, measures_in, scalar_value, scalars_of
 
 __all__ = ["Episodes", "TaskProgram", "check_actions", "compile_task", "load_task"]
 
@@ -64,17 +64,18 @@ class TaskProgram:
         self.task, self.split, self.simulator = task, split, simulator
         device = simulator.device
         self._starts = StartWorlds(task, split, simulator.kind)
-        self.measures = measures_of(task.goal)
+        scalars = scalars_of(task.goal)
+        self.measures = measures_in(scalars)
         self._places = {measure: number for number, measure in enumerate(self.measures)}
         self._fixed = self._starts.fixed
         """Regions that are the same in all worlds of the split, bool [1, H, W]."""
         self._meter = Meter(simulator.ruleset, self.measures, task.size, self._fixed, device)
         goal = task.goal
         self._counts_always = (goal.each, goal.success, goal.failure) != (None, None, None) or any(
-            part.op == "before" for part in scalars_of(goal)
+            part.op == "before" for part in scalars
         )
         """Whether measures are needed after every action, and not only after the last."""
-        self._asked = {part.value for part in scalars_of(goal) if part.op == "action"}
+        self._asked = {part.value for part in scalars if part.op == "action"}
         """The numbers of actions that the goal reads."""
         self._hands = Hands(simulator, task.agent, task.size, counts="painted" in self._asked)
         self.action_nvec = task.agent.action_nvec
@@ -112,18 +113,15 @@ class TaskProgram:
         if len(places) == len(episodes):
             return new
 
-        def placed(old: Tensor, fresh: Tensor) -> Tensor:
-            return put_rows(old, places, fresh, reuse)
-
-        def all_placed(old: Mapping[str, Tensor], fresh: Mapping[str, Tensor]) -> dict[str, Tensor]:
-            return {name: placed(value, fresh[name]) for name, value in old.items()}
+        def placed(old: Mapping[str, Tensor], fresh: Mapping[str, Tensor]) -> dict[str, Tensor]:
+            return {name: put_rows(value, places, fresh[name], reuse) for name, value in old.items()}
 
         own = {name: value for name, value in episodes.regions.items() if name not in self._fixed}
         return Episodes(
             put_worlds(episodes.world, places, new.world, reuse=reuse),
-            regions={**episodes.regions, **all_placed(own, new.regions)},
-            targets=all_placed(episodes.targets, new.targets),
-            **{name: placed(getattr(episodes, name), getattr(new, name)) for name in ROWS},
+            regions={**episodes.regions, **placed(own, new.regions)},
+            targets=placed(episodes.targets, new.targets),
+            **placed({name: getattr(episodes, name) for name in ROWS}, vars(new)),
         )
 
     # Saving
@@ -215,16 +213,7 @@ class TaskProgram:
         if goal.final is not None:
             final = scalar_value(goal.final, facts)
             reward = reward + torch.where(over, final, torch.zeros_like(final))
-        after = Episodes(
-            world,
-            episodes.seed,
-            acted,
-            failed,
-            episodes.regions,
-            episodes.targets,
-            episodes.start,
-            now,
-        )
+        after = replace(episodes, world=world, acted=acted, failed=failed, before=now)
         return after, reward.float(), success, over
 
     @property

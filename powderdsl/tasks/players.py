@@ -8,8 +8,8 @@ from torch import Tensor
 from powderdsl.system.random import action_keys, uniforms
 from powderdsl.tasks.episodes import Episodes, TaskProgram
 from powderdsl.tasks.goals import parts_of
-from powderdsl.tasks.task import Expert, ExpertMove, Measure
-from powderdsl.tasks.tensors.measures import Facts, Meter, scalar_value
+from powderdsl.tasks.task import ExpertMove
+from powderdsl.tasks.tensors.measures import Facts, Meter, measures_in, scalar_value
 from powderdsl.worlds.raster import mask
 
 SIMULATED = 1024
@@ -30,7 +30,9 @@ class ExpertPlayer:
         if expert is None:
             raise ValueError(f"the task {program.task.name} has no expert")
         self.program, self.expert = program, expert
-        self.measures = _measures_of(expert)
+        scalars = [part for move in expert.moves if move.condition for part in parts_of(move.condition)]
+        most = [move.most for move in expert.moves if move.most is not None]
+        self.measures = tuple(dict.fromkeys([*most, *measures_in(scalars)]))
         self._numbers = {measure: number for number, measure in enumerate(self.measures)}
         self._meter = Meter(
             program.simulator.ruleset, self.measures, program.task.size, {}, program.simulator.device
@@ -82,11 +84,10 @@ class ExpertPlayer:
             row, column = self._fullest(cells)
         else:
             assert move.cell is not None
-            at = [
+            row, column = (
                 torch.full_like(episodes.acted, place * bins // side)
                 for place, bins, side in zip(move.cell, task.agent.bins, task.size, strict=True)
-            ]
-            row, column = at
+            )
         rows, columns = move.toward
         other = [torch.full_like(episodes.acted, value) for value in (move.choice, columns + 1, rows + 1)]
         return torch.stack([column, row, *other], 1), count
@@ -145,14 +146,3 @@ def _returns(program: TaskProgram, seeds: Tensor, plans: Tensor) -> Tensor:
         total += torch.where(going, reward.double(), 0.0)
         going &= ~over
     return total
-
-
-def _measures_of(expert: Expert) -> tuple[Measure, ...]:
-    """Every measure that an expert's moves read, once."""
-    found: dict[Measure, None] = {}
-    for move in expert.moves:
-        if move.most is not None:
-            found[move.most] = None
-        if move.condition is not None:
-            found |= {part.value: None for part in parts_of(move.condition) if part.op == "measure"}
-    return tuple(found)

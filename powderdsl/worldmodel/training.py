@@ -206,7 +206,12 @@ class _Trainer:
                     loss = sum(self.recent) / len(self.recent)
                     self.recent = []
                     if not loss < float("inf"):
-                        raise diverged(self.run.path, self.done, config.learning_rate)
+                        raise failure(
+                            "PD624",
+                            f"the loss is no longer finite after {self.done:,} iterations",
+                            notes=(f"in {self.run.path}",),
+                            helps=(f"choose a smaller learning rate than {config.learning_rate:g}",),
+                        )
                     took = time.monotonic() - since
                     speed = LOG_EVERY * config.batch / took
                     values = {
@@ -307,13 +312,3 @@ def check_slots(folder: Path, palette: Palette, rules: Ruleset) -> None:
     """Raises CompileError (PD623) if a run's network has no slots for elements of some rules."""
     fix = "or teach the network those packs: `powderdsl wm finetune RUN --packs PACK`"
     check_palette(folder, palette, {element.id: element.qualified for element in rules.elements}, fix)
-
-
-def diverged(folder: Path, done: int, learning_rate: float) -> CompileError:
-    """The error for a loss that is no longer finite (PD624)."""
-    return failure(
-        "PD624",
-        f"the loss is no longer finite after {done:,} iterations",
-        notes=(f"in {folder}",),
-        helps=(f"choose a smaller learning rate than {learning_rate:g}",),
-    )

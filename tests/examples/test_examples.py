@@ -13,8 +13,8 @@ import pytest
 
 from powderdsl.datasets import record
 from powderdsl.ogbench.collect import collect
+from powderdsl.ogbench.episodes import LevelProgram
 from powderdsl.ogbench.levels import find_level
-from powderdsl.ogbench.program import LevelProgram
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = ROOT / "examples"

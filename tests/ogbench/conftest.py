@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from powderdsl.ogbench.env import EnvOptions
-from powderdsl.ogbench.program import LevelProgram
+from powderdsl.ogbench.episodes import LevelProgram
 
 
 @pytest.fixture(scope="session")

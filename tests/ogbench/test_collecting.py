@@ -18,8 +18,8 @@ from powderdsl.ogbench import collect as collecting
 from powderdsl.ogbench.collect import collect, play, scripted
 from powderdsl.ogbench.datasets import load_dataset, make_env_and_datasets
 from powderdsl.ogbench.env import PowderworldEnv
+from powderdsl.ogbench.episodes import LevelProgram
 from powderdsl.ogbench.levels import find_level
-from powderdsl.ogbench.program import LevelProgram
 
 ROWS = 20
 NAME = "powderworld-easy-play-v0"

@@ -14,9 +14,8 @@ from gymnasium.vector import AutoresetMode
 
 import powderdsl.ogbench
 from powderdsl.ogbench.env import PowderworldEnv, PowderworldVectorEnv
-from powderdsl.ogbench.episodes import Episodes
+from powderdsl.ogbench.episodes import Episodes, LevelProgram
 from powderdsl.ogbench.levels import find_level, read_level, shipped_levels
-from powderdsl.ogbench.program import LevelProgram
 
 
 def actions(count: int, worlds: int = 0, seed: int = 0) -> np.ndarray:

@@ -45,7 +45,7 @@ def command(
     with user_values():
         found = find_level(level)
     from powderdsl.ogbench.collect import collect
-    from powderdsl.ogbench.program import LevelProgram
+    from powderdsl.ogbench.episodes import LevelProgram
 
     with (
         user_values(),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -42,9 +42,9 @@ def scalars_of(goal: Goal) -> list[Expr]:
     return [part for one in scalars for part in parts_of(one)]
 
 
-def measures_of(goal: Goal) -> tuple[Measure, ...]:
-    """Every measure of a goal once."""
-    return tuple(dict.fromkeys(part.value for part in scalars_of(goal) if part.op == "measure"))
+def measures_in(scalars: Iterable[Expr]) -> tuple[Measure, ...]:
+    """Every measure among parts of expressions, once."""
+    return tuple(dict.fromkeys(part.value for part in scalars if part.op == "measure"))
 
 
 class Meter:
