@@ -15,15 +15,10 @@ from torch import Tensor
 from powderdsl.envs.actions import action_form
 from powderdsl.envs.observations import observation_of
 from powderdsl.simulation.simulator import MAX_CELLS
+from powderdsl.simulation.state_checks import given_mapping
 from powderdsl.system.random import MASK, mix
 from powderdsl.system.settings import check_count
-from powderdsl.tasks.episodes import (
-    Episodes,
-    TaskProgram,
-    compile_task,
-    integer_tensor,
-    load_task,
-)
+from powderdsl.tasks.episodes import Episodes, TaskProgram, compile_task, integer_tensor, load_task
 from powderdsl.tasks.task import Task
 
 Info = dict[str, Any]
@@ -222,9 +217,7 @@ class TensorEnv:
         """The parameters after a reset of `mask`."""
         if given is None:
             return self.params
-        if not isinstance(given, Mapping):
-            raise TypeError(f"params takes a mapping from names to values, found {type(given).__name__}")
-        whole = self.simulator.parameters(given, self.num_envs)
+        whole = self.simulator.parameters(given_mapping("params", given), self.num_envs)
         names = given.keys() if bool(mask.all()) else {**given, **self.params}.keys()
         old = {**self.simulator.parameters({}, self.num_envs), **self.params}
         return {name: torch.where(mask, whole[name], old[name]) for name in names}

@@ -40,7 +40,6 @@ from powderdsl.simulation.observe import Observer
 from powderdsl.system.writing import failure
 from powderdsl.tasks.episodes import TaskProgram, compile_task
 from powderdsl.tasks.shipped import load_task
-from powderdsl.tasks.task import Task
 
 KIND = "ppo"
 ASKED = "asked.json"
@@ -66,7 +65,10 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
         KeyboardInterrupt: after the state before the rollout that was in progress has been saved.
     """
     check_config(config)
-    task, palette = _task_and_palette(config)
+    how: dict[str, Any] = {name: getattr(config, name) for name in ("knobs", "params", "packs")}
+    used = whole_palette(*load_task(config.task, **how).rules)
+    palette = (*used, *[None] * (config.slots - len(used)))  # slots that the rules need, and free ones
+    task = load_task(config.task, **how, palette=palette)
     check_task(config, task)
     trained_on = task.with_shaped_reward() if config.reward == "shaped" else task
     try:
@@ -116,14 +118,6 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
             keeper.play_held_out(learner.step)
             run.save_checkpoint(learner.step, learner.state())
     return run
-
-
-def _task_and_palette(config: TrainConfig) -> tuple[Task, tuple[str | None, ...]]:
-    """The task, with the ids of the network's slots: those that its rules need, and free ones as asked for."""
-    how: dict[str, Any] = {name: getattr(config, name) for name in ("knobs", "params", "packs")}
-    used = whole_palette(*load_task(config.task, **how).rules)
-    palette = (*used, *[None] * (config.slots - len(used)))
-    return load_task(config.task, **how, palette=palette), palette
 
 
 class _Learner:

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 from powderdsl.compiler import lower, parts
 from powderdsl.ir.ops import Program
-from powderdsl.ir.segments import Segment
 from powderdsl.model.state import property_dtype, slot_name
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.any_arrays import AnySimulator, AnyWorld
@@ -54,11 +53,8 @@ class ArraySimulator(AnySimulator[ArrayWorld]):
         super().__init__(ruleset, PlainArrays())
         self.backend = self.running = backend
         self._memo = Memo() if memo is None else memo
-        self._program = (
-            ReferenceProgram(ruleset, self.kind)
-            if backend == "reference"
-            else WholeOrParts(ruleset, self._memo)
-        )
+        oracle = backend == "reference"
+        self._program = ReferenceProgram(ruleset, self.kind) if oracle else WholeOrParts(ruleset, self._memo)
 
     def of(self, ruleset: Ruleset) -> ArraySimulator:
         return ArraySimulator(ruleset, self.backend, self._memo)
@@ -96,14 +92,13 @@ class WholeOrParts:
         program = self._lowered
         if chosen is not None:
             program = replace(program, passes=tuple(one for one in program.passes if one.name in chosen))
-        found = parts(program, self._memo)
-        made = [self._part(one, first=number == 0) for number, one in enumerate(found)]
-        return made[0] if len(made) == 1 else MixedProgram(made)
-
-    def _part(self, segment: Segment, *, first: bool) -> Runnable:
-        if segment.planes is not None:
-            return WasmProgram(segment.program, segment.planes, self._kind, self._memo)
-        return OracleOfPasses(self._ruleset, segment.program, first=first)
+        programs: list[Runnable] = []
+        for segment in parts(program, self._memo):
+            if segment.planes is not None:
+                programs.append(WasmProgram(segment.program, segment.planes, self._kind, self._memo))
+            else:
+                programs.append(OracleOfPasses(self._ruleset, segment.program, first=not programs))
+        return programs[0] if len(programs) == 1 else MixedProgram(programs)
 
 
 class OracleOfPasses:

@@ -48,27 +48,19 @@ def standalone_module(ruleset: Ruleset, size: tuple[int, int], memo: Memo | None
         helps = (f"a module holds at most {MAX_CELLS:,} cells",)
         raise failure("PD607", f"a world of {size[0]}×{size[1]} cells", helps=helps)
     program = lower(ruleset, memo)
-    found = parts(program, memo)
-    if len(found) > 1 or found[0].planes is None:
-        raise _cannot_run(ruleset)
-    face = _face(ruleset, size, pieces(program))
-    return wasm_module(found[0].planes, size[1], face=face, memo=memo).code
-
-
-def _cannot_run(ruleset: Ruleset) -> Exception:
-    program = lower(ruleset)
-    refused = [found for found in (carry(program, one) for one in program.passes) if found.planes is None]
-    notes = tuple(f"{one.place}: the pass `{one.cells.name}` needs {one.why}" for one in refused)
-    helps = ("use smaller numbers or kernels there",)
-    return failure("PD702", f"{ruleset.name} does not fit into WebAssembly", notes=notes, helps=helps)
-
-
-def _face(ruleset: Ruleset, size: tuple[int, int], held: dict[str, tuple[Piece, ...]]) -> Face:
-    ids = tuple(sorted(element.id for element in ruleset.elements))
+    segments = parts(program, memo)
+    if len(segments) > 1 or segments[0].planes is None:
+        carried = (carry(program, one) for one in program.passes)
+        refused = [one for one in carried if one.planes is None]
+        notes = tuple(f"{one.place}: the pass `{one.cells.name}` needs {one.why}" for one in refused)
+        helps = ("use smaller numbers or kernels there",)
+        raise failure("PD702", f"{ruleset.name} does not fit into WebAssembly", notes=notes, helps=helps)
+    held = pieces(program)
     element, *fields = (_stored(slot, ruleset, held[slot.name]) for slot in slots(ruleset))
-    knobs = tuple(_knob(param) for param in ruleset.params)
+    ids = tuple(sorted(element.id for element in ruleset.elements))
     about = json.dumps(_about(ruleset, size), separators=(",", ":"), ensure_ascii=False).encode()
-    return Face(size[0], ids, element, tuple(fields), knobs, about)
+    face = Face(size[0], ids, element, tuple(fields), tuple(map(_knob, ruleset.params)), about)
+    return wasm_module(segments[0].planes, size[1], face=face, memo=memo).code
 
 
 def _stored(slot: Slot, ruleset: Ruleset, parts: tuple[Piece, ...]) -> Stored:

@@ -244,7 +244,7 @@ class Drawer:
                 self.reporter.error("PD605", "a part in a repetition", statement.span, label)
                 continue
             drawings.append(self.drawing(statement, names))
-        known = tuple(filter(None, drawings))
+        known = tuple(drawing for drawing in drawings if drawing is not None)
         if count is None or len(known) < len(drawings):
             return ()
         low, most = interval(count, self.names)
