@@ -147,7 +147,7 @@ def run_compilers(scratch: Path, *commands: list[str]) -> tuple[int, str]:
                     start_new_session=True,
                 )
                 processes.append(process)
-                _running.add(process)
+                _running.append(process)
             end = time.monotonic() + TIMEOUT
             codes = [process.wait(max(0.0, end - time.monotonic())) for process in processes]
         except OSError as error:
@@ -160,7 +160,7 @@ def run_compilers(scratch: Path, *commands: list[str]) -> tuple[int, str]:
         return next(filter(None, codes), 0), messages.read().decode(errors="replace")
 
 
-_running: set[subprocess.Popen[bytes]] = set()
+_running: list[subprocess.Popen[bytes]] = []
 """Compilers of all threads."""
 
 
@@ -169,12 +169,13 @@ def _end(processes: Iterable[subprocess.Popen[bytes]]) -> None:
         if process.poll() is None:  # in a fork, the parent's compilers count as ended
             os.killpg(process.pid, signal.SIGTERM)
             process.wait()
-        _running.discard(process)
+        if process in _running:
+            _running.remove(process)
 
 
 @atexit.register
 def _end_all() -> None:
-    _end(sorted(_running, key=lambda process: process.pid))
+    _end([*_running])
 
 
 def open_library(source: str, ruleset: str = "", units: int = 1) -> tuple[Path, ctypes.CDLL]:
