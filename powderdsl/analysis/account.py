@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 from powderdsl.analysis.changes import RuleLine
-from powderdsl.analysis.ledger import FieldEntry, Ledger, RuleEntry
+from powderdsl.analysis.ledger import AGAINST, FieldEntry, Ledger, RuleEntry
 from powderdsl.analysis.overlaps import OUTCOMES
 
 SCHEMA = 1
@@ -84,11 +84,7 @@ TRENDS = {
 
 def trend(ledger: Ledger, name: str) -> str:
     """One of TRENDS."""
-    if ledger.conserved({name: 1}):
-        return "constant"
-    if ledger.never_falls([name]):
-        return "never falls"
-    return "never rises" if ledger.never_rises([name]) else "not decided"
+    return next((trend for trend in AGAINST if ledger.keeps([name], trend)), "not decided")
 
 
 def _place(rule: RuleLine) -> str:

@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from operator import gt, lt, ne
+from typing import Any
 
 from powderdsl.analysis.absent import Wants, find_wants, named_by_fields
 from powderdsl.analysis.changes import Found, RuleLine, facts_of, find_changes
@@ -22,6 +24,10 @@ Bounds = tuple[float, float]
 
 BUDGET = 400_000
 """Nodes evaluated for each part of a ledger: some seconds. The largest shipped ruleset needs half of it."""
+
+
+AGAINST: dict[str, Callable[..., Any]] = {"constant": ne, "never rises": gt, "never falls": lt}
+"""The trends of a number, with how a later value and an earlier one compare where the trend is broken."""
 
 
 @dataclass(frozen=True)
@@ -175,15 +181,15 @@ class Ledger:
 
         Elements that are not named count 0. Raises KeyError for a name that is not an element.
         """
-        return self._weighed(weights, "alone changes", lambda before, after: before != after)
+        return self.keeps(weights, "constant")
 
     def never_rises(self, what: Mapping[str, int] | Iterable[str]) -> Verdict:
         """Whether the (weighted) number of cells with these elements never rises. Raises KeyError as `conserved`."""
-        return self._weighed(_weights(what), "adds to", lambda before, after: before < after)
+        return self.keeps(what, "never rises")
 
     def never_falls(self, what: Mapping[str, int] | Iterable[str]) -> Verdict:
         """Whether the (weighted) number of cells with these elements never falls. Raises KeyError as `conserved`."""
-        return self._weighed(_weights(what), "takes from", lambda before, after: before > after)
+        return self.keeps(what, "never falls")
 
     def unchanged(self, element: str) -> Verdict:
         """Whether a cell with this element keeps it permanently. Others may still become it: see `never_rises`.
@@ -266,17 +272,20 @@ class Ledger:
             return NotProven(f"`{field}` starts outside {low:g}..{high:g}")
         return NotProven(f"`{field}` may be written beyond {low:g}..{high:g}", tuple(lines))
 
-    def _weighed(self, weights: Mapping[str, int], verb: str, breaks: Callable[[int, int], bool]) -> Verdict:
+    def keeps(self, what: Mapping[str, int] | Iterable[str], trend: str) -> Verdict:
+        """Whether a (weighted) number of cells keeps to a trend of AGAINST."""
+        weights = what if isinstance(what, Mapping) else dict.fromkeys(what, 1)
         self._known(weights)
         broken = {
             (a, b): lines
             for (a, b), lines in self.changes.items()
-            if breaks(weights.get(a, 0), weights.get(b, 0))
+            if AGAINST[trend](weights.get(b, 0), weights.get(a, 0))
         }
         if not broken:
             parts = [
                 name if weight == 1 else f"{weight} {name}" for name, weight in weights.items() if weight
             ]
+            verb = {"constant": "alone changes", "never rises": "adds to", "never falls": "takes from"}[trend]
             return Proven(f"no rule {verb} " + (f"`{' + '.join(parts)}`" if parts else "nothing"))
         (before, after), _ = next(iter(broken.items()))
         lines = tuple(dict.fromkeys(line for found in broken.values() for line in found))
@@ -287,10 +296,6 @@ class Ledger:
         for name in names:
             if name not in self.elements:
                 raise KeyError(f"no element `{name}` in {self.name}")
-
-
-def _weights(what: Mapping[str, int] | Iterable[str]) -> Mapping[str, int]:
-    return what if isinstance(what, Mapping) else dict.fromkeys(what, 1)
 
 
 def ledger(ruleset: Ruleset) -> Ledger:

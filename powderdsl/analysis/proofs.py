@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from powderdsl.analysis.changes import facts_of
-from powderdsl.analysis.ledger import Ledger, NotProven, Proven, Verdict
+from powderdsl.analysis.ledger import AGAINST, Ledger, NotProven, Proven, Verdict
 from powderdsl.model.logic.satisfy import satisfiable
 from powderdsl.model.types import (
     Assign,
@@ -47,8 +47,7 @@ def _conserved(trend: str, counted: set[str], ledger: Ledger, without: list[str]
         for before, after in entry.changes:
             if before not in cells or (after in entry.copies and after not in known):
                 continue
-            change = (after in counted) - (before in counted)
-            if {"constant": change != 0, "never rises": change > 0, "never falls": change < 0}[trend]:
+            if AGAINST[trend](after in counted, before in counted):
                 lines.append(entry.rule)
     if lines:
         return NotProven("some rule may change the number", tuple(dict.fromkeys(lines)))
@@ -61,10 +60,7 @@ def _prove(claim: Claim, ruleset: Ruleset, ledger: Ledger) -> Verdict:
             verdicts = [ledger.unchanged(name) for name in _names(ruleset, claim.ids)]
             return next((one for one in verdicts if isinstance(one, NotProven)), verdicts[0])
         case Total() if claim.ids is not None:
-            names = _names(ruleset, claim.ids)
-            if claim.trend == "constant":
-                return ledger.conserved(dict.fromkeys(names, 1))
-            return ledger.never_rises(names) if claim.trend == "never rises" else ledger.never_falls(names)
+            return ledger.keeps(_names(ruleset, claim.ids), claim.trend)
         case Bounded():
             prop = ruleset.property(claim.field)
             if prop is not None and not prop.stored:

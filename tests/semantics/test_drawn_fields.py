@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import powderdsl as package
+from powderdsl.simulation.compiling import compile_any
 from powderdsl.simulation.draw import to_numpy
 from powderdsl.testing.pack_tests.runner import run_examples
 
@@ -60,7 +61,8 @@ def results(tmp_path, *, expected: str, drawn: str = DRAWN, rules: str = FIELDS)
     body = (drawn + expected).replace("\n", "\n  ").rstrip()
     path.write_text(f"{rules}tests:\n  - drawn:\n  {body}\n")
     worlds = []
-    found = run_examples(package.load(path), backend="reference", seen=worlds.append)
+    rules = package.load(path)
+    found = run_examples(rules, sim=compile_any(rules, "reference"), seen=worlds.append)
     return found[0], worlds[0]
 
 

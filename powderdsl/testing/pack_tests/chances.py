@@ -41,7 +41,7 @@ def divergence(share: float, chance: float) -> float:
             if b <= 0:
                 return float("inf")
             total += a * log(a / b)
-    return max(total, 0.0)
+    return total
 
 
 def is_unlikely(hits: int, trials: int, chance: float) -> bool:
@@ -59,15 +59,9 @@ def trials_for(chance: float) -> int:
 
 def _trials_between(first: float, second: float) -> int:
     """The trials after which some share is too unlikely for the first chance or for the second, whatever it is."""
-    low, high = sorted((first, second))
-    a, b = low, high
-    for _ in range(60):  # the share that is equally unlike both
-        middle = (a + b) / 2
-        if divergence(middle, low) < divergence(middle, high):
-            a = middle
-        else:
-            b = middle
-    return ceil(log(2 / ERROR_RATE) / divergence((a + b) / 2, low))
+    hits, misses = log(first / second), log((1 - first) / (1 - second))
+    middle = misses / (misses - hits)  # the share that is equally unlike both
+    return ceil(log(2 / ERROR_RATE) / divergence(middle, first))
 
 
 def chance_problem(start: AnyWorld, steps: int, claims: Sequence[Often], seed: int) -> str:

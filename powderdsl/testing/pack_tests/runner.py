@@ -65,12 +65,7 @@ class ExampleResult:
 
 
 def run_examples(
-    ruleset: Ruleset,
-    backend: str | None = None,
-    device: str = "cpu",
-    *,
-    sim: AnySimulator[Any] | None = None,
-    seen: Callable[[Any], None] | None = None,
+    ruleset: Ruleset, *, sim: AnySimulator[Any] | None = None, seen: Callable[[Any], None] | None = None
 ) -> list[ExampleResult]:
     """Run every test of a ruleset's packs, in the order of the files.
 
@@ -80,11 +75,10 @@ def run_examples(
     the packs of its scope alone, if more are loaded.
 
     Args:
-        backend, device: those of `powderdsl.compile`; unless given, a backend that starts at once.
-        sim: what runs them, instead of a new simulator of this ruleset.
+        sim: what runs them, instead of a new simulator of this ruleset on a backend that starts at once.
         seen: called with the worlds of each batch at its end.
     """
-    sim = sim or compile_any(ruleset, backend or starting_backend(device), device)
+    sim = sim or compile_any(ruleset, starting_backend("cpu"))
     sizes: dict[tuple[int, int], list[int]] = {}
     for number, example in enumerate(ruleset.tests):
         sizes.setdefault((len(example.given), len(example.given[0])), []).append(number)
@@ -130,9 +124,15 @@ def _passing(ruleset: Ruleset | None, places: Collection[Span], sim: AnySimulato
 
 def start_of(example: Example, sim: AnySimulator[W], seed: int) -> W:
     """The start world of a test, one of a seed."""
-    ids = {char: _id(sim.ruleset, name) for char, name in example.legend}
+    ids = _ids(example, sim.ruleset)
     grid = np.array([[[ids[char] for char in row] for row in example.given]], dtype=np.uint8)
     return with_fields(sim.world(grid, seed=[seed]), [example])
+
+
+def _ids(example: Example, ruleset: Ruleset) -> dict[str, int]:
+    """The elements that a test's characters mean."""
+    ids = {element.name: element.id for element in ruleset.elements}
+    return {char: ids[name] for char, name in example.legend}
 
 
 @dataclass(frozen=True)
@@ -145,13 +145,12 @@ class _Running:
 
     @classmethod
     def of(cls, example: Example, sim: AnySimulator[Any]) -> _Running:
-        ids = {char: _id(sim.ruleset, name) for char, name in dict(example.legend).items()}
-        return cls(example, ids, SEEDS if example.seed is None else (example.seed,))
+        return cls(example, _ids(example, sim.ruleset), SEEDS if example.seed is None else (example.seed,))
 
     def stops(self) -> set[int]:
         """The steps after which it is looked at: conditions that hold always want every one."""
         steps = self.example.steps
-        return set(range(1, steps + 1)) if self.example.always else {steps} if steps else set()
+        return {steps, *(range(1, steps) if self.example.always else ())}
 
     def look(self, world: AnyWorld, step: int) -> ExampleResult | None:
         """The failure after a step, if any; `world` holds this test's worlds alone."""
@@ -199,20 +198,18 @@ def _run(
 ) -> list[ExampleResult]:
     """Tests of one size, all at once: each has a slice of the batch."""
     grids = [
-        np.array([[one.ids[char] for char in row] for row in one.example.given], dtype=np.uint8)
-        for one in batch
+        [[one.ids[char] for char in row] for row in one.example.given] for one in batch for _ in one.seeds
     ]
-    copies = [np.repeat(ids[None], len(one.seeds), axis=0) for ids, one in zip(grids, batch, strict=True)]
-    world = sim.world(np.concatenate(copies), seed=[seed for one in batch for seed in one.seeds])
+    world = sim.world(np.array(grids, dtype=np.uint8), seed=[seed for one in batch for seed in one.seeds])
     world = with_fields(world, [one.example for one in batch for _ in one.seeds])
     ends = list(accumulate(len(one.seeds) for one in batch))
     results: dict[int, ExampleResult] = {}
     now = 0
-    for stop in sorted({0}.union(*(one.stops() for one in batch))):
+    for stop in sorted(set[int]().union(*(one.stops() for one in batch))):
         world = sim.step(world, steps=stop - now)
         now = stop
         for number, one in enumerate(batch):
-            if number in results or not (stop in one.stops() or one.example.steps == stop):
+            if number in results or stop not in one.stops():
                 continue
             own = world.select(slice(ends[number] - len(one.seeds), ends[number]))
             problem = one.look(own, stop)
@@ -223,7 +220,7 @@ def _run(
     for number, one in enumerate(batch):
         if one.example.often and number not in results:
             seed = one.seeds[0]
-            start = with_fields(sim.world(grids[number][None], seed=seed), [one.example])
+            start = start_of(one.example, sim, seed)
             problem_of = chance_problem(start, one.example.steps, one.example.often, seed)
             if problem_of:
                 results[number] = ExampleResult(one.example, one.seeds, problem_of, seed, one.example.steps)
@@ -237,12 +234,6 @@ def _rows(world: NDArray[np.uint8], ids: Mapping[str, int], example: Example) ->
     for char in sorted(ids, key=lambda char: char not in used):
         characters.setdefault(ids[char], char)
     return tuple("".join(characters[number] for number in row) for row in world.tolist())
-
-
-def _id(ruleset: Ruleset, name: str) -> int:
-    element = ruleset.element(name)
-    assert element is not None, f"the checked model has a test with the unknown element {name}"
-    return element.id
 
 
 def with_fields(world: W, examples: Sequence[Example]) -> W:

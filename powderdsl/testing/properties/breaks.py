@@ -10,6 +10,7 @@ from operator import or_
 from random import Random
 from typing import Protocol
 
+from powderdsl.analysis.ledger import AGAINST
 from powderdsl.arrays import np
 from powderdsl.model import reference
 from powderdsl.model.state import slots
@@ -145,10 +146,8 @@ def _total(claim: Total, ruleset: Ruleset, sample: Start, states: list[State]) -
     masks = []
     for before, after in pairwise(values):
         change = (after - before).sum((1, 2))
-        wrong = {"constant": change != 0, "never rises": change > 0, "never falls": change < 0}[claim.trend]
-        cells = (after > before) if claim.trend == "never rises" else (after < before)
-        cells = (after != before) if claim.trend == "constant" else cells
-        masks.append(wrong[:, None, None] & cells)
+        wrong = AGAINST[claim.trend]
+        masks.append(wrong(change, 0)[:, None, None] & wrong(after, before))
     return _breaks_of(np.stack(masks))
 
 
@@ -180,10 +179,7 @@ def _outside(values: Array, claim: Bounded) -> Array:
 def _unknown(ruleset: Ruleset, state: State) -> Array:
     known = [element.id for element in ruleset.elements]
     named = [slot.name for slot in slots(ruleset) if slot.kind.name == "element"]
-    wrong: Array = ~np.isin(state["element"], known)
-    for name in named:
-        wrong = wrong | ~np.isin(state[name], known)
-    return wrong
+    return reduce(or_, [~np.isin(state[name], known) for name in named])
 
 
 # Claims about two runs

@@ -210,11 +210,11 @@ FOLDER = ".powderdsl"
 """Where counterexamples are kept, under the working directory."""
 
 
-def file_of(rules: str, prop: Property, folder: Path = Path(FOLDER)) -> Path:
+def file_of(rules: str, prop: Property) -> Path:
     """The file of a property's counterexample: one for each property of some rules."""
     words = re.sub(r"[^A-Za-z0-9]+", "-", f"{prop.owner}-{prop.text}").strip("-")[:60]
     digest = hashlib.sha256(f"{rules}\n{prop.text}".encode()).hexdigest()[:8]
-    return folder / f"{words}-{digest}.yaml"
+    return Path(FOLDER) / f"{words}-{digest}.yaml"
 
 
 def write_example(path: Path, rules: str, prop: Property, found: Counterexample) -> None:
@@ -252,11 +252,11 @@ def read_example(path: Path, ruleset: Ruleset) -> tuple[str, Start, int]:
 
 
 def kept_examples(
-    ruleset: Ruleset, properties: Mapping[str, Property], rules: str, folder: Path = Path(FOLDER)
+    ruleset: Ruleset, properties: Mapping[str, Property], rules: str
 ) -> Iterator[tuple[Property, Start, int]]:
     """The counterexamples that were kept for these rules. Files that no longer fit are passed over."""
     for prop in properties.values():
-        path = file_of(rules, prop, folder)
+        path = file_of(rules, prop)
         if path.is_file():
             try:
                 text, sample, steps = read_example(path, ruleset)

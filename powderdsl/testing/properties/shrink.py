@@ -137,7 +137,11 @@ def _first(
     """The first of these worlds of one shape that the judge accepts, with the seed that does it soonest."""
     most = max(MAX_BATCH // tries, 1)
     for at in range(0, len(candidates), most):
-        some = [_seeded(one, number) for one in candidates[at : at + most] for number in range(tries)]
+        some = [
+            replace(one, seed=np.array([number - 1])) if number else one
+            for one in candidates[at : at + most]
+            for number in range(tries)
+        ]
         batch = joined(some, work.ruleset)
         work.spend(batch, steps)
         first = judge(batch, steps)
@@ -146,10 +150,6 @@ def _first(
             best = min(broken.tolist(), key=lambda i: (i // tries, first[i], i))
             return some[best], int(first[best])
     return None
-
-
-def _seeded(sample: Start, number: int) -> Start:
-    return replace(sample, seed=np.array([number - 1])) if number else sample
 
 
 # Smaller worlds, in the order in which they are tried
