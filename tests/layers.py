@@ -97,7 +97,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "worlds": (*_FRONT, "analysis", "simulation.draw"),
     "worlds.store": (*_FRONT, "worlds", "simulation.any_arrays"),  # saved worlds are values of the simulator
     "testing.generators": _SCREEN,
-    "testing": ("testing.generators",),  # the public names
+    "testing": ("system", "testing.generators"),  # the public names
     "testing.pack_tests": (*_SCREEN, "testing.generators"),
     "testing.properties": (*_SCREEN, *_TESTING[:-1]),
     "testing.mutation": (*_SCREEN, *_TESTING),

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
 from math import prod
 from pathlib import Path
@@ -150,24 +151,23 @@ def read_manifest(folder: Path) -> Manifest:
     version = data.pop("version", None)
     if version != VERSION:
         raise damaged(f"{path} has the version {_short(version)}", f"this powderdsl reads {VERSION}")
+    manifest = _checked(path, data)
+    return replace(manifest, shards=tuple(sorted(manifest.shards, key=lambda shard: shard.number)))
+
+
+def read_recipe(path: Path, data: Any) -> Recipe:
+    """The recipe in a file of another format. Raises CompileError (PD630)."""
+    return _checked(path, {"recipe": data, "created": "unknown", "shards": []}).recipe
+
+
+def _checked(path: Path, data: Any) -> Manifest:
     problems: list[str] = []
     manifest = read_record(Manifest, data, problems)
     if manifest is not None:
         problems += _misfits(manifest.recipe, manifest.shards)
     if manifest is None or problems:
         raise many_damaged(path, problems)
-    return replace(manifest, shards=tuple(sorted(manifest.shards, key=lambda shard: shard.number)))
-
-
-def read_recipe(path: Path, data: Any) -> Recipe:
-    """The recipe in a file of another format. Raises CompileError (PD630)."""
-    problems: list[str] = []
-    recipe = read_record(Recipe, data, problems, "recipe")
-    if recipe is not None:
-        problems += _misfits(recipe)
-    if recipe is None or problems:
-        raise many_damaged(path, problems)
-    return recipe
+    return manifest
 
 
 def check_place(folder: Path) -> None:
@@ -191,6 +191,17 @@ def check_place(folder: Path) -> None:
 def damaged(message: str, reason: str, *helps: str) -> CompileError:
     """PD630: a dataset that cannot be used."""
     return failure("PD630", message, notes=(reason,), helps=helps)
+
+
+@contextmanager
+def reported(message: str, *helps: str) -> Iterator[None]:
+    """Turn whatever reading damaged files raises, as codecs like, into CompileError (PD630)."""
+    try:
+        yield
+    except Exception as error:
+        words = (error.strerror if isinstance(error, OSError) else None) or str(error)
+        reason = " ".join(words.split())[:200] or type(error).__name__
+        raise damaged(message, reason, *helps) from None
 
 
 def many_damaged(path: Path, problems: list[str]) -> CompileError:
@@ -301,7 +312,7 @@ def episode_bytes(recipe: Recipe) -> int:
     return (recipe.actions + 1) * (prod(recipe.shape) + 32)
 
 
-def _misfits(recipe: Recipe, shards: Sequence[ShardRow] = ()) -> list[str]:
+def _misfits(recipe: Recipe, shards: Sequence[ShardRow]) -> list[str]:
     """Contradictions between the values of a recipe, and with the rows of shards."""
     found, numbers = [], set()
     if len(recipe.channels) != recipe.shape[0]:

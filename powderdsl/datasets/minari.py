@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from powderdsl.datasets.dataset import Dataset
-from powderdsl.datasets.manifest import Recipe, changed_params, damaged, read_recipe, recipe_of
+from powderdsl.datasets.manifest import Recipe, changed_params, damaged, read_recipe, recipe_of, reported
 from powderdsl.datasets.recorder import add_shard, begun, held_place
 from powderdsl.datasets.shards import DTYPES, check_episodes, knows_ids, row_shape
 from powderdsl.diagnostics import CompileError
@@ -223,7 +222,7 @@ def _opened(folder: Path) -> minari.MinariDataset:
     from minari import MinariDataset
     from minari.dataset.minari_storage import MinariStorage, is_image_space
 
-    with _reported(folder):
+    with reported(f"{folder} cannot be imported"):
         # Minari makes an environment to get spaces that are missing, with whatever function the file names.
         missing = {"observation_space", "action_space"} - MinariStorage.read_raw_metadata(folder).keys()
         if missing:
@@ -232,16 +231,6 @@ def _opened(folder: Path) -> minari.MinariDataset:
         if source.storage.jpeg_encoding and is_image_space(source.observation_space):
             raise ValueError("its observations are stored as JPEG, which does not keep their values")
     return source
-
-
-@contextmanager
-def _reported(folder: Path, what: str = "") -> Iterator[None]:
-    """Turn whatever Minari raises for a damaged dataset into CompileError (PD630)."""
-    try:
-        yield
-    except Exception as error:
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise damaged(f"{folder} cannot be imported", f"{what}{reason}") from None
 
 
 def _exported_recipe(source: minari.MinariDataset) -> Recipe:
@@ -259,7 +248,7 @@ def _exported_recipe(source: minari.MinariDataset) -> Recipe:
 
 def _form(source: minari.MinariDataset, env: TensorEnv) -> ActionForm:
     """The form of the actions. Raises CompileError (PD630) for actions or observations that are not an environment's."""
-    with _reported(source.storage.data_path):
+    with reported(f"{source.storage.data_path} cannot be imported"):
         space = env.observation.space
         if source.observation_space != space:
             raise ValueError(f"its observations are not {space.dtype} {list(space.shape)}")
@@ -276,7 +265,7 @@ def _shard(
     """The arrays of a shard, in parts, all checked. Raises CompileError (PD630)."""
     parts: dict[str, list[Array]] = {name: [] for name in DTYPES}
     for episode in recipe.episodes_of(number):
-        with _reported(source.storage.data_path, f"episode_{episode}: "):
+        with reported(f"episode_{episode}: {source.storage.data_path} cannot be imported"):
             for name, value in _episode(source, episode, recipe, form).items():
                 parts[name].append(value)
     return parts

@@ -10,8 +10,8 @@ from __future__ import annotations
 import hashlib
 import os
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from powderdsl.datasets.manifest import Recipe, ShardRow, damaged, shard_file
+from powderdsl.datasets.manifest import Recipe, ShardRow, reported, shard_file
 from powderdsl.system.archives import BadArchive, Parts, open_archive, write_archive
 from powderdsl.system.reading import open_regular
 from powderdsl.system.writing import not_writable, replacing
@@ -113,7 +113,7 @@ def open_shard(folder: Path, recipe: Recipe, row: ShardRow) -> Shard:
         CompileError: PD630, naming the shard and what is wrong with it.
     """
     path = folder / row.file
-    with _defects(path):
+    with _damage(path):
         if not is_whole(folder, row):
             raise BadArchive("its size or its SHA-256 is another than the manifest's")
         shard = _read(path, shapes(recipe, row.number, row.transitions))
@@ -128,24 +128,14 @@ def read_episodes(folder: Path, recipe: Recipe, row: ShardRow) -> tuple[Array, A
         CompileError: PD630, as `open_shard`.
     """
     path = folder / row.file
-    with _defects(path):
+    with _damage(path):
         found = _read(path, shapes(recipe, row.number, row.transitions), only=("length", "world")).arrays
         _check_lengths(found["length"].astype(np.int64), recipe, row.transitions)
     return found["length"], found["world"]
 
 
-@contextmanager
-def _defects(path: Path) -> Iterator[None]:
-    """Turns whatever reading a damaged shard raises into CompileError (PD630)."""
-    try:
-        yield
-    except OSError as error:
-        reason = error.strerror or str(error)
-    except Exception as error:  # a damaged archive raises whatever its codec likes
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-    else:
-        return
-    raise damaged(f"the shard {path} is damaged", reason, "the command that recorded it records it again")
+def _damage(path: Path) -> AbstractContextManager[None]:
+    return reported(f"the shard {path} is damaged", "the command that recorded it records it again")
 
 
 def _read(path: Path, expected: dict[str, tuple[int, ...]], only: tuple[str, ...] = tuple(DTYPES)) -> Shard:

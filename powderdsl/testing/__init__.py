@@ -5,7 +5,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from powderdsl.system.packages import importing
 
 if TYPE_CHECKING:
     from powderdsl.testing.generators.strategies import rulesets, worlds
@@ -13,10 +15,4 @@ if TYPE_CHECKING:
 __all__ = ["rulesets", "worlds"]
 
 
-def __getattr__(name: str) -> Any:
-    """The strategies, imported when they are first used."""
-    if name not in __all__:
-        raise AttributeError(f"module 'powderdsl.testing' has no attribute {name!r}")
-    from importlib import import_module
-
-    return getattr(import_module("powderdsl.testing.generators.strategies"), name)
+__getattr__ = importing("powderdsl.testing.generators", strategies="rulesets worlds")

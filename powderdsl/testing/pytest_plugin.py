@@ -54,8 +54,6 @@ def _text(path: Path) -> str:
 
 def home_of(path: Path) -> str:
     """The rules that a pack is tried in, as `powderdsl.load` takes them."""
-    from powderdsl.compiler import shipped_rules
-
     text = _text(path)
     if re.search(r"^ruleset:", text, re.MULTILINE):
         return str(path)
@@ -67,11 +65,7 @@ def home_of(path: Path) -> str:
         if re.search(r"^ruleset:", head, re.MULTILINE) and path.stem in _listed("packs", head):
             return str(other)
     beside = {name: path.parent / f"{name}.yaml" for name in _listed("needs", text)}
-    found = [
-        str(file) if file.is_file() else name
-        for name, file in beside.items()
-        if file.is_file() or name in shipped_rules()
-    ]
+    found = [str(file) if file.is_file() else name for name, file in beside.items()]
     return "+".join([*found, str(path)])
 
 
@@ -113,20 +107,12 @@ class PackFile(pytest.File):
         names: dict[str, int] = {}
         subjects: list[Example | Invariant] = [*ruleset.tests, *ruleset.invariants]
         for one in subjects:
-            if not same_file(one.span.source.name, self.path):
+            if Path(one.span.source.name).resolve() != self.path.resolve():
                 continue
             name = printable(getattr(one, "name", "") or " ".join(one.span.text.split()))
             names[name] = names.get(name, 0) + 1
             unique = name if names[name] == 1 else f"{name} ({names[name]})"
             yield PackItem.from_parent(self, name=unique, ruleset=ruleset, subject=one)
-
-
-def same_file(name: str, path: Path) -> bool:
-    return Path(name).resolve() == path.resolve()
-
-
-class Failed(Exception):
-    """An item failed; the text says how."""
 
 
 class PackItem(pytest.Item):
@@ -146,7 +132,7 @@ class PackItem(pytest.Item):
             (result,) = run_examples(replace(self.ruleset, tests=(self.subject,)))
             if result.failed:
                 after = "\n".join(result.after)
-                raise Failed(f"{result.problem} (seed {result.seed}, after {result.step} steps)\n{after}")
+                self.fail(f"{result.problem} (seed {result.seed}, after {result.step} steps)\n{after}")
             return
         from powderdsl.testing.properties.outcomes import counterexample_lines
 
@@ -156,17 +142,12 @@ class PackItem(pytest.Item):
             search.try_random()
             for outcome in search.finish():
                 if outcome.counterexample is not None and not outcome.holds:
-                    raise Failed("\n".join(counterexample_lines(outcome.counterexample, self.ruleset)))
+                    self.fail("\n".join(counterexample_lines(outcome.counterexample, self.ruleset)))
 
-    def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
-        if isinstance(excinfo.value, Failed):
-            return f"{self.place}: {excinfo.value}"
-        return super().repr_failure(excinfo)
-
-    @property
-    def place(self) -> str:
-        """`file:line`."""
-        return f"{self.subject.span.source.name}:{self.subject.span.line}"
+    def fail(self, words: str) -> None:
+        """Fail with the place of the item and what is wrong."""
+        span = self.subject.span
+        pytest.fail(f"{span.source.name}:{span.line}: {words}", pytrace=False)
 
     def reportinfo(self) -> tuple[Path, int, str]:
         return self.path, self.subject.span.line - 1, self.name

@@ -26,7 +26,7 @@ from powderdsl.system.writing import write_text
 from powderdsl.testing.generators.cases import Array, Start
 from powderdsl.testing.mutation.mutants import Mutant
 from powderdsl.testing.pack_tests.runner import ANYTHING, SEEDS, field_rows
-from powderdsl.testing.properties.running import State, first_difference, random_samples, run_sample
+from powderdsl.testing.properties.running import State, first_difference, framed, random_samples, run_sample
 from powderdsl.testing.properties.shrink import Work, shrink_while
 
 GENERATED = "generated "
@@ -286,9 +286,7 @@ def fresh_samples(ruleset: Ruleset, focus: Sequence[int], seed: int) -> Iterator
             palette = _palette(known, focus, KINDS[group // GROUP % len(KINDS)], random)
             ids[group : group + GROUP] = random.choice(palette, (GROUP, rows, columns))
         if frames and min(rows, columns) > 2:
-            framed = ids[worlds // 2 :]
-            framed[:, [0, -1], :] = frames[0]
-            framed[:, :, [0, -1]] = frames[0]
+            ids[worlds // 2 :] = framed(ids[worlds // 2 :], frames[0])
         yield Start.fresh(ids).seeded(), steps
 
 

@@ -239,7 +239,7 @@ def random_samples(ruleset: Ruleset, seed: int, count: int) -> Iterator[Start]:
             if group % 2:
                 sample = replace(sample, fields={}, params={})
             if group % 4 == 1 and frames and min(shape) > 2:
-                sample = replace(sample, ids=_framed(sample.ids, choices.pick(frames)))
+                sample = replace(sample, ids=framed(sample.ids, choices.pick(frames)))
             groups.append(sample)
         yield joined(groups, ruleset)
         left -= batch
@@ -248,11 +248,12 @@ def random_samples(ruleset: Ruleset, seed: int, count: int) -> Iterator[Start]:
     yield random_start(ruleset, choices, (4, *LARGE)).seeded()
 
 
-def _framed(ids: Array, number: int) -> Array:
-    framed = ids.copy()
-    framed[:, [0, -1], :] = number
-    framed[:, :, [0, -1]] = number
-    return framed
+def framed(ids: Array, number: int) -> Array:
+    """Worlds with one element in all cells at their edges."""
+    ids = ids.copy()
+    ids[:, [0, -1], :] = number
+    ids[:, :, [0, -1]] = number
+    return ids
 
 
 # Worlds seen in a mirror or turned by a quarter: directions and vectors turn with their cells
