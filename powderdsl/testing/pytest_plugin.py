@@ -83,27 +83,23 @@ def loaded(rules: str, stamp: float) -> Ruleset:
     return load(rules)
 
 
-_SEARCHES: dict[int, tuple[Ruleset, InvariantSearch]] = {}
-
-
-def search_of(ruleset: Ruleset, worlds: int) -> InvariantSearch:
+@cache
+def search_of(rules: str, stamp: float, worlds: int) -> InvariantSearch:
     """The search for a ruleset's invariants, made once: the ledger takes a second."""
     from powderdsl.testing.properties.running import Runner
     from powderdsl.testing.properties.search import InvariantSearch, SearchPlan
 
-    if id(ruleset) not in _SEARCHES:
-        _SEARCHES[id(ruleset)] = ruleset, InvariantSearch.of(Runner(ruleset), SearchPlan(worlds))
-    return _SEARCHES[id(ruleset)][1]
+    return InvariantSearch.of(Runner(loaded(rules, stamp)), SearchPlan(worlds))
 
 
 class PackFile(pytest.File):
     """A pack or ruleset."""
 
     def collect(self) -> Iterator[pytest.Item]:
-        rules = home_of(self.path)
+        home = home_of(self.path), self.path.stat().st_mtime
         from powderdsl.diagnostics.printable import printable
 
-        ruleset = loaded(rules, self.path.stat().st_mtime)
+        ruleset = loaded(*home)
         names: dict[str, int] = {}
         subjects: list[Example | Invariant] = [*ruleset.tests, *ruleset.invariants]
         for one in subjects:
@@ -112,15 +108,15 @@ class PackFile(pytest.File):
             name = printable(getattr(one, "name", "") or " ".join(one.span.text.split()))
             names[name] = names.get(name, 0) + 1
             unique = name if names[name] == 1 else f"{name} ({names[name]})"
-            yield PackItem.from_parent(self, name=unique, ruleset=ruleset, subject=one)
+            yield PackItem.from_parent(self, name=unique, home=home, subject=one)
 
 
 class PackItem(pytest.Item):
     """One test or invariant of a pack."""
 
-    def __init__(self, *, ruleset: Ruleset, subject: Example | Invariant, **options: Any):
+    def __init__(self, *, home: tuple[str, float], subject: Example | Invariant, **options: Any):
         super().__init__(**options)
-        self.ruleset, self.subject = ruleset, subject
+        self.home, self.subject = home, subject
 
     def runtest(self) -> None:
         from dataclasses import replace
@@ -129,20 +125,20 @@ class PackItem(pytest.Item):
         from powderdsl.testing.pack_tests.runner import run_examples
 
         if isinstance(self.subject, Example):
-            (result,) = run_examples(replace(self.ruleset, tests=(self.subject,)))
+            (result,) = run_examples(replace(loaded(*self.home), tests=(self.subject,)))
             if result.failed:
                 after = "\n".join(result.after)
                 self.fail(f"{result.problem} (seed {result.seed}, after {result.step} steps)\n{after}")
             return
         from powderdsl.testing.properties.outcomes import counterexample_lines
 
-        whole = search_of(self.ruleset, self.config.getoption("--powderdsl-worlds"))
+        whole = search_of(*self.home, self.config.getoption("--powderdsl-worlds"))
         search = whole.only([" ".join(self.subject.span.text.split())])
         if search.trials:
             search.try_random()
             for outcome in search.finish():
                 if outcome.counterexample is not None and not outcome.holds:
-                    self.fail("\n".join(counterexample_lines(outcome.counterexample, self.ruleset)))
+                    self.fail("\n".join(counterexample_lines(outcome.counterexample, loaded(*self.home))))
 
     def fail(self, words: str) -> None:
         """Fail with the place of the item and what is wrong."""

@@ -304,7 +304,8 @@ def broken_invariant(original: Original, sim: Simulator) -> tuple[Invariant | No
     kept = [one for number, one in enumerate(ruleset.invariants) if number not in broken]
     single = [one for one in kept if not is_paired(one.claim)]
     any_differs = False
-    if same_state(original.ruleset, ruleset):
+    params = [[param.name for param in rules.params] for rules in (original.ruleset, ruleset)]
+    if slots(original.ruleset) == slots(ruleset) and params[0] == params[1]:  # worlds hold the same
         for batch in original.batches():
             states, _ = run_sample(sim, batch.sample, batch.steps)
             differs = first_difference(batch.states, states) > 0
@@ -376,11 +377,6 @@ def _broken_in(
             if asked and look(one.claim, sim.ruleset, sample, some).first.any():
                 return one
     return None
-
-
-def same_state(first: Ruleset, second: Ruleset) -> bool:
-    """Whether worlds of one composition hold what worlds of the other hold."""
-    return slots(first) == slots(second) and [p.name for p in first.params] == [p.name for p in second.params]
 
 
 # Campaigns

@@ -508,8 +508,8 @@ def _also(entry: Entry) -> Changes:
     for part in entry.entries():
         if part.key.text == "tags":
             yield from _tags(part)
-        elif part.key.text == "override" and isinstance(part.node, Scalar):
-            yield part.instead("override", "no" if part.node.text in ("yes", "true") else "yes")
+        elif part.key.text == "override":
+            yield part.instead("override", "no" if part.node.span.text in ("yes", "true") else "yes")
         elif part.key.text not in UNCHANGED:
             yield from _value(part, part.key.word)
 
@@ -574,11 +574,10 @@ def _option(operator: str, *words: str) -> EntryMistake:
     """Another word for a key that takes one of a few, or none."""
 
     def changes(entry: Entry) -> Changes:
-        if isinstance(entry.node, Scalar):
-            for other in words:
-                if other != entry.node.text:
-                    yield entry.instead(operator, other)
-            yield entry.lost(operator)
+        for other in words:
+            if other != entry.node.span.text:
+                yield entry.instead(operator, other)
+        yield entry.lost(operator)
 
     return changes
 
