@@ -113,11 +113,8 @@ def _row(mutant: Mutant, verdict: Verdict) -> dict[str, Any]:
         "pack": mutant.pack,
         "operator": mutant.operator,
         "change": mutant.diff,
-        "status": verdict.status,
-        "by": verdict.by,
-        "detail": verdict.detail,
+        **vars(verdict),
         "test": verdict.test and verdict.test.text,
-        "differs_in": verdict.differs_in,
     }
 
 

@@ -284,11 +284,6 @@ class Report:
     cells: tuple[CellFigures, ...]
     interrupted: bool = False
 
-    @property
-    def programs(self) -> list[str]:
-        """The names of the programs that were measured beside the backends."""
-        return [program.name for program in self.plan.programs]
-
     def ratio(self, figures: CellFigures, program: str) -> float | None:
         """The processor time of a cell divided by that of a program for the same worlds; None if it is unknown."""
         same = figures.cell._replace(backend=program)
@@ -329,9 +324,12 @@ def measuring(plan: Plan, cells: list[CellFigures]) -> Iterator[tuple[str, Cell]
             cells.append(subject.figures)
         for _ in range(plan.rounds):
             for subject in subjects:
-                torch.set_num_threads(subject.figures.cell.threads)
-                subject.measure()
-                yield "measure", subject.figures.cell
+                figures = subject.figures
+                torch.set_num_threads(figures.cell.threads)
+                seconds, processor_seconds = subject.timed(figures.steps_per_call, figures.calls_per_round)
+                figures.round_seconds.append(seconds)
+                figures.round_processor_seconds.append(processor_seconds)
+                yield "measure", figures.cell
         for subject in subjects if plan.profile else ():
             yield "profile", subject.figures.cell
             torch.set_num_threads(subject.figures.cell.threads)
@@ -362,12 +360,6 @@ class _Subject:
         began = time.perf_counter()
         self.timed(figures.steps_per_call, 1)
         figures.calls_per_round = max(1, int(budget / max(time.perf_counter() - began, 1e-9)))
-
-    def measure(self) -> None:
-        """Measure a round."""
-        seconds, processor_seconds = self.timed(self.figures.steps_per_call, self.figures.calls_per_round)
-        self.figures.round_seconds.append(seconds)
-        self.figures.round_processor_seconds.append(processor_seconds)
 
     def timed(self, steps: int, calls: int) -> tuple[float, float]:
         """Seconds, and processor seconds, of some calls. A program loads its worlds before each call, untimed."""
@@ -449,7 +441,7 @@ def report_data(report: Report) -> dict[str, Any]:
         values = figures.cell._asdict() | vars(figures)
         del values["cell"]
         values["world_steps_per_second"] = median(figures.rates)
-        values["beside"] = {name: report.ratio(figures, name) for name in report.programs}
+        values["beside"] = {program.name: report.ratio(figures, program.name) for program in plan.programs}
         cells.append(values)
     return {
         "machine": report.machine,
@@ -478,7 +470,7 @@ def report_text(report: Report) -> str:
             "CPUs: processor time by time; less than the threads means that others were at work",
             "to first step: compiling, which all lines of a backend share, and the first step",
         ]
-        if report.programs:
+        if plan.programs:
             notes.append("÷: processor time divided by that of another program, from the same worlds")
         parts += [_cell_table(report), "\n".join(notes)]
     if profiled := [figures for figures in report.cells if figures.passes]:
@@ -502,9 +494,10 @@ def _cell_table(report: Report) -> str:
         "CPUs": lambda figures: f"{figures.processor_microseconds / figures.world_step_microseconds:.2f}",
         "to first step": lambda figures: f"{figures.compile_seconds + figures.first_step_seconds:.2f} s",
     }
-    rows = [[*columns, *(f"÷ {name}" for name in report.programs)]]
+    programs = [program.name for program in report.plan.programs]
+    rows = [[*columns, *(f"÷ {name}" for name in programs)]]
     for figures in report.cells:
-        ratios = [report.ratio(figures, name) for name in report.programs]
+        ratios = [report.ratio(figures, name) for name in programs]
         rows.append(
             [show(figures) for show in columns.values()]
             + ["?" if ratio is None else number(ratio) for ratio in ratios]
@@ -531,8 +524,6 @@ def _pass_table(profiled: Sequence[CellFigures]) -> str:
 
 def number(value: float) -> str:
     """Three significant digits: 0.0123, 1.23, 12.3, 1,234, 12.3 million as 12.3M."""
-    if value >= 1e9:
-        return f"{value / 1e9:.3g}G"
     if value >= 1e6:
         return f"{value / 1e6:.3g}M"
     return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"

@@ -13,7 +13,7 @@ import platform
 import re
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
@@ -106,7 +106,6 @@ def _digest(data: bytes) -> str:
 # Metrics
 
 LINES = "metrics.jsonl"
-EVENTS = "tensorboard"
 MAX_LINE = 1 << 16
 """Bytes of a line."""
 T_975 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228)
@@ -130,7 +129,7 @@ class Metrics:
         with suppress(ImportError):  # without TensorBoard, the lines hold the same
             from torch.utils.tensorboard import SummaryWriter
 
-            self._events = SummaryWriter(str(folder / EVENTS), purge_step=step + 1 if step else None)
+            self._events = SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1 if step else None)
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
         """Numbers by name, such as ``loss/train``, after `step` steps. What is not finite is left out of the lines."""
@@ -188,10 +187,6 @@ class RunFolder:
     config: Mapping[str, Any]
     about: Mapping[str, Any]
 
-    def locked(self) -> AbstractContextManager[None]:
-        """Keep other processes from training here, which get a CompileError (PD622)."""
-        return held(self.path)
-
     def latest_checkpoint(self) -> Checkpoint | None:
         """The newest checkpoint whose digest is right, with its tensors on the CPU, or None. Damaged ones are passed over.
 
@@ -244,10 +239,6 @@ class RunFolder:
         paths = sorted((self.path / "checkpoints").glob("*"), reverse=True)
         matches = [(NAME.fullmatch(path.name), path) for path in paths]
         return [(int(match[1]), match[2], path) for match, path in matches if match]
-
-    def metrics(self, step: int = 0) -> Metrics:
-        """Where to write numbers from `step` on; those of later steps are dropped."""
-        return Metrics(self.path, step)
 
 
 def open_run(

@@ -31,7 +31,15 @@ from powderdsl.datasets.recorder import record
 from powderdsl.envs.observations import channels_of
 from powderdsl.envs.sb3 import PowderVecEnv
 from powderdsl.envs.tensor_env import check_cells
-from powderdsl.experiments.runs import Metrics, RunFolder, fitting, mean_and_interval, open_run, write_json
+from powderdsl.experiments.runs import (
+    Metrics,
+    RunFolder,
+    fitting,
+    held,
+    mean_and_interval,
+    open_run,
+    write_json,
+)
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.rl.config import TrainConfig, check_config, check_task
 from powderdsl.rl.evaluation import play
@@ -84,7 +92,7 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
     if trained_on is not task:
         plain["shaped_fingerprint"] = fingerprint(trained_on)
     run = open_run(folder, KIND, plain)
-    with run.locked(), _own_random_numbers(config.threads):
+    with held(run.path), _own_random_numbers(config.threads):
         write_json(run.path / ASKED, config.as_json())
         checkpoint = run.latest_checkpoint()
         step = 0 if checkpoint is None else checkpoint.step
@@ -98,7 +106,7 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
             threads=config.threads,
         )
         learner = _Learner(config, program)
-        with run.metrics(step) as metrics:
+        with Metrics(run.path, step) as metrics:
             learner.model.set_logger(Logger(None, [_MetricsWriter(metrics)]))
             if checkpoint is not None:
                 with fitting(checkpoint.path, "its state is that of another run"):

@@ -19,10 +19,12 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.experiments.runs import (
     ABOUT,
     Checkpoint,
+    Metrics,
     RunFolder,
     check_palette,
     does_not_fit,
     fitting,
+    held,
     open_run,
     read_run,
     recorded_palette,
@@ -131,7 +133,7 @@ def train(
         encoder = encoder_of(config, slots)
         network.check(encoder, slots, encoder.example(given.size), config.seed)
     run = open_run(path, KIND, {**config.plain, **identity}, note=note)
-    with run.locked():
+    with held(run.path):
         model = network_of(config, slots, network)
         trainer = _Trainer(config, machine, run, model.to(machine.device), slots)
         trainer.restore(parent)
@@ -194,7 +196,7 @@ class _Trainer:
         saved = since = time.monotonic()
         self.model.train()
         # An iteration is never left half done.
-        with self.run.metrics(self.done) as metrics, held_back() as interrupted:
+        with Metrics(self.run.path, self.done) as metrics, held_back() as interrupted:
             while self.done < total and not interrupted():
                 self.recent.append(self.step(*self.batch(self.done, config.batch)))
                 began = time.monotonic()

@@ -31,7 +31,7 @@ from powderdsl.datasets.manifest import read_manifest
 from powderdsl.diagnostics import CODES, CompileError, Diagnostic, Reporter, Severity, Source
 from powderdsl.diagnostics.codes import page
 from powderdsl.diagnostics.render import render_text
-from powderdsl.experiments.runs import does_not_fit, find_run, open_run
+from powderdsl.experiments.runs import does_not_fit, find_run, held, open_run
 from powderdsl.experiments.studies.run import StudyRun, check_cluster, collected, read_folders
 from powderdsl.experiments.studies.study import TEXT, load_study, read_study
 from powderdsl.rl import preset
@@ -259,7 +259,7 @@ def open_a_run_of_another_seed() -> None:
 
 def train_in_one_folder_twice() -> None:
     run = open_run("runs/dunes", "ppo", {})
-    with run.locked(), run.locked():
+    with held(run.path), held(run.path):
         pass
 
 

@@ -10,13 +10,13 @@ import pytest
 from click.testing import CliRunner
 
 from powderdsl.cli.commands.curves import command
-from powderdsl.experiments.runs import RunFolder, open_run, write_json
+from powderdsl.experiments.runs import Metrics, RunFolder, open_run, write_json
 from powderdsl.experiments.studies.results import as_table, baselines_of, curves_of
 
 
 def written(folder: Path, seed: int, rate: float, lines: dict[int, float]) -> RunFolder:
     run = open_run(folder, "ppo", {"task": "dig", "seed": seed, "learning_rate": rate})
-    with run.metrics() as metrics:
+    with Metrics(run.path) as metrics:
         for step, value in lines.items():
             metrics.write(step, {"held_out/return": value})
             metrics.write(step, {"rollout/other": 1.0})

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from powderdsl.diagnostics import CompileError
-from powderdsl.experiments.runs import find_run, open_run, read_metrics, read_run
+from powderdsl.experiments.runs import Metrics, find_run, held, open_run, read_metrics, read_run
 from tests.processes import waited
 
 
@@ -135,12 +135,12 @@ def test_a_run_is_found_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 def test_metrics_after_the_last_checkpoint_are_written_once(tmp_path: Path) -> None:
     run = open_run(tmp_path / "run", "toy", {})
-    with run.metrics() as metrics:
+    with Metrics(run.path) as metrics:
         for step in range(1, 6):
             metrics.write(step, {"loss": 1 / step, "gap": float("nan")})
     with (run.path / "metrics.jsonl").open("a", encoding="utf-8") as file:
         file.write('{"step": 6, "lo')  # killed while it wrote
-    with run.metrics(3) as metrics:
+    with Metrics(run.path, 3) as metrics:
         metrics.write(4, {"loss": 0.0})
     lines = list(read_metrics(run.path))
     assert [line["step"] for line in lines] == [1, 2, 3, 4]
@@ -150,11 +150,11 @@ def test_metrics_after_the_last_checkpoint_are_written_once(tmp_path: Path) -> N
 
 SAVING = """
 import sys, torch
-from powderdsl.experiments.runs import open_run
+from powderdsl.experiments.runs import held, open_run
 run = open_run(sys.argv[1], "toy", {})
 found = run.latest_checkpoint()
 step = found.step if found else 0
-with run.locked():
+with held(run.path):
     while True:
         step += 1
         run.save_checkpoint(step, {"step": step, "weights": torch.full((20_000,), step)})
@@ -189,7 +189,7 @@ def test_one_process_at_a_time(tmp_path: Path) -> None:
     try:
         assert child.stdout is not None
         assert child.stdout.readline() == "1\n"
-        with pytest.raises(CompileError) as error, run.locked():
+        with pytest.raises(CompileError) as error, held(run.path):
             pass
         assert codes(error) == ["PD622"]
     finally:
@@ -198,7 +198,7 @@ def test_one_process_at_a_time(tmp_path: Path) -> None:
 
     def free() -> bool:
         try:
-            with run.locked():
+            with held(run.path):
                 return True
         except CompileError:
             return False

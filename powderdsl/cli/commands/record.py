@@ -73,13 +73,19 @@ def command(
         return _verify(verify)
     if to_minari is not None or from_minari is not None:
         return _exchanged(task, out, episodes, to_minari, from_minari, how)
-    named = {name: how.pop(name) for name in ("knobs", "settings", "packs")}
+    knobs, settings, packs = (how.pop(name) for name in ("knobs", "settings", "packs"))
     if task is None or out is None or episodes is None:
         required = {"TASK": task, "--out": out, "--episodes": episodes}
         raise BadInput(f"missing {', '.join(name for name, value in required.items() if value is None)}")
     with user_values():
         check_place(out)
-        loaded = _loaded(task, policy, how["split"], **named)
+        palette = None
+        if policy not in SCRIPTED:
+            from powderdsl.experiments.runs import find_run, recorded_palette
+
+            palette = recorded_palette(find_run(policy, "ppo"))
+        loaded = load_task(task, knobs=knobs, params=settings, packs=packs, palette=palette)
+        check_split(loaded, how["split"])
     require_gymnasium()
     from powderdsl.datasets.recorder import record
 
@@ -100,26 +106,6 @@ def command(
         err=True,
     )
     return OK
-
-
-def _loaded(
-    task: str,
-    policy: str,
-    split: str,
-    *,
-    knobs: dict[str, int],
-    settings: dict[str, str],
-    packs: tuple[str, ...],
-) -> Task:
-    """The task, checked before any import that takes long. Raises CompileError and BadInput."""
-    palette = None
-    if policy not in SCRIPTED:
-        from powderdsl.experiments.runs import find_run, recorded_palette
-
-        palette = recorded_palette(find_run(policy, "ppo"))
-    loaded = load_task(task, knobs=knobs, params=settings, packs=packs, palette=palette)
-    check_split(loaded, split)
-    return loaded
 
 
 def _trained(path: str, task: Task, how: dict[str, Any]) -> dict[str, Any]:

@@ -18,7 +18,6 @@ from powderdsl.tasks.task import Task
 @click.argument("run", metavar="RUN|TASK")
 @click.option("--split", help="Split: the set of worlds.  [default: test where the task has it, else train]")
 @opt.option("--worlds", (1, 64), "Number of worlds, side by side.", 4)
-@opt.option("--first", (0, 2**62), "Number of the first world.", 0)
 @opt.option(
     "--policy",
     ("trained", "expert", "random", "nothing"),
@@ -37,7 +36,6 @@ def command(
     run: str,
     split: str | None,
     worlds: int,
-    first: int,
     policy: str | None,
     deterministic: bool,
     seed: int,
@@ -83,11 +81,9 @@ def command(
     with user_values():
         acts = player(policy, program, run_folder, deterministic=deterministic)
     observation = config.observation if policy == "trained" else "ids"
-    numbers = torch.arange(first, first + worlds)
+    numbers = torch.arange(worlds)
     episodes, pictures = film(program, acts, numbers, observation=observation, seed=seed, factor=scale)
     write = write_gif if out.suffix.lower() == ".gif" else write_mp4
     write(out, pictures, fps=fps)
     returns = ", ".join(f"{one:.2f}" for one in episodes.returns.tolist())
-    click.echo(
-        f"wrote {out}: {task.name}, {policy}, worlds {first} to {first + worlds - 1} of {split}: {returns}"
-    )
+    click.echo(f"wrote {out}: {task.name}, {policy}, worlds 0 to {worlds - 1} of {split}: {returns}")

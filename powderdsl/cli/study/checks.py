@@ -39,7 +39,6 @@ MAKES = {("train",): AGENT, ("wm", "train"): NETWORK, ("wm", "finetune"): NETWOR
 """What the runs of commands train."""
 WORKS_ON = {("evaluate",): AGENT, ("wm", "finetune"): NETWORK, ("wm", "eval"): NETWORK}
 """What the runs that commands work on have trained."""
-EVALUATES = {AGENT: "evaluate", NETWORK: "wm eval"}
 
 
 def called(words: tuple[str, ...]) -> click.Command:
@@ -213,7 +212,7 @@ class _StudyCheck:
         made = next((step for step in self.study.steps if step.name == measure.of.text), None)
         if made is None or made.command not in MAKES:
             return  # reported by the reader
-        command = EVALUATES[MAKES[made.command]]
+        command = "evaluate" if MAKES[made.command] == AGENT else "wm eval"
         steps = [
             step
             for step in self.study.steps

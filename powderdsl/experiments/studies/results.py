@@ -314,7 +314,7 @@ def as_table(curves: Sequence[Line]) -> str:
 
 
 def write_curves(
-    path: Path, curves: Sequence[Line], metric: str, baselines: Mapping[str, float], title: str = ""
+    path: Path, curves: Sequence[Line], metric: str, baselines: Mapping[str, float], title: str
 ) -> None:
     """Draw means with their 95 % intervals over seeds, and baselines as dashed lines; losses on a
     logarithmic scale. Raises as `draw`."""

@@ -13,7 +13,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
@@ -33,11 +32,6 @@ from powderdsl.system.reading import read_json
 from powderdsl.system.writing import failure
 
 EVALUATION, ABOUT_STUDY = "evaluation.json", "study.json"
-LOG_LINES = 6
-RETRIES = 20
-"""How often Ray repeats the task of a node or process that died."""
-AHEAD = 1000
-"""Tasks that are submitted to Ray at a time."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +106,7 @@ class StudyRun:
 
     def finished(self, point: Point) -> Outcome | None:
         """The outcome of a point whose steps are done here; None if they are not."""
-        path = self._done(point)
+        path = self.folder / "done" / f"{point.name}.json"
         evaluations = read_json(path)
         if not isinstance(evaluations, dict):
             return None
@@ -122,9 +116,6 @@ class StudyRun:
             )
         except ValueError as error:
             return Outcome(point, {}, f"{path}: {error}")
-
-    def _done(self, point: Point) -> Path:
-        return self.folder / "done" / f"{point.name}.json"
 
     def _point(self, point: Point, patient: bool) -> Outcome:
         place = self.folder / "runs" / point.name
@@ -136,8 +127,8 @@ class StudyRun:
                         self._step(step, point, place)
                     runs = [step.name for step in self.study.steps if step.makes_run]
                     evaluations = {name: read_json(place / name / EVALUATION) for name in runs}
-                    self._done(point).parent.mkdir(exist_ok=True)
-                    write_json(self._done(point), evaluations)
+                    (self.folder / "done").mkdir(exist_ok=True)
+                    write_json(self.folder / "done" / f"{point.name}.json", evaluations)
                 outcome = self.finished(point)
                 assert outcome is not None
                 return outcome
@@ -168,7 +159,7 @@ class StudyRun:
             status = process.wait()
             self._running.discard(process)
         if status != 0:
-            last = log.read_text(encoding="utf-8", errors="replace").splitlines()[-LOG_LINES:]
+            last = log.read_text(encoding="utf-8", errors="replace").splitlines()[-6:]
             raise ValueError("\n".join([f"{step.name} ended with {status}; {log} ends with:", *last]))
 
     def _end_all(self) -> None:
@@ -299,7 +290,7 @@ def run_on_ray(
     # Commands run elsewhere, in other working directories.
     study, folder = replace(run.study, folder=run.study.folder.resolve()), run.folder.resolve()
     with _connected(address) as ray:
-        remote = ray.remote(max_retries=RETRIES, scheduling_strategy="SPREAD")(run_point)
+        remote = ray.remote(max_retries=20, scheduling_strategy="SPREAD")(run_point)
         tasks: list[Any] = []
 
         def wait_for(point: Point) -> Outcome:
@@ -318,7 +309,7 @@ def run_on_ray(
                 with suppress(Exception):
                     ray.cancel(task)
 
-        return run_all(wait_for, points, jobs or max(1, min(len(points), AHEAD)), report, cancel_all)
+        return run_all(wait_for, points, jobs or max(1, min(len(points), 1000)), report, cancel_all)
 
 
 def run_point(study: Study, folder: Path, size: str, threads: int, point: Point) -> Outcome:
@@ -343,9 +334,8 @@ def _connected(address: str) -> Iterator[Any]:
     except Exception as error:
         raise _no_cluster(address, error) from None
     finally:
-        if threading.current_thread() is threading.main_thread():
-            for number, handler in handlers.items():  # Ray's own abort the process
-                signal.signal(number, handler)
+        for number, handler in handlers.items():  # Ray's own abort the process
+            signal.signal(number, handler)
     try:
         yield ray
     finally:
