@@ -201,7 +201,7 @@ def chosen_policies(policies: Sequence[str] | None, task: Task, *, trained: bool
     """
     there = {"trained": trained, "expert": task.expert is not None}
     known = [policy for policy in POLICIES if there.get(policy, True)]
-    slow = {"expert"} if task.expert is not None and not task.expert.scripted else set()
+    slow = {"expert"} if task.expert is not None and task.expert.search else set()
     chosen = [policy for policy in known if (policy not in slow if policies is None else policy in policies)]
     unknown = [policy for policy in policies or () if policy not in known]
     if unknown or not chosen:

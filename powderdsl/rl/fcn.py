@@ -30,11 +30,8 @@ def fcn_policy(env: TensorEnv, channels: int = 32, frames: int = 1) -> dict[str,
         ValueError: for observations that are pictures.
     """
     bins = env.task.agent.bins
-    sides = tuple(min(count, side) for count, side in zip(bins, env.task.size, strict=True))
-    if sides != bins:
-        raise ValueError(f"the agent has {bins} bins in worlds of {env.task.size} cells")
     form = action_form("discrete", env.task.agent, torch.device("cpu"))
-    return {"see": patches_of(env, sides, frames), "channels": channels, "bins": bins, "form": form}
+    return {"see": patches_of(env, bins, frames), "channels": channels, "bins": bins, "form": form}
 
 
 class Trunk(nn.Module):

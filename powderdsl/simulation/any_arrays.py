@@ -314,7 +314,7 @@ class AnySimulator(Generic[W]):
             KeyError: unknown streams, passes or parameters. ValueError: wrong shapes or values.
         """
         self.check(world)
-        steps = whole_count(steps, "steps")
+        steps = whole_count(steps)
         draws: Mapping[str, Array] = _NOTHING
         chosen = None
         clock = clock_of(world)
@@ -398,12 +398,12 @@ def clock_of(world: AnyWorld) -> Clock:
     return Clock(world.seed, world.index, kind.copied(world.step))
 
 
-def whole_count(value: Any, name: str) -> int:
+def whole_count(value: Any) -> int:
     """An integer of 0 or more, Python's or NumPy's."""
     try:
         number = index(value)
     except TypeError:
         number = -1
     if number < 0 or isinstance(value, bool):
-        raise ValueError(f"{name} must be an integer of 0 or more, found {value!r}")
+        raise ValueError(f"steps must be an integer of 0 or more, found {value!r}")
     return number

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import operator
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import lru_cache
 from typing import Any
 
@@ -119,16 +121,16 @@ def _first_values(change: int, ramp: ColorRamp) -> list[int | float]:
     In proportion that is so far along the range: (j - 1/2) / |change|. What falls by more than a half is rounded down.
     """
     found: list[int | float] = []
+    reaches = operator.ge if change > 0 else operator.gt
     for j in range(1, abs(change) + 1):
-        whole = 2 * abs(change)
-        place = ramp.lo * whole + (ramp.hi - ramp.lo) * (2 * j - 1)  # of `whole` parts
+        place = ramp.lo + Fraction((ramp.hi - ramp.lo) * (2 * j - 1), 2 * abs(change))
         if not ramp.real:
-            found.append(-(-place // whole) if change > 0 else place // whole + 1)
+            found.append(math.ceil(place) if change > 0 else math.floor(place) + 1)
             continue
-        value = float(np.float32(place / whole))
-        while not _reached(value, place, whole, change > 0):
+        value = float(np.float32(float(place)))
+        while not reaches(value, place):
             value = _beside(value, 1)
-        while _reached(before := _beside(value, -1), place, whole, change > 0):
+        while reaches(before := _beside(value, -1), place):
             value = before
         found.append(value)
     return found
@@ -141,11 +143,6 @@ def _beside(value: float, way: int) -> float:
     (bits,) = struct.unpack("<i", struct.pack("<f", value))
     (found,) = struct.unpack("<f", struct.pack("<i", bits + (way if value > 0 else -way)))
     return float(found)
-
-
-def _reached(value: float, place: int, whole: int, rises: bool) -> bool:
-    above, below = value.as_integer_ratio()
-    return above * whole >= place * below if rises else above * whole > place * below
 
 
 def rgb(
@@ -181,22 +178,18 @@ def scale(image: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
 
 
 def contact_sheet(
-    images: Array | Sequence[Array],
-    *,
-    columns: int | None = None,
-    gap: int = 2,
-    background: tuple[int, int, int] = (255, 255, 255),
+    images: Array | Sequence[Array], *, columns: int | None = None, gap: int = 2
 ) -> NDArray[np.uint8]:
     """Pictures of one size, uint8 [N, H, W, 3], side by side on one, uint8 [H', W', 3], row by row.
 
-    `columns` defaults to a square of pictures; `gap` pixels of background stand between and around them.
+    `columns` defaults to a square of pictures; `gap` white pixels stand between and around them.
     """
     pictures = [to_numpy(image) for image in images]
     height, width = pictures[0].shape[:2]
     columns = min(columns or math.ceil(math.sqrt(len(pictures))), len(pictures))
     rows = math.ceil(len(pictures) / columns)
     sheet = np.zeros((rows * (height + gap) + gap, columns * (width + gap) + gap, 3), dtype=np.uint8)
-    sheet[:] = background
+    sheet[:] = 255
     for place, picture in enumerate(pictures):
         top, left = gap + place // columns * (height + gap), gap + place % columns * (width + gap)
         sheet[top : top + height, left : left + width] = picture
@@ -220,8 +213,8 @@ def to_numpy(image: Array) -> NDArray[Any]:
 
 
 def _is_tensor(value: object) -> bool:
-    # By its class' module: asking torch itself would import it for people who only use arrays.
-    return any(base.__module__.partition(".")[0] == "torch" for base in type(value).__mro__)
+    # Asking torch itself would import it for people who only use arrays.
+    return hasattr(value, "detach")
 
 
 def _components(color: str) -> tuple[int, int, int]:

@@ -27,8 +27,8 @@ def write_png(path: str | Path, image: Any) -> None:
         picture.save(temporary, format="PNG", optimize=True)
 
 
-def write_gif(path: str | Path, frames: Iterable[Any], *, fps: float = 30, loop: bool = True) -> None:
-    """Write an animation as GIF, from an iterable that may be lazy. At most 50 frames a second.
+def write_gif(path: str | Path, frames: Iterable[Any], *, fps: float = 30) -> None:
+    """Write an endless animation as GIF, from an iterable that may be lazy. At most 50 frames a second.
 
     Frames of up to 256 colors keep them exactly; others are reduced, without dithering.
     """
@@ -37,10 +37,10 @@ def write_gif(path: str | Path, frames: Iterable[Any], *, fps: float = 30, loop:
     module = require("PIL.Image", "writing an animation", "pip install pillow")
     images = (_indexed(module, to_numpy(frame)) for frame in frames)
     first = next(images)
-    endless = {"loop": 0} if loop else {}
     with replacing(Path(path), follow=True) as temporary:
-        options = {"save_all": True, "append_images": images, "duration": delay, "optimize": False, **endless}
-        first.save(temporary, format="GIF", **options)
+        first.save(
+            temporary, "GIF", save_all=True, append_images=images, duration=delay, optimize=False, loop=0
+        )
 
 
 def write_mp4(path: str | Path, frames: Iterable[Any], *, fps: float = 30) -> None:

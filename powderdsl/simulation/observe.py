@@ -265,12 +265,10 @@ class Observer:
             return torch.empty(shape, dtype=dtype, device=self.device)
         if not isinstance(out, Tensor):
             raise TypeError(f"out must be a torch tensor, found {type(out).__name__}")
-        if tuple(out.shape) != shape:
-            raise ValueError(f"out must have the shape {list(shape)}, found {list(out.shape)}")
-        if out.dtype != dtype:
-            raise ValueError(f"out must be {dtype}, found {out.dtype}")
-        if out.device != self.device:
-            raise ValueError(f"out must be on {self.device}, found {out.device}")
+        if (tuple(out.shape), out.dtype, out.device) != (shape, dtype, self.device):
+            wanted = f"{dtype} {list(shape)} on {self.device}"
+            found = f"{out.dtype} {list(out.shape)} on {out.device}"
+            raise ValueError(f"out must be {wanted}, found {found}")
         if shape[0] and not (out[0].is_contiguous() and (shape[0] == 1 or out.stride(0) >= out[0].numel())):
             raise ValueError(
                 f"each world of out must be contiguous, and worlds apart; found the strides {list(out.stride())}"

@@ -111,14 +111,6 @@ class Recorder:
         return Provenance(replace(end, sim=self.sim, state=state), numbers, self.rules)
 
 
-def writers(world: AnyWorld, steps: int = 1, **options: Any) -> Provenance:
-    """The worlds some steps later, and which rules wrote their elements in the last of these steps.
-
-    This compiles the rules for one call; a `Recorder` compiles them once. `options` are those of `Simulator.step`.
-    """
-    return Recorder(world.sim).step(world, steps, **options)
-
-
 def marked(ruleset: Ruleset) -> Ruleset:
     """The same rules, with a field that holds the number of the rule that last wrote a cell's element in this step."""
     rules = numbered_rules(ruleset)

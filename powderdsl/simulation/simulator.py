@@ -103,7 +103,7 @@ class Simulator(AnySimulator[World]):
         Native code counts processor time on one thread, and is compiled once more for it.
         """
         params = self._params.defaults(len(world))
-        job = Job(world.state, clock_of(world), whole_count(steps, "steps"), params, {}, None)
+        job = Job(world.state, clock_of(world), whole_count(steps), params, {}, None)
         seconds = profile_of(self._program, job)
         return {name: seconds.get(name, 0.0) for name in self.passes} if seconds else {}
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from functools import lru_cache
 from typing import Any
 
 from powderdsl.diagnostics import suggest
 from powderdsl.model.state import SNAP, Slot, slots, stored_range
-from powderdsl.model.types import Ruleset
+from powderdsl.model.types import Param, Ruleset
 from powderdsl.targets.array_kind import Array, ArrayKind
 
 CHUNK = 1 << 20
@@ -157,25 +158,23 @@ BATCH_SIZES = 16
 """How many batch sizes the defaults are kept for."""
 
 
+def param_range(param: Param) -> tuple[float, float]:
+    """The lowest and the highest value that a parameter takes."""
+    return (0.0, 1.0) if param.kind.name in ("chance", "flag") else (param.kind.lo, param.kind.hi)
+
+
 class Parameters:
     """Parameters of one ruleset as float64 [B]."""
 
     def __init__(self, ruleset: Ruleset, kind: ArrayKind):
         self._known = {param.name: param for param in ruleset.params}
         self._kind = kind
-        self._defaults: dict[int, Mapping[str, Array]] = {}
-
-    def defaults(self, batch: int) -> Mapping[str, Array]:
+        self.defaults = lru_cache(BATCH_SIZES)(self._defaults)
         """The defaults for a batch: the same mapping for the same size, which programs recognize. Nobody writes to it."""
-        found = self._defaults.get(batch)
-        if found is None:
-            values = {name: float(param.default) for name, param in self._known.items()}
-            found = {name: self._kind.put([value] * batch, "float64") for name, value in values.items()}
-            kept = list(self._defaults.items())[1 - BATCH_SIZES :]
-            self._defaults = dict(
-                [*kept, (batch, found)]
-            )  # a new one: another thread may be reading the old one
-        return found
+
+    def _defaults(self, batch: int) -> Mapping[str, Array]:
+        values = {name: [float(param.default)] * batch for name, param in self._known.items()}
+        return {name: self._kind.put(value, "float64") for name, value in values.items()}
 
     def checked(self, params: Mapping[str, Any], batch: int) -> Mapping[str, Array]:
         """All parameters: copies of given values, and defaults. Raises KeyError, TypeError, ValueError."""
@@ -187,7 +186,7 @@ class Parameters:
             if name not in self._known:
                 raise unknown_name("parameter", name, self._known)
             kind = self._known[name].kind
-            lo, hi = (0.0, 1.0) if kind.name in ("chance", "flag") else (kind.lo, kind.hi)
+            lo, hi = param_range(self._known[name])
             array = xp.asarray(self._kind.given(value, name), dtype=xp.float64)
             if array.ndim > 1 or (array.ndim == 1 and len(array) != batch):
                 raise ValueError(f"{name} takes one value or {batch}, found shape {list(array.shape)}")

@@ -430,8 +430,6 @@ def _drawn(
         return parse_ascii(art.content, [*elements, hole], reader.reporter, {"?": "?", **legend})
     except CompileError as error:
         pass_on(error, reader.reporter, art.span)
-    except ValueError as error:
-        reader.reporter.error("PD110", str(error), art.span)
     return None
 
 

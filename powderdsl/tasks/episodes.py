@@ -302,18 +302,10 @@ def check_numbers(actions: Any, nvec: tuple[int, ...], names: tuple[str, ...]) -
     tensor = integer_tensor("actions", actions)
     if tensor.ndim != 2 or tensor.shape[1] != len(nvec):
         raise ValueError(f"actions must have the shape [episodes, {len(nvec)}], found {list(tensor.shape)}")
-    bounds = _bounds(nvec)
-    bad: Any
-    if (
-        tensor.device.type == "cpu"
-    ):  # NumPy starts an operation on a few numbers in a fraction of torch's time
-        numbers = tensor.numpy()
-        bad = (numbers < 0) | (numbers >= bounds)
-    else:
-        bad = (tensor < 0) | (tensor >= torch.from_numpy(bounds).to(tensor.device))
+    numbers = tensor.cpu().numpy()  # NumPy starts an operation on a few numbers in a fraction of torch's time
+    bad = (numbers < 0) | (numbers >= _bounds(nvec))
     if bad.any():
-        bad = torch.as_tensor(bad)
-        row, column = bad.nonzero()[0].tolist()
+        row, column = np.argwhere(bad)[0].tolist()
         value, most = int(tensor[row, column]), nvec[column] - 1
         raise ValueError(f"actions[{row}, {column}] ({names[column]}) is {value}: it must lie in 0..{most}")
     return tensor

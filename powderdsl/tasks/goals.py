@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
@@ -16,7 +15,6 @@ from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.types import FLAG, REAL, Expr
 from powderdsl.syntax.ast import Syntax
 from powderdsl.tasks.task import Measure
-from powderdsl.worlds.scene.amounts import CALCULATE
 
 MEASURES = {
     "count": "count(CELLS in REGION)",
@@ -46,15 +44,6 @@ _BINARY = {
     "mod": "mod",
 }
 _COMPARE = {"<": "lt", "<=": "le", "==": "eq"}
-_CONSTANT: dict[str, Callable[..., float]] = {
-    **CALCULATE,
-    "div": operator.truediv,
-    "min": min,
-    "max": max,
-    "neg": operator.neg,
-    "abs": abs,
-}
-"""Operations on numbers alone."""
 REGION_LET = "in "
 """How the names of regions begin among the values that cell conditions read."""
 
@@ -120,7 +109,7 @@ class GoalChecker:
             return Expr("neg", REAL, (self.scalar(parts[0]),))
         if kind in _BINARY:
             first, second = self.scalar(parts[0]), self.scalar(parts[1])
-            if kind in ("divide", "mod") and _constant(second) == 0:
+            if kind in ("divide", "mod") and second.op == "const" and not second.value:
                 fix = "divide by another number"
                 raise self.typer.fail("PD402", "division by zero", parts[1].span, "this is 0", fix)
             return Expr(_BINARY[kind], REAL, (first, second))
@@ -251,18 +240,6 @@ class GoalChecker:
         if syntax.kind == "not_in":
             parts = (parts[0], Syntax("not_", (right,), "", right.span))
         return Syntax("and_", parts, "", syntax.span)
-
-
-def _constant(scalar: Expr) -> float | None:
-    """The value of numbers alone; None where the world matters. Divisors are known not to be 0."""
-    if scalar.op == "const":
-        return float(scalar.value)
-    args = [_constant(arg) for arg in scalar.args]
-    if scalar.op == "mul" and 0 in args:
-        return 0.0
-    if scalar.op not in _CONSTANT or None in args:
-        return None
-    return float(_CONSTANT[scalar.op](*args))
 
 
 def parts_of(scalar: Expr) -> list[Expr]:

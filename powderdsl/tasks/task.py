@@ -219,11 +219,6 @@ class Expert:
     moves: tuple[ExpertMove, ...]
     search: int = 0
 
-    @property
-    def scripted(self) -> bool:
-        """Whether it plays without simulating plans, and so by default where policies are compared."""
-        return not self.search
-
 
 @dataclass(frozen=True)
 class Task:

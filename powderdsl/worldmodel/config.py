@@ -16,9 +16,6 @@ TEST_SEEDS = 1 << 32
 MAX_RULESETS = 1024
 """The most rulesets of a run: each is checked before the first step, and each structure compiled."""
 
-MAX_CHANNELS = 256
-"""Channels of recorded observations."""
-
 
 class Checked:
     """Settings that are checked when they are made."""
@@ -87,11 +84,6 @@ class Recorded:
     speed: float
     actions: bool = True
 
-    def __post_init__(self) -> None:
-        """Raises ValueError for values that no dataset has."""
-        if not 1 <= len(self.channels) <= MAX_CHANNELS or self.channels[0] != "element":
-            raise ValueError(f"channels must be 1 to {MAX_CHANNELS} names, the first of them `element`")
-
 
 @dataclass(frozen=True)
 class TrainConfig(Checked):
@@ -116,11 +108,6 @@ class TrainConfig(Checked):
     network: str | None = None
     recorded: Recorded | None = None
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.network is not None and not is_network_name(self.network):
-            raise ValueError("network must have the form module:Class")
-
     @property
     def plain(self) -> dict[str, Any]:
         """For ``run.json``: the settings that are used."""
@@ -137,13 +124,6 @@ class TrainConfig(Checked):
         return config
 
 
-def is_network_name(text: Any) -> bool:
-    """Whether a text has the form ``package.module:Class``. Nothing is imported."""
-    if not isinstance(text, str) or text.count(":") != 1 or len(text) > 200:
-        return False
-    return all(part.isidentifier() for part in text.replace(":", ".").split("."))
-
-
 PRESETS = {
     "paper": TrainConfig(),
     "small": TrainConfig(
@@ -157,14 +137,13 @@ PRESETS = {
 class Machine(Checked):
     """Where a run is computed. A run may continue on another machine.
 
-    `compiled` runs the network through ``torch.compile``. `store` is that of `Replay`.
+    `store` is that of `Replay`.
     """
 
     device: str = setting("cpu", form="a name")
     threads: int = setting(1, low=1, high=1024)
     backend: str = setting("auto", choices=tuple(BACKENDS))
     store: str = setting("auto", choices=("auto", "memory", "disk"))
-    compiled: bool = False
 
     @property
     def simulation(self) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from torch.nn import functional as F
 from powderdsl.diagnostics import CompileError, suggest
 from powderdsl.experiments.runs import Checkpoint, fitting
 from powderdsl.system.writing import failure
-from powderdsl.worldmodel.config import TrainConfig, is_network_name
+from powderdsl.worldmodel.config import TrainConfig
 
 SIDES = 4
 """Rows and columns are padded to a multiple of this: two poolings halve them twice."""
@@ -273,6 +273,11 @@ def custom_network(name: str) -> CustomNetwork:
     if not callable(make):
         raise _invalid(name, f"is not a class but {type(make).__name__}", helps=(CONTRACT,))
     return CustomNetwork(name, make)
+
+
+def is_network_name(text: str) -> bool:
+    """Whether a text has the form ``package.module:Class``. Nothing is imported."""
+    return text.count(":") == 1 and all(part.isidentifier() for part in text.replace(":", ".").split("."))
 
 
 def _words(error: Exception) -> tuple[str, str]:

@@ -39,7 +39,7 @@ from powderdsl.tasks.shipped import load_task
 from powderdsl.worldmodel.config import HERE, DataConfig, Machine, TrainConfig
 from powderdsl.worldmodel.networks import CustomNetwork, encoder_of, fit_weights, network_of
 from powderdsl.worldmodel.replay import Replay
-from powderdsl.worldmodel.scores import Network, score
+from powderdsl.worldmodel.scores import score
 from powderdsl.worldmodel.worlds import Pairs, Worlds, task_worlds, validation_pairs
 
 if TYPE_CHECKING:
@@ -168,7 +168,6 @@ class _Trainer:
     def __init__(self, config: TrainConfig, machine: Machine, run: RunFolder, model: nn.Module, slots: int):
         self.config, self.machine, self.run, self.model, self.slots = config, machine, run, model, slots
         self.optimizer = torch.optim.Adam(model.parameters(), lr=config.learning_rate)
-        self.forward: Network = torch.compile(model) if machine.compiled else model
         self.done = 0
         self.recent: list[float] = []
         self.batch: Callable[[int, int], Pairs]
@@ -244,7 +243,7 @@ class _Trainer:
         torch.manual_seed(int(mix(base_keys(torch.tensor([self.config.seed]), torch.tensor([self.done]))[0])))
         cuda = torch.device(self.machine.device).type == "cuda"
         with torch.autocast("cuda", torch.bfloat16, enabled=cuda):
-            logits = self.forward(starts)
+            logits = self.model(starts)
         expected = (len(starts), self.slots, *starts.shape[-2:])
         if logits.shape != expected:
             raise ValueError(f"the network must give logits {list(expected)}, found {list(logits.shape)}")

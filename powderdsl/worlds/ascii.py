@@ -23,8 +23,7 @@ def parse_ascii(
     """The ids uint8 [H, W] of a drawing in a text, or None after reporting mistakes.
 
     `legend` gives characters to elements by name and wins over their glyphs. Empty lines are skipped. Raises
-    CompileError (PD604) if the legend names an unknown element, ValueError if one of its keys is not a single
-    visible character.
+    CompileError (PD604) if the legend names an unknown element.
     """
     ids = _characters(elements, legend or {})
     rows: list[str] = []
@@ -62,52 +61,37 @@ def parse_ascii(
     return np.frombuffer(text.encode("latin-1"), dtype=np.uint8).reshape(len(rows), -1).copy()
 
 
-def read_ascii(
-    text: str,
-    elements: Sequence[Element],
-    legend: Mapping[str, str] | None = None,
-    *,
-    name: str = "<drawing>",
-) -> NDArray[np.uint8]:
+def read_ascii(text: str, elements: Sequence[Element], *, name: str = "<drawing>") -> NDArray[np.uint8]:
     """The ids uint8 [H, W] of a drawing. `name` stands for the text in messages. Raises CompileError."""
     reporter = Reporter()
-    ids = parse_ascii(Span(Source(name, text), 0, len(text)), elements, reporter, legend)
+    ids = parse_ascii(Span(Source(name, text), 0, len(text)), elements, reporter)
     reporter.raise_if_errors()
     assert ids is not None
     return ids
 
 
-def load_ascii(
-    path: str | Path, elements: Sequence[Element], legend: Mapping[str, str] | None = None
-) -> NDArray[np.uint8]:
+def load_ascii(path: str | Path, elements: Sequence[Element]) -> NDArray[np.uint8]:
     """The ids uint8 [H, W] of a text file. Raises CompileError."""
     reporter = Reporter()
     source = read_source(Path(path), reporter, limit=MAX_BYTES)
     reporter.raise_if_errors()
     assert source is not None
-    return read_ascii(source.text, elements, legend, name=source.name)
+    return read_ascii(source.text, elements, name=source.name)
 
 
-def write_ascii(
-    ids: Any, elements: Sequence[Element], legend: Mapping[str, str] | None = None, *, spaced: bool = False
-) -> str:
-    """Rows of characters for ids [H, W], each ended by a line break; `spaced` puts a blank between cells.
+def write_ascii(ids: Any, elements: Sequence[Element]) -> str:
+    """Rows of characters for ids [H, W], each ended by a line break. `read_ascii` reads it back with the same elements.
 
-    `read_ascii` reads it back with the same elements and legend. Raises ValueError for ids that no
-    element has, and for another shape.
+    Raises ValueError for ids that no element has, and for another shape.
     """
     world = np.asarray(ids.cpu() if hasattr(ids, "cpu") else ids)
     if world.ndim != 2 or world.dtype.kind not in "iu":
         raise ValueError(f"ids must be integers [H, W], not {world.dtype} {world.shape}")
-    # The legend's characters come first, so they win over glyphs here too.
-    characters: dict[int, str] = {}
-    for character, number in _characters(elements, legend or {}).items():
-        characters.setdefault(number, character)
+    characters = {number: character for character, number in _characters(elements, {}).items()}
     vacant = sorted(set(np.unique(world).tolist()) - characters.keys())
     if vacant:
         raise ValueError(f"no element has the ids {vacant[:8]}")
-    separator, glyph = " " if spaced else "", characters.__getitem__
-    return "".join(separator.join(map(glyph, row)) + "\n" for row in world.tolist())
+    return "".join("".join(map(characters.__getitem__, row)) + "\n" for row in world.tolist())
 
 
 def _characters(elements: Sequence[Element], legend: Mapping[str, str]) -> dict[str, int]:
@@ -115,8 +99,6 @@ def _characters(elements: Sequence[Element], legend: Mapping[str, str]) -> dict[
     by_name = {element.qualified: element.id for element in elements} | {e.name: e.id for e in elements}
     characters: dict[str, int] = {}
     for character, name in legend.items():
-        if len(character) != 1 or character.isspace():
-            raise ValueError(f"{character!r} in a legend is not a single visible character")
         if name not in by_name:
             helps = suggest(name, {element.name for element in elements}, "elements")
             raise failure("PD604", f"unknown element `{name}` in a legend", helps=helps)

@@ -20,9 +20,6 @@ from powderdsl.worlds.raster import MAX_CELLS
 MAX_REPORTED = 8
 """Wrong colors that are named one at a time. A smoothed picture has thousands."""
 
-MAX_COLORS = 1 << 16
-"""Wrong colors that are counted: reading stops at the row with more."""
-
 CHUNK = 1 << 20
 """Pixels that are looked up at once: more would take memory."""
 
@@ -64,24 +61,15 @@ def _wrong_colors(
     path: Path, packed: NDArray[np.uint32], known: NDArray[np.bool_], owners: dict[int, list[Element]]
 ) -> list[Diagnostic]:
     """Reports of unknown colors, in the order of their first pixels."""
-    found: dict[int, tuple[int, int]] = {}
-    for row, (line, good) in enumerate(zip(packed, known, strict=True)):
-        wrong = np.flatnonzero(~good)
-        colors, first, counts = np.unique(line[wrong], return_index=True, return_counts=True)
-        for color, at, count in zip(colors.tolist(), wrong[first].tolist(), counts.tolist(), strict=True):
-            place, before = found.get(color, (row * packed.shape[1] + at, 0))
-            found[color] = place, before + count
-        if len(found) > MAX_COLORS:
-            break
-    listed = sorted(found.items(), key=lambda item: item[1][0])
-    result = [
-        _wrong_color(path, color, divmod(place, packed.shape[1]), count, owners)
-        for color, (place, count) in listed[:MAX_REPORTED]
-    ]
-    if len(found) > MAX_REPORTED:
-        number = f"more than {MAX_COLORS:,}" if len(found) > MAX_COLORS else f"{len(found):,}"
+    wrong = np.flatnonzero(~known)
+    colors, first, counts = np.unique(packed.reshape(-1)[wrong], return_index=True, return_counts=True)
+    result = []
+    for number in np.argsort(first)[:MAX_REPORTED].tolist():
+        pixel = divmod(int(wrong[first[number]]), packed.shape[1])
+        result.append(_wrong_color(path, int(colors[number]), pixel, int(counts[number]), owners))
+    if len(colors) > MAX_REPORTED:
         fix = "draw with a hard brush in the elements' colors, one pixel a cell, and scale without smoothing"
-        message = f"{number} colors in {path} are not any element's"
+        message = f"{len(colors):,} colors in {path} are not any element's"
         result.append(Diagnostic("PD609", message, Label(None), helps=(fix,)))
     return result
 

@@ -9,7 +9,7 @@ import pytest
 
 from powderdsl.compiler import load
 from powderdsl.model.types import Ruleset
-from powderdsl.simulation.provenance import SLOT, Provenance, Recorder, writers
+from powderdsl.simulation.provenance import SLOT, Provenance, Recorder
 from powderdsl.simulation.simulator import compile
 from powderdsl.simulation.tracing.trace import record_step
 from powderdsl.testing.generators.cases import Start, random_start
@@ -86,12 +86,12 @@ def assert_traced_alike(ruleset: Ruleset) -> None:
         world = replace(random_start(ruleset, Choices.seeded(7), shape), params={}).world(
             compile(ruleset, backend="torch")
         )
-        found = writers(world)
+        found = Recorder(world.sim).step(world)
         changed = found.world.ids != world.ids
         assert bool((found.numbers[changed] > 0).all()), "a change without a writer"
         for number in range(len(world)):
             for cell in np.ndindex(*shape[1:]):
-                step = record_step(world, cell, number)
+                step = record_step(world.select([number]), cell)
                 rules = [one.rule for one in step.writes if one.slot.name == "element"]
                 assert found.rule_at(*cell, world=number) == (rules[-1] if rules else None)
 

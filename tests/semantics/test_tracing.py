@@ -258,7 +258,7 @@ def explained(ruleset: Ruleset, shape: tuple[int, int, int], seed: int) -> int:
     for number in range(len(world)):
         after = sim.step(world).select([number]).state
         for cell in np.ndindex(*shape[1:]):
-            step = record_step(world, cell, number)
+            step = record_step(world.select([number]), cell)
             writes = step.writes
             for name in step.end:
                 held = pick(step.begin[name], cell)

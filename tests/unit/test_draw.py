@@ -99,7 +99,7 @@ def test_scaling_makes_squares():
 
 def test_a_contact_sheet_puts_pictures_row_by_row():
     images = np.stack([np.full((2, 3, 3), value, dtype=np.uint8) for value in (10, 20, 30)])
-    sheet = contact_sheet(images, columns=2, gap=1, background=(0, 0, 7))
+    sheet = contact_sheet(images, columns=2, gap=1)
     assert sheet.shape == (7, 9, 3)
     assert sheet[:, :, 0].tolist() == [
         [0] * 9,
@@ -110,8 +110,8 @@ def test_a_contact_sheet_puts_pictures_row_by_row():
         [0, 30, 30, 30, 0, 0, 0, 0, 0],
         [0] * 9,
     ]
-    assert sheet[0, 0].tolist() == [0, 0, 7]
-    assert np.array_equal(contact_sheet(torch.tensor(images), columns=2, gap=1, background=(0, 0, 7)), sheet)
+    assert sheet[0, 0].tolist() == [255, 255, 255]
+    assert np.array_equal(contact_sheet(torch.tensor(images), columns=2, gap=1), sheet)
     assert contact_sheet(images, gap=0).shape == (4, 6, 3)
     assert contact_sheet(images, columns=9, gap=0).shape == (2, 9, 3)
 

@@ -31,7 +31,7 @@ KNOBS = ("kinds", "lines", "disks", "squares")
 OF_WORLDS = {one.name for one in (*fields(DataConfig), *fields(Variety))} - {"task"}
 OF_WORLDS |= {*KNOBS, "packs", "held_out", "settings", "worlds", "after"}
 """Options that select worlds: a dataset has its own."""
-MACHINE = ("device", "threads", "backend", "store", "compiled")
+MACHINE = ("device", "threads", "backend", "store")
 
 _network = opt.option(
     "--network",
@@ -55,7 +55,6 @@ _run_options = opt.several(
     _machine_options,
     opt.path("--run", "DIR", "Folder of the run.", to="folder"),
     opt.option("--store", ["auto", "memory", "disk"], "Where to keep the buffer.", "auto"),
-    click.option("--compile/--no-compile", "compiled", default=False, help="Use torch.compile."),
     opt.option("--save-every", (1, 10**6), "Seconds between checkpoints.", 60),
     opt.option("--validate-every", (0, 10**9), "Iterations between tests on held-out worlds; 0: none.", 100),
 )

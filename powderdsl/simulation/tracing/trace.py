@@ -156,12 +156,11 @@ class RecordedStep:
             self.writes.append(Write(change.slot, *values, change.how, substep, rule, asked, source))
 
 
-def record_step(world: AnyWorld, cell: Cell, number: int = 0) -> RecordedStep:
-    """The next step of one world of a batch, with default parameters, recorded."""
-    alone = world.select([number])
+def record_step(world: AnyWorld, cell: Cell) -> RecordedStep:
+    """The next step of a batch of one world, with default parameters, recorded."""
     ruleset, to_numpy = world.sim.ruleset, world.sim.kind.to_numpy
-    state = {name: to_numpy(value) for name, value in alone.state.items()}
-    clock = reference.Clock(*(to_numpy(part) for part in (alone.seed, alone.index, alone.step)))
+    state = {name: to_numpy(value) for name, value in world.state.items()}
+    clock = reference.Clock(*(to_numpy(part) for part in (world.seed, world.index, world.step)))
     step = RecordedStep(ruleset, cell, reference.widened(ruleset, state))
     params = reference.parameters(ruleset, 1, {})
     step.end = reference.widened(ruleset, reference.step(ruleset, state, clock, params, watch=step))

@@ -277,7 +277,7 @@ class _Reading:
 
     def amount(self, tree: Tree, what: str = "a number", lowest: int = -MAX_COORDINATE) -> Amount:
         """An amount. If it is a number as written, it must be at least `lowest`."""
-        found = self.any_amount(tree, what, max(lowest, 0))
+        found = self.any_amount(tree, what)
         if found.is_number and not lowest <= found.integer <= MAX_COORDINATE:
             assert found.span is not None
             self.refuse(found.span, f"{what} must lie in {lowest}..{MAX_COORDINATE}", "out of range")
@@ -286,27 +286,27 @@ class _Reading:
     def repeat(self, tree: Any) -> Amount:
         return self.amount(tree.children[0])
 
-    def any_amount(self, tree: Tree, what: str, instead: int) -> Amount:
+    def any_amount(self, tree: Tree, what: str) -> Amount:
         span, op = self.span(tree.meta), str(tree.data)
         parts: list[Any] = tree.children
         if op == "name":
             return Amount("name", (), str(parts[0]), span)
         if op == "number":
-            return self.written(parts[0], span, what, instead)
-        args = tuple(self.any_amount(part, what, instead) for part in parts)
+            return self.written(parts[0], span, what)
+        args = tuple(self.any_amount(part, what) for part in parts)
         if op == "neg" and args[0].is_number:
             return number(-args[0].integer, span)
         if op == "draw" and all(arg.is_number for arg in args) and args[0].integer > args[1].integer:
             self.refuse(span, "a range without numbers", "the first must not be above the second")
         return Amount(op, args, None, span)
 
-    def written(self, token: str, span: Span, what: str, instead: int) -> Amount:
-        """An integer as written; `instead` after a report."""
+    def written(self, token: str, span: Span, what: str) -> Amount:
+        """An integer as written; an amount of no known kind after a report."""
         if re.fullmatch(r"[0-9]{1,9}", token):
             return number(int(token), span)
         label = "not an integer" if not token.isdecimal() or not token.isascii() else "too large"
         self.refuse(span, f"{what} must be an integer", label)
-        return number(instead, span)
+        return Amount("broken", (), None, span)
 
     def refuse(self, span: Span, message: str, label: str) -> None:
         self.failed = True
