@@ -204,10 +204,7 @@ class PowderEnv(Face, gymnasium.Env[Array, Any], EzPickle):
 
     def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """One action. Infos: ``success``, ``world``; ``episode_return`` and ``episode_length``, so far."""
-        batch, shape = np.asarray(action), self.tensors.single_action_space.shape
-        if batch.shape != shape:
-            raise ValueError(f"an action has the shape {list(shape or ())}, found {list(batch.shape)}")
-        observed, reward, terminated, truncated, info = self.tensors.step(batch[None])
+        observed, reward, terminated, truncated, info = self.tensors.step(np.asarray(action)[None])
         return array(observed[0]), float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._info(info)
 
     def _info(self, info: Info) -> dict[str, Any]:

@@ -54,7 +54,10 @@ class PowderVecEnv(Face, VecEnv):
     def reset(self) -> Array:
         """Begin all episodes with the seeds and options that `seed` and `set_options` have left; they count once."""
         seeds = None if all(one is None for one in self._seeds) else self._seeds
-        observed, info = self.tensors.reset(seed=seeds, options=_merged(self._options))
+        options = self._options[0]
+        if any(one is not options and one != options for one in self._options):
+            raise ValueError("all worlds share one environment: they take the same options")
+        observed, info = self.tensors.reset(seed=seeds, options=options)
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = [{"world": world} for world in info["world"].tolist()]
@@ -132,16 +135,3 @@ class PowderVecEnv(Face, VecEnv):
 
     def _chosen(self, indices: Any) -> list[int]:
         return list(self._get_indices(indices))
-
-
-def _merged(options: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Options of each world as options of the batch."""
-    first = options[0]
-    if all(one is first or one == first for one in options):
-        return dict(first)
-    if any(one.keys() != first.keys() for one in options):
-        raise ValueError("all worlds must be given the same options and parameters, with values of their own")
-    values: dict[str, Any] = {name: [one[name] for one in options] for name in first}
-    if "params" in values:
-        values["params"] = _merged(values["params"])
-    return values

@@ -87,7 +87,7 @@ class TensorEnv:
         action_mask: bool = False,
         backend: str = "auto",
         device: str | torch.device = "cpu",
-        threads: int | None = None,
+        threads: int = 1,
     ):
         check_count("worlds", worlds, MAX_SEED)
         check_count("max_episode_steps", 1 if max_episode_steps is None else max_episode_steps, MAX_SEED)
@@ -391,11 +391,8 @@ def check_cells(num_envs: int, size: tuple[int, int]) -> None:
 
 def mode_of(value: AutoresetMode | str) -> AutoresetMode:
     """A mode of Gymnasium's, or the one of a name, which may be written in any case."""
-    if isinstance(value, AutoresetMode):
-        return value
-    for mode in AutoresetMode:
-        if str(value).lower().replace("_", "") == mode.value.lower():
-            return mode
-    raise ValueError(
-        f"autoreset_mode is one of {', '.join(mode.name for mode in AutoresetMode)}; found {value!r}"
-    )
+    try:
+        return value if isinstance(value, AutoresetMode) else AutoresetMode[value.upper()]
+    except KeyError:
+        names = ", ".join(mode.name for mode in AutoresetMode)
+        raise ValueError(f"autoreset_mode is one of {names}; found {value!r}") from None

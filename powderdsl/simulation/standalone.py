@@ -19,7 +19,6 @@ from powderdsl.model.state import (
     stored_range,
 )
 from powderdsl.model.types import Param, Ruleset
-from powderdsl.simulation.state_checks import param_range
 from powderdsl.system.memo import Memo
 from powderdsl.system.writing import failure
 from powderdsl.targets.codec import Piece, pieces
@@ -88,8 +87,12 @@ def _stored(slot: Slot, ruleset: Ruleset, parts: tuple[Piece, ...]) -> Stored:
     )
 
 
+def _range(param: Param) -> tuple[float, float]:
+    return (0.0, 1.0) if param.kind.name in ("chance", "flag") else (param.kind.lo, param.kind.hi)
+
+
 def _knob(param: Param) -> Knob:
-    return Knob(param.name, float(param.default), *param_range(param), param.kind.name in ("int", "flag"))
+    return Knob(param.name, float(param.default), *_range(param), param.kind.name in ("int", "flag"))
 
 
 def _about(ruleset: Ruleset, size: tuple[int, int]) -> dict[str, Any]:
@@ -113,7 +116,7 @@ def _about(ruleset: Ruleset, size: tuple[int, int]) -> dict[str, Any]:
             fields.append(row)
     parameters = []
     for param in ruleset.params:
-        low, high = param_range(param)
+        low, high = _range(param)
         row = {"name": param.name, "kind": param.kind.name, "value": float(param.default)}
         parameters.append(row | {"low": low, "high": high, "about": param.about})
     return {

@@ -8,7 +8,7 @@ from typing import Any
 
 from powderdsl.diagnostics import suggest
 from powderdsl.model.state import SNAP, Slot, slots, stored_range
-from powderdsl.model.types import Param, Ruleset
+from powderdsl.model.types import Ruleset
 from powderdsl.targets.array_kind import Array, ArrayKind
 
 CHUNK = 1 << 20
@@ -158,11 +158,6 @@ BATCH_SIZES = 16
 """How many batch sizes the defaults are kept for."""
 
 
-def param_range(param: Param) -> tuple[float, float]:
-    """The lowest and the highest value that a parameter takes."""
-    return (0.0, 1.0) if param.kind.name in ("chance", "flag") else (param.kind.lo, param.kind.hi)
-
-
 class Parameters:
     """Parameters of one ruleset as float64 [B]."""
 
@@ -186,7 +181,7 @@ class Parameters:
             if name not in self._known:
                 raise unknown_name("parameter", name, self._known)
             kind = self._known[name].kind
-            lo, hi = param_range(self._known[name])
+            lo, hi = (0.0, 1.0) if kind.name in ("chance", "flag") else (kind.lo, kind.hi)
             array = xp.asarray(self._kind.given(value, name), dtype=xp.float64)
             if array.ndim > 1 or (array.ndim == 1 and len(array) != batch):
                 raise ValueError(f"{name} takes one value or {batch}, found shape {list(array.shape)}")

@@ -261,7 +261,7 @@ def compile_task(
     split: str = "train",
     backend: str = "auto",
     device: str | torch.device = "cpu",
-    threads: int | None = None,
+    threads: int = 1,
 ) -> TaskProgram:
     """A program for one split of a task, or of the task of a name or path.
 
@@ -273,7 +273,7 @@ def compile_task(
     """
     found = task if isinstance(task, Task) else load_task(task)
     check_split(found, split)
-    simulator = compile_rules(found.ruleset, backend, str(device), 1 if threads is None else threads)
+    simulator = compile_rules(found.ruleset, backend, str(device), threads)
     return TaskProgram(found, split, simulator)
 
 

@@ -73,8 +73,6 @@ class Replay:
 
     def advance(self) -> None:
         """Go to the next iteration: `refresh` worlds continue by some steps, and their pairs replace the oldest."""
-        if self.iteration < 0:
-            raise ValueError("the buffer is empty: `go_to` fills it")
         if not self.all_fit:
             config, many = self.config, self.config.refresh
             turn, moment = divmod(self.iteration, config.pairs)

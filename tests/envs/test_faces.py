@@ -103,7 +103,7 @@ def test_one_world_a_slot_and_sb3_play_the_same(small: TaskProgram) -> None:
 
 def test_sb3_options_attributes_and_methods(small: TaskProgram) -> None:
     env = PowderVecEnv(small, 2, render_mode="rgb_array", render_scale=1)
-    env.set_options([{"params": {"water.melt": 0.0}}, {"params": {"water.melt": 1.0}}])
+    env.set_options({"params": {"water.melt": [0.0, 1.0]}})
     env.reset()
     assert env.tensors.params["water.melt"].tolist() == [0, 1]
     env.set_options({"worlds": 7})

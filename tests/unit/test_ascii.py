@@ -92,14 +92,6 @@ def test_a_bad_legend():
         with_legend(".", {"w": "watr"})
 
 
-def test_ids_that_cannot_be_written():
-    with pytest.raises(ValueError, match=r"\[14, 200\]"):
-        write_ascii(np.array([[0, 200, 14]]), ELEMENTS)
-    for ids in (np.zeros(3, dtype=int), np.zeros((1, 2, 2), dtype=int), np.zeros((2, 2))):
-        with pytest.raises(ValueError, match=r"integers \[H, W\]"):
-            write_ascii(ids, ELEMENTS)
-
-
 def test_files(tmp_path):
     path = tmp_path / "world.txt"
     path.write_bytes(b"\xef\xbb\xbf##\r\n#s\r\n")

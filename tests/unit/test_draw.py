@@ -102,13 +102,13 @@ def test_a_contact_sheet_puts_pictures_row_by_row():
     sheet = contact_sheet(images, columns=2, gap=1)
     assert sheet.shape == (7, 9, 3)
     assert sheet[:, :, 0].tolist() == [
-        [0] * 9,
-        [0, 10, 10, 10, 0, 20, 20, 20, 0],
-        [0, 10, 10, 10, 0, 20, 20, 20, 0],
-        [0] * 9,
-        [0, 30, 30, 30, 0, 0, 0, 0, 0],
-        [0, 30, 30, 30, 0, 0, 0, 0, 0],
-        [0] * 9,
+        [255] * 9,
+        [255, 10, 10, 10, 255, 20, 20, 20, 255],
+        [255, 10, 10, 10, 255, 20, 20, 20, 255],
+        [255] * 9,
+        [255, 30, 30, 30, 255, 255, 255, 255, 255],
+        [255, 30, 30, 30, 255, 255, 255, 255, 255],
+        [255] * 9,
     ]
     assert sheet[0, 0].tolist() == [255, 255, 255]
     assert np.array_equal(contact_sheet(torch.tensor(images), columns=2, gap=1), sheet)
