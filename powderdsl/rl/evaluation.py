@@ -198,8 +198,6 @@ def evaluate(
     for name in names:
         check_split(task, name)
     chosen = chosen_policies(policies, task, trained=run is not None)
-    if not names:
-        raise ValueError("splits are empty")
     backend, device = backend or config.backend, device or config.device
     first = compile_task(task, split=names[0], backend=backend, device=device, threads=config.threads)
     players = {one: player(one, first, run, deterministic=deterministic) for one in chosen}

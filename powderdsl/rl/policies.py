@@ -101,7 +101,6 @@ def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: b
         raise does_not_fit(found.path, why)
     own = _own_env(found, config, env)
     checkpoint = found.checkpoint()
-    _check_size(found, checkpoint.state, config)
     kind, how = policy_of(config, own)
     space = own.observation.space
     if config.frames > 1:
@@ -144,16 +143,6 @@ def task_of(run: RunFolder, packs: Sequence[str] = ()) -> Task:
         packs=(*config.packs, *packs),
         palette=recorded_palette(run),
     )
-
-
-def _check_size(run: RunFolder, state: Any, config: TrainConfig) -> None:
-    """Compare sizes before a network takes the memory that a damaged run.json asks for. Raises CompileError (PD623)."""
-    policy = state.get("policy") if isinstance(state, dict) else None
-    features = config.features
-    name = "trunk.means.0.weight" if config.network == "fcn" else "mlp_extractor.policy_net.0.weight"
-    weights = policy.get(name) if isinstance(policy, dict) else None
-    if getattr(weights, "shape", None) != (features, features):
-        raise does_not_fit(run.path, f"its network has no layer of {features:,} features")
 
 
 def config_of(run: RunFolder) -> TrainConfig:

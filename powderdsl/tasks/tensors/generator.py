@@ -482,9 +482,7 @@ class StartWorlds:
         parts = [self._makers[number].make(seeds[variant == number]) for number in numbers]
         made = joined(self.kind, parts, self.fixed)
         # Back from the order of variants to that of the seeds.
-        places = [0] * len(variants)
-        for place, world in enumerate(sorted(range(len(variants)), key=variants.__getitem__)):
-            places[world] = place
-        order = self.kind.put(places, "int64")
+        worlds = sorted(range(len(variants)), key=variants.__getitem__)
+        order = self.kind.put(sorted(worlds, key=worlds.__getitem__), "int64")
         regions = {name: one if name in self.fixed else one[order] for name, one in made.regions.items()}
         return Made(made.ids[order], regions, {name: one[order] for name, one in made.targets.items()})
