@@ -63,7 +63,8 @@ class TestingReport:
         runner = Runner(ruleset, self.backend)
         tests = run_examples(ruleset, sim=runner.sim, seen=lambda world: runner.note(world.state))
         for test in tests:
-            self.say(f"{_word(test)}  {test.example.pack}: {test.example.name}")
+            outcome = "ok  " if test.passed else "FAIL" if test.failed else "differs"
+            self.say(f"{outcome}  {test.example.pack}: {test.example.name}")
             if not test.passed:
                 found = difference_of_test(test, runner)
                 words = [found.with_packs, *difference_lines(found)] if found else []
@@ -160,10 +161,6 @@ def _data(
         "properties": [result_data(result) for result in results],
         "rules": {"all": len(lines), "never": [place_of(span) for span in missed]},
     }
-
-
-def _word(result: ExampleResult) -> str:
-    return "ok  " if result.passed else "FAIL" if result.failed else "differs"
 
 
 def _failure_lines(result: ExampleResult) -> Iterator[str]:

@@ -134,9 +134,9 @@ class _PassBits:
                 gate = {"and": gates.and_, "or": gates.or_, "xor": gates.xor}[node.op]
                 return gate(*(self._flag(arg) for arg in args))
             case "in_set":
-                return self._in_set(node)
+                return self._function(args[0], lambda value: value in node.attr)
             case "table":
-                return self._table(node)
+                return self._numbers(args[0], node.type, node.attr.__getitem__, len(node.attr))
             case "eq" | "lt" | "le" if args[0].type.name == "int":
                 return self._compare(node)
             case "select" if node.type.name == "int":
@@ -218,9 +218,6 @@ class _PassBits:
         planes = self.gates.fit(self._bits(limit), 0, 1 << bits).planes
         return self.build.make("below_planes", FLAG, *reversed(planes), attr=(stream, bits))
 
-    def _in_set(self, node: Node) -> Node:
-        return self._function(node.args[0], lambda v: v in node.attr)
-
     def _function(self, argument: Node, function: Callable[..., int], below: int | None = None) -> Node:
         """A flag that depends on a small integer only; what it is from `below` on does not matter."""
         planes, type = self._bits(argument).planes, argument.type
@@ -239,9 +236,6 @@ class _PassBits:
         count, signed = width(type.lo, type.hi)
         planes = (self._function(argument, lambda v, i=i: function(v) >> i & 1, below) for i in range(count))
         return Bits(tuple(planes), signed)
-
-    def _table(self, node: Node) -> Bits:
-        return self._numbers(node.args[0], node.type, node.attr.__getitem__, len(node.attr))
 
     def _compare(self, node: Node) -> Node:
         near = self._any_neighbor(node)

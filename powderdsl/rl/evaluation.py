@@ -197,6 +197,8 @@ def evaluate(
     names = [one.name for one in task.splits] if splits is None else list(dict.fromkeys(splits))
     for name in names:
         check_split(task, name)
+    if episodes < 1 or not names:
+        raise ValueError("an evaluation needs at least one episode and one split")
     chosen = chosen_policies(policies, task, trained=run is not None)
     backend, device = backend or config.backend, device or config.device
     first = compile_task(task, split=names[0], backend=backend, device=device, threads=config.threads)

@@ -52,7 +52,8 @@ def _block(
     result: list[Statement] = []
     for given, after in zip(body, reversed(lives), strict=True):
         statement = given
-        gone = (reads(statement) | _names(statement)) - after
+        written = {var.name for var in defined_by(statement) if var.type != ANSWER}
+        gone = (reads(statement) | written) - after
         if isinstance(statement, Guard):
             outside = reads(statement) - made_in(statement.body)
             kept = {var.name for var, _ in statement.keeps}
@@ -177,10 +178,6 @@ def _updated(loop: Compute, after: set[str]) -> Compute:
         ends = old and old not in after and olds[old] == 1
         outs.append(replace(out, into=old) if ends else out)
     return replace(loop, outs=tuple(outs))
-
-
-def _names(statement: Statement) -> set[str]:
-    return {var.name for var in defined_by(statement) if var.type != ANSWER}
 
 
 def live_before(statement: Statement, after: set[str]) -> set[str]:

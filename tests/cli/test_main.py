@@ -192,7 +192,6 @@ JSON = {
     "check life": ("check", "life"),
     "show life": ("show", "life"),
     "test life": ("test", "life", "--examples", "0", "--no-keep"),
-    "cache list": ("cache", "list"),
     "trace life": ("trace", "life", "--at", "1,1", "--step", "1", "--size", "8", "--backend", "reference"),
     "bench life": (
         "bench",
@@ -214,4 +213,4 @@ def test_json_has_one_spelling(arguments):
     result = powderdsl(*arguments, "--json")
     assert result.exit_code == 0, result.output
     json.loads(result.stdout)
-    assert "--json" in powderdsl(*arguments[: 2 if arguments[0] == "cache" else 1], "--help").stdout
+    assert "--json" in powderdsl(arguments[0], "--help").stdout

@@ -134,14 +134,9 @@ def _in_units(passes: Sequence[str], units: int, driver: int) -> str:
 ELEMENT = "element:"
 
 
-def _element_planes(layout: Layout) -> int:
-    """How many planes hold the elements."""
-    return sum(name.startswith(ELEMENT) for name in layout.planes)
-
-
 def look(layout: Layout, asked: int) -> str:
     """The function that finds which of the ids in `asked` are present, from products of their low and high bits."""
-    count = _element_planes(layout)
+    count = sum(name.startswith(ELEMENT) for name in layout.planes)
     ids = [code for code in range(1 << count) if asked >> code & 1]
     if not ids:
         return "static void look(Context&) {}"

@@ -169,11 +169,10 @@ class CudaProgram:
         shape = state.like["element"][1] if isinstance(state, DeviceState) else state["element"].shape
         batch, height, width = shape
         source, launch = self.kernel(height, width)
-        after = (
-            self._copy(state)
-            if isinstance(state, DeviceState) and state.program is self
-            else self._pack(state, source)
-        )
+        if isinstance(state, DeviceState) and state.program is self:
+            after = DeviceState(self, state.planes.clone(), state.reals.clone(), state.like)
+        else:
+            after = self._pack(state, source)
         device = after.planes.device
         layout = source.layout
         flags, numbers = parameters(
@@ -188,9 +187,6 @@ class CudaProgram:
             )
         )
         return after
-
-    def _copy(self, state: DeviceState) -> DeviceState:
-        return DeviceState(self, state.planes.clone(), state.reals.clone(), state.like)
 
     def _pack(self, state: Mapping[str, Tensor], source: KernelSource) -> DeviceState:
         """State slots as packed planes and reals."""
