@@ -89,7 +89,7 @@ TASK_KEYS: dict[str, dict[str, Key]] = {
     },
     "agent": {
         "may": Key("words", "elements it may place, `any`, `blow`, `nothing`", True),
-        "speed": Key("word", "the speed that blowing gives to cells"),
+        "speed": Key("word", "a number other than 0: the speed that blowing gives to cells"),
         "speed_field": Key("word", "the field that blowing sets; the ruleset's only vector, if it has one"),
         "brush": Key("any", "cells that an action changes: a number, or [rows, columns]; 10 by default"),
         "bins": Key("any", "places that it can act at: a number, or [rows, columns]; 16 by default"),
@@ -120,7 +120,7 @@ TASK_KEYS: dict[str, dict[str, Key]] = {
         "choose": Key("word", "what it does: an element, `blow` or `nothing`", True),
         "toward": Key("word", "where it blows: `left`, `right`, `above`, `below`, or both as `above.right`"),
         "at": Key("any", "where: `[row, column]`, or `most(CELLS)`, the block with most of these cells"),
-        "within": Key("word", "a shape: only its cells count for `most`"),
+        "within": Key("word", "a shape, in one line: only its cells count for `most`"),
         "least": Key(
             "number",
             "how many cells `most` must find for the move to apply; 1 by default",
