@@ -12,6 +12,7 @@ The text under the caret stands in the example, in a comment ``# ^ text`` below 
 
 from __future__ import annotations
 
+import math
 import re
 import sys
 from collections.abc import Callable
@@ -39,8 +40,9 @@ from powderdsl.simulation.standalone import standalone_module
 from powderdsl.system.writing import replacing
 from powderdsl.tasks.shipped import load_task, load_task_with_diagnostics
 from powderdsl.testing.properties.refute import refuted
+from powderdsl.worldmodel import training
+from powderdsl.worldmodel.config import HERE, DataConfig, TrainConfig
 from powderdsl.worldmodel.networks import custom_network
-from powderdsl.worldmodel.training import diverged
 from powderdsl.worlds.ascii import read_ascii
 from powderdsl.worlds.image import read_image
 from powderdsl.worlds.scene import draw_scene, find_scene
@@ -268,7 +270,11 @@ def use_a_run_that_does_not_fit() -> None:
 
 
 def learn_too_fast() -> None:
-    raise diverged(Path("runs/dunes"), 40, 0.5)
+    data = DataConfig("sand-pushing", states=4, steps=1, pairs=1, capacity=4, refresh=1)
+    config = TrainConfig(data, width=1, iterations=50, batch=1, learning_rate=0.5)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training._Trainer, "step", lambda self, *pairs: math.inf if self.done == 35 else 1.0)
+        training.train(config, "runs/dunes", machine=HERE)
 
 
 def collect_different_results() -> None:
