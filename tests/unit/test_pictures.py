@@ -84,7 +84,9 @@ def surroundings(monkeypatch):
 
 
 def set_size(monkeypatch, columns: int, lines: int) -> None:
-    monkeypatch.setattr(pictures.shutil, "get_terminal_size", lambda *args, **kwargs: os.terminal_size((columns, lines)))
+    monkeypatch.setattr(
+        pictures.shutil, "get_terminal_size", lambda *args, **kwargs: os.terminal_size((columns, lines))
+    )
 
 
 @pytest.mark.parametrize("height", [1, 2, 5, 6])
