@@ -121,7 +121,7 @@ def _base(value: Node) -> str:
     return str(value.attr)
 
 
-CONTINUING = ("load", "const", "param", "add", "sub", "mul", "fused", "neg", "abs")
+CONTINUING = ("load", "const", "param", "add", "sub", "mul", "neg", "abs")
 """Operations that are applied to the results of choices in registers."""
 
 

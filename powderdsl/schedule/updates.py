@@ -103,13 +103,11 @@ def _is_update(value: Node, masks: set[str], old: Node, graph: Graph) -> bool:
     """Whether a flag is computed from stored planes, and is the old one where no mask holds."""
     if value.type != FLAG or old.op != "load" or old.attr in masks:
         return False
-    if any(node.op not in IN_A_WORD and not _is_neighbor(node) for node in ordered([value])):
-        return False
+    for node in ordered([value]):
+        at_neighbor = node.op == "shift" and node.args[0].op == "load" and node.attr[2]
+        if node.op not in IN_A_WORD and not at_neighbor:
+            return False
     return without(value, masks, graph) is old
-
-
-def _is_neighbor(node: Node) -> bool:
-    return node.op == "shift" and node.args[0].op == "load" and node.attr[2]
 
 
 def is_cleared(out: Out, graph: Graph) -> bool:

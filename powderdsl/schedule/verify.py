@@ -150,14 +150,11 @@ def _is_region(node: Node | None) -> bool:
     return node is None or node.op in ("load", "live", "const")
 
 
-SCHEDULE_OPS = frozenset({
-    "load", "below_param", "any", "when", "led", "live", "present", "fused", "ratio",
-})  # fmt: skip
+SCHEDULE_OPS = frozenset({"load", "below_param", "any", "when", "led", "live", "present"})
 """Operations that only schedules have: `load` → what a variable holds; `below_param` → a draw below a parameter; `any`
 (flag) → whether it holds in some cell; `when` (flag, flag) → both, the second computed only in words where the first
-holds somewhere; `led` (comparison, comparison) → the same in cells; `fused` (a, b, c) → a + b·c, where b·c is exact;
-`ratio` (a, b) → a / b far from the limits of floats (`exact`); `live` (floats), attribute (rows, reach) → whether the
-field may be other than zero so many rows down, at most so many columns to either side."""
+holds somewhere; `led` (comparison, comparison) → the same in cells; `live` (floats), attribute (rows, reach) → whether
+the field may be other than zero so many rows down, at most so many columns to either side."""
 
 
 def _demand(holds: bool, message: str) -> None:

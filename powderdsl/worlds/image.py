@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 import zlib
 from collections.abc import Sequence
@@ -142,11 +143,7 @@ def _wrong_color(
     else:
         message = f"{where} is {name}, which is not any element's color"
         candidates = [element for owned in owners.values() for element in owned]
-        nearest = min(candidates, key=lambda element: _distance(element.color, name))
+        nearest = min(candidates, key=lambda element: math.dist(bytes.fromhex(element.color[1:]), components))
         helps = (f"the nearest is `{nearest.name}`, {nearest.color}",)
     notes = (f"{path}: {count:,} such pixels, this is the first",)
     return Diagnostic("PD609", message, Label(None), notes=notes, helps=helps)
-
-
-def _distance(one: str, other: str) -> int:
-    return sum((a - b) ** 2 for a, b in zip(bytes.fromhex(one[1:]), bytes.fromhex(other[1:]), strict=True))

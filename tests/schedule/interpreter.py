@@ -281,15 +281,8 @@ def _wanted(holds: Array, where: list[Array]) -> Array:
     return np.where(where[0], holds, ~holds) if where else holds
 
 
-def _fused(a: Array, b: Array, c: Array) -> Array:
-    product = np.multiply(b, c)
-    assert np.array_equal(product, np.multiply(b, c, dtype=np.float64)), "a product that is fused is exact"
-    return np.add(a, product)
-
-
 _SIMPLE: dict[str, Callable[..., Any]] = {
     "and": np.logical_and, "when": np.logical_and, "led": np.logical_and, "or": np.logical_or, "xor": np.logical_xor, "eq": np.equal, "lt": np.less,
     "le": np.less_equal, "neg": np.negative, "abs": np.abs, "sqrt": np.sqrt, "min": np.minimum, "max": np.maximum,
-    "ratio": np.divide, "fused": _fused,
     "add": np.add, "sub": np.subtract, "mul": np.multiply,
 }  # fmt: skip

@@ -92,10 +92,8 @@ class Chunks(CellValues[str]):
                 return self.temporary(f"bits_{node.op}({args[0]}, {args[1]})", "u32", "b")
             case "add" | "sub" | "mul":
                 return self.temporary(f"{args[0]} {_INFIX[node.op]} {args[1]}")
-            case "fused":
-                return self.temporary(f"fused({args[0]}, {args[1]}, {literal(float(node.args[2].attr))})")
-            case "div" | "ratio" if node.args[1].op == "const" and node.args[1].attr:
-                return self.temporary(quotient(args[0], float(node.args[1].attr), near=node.op == "ratio"))
+            case "div" if node.args[1].op == "const" and node.args[1].attr:
+                return self.temporary(quotient(args[0], float(node.args[1].attr)))
             case "div":
                 return self.temporary(f"divide({args[0]}, {args[1]})")
             case "neg":
@@ -164,9 +162,8 @@ class Chunks(CellValues[str]):
             self.known[id(one[0])] = name
 
 
-def quotient(value: str, divisor: float, *, near: bool) -> str:
+def quotient(value: str, divisor: float) -> str:
     """A division by a constant; a product, unless the divisor's fraction is all ones (Markstein 1990, theorem 8)."""
     if all_ones(divisor) or not 2.0**-60 < abs(divisor) < 2.0**60:
         return f"{value} / splatf({literal(divisor)})"
-    function = "divide_near" if near else "divide_by"
-    return f"{function}({value}, {literal(divisor)}, {literal(divided(1.0, single(divisor)))})"
+    return f"divide_by({value}, {literal(divisor)}, {literal(divided(1.0, single(divisor)))})"

@@ -146,25 +146,18 @@ ALWAYS F divide(F a, F b) { return choose(b == 0.0f, splatf(0), a / b); }
 ALWAYS F fused(F a, F b, float c) { return (F)_mm512_fmadd_ps((__m512)b, _mm512_set1_ps(c), (__m512)a); }
 #elif VECTOR == 32 && defined(__FMA__)
 ALWAYS F fused(F a, F b, float c) { return (F)_mm256_fmadd_ps((__m256)b, _mm256_set1_ps(c), (__m256)a); }
-#else
-ALWAYS F fused(F a, F b, float c) { return a + b * c; }  // b * c is exact
 #endif
-ALWAYS F divide_near(F x, float d, float inverse) {
+ALWAYS F divide_by(F x, float d, float inverse) {
 #if VECTOR == 64 || (VECTOR == 32 && defined(__FMA__))
+  const I size = (I)magnitude(x);
+  const I odd = (size < (I)splatf(0x1p-60f)) & (size != 0);
+  if (__builtin_expect(bits_of(odd | (size > (I)splatf(0x1p60f))), 0)) return x / splatf(d);
   const F q = x * inverse;
   return fused(q, fused(x, q, -d), inverse);
 #else
   (void)inverse;
   return x / splatf(d);
 #endif
-}
-ALWAYS F divide_by(F x, float d, float inverse) {
-#if VECTOR == 64 || (VECTOR == 32 && defined(__FMA__))
-  const I size = (I)magnitude(x);
-  const I odd = (size < (I)splatf(0x1p-60f)) & (size != 0);
-  if (__builtin_expect(bits_of(odd | (size > (I)splatf(0x1p60f))), 0)) return x / splatf(d);
-#endif
-  return divide_near(x, d, inverse);
 }
 ALWAYS F smaller(F a, F b) { return choose(a < b, a, choose(a != a, a, b)); }
 ALWAYS F larger(F a, F b) { return choose(a > b, a, choose(a != a, a, b)); }

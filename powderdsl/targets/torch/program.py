@@ -184,7 +184,11 @@ class TorchProgram:
             (batch, height, width), self.device, job.params, self._streams, job.draws,
             base_keys(seed, index), self._idents, start, snap=self._snap,
         )  # fmt: skip
-        planes = self._unpack(job.state)
+        planes = {  # in working dtypes: vectors split, integers widened
+            piece.slot: piece.of(job.state[piece.state]).to(_DTYPES[piece.type.name])
+            for parts in self._pieces.values()
+            for piece in parts
+        }
         with torch.no_grad():
             for i in range(job.steps):
                 kernels.begin(start + i)
@@ -199,14 +203,6 @@ class TorchProgram:
                         planes.update(function(kernels, planes))
                         job.tick(name)
         return self._pack(planes, job.state, kernels)
-
-    def _unpack(self, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """State slots in working dtypes: vectors split, integers widened."""
-        return {
-            piece.slot: piece.of(state[piece.state]).to(_DTYPES[piece.type.name])
-            for parts in self._pieces.values()
-            for piece in parts
-        }
 
     def _pack(
         self, slots: Mapping[str, Tensor], like: Mapping[str, Tensor], kernels: Kernels

@@ -374,10 +374,6 @@ class Chunks(CellValues[Value]):
                 if wraps or not dx:
                     return value
                 return value & self.beside(const("i32", memory.at("columns") + 4 * memory.halo), dx)
-            case "fused":
-                return op("f32x4.add", args[0], op("f32x4.mul", args[1], floats(float(node.args[2].attr))))
-            case "ratio":
-                return op("f32x4.div", *args)
             case "div":
                 return op("v128.andnot", op("f32x4.div", *args), op("f32x4.eq", args[1], floats(0)))
             case "min" | "max":
