@@ -99,6 +99,36 @@ def _only_moves(value: Node, slot: str) -> bool:
     return again
 
 
+def chosen(schedule: Schedule) -> Schedule:
+    """A choice between constants at a neighbor asks for the neighbor's flag, so that it is not stored as a field.
+
+    `(m ? 22 : 2)[0,1]` → `m[0,1] ? 22 : 2`, where edges wrap.
+    """
+    graph = schedule.graph
+
+    def rule(node: Node) -> Node | None:
+        at_neighbor = node.op == "shift" and node.type == REAL and node.attr[2]
+        return _at_neighbor(node.args[0], node.attr, graph) if at_neighbor else None
+
+    return map_values(schedule, rule)
+
+
+def _at_neighbor(value: Node, where: tuple[int, int, bool], graph: Graph) -> Node | None:
+    """A float at a neighbor, if it is a constant or a choice between such floats, up to its sign."""
+    match value.op:
+        case "const":
+            return value
+        case "neg":
+            args = [_at_neighbor(value.args[0], where, graph)]
+        case "select" if value.args[0].op not in ("param", "const"):
+            flag = graph.node("shift", FLAG, (value.args[0],), where)
+            args = [flag, *(_at_neighbor(arg, where, graph) for arg in value.args[1:])]
+        case _:
+            return None
+    found = tuple(arg for arg in args if arg is not None)
+    return graph.node(value.op, REAL, found) if len(found) == len(args) else None
+
+
 def led(schedule: Schedule) -> Schedule:
     """A comparison that matters only where another one holds is computed only there.
 

@@ -171,6 +171,12 @@ def _pass_asks(schedule: Schedule, bits: dict[str, int]) -> Node | None:
     return _asked(asked, bits, {}, schedule.graph)
 
 
+def when_present(masks: list[Node], schedule: Schedule) -> Node | None:
+    """An answer without which none of some masks holds anywhere; None if none is known."""
+    bits = _element_bits(schedule)
+    return _asked(masks, bits, _times(schedule, bits), schedule.graph) if bits else None
+
+
 def _asked(masks: list[Node], bits: dict[str, int], times: dict[str, Time], graph: Graph) -> Node | None:
     """An answer that is true whenever one of some masks holds anywhere; None if none is known."""
     needs = _Needs(1 + max(bits.values()), bits, times)

@@ -10,8 +10,9 @@ from powderdsl.schedule.costs import Costs
 from powderdsl.schedule.cut import cut
 from powderdsl.schedule.cut_rows import cut_rows
 from powderdsl.schedule.draws import conditions, thresholds
+from powderdsl.schedule.early import early
 from powderdsl.schedule.empty import empty
-from powderdsl.schedule.floats import late, led
+from powderdsl.schedule.floats import chosen, late, led
 from powderdsl.schedule.join import join
 from powderdsl.schedule.lower import lower
 from powderdsl.schedule.narrow import ask_regions, narrow
@@ -53,12 +54,20 @@ CUDA = (
 CPU = (
     Stage("thresholds", thresholds, "which draws are compared with a parameter"),
     Stage("late", late, "floats are computed where they are used"),
+    Stage(
+        "chosen", chosen, "which floats at neighbors follow from a flag; before `cut`, which would store them"
+    ),
     Stage("led", led, "which comparisons are computed only where another one holds"),
     Stage("conditions", conditions, "where the result of each draw matters"),
     Stage(
         "presence",
         presence,
         "which elements must be present for work to be done; before `cut`, which takes masks apart",
+    ),
+    Stage(
+        "early",
+        early,
+        "which parts of masks are computed once for several; after `presence`, which reads whole masks",
     ),
     Stage(
         "cut",
