@@ -11,6 +11,7 @@ from powderdsl.schedule.join import field_reads, keeps
 from powderdsl.schedule.types import (
     Compute,
     Guard,
+    Move,
     Out,
     Schedule,
     Sweeps,
@@ -48,6 +49,8 @@ def reaches_of(schedule: Schedule) -> dict[str, int]:
             case Sweeps(loops):
                 outs = (out for loop in loops for out in loop.outs)
                 copies += [(out.var.name, out.otherwise) for out in outs if out.otherwise is not None]
+            case Move(planes=planes):
+                copies += [(plane.new.name, plane.old) for plane in planes]
     for _ in copies:
         before = dict(found)
         for name, old in copies:
