@@ -55,10 +55,7 @@ def buffers(schedule: Schedule, homes: Mapping[str, int], pool: Pool, *, in_plac
     for slot, node in schedule.leaves:
         if node.op == "load":
             plan.wanted.setdefault(node.attr, homes[slot])
-    for slot, var in schedule.finds:
-        if slot not in changed:
-            plan.last[var.name] = FOREVER
-    plan.run()
+    plan.run(kept=[var.name for slot, var in schedule.finds if slot not in changed])
     return _explicit(schedule, plan, homes)
 
 
@@ -79,10 +76,12 @@ class _Plan:
     ends: dict[str, int] = field(default_factory=dict)
     """The position at which that value must be in place."""
 
-    def run(self) -> None:
+    def run(self, kept: Sequence[str]) -> None:
+        """Assign all buffers; those of the variables `kept` hold slots that the pass does not change."""
         order = list(_in_order(self.schedule.body))
         for position, statement in enumerate(order):
             self.number(statement, position)
+        self.last |= dict.fromkeys(kept, FOREVER)
         end = len(order)
         for _, node in self.schedule.leaves:
             if node.op == "load":

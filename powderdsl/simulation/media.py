@@ -12,6 +12,7 @@ from typing import Any
 
 from powderdsl.arrays import NDArray, np
 from powderdsl.simulation.draw import to_numpy
+from powderdsl.system.interrupts import held_back
 from powderdsl.system.packages import require
 from powderdsl.system.writing import replacing
 
@@ -75,8 +76,10 @@ def _encode(command: list[str], frames: Iterable[NDArray[np.uint8]]) -> None:
     with tempfile.TemporaryFile() as log:
         encoder = None
         try:
-            # A session of its own: Ctrl-C reaches us alone, and we end the encoder.
-            encoder = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log, start_new_session=True)
+            # A session of its own: Ctrl-C reaches us alone, and we end the encoder. A signal while it starts must wait
+            # until we know it: it would write its file after we removed ours.
+            with held_back():
+                encoder = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log, start_new_session=True)
             assert encoder.stdin is not None
             with suppress(BrokenPipeError), encoder.stdin as pipe:  # the encoder died: its words say why
                 for frame in frames:

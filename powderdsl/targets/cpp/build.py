@@ -18,6 +18,7 @@ from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryFile
 
+from powderdsl.system.interrupts import held_back
 from powderdsl.system.user_cache import cache_folder
 from powderdsl.system.writing import scratch_folder
 from powderdsl.targets import cache
@@ -137,17 +138,18 @@ def run_compilers(scratch: Path, *commands: list[str]) -> tuple[int, str]:
     with TemporaryFile() as messages:
         try:
             for command in commands:
-                # A session of its own: g++ starts other programs, which are ended with it.
-                process = subprocess.Popen(
-                    command,
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.DEVNULL,
-                    stderr=messages,
-                    env=environment,
-                    start_new_session=True,
-                )
-                processes.append(process)
-                _running.append(process)
+                with held_back():  # a process that starts while a signal raises would be unknown to us
+                    # A session of its own: g++ starts other programs, which are ended with it.
+                    process = subprocess.Popen(
+                        command,
+                        stdin=subprocess.DEVNULL,
+                        stdout=subprocess.DEVNULL,
+                        stderr=messages,
+                        env=environment,
+                        start_new_session=True,
+                    )
+                    processes.append(process)
+                    _running.append(process)
             end = time.monotonic() + TIMEOUT
             codes = [process.wait(max(0.0, end - time.monotonic())) for process in processes]
         except OSError as error:
