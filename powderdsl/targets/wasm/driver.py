@@ -23,8 +23,8 @@ from collections.abc import Sequence
 
 from powderdsl.ir.ops import REAL, Program
 from powderdsl.system.random import MASK
+from powderdsl.targets.machine.functions import Callee, Function, Local, Value, const, load, op
 from powderdsl.targets.wasm.batches import GROUPS, WORLDS, Batches
-from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, load, op
 from powderdsl.targets.wasm.grids import Grid
 from powderdsl.targets.wasm.library import GOLDEN, ZERO, Library, counted, either, word
 from powderdsl.targets.wasm.memory import HEADER, LANES, SOME
@@ -87,7 +87,7 @@ class Steps(Batches):
             count.give(word(count.param(0), GROUPS))
             module.add(count, "groups", export=True)
             for number, one in enumerate(self.passes):
-                module.export(one, str(number))
+                module.exports.append((str(number), one))
         with f.block() as nothing:
             f.jump(nothing, op("i32.eqz", steps))
             with f.each(ZERO, word(batch, GROUPS)) as group:

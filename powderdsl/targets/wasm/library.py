@@ -5,7 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from powderdsl.system.random import MASK, START_0, START_1
-from powderdsl.targets.wasm.binary import Callee, Function, Local, Module, Value, const, load, op, vector
+from powderdsl.targets.machine.functions import (
+    Callee,
+    Function,
+    Local,
+    Module,
+    Value,
+    const,
+    load,
+    op,
+    vector,
+)
 from powderdsl.targets.wasm.memory import HALOED, HEADER, NEXT, REFS, SOME, WORD, Memory
 
 PAGE = 1 << 16
@@ -33,7 +43,7 @@ def some(flags: Value) -> Value:
 
 def either(condition: Value, yes: Value, no: Value) -> Value:
     """A choice between two integers."""
-    return Value(yes.type, yes.code + no.code + condition.code + op("select").code)
+    return Value("select", yes.type, (yes, no, condition))
 
 
 def choose(mask: Value, yes: Value, no: Value) -> Value:
@@ -106,9 +116,9 @@ class Library:
         with f.when(f.param(0) >= self.module.most * PAGE):
             f.trap()
         end = f.let(place + f.param(0))
-        pages, size = f.let((end + (PAGE - 1)) >> 16), op("memory.size", tail=b"\0")
+        pages, size = f.let((end + (PAGE - 1)) >> 16), op("memory.size")
         with f.when(pages >= size + 1):
-            grown = op("memory.grow", pages - size, tail=b"\0")
+            grown = op("memory.grow", pages - size)
             with f.when(grown.equals(const("i32", -1))):
                 f.trap()
         f.set(self.top, end)

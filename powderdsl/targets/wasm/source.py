@@ -13,7 +13,8 @@ from powderdsl.schedule.stages import CPU, plan
 from powderdsl.schedule.types import Schedule
 from powderdsl.system.memo import Memo, collection_paused
 from powderdsl.targets.layout import Layout, layout_of
-from powderdsl.targets.wasm.binary import Module
+from powderdsl.targets.machine.functions import Module
+from powderdsl.targets.wasm.binary import function_code, module_code
 from powderdsl.targets.wasm.driver import add_driver
 from powderdsl.targets.wasm.library import PAGE, Library
 from powderdsl.targets.wasm.memory import Memory, extent_of
@@ -34,7 +35,7 @@ class WasmModule:
 
     @property
     def code(self) -> bytes:
-        return self.module.code()
+        return module_code(self.module)
 
 
 @collection_paused()
@@ -51,7 +52,7 @@ def wasm_module(
     layout = layout_of(program)
     schedules = [_schedule(pass_, memo) for pass_ in program.passes]
     memory = Memory(width, extent_of(schedules), layout)
-    module = Module(memory.top // PAGE + 1, PAGES)
+    module = Module(memory.top // PAGE + 1, PAGES, function_code)
     library = Library(memory, module)
     passes = [pass_function(schedule, library) for schedule in schedules]
     asked = reduce(or_, map(asked_ids, schedules), 0)

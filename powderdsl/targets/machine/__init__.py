@@ -1,0 +1,1 @@
+"""One low-level program for processors and for WebAssembly."""
