@@ -61,7 +61,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "targets": ("arrays", "diagnostics", "system", "ir", "schedule"),  # what targets share; never the model
     "targets.torch": ("diagnostics", "system", "ir", "schedule", "targets"),
     "targets.cpp": ("diagnostics", "system", "ir", "schedule", "targets", "targets.torch"),
-    "targets.machine": (),
+    "targets.machine": ("system", "ir", "schedule", "targets"),
     "targets.wasm": ("diagnostics", "system", "ir", "schedule", "targets", "targets.machine"),
     "targets.cuda": ("diagnostics", "system", "ir", "schedule", "targets", "targets.torch", "targets.cpp"),
     "compiler": _COMPILER[:-1],

@@ -71,7 +71,7 @@ def test_operators() -> None:
 def test_vectors() -> None:
     octets = bytes(range(16))
     low = int.from_bytes(octets[:8], "little")
-    word = op("i64x2.extract_lane", vector(octets) >> 8, attr=0)
+    word = op("i64x2.extract_lane", op("i64x2.shr_u", vector(octets), const("i32", 8)), attr=0)
     assert value_of(word) == low >> 8
     high = op("i64x2.extract_lane", vector(octets), attr=1)
     assert value_of(high) == int.from_bytes(octets[8:], "little")

@@ -166,7 +166,11 @@ def _immediates(name: str, attr: Any) -> bytes:
     if rest == "const":
         if kind in ("i32", "i64"):
             return signed(attr)
-        return attr if kind == "v128" else struct.pack("<f" if kind == "f32" else "<d", attr)
+        return (
+            attr * (16 // len(attr)) if kind == "v128" else struct.pack("<f" if kind == "f32" else "<d", attr)
+        )
+    if name == "i8x16.shuffle":
+        return bytes(attr)
     if name in ALIGNMENTS:
         return bytes([ALIGNMENTS[name]]) + unsigned(attr)
     return unsigned(attr)

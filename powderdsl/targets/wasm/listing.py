@@ -38,7 +38,9 @@ def _operands(name: str, attr: Any, names: list[str]) -> str:
     if name == "call":
         return f" ${names[attr.index]}"
     if name == "v128.const":
-        return " i32x4 " + " ".join(f"{part:#x}" for part in struct.unpack("<4I", attr))
+        return " i32x4 " + " ".join(f"{part:#x}" for part in struct.unpack("<4I", attr * (16 // len(attr))))
     if rest.startswith(("load", "store")):
         return f" offset={attr}"
+    if name == "i8x16.shuffle":
+        return "".join(f" {octet}" for octet in attr)
     return "" if attr is None else f" {attr}"
