@@ -9,12 +9,12 @@ import os
 import re
 import signal
 from collections import Counter
-from collections.abc import Generator, Iterable, Iterator, Mapping
+from collections.abc import Generator, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache, partial
-from itertools import groupby
+from itertools import groupby, product
 from multiprocessing import active_children, get_context, parent_process
 from threading import Thread
 
@@ -41,7 +41,7 @@ from powderdsl.testing.mutation.operators import mutants_of
 from powderdsl.testing.mutation.written import GENERATED, GeneratedTest, distinguish, written_test
 from powderdsl.testing.pack_tests.runner import run_examples
 from powderdsl.testing.properties.breaks import breaks, is_paired, look, steps_for
-from powderdsl.testing.properties.running import State, first_difference, joined, random_samples, run_sample
+from powderdsl.testing.properties.running import Runner, State, first_difference, random_samples, run_sample
 from powderdsl.testing.properties.search import STEPS
 
 Settings = tuple[tuple[str, str], ...]
@@ -62,14 +62,11 @@ def is_generated(example: Example) -> bool:
 
 @dataclass(frozen=True)
 class Batch:
-    """Start worlds of one shape, several times: once for each set of elements that some invariant leaves out.
-
-    `states` are the original's, at the start and after each step; `group` [B] says which set is left out.
-    """
+    """Start worlds of one shape `without` some elements; `states`: the original's, at the start and after each step."""
 
     sample: Start
     steps: int
-    group: np.ndarray
+    without: frozenset[int]
     states: list[State]
 
 
@@ -145,16 +142,12 @@ class Original:
         return list(random_samples(self.ruleset, 0, WORLDS))
 
     def batches(self) -> Iterator[Batch]:
-        """The samples with the original's states, which are kept: the first use runs them."""
-        for number, sample in enumerate(self.samples):
-            if number == len(self._batches):
-                some = [sample.without(gone, self.ruleset) for gone in self.withouts]
-                whole = joined(some, self.ruleset)
-                steps = STEPS[number % len(STEPS)]
-                states, _ = run_sample(self.sim, whole, steps)
-                group = np.repeat(np.arange(len(some)), len(sample))
-                self._batches.append(Batch(whole, steps, group, states))
-            yield self._batches[number]
+        """The samples without each set with the original's states, which are kept: the first use runs them."""
+        for place, (number, gone) in enumerate(product(range(len(self.samples)), self.withouts)):
+            if place == len(self._batches):
+                sample, steps = self.samples[number].without(gone, self.ruleset), STEPS[number % len(STEPS)]
+                self._batches.append(Batch(sample, steps, gone, run_sample(self.sim, sample, steps)[0]))
+            yield self._batches[place]
 
 
 def warnings_of(diagnostics: tuple[Diagnostic, ...]) -> Counter[str]:
@@ -279,20 +272,6 @@ def failed_test(original: Original, sim: Simulator, pack: str, *, quick: bool) -
 # Invariants
 
 
-@dataclass(frozen=True)
-class _Mutated:
-    """Runs worlds with the mutant."""
-
-    sim: Simulator
-
-    @property
-    def ruleset(self) -> Ruleset:
-        return self.sim.ruleset
-
-    def states(self, sample: Start, steps: int, random: Mapping[str, Array] | None = None) -> list[State]:
-        return run_sample(self.sim, sample, steps, random)[0]
-
-
 def broken_invariant(original: Original, sim: Simulator) -> tuple[Invariant | None, bool]:
     """An invariant of the mutant that some world breaks, and whether any world ended otherwise than before.
 
@@ -311,13 +290,13 @@ def broken_invariant(original: Original, sim: Simulator) -> tuple[Invariant | No
             differs = first_difference(batch.states, states) > 0
             any_differs |= bool(differs.any())
             asked = differs if alike else np.ones_like(differs)
-            found = _broken_in(batch, original, sim, single, states, asked)
-            if found is not None:
-                return found, True
+            broken_one = _broken_in(batch, sim.ruleset, single, states, asked)
+            if broken_one is not None:
+                return broken_one, True
             if any_differs and not single:
                 break
-    found = next((one for one in kept if is_paired(one.claim) and _is_broken(one, original, sim)), None)
-    return found, any_differs or found is not None
+    broken_one = next((one for one in kept if is_paired(one.claim) and _is_broken(one, original, sim)), None)
+    return broken_one, any_differs or broken_one is not None
 
 
 def _declared(ruleset: Ruleset) -> tuple[object, ...]:
@@ -335,7 +314,7 @@ def _is_broken(invariant: Invariant, original: Original, sim: Simulator) -> bool
         return False
     if isinstance(invariant.claim, Symmetric) and ruleset.streams:
         return False  # the same draws may be used in another way, and frequencies take thousands of worlds
-    runs = _Mutated(sim)
+    runs = Runner(ruleset, sim=sim)
     samples = (sample.without(invariant.without, ruleset) for sample in original.samples[:PAIRED])
     return any(bool(breaks(invariant.claim, runs, sample, 1).first.any()) for sample in samples)
 
@@ -343,40 +322,33 @@ def _is_broken(invariant: Invariant, original: Original, sim: Simulator) -> bool
 @lru_cache(maxsize=4)
 def original_breaks(original: Original) -> frozenset[int]:
     """Places of invariants that the original itself breaks: what more packs change says nothing about a mutant."""
-    found = set()
-    for number, one in enumerate(original.ruleset.invariants):
-        if is_paired(one.claim):
-            broken = _is_broken(one, original, original.sim)
-        else:
-            everywhere = np.ones(1, bool)
-            broken = any(
-                _broken_in(batch, original, original.sim, [one], batch.states, everywhere) is not None
-                for batch in original.batches()
-            )
-        if broken:
-            found.add(number)
-    return frozenset(found)
+    ruleset, sim = original.ruleset, original.sim
+
+    def is_broken(invariant: Invariant) -> bool:
+        if is_paired(invariant.claim):
+            return _is_broken(invariant, original, sim)
+        return any(
+            _broken_in(batch, ruleset, [invariant], batch.states, np.ones(len(batch.sample), bool))
+            for batch in original.batches()
+        )
+
+    return frozenset(number for number, one in enumerate(ruleset.invariants) if is_broken(one))
 
 
 def _broken_in(
-    batch: Batch,
-    original: Original,
-    sim: Simulator,
-    invariants: list[Invariant],
-    states: list[State],
-    differs: Array,
+    batch: Batch, ruleset: Ruleset, invariants: list[Invariant], states: list[State], asked: Array
 ) -> Invariant | None:
-    for number, without in enumerate(original.withouts):
-        worlds = np.nonzero(differs & (batch.group == number))[0]
-        if not len(worlds):
-            continue
-        sample = batch.sample.select(worlds)
-        some = [{name: values[worlds] for name, values in state.items()} for state in states]
-        for one in invariants:
-            asked = one.without == without and steps_for(one.claim, batch.steps) <= batch.steps
-            if asked and look(one.claim, sim.ruleset, sample, some).first.any():
-                return one
-    return None
+    """The first of some invariants that one of the worlds `asked`, bool [B], breaks."""
+    tried = [
+        one
+        for one in invariants
+        if one.without == batch.without and steps_for(one.claim, batch.steps) <= batch.steps
+    ]
+    if not tried or not asked.any():
+        return None
+    sample = batch.sample.select(asked)
+    some = [{name: values[asked] for name, values in state.items()} for state in states]
+    return next((one for one in tried if look(one.claim, ruleset, sample, some).first.any()), None)
 
 
 # Campaigns

@@ -27,12 +27,17 @@ MARK = "happened "
 
 
 class Runner:
-    """Runs a ruleset on one backend. `happened` collects the lines of rules that changed or claimed some cell."""
+    """Runs a ruleset on one backend. `happened` collects the lines of rules that changed or claimed some cell.
 
-    def __init__(self, ruleset: Ruleset, backend: str | None = None):
+    `sim`: one that exists already, which sets no flags: then no line is known to happen.
+    """
+
+    def __init__(self, ruleset: Ruleset, backend: str | None = None, sim: AnySimulator[Any] | None = None):
         self.ruleset = ruleset
         self.backend = backend or starting_backend("cpu")
-        self.lines = rule_spans(ruleset)
+        self.lines = () if sim else rule_spans(ruleset)
+        if sim is not None:
+            self.sim = sim
         self.happened: set[Span] = set()
         self.worlds_run = 0
 
