@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
@@ -22,7 +22,7 @@ from powderdsl.worldmodel.rulesets import UNSEEN_RULESETS
 from powderdsl.worldmodel.scores import Network, Score, elements_of, frequent, outcomes, score, still
 from powderdsl.worldmodel.trained import Trained
 from powderdsl.worldmodel.training import check_slots, load_rules_of
-from powderdsl.worldmodel.worlds import TaskWorlds, pairs_of, task_worlds, unseen_seeds
+from powderdsl.worldmodel.worlds import Pairs, TaskWorlds, pairs_of, task_worlds, unseen_seeds
 
 FIT_WORLDS = 64
 """The most training worlds that baselines are fitted on."""
@@ -91,13 +91,8 @@ def evaluate(
     data, names, slots = trained.config.data, unseen.names, len(trained.palette)
     seeds = torch.arange(min(FIT_WORLDS, data.states), device=machine.device)
     trained_on = task_worlds(data, **machine.simulation, palette=trained.palette)
-    fit = outcomes(pairs_of(trained_on, seeds, data.steps, data.pairs), slots)
-    ids = [element.id for element in unseen.rules.elements]
-    predictors: dict[str, Network] = {
-        MODEL: trained.network,
-        STILL: still(fit, ids),
-        FREQUENT: frequent(fit, ids),
-    }
+    fit = pairs_of(trained_on, seeds, data.steps, data.pairs)
+    predictors: dict[str, Network] = {MODEL: trained.network, **_baselines(fit, unseen.rules, slots)}
     count = worlds or (4 if len(names) > 1 else 32)
     scores = {}
     for name, seeds in zip(names, unseen_seeds(count, len(names)).view(len(names), count), strict=True):
@@ -136,12 +131,10 @@ def evaluate_recording(trained: Trained, recording: Recording, *, machine: Machi
     ]
     if why:
         raise does_not_fit(trained.run.path, *why)
-    slots, ids = len(trained.palette), [element.id for element in recording.rules.elements]
-    fit = outcomes(recording.spread(recording.parts[0], TRANSITIONS), slots)
-    predictors: dict[str, Network] = {MODEL: trained.network}
+    slots, predictors = len(trained.palette), dict[str, Network]({MODEL: trained.network})
     if known.actions:
         predictors[BLIND] = lambda inputs: trained.network(without_actions(inputs))
-    predictors |= {STILL: still(fit, ids), FREQUENT: frequent(fit, ids)}
+    predictors |= _baselines(recording.spread(recording.parts[0], TRANSITIONS), recording.rules, slots)
     rows = recording.parts[2] if known.digest == here.digest else recording.all
     pairs = recording.spread(rows, TRANSITIONS, machine.device)
     return Tested(
@@ -155,6 +148,11 @@ def evaluate_recording(trained: Trained, recording: Recording, *, machine: Machi
         palette=trained.palette,
         step=trained.checkpoint.step,
     )
+
+
+def _baselines(fit: Iterable[Pairs], rules: Ruleset, slots: int) -> dict[str, Network]:
+    counts, ids = outcomes(fit, slots), [element.id for element in rules.elements]
+    return {STILL: still(counts, ids), FREQUENT: frequent(counts, ids)}
 
 
 def unseen_worlds(trained: Trained, *, machine: Machine = HERE, **tested_on: Any) -> TaskWorlds:
@@ -220,9 +218,9 @@ class Strip:
     predicted: NDArray[np.uint8]
 
     @property
-    def wrong(self) -> int:
-        """The number of cells that were predicted wrongly."""
-        return int((self.truth != self.predicted).sum())
+    def wrong(self) -> NDArray[np.bool_]:
+        """The cells that were predicted wrongly: bool [H, W]."""
+        return self.truth != self.predicted
 
 
 @torch.no_grad()
@@ -265,6 +263,7 @@ def sheet(found: list[Strip], rules: Ruleset, *, factor: int = 2) -> NDArray[np.
     pictures = []
     for strip in found:
         pictures += [rgb(ids, colors) for ids in (strip.start, strip.truth, strip.predicted)]
-        wrong = (strip.truth != strip.predicted)[..., None]
-        pictures.append(np.where(wrong, *(np.array(color, dtype=np.uint8) for color in (WRONG, RIGHT))))
+        pictures.append(
+            np.where(strip.wrong[..., None], *(np.array(color, dtype=np.uint8) for color in (WRONG, RIGHT)))
+        )
     return contact_sheet([scale(picture, factor) for picture in pictures], columns=4, gap=4)

@@ -39,53 +39,35 @@ CONTRACT = "it is called as NAME(channels, slots) and gives a torch.nn.Module: f
 
 
 @dataclass(frozen=True)
-class OneHot:
-    """Ids uint8 [B, H, W] -> float32 [B, slots, H, W]: 1 in the channel of the element, 0 in the others."""
-
-    slots: int
-
-    @property
-    def channels(self) -> int:
-        return self.slots
-
-    def __call__(self, inputs: Tensor) -> Tensor:
-        return F.one_hot(inputs.long(), self.slots).permute(0, 3, 1, 2).float().contiguous()
-
-    def example(self, size: tuple[int, int]) -> Tensor:
-        """Two inputs: uint8 [2, H, W]."""
-        return torch.zeros(2, *size, dtype=torch.uint8)
-
-
-@dataclass(frozen=True)
 class ActionChannels:
-    """A state and an action, uint8 [B, observed + 3, H, W] as `recordings` has them -> float32 [B, channels, H, W].
+    """Inputs, uint8 -> what networks see, float32 [B, channels, H, W]: the elements, one-hot, and what belongs to actions.
 
-    The channels: the elements, one-hot, after the action has placed its own; the other channels of the observation,
-    about −1 to 1; and, with `actions`, 1 where the action places an element, 1 where it blows, and its speed there in
-    rows and columns, −1 to 1. Without, nothing of the action is seen.
+    Without `observed`, inputs are ids [B, H, W]. Otherwise they are a state and an action, [B, observed + 3, H, W] as
+    `recordings` has them. Then the elements are those after the action has placed its own, and more channels follow: the
+    others of the observation, about −1 to 1; and, with `actions`, 1 where the action places an element, 1 where it
+    blows, and its speed there in rows and columns, −1 to 1. Without, nothing of the action is seen.
     """
 
     slots: int
-    observed: int
+    observed: int = 0
     actions: bool = True
 
     @property
     def channels(self) -> int:
-        return self.slots + self.observed - 1 + (4 if self.actions else 0)
+        return self.slots + (self.observed - 1 + 4 * self.actions if self.observed else 0)
 
     def __call__(self, inputs: Tensor) -> Tensor:
-        ids, placed, speed = inputs[:, 0], inputs[:, self.observed], inputs[:, self.observed + 1 :]
-        found = [inputs[:, 1 : self.observed].float() / 128 - 1]
-        if self.actions:
-            here = placed != NO_ELEMENT
-            ids = torch.where(here, placed, ids)
-            blown = (speed[:, :1] != 0).float()
-            found += [here[:, None].float(), blown, (speed.float() - 2) * blown]
-        return torch.cat([OneHot(self.slots)(ids), *found], 1)
-
-    def example(self, size: tuple[int, int]) -> Tensor:
-        """Two inputs: uint8 [2, observed + 3, H, W]."""
-        return torch.zeros(2, self.observed + 3, *size, dtype=torch.uint8)
+        ids, others = inputs, list[Tensor]()
+        if self.observed:
+            ids, placed, speed = inputs[:, 0], inputs[:, self.observed], inputs[:, self.observed + 1 :]
+            others = [inputs[:, 1 : self.observed].float() / 128 - 1]
+            if self.actions:
+                here = placed != NO_ELEMENT
+                ids = torch.where(here, placed, ids)
+                blown = (speed[:, :1] != 0).float()
+                others += [here[:, None].float(), blown, (speed.float() - 2) * blown]
+        elements = F.one_hot(ids.long(), self.slots).permute(0, 3, 1, 2).float().contiguous()
+        return torch.cat([elements, *others], 1)
 
 
 def without_actions(inputs: Tensor) -> Tensor:
@@ -95,14 +77,10 @@ def without_actions(inputs: Tensor) -> Tensor:
     return found
 
 
-Encoder = OneHot | ActionChannels
-"""What makes the channels that networks see, float32 [B, channels, H, W], of inputs, uint8."""
-
-
 class Encoded(nn.Module):
     """A network on channels, as one on ids: encodes its inputs first."""
 
-    def __init__(self, encoder: Encoder, network: nn.Module):
+    def __init__(self, encoder: ActionChannels, network: nn.Module):
         super().__init__()
         self.encoder, self.network = encoder, network
 
@@ -196,7 +174,7 @@ class CustomNetwork:
     name: str
     make: Callable[[int, int], Any]
 
-    def build(self, encoder: Encoder, slots: int, seed: int) -> Encoded:
+    def build(self, encoder: ActionChannels, seed: int) -> Encoded:
         """A network whose random weights depend on the seed alone.
 
         Raises:
@@ -204,23 +182,24 @@ class CustomNetwork:
         """
         with torch.random.fork_rng(devices=[]), self._told("cannot be made"):
             torch.manual_seed(seed)
-            network = self.make(encoder.channels, slots)
+            network = self.make(encoder.channels, encoder.slots)
         if not isinstance(network, nn.Module):
             found = type(network).__name__
             raise _invalid(self.name, f"must give a torch.nn.Module, found {found}", helps=(CONTRACT,))
         return Encoded(encoder, network)
 
-    def check(self, encoder: Encoder, slots: int, inputs: Tensor, seed: int) -> None:
-        """Try a network on some inputs: the shape of its logits, and whether it can learn.
+    def check(self, encoder: ActionChannels, size: tuple[int, int], seed: int) -> None:
+        """Try a network on two worlds of a size: the shape of its logits, and whether it can learn.
 
         Raises:
             CompileError: PD625.
         """
-        network = self.build(encoder, slots, seed).to(inputs.device)
+        network = self.build(encoder, seed)
+        state = (encoder.observed + 3,) if encoder.observed else ()
+        inputs = torch.zeros(2, *state, *size, dtype=torch.uint8)
         with torch.random.fork_rng(devices=[]), self._told("fails on a batch"):
             logits = network(inputs)
-        given = f"for channels [{len(inputs)}, {encoder.channels}, {inputs.shape[-2]}, {inputs.shape[-1]}]"
-        expected = [len(inputs), slots, *inputs.shape[-2:]]
+        given, expected = f"for channels {[2, encoder.channels, *size]}", [2, encoder.slots, *size]
         is_tensor = isinstance(logits, Tensor)
         if not is_tensor or list(logits.shape) != expected or not logits.is_floating_point():
             result = f"{list(logits.shape)} of {logits.dtype}" if is_tensor else type(logits).__name__
@@ -230,8 +209,7 @@ class CustomNetwork:
         weights = [one for one in network.parameters() if one.requires_grad]
         if logits.requires_grad and weights:
             with self._told("has no gradient"):
-                truth = torch.zeros(len(inputs), *inputs.shape[-2:], dtype=torch.int64, device=inputs.device)
-                F.cross_entropy(logits.float(), truth).backward()
+                F.cross_entropy(logits.float(), torch.zeros(2, *size, dtype=torch.int64)).backward()
         if all(one.grad is None for one in weights):
             helps = ("its logits must depend on parameters that require a gradient",)
             raise _invalid(self.name, "cannot be trained: no gradient reaches a parameter", helps=helps)
@@ -297,10 +275,10 @@ def _invalid(name: str, what: str, *notes: str, helps: tuple[str, ...] = ()) -> 
 # Networks of runs
 
 
-def encoder_of(config: TrainConfig, slots: int) -> Encoder:
+def encoder_of(config: TrainConfig, slots: int) -> ActionChannels:
     """What makes channels of the inputs."""
     if config.recorded is None:
-        return OneHot(slots)
+        return ActionChannels(slots)
     return ActionChannels(slots, len(config.recorded.channels), config.recorded.actions)
 
 
@@ -308,10 +286,10 @@ def network_of(config: TrainConfig, slots: int, given: nn.Module | CustomNetwork
     """The network that is given, or the paper's, which encodes worlds without actions by itself."""
     encoder = encoder_of(config, slots)
     if isinstance(given, CustomNetwork):
-        return given.build(encoder, slots, config.seed)
+        return given.build(encoder, config.seed)
     if given is not None:
         return given
-    if isinstance(encoder, OneHot):
+    if config.recorded is None:
         return fresh_unet(slots, config.width, config.seed)
     return Encoded(encoder, fresh_unet(slots, config.width, config.seed, encoder.channels))
 

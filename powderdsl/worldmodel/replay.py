@@ -56,7 +56,12 @@ class Replay:
         shape = (self.size, *worlds.size)
         if store == "auto":
             store = "disk" if 2 * math.prod(shape) > memory_of(self.device) // 2 else "memory"
-        self.starts, self.ends = (_zeros(shape, store, folder, self.device) for _ in range(2))
+        if store == "memory":
+            self.starts, self.ends = torch.zeros(2, *shape, dtype=torch.uint8, device=self.device)
+        else:
+            with TemporaryFile(dir=folder) as file:  # what is mapped outlives the file
+                pairs = np.memmap(file, dtype=np.uint8, mode="w+", shape=(2, *shape))
+            self.starts, self.ends = torch.from_numpy(pairs)
         self.iteration = -1
         self._live: Any = None
 
@@ -116,14 +121,6 @@ class Replay:
             # If one iteration brings more pairs than fit, the newest stay.
             kept = slice(max(0, len(place) - self.size), None)
             room[place[kept]] = ids[kept].to(room.device)
-
-
-def _zeros(shape: tuple[int, ...], store: str, folder: Path | None, device: torch.device) -> Tensor:
-    """Zeros, uint8, in the memory of a device or in a file that is deleted with its last user."""
-    if store == "memory":
-        return torch.zeros(shape, dtype=torch.uint8, device=device)
-    with TemporaryFile(dir=folder) as file:  # what is mapped outlives the file
-        return torch.from_numpy(np.memmap(file, dtype=np.uint8, mode="w+", shape=shape))
 
 
 def memory_of(device: torch.device) -> int:

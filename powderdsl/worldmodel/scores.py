@@ -188,18 +188,13 @@ def _binned(chances: Tensor, right: Tensor) -> Tensor:
     return table.index_add_(0, number, columns).cpu()
 
 
-class Table:
-    """A baseline: log-probabilities of what a cell becomes, by what it holds. A callable as networks are.
+def baseline(chances: Tensor) -> Network:
+    """Log-probabilities of what a cell becomes, by what it holds.
 
     `chances` is float64 [slots, slots]: a row for each start element, which sums to 1.
     """
-
-    def __init__(self, chances: Tensor):
-        self.chances = chances
-
-    def __call__(self, inputs: Tensor) -> Tensor:
-        ids = ids_of(inputs)
-        return self.chances.log().float().to(ids.device)[ids.long()].permute(0, 3, 1, 2)
+    logits = chances.log().float()
+    return lambda inputs: logits.to(inputs.device)[ids_of(inputs).long()].permute(0, 3, 1, 2)
 
 
 def outcomes(pairs: Iterable[Pairs], slots: int) -> Tensor:
@@ -216,7 +211,7 @@ def _counts(rows: Tensor, columns: Tensor, slots: int) -> Tensor:
     return torch.bincount(both, minlength=slots * slots).view(slots, slots).cpu()
 
 
-def still(counts: Tensor, ids: Sequence[int]) -> Table:
+def still(counts: Tensor, ids: Sequence[int]) -> Network:
     """ "Nothing changes": a cell stays with one chance, and becomes each of the other elements with an equal share.
 
     The chance is the one with the lowest cross-entropy on the counted pairs: the share of cells that stayed, with one
@@ -225,17 +220,17 @@ def still(counts: Tensor, ids: Sequence[int]) -> Table:
     stays = (int(counts.diagonal().sum()) + 1) / (int(counts.sum()) + 2)
     chances = torch.zeros(len(counts), len(counts), dtype=torch.float64)
     chances[:, list(ids)] = (1 - stays) / max(len(ids) - 1, 1)
-    return Table(chances.fill_diagonal_(stays))
+    return baseline(chances.fill_diagonal_(stays))
 
 
-def frequent(counts: Tensor, ids: Sequence[int]) -> Table:
+def frequent(counts: Tensor, ids: Sequence[int]) -> Network:
     """ "Most frequent outcome": for each start element the counted shares of what it became.
 
     One cell is counted besides for each element that it may become, those of `ids`, so that no chance of these is 0.
     """
     seen = counts.double()
     seen[:, list(ids)] += 1
-    return Table(seen / seen.sum(1, keepdim=True))
+    return baseline(seen / seen.sum(1, keepdim=True))
 
 
 def elements_of(total: Score, palette: tuple[str | None, ...]) -> dict[str, dict[str, float | int | None]]:

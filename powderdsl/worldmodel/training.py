@@ -130,8 +130,7 @@ def train(
     identity |= {"palette": palette, "rules_fingerprint": fingerprint(given.rules)}
     slots = len(palette)
     if isinstance(network, CustomNetwork):
-        encoder = encoder_of(config, slots)
-        network.check(encoder, slots, encoder.example(given.size), config.seed)
+        network.check(encoder_of(config, slots), given.size, config.seed)
     run = open_run(path, KIND, {**config.plain, **identity}, note=note)
     with held(run.path):
         model = network_of(config, slots, network)

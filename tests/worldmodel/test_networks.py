@@ -12,7 +12,7 @@ import torch
 
 from powderdsl.diagnostics import CompileError
 from powderdsl.worldmodel import DataConfig, Machine, TrainConfig, custom_network, load_trained, train
-from powderdsl.worldmodel.networks import CustomNetwork, OneHot, is_network_name
+from powderdsl.worldmodel.networks import ActionChannels, CustomNetwork, is_network_name
 from tests.cli.commands import powderdsl as run
 from tests.worldmodel.test_training import same, weights
 
@@ -147,13 +147,13 @@ def test_an_interrupted_run_ends_with_the_same_weights(dunes: str) -> None:
 
 
 def test_weights_of_a_network_depend_on_the_seed_alone(dunes: str) -> None:
-    network, encoder = custom_network("nets:Wide"), OneHot(5)
+    network, encoder = custom_network("nets:Wide"), ActionChannels(5)
     torch.rand(3)
-    one = network.build(encoder, 5, 7).state_dict()
+    one = network.build(encoder, 7).state_dict()
     torch.rand(3)
-    other = network.build(encoder, 5, 7).state_dict()
+    other = network.build(encoder, 7).state_dict()
     assert same(one, other)
-    assert not same(one, network.build(encoder, 5, 8).state_dict())
+    assert not same(one, network.build(encoder, 8).state_dict())
 
 
 @pytest.mark.parametrize(
@@ -178,9 +178,9 @@ def test_weights_of_a_network_depend_on_the_seed_alone(dunes: str) -> None:
     ],
 )
 def test_networks_that_cannot_be_trained_are_refused(name: str, said: str) -> None:
-    encoder = OneHot(10)
+    encoder = ActionChannels(10)
     with pytest.raises(CompileError) as error:
-        custom_network(name).check(encoder, 10, encoder.example((14, 18)), 0)
+        custom_network(name).check(encoder, (14, 18), 0)
     (found,) = error.value.diagnostics
     assert found.code == "PD625"
     assert said in " ".join([found.message, *found.notes, *found.helps])

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from powderdsl.worldmodel.networks import UNet, fresh_unet
-from powderdsl.worldmodel.scores import Table, elements_of, frequent, outcomes, score, still
+from powderdsl.worldmodel.scores import baseline, elements_of, frequent, outcomes, score, still
 
 START = torch.tensor([[[0, 0, 1, 1], [2, 2, 2, 0]]], dtype=torch.uint8)
 END = torch.tensor([[[0, 1, 1, 1], [2, 0, 2, 0]]], dtype=torch.uint8)
@@ -52,7 +52,7 @@ def test_no_other_chance_that_cells_stay_does_better() -> None:
     best = score(still(counts, ids=(0, 1, 2)), PAIRS, 4).loss
     for stays in (0.70, 0.74, 0.76, 0.80):
         chances = torch.full((3, 3), (1 - stays) / 2, dtype=torch.float64).fill_diagonal_(stays)
-        assert score(Table(chances), PAIRS, 3).loss > best
+        assert score(baseline(chances), PAIRS, 3).loss > best
 
 
 def test_a_network_is_scored_as_torch_would() -> None:

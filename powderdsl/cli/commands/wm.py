@@ -254,7 +254,7 @@ def _show(found: list[Strip], rules: Ruleset, out: Path, scale: int) -> None:
 
     write_png(out, sheet(found, rules, factor=scale))
     for number, strip in enumerate(found, 1):
-        click.echo(f"{number}  {strip.name}: {strip.wrong:,} of {strip.truth.size:,} cells wrong")
+        click.echo(f"{number}  {strip.name}: {strip.wrong.sum():,} of {strip.truth.size:,} cells wrong")
 
 
 def tested_on(values: Mapping[str, Any]) -> dict[str, Any]:
