@@ -60,10 +60,20 @@ class Face:
     render_scale: int
     _spec: EnvSpec | None = None
 
-    def _show(self, mode: str | None, factor: int) -> None:
-        if mode is not None and mode not in RENDER_MODES:
-            raise ValueError(f"render_mode is one of {', '.join(RENDER_MODES)}; found {mode!r}")
-        self.render_mode, self.render_scale = mode, factor
+    def _show(self, task: Any, how: Mapping[str, Any], **fixed: Any) -> None:
+        """Make the environment for tensors; `how` and `fixed` are its arguments, the spec has those of `how`."""
+        how = {"render_mode": None, "render_scale": 8, "actions": "multidiscrete", **how}
+        rest = {**how, **fixed}
+        self.render_mode, self.render_scale = rest.pop("render_mode"), rest.pop("render_scale")
+        if self.render_mode not in (None, *RENDER_MODES):
+            raise ValueError(f"render_mode is one of {', '.join(RENDER_MODES)}; found {self.render_mode!r}")
+        self.tensors = TensorEnv(task, **rest)
+        self.spec = EnvSpec(
+            env_id(self.tensors.task.name),
+            entry_point="powderdsl.envs.gym:PowderEnv",
+            vector_entry_point="powderdsl.envs.gym:PowderVectorEnv",
+            kwargs={"task": task, **how},
+        )
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -74,15 +84,6 @@ class Face:
     def spec(self, value: EnvSpec | None) -> None:
         limit = self.tensors.max_episode_steps
         self._spec = None if value is None else replace(value, max_episode_steps=limit)
-
-    def spec_of(self, task: Any, how: Mapping[str, Any]) -> EnvSpec:
-        """The spec of an environment that was made directly; `how` are its arguments."""
-        return EnvSpec(
-            env_id(self.tensors.task.name),
-            entry_point="powderdsl.envs.gym:PowderEnv",
-            vector_entry_point="powderdsl.envs.gym:PowderVectorEnv",
-            kwargs={"task": task, **how},
-        )
 
     def frames(self, mode: str) -> tuple[Any, ...]:
         """A picture of each world, uint8 [H·factor, W·factor, 3], or its rows as text."""
@@ -114,15 +115,10 @@ class PowderVectorEnv(Face, VectorEnv[Any, Any, Any]):
         task: str | Path | Task | TaskProgram,
         num_envs: int = 1,
         *,
-        render_mode: str | None = None,
-        render_scale: int = 8,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        actions: str = "multidiscrete",
         **how: Any,
     ):
-        self._show(render_mode, render_scale)
-        how |= {"autoreset_mode": autoreset_mode, "actions": actions}
-        self.tensors = TensorEnv(task, num_envs, **how)
+        self._show(task, {"num_envs": num_envs, "autoreset_mode": autoreset_mode, **how})
         self.num_envs = num_envs
         self.autoreset_mode = self.tensors.autoreset_mode
         self.metadata = {
@@ -134,8 +130,6 @@ class PowderVectorEnv(Face, VectorEnv[Any, Any, Any]):
         self.single_action_space = self.tensors.single_action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        shown = {"render_mode": render_mode, "render_scale": render_scale}
-        self.spec = self.spec_of(task, {"num_envs": num_envs, **shown, **how})
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -176,23 +170,11 @@ class PowderEnv(Face, gymnasium.Env[Array, Any], EzPickle):
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 15}  # noqa: RUF012 as Gymnasium declares it
 
-    def __init__(
-        self,
-        task: str | Path | Task | TaskProgram,
-        *,
-        render_mode: str | None = None,
-        render_scale: int = 8,
-        actions: str = "multidiscrete",
-        **how: Any,
-    ):
-        how["actions"] = actions
-        shown = {"render_mode": render_mode, "render_scale": render_scale}
-        EzPickle.__init__(self, task, **shown, **how)
-        self._show(render_mode, render_scale)
-        self.tensors = TensorEnv(task, 1, autoreset_mode="disabled", **how)
+    def __init__(self, task: str | Path | Task | TaskProgram, **how: Any):
+        EzPickle.__init__(self, task, **how)
+        self._show(task, how, autoreset_mode="disabled")
         self.observation_space = self.tensors.observation.space
         self.action_space = self.tensors.single_action_space
-        self.spec = self.spec_of(task, {**shown, **how})
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -13,7 +13,6 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
 from powderdsl.envs.gym import Face, array, arrays
-from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.tasks.episodes import TaskProgram
 from powderdsl.tasks.task import Task
 
@@ -33,22 +32,10 @@ class PowderVecEnv(Face, VecEnv):
         render_mode: ``rgb_array`` or ``ansi``. render_scale: pixels along a cell's side.
     """
 
-    def __init__(
-        self,
-        task: str | Path | Task | TaskProgram,
-        num_envs: int = 1,
-        *,
-        render_mode: str | None = None,
-        render_scale: int = 8,
-        actions: str = "multidiscrete",
-        **how: Any,
-    ):
-        self._show(render_mode, render_scale)
-        self.tensors = TensorEnv(task, num_envs, autoreset_mode="same_step", actions=actions, **how)
+    def __init__(self, task: str | Path | Task | TaskProgram, num_envs: int = 1, **how: Any):
+        self._show(task, how, num_envs=num_envs, autoreset_mode="same_step")
         self._actions: Any = None
         self._began = time.time()
-        how["actions"] = actions
-        self.spec = self.spec_of(task, how)
         super().__init__(num_envs, self.tensors.observation.space, self.tensors.single_action_space)
 
     def reset(self) -> Array:
