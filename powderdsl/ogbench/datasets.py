@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -22,16 +23,6 @@ ROWS = ("observations", "actions", "terminals")
 """The arrays of a file; rows of all episodes, one after the other."""
 
 Dataset = dict[str, NDArray[Any]]
-
-
-def split_name(name: str) -> tuple[str, str]:
-    """The level and the kind of data of ``powderworld-easy-play-v0``. Raises ValueError for other names."""
-    parts = name.split("-")
-    levels = shipped_levels()
-    if len(parts) == 4 and parts[0] == FAMILY and parts[1] in levels and parts[2] and parts[3] == VERSION:
-        return parts[1], parts[2]
-    known = [f"{FAMILY}-{level}-play-{VERSION}" for level in levels]
-    raise ValueError("; ".join([f"no data set named {name!r}", *suggest(name, known, "data sets")]))
 
 
 def make_env_and_datasets(
@@ -63,7 +54,13 @@ def make_env_and_datasets(
     Raises:
         ValueError: an unknown name, or a file that is not such a data set. FileNotFoundError: there is no such file.
     """
-    level, _ = split_name(dataset_name)
+    levels = shipped_levels()
+    named = re.fullmatch(rf"{FAMILY}-({'|'.join(levels)})-[^-]+-{VERSION}", dataset_name)
+    if named is None:
+        known = [f"{FAMILY}-{name}-play-{VERSION}" for name in levels]
+        helps = suggest(dataset_name, known, "data sets")
+        raise ValueError("; ".join([f"no data set named {dataset_name!r}", *helps]))
+    level = named[1]
     env = None
     if env_only or not dataset_only:
         spec = gymnasium.spec(f"powderdsl/{FAMILY}-{level}-{VERSION}")
