@@ -95,8 +95,17 @@ def command(
             programs=[read_program(file) for file in programs],
             **measurement,
         )
-    with user_values() if plan.programs else nullcontext():
-        report, interrupt = _measured(plan)
+    machine, figures = this_machine(plan.device), list[CellFigures]()
+    interrupt: KeyboardInterrupt | None = None
+    parts = len(plan.cells) * (1 + plan.rounds + plan.profile)
+    with user_values() if plan.programs else nullcontext(), progress("bench", parts) as show:
+        try:
+            for done, (what, cell) in enumerate(measuring(plan, figures)):
+                show(done, f"{what} {cell}")
+        except KeyboardInterrupt as caught:  # what was measured until then is shown
+            interrupt = caught
+    measured = tuple(cell for cell in figures if cell.round_seconds)
+    report = Report(plan, machine, measured, interrupt is not None)
     if printed:
         print_json(report_data(report))
     else:
@@ -117,18 +126,3 @@ def _usual_backends(device: str) -> tuple[str, ...]:
         click.echo(f"without the backend `native`: {error}", err=True)
         return (first,)
     return (first, "native")
-
-
-def _measured(plan: Plan) -> tuple[Report, KeyboardInterrupt | None]:
-    """The report of a plan, or of the part that was done when Ctrl-C or another signal came."""
-    machine = this_machine(plan.device)
-    figures: list[CellFigures] = []
-    interrupt: KeyboardInterrupt | None = None
-    try:
-        with progress("bench", len(plan.cells) * (1 + plan.rounds + plan.profile)) as show:
-            for done, (what, cell) in enumerate(measuring(plan, figures)):
-                show(done, f"{what} {cell}")
-    except KeyboardInterrupt as caught:
-        interrupt = caught
-    measured = tuple(cell for cell in figures if cell.round_seconds)
-    return Report(plan, machine, measured, interrupt is not None), interrupt
