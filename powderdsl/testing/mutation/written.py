@@ -60,7 +60,8 @@ def written_test(
     before, wanted = found.sample.ids[0], found.first["element"][0]
     there = [e for e in ruleset.elements if e.id in np.unique([*before.ravel(), *wanted.ravel()])]
     glyphs, legend = _legend(there, ruleset, packs, mutant.pack)
-    name = f"{GENERATED}{_digest(mutant.key)} against {mutant.operator} in {_where(mutant)}"
+    digest = hashlib.sha256(re.sub(r":\d+", "", mutant.key).encode()).hexdigest()[:6]
+    name = f"{GENERATED}{digest} against {mutant.operator} in {_where(mutant)}"
     lines = [f"- {name}:"]
     if legend:
         quoted = [(glyph if glyph.isalpha() else f'"{glyph}"', element) for glyph, element in legend]
@@ -113,10 +114,6 @@ def _known(field: str, ruleset: Ruleset, needed: frozenset[str]) -> str:
 
 def _drawn(ids: np.ndarray, glyphs: dict[int, str]) -> list[str]:
     return ["      " + " ".join(glyphs[number] for number in row) for row in ids.tolist()]
-
-
-def _digest(key: str) -> str:
-    return hashlib.sha256(re.sub(r":\d+", "", key).encode()).hexdigest()[:6]
 
 
 def _where(mutant: Mutant) -> str:

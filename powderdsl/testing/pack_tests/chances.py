@@ -13,12 +13,12 @@ from dataclasses import replace
 from math import ceil, log, prod
 from typing import TYPE_CHECKING
 
-from powderdsl.arrays import NDArray, np
 from powderdsl.model import reference
+from powderdsl.model.text import one_line
 from powderdsl.model.types import Expr, Often
 
 if TYPE_CHECKING:
-    from powderdsl.simulation.any_arrays import AnyWorld, W
+    from powderdsl.simulation.any_arrays import AnyWorld
 
 ERROR_RATE = 1e-6
 """How likely a correct chance fails a test, at most; and how likely one passes that is off by `OFF`."""
@@ -54,14 +54,12 @@ def trials_for(chance: float) -> int:
     small = min(chance, 1 - chance)
     if small <= 0:
         return 1 << 16
-    return max(_trials_between(chance, chance + side * OFF * small) for side in (1, -1))
-
-
-def _trials_between(first: float, second: float) -> int:
-    """The trials after which some share is too unlikely for the first chance or for the second, whatever it is."""
-    hits, misses = log(first / second), log((1 - first) / (1 - second))
-    middle = misses / (misses - hits)  # the share that is equally unlike both
-    return ceil(log(2 / ERROR_RATE) / divergence(middle, first))
+    needed = []
+    for other in (chance + OFF * small, chance - OFF * small):
+        hits, misses = log(chance / other), log((1 - chance) / (1 - other))
+        middle = misses / (misses - hits)  # the share that is equally unlike both
+        needed.append(ceil(log(2 / ERROR_RATE) / divergence(middle, chance)))
+    return max(needed)
 
 
 def chance_problem(start: AnyWorld, steps: int, claims: Sequence[Often], seed: int) -> str:
@@ -71,17 +69,21 @@ def chance_problem(start: AnyWorld, steps: int, claims: Sequence[Often], seed: i
         start: one world.
         seed: of all copies; each has an index of its own.
     """
-    chosen = [(claim, _cells(claim, start)) for claim in claims]
+    chosen = [
+        (claim, reference.evaluate(claim.before, world_context(start, claim.before))[0]) for claim in claims
+    ]
     for claim, cells in chosen:
         if not cells.any():
-            return f"no cell of the start world is as `{_words(claim)}` says"
+            return f"no cell of the start world is as `{one_line(claim.span)}` says"
     cells_of_one = prod(start.shape)
     most = max(1, MOST // (cells_of_one * max(steps, 1)))
     copies = min(most, max(ceil(trials_for(float(c.chance)) / int(cells.sum())) for c, cells in chosen))
     hits = [0] * len(chosen)
-    chunk = max(1, CHUNK // cells_of_one)
+    chunk, put = max(1, CHUNK // cells_of_one), start.sim.kind.put
     for first in range(0, copies, chunk):
-        world = _copies(start, first, min(chunk, copies - first), seed)
+        index = [*range(first, min(first + chunk, copies))]  # by which each copy has luck of its own
+        world = start.select(put([0] * len(index), "int64"))
+        world = replace(world, index=put(index, "int64"), seed=put([seed] * len(index), "int64"))
         world = world.sim.step(world, steps=steps)
         at = world_context(world, *(claim.after for claim in claims))
         for number, (claim, cells) in enumerate(chosen):
@@ -90,28 +92,10 @@ def chance_problem(start: AnyWorld, steps: int, claims: Sequence[Often], seed: i
         trials = copies * int(cells.sum())
         if is_unlikely(found, trials, float(claim.chance)):
             return (
-                f"`{_words(claim)}` came true {found:,} times in {trials:,}, {100 * found / trials:.3g} %,"
+                f"`{one_line(claim.span)}` came true {found:,} times in {trials:,}, {100 * found / trials:.3g} %,"
                 f" not {100 * float(claim.chance):g} %: luck does that less than once in a million times"
             )
     return ""
-
-
-def _words(claim: Often) -> str:
-    return " ".join(claim.span.text.split())
-
-
-def _cells(claim: Often, start: AnyWorld) -> NDArray[np.bool_]:
-    """The cells [H, W] of the start world that the claim is about."""
-    holds: NDArray[np.bool_] = reference.evaluate(claim.before, world_context(start, claim.before))[0]
-    return holds
-
-
-def _copies(start: W, first: int, count: int, seed: int) -> W:
-    """The world many times over, each with another index and so with luck of its own."""
-    put = start.sim.kind.put
-    many = start.select(put([0] * count, "int64"))
-    index, seeds = put([*range(first, first + count)], "int64"), put([seed] * count, "int64")
-    return replace(many, index=index, seed=seeds)
 
 
 def world_context(world: AnyWorld, *conditions: Expr) -> reference.Context:

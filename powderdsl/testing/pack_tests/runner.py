@@ -124,9 +124,17 @@ def _passing(ruleset: Ruleset | None, places: Collection[Span], sim: AnySimulato
 
 def start_of(example: Example, sim: AnySimulator[W], seed: int) -> W:
     """The start world of a test, one of a seed."""
-    ids = _ids(example, sim.ruleset)
-    grid = np.array([[[ids[char] for char in row] for row in example.given]], dtype=np.uint8)
-    return with_fields(sim.world(grid, seed=[seed]), [example])
+    return _started([(example, seed)], sim)
+
+
+def _started(worlds: Sequence[tuple[Example, int]], sim: AnySimulator[W]) -> W:
+    """The start worlds of some tests of one size, with a seed each."""
+    grids = []
+    for example, _ in worlds:
+        ids = _ids(example, sim.ruleset)
+        grids.append([[ids[char] for char in row] for row in example.given])
+    world = sim.world(np.array(grids, dtype=np.uint8), seed=[seed for _, seed in worlds])
+    return with_fields(world, [example for example, _ in worlds])
 
 
 def _ids(example: Example, ruleset: Ruleset) -> dict[str, int]:
@@ -197,11 +205,7 @@ def _run(
     batch: list[_Running], sim: AnySimulator[Any], seen: Callable[[Any], None] | None
 ) -> list[ExampleResult]:
     """Tests of one size, all at once: each has a slice of the batch."""
-    grids = [
-        [[one.ids[char] for char in row] for row in one.example.given] for one in batch for _ in one.seeds
-    ]
-    world = sim.world(np.array(grids, dtype=np.uint8), seed=[seed for one in batch for seed in one.seeds])
-    world = with_fields(world, [one.example for one in batch for _ in one.seeds])
+    world = _started([(one.example, seed) for one in batch for seed in one.seeds], sim)
     ends = list(accumulate(len(one.seeds) for one in batch))
     results: dict[int, ExampleResult] = {}
     now = 0
@@ -277,7 +281,9 @@ def field_problem(grid: FieldGrid, world: AnyWorld) -> tuple[int, str] | None:
             if cell is None:
                 counts[:, row, column] = False
             elif cell:
-                low[..., row, column], high[..., row, column] = _ends(cell, found.ndim == 4)
+                ends = np.moveaxis(np.array(cell, float), 0, -1)  # [2, components]
+                ends = ends if found.ndim == 4 else ends[:, 0]
+                low[..., row, column], high[..., row, column] = ends
     wrong = (found < low) | (found > high)
     wrong = (wrong.any(axis=1) if wrong.ndim == 4 else wrong) & counts
     if not wrong.any():
@@ -289,12 +295,6 @@ def field_problem(grid: FieldGrid, world: AnyWorld) -> tuple[int, str] | None:
         index,
         f"row {row}, column {column} is {_word(world.sim.ruleset, slot.kind, found[here])}, not {wanted}",
     )
-
-
-def _ends(cell: Cell, vector: bool) -> NDArray[Any]:
-    """The lowest and the highest value that a cell allows, [2], or [2, components] of a vector."""
-    ends = np.moveaxis(np.array(cell, float), 0, -1)
-    return ends if vector else ends[:, 0]
 
 
 def field_rows(name: str, world: AnyWorld, index: int) -> tuple[str, ...]:

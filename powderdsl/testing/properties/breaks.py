@@ -86,13 +86,18 @@ def breaks(claim: Tested, runs: Runs, sample: Start, steps: int) -> Breaks:
     """Run the worlds and look."""
     match claim:
         case Local():
-            return _breaks_of(_local(claim, runs, sample)[None])
+            other, mask = touched(runs.ruleset, sample)
+            first, second = (runs.states(start, 1)[-1] for start in (sample, other))
+            return _breaks_of((differences(first, second) & ~near(mask, claim.radius))[None])
         case Symmetric():
             return _breaks_of(_symmetric(claim, runs, sample)[None])
         case Alike():
             return _breaks_of(_alike(claim, runs, sample)[None])
         case Agreement():
-            return _agreement(runs, sample, steps)
+            pairs = zip(
+                runs.states(sample, steps), reference_states(runs.ruleset, sample, steps), strict=True
+            )
+            return _breaks_of(np.stack([differences(a, b) for a, b in pairs][1:]))
     return look(claim, runs.ruleset, sample, runs.states(sample, steps))
 
 
@@ -119,9 +124,14 @@ def look(claim: Tested, ruleset: Ruleset, sample: Start, states: list[State]) ->
             ]
             return _never(claim.steps, held)
         case Bounded():
-            return _never(1, [_outside(_field(ruleset, claim.field, state), claim) for state in states])
+            fields = [_field(ruleset, claim.field, state) for state in states]
+            outside = [np.asarray((values < claim.lo) | (values > claim.hi)) for values in fields]
+            return _never(1, [np.asarray(mask.any(1)) if mask.ndim == 4 else mask for mask in outside])
         case KnownIds():
-            return _breaks_of(np.stack([_unknown(ruleset, state) for state in states[1:]]))
+            known = [element.id for element in ruleset.elements]
+            named = [slot.name for slot in slots(ruleset) if slot.kind.name == "element"]
+            masks = [reduce(or_, [~np.isin(state[name], known) for name in named]) for state in states[1:]]
+            return _breaks_of(np.stack(masks))
     raise TypeError(f"{type(claim).__name__} needs more than one run")
 
 
@@ -171,17 +181,6 @@ def _field(ruleset: Ruleset, name: str, state: State) -> Array:
     return property_table(ruleset, prop)[state["element"]]
 
 
-def _outside(values: Array, claim: Bounded) -> Array:
-    mask = np.asarray((values < claim.lo) | (values > claim.hi))
-    return np.asarray(mask.any(1)) if mask.ndim == 4 else mask
-
-
-def _unknown(ruleset: Ruleset, state: State) -> Array:
-    known = [element.id for element in ruleset.elements]
-    named = [slot.name for slot in slots(ruleset) if slot.kind.name == "element"]
-    return reduce(or_, [~np.isin(state[name], known) for name in named])
-
-
 # Claims about two runs
 
 
@@ -222,12 +221,6 @@ def near(mask: Array, radius: int) -> Array:
     return mask
 
 
-def _local(claim: Local, runs: Runs, sample: Start) -> Array:
-    other, mask = touched(runs.ruleset, sample)
-    first, second = (runs.states(one, 1)[-1] for one in (sample, other))
-    return differences(first, second) & ~near(mask, claim.radius)
-
-
 def draws_for(ruleset: Ruleset, sample: Start) -> dict[str, Array]:
     """Draws for all streams, by the worlds' seeds: float64 [B, H, W]."""
     height, width = sample.shape
@@ -264,9 +257,3 @@ def _alike(claim: Alike, runs: Runs, sample: Start) -> Array:
             mask = mask | (np.abs(a - b) > margin)
         masks.append(turned_back(mask, claim.turn))
     return np.stack(masks)
-
-
-def _agreement(runs: Runs, sample: Start, steps: int) -> Breaks:
-    found = runs.states(sample, steps)
-    wanted = reference_states(runs.ruleset, sample, steps)
-    return _breaks_of(np.stack([differences(a, b) for a, b in zip(found[1:], wanted[1:], strict=True)]))

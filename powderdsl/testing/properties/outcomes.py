@@ -141,21 +141,16 @@ def counterexample_lines(found: Counterexample, ruleset: Ruleset) -> Iterator[st
     names = {element.id: element.name for element in ruleset.elements}
     there = np.unique([found.before["element"], found.after["element"]]).tolist()
     yield ", ".join(f"{glyphs[number]} {names[number]}" for number in there if number in names)
-    yield from _field_lines(found, ruleset)
+    for slot in slots(ruleset):
+        values = found.sample.fields.get(slot.name)
+        if values is None or np.array_equal(values, fresh(ruleset, slot, found.sample.ids)):
+            continue  # as in fresh cells
+        text = " / ".join(" ".join(row) for row in field_words(ruleset, slot.kind, values[0]))
+        yield f"{slot.name}: {text if len(text) <= MAX_TEXT else f'{text[:MAX_TEXT]} …'}"
     for name, values in found.sample.params.items():
         yield f"{name} = {float(values[0]):g}"
     if found.sample.step.any():
         yield f"the clock says {int(found.sample.step[0])}"
-
-
-def _field_lines(found: Counterexample, ruleset: Ruleset) -> Iterator[str]:
-    """The fields that are not as in fresh cells, row by row, each value as a word."""
-    for slot in slots(ruleset):
-        values = found.sample.fields.get(slot.name)
-        if values is None or np.array_equal(values, fresh(ruleset, slot, found.sample.ids)):
-            continue
-        text = " / ".join(" ".join(row) for row in field_words(ruleset, slot.kind, values[0]))
-        yield f"{slot.name}: {text if len(text) <= MAX_TEXT else f'{text[:MAX_TEXT]} …'}"
 
 
 def picture(found: Counterexample, ruleset: Ruleset) -> Array:
