@@ -6,7 +6,6 @@ import copy
 import math
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from operator import index as integer
 from pathlib import Path
@@ -237,18 +236,13 @@ class Dataset:
         return self._shards[number]
 
 
-@dataclass(frozen=True)
-class _Episodes:
+class _Episodes(NamedTuple):
     """Some episodes of several datasets, int64 [n] each: the dataset's place, their numbers in it, worlds, actions."""
 
     source: Array
     number: Array
     world: Array
     length: Array
-
-    def where(self, mask: Array) -> _Episodes:
-        """Those that a mask, bool [n], selects."""
-        return _Episodes(self.source[mask], self.number[mask], self.world[mask], self.length[mask])
 
 
 class Transitions(torch.utils.data.Dataset[Batch]):
@@ -275,15 +269,11 @@ class Transitions(torch.utils.data.Dataset[Batch]):
         if length is not None:
             check_count("length", length, max(one.recipe.actions for one in self.datasets))
         self.length = length
-        parts = [one.lengths_and_worlds() for one in self.datasets]
-        self._select(
-            _Episodes(
-                np.repeat(np.arange(len(parts)), [len(one) for one, _ in parts]),
-                np.concatenate([np.arange(len(one)) for one, _ in parts]),
-                np.concatenate([world for _, world in parts]),
-                np.concatenate([one for one, _ in parts]),
-            )
-        )
+        parts = []
+        for number, one in enumerate(self.datasets):
+            lengths, worlds = one.lengths_and_worlds()
+            parts.append((np.full(len(lengths), number), np.arange(len(lengths)), worlds, lengths))
+        self._select(_Episodes(*map(np.concatenate, zip(*parts, strict=True))))
         if not len(self):
             raise ValueError(f"no episode has {length} actions; the longest has {self.episodes.length.max()}")
 
@@ -412,7 +402,7 @@ def split(
     parts = []
     for number in range(len(fractions)):
         selected = copy.copy(rows)
-        selected._select(episodes.where(part == number))
+        selected._select(_Episodes(*(column[part == number] for column in episodes)))
         if not len(selected):
             count = len(rows.worlds) if by == "world" else len(episodes.number)
             raise ValueError(f"part {number} would be empty: {count} {by}s are too few, or take another seed")

@@ -64,23 +64,18 @@ class ActionForm:
         """
         device = self.table.device
         if self.kind == "discrete":
-            return self.table[self._checked_values(actions).to(device)]
+            values = integer_tensor("actions", actions)
+            if values.ndim != 1:
+                raise ValueError(f"actions must have the shape [episodes], found {list(values.shape)}")
+            bad = ((values < 0) | (values >= self.nvec[0])).nonzero()
+            if len(bad):
+                place, most = int(bad[0]), self.nvec[0] - 1
+                raise ValueError(f"actions[{place}] is {int(values[place])}: it must lie in 0..{most}")
+            return self.table[values.to(device)]
         numbers = check_numbers(actions, self.nvec, self.names).to(device)
         if len(self.columns) == len(ACTION):
             return numbers
         return self.table.expand(len(numbers), -1).clone().index_copy_(1, self.columns, numbers)
-
-    def _checked_values(self, actions: Any) -> Tensor:
-        """Discrete actions from outside, int64 [B]."""
-        values = integer_tensor("actions", actions)
-        if values.ndim != 1:
-            raise ValueError(f"actions must have the shape [episodes], found {list(values.shape)}")
-        bad = (values < 0) | (values >= self.nvec[0])
-        if bool(bad.any()):
-            place = int(bad.nonzero()[0])
-            most = self.nvec[0] - 1
-            raise ValueError(f"actions[{place}] is {int(values[place])}: it must lie in 0..{most}")
-        return values
 
     def encode(self, numbers: Any) -> Tensor:
         """The actions in this form, int64 [B] or [B, k], that do the same as five numbers each, [B, 5].

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from filelock import FileLock, Timeout
 
@@ -160,15 +160,22 @@ def read_metrics(folder: Path) -> Iterator[dict[str, Any]]:
                     yield line
 
 
-def mean_and_interval(values: Sequence[float]) -> tuple[float, float | None]:
-    """The mean, and half of its 95 % interval by Student's t; None for a single value."""
+class Estimate(NamedTuple):
+    """A mean, and half of its 95 % interval; None for a single value."""
+
+    mean: float
+    interval: float | None
+
+
+def mean_and_interval(values: Sequence[float]) -> Estimate:
+    """The mean, and half of its 95 % interval by Student's t."""
     mean, freedom = statistics.fmean(values), len(values) - 1
     if freedom < 1:
-        return mean, None
+        return Estimate(mean, None)
     # Beyond the table: the expansion of Cornish and Fisher, exact to four digits.
     expansion = 1.95996 + 2.37227 / freedom + 2.8225 / freedom**2 + 2.5557 / freedom**3
     quantile = T_975[freedom - 1] if freedom <= len(T_975) else expansion
-    return mean, quantile * statistics.stdev(values) / math.sqrt(len(values))
+    return Estimate(mean, quantile * statistics.stdev(values) / math.sqrt(len(values)))
 
 
 # Folders

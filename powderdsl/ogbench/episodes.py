@@ -239,7 +239,11 @@ class Episodes:
         self.program, self.level, self.mode = program, program.level, mode
         self.seeds = np.array(seeds, dtype=np.int64)
         self.count = count = len(self.seeds)
-        self._draws = self._made(randomness)
+        if randomness == "counter":
+            randomness = Draws(self.seeds)
+        elif isinstance(randomness, str):
+            randomness = LegacyDraws(self.seeds, len(program.streams), self.level.side)
+        self._draws = randomness
         side, device = self.level.side, program.device
         self.episode = np.full(count, -1, dtype=np.int64)
         """The number of each environment's episode."""
@@ -259,13 +263,6 @@ class Episodes:
         self.goal_pictures = torch.zeros(count, side, side, 3, dtype=torch.uint8, device=device)
         self._goals: dict[tuple[int, GoalTask], Goal] = {}
         self._columns = torch.arange(side, device=device)
-
-    def _made(self, randomness: str | Draws) -> Draws:
-        if not isinstance(randomness, str):
-            return randomness
-        if randomness == "counter":
-            return Draws(self.seeds)
-        return LegacyDraws(self.seeds, len(self.program.streams), self.level.side)
 
     def seed(self, which: Numbers, seeds: Numbers) -> None:
         """Give environments new seeds, int64 [n]; their next episode has the number 0."""

@@ -13,7 +13,7 @@ from torch import Tensor
 from powderdsl.envs.acting import FrameStack, Policy, action_keys, random_policy
 from powderdsl.envs.observations import observation_of
 from powderdsl.envs.tensor_env import TensorEnv
-from powderdsl.experiments.runs import RunFolder, find_run, mean_and_interval, write_json
+from powderdsl.experiments.runs import Estimate, RunFolder, find_run, mean_and_interval, write_json
 from powderdsl.rl.config import BASELINES, TrainConfig, chosen_policies
 from powderdsl.rl.policies import TrainedPolicy, config_of, load_policy, task_of
 from powderdsl.tasks.episodes import TaskProgram, compile_task
@@ -56,8 +56,8 @@ class Score:
     interval: float | None
     success: float | None
     length: float
-    above: Mapping[str, tuple[float, float | None]]
-    normalized: tuple[float, float | None] | None = None
+    above: Mapping[str, Estimate]
+    normalized: Estimate | None = None
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Seen:
     means and intervals of policies without them."""
 
     worlds: int
-    without: Mapping[str, tuple[float, float | None]]
+    without: Mapping[str, Estimate]
 
 
 @dataclass(frozen=True)
@@ -90,22 +90,19 @@ class Evaluation:
         splits: dict[str, dict[str, Any]] = {}
         for score in self.scores:
             numbers = {name: value for name, value in vars(score).items() if name not in ("split", "policy")}
-            numbers["above"] = _plain(score.above)
+            numbers["above"] = {other: estimate._asdict() for other, estimate in score.above.items()}
             if score.normalized is not None:
-                numbers["normalized"] = dict(zip(ESTIMATE, score.normalized, strict=True))
+                numbers["normalized"] = score.normalized._asdict()
             splits.setdefault(score.split, {})[score.policy] = numbers
         seen = {
-            split: {"worlds": one.worlds, "without": _plain(one.without)} for split, one in self.seen.items()
+            split: {
+                "worlds": one.worlds,
+                "without": {policy: estimate._asdict() for policy, estimate in one.without.items()},
+            }
+            for split, one in self.seen.items()
         }
         about = {name: value for name, value in vars(self).items() if name != "scores"}
         return {**about, "seen": seen, "splits": splits}
-
-
-ESTIMATE = ("mean", "interval")
-
-
-def _plain(estimates: Mapping[str, tuple[float, float | None]]) -> dict[str, dict[str, float | None]]:
-    return {name: dict(zip(ESTIMATE, estimate, strict=True)) for name, estimate in estimates.items()}
 
 
 def play(
@@ -300,11 +297,11 @@ def _score(split: str, policy: str, all_played: Mapping[str, Played], task: Task
     )
 
 
-def _ratio(values: Tensor, scale: Tensor) -> tuple[float, float | None] | None:
+def _ratio(values: Tensor, scale: Tensor) -> Estimate | None:
     """The ratio of two means of the same worlds, and half of its 95 % interval; None unless the second is positive."""
     whole = float(scale.mean())
     if whole <= 0:
         return None
     ratio = float(values.mean()) / whole
     _, half = mean_and_interval((values - ratio * scale).tolist())
-    return ratio, None if half is None else half / whole
+    return Estimate(ratio, None if half is None else half / whole)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from itertools import combinations
 from typing import Any
 
@@ -77,6 +76,7 @@ class RulesetSource:
         reporter.raise_if_errors()
         self.variety, self.params, self.palette = variety, params or {}, palette
         self.base = self._checked(self.packs)
+        self._models = {Drawn(0).structure: self.base}
         self.palette = palette or self.base.palette  # ids stay where they are when packs are left out
         check_properties(self.base, variety.swaps)
 
@@ -95,16 +95,12 @@ class RulesetSource:
 
     def model(self, drawn: Drawn) -> Ruleset:
         """The checked model of a ruleset, with the base's parameters. Raises CompileError for inconsistent rules."""
-        return self._model(drawn.left_out, drawn.swapped)
-
-    @lru_cache(maxsize=256)  # noqa: B019  a source lives as long as what it has checked
-    def _model(self, left_out: tuple[str, ...], swapped: tuple[tuple[str, str, str], ...]) -> Ruleset:
-        if not left_out and not swapped:
-            return self.base
-        packs = [pack for pack in self.packs if pack.name.text not in left_out]
-        for prop, first, second in swapped:
-            packs = _exchanged(packs, prop, first, second)
-        return self._checked(packs)
+        if drawn.structure not in self._models:
+            packs = [pack for pack in self.packs if pack.name.text not in drawn.left_out]
+            for prop, first, second in drawn.swapped:
+                packs = _exchanged(packs, prop, first, second)
+            self._models[drawn.structure] = self._checked(packs)
+        return self._models[drawn.structure]
 
     def _checked(self, packs: Sequence[PackDecl]) -> Ruleset:
         reporter = Reporter()

@@ -169,23 +169,18 @@ class Comparison:
         """A choice of which only one branch is ever taken, a movement in which nothing moves."""
         if a.op == "select":
             condition, yes, no = a.args
-            return (self.never(condition) and self.equal(no, b)) or (
-                self.always(condition) and self.equal(yes, b)
+            return (self.is_always(condition, 0) and self.equal(no, b)) or (
+                self.is_always(condition, 1) and self.equal(yes, b)
             )
         if a.op in ("swap", "arrive"):
-            return self.never(a.args[1]) and self.equal(a.args[2], b)
+            return self.is_always(a.args[1], 0) and self.equal(a.args[2], b)
         return False
 
-    def never(self, flag: Node) -> bool:
-        """Whether a flag is false everywhere."""
-        return self._holds(flag, lambda value: not value.any())
-
-    def always(self, flag: Node) -> bool:
-        """Whether a flag is true everywhere."""
-        return self._holds(flag, lambda value: bool(value.all()))
-
-    def _holds(self, flag: Node, question: Callable[[Array], bool]) -> bool:
-        return self._decided((flag,), lambda case: question(case.value(flag, (0, 0))[case.valid]))
+    def is_always(self, flag: Node, value: int) -> bool:
+        """Whether a flag is this, 0 or 1, everywhere."""
+        return self._decided(
+            (flag,), lambda case: bool((case.value(flag, (0, 0)) == value)[case.valid].all())
+        )
 
     def _tried(self, a: Node, b: Node) -> bool:
         if REAL in (a.type, b.type):
