@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 _FRONT = ("arrays", "diagnostics", "system", "syntax", "model")
 _COMPILER = (*_FRONT, "analysis", "ir", "ir.stages", "ir.lower", "schedule", "compiler")
-_TARGETS = ("targets", "targets.torch", "targets.cpp", "targets.machine", "targets.wasm", "targets.cuda")
+_TARGETS = ("targets", "targets.torch", "targets.cpp", "targets.wasm", "targets.cuda")
 _BACK = (*_COMPILER, "model.reference", *_TARGETS)
 _STEPS = (
     "simulation.draw",
@@ -61,8 +61,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "targets": ("arrays", "diagnostics", "system", "ir", "schedule"),  # what targets share; never the model
     "targets.torch": ("diagnostics", "system", "ir", "schedule", "targets"),
     "targets.cpp": ("diagnostics", "system", "ir", "schedule", "targets", "targets.torch"),
-    "targets.machine": ("system", "ir", "schedule", "targets"),
-    "targets.wasm": ("diagnostics", "system", "ir", "schedule", "targets", "targets.machine"),
+    "targets.wasm": ("diagnostics", "system", "ir", "schedule", "targets"),
     "targets.cuda": ("diagnostics", "system", "ir", "schedule", "targets", "targets.torch", "targets.cpp"),
     "compiler": _COMPILER[:-1],
     "simulation": (),

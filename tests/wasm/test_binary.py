@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 import wasmtime
 
-from powderdsl.targets.machine.functions import Function, Module, Value, const, load, op, vector
 from powderdsl.targets.wasm.binary import function_code, module_code, signed, unsigned
+from powderdsl.targets.wasm.functions import Function, Module, Value, const, load, op, vector
 from powderdsl.targets.wasm.listing import listing
 
 
@@ -71,7 +71,7 @@ def test_operators() -> None:
 def test_vectors() -> None:
     octets = bytes(range(16))
     low = int.from_bytes(octets[:8], "little")
-    word = op("i64x2.extract_lane", op("i64x2.shr_u", vector(octets), const("i32", 8)), attr=0)
+    word = op("i64x2.extract_lane", vector(octets) >> 8, attr=0)
     assert value_of(word) == low >> 8
     high = op("i64x2.extract_lane", vector(octets), attr=1)
     assert value_of(high) == int.from_bytes(octets[8:], "little")

@@ -134,8 +134,8 @@ def _kernels(program: Program, backend: str, pass_name: str | None) -> Iterator[
 
             yield cuda_source(part.planes, 64, 64, SHOWN_SHARED).text
         else:
-            from powderdsl.targets.machine.passes import pass_function_name
             from powderdsl.targets.wasm.listing import listing
+            from powderdsl.targets.wasm.passes import pass_function_name
             from powderdsl.targets.wasm.source import wasm_module
 
             chosen = None if pass_name is None else pass_function_name(pass_name)

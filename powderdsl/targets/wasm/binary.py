@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from itertools import groupby
 from typing import Any
 
-from powderdsl.targets.machine.functions import Function, Module, Statement, Value
+from powderdsl.targets.wasm.functions import Function, Module, Statement, Value
 
 TYPES = {"i32": 0x7F, "i64": 0x7E, "f32": 0x7D, "f64": 0x7C, "v128": 0x7B}
 
@@ -166,11 +166,7 @@ def _immediates(name: str, attr: Any) -> bytes:
     if rest == "const":
         if kind in ("i32", "i64"):
             return signed(attr)
-        return (
-            attr * (16 // len(attr)) if kind == "v128" else struct.pack("<f" if kind == "f32" else "<d", attr)
-        )
-    if name == "i8x16.shuffle":
-        return bytes(attr)
+        return attr if kind == "v128" else struct.pack("<f" if kind == "f32" else "<d", attr)
     if name in ALIGNMENTS:
         return bytes([ALIGNMENTS[name]]) + unsigned(attr)
     return unsigned(attr)

@@ -6,8 +6,8 @@ import struct
 from itertools import groupby
 from typing import Any
 
-from powderdsl.targets.machine.functions import Function, Module
 from powderdsl.targets.wasm.binary import instructions
+from powderdsl.targets.wasm.functions import Function, Module
 
 
 def listing(module: Module, only: str | None = None) -> str:
@@ -38,9 +38,7 @@ def _operands(name: str, attr: Any, names: list[str]) -> str:
     if name == "call":
         return f" ${names[attr.index]}"
     if name == "v128.const":
-        return " i32x4 " + " ".join(f"{part:#x}" for part in struct.unpack("<4I", attr * (16 // len(attr))))
+        return " i32x4 " + " ".join(f"{part:#x}" for part in struct.unpack("<4I", attr))
     if rest.startswith(("load", "store")):
         return f" offset={attr}"
-    if name == "i8x16.shuffle":
-        return "".join(f" {octet}" for octet in attr)
     return "" if attr is None else f" {attr}"

@@ -13,12 +13,12 @@ from powderdsl.schedule.stages import CPU, plan
 from powderdsl.schedule.types import Schedule
 from powderdsl.system.memo import Memo, collection_paused
 from powderdsl.targets.layout import Layout, layout_of
-from powderdsl.targets.machine.functions import Module
-from powderdsl.targets.machine.library import PAGE, Library
-from powderdsl.targets.machine.memory import Memory, extent_of
-from powderdsl.targets.machine.passes import pass_function
 from powderdsl.targets.wasm.binary import function_code, module_code
 from powderdsl.targets.wasm.driver import add_driver
+from powderdsl.targets.wasm.functions import Module
+from powderdsl.targets.wasm.library import PAGE, Library
+from powderdsl.targets.wasm.memory import Memory, extent_of
+from powderdsl.targets.wasm.passes import pass_function
 from powderdsl.targets.wasm.standalone import Face, Standalone
 
 PAGES = 1 << 15

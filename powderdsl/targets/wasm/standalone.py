@@ -26,9 +26,9 @@ from dataclasses import dataclass
 
 from powderdsl.ir.ops import Threshold
 from powderdsl.targets.codec import Piece
-from powderdsl.targets.machine.functions import Callee, Function, Local, Value, const, load, op
-from powderdsl.targets.machine.library import PAGE, ZERO, Library, either, word
-from powderdsl.targets.machine.memory import HEADER, aligned
+from powderdsl.targets.wasm.functions import Callee, Function, Local, Value, const, load, op
+from powderdsl.targets.wasm.library import PAGE, ZERO, Library, either, word
+from powderdsl.targets.wasm.memory import HEADER, aligned
 from powderdsl.targets.wasm.transfer import Transfer
 
 Box = tuple[Local, Local, Local, Local]

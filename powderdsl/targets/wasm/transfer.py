@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from powderdsl.targets.machine.batches import Batches
-from powderdsl.targets.machine.functions import Function, Local, Value, const, load, op, vector
-from powderdsl.targets.machine.library import ZERO, counted, either, splat, word
-from powderdsl.targets.machine.memory import HEADER, SOME
+from powderdsl.targets.wasm.batches import Batches
+from powderdsl.targets.wasm.functions import Function, Local, Value, const, load, op, vector
+from powderdsl.targets.wasm.library import ZERO, counted, either, splat, word
+from powderdsl.targets.wasm.memory import HEADER, SOME, WORD
 
-WORD = 64
 WEIGHTS = bytes(1 << i for i in range(8)) * 2
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from powderdsl.targets.machine.functions import Callee, Function, Local, Value, const, load, op
-from powderdsl.targets.machine.library import ZERO, Library, either, word
-from powderdsl.targets.machine.memory import HEADER
+from powderdsl.targets.wasm.functions import Callee, Function, Local, Value, const, load, op
+from powderdsl.targets.wasm.library import ZERO, Library, either, word
+from powderdsl.targets.wasm.memory import HEADER, LANES
 
 WORLDS, GROUPS, NEXT, SIZE = 0, 4, 8, 12
 """Where a batch keeps its numbers."""
@@ -42,17 +42,15 @@ class Batches:
         library.trap_from(f, worlds, per_world + memory.group)
         library.trap_from(f, rows, 8 * memory.stride + memory.row)
         with f.when(library.world_rows.value.equals(0)):
-            lanes = memory.shape.lanes
-            even = (rows & lanes - 1).equals(0)
-            reachable = (rows >> lanes.bit_length() - 1) >= max(1, memory.extent.around)
-            few = (worlds < lanes // 2 + 1) | ((rows * memory.row) >= LARGE_PLANE)
+            even = (rows & 1).equals(0)
+            reachable = (rows >> 1) >= max(1, memory.extent.around)
+            few = worlds.equals(1) | ((rows * memory.row) >= LARGE_PLANE)
             f.do(setup(rows, even & reachable & few))
             f.otherwise()
             with f.when(op("i32.ne", library.world_rows.value, rows)):
                 f.trap()
-        lanes = memory.shape.lanes
-        groups = (worlds + (lanes - 1)) >> lanes.bit_length() - 1
-        count = f.let(either(library.strips.value, worlds, groups))
+        count = f.let((worlds + 1) >> op("i32.eqz", library.strips.value))
+        f.set(count, either(library.strips.value, worlds, count))
         size = f.let((worlds * per_world + count * memory.group + (HEADER + 32 + 15)) & ~15)
         before, batch = f.let(ZERO), f.let(library.batches.value)
         with f.block() as found:
@@ -138,13 +136,13 @@ class Batches:
         strips = self.library.strips.value
         number = f.let(ZERO)
         with self.each_group(f, batch) as group, self._lanes(f, number) as lane:
-            world = f.let(either(strips, number, number * self.memory.shape.lanes + lane))
+            world = f.let(either(strips, number, (number << 1) + lane))
             top = f.let(either(strips, lane * self.library.rows.value, ZERO))
             with f.when(world < word(batch, WORLDS)):
                 yield group, lane, world, top
 
     @contextmanager
     def _lanes(self, f: Function, number: Local) -> Iterator[Local]:
-        with f.each(ZERO, const("i32", self.memory.shape.lanes)) as lane:
+        with f.each(ZERO, const("i32", LANES)) as lane:
             yield lane
         f.set(number, number + 1)

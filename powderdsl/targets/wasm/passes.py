@@ -19,12 +19,12 @@ from powderdsl.schedule.types import (
     Var,
 )
 from powderdsl.schedule.updates import is_cleared
-from powderdsl.targets.machine.cells import sweep
-from powderdsl.targets.machine.functions import Callee, Function, Local, Value, const, op
-from powderdsl.targets.machine.library import ZERO, Library, word
-from powderdsl.targets.machine.moves import exchanger, moves_in_place
-from powderdsl.targets.machine.moves import move as in_place
-from powderdsl.targets.machine.words import WordLoop
+from powderdsl.targets.wasm.cells import sweep
+from powderdsl.targets.wasm.functions import Callee, Function, Local, Value, const, op
+from powderdsl.targets.wasm.library import ZERO, Library, word
+from powderdsl.targets.wasm.moves import exchanger, moves_in_place
+from powderdsl.targets.wasm.moves import move as in_place
+from powderdsl.targets.wasm.words import WordLoop
 
 ONE = const("i32", 1)
 
@@ -201,7 +201,7 @@ class Pass:
         place = memory.at(table, number, 4)
         if table == "fixed":
             return word(ZERO, place)
-        return self.library.coin(const("i32", place), const("i32", memory.at("keys", 2 * number)))
+        return self.library.coin(const("i32", place), const("i32", memory.at("keys", number, 32)))
 
     def update(self, loop: Compute) -> None:
         """Planes that change only in words where a mask holds."""

@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from powderdsl.schedule.types import Leftover, Move
-from powderdsl.targets.machine.functions import Callee, Function, Local, Value, const, load, op
-from powderdsl.targets.machine.library import ZERO, Library, choose, either, some, word
-from powderdsl.targets.machine.memory import HALOED, HEADER, SOME
+from powderdsl.targets.wasm.functions import Callee, Function, Local, Value, const, load, op
+from powderdsl.targets.wasm.library import ZERO, Library, choose, either, some, word
+from powderdsl.targets.wasm.memory import HALOED, HEADER, SOME, WORD
 
 TOGETHER = 4
 """Planes that a loop over rows of one word changes, since each waits for what it reads."""
@@ -43,10 +43,10 @@ def _rows_that_move(library: Library, downwards: bool) -> Callee:
         if memory.words <= 4:
             for w in range(memory.words):
                 for plane in (movers, targets):
-                    found = found | load("v128.load", plane + at, memory.base + memory.shape.vector * w)
+                    found = found | load("v128.load", plane + at, memory.base + 16 * w)
         else:
             total = f.let(found)
-            with f.each(at, at + memory.row, memory.shape.vector) as one:
+            with f.each(at, at + memory.row, 16) as one:
                 for plane in (movers, targets):
                     f.set(total, total | load("v128.load", plane + one, memory.base))
             found = total
@@ -122,14 +122,14 @@ class _Mover:
         """A row of several words, of which the old ones are kept beside the planes."""
         f, memory, library, dx = self.f, self.memory, self.library, self.dx
         start = f.let(plane + at + memory.base)
-        with f.each(ZERO, const("i32", memory.row), memory.shape.vector) as w:
+        with f.each(ZERO, const("i32", memory.row), 16) as w:
             f.store("v128.store", self.here + w, load("v128.load", start + w))
         source = f.let(start - self.dy * memory.row) if self.dy else self.here
         other = before if self.dy else self.here
-        with f.each(ZERO, const("i32", memory.row), memory.shape.vector) as w, f.scope():
+        with f.each(ZERO, const("i32", memory.row), 16) as w, f.scope():
             m, t = (f.let(load("v128.load", p + at + w, memory.base)) for p in (self.movers, self.targets))
             old = f.let(load("v128.load", self.here + w))
-            x = f.let(self.library.columns_before(w))
+            x = f.let(w << 2)
 
             def seen(row: Local, dx: int) -> Value:
                 if not dx:
@@ -183,31 +183,31 @@ def exchanger(library: Library, offset: tuple[int, int]) -> Callee:
 
 
 def _exchanger(library: Library, dy: int, dx: int) -> Callee:
-    f, memory, shape = library.function("i32 i32"), library.memory, library.shape
+    f, memory = library.function("i32 i32"), library.memory
     movers, field = f.param(0), f.param(1)
     line = f.let(ZERO)
     with (
-        f.each(ZERO, const("i32", shape.vector), shape.lane) as lane,
+        f.each(ZERO, const("i32", 16), 8) as lane,
         f.each(lane, lane + library.cells.value, memory.row) as row,
     ):
         with f.scope(), f.block() as skip:
-            flags = f.let(library.zero())
-            with f.each(row, row + memory.row, shape.vector) as at:
-                f.set(flags, flags | library.lane_word(movers + at, memory.base))
-            f.jump(skip, flags.equals(0))
+            found = f.let(const("i64", 0))
+            with f.each(row, row + memory.row, 16) as at:
+                f.set(found, found | load("i64.load", movers + at, memory.base))
+            f.jump(skip, op("i64.eqz", found))
             other = f.let(library.other_line(line, dy, wraps=True))
             f.jump(skip, op("i32.eqz", library.live(field, line) | library.live(field, other)))
             here, there = (f.let(library.line_start(field, number)) for number in (line, other))
             for number, start in ((line, here), (other, there)):
                 with f.when(op("i32.eqz", library.live(field, number))):
-                    with f.each(ZERO, const("i32", 4 * memory.width), shape.vector) as at:
+                    with f.each(ZERO, const("i32", 4 * memory.width), 16) as at:
                         f.store("v128.store", start + at, const("v128", 0))
                     f.store("i32.store8", field + number, const("i32", 1), HEADER)
             x = f.let(ZERO)
-            with f.each(row, row + memory.row, shape.vector) as at:
-                left = f.let(library.lane_word(movers + at, memory.base))
-                _exchange_word(library, f, left, x, here, there, dx % memory.width)
-                f.set(x, x + shape.word)
+            with f.each(row, row + memory.row, 16) as at:
+                left = f.let(load("i64.load", movers + at, memory.base))
+                _exchange_word(f, left, x, here, there, dx % memory.width, memory.width)
+                f.set(x, x + WORD)
             library.finish_line(f, here)
             library.finish_line(f, there)
         f.set(line, line + 1)
@@ -215,16 +215,15 @@ def _exchanger(library: Library, dy: int, dx: int) -> Callee:
 
 
 def _exchange_word(
-    library: Library, f: Function, left: Local, x: Local, here: Local, there: Local, by: int
+    f: Function, left: Local, x: Local, here: Local, there: Local, by: int, width: int
 ) -> None:
     """Cells of the movers `left`, the first of which is in column `x`, exchange with those `by` columns on, around."""
     with f.block() as done, f.loop() as again, f.scope():
-        f.jump(done, left.equals(0))
-        column = f.let(x + library.low(op(f"{left.type}.ctz", left)))
+        f.jump(done, op("i64.eqz", left))
+        column = f.let(x + op("i32.wrap_i64", op("i64.ctz", left)))
         f.set(left, left & (left - 1))
         target = f.let(column + by)
         if by:
-            width = library.memory.width
             f.set(target, either(target < width, target, target - width))
         own, other = f.let(here + (column << 2)), f.let(there + (target << 2))
         kept = f.let(word(own))

@@ -1,12 +1,11 @@
-"""The memory of a module: what lies where. A group is as many lanes of work as a vector has words: worlds, or the strips
-of one world.
+"""The memory of a module: what lies where. A group is two lanes of work: two worlds, or the two halves of one world.
 
-Addresses are bytes. Everything is aligned to a vector.
+Addresses are bytes. Everything is aligned to 16 bytes.
 
     plane   refs, some, haloed, next: i32 each. Rows of words, lane by lane, with `around` rows above and below, which
             hold the rows that follow on the torus if `haloed`. `some`: it may hold a flag; if not, all words are zero.
     field   refs, some, –, next. A byte a line: whether it is `live`; other lines are zero and not to be read. Then the
-            lines, of all lanes one after the other, with `reach` columns of the torus on both sides.
+            lines, of both lanes one after the other, with `reach` columns of the torus on both sides.
     batch   worlds, groups, next, bytes. Seeds, indices and steps, i64 a world each. The bits of parameters, a byte a
             world each; then their float32 values. Then the groups.
     group   the planes and fields of slots, i32 each; i64: the ids that are present, of those that passes ask for.
@@ -22,6 +21,7 @@ from powderdsl.schedule.types import Move, Schedule, Sweeps, flat, values_of
 from powderdsl.targets.layout import Layout
 from powderdsl.targets.values import chains_of
 
+WORD, LANES = 64, 2
 REFS, SOME, HALOED, NEXT, HEADER = 0, 4, 8, 12, 16
 MOST_BITS = 64
 """Of a draw."""
@@ -29,37 +29,6 @@ MOST_BITS = 64
 
 def aligned(count: int, by: int = 16) -> int:
     return -(-count // by) * by
-
-
-@dataclass(frozen=True)
-class Shape:
-    """The bytes of a vector, and the bits of a word. Its words are the lanes; its floats are a chunk."""
-
-    vector: int = 16
-    word: int = 64
-
-    @property
-    def lanes(self) -> int:
-        return 8 * self.vector // self.word
-
-    @property
-    def lane(self) -> int:
-        """The bytes of a word."""
-        return self.word // 8
-
-    @property
-    def chunk(self) -> int:
-        return self.vector // 4
-
-    @property
-    def scalar(self) -> str:
-        """The type of a word."""
-        return f"i{self.word}"
-
-    @property
-    def words(self) -> str:
-        """What operations on all words of a vector begin with."""
-        return f"{self.scalar}x{128 // self.word}"
 
 
 @dataclass(frozen=True)
@@ -99,22 +68,21 @@ class Memory:
     width: int
     extent: Extent
     layout: Layout
-    shape: Shape = Shape()
     top: int = 64
     places: dict[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        layout, vector, lanes = self.layout, self.shape.vector, self.shape.lanes
+        layout = self.layout
         for name, size in (
-            ("turn", vector),
-            ("apart", vector),
-            ("worlds", 2 * vector),
-            ("clock", vector),
-            ("keys", 2 * vector * len(layout.streams)),
-            ("params", vector * len(layout.param_planes)),
-            ("reals", 4 * lanes * len(layout.param_reals)),
-            ("steps", vector * len(layout.step_planes)),
-            ("limits", vector * (MOST_BITS + 1)),
+            ("turn", 16),
+            ("apart", 16),
+            ("worlds", 32),
+            ("clock", 16),
+            ("keys", 32 * len(layout.streams)),
+            ("params", 16 * len(layout.param_planes)),
+            ("reals", 8 * len(layout.param_reals)),
+            ("steps", 16 * len(layout.step_planes)),
+            ("limits", 16 * (MOST_BITS + 1)),
             ("coins", 4 * len(layout.streams)),
             ("fixed", 4 * len(layout.fixed)),
             ("lines", 4 * 2 * (2 * self.extent.lines + 1)),
@@ -125,37 +93,37 @@ class Memory:
             ("chains", 4 * self.stride * self.extent.chains),
         ):
             self.places[name] = self.top
-            self.top = aligned(self.top + size, vector)
+            self.top = aligned(self.top + size)
 
     @property
     def words(self) -> int:
         """The words of a row."""
-        return -(-self.width // self.shape.word)
+        return -(-self.width // WORD)
 
     @property
     def whole(self) -> bool:
         """Whether all words of a row are full."""
-        return self.width % self.shape.word == 0
+        return self.width % WORD == 0
 
     @property
     def row(self) -> int:
-        """The bytes of a plane's row, all lanes."""
-        return self.shape.vector * self.words
+        """The bytes of a plane's row, both lanes."""
+        return 8 * LANES * self.words
 
     @property
     def base(self) -> int:
         """Where a plane's first row lies."""
-        return aligned(HEADER, self.shape.vector) + self.extent.around * self.row
+        return HEADER + self.extent.around * self.row
 
     @property
     def halo(self) -> int:
         """The columns beside a line of a field for which there is room."""
-        return aligned(self.extent.reach, self.shape.chunk)
+        return aligned(self.extent.reach, 4)
 
     @property
     def stride(self) -> int:
         """The floats of a line, with both halos and what a chunk may overlap."""
-        return aligned(self.width, self.shape.chunk) + 2 * self.halo + self.shape.chunk
+        return aligned(self.width, 4) + 2 * self.halo + 4
 
     @property
     def group(self) -> int:
@@ -167,13 +135,9 @@ class Memory:
         """Where a group keeps the ids that are present."""
         return aligned(4 * (len(self.layout.planes) + len(self.layout.reals)), 8)
 
-    def at(self, name: str, number: int = 0, size: int | None = None) -> int:
-        """The address of an item of a static table; of its vectors if no size is given."""
-        return self.places[name] + number * (self.shape.vector if size is None else size)
-
-    def keys(self, stream: str) -> int:
-        """Where the keys of a stream's draws lie: two vectors."""
-        return self.at("keys", 2 * self.layout.streams[stream])
+    def at(self, name: str, number: int = 0, size: int = 16) -> int:
+        """The address of an item of a static table."""
+        return self.places[name] + number * size
 
     def slot(self, name: str, type: object) -> int:
         """Where a group keeps a slot."""

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from powderdsl.targets.machine.functions import Callee, Function, Value, const, op
-from powderdsl.targets.machine.library import GOLDEN, ZERO, Library, either
-from powderdsl.targets.machine.memory import HALOED, HEADER, SOME
+from powderdsl.targets.wasm.functions import Callee, Function, Value, const, load, op, vector
+from powderdsl.targets.wasm.library import GOLDEN, STILL, SWAPPED, ZERO, Library, counted, either
+from powderdsl.targets.wasm.memory import HALOED, HEADER, LANES, SOME, WORD
 
 
 class Grid:
@@ -19,17 +19,19 @@ class Grid:
         height, strips = f.param(0), f.param(1)
         f.set(library.world_rows, height)
         f.set(library.strips, strips)
-        shape = memory.shape
-        f.set(library.rows, either(strips, height >> shape.lanes.bit_length() - 1, height))
+        f.set(library.rows, height >> strips)
         rows = f.let(library.rows.value)
-        f.set(library.lines, rows * shape.lanes)
+        f.set(library.lines, rows << 1)
         lines = f.let(library.lines.value)
         f.set(library.cells, rows * memory.row)
         f.set(library.plane_size, rows * memory.row + (memory.base + memory.extent.around * memory.row))
         f.set(library.live_size, (lines + 16) & ~15)
         f.set(library.field_size, library.live_size.value + lines * (4 * memory.stride) + (HEADER + 64 & ~15))
-        turned = op("i32x4.splat", ZERO - strips)
-        f.store("v128.store", ZERO, turned, memory.at("turn"))
+        turn = const("i32", memory.at("turn"))
+        with f.when(strips):
+            f.store("v128.store", turn, vector(SWAPPED))
+            f.otherwise()
+            f.store("v128.store", turn, vector(STILL))
         self._apart(f, either(strips, rows, ZERO))
         for plane in (library.nothing, library.everything, library.inside):
             f.set(plane, library.take())
@@ -52,44 +54,37 @@ class Grid:
         return library.module.add(f, "setup")
 
     def _apart(self, f: Function, rows: Value) -> None:
-        """What the hashes of lanes differ by: strips continue each other, and a word of 64 bits has two hashes.
+        """What the four hashes of a vector differ by: a word of a lane has two, and strips continue each other.
 
         Args:
             rows: of a strip; 0 if lanes are worlds.
         """
-        shape, across = self.memory.shape, -(-self.memory.width // 32)
-        strip = f.let(rows * (across * 32 * GOLDEN))
-        with f.each(ZERO, const("i32", shape.vector), 4) as at:
-            hashes = strip * (at // shape.lane)
-            if shape.word == 64:
-                hashes = hashes + ((at >> 2) & 1) * (32 * GOLDEN)
-            f.store("i32.store", at, hashes, self.memory.at("apart"))
+        strip = f.let(rows * (-(-self.memory.width // 32) * 32 * GOLDEN))
+        for number in range(4):
+            hashes = strip * (number // 2) + number % 2 * 32 * GOLDEN
+            f.store("i32.store", ZERO, hashes, self.memory.at("apart") + 4 * number)
 
     def _filled(self, f: Function, plane: Value, rows: Value) -> None:
         """All flags of the rows."""
         memory = self.memory
-        shape = memory.shape
-        with f.each(ZERO, rows * memory.row, shape.vector) as at, f.scope():
-            last = (at % memory.row).equals(memory.row - shape.vector)
+        with f.each(ZERO, rows * memory.row, 8 * LANES) as at, f.scope():
+            last = (at % memory.row).equals(memory.row - 8 * LANES)
             full, rest = (
-                self.library.flags((1 << min(shape.word, memory.width - shape.word * w)) - 1)
-                for w in (0, memory.words - 1)
+                const("v128", (1 << min(WORD, memory.width - WORD * w)) - 1) for w in (0, memory.words - 1)
             )
             f.store("v128.store", plane + at, either(last, rest, full), memory.base)
 
     def _beyond(self, f: Function, plane: Value, rows: Value) -> None:
-        """In the halo, the rows of other strips: each but the first has one above it, each but the last one below it."""
-        memory, library, shape = self.memory, self.library, self.memory.shape
+        """In the halo, the rows of the other strip: the lower one lies below the upper one, and around it nothing."""
+        memory, library = self.memory, self.library
         size = memory.extent.around * memory.row
         if not size:
             return
-        with f.when(library.strips.value), f.each(ZERO, const("i32", size), shape.vector) as at, f.scope():
-            above, below = plane + at, plane + rows * memory.row + at
-            flags = f.let(library.lane_word(plane + at % memory.row, memory.base))
-            for lane in range(1, shape.lanes):
-                place = shape.lane * lane
-                f.store(f"{shape.scalar}.store", above, flags, memory.base - size + place)
-                f.store(f"{shape.scalar}.store", below, flags, memory.base + place - shape.lane)
+        with f.when(library.strips.value), f.each(ZERO, const("i32", size), 8 * LANES) as at, f.scope():
+            below = rows * memory.row + at
+            same = load("i64.load", plane + at % memory.row, memory.base)
+            f.store("i64.store", plane + at, same, HEADER + 8)
+            f.store("i64.store", plane + below, same, memory.base)
 
     def _line_table(self, f: Function, dy: int, wraps: bool) -> None:
         library = self.library
@@ -117,10 +112,7 @@ class Grid:
             f.store("i32.store", const("i32", place), plane)
             f.store("i32.store", plane, const("i32", 1), SOME)
             strips_rows = f.let(either(library.strips.value, library.rows.value, ZERO))
-            with (
-                f.each(ZERO, const("i32", memory.shape.lanes)) as lane,
-                f.each(ZERO, library.rows.value) as y,
-            ):
+            with f.each(ZERO, const("i32", LANES)) as lane, f.each(ZERO, library.rows.value) as y:
                 row = f.let(y + strips_rows * lane)
                 with f.each(ZERO, const("i32", memory.width)) as x, f.scope():
                     if kind == 2:
@@ -128,7 +120,6 @@ class Grid:
                         flag = within & ((x + b) < memory.width)
                     else:
                         flag = (((x if kind else row) % a) >> b) & 1
-                    at = f.let(plane + y * memory.row + library.word_place(x) + lane * memory.shape.lane)
-                    bit = library.as_word(flag) << library.as_word(x & memory.shape.word - 1)
-                    kept = library.lane_word(at, memory.base)
-                    f.store(f"{memory.shape.scalar}.store", at, kept | bit, memory.base)
+                    at = f.let(plane + y * memory.row + ((x >> 6) << 4) + (lane << 3))
+                    bit = counted(flag) << counted(x & 63)
+                    f.store("i64.store", at, load("i64.load", at, memory.base) | bit, memory.base)

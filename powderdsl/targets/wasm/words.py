@@ -1,4 +1,4 @@
-"""Loops over words of planes, a vector at a time."""
+"""Loops over words of planes: 64 columns of two lanes at a time."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from powderdsl.schedule.draws import is_coin
 from powderdsl.schedule.types import Compute, loaded
 from powderdsl.schedule.updates import asked
 from powderdsl.targets.layout import param_key
-from powderdsl.targets.machine.functions import Callee, Function, Local, Value, const, load, op
-from powderdsl.targets.machine.library import ZERO, Library, choose, some
-from powderdsl.targets.machine.memory import SOME
+from powderdsl.targets.wasm.functions import Callee, Function, Local, Value, const, load, op
+from powderdsl.targets.wasm.library import ZERO, Library, choose, some
+from powderdsl.targets.wasm.memory import SOME, WORD
 
 _DRAWS = ("chance", "below_param", "below_planes")
 
@@ -68,7 +68,7 @@ class WordLoop:
         kept = [f.let(const("v128", 0)) for _ in self.outs]
         self.y = self.row = self.x = None
         if memory.words == 1:
-            with f.each(ZERO, stop, library.shape.vector) as at:
+            with f.each(ZERO, stop, 16) as at:
                 self.at = at
                 self.body(kept)
         else:
@@ -79,8 +79,8 @@ class WordLoop:
                 with f.loop() as again:
                     self.at = f.let(row + within)
                     self.body(kept)
-                    f.set(x, x + library.shape.word)
-                    f.set(within, within + library.shape.vector)
+                    f.set(x, x + WORD)
+                    f.set(within, within + 16)
                     f.jump(again, within < memory.row)
                 f.set(y, y + 1)
         for place, any_flag in zip(self.outs, kept, strict=True):
@@ -151,7 +151,7 @@ class WordValues:
 
     def valid(self) -> Value:
         if self.memory.words == 1:
-            return self.library.flags((1 << self.memory.width) - 1)
+            return const("v128", (1 << self.memory.width) - 1)
         return load("v128.load", self.library.everything.value + self.loop.at, self.memory.base)
 
     def node(self, node: Node) -> Value:
@@ -229,7 +229,8 @@ class WordValues:
     def draw(self, node: Node, known: Sequence[Value]) -> Value:
         layout, memory = self.memory.layout, self.memory
         stream, bits, *rest = node.attr
-        keys = const("i32", memory.keys(stream))
+        number = layout.streams[stream]
+        keys = const("i32", memory.at("keys", number, 32))
         given = node.args[-1:] if node.op != "below_planes" else node.args[bits + 1 :]
         wanted = self.clean(given[0]) if given else self.valid() if not memory.whole else const("v128", -1)
         if plane_name(node, self.library) is not None:
@@ -248,5 +249,5 @@ class WordValues:
         return self.f.let(self.below(at, wanted, keys, memory.at("limits"), bits))
 
     def below(self, at: Value, wanted: Value, keys: Value, limit: int, bits: int) -> Value:
-        end = const("i32", limit + self.library.shape.vector * (bits + 1))
+        end = const("i32", limit + 16 * (bits + 1))
         return self.library.draw_below_planes(at, wanted, keys, const("i32", limit), end)

@@ -1,6 +1,6 @@
 """Functions of a machine with one memory, as values: typed expressions, statements, functions, modules.
 
-Instructions are those of WebAssembly, under its names; a vector may have more than the 16 bytes of a `v128`. Nothing here knows rules or planes, or how functions are printed.
+Nothing here knows rules or planes, or how functions are written: `binary` and `listing` do that.
 """
 
 from __future__ import annotations
@@ -85,7 +85,12 @@ class Value:
         return self._shifted("shr_u", by)
 
     def _shifted(self, name: str, by: Value | int) -> Value:
-        return self if isinstance(by, int) and not by else self._with(name, by)
+        """Vectors are shifted as two words, by an i32."""
+        if isinstance(by, int):
+            if not by:
+                return self
+            by = const("i32" if self.type == "v128" else self.type, by)
+        return op(f"{'i64x2' if self.type == 'v128' else self.type}.{name}", self, by)
 
     def __invert__(self) -> Value:
         return op("v128.not", self)
@@ -106,9 +111,9 @@ def op(name: str, *args: Value, attr: Any = None) -> Value:
 
 
 def const(type: str, number: float) -> Value:
-    """A number; of a vector, equal words of 64 bits."""
+    """A number; of a vector, two equal words."""
     if type == "v128":
-        return vector(struct.pack("<Q", int(number) & (1 << 64) - 1))
+        return vector(struct.pack("<QQ", *[int(number) & (1 << 64) - 1] * 2))
     if type in ("i32", "i64"):
         bits = 32 if type == "i32" else 64
         number = int(number) & (1 << bits) - 1
@@ -117,13 +122,13 @@ def const(type: str, number: float) -> Value:
 
 
 def vector(octets: bytes) -> Value:
-    """A vector of these bytes, over and over."""
+    """A vector of 16 bytes."""
     return Value("v128.const", "v128", (), octets)
 
 
 def floats(number: float) -> Value:
-    """A vector of equal float32 values."""
-    return vector(struct.pack("<f", number))
+    """A vector of four equal float32 values."""
+    return vector(struct.pack("<4f", *[number] * 4))
 
 
 def load(name: str, address: Value, offset: int = 0) -> Value:

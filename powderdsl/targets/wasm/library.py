@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from powderdsl.system.random import MASK
-from powderdsl.targets.machine.functions import (
+from powderdsl.targets.wasm.functions import (
     Callee,
     Function,
     Local,
@@ -16,21 +16,24 @@ from powderdsl.targets.machine.functions import (
     op,
     vector,
 )
-from powderdsl.targets.machine.memory import HALOED, HEADER, NEXT, REFS, SOME, Memory
+from powderdsl.targets.wasm.memory import HALOED, HEADER, NEXT, REFS, SOME, WORD, Memory
 
 PAGE = 1 << 16
 GOLDEN, FIRST, SECOND = 0x9E3779B1, 0x7FEB352D, 0x846CA68B
 AHEAD = 4
 """Bits of a draw that are made together, since the multiplications of one wait for each other."""
 
+STILL, SWAPPED = bytes(range(16)), bytes([*range(8, 16), *range(8)])
+"""For `i8x16.swizzle`: the lanes as they are, and exchanged."""
+
 
 def splat(number: Value) -> Value:
-    """A vector of equal i32."""
+    """A vector of four equal i32."""
     return op("i32x4.splat", number)
 
 
 def integers(number: int) -> Value:
-    return vector((number & MASK).to_bytes(4, "little"))
+    return vector((number & MASK).to_bytes(4, "little") * 4)
 
 
 def some(flags: Value) -> Value:
@@ -60,24 +63,18 @@ def counted(value: Value) -> Value:
 ZERO = const("i32", 0)
 
 
-def _scaled(number: Value, by: int, over: int) -> Value:
-    """A number times the ratio of two powers of two."""
-    shift = by.bit_length() - over.bit_length()
-    return number << shift if shift >= 0 else number >> -shift
-
-
 class Library:
     """The functions and variables of a module."""
 
     def __init__(self, memory: Memory, module: Module):
-        self.memory, self.module, self.shape = memory, module, memory.shape
+        self.memory, self.module = memory, module
         variable = module.variable
         self.top = variable("i32", memory.top)
         """Where memory that was never used begins."""
         self.planes, self.fields, self.batches = variable("i32"), variable("i32"), variable("i32")
         """The first plane, field and batch that is free."""
         self.rows, self.lines, self.cells = variable("i32"), variable("i32"), variable("i32")
-        """Rows of a lane; lines of all lanes; bytes of the rows of a plane."""
+        """Rows of a lane; lines of both lanes; bytes of the rows of a plane."""
         self.strips, self.plane_size, self.field_size = variable("i32"), variable("i32"), variable("i32")
         self.live_size = variable("i32")
         self.nothing, self.everything, self.inside = variable("i32"), variable("i32"), variable("i32")
@@ -113,12 +110,12 @@ class Library:
     # Memory
 
     def _bump(self) -> Callee:
-        """New memory: bytes → address. Traps where the module's limit is reached."""
+        """New memory: bytes, a multiple of 16 → address. Traps where the module's limit is reached."""
         f = self.function("i32", "i32")
         place = f.let(self.top.value)
         with f.when(f.param(0) >= self.module.most * PAGE):
             f.trap()
-        end = f.let((place + f.param(0) + (self.shape.vector - 1)) & -self.shape.vector)
+        end = f.let(place + f.param(0))
         pages, size = f.let((end + (PAGE - 1)) >> 16), op("memory.size")
         with f.when(pages >= size + 1):
             grown = op("memory.grow", pages - size)
@@ -195,12 +192,9 @@ class Library:
 
     # Rows around the edges
 
-    def turned(self, row: Local, by: int) -> Value:
-        """A row as lanes see it beyond an edge: strips see the strip above (-1) or below (1), worlds see themselves."""
-        vector = self.shape.vector
-        octets = tuple((i + by * self.shape.lane) % vector for i in range(vector))
-        turned = op("i8x16.shuffle", row, row, attr=octets)
-        return choose(load("v128.load", ZERO, self.memory.at("turn")), turned, row)
+    def turned(self, row: Value) -> Value:
+        """A row of the lanes as those see it that lie beyond an edge: strips see the other strip."""
+        return op("i8x16.swizzle", row, load("v128.load", ZERO, self.memory.at("turn")))
 
     def _edges(self) -> Callee:
         """To be called before rows above and below are read."""
@@ -212,14 +206,14 @@ class Library:
         around = memory.extent.around
         if around:
             with f.each(const("i32", 1), const("i32", around + 1)) as k:
-                for target, source, by in (
-                    (ZERO - k, (rows * around - k) % rows, -1),
-                    (rows + (k - 1), (k - 1) % rows, 1),
+                for target, source in (
+                    (const("i32", around) - k, (rows * around - k) % rows),
+                    (rows + (k + (around - 1)), (k - 1) % rows),
                 ):
                     to, came = (f.let(plane + place * memory.row) for place in (target, source))
-                    with f.each(ZERO, const("i32", memory.row), self.shape.vector) as w:
-                        row = f.let(load("v128.load", came + w, memory.base))
-                        f.store("v128.store", to + w, self.turned(row, by), memory.base)
+                    with f.each(ZERO, const("i32", memory.row), 16) as w:
+                        seen = self.turned(load("v128.load", came + w, memory.base))
+                        f.store("v128.store", to + w, seen, HEADER)
         return self.module.add(f, "edges")
 
     # Draws
@@ -250,7 +244,7 @@ class Library:
 
     def drawn(self, f: Function, number: Value, keys: Value) -> Local:
         """A bit of the draws of a word: `number` is that of the word and bit times GOLDEN, with the first key."""
-        return self.mixed(f, number, load("v128.load", keys, self.shape.vector))
+        return self.mixed(f, number, load("v128.load", keys, 16))
 
     def first_number(self, word_number: Value, keys: Value) -> Value:
         """What `drawn` takes for bit 0 of a word; `number` of the word in the hash."""
@@ -292,34 +286,31 @@ class Library:
         """The same with a limit given plane by plane: number, wanted, keys, the limit's address, its end."""
         f = self.function("i32 v128 i32 i32 i32", "v128")
         at, wanted, keys, limit, end = (f.param(i) for i in range(5))
-        vector = self.shape.vector
         number = f.let(self.first_number(at, keys))
         below = f.let(wanted & load("v128.load", limit))
         f.set(wanted, op("v128.andnot", wanted, load("v128.load", limit)))
         with f.block() as done:
             for count in (AHEAD, 1):
                 with f.block() as out, f.loop() as again:
-                    f.jump(out, end < limit + vector * (count + 1))
+                    f.jump(out, end < limit + 16 * (count + 1))
                     f.jump(done, some(wanted).equals(0))
                     with f.scope():
                         for i, drawn in enumerate(self.ahead(f, number, keys, count)):
-                            self._compare(f, below, wanted, drawn, load("v128.load", limit, vector * (i + 1)))
-                    f.set(limit, limit + vector * count)
+                            self._compare(f, below, wanted, drawn, load("v128.load", limit, 16 * (i + 1)))
+                    f.set(limit, limit + 16 * count)
                     f.jump(again)
         f.give(below)
         return self.module.add(f, "draw_below_planes")
 
     def word_number(self, at: Value, y: Value | None) -> Value:
         """The number of a word in the hash; `at`: bytes from the first word of the plane, `y`: its row."""
-        vector, word = self.shape.vector, self.shape.word
         across = -(-self.memory.width // 32)
+        if across == 2 * self.memory.words:
+            return at << 2
         if across == 1:
-            return _scaled(at, 32, vector)
-        number = _scaled(at, word, vector)
-        if across * 32 == self.memory.words * word:
-            return number
+            return at << 1
         assert y is not None
-        return number - (y << 5)
+        return (at << 2) - (y << 5)
 
     def _coin(self) -> Callee:
         """The plane of the highest bit of a stream's draws. Several passes ask for it: it is made once a step."""
@@ -332,7 +323,7 @@ class Library:
             f.store("i32.store", plane, const("i32", 1), SOME)
             y = f.let(ZERO)
             with f.each(ZERO, self.cells.value, self.memory.row) as row:
-                with f.each(row, row + self.memory.row, self.shape.vector) as at, f.scope():
+                with f.each(row, row + self.memory.row, 16) as at, f.scope():
                     bit = self.drawn(f, self.first_number(self.word_number(at, y), keys), keys)
                     f.store("v128.store", plane + at, bit, self.memory.base)
                 f.set(y, y + 1)
@@ -352,54 +343,12 @@ class Library:
         with f.each(ZERO, bits):
             (drawn,) = self.ahead(f, number, keys, 1)
             f.store("v128.store", scratch, drawn)
-            bit = (self.as_long(self.lane_word(scratch + lane)) >> counted(column)) & 1
+            bit = (load("i64.load", scratch + lane) >> counted(column)) & 1
             f.set(total, (total << 1) + bit)
         half = op("f64.add", op("f64.convert_i64_u", total), const("f64", 0.5))
         count = op("f64.convert_i64_u", const("i64", 1) << counted(bits))
         f.give(op("f32.demote_f64", op("f64.div", half, count)))
         return self.module.add(f, "draw_float")
-
-    # Words
-
-    def flags(self, number: int) -> Value:
-        """A vector of equal words."""
-        return vector((number & (1 << self.shape.word) - 1).to_bytes(self.shape.lane, "little"))
-
-    def left(self, flags: Value, by: Value | int) -> Value:
-        """All words shifted to higher columns."""
-        return op(f"{self.shape.words}.shl", flags, const("i32", by) if isinstance(by, int) else by)
-
-    def right(self, flags: Value, by: Value | int) -> Value:
-        """All words shifted to lower columns."""
-        return op(f"{self.shape.words}.shr_u", flags, const("i32", by) if isinstance(by, int) else by)
-
-    def lane_word(self, address: Value, offset: int = 0) -> Value:
-        """A word of a lane, in its own type."""
-        return load(f"{self.shape.scalar}.load", address, offset)
-
-    def as_word(self, number: Value) -> Value:
-        """An i32 as a word, unsigned."""
-        return counted(number) if self.shape.word == 64 else number
-
-    def as_long(self, word: Value) -> Value:
-        """A word as i64."""
-        return counted(word) if self.shape.word == 32 else word
-
-    def low(self, word: Value) -> Value:
-        """The low 32 bits of a word."""
-        return op("i32.wrap_i64", word) if self.shape.word == 64 else word
-
-    def word_place(self, column: Value) -> Value:
-        """Bytes from a row's first word to that of a column."""
-        return (column >> self.shape.word.bit_length() - 1) << self.shape.vector.bit_length() - 1
-
-    def columns_before(self, at: Value) -> Value:
-        """The column at which a word begins, from the bytes before it in its row."""
-        return _scaled(at, self.shape.word, self.shape.vector)
-
-    def zero(self) -> Value:
-        """A word without a flag."""
-        return const(self.shape.scalar, 0)
 
     # Columns
 
@@ -411,28 +360,28 @@ class Library:
             at: bytes from there to the word.
             x: the column of the word's first flag, as an i32.
         """
-        memory, (vector, size) = self.memory, (self.shape.vector, self.shape.word)
-        if memory.whole and abs(dx) < size:
-            last = const("i32", memory.row - vector)
+        memory = self.memory
+        if memory.whole and abs(dx) < WORD:
+            last = const("i32", memory.row - 16)
             here = load("v128.load", row + at)
             if dx > 0:
-                next_at = either(at.equals(last), ZERO, at + vector)
+                next_at = either(at.equals(last), ZERO, at + 16)
                 beyond = load("v128.load", row + next_at)
                 if not wraps:
                     beyond = beyond & op("i64x2.splat", op("i64.extend_i32_s", ZERO - (at < last)))
-                return self.right(here, dx) | self.left(beyond, size - dx)
-            next_at = either(at, at - vector, last)
+                return (here >> dx) | (beyond << (WORD - dx))
+            next_at = either(at, at - 16, last)
             beyond = load("v128.load", row + next_at)
             if not wraps:
                 beyond = beyond & op("i64x2.splat", op("i64.extend_i32_s", ZERO - (ZERO < at)))
-            return self.left(here, -dx) | self.right(beyond, size + dx)
+            return (here << -dx) | (beyond >> (WORD + dx))
         return self.lazily(("columns", wraps), lambda: self._columns(wraps))(row, x + dx)
 
     def _columns(self, wraps: bool) -> Callee:
-        """A word of columns of a row from a column on: address of the row, column."""
+        """64 columns of a row from a column on: address of the row, column."""
         f = self.function("i32 i32", "v128")
         row, first = f.param(0), f.param(1)
-        width, size = self.memory.width, self.shape.word
+        width = self.memory.width
         filled = f.let(ZERO)
         found = f.let(const("v128", 0))
         if wraps:
@@ -444,13 +393,13 @@ class Library:
                 f.set(filled, ZERO - first)
                 f.set(first, ZERO)
         with f.block() as out, f.loop() as again:
-            f.jump(out, filled >= size)
+            f.jump(out, filled >= WORD)
             if not wraps:
                 f.jump(out, first >= width)
-            within = f.let(first & (size - 1))
-            part = self.right(load("v128.load", row + self.word_place(first)), within)
-            f.set(found, found | self.left(part, filled))
-            left = f.let(const("i32", size) - within)
+            within = f.let(first & (WORD - 1))
+            part = load("v128.load", row + ((first >> 6) << 4)) >> within
+            f.set(found, found | (part << filled))
+            left = f.let(const("i32", WORD) - within)
             rest = f.let(const("i32", width) - first)
             f.set(left, either(left < rest, left, rest))
             f.set(filled, filled + left)
@@ -465,14 +414,14 @@ class Library:
         """The flags `dx` columns to the right, of rows of one word. Beyond the width they are garbage."""
         width = self.memory.width
         if not wraps:
-            if abs(dx) >= self.shape.word:
+            if abs(dx) >= WORD:
                 return const("v128", 0)
-            return self.right(row, dx) if dx > 0 else self.left(row, -dx)
+            return row >> dx if dx > 0 else row << -dx
         by = dx % width
         if not by:
             return row
         held = row if isinstance(row, Local) else f.let(row)
-        return self.right(held, by) | self.left(held, width - by)
+        return (held >> by) | (held << (width - by))
 
     # Lines of fields
 

@@ -1,4 +1,4 @@
-"""Loops over cells: line by line, a chunk of floats at a time. Lines outside the region are skipped."""
+"""Loops over cells: line by line, four floats at a time. Lines outside the region are skipped."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 from powderdsl.ir.ops import REAL, SNAP, Node, ordered
 from powderdsl.schedule.types import Compute, alternatives, loaded
 from powderdsl.targets.layout import param_key
-from powderdsl.targets.machine.functions import (
+from powderdsl.targets.values import CellValues, chains_of
+from powderdsl.targets.wasm.functions import (
     Callee,
     Function,
     Local,
@@ -22,13 +23,14 @@ from powderdsl.targets.machine.functions import (
     op,
     vector,
 )
-from powderdsl.targets.machine.library import ZERO, Library, choose, either, some, splat
-from powderdsl.targets.machine.memory import HALOED, HEADER, SOME
-from powderdsl.targets.values import CellValues, chains_of
+from powderdsl.targets.wasm.library import ZERO, Library, choose, counted, either, some, splat
+from powderdsl.targets.wasm.memory import HALOED, HEADER, SOME, WORD
 
 if TYPE_CHECKING:
-    from powderdsl.targets.machine.passes import Pass
+    from powderdsl.targets.wasm.passes import Pass
 
+CHUNK = 4
+BITS = struct.pack("<4I", 1, 2, 4, 8)
 _ARITHMETIC = {"add", "sub", "mul", "neg", "abs", "sqrt", "eq", "lt", "le"}
 
 
@@ -81,16 +83,13 @@ class CellLoop:
         self.nodes = ordered(roots)
         self.starts: dict[tuple[str, int, bool], Local] = {}
         self.choices = loop.over == "choices"
-        self.shape = self.memory.shape
-        self.bits = vector(struct.pack(f"<{self.shape.chunk}I", *(1 << i for i in range(self.shape.chunk))))
-        """The flag of each float of a chunk."""
 
     def made(self) -> Callee:
         """The function."""
         f, library, memory = self.f, self.library, self.memory
         line = self.line = f.let(ZERO)
         self.somewhere = [f.let(ZERO) for _ in self.outs]
-        with f.each(ZERO, const("i32", self.shape.vector), self.shape.lane) as lane:
+        with f.each(ZERO, const("i32", 16), 8) as lane:
             self.lane = lane
             with f.each(lane, lane + library.cells.value, memory.row) as row:
                 self.row = row
@@ -104,10 +103,6 @@ class CellLoop:
             if out.var.type != REAL:
                 f.store("i32.store", place, ZERO, HALOED)
         return library.module.add(f, f"cells_{self.loop.place.rpartition('/')[2]}")
-
-    def spread(self, bits: Value) -> Value:
-        """The bits of a chunk as lanes of ones."""
-        return op("i32x4.eq", splat(bits) & self.bits, self.bits)
 
     # Lines
 
@@ -138,27 +133,22 @@ class CellLoop:
 
     def flags(self, plane: Value, at: Value) -> Value:
         """The word of a plane for this lane; `at`: bytes from its first word."""
-        return self.library.lane_word(plane + at, self.memory.base)
+        return load("i64.load", plane + at, self.memory.base)
 
     def row_flags(self, planes: Sequence[str]) -> Value:
         """Whether planes hold a flag in this row of the lane."""
-        flags, memory = self.library.zero(), self.memory
-        if memory.words <= 4:
+        found = const("i64", 0)
+        if self.memory.words <= 4:
             for name in planes:
-                for w in range(memory.words):
-                    offset = memory.base + self.shape.vector * w
-                    flags = flags | self.library.lane_word(self.held[name] + self.row, offset)
-            return self.any(flags)
+                for w in range(self.memory.words):
+                    found = found | load("i64.load", self.held[name] + self.row, self.memory.base + 16 * w)
+            return op("i64.ne", found, const("i64", 0))
         f = self.f
-        total = f.let(flags)
+        total = f.let(found)
         for name in planes:
-            with f.each(ZERO, const("i32", memory.row), self.shape.vector) as at:
+            with f.each(ZERO, const("i32", self.memory.row), 16) as at:
                 f.set(total, total | self.flags(self.held[name], self.row + at))
-        return self.any(total)
-
-    def any(self, flags: Value) -> Value:
-        """Whether a word has a flag: i32."""
-        return op(f"{self.shape.scalar}.ne", flags, self.library.zero())
+        return op("i64.ne", total, const("i64", 0))
 
     def copy(self, place: int, source: Local) -> None:
         """A line as it is in another field."""
@@ -176,7 +166,7 @@ class CellLoop:
     def _copy_line(self) -> Callee:
         f, memory = Function(["i32", "i32"]), self.memory
         begin = -4 * memory.halo
-        with f.each(ZERO, const("i32", 4 * memory.stride - self.shape.vector), self.shape.vector) as at:
+        with f.each(ZERO, const("i32", 4 * memory.stride - 16), 16) as at:
             f.store("v128.store", (f.param(0) + begin) + at, load("v128.load", (f.param(1) + begin) + at))
         return self.library.module.add(f, "copy_line")
 
@@ -206,28 +196,27 @@ class CellLoop:
                     if out.otherwise.attr:
                         f.set(self.somewhere[i], const("i32", 1))
                     for w in range(self.memory.words):
-                        value = const(self.shape.scalar, self.valid(w) if out.otherwise.attr else 0)
-                        at = self.memory.base + self.shape.vector * w
-                        f.store(f"{self.shape.scalar}.store", self.outs[i] + self.row, value, at)
+                        value = const("i64", self.valid(w) if out.otherwise.attr else 0)
+                        f.store("i64.store", self.outs[i] + self.row, value, self.memory.base + 16 * w)
             f.jump(self.skip)
 
     def valid(self, w: int) -> int:
         """The columns of a word that lie in the grid."""
-        return (1 << min(self.shape.word, self.memory.width - self.shape.word * w)) - 1
+        return (1 << min(WORD, self.memory.width - WORD * w)) - 1
 
     def body(self) -> None:
         f, memory, library = self.f, self.memory, self.library
         self.skipped()
         self.find_starts()
-        width, chunk, scalar = memory.width, self.shape.chunk, self.shape.scalar
+        width = memory.width
         fields = [(i, out) for i, out in enumerate(self.loop.outs) if out.var.type == REAL]
         flags = [(i, out) for i, out in enumerate(self.loop.outs) if out.var.type != REAL]
         lines = {i: f.let(library.line_start(self.outs[i], self.line)) for i, _ in fields}
         alive = {i: f.let(const("v128", 0)) for i, _ in fields}
         with self.each_word() as (at, x, stop):
-            bits = {i: f.let(library.zero()) for i, _ in flags}
+            bits = {i: f.let(const("i64", 0)) for i, _ in flags}
             words = {name: f.let(self.flags(self.held[name], at)) for name in self.plane_names()}
-            with f.each(x, stop, chunk) as column, f.scope():
+            with f.each(x, stop, CHUNK) as column, f.scope():
                 self.column, self.at = column, at
                 values = Chunks(self, words)
                 found = [values.of(out.value) for out in self.loop.outs]
@@ -235,25 +224,25 @@ class CellLoop:
                 for i, _ in fields:
                     f.store("v128.store", lines[i] + (column << 2), found[i])
                     kept = found[i]
-                    if width % chunk:
+                    if width % CHUNK:
                         kept = kept & load("v128.load", column << 2, memory.at("columns") + 4 * memory.halo)
                     f.set(alive[i], alive[i] | kept)
                 for i, _ in flags:
-                    part = library.as_word(op("i32x4.bitmask", found[i]))
-                    f.set(bits[i], bits[i] | (part << library.as_word(column)))
+                    four = op("i64.extend_i32_u", op("i32x4.bitmask", found[i]))
+                    f.set(bits[i], bits[i] | (four << counted(column)))
             for i, _ in flags:
                 value: Value = bits[i]
                 if not memory.whole:
                     value = value & self.valid_word(at)
                     f.set(bits[i], value)
-                f.set(self.somewhere[i], self.somewhere[i] | self.any(bits[i]))
-                f.store(f"{scalar}.store", self.outs[i] + at, bits[i], memory.base)
+                f.set(self.somewhere[i], self.somewhere[i] | op("i64.ne", bits[i], const("i64", 0)))
+                f.store("i64.store", self.outs[i] + at, bits[i], memory.base)
         for i, _ in fields:
             self.set_live(i, some(op("i32x4.shl", alive[i], const("i32", 1))))
             library.finish_line(f, lines[i])
 
     def valid_word(self, at: Value) -> Value:
-        return self.flags(self.library.everything.value, at)
+        return load("i64.load", self.library.everything.value + at, self.memory.base)
 
     @contextmanager
     def each_word(self):  # type: ignore[no-untyped-def]
@@ -264,13 +253,13 @@ class CellLoop:
             return
         at, x = f.let(self.row), f.let(ZERO)
         with f.loop() as again:
-            stop = x + self.shape.word
+            stop = x + WORD
             if not memory.whole:
                 stop = f.let(stop)
                 f.set(stop, either(stop < memory.width, stop, const("i32", memory.width)))
             yield at, x, stop
-            f.set(at, at + self.shape.vector)
-            f.set(x, x + self.shape.word)
+            f.set(at, at + 16)
+            f.set(x, x + WORD)
             f.jump(again, x < memory.width)
 
     def plane_names(self) -> list[str]:
@@ -312,7 +301,7 @@ class CellLoop:
                 with f.scope():
                     self.choose(at, x, mask, [chain[level] for chain in chains], running)
         if continued:
-            with f.each(ZERO, const("i32", memory.width), self.shape.chunk) as self.column, f.scope():
+            with f.each(ZERO, const("i32", memory.width), CHUNK) as self.column, f.scope():
                 values = Chunks(self, {})
                 for chain, line in zip(chains, running, strict=True):
                     values.known[id(chain[-1])] = f.let(load("v128.load", line + (self.column << 2)))
@@ -323,14 +312,15 @@ class CellLoop:
 
     def choose(self, at: Value, x: Value, mask: str, choices: Sequence[Node], lines: Sequence[Local]) -> None:
         """Choices on a mask, in the chunks of a word in which it holds: `x` is the word's first column."""
-        f, library, chunk, scalar = self.f, self.library, self.shape.chunk, self.shape.scalar
+        f = self.f
         left = f.let(self.flags(self.held[mask], at))
         with f.block() as done, f.loop() as again:
-            f.jump(done, left.equals(0))
-            first = f.let(op(f"{scalar}.ctz", left) & (self.shape.word - chunk))
-            self.column = f.let(x + library.low(first))
-            chosen = f.let(self.spread(library.low(left >> first)))
-            f.set(left, left & (const(scalar, -1) ^ (const(scalar, (1 << chunk) - 1) << first)))
+            f.jump(done, op("i64.eqz", left))
+            nibble = f.let(op("i64.ctz", left) & (WORD - CHUNK))
+            self.column = f.let(x + op("i32.wrap_i64", nibble))
+            four = splat(op("i32.wrap_i64", left >> nibble))
+            chosen = f.let(op("i32x4.eq", four & vector(BITS), vector(BITS)))
+            f.set(left, left & (const("i64", -1) ^ (const("i64", 15) << nibble)))
             values = Chunks(self, {})
             places = [line + (self.column << 2) for line in lines]
             for choice, place in zip(choices, places, strict=True):
@@ -342,7 +332,7 @@ class CellLoop:
 
 
 class Chunks(CellValues[Value]):
-    """Values of a chunk of cells: floats, or flags as lanes of ones."""
+    """Values of four cells: floats, or flags as lanes of ones."""
 
     def __init__(self, loop: CellLoop, words: dict[str, Local]):
         super().__init__()
@@ -351,12 +341,16 @@ class Chunks(CellValues[Value]):
         self.choices = [node for node in loop.nodes if node.op == "select"]
         self.uses = Counter(id(arg) for node in loop.nodes for arg in node.args)
 
-    def flags(self, node: Node) -> Value:
+    def nibble(self, node: Node) -> Value:
         """The bits of a flag's plane from this column on: i32."""
         if node.op == "param":
             number = self.memory.layout.param_planes[param_key(node)]
-            return self.library.low(self.library.lane_word(self.loop.lane, self.memory.at("params", number)))
-        return self.library.low(self.words[str(node.attr)] >> self.library.as_word(self.loop.column))
+            return op("i32.wrap_i64", load("i64.load", self.loop.lane, self.memory.at("params", number)))
+        return op("i32.wrap_i64", self.words[str(node.attr)] >> counted(self.loop.column))
+
+    def spread(self, bits: Value) -> Value:
+        """Four bits as lanes."""
+        return op("i32x4.eq", splat(bits) & vector(BITS), vector(BITS))
 
     def node(self, node: Node) -> Value:
         value = self._node(node)
@@ -373,17 +367,14 @@ class Chunks(CellValues[Value]):
             case "const":
                 return floats(float(attr))
             case "load" if node.type != REAL:
-                return self.loop.spread(self.flags(node))
+                return self.spread(self.nibble(node))
             case "load":
                 return load("v128.load", loop.start(str(attr)) + (loop.column << 2))
             case "param":
                 if node.type != REAL:
-                    return self.loop.spread(self.flags(node))
+                    return self.spread(self.nibble(node))
                 number = memory.layout.param_reals[attr[0]]
-                size = self.loop.shape.lanes * 4
-                return load(
-                    "v128.load32_splat", loop.lane >> loop.shape.lane // 8, memory.at("reals", number, size)
-                )
+                return load("v128.load32_splat", loop.lane >> 1, memory.at("reals", number, 8))
             case "draw":
                 return self.draw(node)
             case "shift":
@@ -414,14 +405,14 @@ class Chunks(CellValues[Value]):
 
     def draw(self, node: Node) -> Value:
         stream, bits = node.attr
-        keys = self.memory.keys(stream)
+        keys = self.memory.at("keys", self.memory.layout.streams[stream], 32)
         loop, f = self.loop, self.f
         row = op("i32.sub", loop.row, loop.lane)
         y = f.let(row // self.memory.row)
         at = f.let(self.library.word_number(loop.at - loop.lane, y))
         found = f.let(const("v128", 0))
-        for i in range(loop.shape.chunk):
-            within = (loop.column + i) & (loop.shape.word - 1)
+        for i in range(CHUNK):
+            within = (loop.column + i) & (WORD - 1)
             number = self.library.draw_float()(at, loop.lane, within, const("i32", keys), const("i32", bits))
             f.set(found, op("f32x4.replace_lane", found, number, attr=i))
         return found
@@ -451,9 +442,9 @@ class Chunks(CellValues[Value]):
             before = self.known
             running = {id(one[level].args[2]): name for one, name in zip(chains, names, strict=True)}
             self.known = before | running  # valid only here, since the variables change
-            bits = f.let(self.flags(masks[level]) & (1 << self.loop.shape.chunk) - 1)
+            bits = f.let(self.nibble(masks[level]) & 15)
             with f.when(bits):
-                mask = f.let(self.loop.spread(bits))
+                mask = f.let(self.spread(bits))
                 chosen = [self.of(one[level].args[1]) for one in chains]
                 chosen = [value if len(chains) == 1 else f.let(value) for value in chosen]
                 for name, value in zip(names, chosen, strict=True):

@@ -1,1 +1,0 @@
-"""One low-level program for processors and for WebAssembly."""
