@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from powderdsl.targets.wasm.functions import Callee, Function, Local, Value, const, load, op
+from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, load, op
 from powderdsl.targets.wasm.library import ZERO, Library, either, word
 from powderdsl.targets.wasm.memory import HEADER, LANES
 

@@ -1,13 +1,14 @@
-"""The binary format of WebAssembly: functions and modules as bytes."""
+"""The binary format of WebAssembly: typed expressions, functions, modules.
+
+An expression (`Value`) is the code that leaves it on the stack, with its type. Nothing here knows rules or planes.
+"""
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Sequence
-from itertools import groupby
-from typing import Any
-
-from powderdsl.targets.wasm.functions import Function, Module, Statement, Value
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
 
 TYPES = {"i32": 0x7F, "i64": 0x7E, "f32": 0x7D, "f64": 0x7C, "v128": 0x7B}
 
@@ -66,142 +67,387 @@ _NUMBERED = (
 
 def unsigned(number: int) -> bytes:
     """LEB128 of a number from 0 on."""
-    if number < 128:
-        return bytes((number,))
-    octets = bytearray()
+    found = bytearray()
     while number > 127:
-        octets.append(number & 127 | 128)
+        found.append(number & 127 | 128)
         number >>= 7
-    return bytes([*octets, number])
+    return bytes([*found, number])
 
 
 def signed(number: int) -> bytes:
     """LEB128 of a signed number."""
-    octets = bytearray()
+    found = bytearray()
     while not -64 <= number < 64:
-        octets.append(number & 127 | 128)
+        found.append(number & 127 | 128)
         number >>= 7
-    return bytes([*octets, number & 127])
+    return bytes([*found, number & 127])
+
+
+def _result(name: str) -> str:
+    """The type of an instruction's result."""
+    kind, _, rest = name.partition(".")
+    if any(word in rest for word in ("any_true", "bitmask", "extract_lane")):
+        return "i64" if kind == "i64x2" else "i32"
+    if "x" in kind:
+        return "v128"
+    if rest.split("_")[0] in ("eqz", "eq", "ne", "lt", "gt", "le", "ge") or kind == "memory":
+        return "i32"
+    return kind
 
 
 OPCODES: dict[str, bytes] = {}
+NAMES: dict[int, str] = {}
 for _first, _names in _NUMBERED:
     for _number, _name in enumerate(_names.split(), _first):
-        prefix = bytes([_number >> 8]) if _number > 255 else b""
-        OPCODES[_name] = prefix + (unsigned(_number & 255) if prefix else bytes([_number]))
-for _name in ("block", "loop", "if"):
-    OPCODES[_name] += b"\x40"  # without a result
-for _name in ("memory.size", "memory.grow", "memory.fill", "memory.copy", "memory.copy"):
-    OPCODES[_name] += b"\0"  # of memory 0
+        NAMES[_number] = _name
+        OPCODES[_name] = (
+            bytes([_number]) if _number < 256 else bytes([_number >> 8]) + unsigned(_number & 255)
+        )
+RESULTS = {name: _result(name) for name in OPCODES}
+
+
+class Value:
+    """An expression. Operators are those of its type; integers are unsigned. A Python number becomes a constant."""
+
+    __slots__ = ("code", "type")
+
+    def __init__(self, type: str, code: bytes):
+        self.type, self.code = type, code
+
+    def _with(self, name: str, other: Value | int) -> Value:
+        if isinstance(other, int):
+            other = const(self.type, other)
+        return op(f"{self.type}.{name}", self, other)
+
+    def __add__(self, other: Value | int) -> Value:
+        return self if isinstance(other, int) and not other else self._with("add", other)
+
+    def __sub__(self, other: Value | int) -> Value:
+        return self._with("sub", other)
+
+    def __mul__(self, other: Value | int) -> Value:
+        return self if isinstance(other, int) and other == 1 else self._with("mul", other)
+
+    def __mod__(self, other: Value | int) -> Value:
+        return self._with("rem_u", other)
+
+    def __floordiv__(self, other: Value | int) -> Value:
+        return self._with("div_u", other)
+
+    def __and__(self, other: Value | int) -> Value:
+        return self._with("and", other)
+
+    def __or__(self, other: Value | int) -> Value:
+        return self._with("or", other)
+
+    def __xor__(self, other: Value | int) -> Value:
+        return self._with("xor", other)
+
+    def __lt__(self, other: Value | int) -> Value:
+        return self._with("lt_u", other)
+
+    def __ge__(self, other: Value | int) -> Value:
+        return self._with("ge_u", other)
+
+    def equals(self, other: Value | int) -> Value:
+        """Whether two integers are equal: i32."""
+        return op(f"{self.type}.eqz", self) if other == 0 else self._with("eq", other)
+
+    def __lshift__(self, by: Value | int) -> Value:
+        return self._shifted("shl", by)
+
+    def __rshift__(self, by: Value | int) -> Value:
+        return self._shifted("shr_u", by)
+
+    def _shifted(self, name: str, by: Value | int) -> Value:
+        """Vectors are shifted as two words, by an i32."""
+        if isinstance(by, int):
+            if not by:
+                return self
+            by = const("i32" if self.type == "v128" else self.type, by)
+        return op(f"{'i64x2' if self.type == 'v128' else self.type}.{name}", self, by)
+
+    def __invert__(self) -> Value:
+        return op("v128.not", self)
+
+
+class Local(Value):
+    """A local variable or parameter, as an expression."""
+
+    __slots__ = ("index",)
+
+    def __init__(self, type: str, index: int):
+        super().__init__(type, OPCODES["local.get"] + unsigned(index))
+        self.index = index
+
+
+def op(name: str, *args: Value, tail: bytes = b"") -> Value:
+    """An instruction on its arguments; `tail`: its immediates."""
+    return Value(RESULTS[name], b"".join([arg.code for arg in args]) + OPCODES[name] + tail)
+
+
+def const(type: str, number: float) -> Value:
+    """A number; of a vector, two equal words."""
+    if type == "v128":
+        return vector(struct.pack("<QQ", *[int(number) & (1 << 64) - 1] * 2))
+    if type in ("f32", "f64"):
+        return Value(type, OPCODES[f"{type}.const"] + struct.pack("<f" if type == "f32" else "<d", number))
+    bits = 32 if type == "i32" else 64
+    number = int(number) & (1 << bits) - 1
+    return Value(type, OPCODES[f"{type}.const"] + signed(number - (number >> bits - 1 << bits)))
+
+
+def vector(octets: bytes) -> Value:
+    """A vector of 16 bytes."""
+    return Value("v128", OPCODES["v128.const"] + octets)
+
+
+def floats(number: float) -> Value:
+    """A vector of four equal float32 values."""
+    return vector(struct.pack("<4f", *[number] * 4))
+
 
 _ALIGN = {"v128": 4, "i64": 3, "f64": 3, "i32": 2, "f32": 2, "8": 0, "16": 1, "32": 2, "64": 3}
-ALIGNMENTS = {
-    name: _ALIGN["".join(filter(str.isdigit, access)) or kind]
-    for name in OPCODES
-    for kind, _, access in [name.partition(".")]
-    if access.startswith(("load", "store"))
-}
-"""The natural alignment of accesses to memory, which is only a hint."""
-
-Instruction = tuple[str, Any]
-"""Its name, and what follows it."""
 
 
-def instructions(function: Function) -> list[Instruction]:
-    """The instructions of a function in order; jumps have the number of blocks that they leave."""
-    code: list[Instruction] = []
-
-    def block(body: Iterable[Statement], around: Sequence[Statement]) -> None:
-        for statement in body:
-            for value in statement.args:
-                code.extend(_expression(value))
-            match statement.op:
-                case "do":
-                    pass
-                case "block" | "loop" | "if":
-                    inside = [*around, statement]
-                    code.append((statement.op, None))
-                    block(statement.body, inside)
-                    if statement.otherwise is not None:
-                        code.append(("else", None))
-                        block(statement.otherwise, inside)
-                    code.append(("end", None))
-                case "br" | "br_if":
-                    code.append((statement.op, len(around) - 1 - around.index(statement.attr)))
-                case _:
-                    code.append((statement.op, statement.attr))
-
-    block(function.body, ())
-    return code
+def _access(name: str, offset: int) -> bytes:
+    """The immediates of an access to memory: its natural alignment, which is only a hint, and the offset."""
+    type, _, what = name.partition(".")
+    size = "".join(c for c in what if c.isdigit())
+    return unsigned(_ALIGN[size or type]) + unsigned(offset)
 
 
-def _expression(root: Value) -> list[Instruction]:
-    """The code that leaves a value on the stack."""
-    code, waiting = [], [root]
-    while waiting:
-        value = waiting.pop()
-        code.append((value.op, value.attr))
-        waiting.extend(value.args)
-    return code[::-1]
+def load(name: str, address: Value, offset: int = 0) -> Value:
+    """A value from memory by an instruction such as ``v128.load``."""
+    return op(name, address, tail=_access(name, offset))
 
 
-def function_code(function: Function) -> bytes:
-    """Locals and body, as in the code section."""
-    groups = [(len(list(group)), kind) for kind, group in groupby(function.types[len(function.params) :])]
-    local = _vector([unsigned(count) + bytes([TYPES[kind]]) for count, kind in groups])
-    body = [
-        OPCODES[name] if attr is None else OPCODES[name] + _immediates(name, attr)
-        for name, attr in instructions(function)
-    ]
-    return b"".join([local, *body, OPCODES["end"]])
+@dataclass(frozen=True)
+class Callee:
+    """A function of a module."""
+
+    index: int
+    results: tuple[str, ...]
+
+    def __call__(self, *args: Value) -> Value:
+        code = b"".join([arg.code for arg in args]) + OPCODES["call"] + unsigned(self.index)
+        return Value(self.results[0] if self.results else "", code)
 
 
-def _immediates(name: str, attr: Any) -> bytes:
-    """What follows an instruction."""
-    kind, dot, rest = name.partition(".")
-    if name == "call":
-        return unsigned(attr.index)
-    if not dot or kind in ("local", "global"):
-        return unsigned(attr)
-    if rest == "const":
-        if kind in ("i32", "i64"):
-            return signed(attr)
-        return attr if kind == "v128" else struct.pack("<f" if kind == "f32" else "<d", attr)
-    if name in ALIGNMENTS:
-        return bytes([ALIGNMENTS[name]]) + unsigned(attr)
-    return unsigned(attr)
+@dataclass(frozen=True)
+class Global:
+    """A mutable global variable of a module."""
+
+    index: int
+    type: str
+
+    @property
+    def value(self) -> Value:
+        return Value(self.type, OPCODES["global.get"] + unsigned(self.index))
 
 
-def module_code(module: Module) -> bytes:
-    """A module in the binary format."""
-    signatures = [
-        b"\x60"
-        + _vector([bytes([TYPES[t]]) for t in function.params])
-        + _vector([bytes([TYPES[t]]) for t in function.results])
-        for _, function, _ in module.functions
-    ]
-    types = list(dict.fromkeys(signatures))
-    variables = [bytes([TYPES[t], 1]) + _start(t, start) for t, start in module.variables]
-    exports = [_text(name) + b"\x00" + unsigned(callee.index) for name, callee in module.exports]
-    data = [b"\0" + _start("i32", at) + unsigned(len(octets)) + octets for at, octets in module.data]
-    sections = [
-        (1, _vector(types)),
-        (3, _vector([unsigned(types.index(signature)) for signature in signatures])),
-        (5, _vector([b"\x01" + unsigned(module.pages) + unsigned(module.most)])),
-        (6, _vector(variables)),
-        (7, _vector([_text("memory") + b"\x02\x00", *exports])),
-        (10, _vector([unsigned(len(code)) + code for _, _, code in module.functions])),
-        *([(11, _vector(data))] if data else []),
-        *((0, _text(name) + octets) for name, octets in module.custom),
-    ]  # fmt: skip
-    return b"\0asm\1\0\0\0" + b"".join(
-        bytes([number]) + unsigned(len(section)) + section for number, section in sections
-    )
+class Function:
+    """A function under construction. Parameters are the first locals."""
+
+    def __init__(self, params: Sequence[str] = (), results: Sequence[str] = ()):
+        self.params, self.results = tuple(params), tuple(results)
+        self.types = list(params)
+        self.body = bytearray()
+        self._depth = 0
+        self._free: dict[str, list[int]] = {}
+        self._scopes: list[list[Local]] = []
+
+    def param(self, number: int) -> Local:
+        return Local(self.types[number], number)
+
+    def local(self, type: str) -> Local:
+        """A variable that holds anything; in a scope, until its end."""
+        free = self._free.get(type)
+        if free:
+            found = Local(type, free.pop())
+        else:
+            found = Local(type, len(self.types))
+            self.types.append(type)
+        if self._scopes:
+            self._scopes[-1].append(found)
+        return found
+
+    @contextmanager
+    def scope(self) -> Iterator[None]:
+        """The variables made inside can be used again for others after it."""
+        self._scopes.append([])
+        yield
+        for local in self._scopes.pop():
+            self._free.setdefault(local.type, []).append(local.index)
+
+    def let(self, value: Value) -> Local:
+        """A new variable with a value."""
+        local = self.local(value.type)
+        self.set(local, value)
+        return local
+
+    def do(self, value: Value) -> None:
+        """Run code that leaves nothing."""
+        self.body += value.code
+
+    def set(self, target: Local | Global, value: Value) -> None:
+        name = "local.set" if isinstance(target, Local) else "global.set"
+        self.body += value.code + OPCODES[name] + unsigned(target.index)
+
+    def store(self, name: str, address: Value, value: Value, offset: int = 0) -> None:
+        self.body += address.code + value.code + OPCODES[name] + _access(name, offset)
+
+    def copy(self, target: Value, source: Value, size: Value) -> None:
+        """Copy bytes in memory."""
+        self.body += target.code + source.code + size.code + OPCODES["memory.copy"] + b"\0\0"
+
+    def fill(self, target: Value, byte: Value, size: Value) -> None:
+        """Set bytes in memory."""
+        self.body += target.code + byte.code + size.code + OPCODES["memory.fill"] + b"\0"
+
+    def give(self, value: Value) -> None:
+        """The result of the function is this."""
+        self.body += value.code + OPCODES["return"]
+
+    def leave(self) -> None:
+        """Return nothing."""
+        self.body += OPCODES["return"]
+
+    def trap(self) -> None:
+        self.body += OPCODES["unreachable"]
+
+    @contextmanager
+    def _nested(self, name: str) -> Iterator[int]:
+        self.body += OPCODES[name] + b"\x40"
+        self._depth += 1
+        yield self._depth
+        self._depth -= 1
+        self.body += OPCODES["end"]
+
+    def block(self) -> AbstractContextManager[int]:
+        """A block, by its label; jumping to it leaves it."""
+        return self._nested("block")
+
+    def loop(self) -> AbstractContextManager[int]:
+        """A loop, by its label; jumping to it begins it again."""
+        return self._nested("loop")
+
+    @contextmanager
+    def when(self, condition: Value) -> Iterator[None]:
+        """Statements that run if a condition (i32) is not zero."""
+        self.body += condition.code
+        with self._nested("if"):
+            yield
+
+    def otherwise(self) -> None:
+        self.body += OPCODES["else"]
+
+    def jump(self, label: int, condition: Value | None = None) -> None:
+        """Jump to a block or loop, if a condition holds."""
+        depth = unsigned(self._depth - label)
+        if condition is None:
+            self.body += OPCODES["br"] + depth
+        else:
+            self.body += condition.code + OPCODES["br_if"] + depth
+
+    @contextmanager
+    def each(self, start: Value, stop: Value, step: int = 1, *, some: bool = True) -> Iterator[Local]:
+        """A loop over numbers from `start` to below `stop`; `some`: there is at least one."""
+        number = self.let(start)
+        with self.block() as out:
+            if not some:
+                self.jump(out, number >= stop)
+            with self.loop() as again:
+                yield number
+                self.set(number, number + step)
+                self.jump(again, number < stop)
+
+    def code(self) -> bytes:
+        """Locals and body, as in the code section."""
+        groups: list[list[int]] = []
+        for type in self.types[len(self.params) :]:
+            if groups and groups[-1][1] == TYPES[type]:
+                groups[-1][0] += 1
+            else:
+                groups.append([1, TYPES[type]])
+        declared = unsigned(len(groups)) + b"".join(unsigned(n) + bytes([t]) for n, t in groups)
+        return declared + bytes(self.body) + OPCODES["end"]
 
 
-def _start(type: str, number: int) -> bytes:
-    """An expression of a constant."""
-    return OPCODES[f"{type}.const"] + signed(number) + OPCODES["end"]
+class Module:
+    """A module with one memory. Equal functions are one."""
+
+    def __init__(self, pages: int, most: int):
+        self.pages, self.most = pages, most
+        self._types: dict[bytes, int] = {}
+        self._functions: dict[tuple[int, bytes], Callee] = {}
+        self._names: list[str] = []
+        self._globals: list[tuple[str, int]] = []
+        self._exports: list[bytes] = [_text("memory") + b"\x02\x00"]
+        self._data: list[bytes] = []
+        self._custom: list[bytes] = []
+
+    def add(self, function: Function, name: str, *, export: bool = False) -> Callee:
+        kind = b"\x60" + _vector([bytes([TYPES[t]]) for t in function.params])
+        kind += _vector([bytes([TYPES[t]]) for t in function.results])
+        key = (self._types.setdefault(kind, len(self._types)), function.code())
+        found = self._functions.setdefault(key, Callee(len(self._functions), function.results))
+        if found.index == len(self._names):
+            self._names.append(name)
+        if export:
+            self.export(found, name)
+        return found
+
+    def export(self, function: Callee, name: str) -> None:
+        self._exports.append(_text(name) + b"\x00" + unsigned(function.index))
+
+    def variable(self, type: str, start: int = 0) -> Global:
+        self._globals.append((type, start))
+        return Global(len(self._globals) - 1, type)
+
+    def restart(self, variable: Global, start: int) -> None:
+        """Another value that a variable begins with."""
+        self._globals[variable.index] = (variable.type, start)
+
+    def data(self, address: int, octets: bytes) -> None:
+        """Bytes that the memory of an instance begins with."""
+        self._data.append(
+            b"\0" + const("i32", address).code + OPCODES["end"] + unsigned(len(octets)) + octets
+        )
+
+    def custom(self, name: str, octets: bytes) -> None:
+        """A custom section: hosts can read it, and running ignores it."""
+        self._custom.append(_text(name) + octets)
+
+    def code(self) -> bytes:
+        """The module in the binary format."""
+        functions = list(self._functions)
+        ends = [const(type, start).code + OPCODES["end"] for type, start in self._globals]
+        variables = [bytes([TYPES[t], 1]) + end for (t, _), end in zip(self._globals, ends, strict=True)]
+        sections = (
+            (1, list(self._types)),
+            (3, [unsigned(type) for type, _ in functions]),
+            (5, [b"\x01" + unsigned(self.pages) + unsigned(self.most)]),
+            (6, variables),
+            (7, self._exports),
+            (10, [unsigned(len(code)) + code for _, code in functions]),
+            *([(11, self._data)] if self._data else []),
+        )
+        found = [b"\0asm\1\0\0\0"]
+        for number, inner in (
+            *((number, _vector(items)) for number, items in sections),
+            *((0, one) for one in self._custom),
+        ):
+            found.append(bytes([number]) + unsigned(len(inner)) + inner)
+        return b"".join(found)
+
+    @property
+    def functions(self) -> list[tuple[str, bytes]]:
+        """The name and code of each function, by number."""
+        return [
+            (f"{name}_{i}", code)
+            for i, (name, (_, code)) in enumerate(zip(self._names, self._functions, strict=True))
+        ]
 
 
 def _vector(items: Sequence[bytes]) -> bytes:

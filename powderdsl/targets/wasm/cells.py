@@ -12,17 +12,7 @@ from powderdsl.ir.ops import REAL, SNAP, Node, ordered
 from powderdsl.schedule.types import Compute, alternatives, loaded
 from powderdsl.targets.layout import param_key
 from powderdsl.targets.values import CellValues, chains_of
-from powderdsl.targets.wasm.functions import (
-    Callee,
-    Function,
-    Local,
-    Value,
-    const,
-    floats,
-    load,
-    op,
-    vector,
-)
+from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, floats, load, op, vector
 from powderdsl.targets.wasm.library import ZERO, Library, choose, counted, either, some, splat
 from powderdsl.targets.wasm.memory import HALOED, HEADER, SOME, WORD
 
@@ -414,7 +404,7 @@ class Chunks(CellValues[Value]):
         for i in range(CHUNK):
             within = (loop.column + i) & (WORD - 1)
             number = self.library.draw_float()(at, loop.lane, within, const("i32", keys), const("i32", bits))
-            f.set(found, op("f32x4.replace_lane", found, number, attr=i))
+            f.set(found, op("f32x4.replace_lane", found, number, tail=bytes([i])))
         return found
 
     def led(self, node: Node) -> Value:

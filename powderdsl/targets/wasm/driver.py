@@ -24,7 +24,7 @@ from collections.abc import Sequence
 from powderdsl.ir.ops import REAL, Program
 from powderdsl.system.random import START_0, START_1
 from powderdsl.targets.wasm.batches import GROUPS, WORLDS, Batches
-from powderdsl.targets.wasm.functions import Callee, Function, Local, Value, const, load, op
+from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, load, op
 from powderdsl.targets.wasm.grids import Grid
 from powderdsl.targets.wasm.library import ZERO, Library, counted, either, integers, word
 from powderdsl.targets.wasm.memory import HEADER, LANES, SOME
@@ -87,7 +87,7 @@ class Steps(Batches):
             count.give(word(count.param(0), GROUPS))
             module.add(count, "groups", export=True)
             for number, one in enumerate(self.passes):
-                module.exports.append((str(number), one))
+                module.export(one, str(number))
         with f.block() as nothing:
             f.jump(nothing, op("i32.eqz", steps))
             with f.each(ZERO, word(batch, GROUPS)) as group:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from powderdsl.targets.wasm.functions import Callee, Function, Value, const, load, op, vector
+from powderdsl.targets.wasm.binary import Callee, Function, Value, const, load, op, vector
 from powderdsl.targets.wasm.library import GOLDEN, STILL, SWAPPED, ZERO, Library, counted, either
 from powderdsl.targets.wasm.memory import HALOED, HEADER, LANES, SOME, WORD
 

@@ -5,17 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from powderdsl.system.random import MASK
-from powderdsl.targets.wasm.functions import (
-    Callee,
-    Function,
-    Local,
-    Module,
-    Value,
-    const,
-    load,
-    op,
-    vector,
-)
+from powderdsl.targets.wasm.binary import Callee, Function, Local, Module, Value, const, load, op, vector
 from powderdsl.targets.wasm.memory import HALOED, HEADER, NEXT, REFS, SOME, WORD, Memory
 
 PAGE = 1 << 16
@@ -43,7 +33,7 @@ def some(flags: Value) -> Value:
 
 def either(condition: Value, yes: Value, no: Value) -> Value:
     """A choice between two integers."""
-    return Value("select", yes.type, (yes, no, condition))
+    return Value(yes.type, yes.code + no.code + condition.code + op("select").code)
 
 
 def choose(mask: Value, yes: Value, no: Value) -> Value:
@@ -116,9 +106,9 @@ class Library:
         with f.when(f.param(0) >= self.module.most * PAGE):
             f.trap()
         end = f.let(place + f.param(0))
-        pages, size = f.let((end + (PAGE - 1)) >> 16), op("memory.size")
+        pages, size = f.let((end + (PAGE - 1)) >> 16), op("memory.size", tail=b"\0")
         with f.when(pages >= size + 1):
-            grown = op("memory.grow", pages - size)
+            grown = op("memory.grow", pages - size, tail=b"\0")
             with f.when(grown.equals(const("i32", -1))):
                 f.trap()
         f.set(self.top, end)

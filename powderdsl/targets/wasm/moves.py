@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from powderdsl.schedule.types import Leftover, Move
-from powderdsl.targets.wasm.functions import Callee, Function, Local, Value, const, load, op
+from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, load, op
 from powderdsl.targets.wasm.library import ZERO, Library, choose, either, some, word
 from powderdsl.targets.wasm.memory import HALOED, HEADER, SOME, WORD
 

@@ -19,8 +19,8 @@ from powderdsl.schedule.types import (
     Var,
 )
 from powderdsl.schedule.updates import is_cleared
+from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, op
 from powderdsl.targets.wasm.cells import sweep
-from powderdsl.targets.wasm.functions import Callee, Function, Local, Value, const, op
 from powderdsl.targets.wasm.library import ZERO, Library, word
 from powderdsl.targets.wasm.moves import exchanger, moves_in_place
 from powderdsl.targets.wasm.moves import move as in_place

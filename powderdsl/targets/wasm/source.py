@@ -13,9 +13,8 @@ from powderdsl.schedule.stages import CPU, plan
 from powderdsl.schedule.types import Schedule
 from powderdsl.system.memo import Memo, collection_paused
 from powderdsl.targets.layout import Layout, layout_of
-from powderdsl.targets.wasm.binary import function_code, module_code
+from powderdsl.targets.wasm.binary import Module
 from powderdsl.targets.wasm.driver import add_driver
-from powderdsl.targets.wasm.functions import Module
 from powderdsl.targets.wasm.library import PAGE, Library
 from powderdsl.targets.wasm.memory import Memory, extent_of
 from powderdsl.targets.wasm.passes import pass_function
@@ -35,7 +34,7 @@ class WasmModule:
 
     @property
     def code(self) -> bytes:
-        return module_code(self.module)
+        return self.module.code()
 
 
 @collection_paused()
@@ -52,7 +51,7 @@ def wasm_module(
     layout = layout_of(program)
     schedules = [_schedule(pass_, memo) for pass_ in program.passes]
     memory = Memory(width, extent_of(schedules), layout)
-    module = Module(memory.top // PAGE + 1, PAGES, function_code)
+    module = Module(memory.top // PAGE + 1, PAGES)
     library = Library(memory, module)
     passes = [pass_function(schedule, library) for schedule in schedules]
     asked = reduce(or_, map(asked_ids, schedules), 0)

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 
 from powderdsl.ir.ops import Threshold
 from powderdsl.targets.codec import Piece
-from powderdsl.targets.wasm.functions import Callee, Function, Local, Value, const, load, op
+from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, load, op
 from powderdsl.targets.wasm.library import PAGE, ZERO, Library, either, word
 from powderdsl.targets.wasm.memory import HEADER, aligned
 from powderdsl.targets.wasm.transfer import Transfer
@@ -106,7 +106,7 @@ class Standalone(Transfer):
 
     def _data(self, octets: bytes) -> int:
         place = self._place(len(octets))
-        self.module.data.append((place, octets))
+        self.module.data(place, octets)
         return place
 
     def _table(self, octets: Sequence[int]) -> int:
@@ -127,16 +127,16 @@ class Standalone(Transfer):
         self._export("cells", "", "i32", lambda f: self._cells(f, ready))
         self._export("begin", "i32", "", lambda f: self._begin(f, ready))
         self._export("step", "i32", "", lambda f: self._step(f, ready))
-        self.module.exports.append(("show", show))
+        self.module.export(show, "show")
         self._export("field", "i32", "i32", lambda f: self._field(f, ready, reads))
         self._export("take", "i32", "", lambda f: self._take_number(f, show, takes))
         self._export("paint", "i32 " * 5, "", lambda f: self._paint(f, ready))
         self._export("set", "i32 " * 6 + "f64", "", lambda f: self._set(f, show, reads, takes))
         self._export("parameter", "i32 f64", "", lambda f: self._parameter(f, ready))
         self._export("clock", "", "i32", lambda f: self._clock(f, ready))
-        self.module.custom.append(("powderdsl", self.face.about))
+        self.module.custom("powderdsl", self.face.about)
         self.module.pages = self.end // PAGE + 1
-        self.module.variables[self.library.top.index] = ("i32", self.end)
+        self.module.restart(self.library.top, self.end)
 
     def _export(self, name: str, params: str, results: str, fill: Callable[[Function], None]) -> None:
         f = self.library.function(params, results)
@@ -294,7 +294,7 @@ class Standalone(Transfer):
         f.give(ZERO)
 
     def _take_number(self, f: Function, show: Callee, takes: Sequence[Callee]) -> None:
-        f.do(show())
+        f.body += show().code + op("drop").code
         for number in range(len(self.face.fields)):
             with self._chosen(f, f.param(0), number):
                 f.do(takes[number]())
@@ -335,7 +335,7 @@ class Standalone(Transfer):
                 f.do(self.batch_calls["fill"](batch, ZERO, first, count, *box))
 
     def _set(self, f: Function, show: Callee, reads: Sequence[Callee], takes: Sequence[Callee]) -> None:
-        f.do(show())
+        f.body += show().code + op("drop").code
         top, bottom, left, right = self._box(f, 2)
         component, given = f.param(1), f.param(6)
         for number, one in enumerate(self.face.fields):

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from powderdsl.targets.wasm.batches import Batches
-from powderdsl.targets.wasm.functions import Function, Local, Value, const, load, op, vector
+from powderdsl.targets.wasm.binary import Function, Local, Value, const, load, op, vector
 from powderdsl.targets.wasm.library import ZERO, counted, either, splat, word
 from powderdsl.targets.wasm.memory import HEADER, SOME, WORD
 

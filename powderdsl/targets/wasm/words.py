@@ -10,7 +10,7 @@ from powderdsl.schedule.draws import is_coin
 from powderdsl.schedule.types import Compute, loaded
 from powderdsl.schedule.updates import asked
 from powderdsl.targets.layout import param_key
-from powderdsl.targets.wasm.functions import Callee, Function, Local, Value, const, load, op
+from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, load, op
 from powderdsl.targets.wasm.library import ZERO, Library, choose, some
 from powderdsl.targets.wasm.memory import SOME, WORD
 
