@@ -175,17 +175,15 @@ def several(*options: Option) -> Option:
     return decorate
 
 
-def settings_of(config: type, *, only: Sequence[str] = (), checked: bool = False) -> Option:
+def settings_of(config: type, *, only: Sequence[str] = ()) -> Option:
     """An option for each field of a dataclass that has a help text (`system.settings`). Its default is None.
 
-    Args:
-        only: names of fields; unless given, all.
-        checked: bounds are those of the option; otherwise the settings themselves report all mistakes together.
+    The settings themselves report values out of range, all mistakes together. `only`: names of fields; unless given, all.
     """
-    return several(*(_setting(one, checked) for one in fields(config) if not only or one.name in only))
+    return several(*(_setting(one) for one in fields(config) if not only or one.name in only))
 
 
-def _setting(one: Field[Any], checked: bool) -> Option:
+def _setting(one: Field[Any]) -> Option:
     about = one.metadata.get("about")
     if not about:
         return several()
@@ -195,7 +193,7 @@ def _setting(one: Field[Any], checked: bool) -> Option:
     if limits.choices:
         kind = limits.choices
     elif isinstance(one.default, int):
-        kind = (limits.low, limits.high) if checked else COUNT
+        kind = COUNT
     elif isinstance(one.default, float):
         kind = float
     return option(f"--{name}", kind, about, to=one.name, multiple=isinstance(one.default, tuple))

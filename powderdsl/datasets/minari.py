@@ -25,7 +25,7 @@ from powderdsl.envs.actions import KINDS, ActionForm, action_form
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.system.packages import require
-from powderdsl.system.writing import failure, not_writable, scratch_folder
+from powderdsl.system.writing import failure, scratch_folder, writing
 from powderdsl.tasks.episodes import TaskProgram
 from powderdsl.tasks.shipped import load_task, shipped_tasks
 from powderdsl.tasks.task import Task
@@ -97,7 +97,7 @@ def to_minari(
         KEY: {"recipe": asdict(recipe)},
         **({"author": {author}} if author else {}),
     }
-    try:
+    with writing(place):
         if namespace is not None and namespace not in list_local_namespaces():
             create_namespace(namespace)
         with scratch_folder(place.parent) as folder:
@@ -114,8 +114,6 @@ def to_minari(
             storage.update_metadata(metadata)
             storage.update_episodes(_buffers(dataset))
             whole.rename(place)
-    except OSError as error:
-        raise not_writable(place, error) from None
     return minari.load_dataset(dataset_id)
 
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from powderdsl.datasets.manifest import Recipe, ShardRow, reported, shard_file
 from powderdsl.system.archives import BadArchive, Parts, open_archive, write_archive
 from powderdsl.system.reading import open_regular
-from powderdsl.system.writing import not_writable, replacing
+from powderdsl.system.writing import replacing
 
 Array = NDArray[Any]
 
@@ -67,16 +67,13 @@ def write_shard(
         rows = [np.asarray(part, dtype) for part in parts[name]]
         arrays[name] = Parts(dtype, (sum(map(len, rows)), *rows[0].shape[1:]), rows)
     with replacing(path) as temporary:
-        try:
-            with temporary.open("w+b") as file:
-                write_archive(file, arrays, LEVEL if compress else 0)
-                file.flush()
-                file.seek(0)
-                os.fsync(file.fileno())
-                digest = hashlib.file_digest(file, "sha256").hexdigest()
-            size = temporary.stat().st_size
-        except OSError as error:
-            raise not_writable(path, error) from None
+        with temporary.open("w+b") as file:
+            write_archive(file, arrays, LEVEL if compress else 0)
+            file.flush()
+            file.seek(0)
+            os.fsync(file.fileno())
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+        size = temporary.stat().st_size
     return ShardRow(number, digest, size, sum(map(len, parts["action"])))
 
 

@@ -24,7 +24,7 @@ from filelock import FileLock, Timeout
 
 from powderdsl.diagnostics import CompileError, suggest
 from powderdsl.system.reading import check_links, open_regular, parse_json, read_bytes, read_json
-from powderdsl.system.writing import failure, not_writable, replacing, write_text
+from powderdsl.system.writing import failure, not_writable, replacing, write_text, writing
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -227,12 +227,10 @@ class RunFolder:
         """
         data = _encoded(state)
         path = self.path / "checkpoints" / f"{step:012d}-{_digest(data)}.safetensors"
-        try:
+        with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-            with replacing(path) as temporary:
-                temporary.write_bytes(data)
-        except OSError as error:
-            raise not_writable(path, error) from None
+        with replacing(path) as temporary:
+            temporary.write_bytes(data)
         others = [(number, other) for number, _, other in self._checkpoints() if other != path]
         before = next((other for number, other in others if number < step), None)
         for _, other in others:
@@ -309,11 +307,9 @@ def new_folder(folder: Path) -> None:
 
     Raises CompileError: PD621 where it holds files, PD613 where it cannot be made.
     """
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         others = sorted(name for name in os.listdir(folder) if not name.startswith("."))
-    except OSError as error:
-        raise not_writable(folder, error) from None
     if others:
         notes, helps = (f"such as {others[0]}",), ("choose a folder that is empty or not there yet",)
         raise failure("PD621", f"{folder} holds other files", notes=notes, helps=helps)

@@ -24,7 +24,7 @@ from powderdsl.ogbench.episodes import LevelProgram, keyed
 from powderdsl.ogbench.levels import Level
 from powderdsl.system.archives import BadArchive, Parts, open_archive, write_archive
 from powderdsl.system.reading import read_json
-from powderdsl.system.writing import failure, not_writable, replacing, write_text
+from powderdsl.system.writing import failure, replacing, write_text, writing
 
 Array = NDArray[Any]
 Numbers = NDArray[np.int64]
@@ -105,10 +105,8 @@ def collect(
         place / f"{name}.npz": Recipe(level.name, rules, seed, 0, train, level.play.steps),
         place / f"{name}-val.npz": Recipe(level.name, rules, seed, VALIDATION, few, level.play.steps),
     }
-    try:
+    with writing(place):
         place.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise not_writable(place, error) from None
     done = 0.0
 
     def report(more: float) -> None:

@@ -27,7 +27,7 @@ def replacing(path: Path, *, follow: bool = False) -> Iterator[Path]:
     """A temporary path beside `path`, with its suffix, that replaces it when the block succeeds.
 
     When the block fails or is interrupted, nothing is left and an older file stays as it was. Raises CompileError (PD613)
-    if the file cannot be written.
+    if the file cannot be written, by the block itself too.
 
     Args:
         follow: for paths that the user named: a link stays a link, and the file that it leads to is replaced. Otherwise
@@ -41,17 +41,24 @@ def replacing(path: Path, *, follow: bool = False) -> Iterator[Path]:
     os.close(handle)
     temporary = Path(name)
     try:
-        yield temporary
-        # Temporary files are private to their owner; an ordinary new file follows the umask, which can only be set.
-        mask = os.umask(0)
-        os.umask(mask)
-        temporary.chmod(0o666 & ~mask)
-        try:
+        with writing(path):
+            yield temporary
+            # Temporary files are private to their owner; a new file follows the umask, which can only be set.
+            mask = os.umask(0)
+            os.umask(mask)
+            temporary.chmod(0o666 & ~mask)
             os.replace(temporary, target)
-        except OSError as error:
-            raise not_writable(path, error) from None
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Report what the system says inside as an error of writing `path`: CompileError (PD613)."""
+    try:
+        yield
+    except OSError as error:
+        raise not_writable(path, error) from None
 
 
 @contextmanager
@@ -68,10 +75,7 @@ def scratch_folder(parent: Path) -> Iterator[Path]:
 def write_text(path: Path, text: str, *, follow: bool = False) -> None:
     """Write a text as UTF-8, whole or not at all, as `replacing` does. Raises CompileError (PD613)."""
     with replacing(path, follow=follow) as temporary:
-        try:
-            temporary.write_text(text, encoding="utf-8")
-        except OSError as error:
-            raise not_writable(path, error) from None
+        temporary.write_text(text, encoding="utf-8")
 
 
 def destination(path: Path, *, follow: bool) -> Path:

@@ -23,8 +23,7 @@ from powderdsl.model.types import Ruleset
 from powderdsl.system.reports import as_json
 from powderdsl.system.writing import replacing
 from powderdsl.testing.generators.choices import Choices
-from powderdsl.testing.generators.rulemaker import ruleset_text
-from powderdsl.testing.generators.vocabulary import Manner
+from powderdsl.testing.generators.rulemaker import Manner, ruleset_text
 from tests.fuzz.crew import Lost, Tell, work_through
 
 HANGS = 300.0

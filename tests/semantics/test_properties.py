@@ -27,8 +27,7 @@ from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.testing.generators.cases import Start, load_text, random_start
 from powderdsl.testing.generators.choices import Choices
-from powderdsl.testing.generators.rulemaker import random_ruleset_text
-from powderdsl.testing.generators.vocabulary import Manner
+from powderdsl.testing.generators.rulemaker import Manner, random_ruleset_text
 from tests.fuzz.compare import find_difference
 
 ANYTHING = Manner()

@@ -37,7 +37,7 @@ from powderdsl.experiments.studies.study import (
     load_study,
     shipped_studies,
 )
-from powderdsl.system.writing import not_writable
+from powderdsl.system.writing import writing
 
 JOBS = 2
 """Processes at a time, unless the user says."""
@@ -140,10 +140,8 @@ def collect(folders: tuple[Path, ...], seeds: int | None, only: tuple[str, ...],
     study, size = runs[0].study, runs[0].size
     outcomes = [collected(runs, point) for point in selected(study, size, seeds, only)]
     folder = out or folders[0]
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise not_writable(folder, error) from None
     return _report(study, size, folder, outcomes)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,13 +13,13 @@ import click
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput, user_values
 from powderdsl.cli.output import print_json, progress
-from powderdsl.cli.wm_report import told, write_curve
+from powderdsl.system.reports import table
 from powderdsl.worldmodel.config import PRESETS, DataConfig, TrainConfig, Variety
 
 if TYPE_CHECKING:
     from powderdsl.model.types import Ruleset
     from powderdsl.worldmodel.config import Machine
-    from powderdsl.worldmodel.evaluation import Strip
+    from powderdsl.worldmodel.evaluation import Strip, Tested
     from powderdsl.worldmodel.networks import CustomNetwork
     from powderdsl.worldmodel.recordings import Recording
     from powderdsl.worldmodel.trained import Trained
@@ -32,6 +32,8 @@ OF_WORLDS = {one.name for one in (*fields(DataConfig), *fields(Variety))} - {"ta
 OF_WORLDS |= {*KNOBS, "packs", "held_out", "settings", "worlds", "after"}
 """Options that select worlds: a dataset has its own."""
 MACHINE = ("device", "threads", "backend", "store")
+CURVES = {"loss/train": "training worlds", "loss/validation": "held-out worlds"}
+"""Metrics that are plotted, and their labels."""
 
 _network = opt.option(
     "--network",
@@ -80,8 +82,8 @@ def command() -> None:
 )
 @_recording
 @opt.option("--ignore-actions", bool, "With --data: the network does not see the actions.")
-@opt.settings_of(DataConfig, checked=True)
-@opt.settings_of(TrainConfig, checked=True)
+@opt.settings_of(DataConfig)
+@opt.settings_of(TrainConfig)
 @opt.settings_of(Variety)
 @opt.option("--first-ruleset", (0, 1 << 31), "Number of the first drawn ruleset.  [default: 0]")
 @opt.option("--rules", "RULES", "Rules of the worlds.  [default: the task's own]")
@@ -153,7 +155,7 @@ def new_config(values: Mapping[str, Any], rules_of: Callable[..., str]) -> Train
     multiple=True,
     required=True,
 )
-@opt.settings_of(TrainConfig, only=("iterations", "batch", "learning_rate", "seed"), checked=True)
+@opt.settings_of(TrainConfig, only=("iterations", "batch", "learning_rate", "seed"))
 @_run_options
 def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **values: Any) -> None:
     """Continue from the weights of a run, on worlds that draw only elements of other packs.
@@ -164,7 +166,8 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
 
     network = _own_network(values["network_name"])
     trained = load_trained(run, device="cpu", network=network)
-    config = finetuned(trained, packs, **_given(values, TrainConfig))
+    with user_values():
+        config = finetuned(trained, packs, **_given(values, TrainConfig))
     words = "-".join(config.data.only)
     target = folder or trained.run.path.with_name(f"{trained.run.path.name}-{words}")
     note = {"parent": {"path": str(trained.run.path), "iterations": trained.checkpoint.step}}
@@ -206,7 +209,7 @@ def eval_command(run: str, as_json: bool, out: Path | None, **values: Any) -> No
     if as_json:
         print_json(plain)
     else:
-        click.echo("\n".join(told(tested, plain)))
+        click.echo("\n".join(_told(tested, plain)))
 
 
 @command.command("show", cls=opt.ManyWords)
@@ -224,9 +227,18 @@ def show_command(run: str, out: Path, curve: bool, scale: int, **values: Any) ->
     """
     if curve:
         from powderdsl.experiments.runs import find_run
+        from powderdsl.experiments.studies.results import curves_of, write_curves
         from powderdsl.worldmodel.training import KIND
 
-        write_curve(find_run(run, KIND), out)
+        record = find_run(run, KIND)
+        curves = [
+            replace(curve, label=label)
+            for metric, label in CURVES.items()
+            for curve in curves_of([record], metric)
+        ]
+        if not curves:
+            raise BadInput(f"{record.path} has no losses yet")
+        write_curves(out, curves, "loss", {}, record.path.name)
         return
     from powderdsl.worldmodel.evaluation import recorded_strips, strips, unseen_worlds
 
@@ -366,3 +378,42 @@ def _run(config: TrainConfig, folder: Path, values: dict[str, Any], **more: Any)
     click.echo(
         f"{run.path}: {config.iterations:,} iterations, {took:.0f} s here; powderdsl wm eval {run.path}"
     )
+
+
+# Reports
+
+
+def _told(tested: Tested, plain: Mapping[str, Any]) -> Iterator[str]:
+    """The results of a test as tables. `plain` has them for JSON."""
+    predictors = list(plain["mean"])
+    yield f"{tested.rules}, {tested.task}/{tested.split}, after {tested.step:,} iterations: loss (accuracy; of cells that change)"
+    rows = [["", *predictors]]
+    for name, found in {**plain["tests"], "mean": plain["mean"]}.items():
+        rows.append([name, *(_figures(found[who]) for who in predictors)])
+    yield from ("", *table(rows))
+    yield ""
+    rows = [["element", "cells", "recall", "precision"]]
+    for name, one in plain["elements"].items():
+        rows.append([name, f"{one['cells']:,}", _share(one["recall"]), _share(one["precision"])])
+    yield from table(rows)
+    yield ""
+    rows = [["changes, calibration", "recall", "precision", "F1", "ECE", "ECE, changed", "ECE, of change"]]
+    for who, one in plain["mean"].items():
+        shares = (_share(one[name]) for name in ("changed_accuracy", "change_precision", "change_f1"))
+        errors = (_number(one[name]) for name in ("ece", "changed_ece", "change_ece"))
+        rows.append([who, *shares, *errors])
+    yield from table(rows)
+    for name, lacking in plain["left_out"].items():
+        yield f"left out: {name}, which needs {', '.join(lacking)}"
+
+
+def _figures(one: Mapping[str, Any]) -> str:
+    return f"{one['loss']:.4f} ({_share(one['accuracy'])}; {_share(one['changed_accuracy'])})"
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.4f}"
+
+
+def _share(value: float | None) -> str:
+    return "–" if value is None else f"{100 * value:.1f} %"

@@ -13,8 +13,7 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.model.types import Ruleset
 from powderdsl.testing.generators.cases import Start, load_text, random_start
 from powderdsl.testing.generators.choices import Choices
-from powderdsl.testing.generators.rulemaker import ruleset_text
-from powderdsl.testing.generators.vocabulary import Manner
+from powderdsl.testing.generators.rulemaker import Manner, ruleset_text
 
 T = TypeVar("T")
 

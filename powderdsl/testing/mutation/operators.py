@@ -18,16 +18,17 @@ from powderdsl.syntax.yaml_tree import Node, Scalar, Sequence, parse_yaml
 from powderdsl.testing.mutation.mutants import (
     Change,
     Mutant,
+    Names,
     Path,
     exchanged,
     inserted,
     is_action,
+    names_of,
     removed,
     without,
     without_action,
     written,
 )
-from powderdsl.testing.mutation.names import Names, names_of
 
 SIMILAR = {
     **{place: ("neighbor", *others) for place, others in {
