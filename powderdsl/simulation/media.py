@@ -47,7 +47,7 @@ def write_gif(path: str | Path, frames: Iterable[Any], *, fps: float = 30) -> No
 def write_mp4(path: str | Path, frames: Iterable[Any], *, fps: float = 30) -> None:
     """Write an animation as H.264, from an iterable that may be lazy. Odd sizes grow by one row or column.
 
-    Raises CompileError (PD612) if imageio-ffmpeg is not installed, and OSError with the encoder's own words if it fails.
+    Raises CompileError: PD612 if imageio-ffmpeg is not installed, PD613 with the encoder's own words if it fails.
     """
     helps = ("pip install 'powderdsl[video]'", "or write a .gif, which needs nothing")
     ffmpeg = require("imageio_ffmpeg", "writing MP4", *helps).get_ffmpeg_exe()

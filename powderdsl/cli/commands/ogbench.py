@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -24,12 +25,10 @@ from powderdsl.cli.output import counted, progress
 def command(
     level: str,
     out: Path,
-    episodes: int | None,
-    validation: int | None,
-    seed: int,
     threads: int,
     backend: str,
     device: str,
+    **how: Any,
 ) -> int:
     """Collect the data set of LEVEL, easy, medium or hard: scripted play, in OGBench's files.
 
@@ -49,14 +48,12 @@ def command(
 
     with (
         user_values(),
-        progress(found.name, episodes or found.play.episodes, lines=True, resumes=out) as show,
+        progress(found.name, how["episodes"] or found.play.episodes, lines=True, resumes=out) as show,
     ):
         files = collect(
             LevelProgram(found, backend=backend, device=device, threads=threads),
             out,
-            episodes=episodes,
-            validation=validation,
-            seed=seed,
+            **how,
             progress=lambda done, total: show(done, "episodes"),
         )
     size = sum(path.stat().st_size for path in files)

@@ -194,11 +194,7 @@ def command(
     if ray is not None:
         check_cluster(ray)
     run.prepare()
-    try:
-        outcomes = {outcome.point: outcome for outcome in _with_progress(run, points, jobs, ray)}
-    except KeyboardInterrupt:
-        click.echo("interrupted; the same command resumes here", err=True)
-        raise
+    outcomes = {outcome.point: outcome for outcome in _with_progress(run, points, jobs, ray)}
     finished = [outcomes.get(point) or run.finished(point) for point in every]
     held, missing = sum(outcome.held for outcome in outcomes.values()), finished.count(None)
     if held:
@@ -215,7 +211,7 @@ def command(
 
 def _with_progress(run: StudyRun, points: list[Point], jobs: int | None, ray: str | None) -> list[Outcome]:
     done = 0
-    with progress(run.study.name, len(points)) as show:
+    with progress(run.study.name, len(points), resumes=run.folder) as show:
 
         def report(outcome: Outcome) -> None:
             nonlocal done

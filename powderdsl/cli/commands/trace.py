@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+from typing import Any
 
 import click
 
@@ -31,9 +32,7 @@ CELL = opt.Parsed("ROW,COLUMN", _cell)
 @opt.option("--seed", (0, 2**63 - 1), "Seed of all random numbers.  [default: 0]")
 @opt.option("--at", CELL, "Row and column of the cell, from 0.", to="cell", required=True)
 @opt.option("--step", (1, 10**9), "Step of the run, from 1.", required=True)
-@opt.option(
-    "--of", "NAME", "Explain only `element`, or this field. May be repeated.", to="names", multiple=True
-)
+@opt.option("--of", "NAME", "Explain only `element`, or this field. May be repeated.", multiple=True)
 @opt.option("--number", (0, 1 << 20), "Number of the world in a saved batch.", 0)
 @opt.option("--all", bool, "List every rule that did not happen, and why.", to="every_rule")
 @opt.option("--json", bool, "Print one JSON object.", to="as_json")
@@ -46,12 +45,12 @@ def command(
     seed: int | None,
     cell: tuple[int, int],
     step: int,
-    names: tuple[str, ...],
-    number: int,
+    of: tuple[str, ...],
     every_rule: bool,
     as_json: bool,
     backend: str,
     settings: dict[str, str],
+    **how: Any,
 ) -> None:
     """Explain why a cell holds what it holds after a step.
 
@@ -65,7 +64,7 @@ def command(
 
     begun = start(ruleset, world, size, None, seed, backend=backend)
     with user_values():
-        found = trace(begun, *cell, step, number=number, of=names or None, every_rule=every_rule)
+        found = trace(begun, *cell, step, every_rule=every_rule, of=of or None, **how)
     if as_json:
         print_json(trace_data(found))
     else:

@@ -113,7 +113,7 @@ def train_command(folder: Path | None, ignore_actions: bool, **values: Any) -> N
     recording = _opened(values["data"], values["task"])
     recorded = replace(recording.recorded, actions=not ignore_actions)
     with user_values():
-        config = replace(PRESETS[values["preset"]], recorded=recorded, **_given(values, TrainConfig))
+        config = replace(PRESETS[values["preset"]], recorded=recorded, **given_settings(values, TrainConfig))
     name = f"{recording.task.name}-blind" if ignore_actions else recording.task.name
     _run(config, folder or Path("runs") / name, values, recording=recording)
 
@@ -127,17 +127,17 @@ def new_config(values: Mapping[str, Any], rules_of: Callable[..., str]) -> Train
     packs, held_out = values["packs"], values["held_out"]
     if packs and held_out:
         raise BadInput("--packs says what stays, --held-out what goes: give one of them")
-    variety = _given(values, Variety)
+    variety = given_settings(values, Variety)
     if (variety or values["first_ruleset"]) and not values["rulesets"]:
         raise BadInput(
             "--chances, --swap, --leave-out and --first-ruleset say which rulesets: --rulesets says how many"
         )
     with user_values():
-        config = replace(PRESETS[values["preset"]], **_given(values, TrainConfig))
+        config = replace(PRESETS[values["preset"]], **given_settings(values, TrainConfig))
         rules, task = values["rules"] or "", values["task"] or config.data.task
         short = {name: values[name] for name in KNOBS if values[name] is not None}
         changes = {
-            **_given(values, DataConfig),
+            **given_settings(values, DataConfig),
             "rules": rules_of(rules, task, packs, held_out) if packs or held_out else rules,
             "knobs": short | values["knobs"],
             "params": values["settings"],
@@ -167,7 +167,7 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
     network = _own_network(values["network_name"])
     trained = load_trained(run, device="cpu", network=network)
     with user_values():
-        config = finetuned(trained, packs, **_given(values, TrainConfig))
+        config = finetuned(trained, packs, **given_settings(values, TrainConfig))
     words = "-".join(config.data.only)
     target = folder or trained.run.path.with_name(f"{trained.run.path.name}-{words}")
     note = {"parent": {"path": str(trained.run.path), "iterations": trained.checkpoint.step}}
@@ -281,7 +281,7 @@ def tested_on(values: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _given(values: Mapping[str, Any], config: type) -> dict[str, Any]:
+def given_settings(values: Mapping[str, Any], config: type) -> dict[str, Any]:
     """The settings of a dataclass that were given as options."""
     names = [one.name for one in fields(config) if values.get(one.name) not in (None, ())]
     return {name: values[name] for name in names}

@@ -183,6 +183,7 @@ class _StudyCheck:
                 model = wm.new_config(values, self.changed_rules)
                 self.check_data(model.data)
                 return model
+        from powderdsl.worldmodel.config import TrainConfig as WorldModelConfig
         from powderdsl.worldmodel.evaluation import unseen_data
         from powderdsl.worldmodel.trained import with_packs
         from powderdsl.worldmodel.training import KIND
@@ -192,7 +193,8 @@ class _StudyCheck:
             return None
         if command == ("wm", "finetune"):
             own = run.data.rules or _rules_of(run.data.task)
-            run = replace(run, data=with_packs(run.data, own, values["packs"]))
+            data = with_packs(run.data, own, values["packs"])
+            run = replace(run, data=data, **wm.given_settings(values, WorldModelConfig))
             self.check_data(run.data)
             return run
         self.check_data(unseen_data(run.data, **wm.tested_on(values)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from powderdsl.arrays import np
@@ -13,39 +13,21 @@ from powderdsl.model.restrict import Cause, Difference, without
 from powderdsl.model.state import slots
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Pass, Ruleset
-from powderdsl.testing.generators.cases import Array, Start
+from powderdsl.testing.generators.cases import Start
 from powderdsl.testing.pack_tests.runner import ExampleResult, start_of
 from powderdsl.testing.properties.breaks import Agreement, Alike, Tested, breaks, is_paired
 from powderdsl.testing.properties.outcomes import Counterexample, Property
 from powderdsl.testing.properties.running import (
     MARK,
+    Oracle,
     Runner,
-    State,
     marked,
     reference_states,
-    reference_step,
     rule_spans,
 )
 
 MOST = 8
 """Added packs that are left out in turn, to see which of them matter."""
-
-
-@dataclass(frozen=True)
-class Oracle:
-    """Runs worlds on the reference; the rules of the last step may be fewer than those of the steps before."""
-
-    ruleset: Ruleset
-    last: tuple[Pass, ...]
-
-    def of(self, ruleset: Ruleset) -> Oracle:
-        """Runs other rules in the same way."""
-        return Oracle(ruleset, ruleset.passes)
-
-    def states(self, sample: Start, steps: int, random: Mapping[str, Array] | None = None) -> list[State]:
-        states = reference_states(self.ruleset, sample, steps - 1, random)
-        cut = replace(self.ruleset, passes=self.last)
-        return [*states, reference_step(cut, states[-1], sample, steps - 1, random)]
 
 
 def culprits(claim: Tested, ruleset: Ruleset, sample: Start, steps: int) -> tuple[Span, ...]:

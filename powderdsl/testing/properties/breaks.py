@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import pairwise
 from operator import or_
 from random import Random
-from typing import Protocol
 
 from powderdsl.analysis.ledger import AGAINST
 from powderdsl.arrays import np
@@ -17,6 +15,7 @@ from powderdsl.model.state import slots
 from powderdsl.model.types import Bounded, Claim, Local, Never, Ruleset, Symmetric, Total, Unchanging
 from powderdsl.testing.generators.cases import Array, Start, fresh, property_table
 from powderdsl.testing.properties.running import (
+    Runs,
     State,
     context,
     reference_states,
@@ -49,15 +48,6 @@ Tested = Claim | KnownIds | Agreement | Alike
 
 SIGMAS = 6.0
 """How many standard deviations two frequencies may differ: by chance, more happens once in 500 million times."""
-
-
-class Runs(Protocol):
-    """Runs worlds on a backend or on the oracle."""
-
-    @property
-    def ruleset(self) -> Ruleset: ...
-
-    def states(self, sample: Start, steps: int, random: Mapping[str, Array] | None = None) -> list[State]: ...
 
 
 @dataclass(frozen=True)

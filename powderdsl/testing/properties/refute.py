@@ -17,10 +17,9 @@ from powderdsl.diagnostics import Diagnostic, Label, Reporter
 from powderdsl.model.restrict import Cause, Difference
 from powderdsl.model.text import place_of
 from powderdsl.model.types import Ruleset
-from powderdsl.testing.properties.blame import Oracle
 from powderdsl.testing.properties.breaks import Alike
 from powderdsl.testing.properties.outcomes import Result, counterexample_lines
-from powderdsl.testing.properties.running import random_samples
+from powderdsl.testing.properties.running import Oracle, random_samples
 from powderdsl.testing.properties.search import InvariantSearch, SearchPlan
 
 WORLDS = 256

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -136,6 +136,27 @@ def context(ruleset: Ruleset, state: State, sample: Start, step: int) -> referen
     params = reference.parameters(ruleset, len(sample), sample.params)
     working = reference.widened(ruleset, {slot.name: state[slot.name] for slot in slots(ruleset)})
     return reference.Context(ruleset, working, params, {}, _clock(sample, step))
+
+
+@dataclass(frozen=True)
+class Oracle:
+    """Runs worlds on the reference; the rules of the last step may be fewer than those of the steps before."""
+
+    ruleset: Ruleset
+    last: tuple[Pass, ...]
+
+    def of(self, ruleset: Ruleset) -> Oracle:
+        """Runs other rules in the same way."""
+        return Oracle(ruleset, ruleset.passes)
+
+    def states(self, sample: Start, steps: int, random: Mapping[str, Array] | None = None) -> list[State]:
+        states = reference_states(self.ruleset, sample, steps - 1, random)
+        cut = replace(self.ruleset, passes=self.last)
+        return [*states, reference_step(cut, states[-1], sample, steps - 1, random)]
+
+
+Runs = Runner | Oracle
+"""Runs worlds on a backend or on the oracle."""
 
 
 # Which lines happen

@@ -17,7 +17,7 @@ from powderdsl.model.restrict import restricted
 from powderdsl.model.types import Never, Ruleset, Symmetric, Total
 from powderdsl.simulation.draw import shown_fields
 from powderdsl.testing.generators.cases import Start
-from powderdsl.testing.properties.blame import Oracle, culprits, difference, translated
+from powderdsl.testing.properties.blame import culprits, difference, translated
 from powderdsl.testing.properties.breaks import (
     Agreement,
     Alike,
@@ -30,7 +30,7 @@ from powderdsl.testing.properties.breaks import (
     steps_for,
 )
 from powderdsl.testing.properties.outcomes import Counterexample, Property, Result
-from powderdsl.testing.properties.running import LARGE, Runner, random_samples
+from powderdsl.testing.properties.running import LARGE, Runs, random_samples
 from powderdsl.testing.properties.shrink import WORK, Work, shrink
 
 AUTOMATIC = "automatic"
@@ -74,7 +74,7 @@ class Trial:
 class InvariantSearch:
     """Tests the properties of one ruleset; worlds may be brought from outside too."""
 
-    runner: Runner | Oracle
+    runner: Runs
     plan: SearchPlan
     ledger: Ledger
     trials: list[Trial] = field(default_factory=list)
@@ -87,7 +87,7 @@ class InvariantSearch:
     @classmethod
     def of(
         cls,
-        runner: Runner | Oracle,
+        runner: Runs,
         plan: SearchPlan,
         declared_only: bool = False,
         ledger: Ledger | None = None,
@@ -221,7 +221,7 @@ class InvariantSearch:
         return {trial.prop.text for trial in search.trials if trial.sample is not None}
 
 
-def counterexample(claim: Tested, runner: Runner | Oracle, sample: Start, steps: int) -> Counterexample:
+def counterexample(claim: Tested, runner: Runs, sample: Start, steps: int) -> Counterexample:
     """A world that breaks a claim, as it is, and the rules that did it."""
     cell = breaks(claim, runner, sample, steps).cell[0]
     states = runner.states(sample, steps)

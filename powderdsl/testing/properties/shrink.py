@@ -14,8 +14,8 @@ from typing import Any
 from powderdsl.arrays import np
 from powderdsl.model.types import Ruleset
 from powderdsl.testing.generators.cases import Array, Start
-from powderdsl.testing.properties.breaks import Agreement, Alike, Runs, Tested, breaks, is_paired, steps_for
-from powderdsl.testing.properties.running import joined
+from powderdsl.testing.properties.breaks import Agreement, Alike, Tested, breaks, is_paired, steps_for
+from powderdsl.testing.properties.running import Runs, joined
 
 SEEDS = 24
 """How many seeds each smaller world is tried with, its own first."""
