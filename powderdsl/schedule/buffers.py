@@ -20,7 +20,6 @@ from powderdsl.schedule.types import (
     Statement,
     Var,
     load,
-    values_of,
 )
 
 FOREVER = 1 << 30
@@ -171,7 +170,7 @@ def _in_order(body: Sequence[Statement]) -> Iterator[Statement]:
 def neighbors(statement: Statement) -> dict[str, bool]:
     """The variables that a statement reads, and whether it reads them at neighbors too."""
     found: dict[str, bool] = {}
-    for node in ordered(values_of(statement)):
+    for node in ordered(statement.values()):
         if node.op == "load":
             found.setdefault(node.attr, False)
         elif node.op in ("shift", "live") and node.args[0].op == "load" and any(node.attr[:2]):

@@ -35,11 +35,9 @@ from powderdsl.schedule.types import (
     Var,
     combined,
     conjuncts,
-    defined_by,
     flat,
     load,
     loaded,
-    values_of,
 )
 
 
@@ -73,7 +71,7 @@ class Cutter:
         self.known: dict[int, Var] = {}
         """The variables of the values stored so far, by the value's id."""
         self.statements: list[Statement] = []
-        nodes = ordered(node for one in flat(schedule.body) for node in values_of(one))
+        nodes = ordered(node for one in flat(schedule.body) for node in one.values())
         self.comparisons = [node for node in nodes if is_comparison(node)]
         offsets: dict[int, set[Offset]] = {}
         for node in nodes:
@@ -99,7 +97,7 @@ class Cutter:
 
     def emit(self, statement: Statement) -> None:
         self.statements.append(statement)
-        self.there |= {var.name for var in defined_by(statement)}
+        self.there |= {var.name for var in statement.defined()}
 
     def alias(self, names: dict[str, Node]) -> None:
         """Note variables that are only other names of values."""

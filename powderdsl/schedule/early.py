@@ -20,13 +20,11 @@ from powderdsl.schedule.types import (
     Statement,
     combined,
     conjuncts,
-    defined_by,
     flat,
     is_movement,
     load,
     loaded,
     map_computes,
-    values_of,
     with_args,
 )
 
@@ -51,10 +49,10 @@ def early(schedule: Schedule) -> Schedule:
     graph, namer = schedule.graph, Namer(schedule)
     known = {var.name: -1 for _, var in schedule.finds}
     for i, statement in enumerate(schedule.body):
-        known |= {var.name: i for var in defined_by(statement)}
+        known |= {var.name: i for var in statement.defined()}
     users: dict[int, int] = {}  # the first statement that computes a value
     for i, statement in enumerate(schedule.body):
-        for node in ordered(values_of(statement)):
+        for node in ordered(statement.values()):
             users.setdefault(id(node), i)
     groups: dict[int, list[_Mask]] = {}
     for i, (masks, guard) in enumerate(zip(schedule.body, schedule.body[1:], strict=False)):
@@ -81,7 +79,7 @@ def early(schedule: Schedule) -> Schedule:
     if not planes:
         return schedule
     done: dict[int, Node] = {}
-    for node in ordered(node for statement in flat(schedule.body) for node in values_of(statement)):
+    for node in ordered(node for statement in flat(schedule.body) for node in statement.values()):
         done[id(node)] = with_args(node, tuple(done[id(arg)] for arg in node.args), graph)
         if id(node) in planes:
             known_parts = planes[id(node)]

@@ -18,7 +18,6 @@ from powderdsl.schedule.types import (
     flat,
     load,
     rewritten,
-    values_of,
 )
 
 COMPARISONS = ("eq", "lt", "le")
@@ -136,7 +135,7 @@ def led(schedule: Schedule) -> Schedule:
     Draws as floats are costly, so their comparisons follow the condition of a choice, too: `c ? (draw < x ? 1 : 2) : 3`
     → `c ? (led(c, draw < x) ? 1 : 2) : 3`.
     """
-    roots = [node for statement in flat(schedule.body) for node in values_of(statement)]
+    roots = [node for statement in flat(schedule.body) for node in statement.values()]
     comparisons = [node for node in ordered(roots) if is_comparison(node)]
     conjoined = _conjoined(roots, comparisons)
     leaders = _conditions(roots, [node for node in comparisons if _is_drawn(node)])

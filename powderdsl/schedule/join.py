@@ -17,7 +17,6 @@ from powderdsl.schedule.types import (
     loaded,
     map_blocks,
     over_variables,
-    values_of,
 )
 
 FEW = 8
@@ -42,7 +41,7 @@ def join(schedule: Schedule) -> Schedule:
     one row behind. Where a loop only continues the choices before it, it becomes one with them.
     """
     everything = [node for _, node in schedule.leaves]
-    everything += [node for statement in flat(schedule.body) for node in values_of(statement)]
+    everything += [node for statement in flat(schedule.body) for node in statement.values()]
     reads: dict[str, int] = {}
     for name in loaded(everything):
         reads[name] = reads.get(name, 0) + 1
@@ -78,7 +77,7 @@ def keeps(loop: Compute) -> bool:
 def _asks_masks_of(loop: Compute, run: Sequence[Compute]) -> bool:
     """Whether choices are made by flags of a run, which must be there in all rows before."""
     flags = {out.var.name for one in run for out in one.outs if out.var.type == FLAG}
-    return loop.over == "choices" and not flags.isdisjoint(loaded(values_of(loop)))
+    return loop.over == "choices" and not flags.isdisjoint(loaded(loop.values()))
 
 
 def _continued(first: Compute, second: Compute, reads: dict[str, int], graph: Graph) -> Compute | None:
@@ -101,7 +100,7 @@ def _continued(first: Compute, second: Compute, reads: dict[str, int], graph: Gr
     operations = [node for node in nodes if node.args]
     if not simple or len(operations) > FEW or not bases | made.keys() >= {*names, *asked}:
         return None
-    inside = list(loaded(values_of(second)))
+    inside = list(loaded(second.values()))
     if any(reads.get(name, 0) != inside.count(name) for name in made):
         return None
 
@@ -129,7 +128,7 @@ def _components(run: Sequence[Compute]) -> list[list[Compute]]:
     """The loops of a run, apart where none reads what another one of them computes."""
     found: list[tuple[set[str], list[Compute]]] = []
     for loop in run:
-        names = {out.var.name for out in loop.outs} | set(loaded(values_of(loop)))
+        names = {out.var.name for out in loop.outs} | set(loaded(loop.values()))
         joined = [part for part in found if any(out.var.name in names for one in part[1] for out in one.outs)]
         found = [part for part in found if part not in joined]
         found.append((names, [*(one for _, loops in joined for one in loops), loop]))
@@ -148,7 +147,7 @@ def _joined(run: Sequence[Compute], reads: dict[str, int]) -> Sweeps:
     }
     inside = dict.fromkeys(written, 0)
     for loop, part in zip(run, parts, strict=True):
-        for name in loaded(values_of(loop)):
+        for name in loaded(loop.values()):
             if written.get(name) == part:
                 inside[name] += 1
     passing = (name for name in written if reads.get(name, 0) == inside[name])
@@ -157,7 +156,7 @@ def _joined(run: Sequence[Compute], reads: dict[str, int]) -> Sweeps:
 
 def field_reads(loop: Compute) -> Iterator[Read]:
     """The fields that a loop or its region reads."""
-    for node in ordered(values_of(loop)):
+    for node in ordered(loop.values()):
         if node.op == "load" and node.type == REAL:
             yield Read(str(node.attr), 0, 0, True, False)
         elif node.op in ("shift", "live") and node.args[0].op == "load" and node.args[0].type == REAL:

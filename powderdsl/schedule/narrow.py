@@ -23,7 +23,6 @@ from powderdsl.schedule.types import (
     map_computes,
     planes_at_neighbors,
     rewritten,
-    values_of,
 )
 
 
@@ -52,7 +51,7 @@ def _where_read(schedule: Schedule) -> Schedule:
     statements = list(flat(schedule.body))
     shifted = planes_at_neighbors(schedule)
     asking: dict[str, set[str]] = {}  # by field: the flags that hold wherever it is read
-    roots = [node for one in statements for node in values_of(one)] + [node for _, node in schedule.leaves]
+    roots = [node for one in statements for node in one.values()] + [node for _, node in schedule.leaves]
     for name, where, masks in _field_reads(roots):
         flags = {shifted[mask][0] for mask in masks if mask in shifted and shifted[mask][1] == where}
         if where == HERE:

@@ -18,7 +18,6 @@ from powderdsl.schedule.types import (
     Statement,
     combined,
     flat,
-    values_of,
 )
 
 MAX_PLANES = 6
@@ -192,7 +191,7 @@ def _asked(masks: list[Node], bits: dict[str, int], times: dict[str, Time], grap
 def asked_ids(schedule: Schedule) -> int:
     """All ids whose presence a schedule tests."""
     roots = [] if schedule.when is None else [schedule.when]
-    roots += [node for statement in flat(schedule.body) for node in values_of(statement)]
+    roots += [node for statement in flat(schedule.body) for node in statement.values()]
     return reduce(or_, (node.attr for node in ordered(roots) if node.op == "present"), 0)
 
 

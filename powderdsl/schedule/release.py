@@ -22,12 +22,10 @@ from powderdsl.schedule.types import (
     Statement,
     Sweeps,
     combined,
-    defined_by,
     in_order,
     load,
     loaded,
     read_elsewhere,
-    values_of,
 )
 
 
@@ -52,7 +50,7 @@ def _block(
     result: list[Statement] = []
     for given, after in zip(body, reversed(lives), strict=True):
         statement = given
-        written = {var.name for var in defined_by(statement) if var.type != ANSWER}
+        written = {var.name for var in statement.defined() if var.type != ANSWER}
         gone = (reads(statement) | written) - after
         if isinstance(statement, Guard):
             outside = reads(statement) - made_in(statement.body)
@@ -72,7 +70,7 @@ def _block(
             statement = _overtaken(_put_off(statement, after, namer, graph), after)
             gone -= {out.into for loop in statement.loops for out in loop.outs if out.into is not None}
         elif isinstance(statement, Compute) and statement.region is not None:
-            statement = _updated(statement, after | read_elsewhere(values_of(statement)))
+            statement = _updated(statement, after | read_elsewhere(statement.values()))
             gone -= {out.into for out in statement.outs if out.into is not None}
         result.append(statement)
         if gone:
@@ -182,13 +180,13 @@ def _updated(loop: Compute, after: set[str]) -> Compute:
 
 def live_before(statement: Statement, after: set[str]) -> set[str]:
     """The variables that are live before a statement, given those that are live after it."""
-    live = after - {var.name for var in defined_by(statement)}
+    live = after - {var.name for var in statement.defined()}
     return live | (reads(statement) - made_in([statement]))
 
 
 def reads(statement: Statement) -> set[str]:
     """The variables that a statement reads, including nested statements."""
-    found = set(loaded(values_of(statement)))
+    found = set(loaded(statement.values()))
     if isinstance(statement, Sweeps):
         found -= set(statement.passing)
     if isinstance(statement, Guard):
@@ -199,7 +197,7 @@ def reads(statement: Statement) -> set[str]:
 
 def made_in(body: Sequence[Statement]) -> set[str]:
     """The variables that statements define, including nested ones."""
-    found = {var.name for statement in body for var in defined_by(statement)}
+    found = {var.name for statement in body for var in statement.defined()}
     for statement in body:
         if isinstance(statement, Guard):
             found |= made_in(statement.body)

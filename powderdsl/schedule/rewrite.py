@@ -11,14 +11,12 @@ from powderdsl.schedule.types import (
     Compute,
     Forget,
     Guard,
-    Move,
     Schedule,
     Statement,
     flat,
     loaded,
     map_blocks,
     rewritten,
-    values_of,
 )
 
 Rule = Callable[[Node], Node | None]
@@ -38,27 +36,8 @@ def map_values(schedule: Schedule, rule: Rule) -> Schedule:
 
 def with_values(statement: Statement, graph: Graph, rule: Rule) -> Statement:
     """One statement with its own values rewritten, without those of nested statements."""
-    new = rewritten(values_of(statement), graph, rule)
-    match statement:
-        case Compute(outs):
-            changed = (
-                replace(
-                    out,
-                    value=new[id(out.value)],
-                    otherwise=None if out.otherwise is None else new[id(out.otherwise)],
-                )
-                for out in outs
-            )
-            region = None if statement.region is None else new[id(statement.region)]
-            when = None if statement.when is None else new[id(statement.when)]
-            return replace(statement, outs=tuple(changed), region=region, when=when)
-        case Move(_, _, movers, planes):
-            moved = (replace(p, old=new[id(p.old)], leaves=new[id(p.leaves)]) for p in planes)
-            return replace(statement, movers=new[id(movers)], planes=tuple(moved))
-        case Guard(when, _, keeps):
-            kept = tuple((var, new[id(value)]) for var, value in keeps)
-            return replace(statement, when=tuple(new[id(node)] for node in when), keeps=kept)
-    return statement
+    new = rewritten(statement.values(), graph, rule)
+    return statement.with_values(lambda node: new[id(node)])
 
 
 def without_unread(schedule: Schedule) -> Schedule:
@@ -74,7 +53,7 @@ def without_unread(schedule: Schedule) -> Schedule:
 
 
 def _reads(body: Iterable[Statement]) -> Counter[str]:
-    return Counter(loaded(node for statement in flat(body) for node in values_of(statement)))
+    return Counter(loaded(node for statement in flat(body) for node in statement.values()))
 
 
 def _keep(body: Iterable[Statement], read: Counter[str], outside: frozenset[str]) -> tuple[Statement, ...]:

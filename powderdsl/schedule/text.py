@@ -21,7 +21,6 @@ from powderdsl.schedule.types import (
     Statement,
     Sweeps,
     Sync,
-    values_of,
 )
 
 _INFIX = {
@@ -65,7 +64,7 @@ def _block(body: Sequence[Statement], indent: str, names: _Names) -> Iterator[st
 
 
 def _statement(statement: Statement, indent: str, names: _Names) -> Iterator[str]:
-    values = _Values(values_of(statement), names)
+    values = _Values(statement.values(), names)
     match statement:
         case Compute(outs, _, over, region):
             if over:

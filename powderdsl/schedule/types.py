@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, Self
 
 from powderdsl.ir.ops import FLAG, REAL, Graph, Node, Type, ordered
 
@@ -42,7 +42,24 @@ class Out:
 
 
 @dataclass(frozen=True)
-class Compute:
+class Statement:
+    """A statement says once what values it reads and what variables it makes; all walks over schedules follow from that."""
+
+    def values(self) -> Iterator[Node]:
+        """The values that it reads, without those of nested statements."""
+        return iter(())
+
+    def with_values(self, new: Callable[[Node], Node]) -> Self:
+        """The statement with each of these values replaced by another."""
+        return self
+
+    def defined(self) -> Iterator[Var]:
+        """The variables that it defines for statements after it."""
+        return iter(())
+
+
+@dataclass(frozen=True)
+class Compute(Statement):
     """Computes values of cells; all of them read the variables as they were before. `place`: ``rules/acme.yaml:12``.
 
     `over` is the kind of loop that `cut` chose: over words of flags, over cells for floats, or over choices that are
@@ -57,6 +74,23 @@ class Compute:
     """An answer: if it is false, every variable is its `otherwise` (a constant) everywhere."""
     held: bool = False
     """Whether all values are computed before any is stored, since it overwrites what it reads at neighbors (`buffers`)."""
+
+    def values(self) -> Iterator[Node]:
+        yield from (out.value for out in self.outs)
+        yield from (out.otherwise for out in self.outs if out.otherwise is not None)
+        yield from (node for node in (self.region, self.when) if node is not None)
+
+    def with_values(self, new: Callable[[Node], Node]) -> Self:
+        outs = tuple(
+            replace(out, value=new(out.value), otherwise=out.otherwise and new(out.otherwise))
+            for out in self.outs
+        )
+        return replace(
+            self, outs=outs, region=self.region and new(self.region), when=self.when and new(self.when)
+        )
+
+    def defined(self) -> Iterator[Var]:
+        return (out.var for out in self.outs)
 
 
 Leftover = Literal["same", "nothing", "everything"]
@@ -88,7 +122,7 @@ class Carried:
 
 
 @dataclass(frozen=True)
-class Move:
+class Move(Statement):
     """Planes that move together: `swap` or `arrive` of the IR with the same movers and offset."""
 
     op: str
@@ -97,9 +131,21 @@ class Move:
     planes: tuple[Carried, ...]
     place: str = ""
 
+    def values(self) -> Iterator[Node]:
+        yield self.movers
+        for plane in self.planes:
+            yield from (plane.old, plane.leaves)
+
+    def with_values(self, new: Callable[[Node], Node]) -> Self:
+        planes = (replace(plane, old=new(plane.old), leaves=new(plane.leaves)) for plane in self.planes)
+        return replace(self, movers=new(self.movers), planes=tuple(planes))
+
+    def defined(self) -> Iterator[Var]:
+        return (plane.new for plane in self.planes)
+
 
 @dataclass(frozen=True)
-class Guard:
+class Guard(Statement):
     """Statements that run only if one of the flags `when` holds in some cell.
 
     `keeps` lists the variables of the body that are read after it, each with its value if the body is skipped.
@@ -112,16 +158,27 @@ class Guard:
     otherwise: tuple[Statement, ...] = ()
     """Statements that give `keeps` their values if the body is skipped and they share no buffers (set by `buffers`)."""
 
+    def values(self) -> Iterator[Node]:
+        yield from self.when
+        yield from (value for _, value in self.keeps)
+
+    def with_values(self, new: Callable[[Node], Node]) -> Self:
+        keeps = tuple((var, new(value)) for var, value in self.keeps)
+        return replace(self, when=tuple(map(new, self.when)), keeps=keeps)
+
+    def defined(self) -> Iterator[Var]:
+        return (var for var, _ in self.keeps)
+
 
 @dataclass(frozen=True)
-class Release:
+class Release(Statement):
     """Frees the buffers of variables that nothing reads later."""
 
     names: tuple[str, ...]
 
 
 @dataclass(frozen=True)
-class Sweeps:
+class Sweeps(Statement):
     """Consecutive loops over cells that run together, world by world and row by row, so that data stay in the cache.
 
     Each loop runs `lags` rows behind the first of its part: then the rows that it reads of earlier loops are there. A
@@ -134,18 +191,26 @@ class Sweeps:
     lags: tuple[int, ...]
     passing: tuple[str, ...]
 
+    def values(self) -> Iterator[Node]:
+        for loop in self.loops:
+            yield from loop.values()
+
+    def with_values(self, new: Callable[[Node], Node]) -> Self:
+        return replace(self, loops=tuple(loop.with_values(new) for loop in self.loops))
+
+    def defined(self) -> Iterator[Var]:
+        for loop in self.loops:
+            yield from (var for var in loop.defined() if var.name not in self.passing)
+
 
 @dataclass(frozen=True)
-class Forget:
+class Forget(Statement):
     """Discards what is known about which elements occur (`presence`)."""
 
 
 @dataclass(frozen=True)
-class Sync:
+class Sync(Statement):
     """A barrier: all threads have finished the statements before it."""
-
-
-Statement = Compute | Move | Guard | Release | Sweeps | Forget | Sync
 
 
 @dataclass(frozen=True)
@@ -264,39 +329,6 @@ def read_elsewhere(values: Iterable[Node]) -> set[str]:
 # Statements
 
 
-def values_of(statement: Statement) -> Iterator[Node]:
-    """The values that a statement itself reads, without those of nested statements."""
-    match statement:
-        case Compute(outs):
-            yield from (out.value for out in outs)
-            yield from (out.otherwise for out in outs if out.otherwise is not None)
-            yield from (node for node in (statement.region, statement.when) if node is not None)
-        case Sweeps(loops):
-            for loop in loops:
-                yield from values_of(loop)
-        case Move(_, _, movers, planes):
-            yield movers
-            for plane in planes:
-                yield from (plane.old, plane.leaves)
-        case Guard(when, _, keeps):
-            yield from when
-            yield from (value for _, value in keeps)
-
-
-def defined_by(statement: Statement) -> Iterator[Var]:
-    """The variables that a statement defines for those after it."""
-    match statement:
-        case Compute(outs):
-            yield from (out.var for out in outs)
-        case Sweeps(loops):
-            for loop in loops:
-                yield from (var for var in defined_by(loop) if var.name not in statement.passing)
-        case Move(_, _, _, planes):
-            yield from (plane.new for plane in planes)
-        case Guard(_, _, keeps):
-            yield from (var for var, _ in keeps)
-
-
 def flat(body: Iterable[Statement]) -> Iterator[Statement]:
     """All statements, including nested ones; a guard comes before its body."""
     for statement in body:
@@ -327,7 +359,7 @@ def variables(schedule: Schedule) -> dict[str, Var]:
     found = {var.name: var for _, var in schedule.finds}
     for statement in flat(schedule.body):
         loops = statement.loops if isinstance(statement, Sweeps) else (statement,)  # with what only passes
-        found |= {var.name: var for one in loops for var in defined_by(one)}
+        found |= {var.name: var for one in loops for var in one.defined()}
     return found
 
 
@@ -368,6 +400,6 @@ class Namer:
 __all__ = [
     "ANSWER", "FLAG", "REAL",
     "Carried", "Compute", "Forget", "Guard", "Move", "Namer", "Out", "Release", "Schedule", "Statement", "Sweeps", "Sync", "Var",
-    "combined", "conjuncts", "defined_by", "flat", "in_order", "is_movement", "is_zero", "load", "loaded", "map_blocks", "map_computes", "ordered",
-    "over_variables", "planes_at_neighbors", "read_elsewhere", "rewritten", "values_of", "variables", "with_args",
+    "combined", "conjuncts", "flat", "in_order", "is_movement", "is_zero", "load", "loaded", "map_blocks", "map_computes", "ordered",
+    "over_variables", "planes_at_neighbors", "read_elsewhere", "rewritten", "variables", "with_args",
 ]  # fmt: skip

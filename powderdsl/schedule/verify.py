@@ -17,11 +17,9 @@ from powderdsl.schedule.types import (
     Statement,
     Sweeps,
     Var,
-    defined_by,
     in_order,
     loaded,
     read_elsewhere,
-    values_of,
 )
 
 _KINDS = ("flag", "real", ANSWER.name)
@@ -52,7 +50,7 @@ class _Checker:
         live = set(live)
         for statement in body:
             if not isinstance(statement, Sweeps):
-                for node in values_of(statement):
+                for node in statement.values():
                     self.value(node, live)
             match statement:
                 case Guard(when, inner, keeps, _, otherwise):
@@ -72,7 +70,7 @@ class _Checker:
                     continue
                 case Compute(outs):
                     _demand(_is_region(statement.region), "a region is made of stored flags and live fields")
-                    elsewhere = read_elsewhere(values_of(statement)) if statement.over == "words" else set()
+                    elsewhere = read_elsewhere(statement.values()) if statement.over == "words" else set()
                     for out in outs:
                         _demand(out.var.type == out.value.type, f"{out.var.name} gets a {out.value.type}")
                         _demand(
@@ -100,7 +98,7 @@ class _Checker:
                 case Release(names):
                     _demand(set(names) <= live, f"{names} are released, but not there")
                     live -= set(names)
-            for var in defined_by(statement):
+            for var in statement.defined():
                 _demand(self.vars.setdefault(var.name, var) is var, f"two variables are called {var.name}")
                 _demand(var.name not in live, f"{var.name} is assigned twice")
                 live.add(var.name)
@@ -134,7 +132,7 @@ def _check_order(sweeps: Sweeps) -> None:
                     f"{read.name} is gone when it is read",
                 )
         if loop.over == "choices":
-            early = [name for name in loaded(values_of(loop)) if name in made and types[name] == FLAG]
+            early = [name for name in loaded(loop.values()) if name in made and types[name] == FLAG]
             _demand(not early, f"choices are made by {early}, which are not there in all rows")
         for out in loop.outs:  # a row is written over after all rows around it have been computed
             late = any(name == out.into and lag <= least for name, least in seen)

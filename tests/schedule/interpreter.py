@@ -25,7 +25,6 @@ from powderdsl.schedule.types import (
     Statement,
     Sweeps,
     Var,
-    defined_by,
 )
 
 SNAP = np.float32(2.0**-20)
@@ -100,7 +99,7 @@ class _State:
                         found = self.values([value for _, value in keeps])
                         kept = {var.name: value for (var, _), value in zip(keeps, found, strict=True)}
                         self.block(otherwise)
-                        for name in {var.name for one in otherwise for var in defined_by(one)}:
+                        for name in {var.name for one in otherwise for var in one.defined()}:
                             assert np.array_equal(self.held[name], kept[name]), name
                     # What the body released or overwrote is gone in either case.
                     gone = set(before) - set(self.held)
@@ -113,7 +112,7 @@ class _State:
                         made = {
                             self.buffers[v.name]
                             for one in _all(inner)
-                            for v in defined_by(one)
+                            for v in one.defined()
                             if v.name in self.buffers
                         }
                         gone |= {name for name in before if self.buffers.get(name) in made}

@@ -18,7 +18,6 @@ from powderdsl.schedule.types import (
     alternatives,
     flat,
     is_zero,
-    values_of,
 )
 from powderdsl.targets.cpp.chunks import Chunks
 from powderdsl.targets.layout import Layout
@@ -39,7 +38,7 @@ def reaches_of(schedule: Schedule) -> dict[str, int]:
     found = {str(node.attr): ANY_PASS for _, node in schedule.leaves if node.op == "load"}
     copies: list[tuple[str, Node]] = []  # a field whose rows may be those of another one
     for statement in flat(schedule.body):
-        for node in ordered(values_of(statement)):
+        for node in ordered(statement.values()):
             if node.op == "shift" and node.type == REAL and node.attr[2]:
                 name = str(node.args[0].attr)
                 found[name] = max(found.get(name, 0), abs(node.attr[1]))
@@ -108,10 +107,10 @@ def _ahead(sweeps: Sweeps) -> dict[str, int]:
     return {name: count for name, count in found.items() if count}
 
 
-def sweeps_text(sweeps: Sweeps, declared: frozenset[str], layout: Layout, reaches: Mapping[str, int]) -> str:
+def sweeps_text(sweeps: Sweeps, layout: Layout, reaches: Mapping[str, int]) -> str:
     """The text of one loop over worlds, see EACH_WORLD in fields.hpp."""
     if keeps(sweeps.loops[0]):
-        return _changed_text(sweeps.loops[0], declared, layout, reaches)
+        return _changed_text(sweeps.loops[0], layout, reaches)
     waiting = _waiting(sweeps)
     written = {out.var.name for loop in sweeps.loops for out in loop.outs}
     waits = sum(rows.depth for rows in waiting.values())
@@ -163,26 +162,21 @@ def sweeps_text(sweeps: Sweeps, declared: frozenset[str], layout: Layout, reache
     loop_text = "\n".join([start, *inside, "}();"])
     outs = [out for loop in sweeps.loops for out in loop.outs]
     lasting = [out for out in outs if out.var.name not in waiting]
-    declares = " ".join(
-        f"{'Field' if out.var.type == REAL else 'Plane'}* {out.var.name};"
-        for out in lasting
-        if out.var.name not in declared
-    )
     if any(loop.region is None for loop in sweeps.loops):
-        return f"{declares}\n{{\n{loop_text}\n}}"
+        return f"{{\n{loop_text}\n}}"
     asked = dict.fromkeys(
         question for loop in sweeps.loops for name, question in _asked(loop) if name not in written
     )
     quiet = " ".join(f"{out.var.name} = keep({_quiet(out)});" for out in lasting)
     quiet += " ".join(f" give(c, {out.into});" for out in lasting if out.into is not None)
-    return f"{declares}\nif ({' && '.join(asked) or 'true'}) {{ {quiet} }} else {{\n{loop_text}\n}}"
+    return f"if ({' && '.join(asked) or 'true'}) {{ {quiet} }} else {{\n{loop_text}\n}}"
 
 
 def _copies(
     loops: Sequence[Compute], without: Container[str], places: Mapping[str, str] = MappingProxyType({})
 ) -> str:
     """Copies of the addresses that loops need: a compiler knows that what loops store does not change them."""
-    nodes = [node for loop in loops for node in ordered(values_of(loop)) if node.op == "load"]
+    nodes = [node for loop in loops for node in ordered(loop.values()) if node.op == "load"]
     names = [places.get(str(node.attr), str(node.attr)) for node in nodes]
     types = {name: node.type for name, node in zip(names, nodes, strict=True)}
     types |= {out.var.name: out.var.type for loop in loops for out in loop.outs}
@@ -195,7 +189,7 @@ def _copies(
     )
 
 
-def _changed_text(loop: Compute, declared: frozenset[str], layout: Layout, reaches: Mapping[str, int]) -> str:
+def _changed_text(loop: Compute, layout: Layout, reaches: Mapping[str, int]) -> str:
     """A loop that changes fields in place, in rows of its region."""
     olds = {out.var.name: str(out.otherwise.attr) for out in loop.outs if out.otherwise is not None}
     places = {out.into: out.var.name for out in loop.outs if out.into is not None}
@@ -204,7 +198,7 @@ def _changed_text(loop: Compute, declared: frozenset[str], layout: Layout, reach
     lines = []
     for name, old in olds.items():
         value = old if old in places else f"keep({old})"
-        lines.append(f"{'' if name in declared else 'Field* '}{name} = {value}; bool some{name} = false;")
+        lines.append(f"{name} = {value}; bool some{name} = false;")
     asked = " || ".join(dict.fromkeys(f"!{question}" for _, question in _asked(loop))) or "false"
     lines.append(f"if ({asked}) {{ {' '.join(f'own(c, {name});' for name in olds)}")
     lines += _marking(0, marked, layout)

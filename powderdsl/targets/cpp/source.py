@@ -15,7 +15,7 @@ from powderdsl.system.memo import collection_paused
 from powderdsl.targets.cpp.text import pass_text
 from powderdsl.targets.layout import Layout, layout_of, literal
 
-GENERATOR_VERSION = 10
+GENERATOR_VERSION = 11
 """Part of every cache key; increase it when generated code changes meaning."""
 
 LIBRARY = ("vectors", "runtime", "planes", "movements", "fields")

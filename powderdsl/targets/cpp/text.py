@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 from powderdsl.ir.ops import FLAG, REAL, Node
 from powderdsl.schedule.draws import is_coin
-from powderdsl.schedule.empty import is_whole
-from powderdsl.schedule.types import Compute, Forget, Guard, Move, Release, Schedule, Statement, Sweeps, Var
+from powderdsl.schedule.types import Compute, Guard, Move, Out, Schedule, Statement, Sweeps, Var, variables
 from powderdsl.schedule.updates import asked, is_cleared
 from powderdsl.targets.cpp.cells import reaches_of, sweeps_text
 from powderdsl.targets.layout import Layout, number, param_key
+from powderdsl.targets.statements import printed
 from powderdsl.targets.values import WordValues
 
 _LOGIC = {"and": "&", "or": "|", "xor": "^"}
@@ -37,7 +37,9 @@ def pass_text(schedule: Schedule, number: int, layout: Layout) -> str:
             lines.append(f"{kind(var)}* {var.name} = {place}; {place} = nullptr;")
         else:
             lines.append(f"{kind(var)}* {var.name} = keep({place});")
-    lines += printer.block(schedule.body, frozenset())
+    there = {var.name for _, var in schedule.finds}
+    lines += [f"{kind(var)}* {name};" for name, var in variables(schedule).items() if name not in there]
+    lines += printer.block(schedule.body)
     lines += printer.leave(schedule)
     body = "\n".join(lines)
     return f"// pass {number}\n__attribute__((noinline)) void pass_{number}(Context& c) {{\n{body}\n}}"
@@ -69,29 +71,36 @@ class _Printer:
             return f"c.real[{self.layout.reals[name]}]"
         return f"c.slot[{self.layout.planes[name]}]"
 
-    def block(self, body: Sequence[Statement], declared: frozenset[str]) -> Iterator[str]:
-        """The text of a block. `declared`: variables that a guard around the block has declared."""
+    def block(self, body: Sequence[Statement]) -> Iterator[str]:
         for statement in body:
-            match statement:
-                case Compute((out,), _, "words") if is_whole(out.value):
-                    type = "" if out.var.name in declared else "Plane* "
-                    yield f"{type}{out.var.name} = {whole(out.value, self.layout)};"
-                case Compute() if statement.region is not None:
-                    yield from self.update(statement, declared)
-                case Compute():
-                    yield from self.words(statement, declared)
-                case Sweeps():
-                    yield sweeps_text(statement, declared, self.layout, self.reaches)
-                case Move():
-                    yield from self.move(statement, declared)
-                case Guard():
-                    yield from self.guard(statement, declared)
-                case Release(names):
-                    yield " ".join(f"give(c, {name});" for name in names)
-                case Forget():
-                    yield "c.present = ~0ull;"
-                case _:
-                    raise AssertionError("no such statement in C++")
+            yield from printed(self, statement)
+
+    def whole(self, out: Out) -> Iterator[str]:
+        """An operation on whole planes that tests for empty ones itself."""
+        yield f"{out.var.name} = {self.of_planes(out.value)};"
+
+    def of_planes(self, value: Node) -> str:
+        args = value.args
+        match value.op:
+            case "load" | "const":
+                return f"keep({_held(value)})"
+            case "shift":
+                dy, dx, _ = value.attr
+                self.layout.around = max(self.layout.around, abs(dy))
+                return f"shifted(c, {args[0].attr}, {dy}, {dx})"
+            case "or":
+                return f"joined(c, {args[0].attr}, {args[1].attr})"
+        kept, gone = args if args[1].op == "not" else args[::-1]
+        return f"cleared(c, {kept.attr}, {gone.args[0].attr})"
+
+    def sweeps(self, sweeps: Sweeps) -> Iterator[str]:
+        yield sweeps_text(sweeps, self.layout, self.reaches)
+
+    def release(self, names: Iterable[str]) -> Iterator[str]:
+        yield " ".join(f"give(c, {name});" for name in names)
+
+    def forget(self) -> Iterator[str]:
+        yield "c.present = ~0ull;"
 
     def leave(self, schedule: Schedule) -> Iterator[str]:
         """The new values of slots; all are read before any is stored."""
@@ -105,28 +114,23 @@ class _Printer:
         names = dict.fromkeys(str(node.attr) for _, node in schedule.leaves if node.op == "load")
         yield " ".join(f"give(c, {name});" for name in names)
 
-    def guard(self, guard: Guard, declared: frozenset[str]) -> Iterator[str]:
+    def guard(self, guard: Guard) -> Iterator[str]:
         asked = " || ".join(f"!{node.attr}->zero" for node in guard.when) or "false"
-        kept = [var for var, _ in guard.keeps]
-        for var in kept:
-            if var.name not in declared:
-                yield f"{kind(var)}* {var.name};"
         yield f"if ({asked}) {{"
-        yield from self.block(guard.body, frozenset(var.name for var in kept))
-        if kept:
+        yield from self.block(guard.body)
+        if guard.keeps:
             yield "} else {"
             for var, value in guard.keeps:
                 yield f"{var.name} = {_kept(value)};"
         yield "}"
 
-    def move(self, move: Move, declared: frozenset[str]) -> Iterator[str]:
+    def move(self, move: Move) -> Iterator[str]:
         dy, dx = move.offset
         self.layout.around = max(self.layout.around, abs(dy))
         movers = str(move.movers.attr)
         if move.planes[0].new.type == REAL:
-            yield from self.exchange(move, declared)
+            yield from self.exchange(move)
             return
-        names = {plane.new.name: "" if plane.new.name in declared else "Plane* " for plane in move.planes}
         far = move.op == "arrive" and abs(dy) > 1  # `arrive_planes` moves by one row
         copies = far or any(plane.leftover(move.movers) is None for plane in move.planes)
         if copies and move.op == "swap":
@@ -134,8 +138,6 @@ class _Printer:
             for plane in move.planes:
                 old, rest = plane.old.attr, _held(plane.leaves)
                 call = f"swap_plane(c, {old}, {movers}, target, {rest}, {dy}, {dx})"
-                if names[plane.new.name]:
-                    yield f"Plane* {plane.new.name};"
                 yield f"{{ Plane* target = {target}; {plane.new.name} = {call}; give(c, target); }}"
                 if plane.into:
                     yield f"give(c, {plane.into});"
@@ -144,7 +146,7 @@ class _Printer:
         kinds: dict[str, list[str]] = {}
         for plane in move.planes:
             kept = f"keep({_held(plane.leaves) if copies else plane.old.attr})"
-            yield f"{names[plane.new.name]}{plane.new.name} = {plane.into or kept};"
+            yield f"{plane.new.name} = {plane.into or kept};"
             if copies:
                 continue
             kinds.setdefault(str(plane.leftover(move.movers)), []).append(f"&{plane.new.name}")
@@ -158,17 +160,17 @@ class _Printer:
             call = f"{function}(c, {movers}, {dy}, {dx}, all, {len(targets)});"
             yield f"{{ Plane** const all[] = {{{', '.join(targets)}}}; {call} }}"
 
-    def exchange(self, move: Move, declared: frozenset[str]) -> Iterator[str]:
+    def exchange(self, move: Move) -> Iterator[str]:
         """Fields that exchange values."""
         dy, dx = move.offset
         for field in move.planes:
             value = field.into or f"keep({field.old.attr})"
-            yield f"{'' if field.new.name in declared else 'Field* '}{field.new.name} = {value};"
+            yield f"{field.new.name} = {value};"
         fields = ", ".join(f"&{field.new.name}" for field in move.planes)
         call = f"swap_fields<{len(move.planes)}>(c, {move.movers.attr}, {dy}, {dx}, all);"
         yield f"{{ Field** const all[] = {{{fields}}}; {call} }}"
 
-    def update(self, loop: Compute, declared: frozenset[str]) -> Iterator[str]:
+    def update(self, loop: Compute) -> Iterator[str]:
         """Planes that change only in words where a mask holds. Empty ones that can only lose flags need no copy."""
         values = _Words(self.layout)
         for out in loop.outs:
@@ -176,7 +178,7 @@ class _Printer:
             name, old = out.var.name, str(out.otherwise.attr)
             if out.into:
                 values.places[old] = name
-            yield f"{'' if name in declared else 'Plane* '}{name} = {old if out.into else f'keep({old})'};"
+            yield f"{name} = {old if out.into else f'keep({old})'};"
         masks = [str(node.attr) for node in asked(loop)]
         yield f"if ({' || '.join(f'!{mask}->zero' for mask in masks)}) {{"
         before, stores, after = [], [], []
@@ -195,16 +197,13 @@ class _Printer:
         yield "\n".join([*before, values.ready(), values.pointers(), LOOP, f"if (!any({some})) continue;"])
         yield "\n".join([*values.lines, *stores, "}", *after, "}"])
 
-    def words(self, loop: Compute, declared: frozenset[str]) -> Iterator[str]:
+    def words(self, loop: Compute) -> Iterator[str]:
         names = [out.var.name for out in loop.outs]
         values = _Words(self.layout)
         stores = [
             f"{{ const V o = {values.clean(out.value)}; d{out.var.name}[i] = o; a{out.var.name} |= o; }}"
             for out in loop.outs
         ]
-        new = [name for name in names if name not in declared]
-        if new:
-            yield "Plane " + ", ".join(f"*{name}" for name in new) + ";"
         if loop.when is not None:
             without = " ".join(f"{name} = keep(c.nothing);" for name in names)
             yield f"if (!{answer(loop.when)}) {{ {without} }} else {{"
@@ -227,22 +226,6 @@ def _kept(value: Node) -> str:
     if value.op == "load" or value.type == FLAG:
         return f"keep({_held(value)})"
     return "keep(c.calm)"
-
-
-def whole(value: Node, layout: Layout) -> str:
-    """An operation on whole planes that tests for empty ones itself, see `empty.is_whole`."""
-    args = value.args
-    match value.op:
-        case "load" | "const":
-            return f"keep({_held(value)})"
-        case "shift":
-            dy, dx, _ = value.attr
-            layout.around = max(layout.around, abs(dy))
-            return f"shifted(c, {args[0].attr}, {dy}, {dx})"
-        case "or":
-            return f"joined(c, {args[0].attr}, {args[1].attr})"
-    kept, gone = args if args[1].op == "not" else args[::-1]
-    return f"cleared(c, {kept.attr}, {gone.args[0].attr})"
 
 
 class _Words(WordValues):

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from powderdsl.ir.ops import REAL, ordered
-from powderdsl.schedule.types import Move, Schedule, Sweeps, flat, values_of
+from powderdsl.schedule.types import Move, Schedule, Sweeps, flat
 from powderdsl.targets.layout import Layout
 from powderdsl.targets.values import chains_of
 
@@ -52,7 +52,7 @@ def extent_of(schedules: Sequence[Schedule]) -> Extent:
         elif isinstance(statement, Sweeps):
             laid = (loop for loop in statement.loops if loop.over == "choices")
             chains = max(chains, *(len(chains_of(loop)) for loop in laid), 0)
-        for node in ordered(values_of(statement)):
+        for node in ordered(statement.values()):
             if node.op == "shift" and node.type != REAL:
                 around = max(around, abs(node.attr[0]))
             elif node.op in ("shift", "live"):

@@ -5,20 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from powderdsl.ir.ops import FLAG, REAL, Node, Offset
-from powderdsl.schedule.empty import is_whole
 from powderdsl.schedule.types import (
     Compute,
-    Forget,
     Guard,
     Move,
     Out,
-    Release,
     Schedule,
     Statement,
     Sweeps,
     Var,
 )
 from powderdsl.schedule.updates import is_cleared
+from powderdsl.targets.statements import printed
 from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, op
 from powderdsl.targets.wasm.cells import sweep
 from powderdsl.targets.wasm.library import ZERO, Library, word
@@ -130,27 +128,15 @@ class Pass:
 
     def block(self, body: Sequence[Statement]) -> None:
         for statement in body:
-            match statement:
-                case Compute((out,), _, "words") if is_whole(out.value):
-                    self.whole(out)
-                case Compute() if statement.region is not None:
-                    self.update(statement)
-                case Compute():
-                    self.words(statement)
-                case Sweeps(loops, _, _, passing):
-                    for loop in loops:
-                        sweep(self, loop)
-                    self.release(passing)
-                case Move():
-                    self.move(statement)
-                case Guard():
-                    self.guard(statement)
-                case Release(names):
-                    self.release(names)
-                case Forget():
-                    self.f.set(self.library.present, const("i64", -1))
-                case _:
-                    raise AssertionError("no such statement on words")
+            printed(self, statement)
+
+    def sweeps(self, sweeps: Sweeps) -> None:
+        for loop in sweeps.loops:
+            sweep(self, loop)
+        self.release(sweeps.passing)
+
+    def forget(self) -> None:
+        self.f.set(self.library.present, const("i64", -1))
 
     def guard(self, guard: Guard) -> None:
         f = self.f
