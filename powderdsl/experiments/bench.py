@@ -391,7 +391,7 @@ class _Subject:
     def profile(self) -> None:
         """Measure the microseconds a world and step of each pass, if the backend can report them."""
         figures = self.figures
-        if self.program is not None or not self.sim.profile(self.world, 1):  # compiles what profiling needs
+        if self.program is not None or not self.sim.profile(self.world, 1):
             return
         steps, calls = figures.steps_per_call, figures.calls_per_round
         samples = [self.sim.profile(self.world, steps) for _ in range(calls)]

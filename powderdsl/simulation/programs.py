@@ -37,7 +37,7 @@ from powderdsl.simulation.reference_program import ReferenceProgram
 from powderdsl.system.writing import failure
 from powderdsl.targets.cache import turn
 from powderdsl.targets.cpp.build import building, cache_key, current
-from powderdsl.targets.cpp.code import NativeCode, compile_program, recall, remember
+from powderdsl.targets.cpp.code import compile_program, recall, remember
 from powderdsl.targets.cpp.compilers import (
     INSTALL,
     MISSING,
@@ -224,23 +224,11 @@ def native_program(ruleset: Ruleset, lowered: Lowered, threads: int, width: int)
                 code = compile_program(found[0].program, found[0].planes, width)
                 remember(key, code)
                 remember(start_key(ruleset), code)
-    return _recalled(code, lowered, threads, width)
-
-
-def _recalled(code: NativeCode, lowered: Lowered, threads: int, width: int) -> Runnable:
-    """The program of code for a whole ruleset, which is only lowered if its passes are timed."""
-
-    def with_clocks() -> NativeCode:
-        (segment,) = segments(lowered())
-        assert segment.planes is not None
-        return compile_program(segment.program, segment.planes, width, clocks=True)
-
-    return NativeProgram(code, threads, with_clocks)
+    return NativeProgram(code, threads)
 
 
 def _compiled(cells: Program, planes: Program, threads: int, width: int) -> Runnable:
-    code = compile_program(cells, planes, width)
-    return NativeProgram(code, threads, lambda: compile_program(cells, planes, width, clocks=True))
+    return NativeProgram(compile_program(cells, planes, width), threads)
 
 
 class ByWidth:
@@ -296,7 +284,7 @@ def auto_by_width(
     def make(width: int) -> AutoProgram:
         def ready() -> Runnable | None:
             code = recall(start_key(ruleset, width))
-            return None if code is None else _recalled(code, lowered, threads, width)
+            return None if code is None else NativeProgram(code, threads)
 
         return AutoProgram(first, asked, ready, lambda: native_program(ruleset, lowered, threads, width))
 

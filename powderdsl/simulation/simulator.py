@@ -100,7 +100,7 @@ class Simulator(AnySimulator[World]):
     def profile(self, world: World, steps: int = 1) -> dict[str, float]:
         """Seconds that each pass takes over some steps, in the order they run; empty if the backend cannot report them.
 
-        Native code counts processor time on one thread, and is compiled once more for it.
+        Native code counts processor time on one thread.
         """
         params = self._params.defaults(len(world))
         job = Job(world.state, clock_of(world), whole_count(steps), params, {}, None)

@@ -220,11 +220,9 @@ def load_library(path: Path) -> ctypes.CDLL:
             [pointer, integer, pointer, integer, pointer, integer, integer, pointer, pointer],
         ),
         "pd_codes": (None, [pointer, integer, ctypes.c_float, pointer, long]),
-        "pd_run": (pointer, [pointer, integer, long, integer, *[pointer] * 3, long, pointer, pointer]),
+        "pd_run": (pointer, [pointer, integer, long, integer, *[pointer] * 3, long, *[pointer] * 3]),
     }
     for name, (result, arguments) in signatures.items():
         function = getattr(library, name)
         function.restype, function.argtypes = result, arguments
-    if hasattr(library, "pd_profile"):  # only in libraries built with clocks
-        library.pd_profile.restype, library.pd_profile.argtypes = None, [pointer]
     return library

@@ -30,20 +30,19 @@ class NativeCode:
     passes: tuple[str, ...]
 
 
-def compile_program(program: Program, planes: Program, width: int, *, clocks: bool = False) -> NativeCode:
+def compile_program(program: Program, planes: Program, width: int) -> NativeCode:
     """Write a program as C++ and compile it.
 
     Args:
         program: the numeric program, whose slots are the state's.
         planes: the same program from `ir.bits.lower_bits`.
         width: of grids, see `source.known_width`.
-        clocks: measure the time of each pass.
 
     Raises:
         NoCompiler: there is no C++ compiler, or it failed.
     """
     source, layout, units = native_source(planes, width)
-    library, _ = open_library(f"#define PROFILE\n{source}" if clocks else source, program.name, units)
+    library, _ = open_library(source, program.name, units)
     return NativeCode(library, width, layout, pieces(program), tuple(p.name for p in planes.passes))
 
 

@@ -465,15 +465,16 @@ API void pd_fill_real(void* batch, int slot, const int64_t* boxes, const float* 
   });
   put_back(c);
 }
-// Runs a batch, or a copy of it, and returns what has run.
-API void* pd_run(void* batch, int copy, int64_t steps, int threads, const u64* seed, const u64* index, const u64* step, int64_t since, const uint8_t* planes, const float* reals) {
+// Runs a batch, or a copy of it, and returns what has run. `seconds`: null, or to which each pass adds its time.
+API void* pd_run(void* batch, int copy, int64_t steps, int threads, const u64* seed, const u64* index, const u64* step, int64_t since, const uint8_t* planes, const float* reals, double* seconds) {
   if (copy) batch = pd_copy(batch);
   Batch& b = *(Batch*)batch;
   Clocks k{seed, index, step, (u64)since};
-  int count = std::max(1, std::min(threads, (int)b.groups.size()));
+  int count = seconds ? 1 : std::max(1, std::min(threads, (int)b.groups.size()));
   std::atomic<int> next{0};
   auto task = [&](int) {
     Context* c = borrow(b.g);
+    c->seconds = seconds;
     for (int n; (n = next++) < (int)b.groups.size();) run_group(*c, b, n, steps, k, planes, reals);
     put_back(c);
   };
@@ -482,9 +483,3 @@ API void* pd_run(void* batch, int copy, int64_t steps, int threads, const u64* s
   pool().run(count, task);
   return batch;
 }
-#if defined(PROFILE)
-API void pd_profile(double* seconds) {
-  memcpy(seconds, pass_seconds, sizeof(double) * PASSES);
-  memset(pass_seconds, 0, sizeof(pass_seconds));
-}
-#endif

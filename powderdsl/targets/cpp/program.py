@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import torch
@@ -13,7 +13,6 @@ from powderdsl.targets.codec import parameters
 from powderdsl.targets.cpp.build import load_library
 from powderdsl.targets.cpp.code import NativeCode
 from powderdsl.targets.job import Job
-from powderdsl.targets.profiling import PassClock
 
 Like = Mapping[str, tuple[torch.dtype, tuple[int, ...]]]
 """The dtype and shape of each tensor of a state."""
@@ -150,18 +149,12 @@ class PackedState(Mapping[str, Tensor]):
 
 
 class NativeProgram:
-    """A program as compiled C++.
+    """A program as compiled C++. Passes are timed on one thread, in processor time."""
 
-    Args:
-        with_clocks: makes the same code with a clock for each pass; called when passes are timed.
-    """
-
-    def __init__(self, code: NativeCode, threads: int, with_clocks: Callable[[], NativeCode]):
+    def __init__(self, code: NativeCode, threads: int):
         self.library = load_library(code.library)
         self.layout, self.threads = code.layout, threads
         self.pieces, self._passes = code.pieces, code.passes
-        self._clocks = with_clocks
-        self._with_clocks: NativeProgram | None = None
         self._inputs: dict[int, Inputs] = {}
         self._planes = {
             name: (self.layout.planes[parts[0].planes[0]], len(parts[0].planes), parts[0].signed)
@@ -173,8 +166,6 @@ class NativeProgram:
         """The state `job.steps` later. Jobs with given draws or chosen passes are for other backends."""
         assert not job.draws
         assert job.passes is None
-        if job.timing is not None:
-            return self._timed(job, job.timing)
         state, (seed, index, start, since) = job.state, job.clock
         if not (seed.is_contiguous() and index.is_contiguous() and start.is_contiguous()):
             seed, index, start = seed.contiguous(), index.contiguous(), start.contiguous()
@@ -187,27 +178,15 @@ class NativeProgram:
         else:
             copy = False
             handle, like = self._pack(state)
+        seconds = None if job.timing is None else (ctypes.c_double * len(self._passes))()
         handle = self.library.pd_run(
             handle, copy, job.steps, self.threads,
-            seed.data_ptr(), index.data_ptr(), start.data_ptr(), since, inputs.planes_at, inputs.reals_at,
+            seed.data_ptr(), index.data_ptr(), start.data_ptr(), since, inputs.planes_at, inputs.reals_at, seconds,
         )  # fmt: skip
+        if job.timing is not None and seconds is not None:
+            for name, spent in zip(self._passes, seconds, strict=True):
+                job.timing.add(name, spent)
         return PackedState(self, handle, like)
-
-    def _timed(self, job: Job, clock: PassClock) -> Mapping[str, Tensor]:
-        """Run on one thread and count processor time by pass.
-
-        The first call compiles the program once more, with clocks in it. Raises NoCompiler if that fails.
-        """
-        if self._with_clocks is None:
-            self._with_clocks = NativeProgram(self._clocks(), 1, self._clocks)
-        seconds = (ctypes.c_double * len(self._passes))()
-        library = self._with_clocks.library
-        library.pd_profile(seconds)  # discard what earlier runs left
-        state = self._with_clocks.run(job._replace(timing=None))
-        library.pd_profile(seconds)
-        for name, spent in zip(self._passes, seconds, strict=True):
-            clock.add(name, spent)
-        return state
 
     def _made_inputs(self, params: Mapping[str, Tensor], batch: int) -> Inputs:
         """The inputs of some parameters, kept for the next call with the same mapping."""

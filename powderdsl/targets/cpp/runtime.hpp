@@ -60,6 +60,7 @@ struct Context {
   Field* real[REALS + 1];
   std::vector<V*> fixed;  // planes of coordinates and insides, made once
   int lanes;
+  double* seconds;  // by pass; null if nobody asks
   u64 present;  // the ids that are there, of those that passes ask for; all bits: not known
 
 #if WIDTH
@@ -160,18 +161,11 @@ ALWAYS void give(Context& c, Field* f) {
   if (--f->refs == 0) c.fields.push_back(f);
 }
 
-// Seconds spent in each pass, measured only in libraries that are built to be profiled.
-#if defined(PROFILE)
-#include <ctime>
-static double pass_seconds[PASSES + 1];
+// Seconds spent in each pass, measured where a call asks for them.
 static double thread_seconds() {
   timespec t;
   clock_gettime(CLOCK_THREAD_CPUTIME_ID, &t);
   return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
 }
-#define START double tick = thread_seconds()
-#define TICK(i) do { double now = thread_seconds(); pass_seconds[i] += now - tick; tick = now; } while (0)
-#else
-#define START
-#define TICK(i)
-#endif
+#define START double tick = c.seconds ? thread_seconds() : 0
+#define TICK(i) if (c.seconds) { const double now = thread_seconds(); c.seconds[i] += now - tick; tick = now; }

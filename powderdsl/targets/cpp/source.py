@@ -56,7 +56,7 @@ def native_source(program: Program, width: int = 0) -> NativeSource:
     schedules = [plan(pass_, CPU) for pass_ in program.passes]
     passes = [pass_text(schedule, i, layout) for i, schedule in enumerate(schedules)]
     asked = reduce(or_, map(asked_ids, schedules), 0)
-    calls = "\n".join(f"  pass_{i}(c); TICK({i});" for i in range(len(program.passes)))
+    calls = "\n".join(f"  pass_{i}(c); TICK({i})" for i in range(len(program.passes)))
     resets = [
         (slot, layout.planes.get(slot.name), layout.reals.get(slot.name))
         for slot in program.slots

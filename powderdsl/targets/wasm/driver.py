@@ -37,7 +37,6 @@ def add_driver(
     passes: Sequence[Callee],
     asked: int,
     *,
-    apart: bool = False,
     export: bool = True,
 ) -> dict[str, Callee]:
     """Add the functions that a host calls, and give them by name.
@@ -45,7 +44,6 @@ def add_driver(
     Args:
         program: on bit planes.
         asked: the ids whose presence passes ask for.
-        apart: export passes too, by their numbers, and what comes before and after them.
         export: whether hosts see these functions.
     """
     module, batches, cells = library.module, Batches(library), Transfer(library)
@@ -56,7 +54,7 @@ def add_driver(
         (batches.release(), "release"),
         (batches.scratch(), "scratch"),
         (batches.inputs(), "inputs"),
-        (Steps(library, program, passes, asked).run(apart=apart), "run"),
+        (Steps(library, program, passes, asked).run(export=export), "run"),
         (cells.load(), "load"),
         (cells.store(), "store"),
         (cells.load_real(), "load_real"),
@@ -75,14 +73,14 @@ class Steps(Batches):
         super().__init__(library)
         self.program, self.passes, self.asked = program, passes, asked
 
-    def run(self, *, apart: bool) -> Function:
-        """Runs a batch. `apart`: what it calls is exported too, so that a host can measure the time of passes."""
+    def run(self, *, export: bool) -> Function:
+        """Runs a batch. `export`: hosts see what it calls, so that they can measure the time of passes."""
         f, module = self.library.function("i32 i32"), self.library.module
         batch, steps = f.param(0), f.param(1)
-        enter = module.add(self._enter(), "enter", export=apart)
-        begin = module.add(self._begin(), "begin", export=apart)
-        leave = module.add(self._leave(), "leave", export=apart)
-        if apart:
+        enter = module.add(self._enter(), "enter", export=export)
+        begin = module.add(self._begin(), "begin", export=export)
+        leave = module.add(self._leave(), "leave", export=export)
+        if export:
             count = self.library.function("i32", "i32")
             count.give(word(count.param(0), GROUPS))
             module.add(count, "groups", export=True)

@@ -47,14 +47,13 @@ class Loaded:
         width: int,
         digest: Hashable,
         *,
-        apart: bool,
         memo: Memo | None = None,
     ):
         def make() -> tuple[Any, Layout]:
-            made = wasm_module(planes, width, apart=apart, memo=memo)
+            made = wasm_module(planes, width, memo=memo)
             return host.compile(made.code), made.layout
 
-        self.module, self.layout = _MODULES.of((host, digest, width, apart), "", make)
+        self.module, self.layout = _MODULES.of((host, digest, width), "", make)
         self.host, self.kind, self.pieces = host, kind, pieces(program)
         self.passes = tuple(one.name for one in planes.passes)
         self._instances: dict[tuple[int, bool], Instance] = {}

@@ -27,23 +27,21 @@ class WasmProgram:
         self._memo = Memo() if memo is None else memo  # the schedules are the same for all widths
         self._digest = digest_of(planes)
         self._host = this_host()
-        self._modules: dict[tuple[int, bool], Loaded] = {}
+        self._modules: dict[int, Loaded] = {}
 
-    def loaded(self, width: int, *, apart: bool = False) -> Loaded:
-        """The module for a width; `apart`: one whose passes can be called one by one."""
-        key = (width, apart)
-        if key not in self._modules:
-            self._modules[key] = Loaded(
+    def loaded(self, width: int) -> Loaded:
+        """The module for a width."""
+        if width not in self._modules:
+            self._modules[width] = Loaded(
                 self._host,
                 self._kind,
                 self._program,
                 self._planes,
                 width,
                 self._digest,
-                apart=apart,
                 memo=self._memo,
             )
-        return self._modules[key]
+        return self._modules[width]
 
     def run(self, job: Job) -> Mapping[str, Array]:
         """The state `job.steps` later. Jobs with given draws or chosen passes are for other backends."""
@@ -51,7 +49,7 @@ class WasmProgram:
         assert job.passes is None
         state = job.state
         worlds, rows, width = shape_of(state)
-        loaded = self.loaded(width, apart=job.timing is not None)
+        loaded = self.loaded(width)
         if isinstance(state, WasmState) and state.instance.loaded is loaded and job.reuse:
             instance = state.instance
         else:

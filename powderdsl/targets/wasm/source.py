@@ -39,12 +39,11 @@ class WasmModule:
 
 @collection_paused()
 def wasm_module(
-    program: Program, width: int, *, apart: bool = False, face: Face | None = None, memo: Memo | None = None
+    program: Program, width: int, *, face: Face | None = None, memo: Memo | None = None
 ) -> WasmModule:
     """The module of a program on planes, for grids of this width.
 
     Args:
-        apart: passes are exported too, by their numbers.
         face: the module is a world by itself (`standalone`), and exports only what that has.
         memo: where schedules of passes that have not changed are found.
     """
@@ -55,7 +54,7 @@ def wasm_module(
     library = Library(memory, module)
     passes = [pass_function(schedule, library) for schedule in schedules]
     asked = reduce(or_, map(asked_ids, schedules), 0)
-    added = add_driver(library, program, passes, asked, apart=apart, export=face is None)
+    added = add_driver(library, program, passes, asked, export=face is None)
     if face is not None:
         Standalone(library, face, added).add()
     return WasmModule(module, layout, width)
