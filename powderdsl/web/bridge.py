@@ -216,19 +216,15 @@ class Session:
 
     def open_world(self, data: str) -> dict[str, Any]:
         """The first world of an .npz (base64)."""
-        from powderdsl.web.worlds import world_data
+        from powderdsl.web.worlds import first_world_data
         from powderdsl.worlds.store import load_world
 
         path = self.folder.parent / "opened.npz"
         path.write_bytes(base64.b64decode(data))
         try:
-            found = load_world(path, self._simulator())
+            return first_world_data(load_world(path, self._simulator()))
         finally:
             path.unlink()
-        state = {name: np.asarray(value)[0] for name, value in found.state.items()}
-        ids = state.pop("element")
-        clock = int(found.seed[0]), int(found.index[0]), int(found.step[0])
-        return world_data(self._rules(), ids, state, clock)
 
     def _simulator(self) -> Any:
         """One for each rules: compiling takes a while."""

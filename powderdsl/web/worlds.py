@@ -32,5 +32,12 @@ def world_data(
     }
 
 
+def first_world_data(world: Any) -> dict[str, Any]:
+    """The first of some worlds of a simulator as JSON."""
+    state = {name: world.sim.kind.to_numpy(values)[0] for name, values in world.state.items()}
+    clock = int(world.seed[0]), int(world.index[0]), int(world.step[0])
+    return world_data(world.sim.ruleset, state.pop("element"), state, clock)
+
+
 def _text(data: bytes) -> str:
     return base64.b64encode(data).decode()

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from powderdsl.worldmodel.recordings import open_recording as open_recording
     from powderdsl.worldmodel.replay import Replay as Replay
     from powderdsl.worldmodel.scores import score as score
-    from powderdsl.worldmodel.trained import finetuned as finetuned
-    from powderdsl.worldmodel.trained import load_trained as load_trained
+    from powderdsl.worldmodel.training import finetuned as finetuned
+    from powderdsl.worldmodel.training import load_trained as load_trained
     from powderdsl.worldmodel.training import train as train
     from powderdsl.worldmodel.worlds import pairs_of as pairs_of
     from powderdsl.worldmodel.worlds import task_worlds as task_worlds
@@ -35,9 +35,8 @@ __getattr__ = importing(
     replay="Replay",
     networks="UNet custom_network",
     evaluation="evaluate evaluate_recording",
-    trained="finetuned load_trained",
     recordings="open_recording",
     worlds="pairs_of task_worlds unseen_seeds",
     scores="score",
-    training="train",
+    training="finetuned load_trained train",
 )

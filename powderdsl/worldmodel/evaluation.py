@@ -20,8 +20,7 @@ from powderdsl.worldmodel.networks import without_actions
 from powderdsl.worldmodel.recordings import Recording
 from powderdsl.worldmodel.rulesets import UNSEEN_RULESETS
 from powderdsl.worldmodel.scores import Network, Score, elements_of, frequent, outcomes, score, still
-from powderdsl.worldmodel.trained import Trained
-from powderdsl.worldmodel.training import check_slots, load_rules_of
+from powderdsl.worldmodel.training import Trained, check_slots, load_rules_of
 from powderdsl.worldmodel.worlds import Pairs, TaskWorlds, pairs_of, task_worlds, unseen_seeds
 
 FIT_WORLDS = 64

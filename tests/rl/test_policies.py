@@ -18,8 +18,7 @@ from powderdsl.envs.observations import observation_of
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.experiments.runs import RunFolder
 from powderdsl.rl import evaluate, load_policy, train
-from powderdsl.rl.evaluation import play
-from powderdsl.rl.films import HAND, Film, film
+from powderdsl.rl.evaluation import HAND, Film, film, play
 from powderdsl.simulation.draw import OUTLINES
 from powderdsl.simulation.simulator import World
 from powderdsl.tasks.episodes import TaskProgram, compile_task

@@ -19,7 +19,7 @@ from powderdsl.worldmodel import Machine, TrainConfig, load_trained, train
 from powderdsl.worldmodel.evaluation import evaluate, evaluate_recording
 from powderdsl.worldmodel.networks import NO_ELEMENT, ActionChannels, without_actions
 from powderdsl.worldmodel.recordings import Recording, open_recording
-from powderdsl.worldmodel.trained import finetuned
+from powderdsl.worldmodel.training import finetuned
 from tests.cli.commands import powderdsl as run
 from tests.worldmodel.test_training import same, weights
 

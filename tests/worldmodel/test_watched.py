@@ -10,8 +10,7 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.tasks.episodes import compile_task
 from powderdsl.tasks.shipped import load_task
 from powderdsl.worldmodel import DataConfig, task_worlds
-from powderdsl.worldmodel.trained import add, keep, leave_out
-from powderdsl.worldmodel.training import palette_of
+from powderdsl.worldmodel.training import add, keep, leave_out, palette_of
 from powderdsl.worldmodel.worlds import watch
 
 PAPER = ("empty", "sand", "water", "wall", "plant", "fire", "wood", "ice", "lava", "dust", "cloner")

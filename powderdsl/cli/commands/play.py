@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput
-from powderdsl.model.types import Ruleset
 
 if TYPE_CHECKING:
     from powderdsl.web.site import Site
@@ -48,25 +47,19 @@ def command(
     if rules is not None:
         ruleset = opt.load_rules(rules, settings)
         key = re.sub(r"[^A-Za-z0-9]+", "-", ruleset.name).strip("-") or "rules"
-        start = None if world is None else _start(ruleset, world)
+        start = None
+        if world is not None:
+            from powderdsl.cli.start_worlds import start as begin
+            from powderdsl.web.worlds import first_world_data
+
+            drawn = first_world_data(begin(ruleset, world, None, None, None))
+            start = {"name": Path(world).name, "about": "", **drawn}
         first = Entry(key, (rules,), settings, start)
     site = Site(first)
     if export is not None:
         click.echo(f"{export}: {site.write(export)} files")
     else:
         _serve(site, port, not no_open)
-
-
-def _start(ruleset: Ruleset, world: str) -> dict[str, Any]:
-    """The user's start world, as the page reads worlds."""
-    from powderdsl.cli.start_worlds import start
-    from powderdsl.web.worlds import world_data
-
-    first = start(ruleset, world, None, None, None)
-    state = {name: value[0].cpu().numpy() for name, value in first.state.items()}
-    ids = state.pop("element")
-    clock = int(first.seed[0]), int(first.index[0]), int(first.step[0])
-    return {"name": Path(world).name, "about": ""} | world_data(ruleset, ids, state, clock)
 
 
 def _serve(site: Site, port: int, opens: bool) -> None:

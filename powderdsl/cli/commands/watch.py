@@ -71,8 +71,7 @@ def command(
         raise BadInput("such a picture is too large: choose a smaller --scale, or fewer --worlds")
     import torch
 
-    from powderdsl.rl.evaluation import player
-    from powderdsl.rl.films import film
+    from powderdsl.rl.evaluation import film, player
     from powderdsl.simulation.media import write_gif, write_mp4
     from powderdsl.tasks.episodes import compile_task
 

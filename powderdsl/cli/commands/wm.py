@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from powderdsl.worldmodel.evaluation import Strip, Tested
     from powderdsl.worldmodel.networks import CustomNetwork
     from powderdsl.worldmodel.recordings import Recording
-    from powderdsl.worldmodel.trained import Trained
-    from powderdsl.worldmodel.training import TrainingProgress
+    from powderdsl.worldmodel.training import Trained, TrainingProgress
 
 
 KNOBS = ("kinds", "lines", "disks", "squares")
@@ -162,7 +161,7 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
 
     RUN is a run's folder, or its name in runs/. The result is a new run.
     """
-    from powderdsl.worldmodel.trained import finetuned, load_trained
+    from powderdsl.worldmodel.training import finetuned, load_trained
 
     network = _own_network(values["network_name"])
     trained = load_trained(run, device="cpu", network=network)
@@ -318,7 +317,7 @@ def _opened(folder: Path, task: str | None) -> Recording:
 
 def _loaded(run: str, values: dict[str, Any]) -> tuple[Trained, Recording | None, Machine]:
     """The network of a run, the recording that it is tested on if it has actions, and where to compute."""
-    from powderdsl.worldmodel.trained import load_trained
+    from powderdsl.worldmodel.training import load_trained
 
     machine, folder = _machine(values), values["data"]
     trained = load_trained(run, device=machine.device, network=_own_network(values["network_name"]))
@@ -346,7 +345,7 @@ def _own_network(name: str | None) -> CustomNetwork | None:
 def rules_of(rules: str, task: str, packs: tuple[str, ...], held_out: tuple[str, ...]) -> str:
     """Rules, or those of a task, with some packs alone or without others."""
     from powderdsl.tasks.shipped import load_task
-    from powderdsl.worldmodel.trained import keep, leave_out
+    from powderdsl.worldmodel.training import keep, leave_out
 
     base = rules or "+".join(load_task(task).rules)
     return keep(base, packs) if packs else leave_out(base, held_out)

@@ -185,8 +185,7 @@ class _StudyCheck:
                 return model
         from powderdsl.worldmodel.config import TrainConfig as WorldModelConfig
         from powderdsl.worldmodel.evaluation import unseen_data
-        from powderdsl.worldmodel.trained import with_packs
-        from powderdsl.worldmodel.training import KIND
+        from powderdsl.worldmodel.training import KIND, with_packs
 
         if run is None:
             find_run(values["run"], KIND)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -135,9 +135,7 @@ def counterexample_lines(found: Counterexample, ruleset: Ruleset) -> Iterator[st
         [title, *(" ".join(glyphs.get(number, "?") for number in row) for row in ids[:MAX_DRAWN, :MAX_DRAWN].tolist())]
         for title, ids in (("before", found.before["element"]), ("after", found.after["element"]))
     ]  # fmt: skip
-    width = max(len(line) for lines in columns for line in lines) + 3
-    for lines in zip(*columns, strict=True):
-        yield "".join(line.ljust(width) for line in lines).rstrip()
+    yield from side_by_side(columns)
     names = {element.id: element.name for element in ruleset.elements}
     there = np.unique([found.before["element"], found.after["element"]]).tolist()
     yield ", ".join(f"{glyphs[number]} {names[number]}" for number in there if number in names)
@@ -151,6 +149,13 @@ def counterexample_lines(found: Counterexample, ruleset: Ruleset) -> Iterator[st
         yield f"{name} = {float(values[0]):g}"
     if found.sample.step.any():
         yield f"the clock says {int(found.sample.step[0])}"
+
+
+def side_by_side(columns: Sequence[Sequence[str]]) -> Iterator[str]:
+    """Columns of lines, as many in each."""
+    width = max(len(line) for lines in columns for line in lines) + 3
+    for lines in zip(*columns, strict=True):
+        yield "".join(line.ljust(width) for line in lines).rstrip()
 
 
 def picture(found: Counterexample, ruleset: Ruleset) -> Array:
