@@ -22,6 +22,7 @@ from powderdsl.schedule.types import (
     Statement,
     Sweeps,
     combined,
+    flat,
     in_order,
     load,
     loaded,
@@ -186,19 +187,10 @@ def live_before(statement: Statement, after: set[str]) -> set[str]:
 
 def reads(statement: Statement) -> set[str]:
     """The variables that a statement reads, including nested statements."""
-    found = set(loaded(statement.values()))
-    if isinstance(statement, Sweeps):
-        found -= set(statement.passing)
-    if isinstance(statement, Guard):
-        for inner in statement.body:
-            found |= reads(inner)
-    return found
+    names = set(loaded(node for inner in flat([statement]) for node in inner.values()))
+    return names - set(statement.passing) if isinstance(statement, Sweeps) else names
 
 
 def made_in(body: Sequence[Statement]) -> set[str]:
     """The variables that statements define, including nested ones."""
-    found = {var.name for statement in body for var in statement.defined()}
-    for statement in body:
-        if isinstance(statement, Guard):
-            found |= made_in(statement.body)
-    return found
+    return {var.name for statement in flat(body) for var in statement.defined()}

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import Literal, Self
 
 from powderdsl.ir.ops import FLAG, REAL, Graph, Node, Type, ordered
@@ -57,6 +58,10 @@ class Statement:
         """The variables that it defines for statements after it."""
         return iter(())
 
+    def unchanged(self) -> Iterator[tuple[Var, Node]]:
+        """Variables with the value that they have where the statement does nothing."""
+        return iter(())
+
 
 @dataclass(frozen=True)
 class Compute(Statement):
@@ -91,6 +96,9 @@ class Compute(Statement):
 
     def defined(self) -> Iterator[Var]:
         return (out.var for out in self.outs)
+
+    def unchanged(self) -> Iterator[tuple[Var, Node]]:
+        return ((out.var, out.otherwise) for out in self.outs if out.otherwise is not None)
 
 
 Leftover = Literal["same", "nothing", "everything"]
@@ -143,6 +151,9 @@ class Move(Statement):
     def defined(self) -> Iterator[Var]:
         return (plane.new for plane in self.planes)
 
+    def unchanged(self) -> Iterator[tuple[Var, Node]]:
+        return ((plane.new, plane.old) for plane in self.planes)
+
 
 @dataclass(frozen=True)
 class Guard(Statement):
@@ -168,6 +179,9 @@ class Guard(Statement):
 
     def defined(self) -> Iterator[Var]:
         return (var for var, _ in self.keeps)
+
+    def unchanged(self) -> Iterator[tuple[Var, Node]]:
+        return iter(self.keeps)
 
 
 @dataclass(frozen=True)
@@ -201,6 +215,9 @@ class Sweeps(Statement):
     def defined(self) -> Iterator[Var]:
         for loop in self.loops:
             yield from (var for var in loop.defined() if var.name not in self.passing)
+
+    def unchanged(self) -> Iterator[tuple[Var, Node]]:
+        return chain.from_iterable(loop.unchanged() for loop in self.loops)
 
 
 @dataclass(frozen=True)

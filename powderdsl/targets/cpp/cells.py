@@ -10,8 +10,6 @@ from powderdsl.ir.ops import REAL, Node, ordered
 from powderdsl.schedule.join import field_reads, keeps
 from powderdsl.schedule.types import (
     Compute,
-    Guard,
-    Move,
     Out,
     Schedule,
     Sweeps,
@@ -42,14 +40,7 @@ def reaches_of(schedule: Schedule) -> dict[str, int]:
             if node.op == "shift" and node.type == REAL and node.attr[2]:
                 name = str(node.args[0].attr)
                 found[name] = max(found.get(name, 0), abs(node.attr[1]))
-        match statement:
-            case Guard(_, _, keeps):
-                copies += [(var.name, value) for var, value in keeps]
-            case Sweeps(loops):
-                outs = (out for loop in loops for out in loop.outs)
-                copies += [(out.var.name, out.otherwise) for out in outs if out.otherwise is not None]
-            case Move(planes=planes):
-                copies += [(plane.new.name, plane.old) for plane in planes]
+        copies += [(var.name, value) for var, value in statement.unchanged()]
     for _ in copies:
         before = dict(found)
         for name, old in copies:
