@@ -53,8 +53,7 @@ def called(words: tuple[str, ...]) -> click.Command:
 def check_study(study: Study, reporter: Reporter, *, devices: bool = True) -> None:
     """Report what a study's commands would refuse, and measures that lead to no number.
 
-    `devices`: whether the study runs on this machine, with its devices.
-    """
+    `devices`: whether it runs on this machine."""
     check = _StudyCheck(study, reporter, devices)
     for step, point in product(study.steps, check.points):
         check.result(step, point)
@@ -183,7 +182,6 @@ class _StudyCheck:
                 model = wm.new_config(values, self.changed_rules)
                 self.check_data(model.data)
                 return model
-        from powderdsl.worldmodel.config import TrainConfig as WorldModelConfig
         from powderdsl.worldmodel.evaluation import unseen_data
         from powderdsl.worldmodel.training import KIND, with_packs
 
@@ -191,9 +189,8 @@ class _StudyCheck:
             find_run(values["run"], KIND)
             return None
         if command == ("wm", "finetune"):
-            own = run.data.rules or _rules_of(run.data.task)
-            data = with_packs(run.data, own, values["packs"])
-            run = replace(run, data=data, **wm.given_settings(values, WorldModelConfig))
+            data = with_packs(run.data, run.data.rules or _rules_of(run.data.task), values["packs"])
+            run = replace(run, data=data, **wm.given_settings(values, type(run)))
             self.check_data(run.data)
             return run
         self.check_data(unseen_data(run.data, **wm.tested_on(values)))
