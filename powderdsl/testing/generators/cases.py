@@ -178,7 +178,9 @@ def random_start(
 ) -> Start:
     """Random worlds: any shape up to the bounds, any ids, and any values that the ruleset's fields can hold."""
     if shape is None:
-        shape = (choices.integer(1, max_batch), *_sides(choices, max_side))
+        batch, lengths = choices.integer(1, max_batch), [side for side in SIDES if side <= max_side]
+        height, width = choices.pick(lengths[:6]), choices.pick(lengths)
+        shape = (batch, width, height) if choices.maybe(20) else (batch, height, width)
     palette = [e.id for e in ruleset.elements]
     palette = choices.some(palette, 1, len(palette)) if choices.maybe(40) else palette
     shape = (shape[0], *(fitting(ruleset, side) for side in shape[1:]))
@@ -195,12 +197,6 @@ def random_start(
             for p in ruleset.params
         }
     return Start.fresh(ids, choices.below(1 << 31), choices.pick(CLOCKS), fields, params)
-
-
-def _sides(choices: Choices, max_side: int) -> tuple[int, int]:
-    lengths = [side for side in SIDES if side <= max_side]
-    height, width = choices.pick(lengths[:6]), choices.pick(lengths)
-    return (width, height) if choices.maybe(20) else (height, width)
 
 
 class _Fill:

@@ -118,17 +118,10 @@ def _later(
         return sample, steps
     before = dict(runs.states(sample, steps - 1)[-1])
     late = replace(sample, ids=before.pop("element"), step=sample.step + steps - 1, fields=before)
-    if _holds(late, without, runs.ruleset):
-        return sample, steps
-    return (late, 1) if breaks(claim, runs, late, 1).first.any() else (sample, steps)
-
-
-def _holds(sample: Start, elements: frozenset[int], ruleset: Ruleset) -> bool:
-    """Whether some of these elements are there, in cells or in fields."""
-    other = sample.without(elements, ruleset)
-    same = [np.array_equal(sample.ids, other.ids)]
-    same += [np.array_equal(values, other.fields[name]) for name, values in sample.fields.items()]
-    return not all(same)
+    other = late.without(without, runs.ruleset)
+    same = [np.array_equal(late.ids, other.ids)]
+    same += [np.array_equal(values, other.fields[name]) for name, values in late.fields.items()]
+    return (late, 1) if all(same) and breaks(claim, runs, late, 1).first.any() else (sample, steps)
 
 
 def _first(
