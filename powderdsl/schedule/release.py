@@ -187,8 +187,11 @@ def live_before(statement: Statement, after: set[str]) -> set[str]:
 
 def reads(statement: Statement) -> set[str]:
     """The variables that a statement reads, including nested statements."""
-    names = set(loaded(node for inner in flat([statement]) for node in inner.values()))
-    return names - set(statement.passing) if isinstance(statement, Sweeps) else names
+    names: set[str] = set()
+    for inner in flat([statement]):
+        passing = inner.passing if isinstance(inner, Sweeps) else ()
+        names |= set(loaded(inner.values())) - set(passing)
+    return names
 
 
 def made_in(body: Sequence[Statement]) -> set[str]:
