@@ -20,8 +20,8 @@ from powderdsl.analysis.outgrown import with_outgrown
 from powderdsl.diagnostics import CompileError, Label, Reporter, Severity, Source, Span, suggest
 from powderdsl.model.check import check
 from powderdsl.model.composition.compose import compose
+from powderdsl.model.composition.contested import words_of_tree
 from powderdsl.model.composition.layout import own_slots
-from powderdsl.model.composition.optional_names import words_of_tree
 from powderdsl.model.composition.palette import Palette
 from powderdsl.model.declarations import PackDecl, RulesetDecl
 from powderdsl.model.packs import read_file
@@ -451,7 +451,7 @@ def _report_unknown(word: str, span: Span | None, reporter: Reporter, notes: Seq
 @collection_paused()
 def lower(ruleset: Ruleset, memo: Memo | None = None) -> Program:
     """The checked model as optimized IR. With a memo, only passes that have changed go through the stages."""
-    from powderdsl.ir.lower.rules import lower_ruleset
+    from powderdsl.ir.lower import lower_ruleset
     from powderdsl.ir.stages import run_passes
     from powderdsl.ir.structure import structure
 

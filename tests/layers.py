@@ -177,7 +177,7 @@ THIRD_PARTIES: dict[str, Home] = {
         (
             *_TORCH,
             "system.random",
-            "targets.profiling",
+            "targets.job",
             "simulation.draw",
             "simulation.media",
             "experiments.bench",

@@ -286,7 +286,7 @@ def test_every_module_keeps(rule: Callable[[str, str], Iterable[str]], sources: 
         (layer_faults, "targets.wasm.program", "from powderdsl.targets.cpp import build", "may not import"),
         (layer_faults, "targets.job", "from powderdsl.targets.cpp import build", "may not import"),
         (layer_faults, "ir.ops", "from powderdsl.model import Rule", "may not import"),
-        (layer_faults, "ir.ops", "from powderdsl.ir.lower.rules import lower_ruleset", "may not import"),
+        (layer_faults, "ir.ops", "from powderdsl.ir.lower import lower_ruleset", "may not import"),
         (layer_faults, "worlds.scene", "from powderdsl.simulation.simulator import World", "may not import"),
         (layer_faults, "syntax.parse", "def late():\n    from powderdsl.model import x", "syntax.parse:2"),
         (layer_faults, "model.read", "if TYPE_CHECKING:\n    import powderdsl.ir", "model.read:2"),
@@ -324,7 +324,7 @@ def test_each_rule_can_fail(
 @pytest.mark.parametrize(
     ("rule", "module", "source"),
     [
-        (layer_faults, "ir.lower.rules", "from powderdsl.model import types"),
+        (layer_faults, "ir.lower", "from powderdsl.model import types"),
         (layer_faults, "worlds.store", "from powderdsl.simulation.any_arrays import AnyWorld"),
         (layer_faults, "__init__", "def f():\n    import powderdsl.simulation.simulator"),
         (layer_faults, "cli.run", "from powderdsl import worlds, compiler"),

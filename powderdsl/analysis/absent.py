@@ -9,7 +9,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from powderdsl.analysis.changes import HERE, Asked, RuleLine, rule_line
-from powderdsl.model.expressions.operands import FALSE, TRUE, conjunction, disjunction, look, member, negation
+from powderdsl.model.expressions.operators import (
+    FALSE,
+    TRUE,
+    conjunction,
+    disjunction,
+    look,
+    member,
+    negation,
+)
 from powderdsl.model.logic.satisfy import Facts
 from powderdsl.model.types import ELEMENT, Assign, Expr, Let, Move, Rule, Ruleset, Transform, integer
 

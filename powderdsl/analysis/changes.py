@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from powderdsl.diagnostics import Span
-from powderdsl.model.expressions.operands import ELEMENT_HERE, member, negation
+from powderdsl.model.expressions.operators import ELEMENT_HERE, member, negation
 from powderdsl.model.logic.satisfy import Facts, satisfiable
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Assign, Expr, Moment, Move, Offset, Pass, Rule, Ruleset, Swap, Transform

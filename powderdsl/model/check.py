@@ -9,9 +9,8 @@ from functools import partial
 from powderdsl.diagnostics import CompileError, Reporter, Span
 from powderdsl.model.added_conflicts import AddedPacks
 from powderdsl.model.composition.compose import compose
-from powderdsl.model.composition.contested import report_contested
+from powderdsl.model.composition.contested import report_contested, report_misspelled
 from powderdsl.model.composition.layout import matrix_channels, state_order
-from powderdsl.model.composition.optional_names import report_misspelled
 from powderdsl.model.composition.palette import Palette
 from powderdsl.model.declarations import PackDecl, RulesetDecl
 from powderdsl.model.definitions import define_symbols

@@ -13,7 +13,7 @@ from powderdsl.model.composition.compose import Composition
 from powderdsl.model.composition.contested import given_values
 from powderdsl.model.composition.names import Named, report_unknown
 from powderdsl.model.declarations import KernelDecl, TintDecl, TypedDecl
-from powderdsl.model.expressions.operands import Broken, Operand, Poisoned, Scope, SetOf, Unresolved
+from powderdsl.model.expressions.operators import Broken, Operand, Poisoned, Scope, SetOf, Unresolved
 from powderdsl.model.expressions.symbols import clamped, default_of, not_a_value, number_value, read_kind
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.schema import KEYS

@@ -8,7 +8,7 @@ from powderdsl.diagnostics import Span, suggest
 from powderdsl.model.builtins import DIRECTION_SETS, DIRECTIONS
 from powderdsl.model.composition.names import Named
 from powderdsl.model.declarations import Block, PassDecl, TypedDecl
-from powderdsl.model.expressions.operands import (
+from powderdsl.model.expressions.operators import (
     FALSE,
     IDENTITY,
     Absent,

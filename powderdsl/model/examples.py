@@ -12,10 +12,10 @@ from powderdsl.diagnostics import Reporter, Span
 from powderdsl.model.composition.claim_scopes import words_of
 from powderdsl.model.composition.names import report_unknown
 from powderdsl.model.declarations import TestDecl
-from powderdsl.model.expressions.operands import Poisoned, Scope, Unresolved
+from powderdsl.model.expressions.operators import Poisoned, Scope, Unresolved
 from powderdsl.model.expressions.symbols import Symbols
 from powderdsl.model.expressions.typer import Typer
-from powderdsl.model.fields.grids import GridReader, size_of
+from powderdsl.model.fields import GridReader, size_of
 from powderdsl.model.schema import comment_after
 from powderdsl.model.types import CHANCE, Example, Kernel, Often
 from powderdsl.syntax.ast import Syntax

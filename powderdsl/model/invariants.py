@@ -9,7 +9,7 @@ from powderdsl.model.composition.claim_scopes import names_left_out, with_option
 from powderdsl.model.composition.compose import Composition
 from powderdsl.model.declarations import RulesetDecl
 from powderdsl.model.expressions.coercer import read_bounds
-from powderdsl.model.expressions.operands import (
+from powderdsl.model.expressions.operators import (
     ELEMENT_HERE,
     FALSE,
     TRUE,
@@ -20,9 +20,9 @@ from powderdsl.model.expressions.operands import (
     SetOf,
     Unresolved,
     disjunction,
+    kind_name,
     member,
 )
-from powderdsl.model.expressions.operators import kind_name
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.text import one_line
 from powderdsl.model.types import (

@@ -9,7 +9,7 @@ from powderdsl.model.composition.contested import report_replaced
 from powderdsl.model.composition.names import report_unknown
 from powderdsl.model.declarations import RampDecl
 from powderdsl.model.expressions.coercer import read_bounds
-from powderdsl.model.expressions.operands import Poisoned
+from powderdsl.model.expressions.operators import Poisoned
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.types import ColorRamp, Element, Field
 

@@ -9,7 +9,7 @@ from fractions import Fraction
 from powderdsl.diagnostics import Span
 from powderdsl.model.builtins import DIRECTIONS, OCTANTS
 from powderdsl.model.declarations import Block, PackDecl, PassDecl
-from powderdsl.model.expressions.operands import TRUE
+from powderdsl.model.expressions.operators import TRUE
 from powderdsl.model.types import (
     Assign,
     Element,

@@ -1,7 +1,7 @@
 """The checked model: what a ruleset means, resolved, typed and unrolled. Frozen, printable, no torch, no NumPy.
 
 Everything discrete has a declared range; every chance and count is explicit. The reference interpreter runs these
-values directly, and `ir/lower/rules.py` lowers them; neither looks at syntax again.
+values directly, and `ir/lower.py` lowers them; neither looks at syntax again.
 """
 
 from __future__ import annotations

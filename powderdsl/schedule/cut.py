@@ -13,15 +13,16 @@ from typing import Literal
 from powderdsl.ir.ops import FLAG, REAL, Node, Offset, ordered, walk
 from powderdsl.schedule.costs import (
     ARITHMETIC,
+    DRAWS,
     LOGIC,
     UNIFORM,
     Costs,
+    asked_for,
     is_constant,
     movable,
     sources_of,
     stored_parts,
 )
-from powderdsl.schedule.draws import DRAWS, asked_for
 from powderdsl.schedule.floats import is_comparison, of_floats
 from powderdsl.schedule.types import (
     ANSWER,

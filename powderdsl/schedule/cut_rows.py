@@ -11,9 +11,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 from powderdsl.ir.ops import FLAG, REAL, Node, Offset, walk
-from powderdsl.schedule.costs import UNIFORM, Costs, Have, is_constant
+from powderdsl.schedule.costs import DRAWS, UNIFORM, Costs, Have, is_coin, is_constant
 from powderdsl.schedule.cut import Cutter, Pairs
-from powderdsl.schedule.draws import DRAWS, is_coin
 from powderdsl.schedule.floats import is_comparison, of_floats
 from powderdsl.schedule.types import (
     Carried,

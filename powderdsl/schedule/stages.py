@@ -6,23 +6,18 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from powderdsl.ir.ops import PassGraph
-from powderdsl.schedule.costs import Costs
+from powderdsl.schedule.costs import Costs, conditions, thresholds
 from powderdsl.schedule.cut import cut
 from powderdsl.schedule.cut_rows import cut_rows
-from powderdsl.schedule.draws import conditions, thresholds
-from powderdsl.schedule.early import early
-from powderdsl.schedule.empty import empty
 from powderdsl.schedule.floats import chosen, late, led
-from powderdsl.schedule.join import join
+from powderdsl.schedule.join import ask_regions, join, narrow
+from powderdsl.schedule.lifetimes import release, swaps
 from powderdsl.schedule.lower import lower
-from powderdsl.schedule.narrow import ask_regions, narrow
 from powderdsl.schedule.presence import presence
-from powderdsl.schedule.release import release
 from powderdsl.schedule.rewrite import without_unread
-from powderdsl.schedule.swaps import swaps
 from powderdsl.schedule.types import Schedule
-from powderdsl.schedule.updates import updates
 from powderdsl.schedule.verify import verify
+from powderdsl.schedule.words import early, empty, updates
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from powderdsl.ir.gates import width as width_of
-from powderdsl.ir.lower.rules import ir_type, slot_names
+from powderdsl.ir.lower import ir_type, slot_names
 from powderdsl.ir.ops import component_of
 from powderdsl.model.state import Slot, property_dtype, property_values, slot_name, slots
 from powderdsl.model.types import MatrixChannel, Ruleset

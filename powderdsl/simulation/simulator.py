@@ -12,8 +12,7 @@ from powderdsl.model.types import Ruleset
 from powderdsl.simulation.any_arrays import MAX_CELLS, AnySimulator, AnyWorld, clock_of, whole_count
 from powderdsl.simulation.observe import Observer
 from powderdsl.simulation.programs import find_device, make_program
-from powderdsl.targets.job import Job
-from powderdsl.targets.profiling import profile_of
+from powderdsl.targets.job import Job, profile_of
 from powderdsl.targets.tensor_kind import Tensors
 
 __all__ = ["MAX_CELLS", "Simulator", "World", "compile"]

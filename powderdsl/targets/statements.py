@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
-from powderdsl.schedule.empty import is_whole
 from powderdsl.schedule.types import Compute, Forget, Guard, Move, Out, Release, Statement, Sweeps
+from powderdsl.schedule.words import is_whole
 
 
 class Printer(Protocol):

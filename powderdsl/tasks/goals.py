@@ -10,7 +10,7 @@ from itertools import pairwise
 
 from powderdsl.diagnostics import Span, suggest
 from powderdsl.model.expressions.coercer import read_number
-from powderdsl.model.expressions.operands import Number, Operand, Poisoned, Scope, SetOf, Unresolved
+from powderdsl.model.expressions.operators import Number, Operand, Poisoned, Scope, SetOf, Unresolved
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.types import FLAG, REAL, Expr
 from powderdsl.syntax.ast import Syntax

@@ -192,8 +192,7 @@ class Session:
     def trace(self, world: dict[str, Any], row: int, column: int, params: dict[str, float]) -> str:
         """Why a cell holds what it holds one step after a world, with other values for some parameters."""
         from powderdsl.simulation.array_worlds import ArraySimulator
-        from powderdsl.simulation.tracing.report import trace_text
-        from powderdsl.simulation.tracing.trace import trace
+        from powderdsl.simulation.tracing import trace, trace_text
 
         reporter, sim = Reporter(), self._simulator()
         rules = self._rules()

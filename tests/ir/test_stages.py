@@ -10,7 +10,7 @@ import pytest
 from powderdsl.compiler import load
 from powderdsl.ir.bits import lower_bits
 from powderdsl.ir.build import Builder
-from powderdsl.ir.lower.rules import lower_ruleset
+from powderdsl.ir.lower import lower_ruleset
 from powderdsl.ir.ops import FLAG, OPS, REAL, Node, PassGraph, Program, SubstepGraph, integer, nodes_of
 from powderdsl.ir.rewrite import RewriteLoop, Rules, rewrite_pass
 from powderdsl.ir.stages import PIPELINE, run_passes

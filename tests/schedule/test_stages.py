@@ -15,8 +15,7 @@ from powderdsl.ir.ops import PassGraph, Program, plane_name
 from powderdsl.ir.segments import segments
 from powderdsl.model.state import slots as state_slots
 from powderdsl.model.types import Ruleset
-from powderdsl.schedule.barriers import Pending, barriers
-from powderdsl.schedule.buffers import Pool, buffers
+from powderdsl.schedule.lifetimes import Pending, Pool, barriers, buffers
 from powderdsl.schedule.stages import CPU, CUDA, Stage, steps
 from powderdsl.schedule.types import Schedule
 from powderdsl.schedule.verify import verify

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import powderdsl
-from powderdsl.ir.lower.rules import live_passes
+from powderdsl.ir.lower import live_passes
 
 PACK = """pack: weights
 needs: core

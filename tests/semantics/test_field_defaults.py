@@ -95,7 +95,7 @@ def test_painted_cells_are_fresh(rules):
 
 
 def test_the_ledger_and_traces_know_them(rules):
-    from powderdsl.simulation.tracing.trace import trace
+    from powderdsl.simulation.tracing import trace
 
     fields = {entry.name: entry for entry in package.ledger(rules).fields}
     assert fields["energy"].fresh_bounds == (1, 7)

@@ -420,7 +420,7 @@ def test_scenes_and_traces_take_qualified_fields() -> None:
         "scene: both\nsize: [2, 2]\nfill: one.slime\n"
         "draw: [one.wet := 4 in box rows 0:1 columns 0:2, two.wet := 6 in box rows 1:2 columns 0:2]\n"
     )
-    from powderdsl.simulation.tracing.trace import trace
+    from powderdsl.simulation.tracing import trace
     from powderdsl.worlds.scene import load_start
 
     for order in (("one", "two"), ("two", "one")):

@@ -12,8 +12,7 @@ import pytest
 from powderdsl.compiler import load
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import World, compile
-from powderdsl.simulation.tracing.report import trace_data, trace_text
-from powderdsl.simulation.tracing.trace import Miss, Trace, pick, record_step, trace
+from powderdsl.simulation.tracing import Miss, Trace, pick, record_step, trace, trace_data, trace_text
 from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.semantics.test_differential import seeded_ruleset

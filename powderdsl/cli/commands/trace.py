@@ -59,8 +59,7 @@ def command(
     """
     ruleset = opt.load_rules(rules, settings)
     from powderdsl.cli.start_worlds import start
-    from powderdsl.simulation.tracing.report import trace_data, trace_text
-    from powderdsl.simulation.tracing.trace import trace
+    from powderdsl.simulation.tracing import trace, trace_data, trace_text
 
     begun = start(ruleset, world, size, None, seed, backend=backend)
     with user_values():

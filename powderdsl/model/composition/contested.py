@@ -1,14 +1,18 @@
-"""Values of one element that several packs give: the order that decides, and a report of each replaced value."""
+"""Values that several packs give one element, and optional names that look like misspelled ones."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import dataclasses
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from fractions import Fraction
 
 from powderdsl.diagnostics import Label, Reporter, Span
 from powderdsl.model.composition.compose import Composition
+from powderdsl.model.declarations import PackDecl, RulesetDecl, TestDecl
 from powderdsl.syntax.ast import Syntax
-from powderdsl.syntax.yaml_tree import Scalar
+from powderdsl.syntax.yaml_tree import Mapping as MappingNode
+from powderdsl.syntax.yaml_tree import Node, Scalar
 
 Given = tuple[str, str, str, Scalar, Syntax]
 """A pack, a property or field, an element (global names; one that is absent as written), the key, the value."""
@@ -79,3 +83,118 @@ def _meaning(value: Syntax) -> object:
         return Fraction(text[:-1]) / 100 if text.endswith("%") else Fraction(text)
     except (ValueError, ZeroDivisionError):
         return text
+
+
+SECTIONS = ("tags", "properties", "fields", "streams", "kernels", "sets", "elements", "passes")
+"""Sections of a pack whose keys are names that other packs may ask for."""
+
+MAX_PLACES = 4
+"""Places of one name that are shown besides the first."""
+
+_OPTIONAL = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\?")
+
+
+def report_misspelled(
+    packs: Sequence[PackDecl],
+    ruleset: RulesetDecl | None,
+    elsewhere: Callable[[], Mapping[str, str]],
+    reporter: Reporter,
+) -> None:
+    """Warn of optional names that no pack defines and that are a slip away from one that some pack defines.
+
+    Args:
+        elsewhere: words that packs define which are not loaded, and these packs. Asked only if it matters.
+    """
+    left_out = ruleset.left_out if ruleset else ()
+    known = {word for pack in (*packs, *left_out) for word in defined_words(pack)}
+    asked: dict[str, dict[Span, None]] = {}
+    for decl in (*packs, *((ruleset,) if ruleset else ())):
+        for word, span in _optional_names(decl):
+            if word not in known:
+                asked.setdefault(word, {})[span] = None
+    others = elsewhere() if asked else {}
+    for word, places in asked.items():
+        meant = None if word in others else _meant(word, [*sorted(known), *others])
+        if meant is None:
+            continue
+        pack = others.get(meant) if meant not in known else None
+        first, *more = places
+        reporter.report(
+            "PD315", f"no loaded or shipped pack defines `{word}`", first,
+            "with the `?`, it is always absent",
+            secondary=[Label(span, "and here") for span in more[:MAX_PLACES]],
+            helps=[f"did you mean `{meant}?`" + (f", which `{pack}` defines" if pack else "")],
+        )  # fmt: skip
+
+
+def defined_words(pack: PackDecl) -> Iterator[str]:
+    """The names that other packs may use, and the names under `let` and `scratch`."""
+    yield from (one.name.text for one in (*pack.definitions, *pack.params, *pack.passes))
+    for one in pack.passes:
+        yield from (item.name.text for item in one.scratch)
+        yield from (name.text for block in one.block.walk() for name, _ in block.lets)
+
+
+def words_of_tree(tree: Node | None) -> Iterator[str]:
+    """The names that a pack's file defines, from its structure alone."""
+    if isinstance(tree, MappingNode):
+        for key, section in tree.entries:
+            if key.text in SECTIONS and isinstance(section, MappingNode):
+                yield from (name.text for name, _ in section.entries)
+            elif key.text in SECTIONS and not isinstance(section, Scalar | MappingNode):
+                yield from (item.text for item in section.items if isinstance(item, Scalar))
+
+
+def _optional_names(value: object) -> Iterator[tuple[str, Span]]:
+    """Every word with a `?` in declarations, and where it stands."""
+    match value:
+        case Scalar():
+            if _OPTIONAL.fullmatch(value.text):
+                yield value.text[:-1], value.span
+        case Syntax():
+            if value.kind == "optional_name":
+                yield value.text.removesuffix("?"), value.span
+            for child in value.children:
+                yield from _optional_names(child)
+        case TestDecl():  # in its worlds a `?` stands for anything
+            keys = [key for key, _ in (*value.fields, *value.expect_fields)]
+            yield from _optional_names((value.legend, value.always, value.often, tuple(keys)))
+        case tuple():
+            for item in value:
+                yield from _optional_names(item)
+        case RulesetDecl():
+            yield from _optional_names((value.matrix, value.invariants))
+        case _ if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            for item in dataclasses.fields(value):
+                yield from _optional_names(getattr(value, item.name))
+
+
+def _meant(word: str, known: Iterable[str]) -> str | None:
+    """The name that a word was probably meant for: the first of the closest ones."""
+    near = {name: slips for name in known if (slips := _slips(word, name)) is not None}
+    return min(near, key=lambda name: near[name], default=None)
+
+
+def _slips(word: str, name: str) -> int | None:
+    """How many slips make a word of a name; None if they are more than its length makes likely.
+
+    A letter that is left out, added, wrong, or exchanged with the next one is a slip. Other words may differ by one
+    letter too, as `food` and `mood`, `ash` and `dash`. So short words, and the first letter, must be right.
+    """
+    most = 2 if len(name) >= 8 else 1
+    if min(len(word), len(name)) < 3 or abs(len(word) - len(name)) > most:
+        return None
+    wrong = 1 if len(name) >= 5 and word[0] == name[0] else most + 1
+    rows = [list(range(len(name) + 1))]
+    for i, a in enumerate(word, 1):
+        row = [i]
+        for j, b in enumerate(name, 1):
+            best = min(rows[-1][j] + 1, row[-1] + 1, rows[-1][j - 1] + (wrong if a != b else 0))
+            if i > 1 and j > 1 and a == name[j - 2] and b == word[i - 2]:
+                best = min(best, rows[-2][j - 2] + 1)
+            row.append(best)
+        rows.append(row)
+    found = rows[-1][-1]
+    if min(len(word), len(name)) == 3 and len(word) != len(name):
+        return None  # `ash` and `dash`
+    return found if 0 < found <= most else None

@@ -7,7 +7,7 @@ from fractions import Fraction
 
 from powderdsl.diagnostics import Label, Reporter, Span
 from powderdsl.model.builtins import MAX_MAGNITUDE, MAX_OFFSET, OCTANTS
-from powderdsl.model.expressions.operands import (
+from powderdsl.model.expressions.operators import (
     ELEMENT_HERE,
     FALSE,
     Absent,

@@ -8,16 +8,21 @@ from typing import TYPE_CHECKING
 
 from powderdsl.diagnostics import Span, suggest
 from powderdsl.model.builtins import FUNCTIONS, KERNEL_SHAPES, KERNELS, MAX_RADIUS, shaped_kernel
-from powderdsl.model.expressions.operands import (
+from powderdsl.model.expressions.operators import (
     Number,
     Operand,
     Place,
     PlaceChoice,
     Scope,
     Value,
+    choose,
+    compare,
     disjunction,
+    extreme,
+    is_integer,
+    kind_name,
+    on_integers,
 )
-from powderdsl.model.expressions.operators import choose, compare, extreme, is_integer, kind_name, on_integers
 from powderdsl.model.expressions.symbols import ELSEWHERE
 from powderdsl.model.types import DIRECTION, DRAW, FLAG, REAL, VEC2, Expr, Kernel, Kind, integer
 from powderdsl.syntax.ast import Syntax

@@ -12,7 +12,7 @@ from powderdsl.diagnostics import Reporter, Span
 from powderdsl.model.builtins import COORDINATES, FUNCTIONS, KERNEL_SHAPES, KERNELS
 from powderdsl.model.expressions.coercer import Coercer, read_bounds, read_number
 from powderdsl.model.expressions.functions import call
-from powderdsl.model.expressions.operands import (
+from powderdsl.model.expressions.operators import (
     FALSE,
     IDENTITY,
     TRUE,
@@ -29,21 +29,19 @@ from powderdsl.model.expressions.operands import (
     SetOf,
     Unresolved,
     Value,
-    conjunction,
-    disjunction,
-    look,
-    negation,
-    turned,
-)
-from powderdsl.model.expressions.operators import (
     binary,
     choose,
     compare,
+    conjunction,
+    disjunction,
     holds,
     kind_name,
+    look,
     modulo,
     negate,
+    negation,
     quotient,
+    turned,
 )
 from powderdsl.model.expressions.symbols import Symbols, UnknownNames, number_value
 from powderdsl.model.logic.needless import report_repeated

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from powderdsl.diagnostics import Label, Reporter, Span
 from powderdsl.model.added_conflicts import AddedPacks, may_settle, report_added
 from powderdsl.model.builtins import MAX_SIDE_MULTIPLE
-from powderdsl.model.expressions.operands import (
+from powderdsl.model.expressions.operators import (
     ELEMENT_HERE,
     TRUE,
     conjunction,

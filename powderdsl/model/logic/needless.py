@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 from powderdsl.diagnostics import Label, Reporter, Span
-from powderdsl.model.expressions.operands import ELEMENT_HERE, look, member, negation
+from powderdsl.model.expressions.operators import ELEMENT_HERE, look, member, negation
 from powderdsl.model.logic.satisfy import (
     HERE,
     Budget,

@@ -15,9 +15,40 @@ from fractions import Fraction
 from functools import cached_property
 from typing import Any, NamedTuple, TypeVar
 
-from powderdsl.model.logic.literals import contradict
 from powderdsl.model.operations import OPS, Bounds
 from powderdsl.model.types import Assign, Expr, Moment, Offset, Pass, Property, Rule
+
+Literal = tuple[str, Offset]
+"""The name of a value, and the place where it is asked for."""
+
+
+def contradict(conditions: Sequence[tuple[Expr, Offset]]) -> bool:
+    """Whether one of the conditions needs a value to hold at a place where another one needs that it does not."""
+    found: dict[Literal, bool] = {}
+    return any(
+        found.setdefault(literal, holds) != holds
+        for condition, at in conditions
+        for literal, holds in _literals([(condition, at, True)])
+    )
+
+
+def _literals(waiting: Iterable[tuple[Expr, Offset, bool]]) -> Iterator[tuple[Literal, bool]]:
+    """What must hold, or must not, for conditions to be as they are said to be."""
+    stack = list(waiting)
+    while stack:
+        expr, at, holds = stack.pop()
+        match expr.op:
+            case "let":
+                yield (str(expr.value), at), holds
+            case "not":
+                stack.append((expr.args[0], at, not holds))
+            case "look":
+                stack.append((expr.args[0], (at[0] + expr.value[0], at[1] + expr.value[1]), holds))
+            case "and" if holds:
+                stack += [(arg, at, True) for arg in expr.args]
+            case "or" if not holds:
+                stack += [(arg, at, False) for arg in expr.args]
+
 
 HERE: Offset = (0, 0)
 

@@ -9,7 +9,7 @@ from powderdsl.diagnostics import Reporter, Span
 from powderdsl.model.composition.claim_scopes import words_of
 from powderdsl.model.composition.compose import Composition
 from powderdsl.model.declarations import PackDecl
-from powderdsl.model.expressions.operands import ELEMENT_HERE, member
+from powderdsl.model.expressions.operators import ELEMENT_HERE, member
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.logic.satisfy import HERE, Facts, satisfiable, substeps, writes_of
 from powderdsl.model.types import Assign, Moment, Move, Pass, Transform

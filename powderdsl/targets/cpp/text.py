@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 
 from powderdsl.ir.ops import FLAG, REAL, Node
-from powderdsl.schedule.draws import is_coin
+from powderdsl.schedule.costs import is_coin
 from powderdsl.schedule.types import Compute, Guard, Move, Out, Schedule, Statement, Sweeps, Var, variables
-from powderdsl.schedule.updates import asked, is_cleared
+from powderdsl.schedule.words import asked, is_cleared
 from powderdsl.targets.cpp.cells import reaches_of, sweeps_text
 from powderdsl.targets.layout import Layout, number, param_key
 from powderdsl.targets.statements import printed

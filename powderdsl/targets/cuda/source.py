@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from importlib.resources import files
 
 from powderdsl.ir.ops import SNAP, Program
-from powderdsl.schedule.barriers import Pending, barriers
-from powderdsl.schedule.buffers import Pool, buffers
+from powderdsl.schedule.lifetimes import Pending, Pool, barriers, buffers
 from powderdsl.schedule.stages import CUDA, plan
 from powderdsl.system.memo import collection_paused
 from powderdsl.targets.cuda.text import pass_text

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from powderdsl.ir.ops import REAL, Node, ordered
-from powderdsl.schedule.buffers import Buffer
+from powderdsl.schedule.lifetimes import Buffer
 from powderdsl.schedule.types import ANSWER, Compute, Guard, Out, Schedule, Statement, Sync
 from powderdsl.targets.layout import Layout, literal, param_key
 from powderdsl.targets.values import CellValues, WordValues

@@ -13,9 +13,8 @@ from powderdsl.ir.structure import structure
 from powderdsl.system.memo import Memo
 from powderdsl.targets.array_kind import Array, ArrayKind
 from powderdsl.targets.codec import parameters, pieces
-from powderdsl.targets.job import Job
+from powderdsl.targets.job import Job, PassClock
 from powderdsl.targets.layout import Layout
-from powderdsl.targets.profiling import PassClock
 from powderdsl.targets.wasm.host import Host
 from powderdsl.targets.wasm.source import wasm_module
 

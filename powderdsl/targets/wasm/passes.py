@@ -15,7 +15,7 @@ from powderdsl.schedule.types import (
     Sweeps,
     Var,
 )
-from powderdsl.schedule.updates import is_cleared
+from powderdsl.schedule.words import is_cleared
 from powderdsl.targets.statements import printed
 from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, op
 from powderdsl.targets.wasm.cells import sweep

@@ -6,9 +6,9 @@ from collections import Counter
 from collections.abc import Sequence
 
 from powderdsl.ir.ops import Node, ordered
-from powderdsl.schedule.draws import is_coin
+from powderdsl.schedule.costs import is_coin
 from powderdsl.schedule.types import Compute, loaded
-from powderdsl.schedule.updates import asked
+from powderdsl.schedule.words import asked
 from powderdsl.targets.layout import param_key
 from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, load, op
 from powderdsl.targets.wasm.library import ZERO, Library, choose, some

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from powderdsl.ir.lower.rules import lower_pass, lower_substep, slot_names
+from powderdsl.ir.lower import lower_pass, lower_substep, slot_names
 from powderdsl.ir.ops import COMMUTATIVE, OPS, REAL, Graph, Node, Offset
 from powderdsl.model.state import slots
 from powderdsl.model.types import Pass, Ruleset

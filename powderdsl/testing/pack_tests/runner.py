@@ -11,7 +11,7 @@ from powderdsl.arrays import NDArray, np
 from powderdsl.compiler import starting_backend
 from powderdsl.diagnostics import Span
 from powderdsl.model import reference
-from powderdsl.model.fields.words import direction_word
+from powderdsl.model.fields import direction_word
 from powderdsl.model.restrict import restricted, without
 from powderdsl.model.text import one_line, show_number, show_single, show_value
 from powderdsl.model.types import Cell, Example, FieldGrid, Kind, Ruleset

@@ -12,7 +12,7 @@ from powderdsl.arrays import np
 from powderdsl.compiler import starting_backend
 from powderdsl.diagnostics import Span
 from powderdsl.model import reference
-from powderdsl.model.expressions.operands import TRUE
+from powderdsl.model.expressions.operators import TRUE
 from powderdsl.model.state import Slot, slots
 from powderdsl.model.types import FLAG, Assign, Field, Moment, Pass, Rule, Ruleset
 from powderdsl.simulation.compiling import compile_any

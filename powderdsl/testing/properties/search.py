@@ -12,7 +12,7 @@ from powderdsl.analysis.ledger import Ledger, Proven
 from powderdsl.analysis.ledger import ledger as make_ledger
 from powderdsl.analysis.proofs import prove
 from powderdsl.arrays import np
-from powderdsl.model.expressions.operands import ELEMENT_HERE, member
+from powderdsl.model.expressions.operators import ELEMENT_HERE, member
 from powderdsl.model.restrict import restricted
 from powderdsl.model.types import Never, Ruleset, Symmetric, Total
 from powderdsl.simulation.draw import shown_fields

@@ -1,1 +1,0 @@
-"""The checked model -> IR: the one door between them."""

@@ -1,1 +1,0 @@
-"""Values of fields as written: by element, as words, cell by cell."""
