@@ -8,7 +8,6 @@ from typing import Any
 from powderdsl.compiler import lower, parts
 from powderdsl.ir.segments import carry
 from powderdsl.model.state import (
-    SNAP,
     Slot,
     fits,
     property_values,
@@ -83,7 +82,6 @@ def _stored(slot: Slot, ruleset: Ruleset, parts: tuple[Piece, ...]) -> Stored:
         prop.stored if prop is not None else slot.of,
         slot.travels,
         slot.kind.name == "element",
-        SNAP,
     )
 
 

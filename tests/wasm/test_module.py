@@ -19,7 +19,6 @@ from powderdsl.system.memo import Memo
 from powderdsl.targets.tensor_kind import Tensors
 from powderdsl.targets.wasm import instances
 from powderdsl.targets.wasm.instances import Instance, WasmState
-from powderdsl.targets.wasm.listing import listing
 from powderdsl.targets.wasm.program import WasmProgram
 from powderdsl.targets.wasm.source import WasmModule, wasm_module
 from tests.wasm.jobs import hashes, hashes_in_v8, write_job
@@ -51,7 +50,7 @@ def test_modules_import_nothing_and_have_bounded_memory() -> None:
 
 def test_powderworld_has_every_kind_of_function() -> None:
     """What other tests compare with the reference includes these."""
-    text = listing(module_of("powderworld", 64).module)
+    text = module_of("powderworld", 64).module.listing()
     for name in ("words", "cells", "swap_1_1_same", "arrive_-1_0_nothing", "arrive_-1_0_everything"):
         assert f"$ {name}".replace(" ", "") in text
     for name in ("draw_below", "draw_below_planes", "coin", "copy_line", "look"):

@@ -134,12 +134,11 @@ def _kernels(program: Program, backend: str, pass_name: str | None) -> Iterator[
 
             yield cuda_source(part.planes, 64, 64, SHOWN_SHARED).text
         else:
-            from powderdsl.targets.wasm.listing import listing
             from powderdsl.targets.wasm.passes import pass_function_name
             from powderdsl.targets.wasm.source import wasm_module
 
             chosen = None if pass_name is None else pass_function_name(pass_name)
-            yield listing(wasm_module(part.planes, SHOWN_WIDTH).module, chosen)
+            yield wasm_module(part.planes, SHOWN_WIDTH).module.listing(chosen)
 
 
 def _check_known(what: str, name: str, known: Sequence[str], plural: str) -> None:

@@ -1,14 +1,19 @@
-"""The binary format of WebAssembly: typed expressions, functions, modules.
+"""The binary format of WebAssembly: typed expressions, functions, modules, and their text.
 
-An expression (`Value`) is the code that leaves it on the stack, with its type. Nothing here knows rules or planes.
+An expression (`Value`) is the code that leaves it on the stack, with its type. Variables and items in memory (`Place`) are
+expressions that can be set. Nothing here knows rules or planes.
 """
 
 from __future__ import annotations
 
+import inspect
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
+from io import BytesIO
+from itertools import groupby
+from typing import NamedTuple, TypeAlias
 
 TYPES = {"i32": 0x7F, "i64": 0x7E, "f32": 0x7D, "f64": 0x7C, "v128": 0x7B}
 
@@ -67,20 +72,28 @@ _NUMBERED = (
 
 def unsigned(number: int) -> bytes:
     """LEB128 of a number from 0 on."""
-    found = bytearray()
+    octets = bytearray()
     while number > 127:
-        found.append(number & 127 | 128)
+        octets.append(number & 127 | 128)
         number >>= 7
-    return bytes([*found, number])
+    return bytes([*octets, number])
 
 
 def signed(number: int) -> bytes:
     """LEB128 of a signed number."""
-    found = bytearray()
+    octets = bytearray()
     while not -64 <= number < 64:
-        found.append(number & 127 | 128)
+        octets.append(number & 127 | 128)
         number >>= 7
-    return bytes([*found, number & 127])
+    return bytes([*octets, number & 127])
+
+
+def _vector(items: Sequence[bytes]) -> bytes:
+    return unsigned(len(items)) + b"".join(items)
+
+
+def _text(text: str) -> bytes:
+    return _vector([bytes([octet]) for octet in text.encode()])
 
 
 def _result(name: str) -> str:
@@ -106,6 +119,21 @@ for _first, _names in _NUMBERED:
 RESULTS = {name: _result(name) for name in OPCODES}
 
 
+class Member(NamedTuple):
+    """A member of records in memory: the instruction that loads it, and the bytes from a record's beginning."""
+
+    load: str
+    offset: int
+
+
+def _operator(name: str) -> Callable[[Value, Value | int], Value]:
+    return lambda self, other: op(f"{self.type}.{name}", self, other)
+
+
+def _reflected(name: str) -> Callable[[Value, int], Value]:
+    return lambda self, other: op(f"{self.type}.{name}", other, self)
+
+
 class Value:
     """An expression. Operators are those of its type; integers are unsigned. A Python number becomes a constant."""
 
@@ -114,44 +142,21 @@ class Value:
     def __init__(self, type: str, code: bytes):
         self.type, self.code = type, code
 
-    def _with(self, name: str, other: Value | int) -> Value:
-        if isinstance(other, int):
-            other = const(self.type, other)
-        return op(f"{self.type}.{name}", self, other)
+    __sub__, __rsub__ = _operator("sub"), _reflected("sub")
+    __mod__, __floordiv__ = _operator("rem_u"), _operator("div_u")
+    __and__, __or__, __xor__ = _operator("and"), _operator("or"), _operator("xor")
+    __lt__, __ge__ = _operator("lt_u"), _operator("ge_u")
+    __rlshift__ = _reflected("shl")
 
     def __add__(self, other: Value | int) -> Value:
-        return self if isinstance(other, int) and not other else self._with("add", other)
-
-    def __sub__(self, other: Value | int) -> Value:
-        return self._with("sub", other)
+        return self if isinstance(other, int) and not other else op(f"{self.type}.add", self, other)
 
     def __mul__(self, other: Value | int) -> Value:
-        return self if isinstance(other, int) and other == 1 else self._with("mul", other)
-
-    def __mod__(self, other: Value | int) -> Value:
-        return self._with("rem_u", other)
-
-    def __floordiv__(self, other: Value | int) -> Value:
-        return self._with("div_u", other)
-
-    def __and__(self, other: Value | int) -> Value:
-        return self._with("and", other)
-
-    def __or__(self, other: Value | int) -> Value:
-        return self._with("or", other)
-
-    def __xor__(self, other: Value | int) -> Value:
-        return self._with("xor", other)
-
-    def __lt__(self, other: Value | int) -> Value:
-        return self._with("lt_u", other)
-
-    def __ge__(self, other: Value | int) -> Value:
-        return self._with("ge_u", other)
+        return self if isinstance(other, int) and other == 1 else op(f"{self.type}.mul", self, other)
 
     def equals(self, other: Value | int) -> Value:
         """Whether two integers are equal: i32."""
-        return op(f"{self.type}.eqz", self) if other == 0 else self._with("eq", other)
+        return op(f"{self.type}.eqz", self) if other == 0 else op(f"{self.type}.eq", self, other)
 
     def __lshift__(self, by: Value | int) -> Value:
         return self._shifted("shl", by)
@@ -161,29 +166,74 @@ class Value:
 
     def _shifted(self, name: str, by: Value | int) -> Value:
         """Vectors are shifted as two words, by an i32."""
-        if isinstance(by, int):
-            if not by:
-                return self
-            by = const("i32" if self.type == "v128" else self.type, by)
+        if isinstance(by, int) and not by:
+            return self
         return op(f"{'i64x2' if self.type == 'v128' else self.type}.{name}", self, by)
 
     def __invert__(self) -> Value:
         return op("v128.not", self)
 
+    def __getitem__(self, member: Member) -> Place:
+        """A member of the record at this address."""
+        return load(member.load, self, member.offset)
 
-class Local(Value):
-    """A local variable or parameter, as an expression."""
 
+class Place(Value):
+    """A value that can be set, by code before and after that of its new value."""
+
+    __slots__ = ("after", "before")
+
+    def __init__(self, type: str, code: bytes, before: bytes, after: bytes):
+        super().__init__(type, code)
+        self.before, self.after = before, after
+
+
+class _Variable(Place):
     __slots__ = ("index",)
+    scope: str
 
     def __init__(self, type: str, index: int):
-        super().__init__(type, OPCODES["local.get"] + unsigned(index))
+        get, put = (OPCODES[f"{self.scope}.{name}"] + unsigned(index) for name in ("get", "set"))
+        super().__init__(type, get, b"", put)
         self.index = index
 
 
-def op(name: str, *args: Value, tail: bytes = b"") -> Value:
-    """An instruction on its arguments; `tail`: its immediates."""
-    return Value(RESULTS[name], b"".join([arg.code for arg in args]) + OPCODES[name] + tail)
+class Local(_Variable):
+    """A local variable or parameter."""
+
+    __slots__ = ()
+    scope = "local"
+
+
+class Global(_Variable):
+    """A global variable of a module."""
+
+    __slots__ = ()
+    scope = "global"
+
+
+I32: TypeAlias = Local
+I64: TypeAlias = Local
+F32: TypeAlias = Local
+F64: TypeAlias = Local
+V128: TypeAlias = Local
+"""Parameters of functions, by type (`Module.define`)."""
+
+
+Body: TypeAlias = "Callable[..., Value | int | None]"
+"""Writes a function that it is given with its parameters, and returns the result, if it has one."""
+
+
+def op(name: str, *args: Value | int, tail: bytes = b"") -> Value:
+    """An instruction on its arguments, where numbers are of its own type, or i32 beside vectors; `tail`: its immediates."""
+    kind = name.partition(".")[0]
+    code = _codes(args, kind if kind in TYPES else "i32")
+    return Value(RESULTS[name], code + OPCODES[name] + tail)
+
+
+def _codes(values: Iterable[Value | int], type: str) -> bytes:
+    """The code of values; numbers are of a type."""
+    return b"".join([value.code if isinstance(value, Value) else const(type, value).code for value in values])
 
 
 def const(type: str, number: float) -> Value:
@@ -210,16 +260,16 @@ def floats(number: float) -> Value:
 _ALIGN = {"v128": 4, "i64": 3, "f64": 3, "i32": 2, "f32": 2, "8": 0, "16": 1, "32": 2, "64": 3}
 
 
-def _access(name: str, offset: int) -> bytes:
-    """The immediates of an access to memory: its natural alignment, which is only a hint, and the offset."""
+def load(name: str, address: Value | int, offset: int = 0) -> Place:
+    """An item in memory, which an instruction such as ``v128.load`` reads."""
     type, _, what = name.partition(".")
     size = "".join(c for c in what if c.isdigit())
-    return unsigned(_ALIGN[size or type]) + unsigned(offset)
-
-
-def load(name: str, address: Value, offset: int = 0) -> Value:
-    """A value from memory by an instruction such as ``v128.load``."""
-    return op(name, address, tail=_access(name, offset))
+    immediates = unsigned(_ALIGN[size or type]) + unsigned(
+        offset
+    )  # the natural alignment, which is only a hint
+    at = _codes([address], "i32")
+    store = OPCODES.get(f"{type}.store{size}", b"")
+    return Place(RESULTS[name], at + OPCODES[name] + immediates, at, store + immediates)
 
 
 @dataclass(frozen=True)
@@ -227,50 +277,36 @@ class Callee:
     """A function of a module."""
 
     index: int
-    results: tuple[str, ...]
+    result: str
 
-    def __call__(self, *args: Value) -> Value:
-        code = b"".join([arg.code for arg in args]) + OPCODES["call"] + unsigned(self.index)
-        return Value(self.results[0] if self.results else "", code)
-
-
-@dataclass(frozen=True)
-class Global:
-    """A mutable global variable of a module."""
-
-    index: int
-    type: str
-
-    @property
-    def value(self) -> Value:
-        return Value(self.type, OPCODES["global.get"] + unsigned(self.index))
+    def __call__(self, *args: Value | int) -> Value:
+        """A call; numbers are i32."""
+        return Value(self.result, _codes(args, "i32") + OPCODES["call"] + unsigned(self.index))
 
 
 class Function:
     """A function under construction. Parameters are the first locals."""
 
-    def __init__(self, params: Sequence[str] = (), results: Sequence[str] = ()):
-        self.params, self.results = tuple(params), tuple(results)
+    def __init__(self, params: Sequence[str] = ()):
         self.types = list(params)
+        self.params = [Local(type, i) for i, type in enumerate(params)]
+        self.result = ""
         self.body = bytearray()
         self._depth = 0
         self._free: dict[str, list[int]] = {}
         self._scopes: list[list[Local]] = []
 
-    def param(self, number: int) -> Local:
-        return Local(self.types[number], number)
-
     def local(self, type: str) -> Local:
         """A variable that holds anything; in a scope, until its end."""
         free = self._free.get(type)
         if free:
-            found = Local(type, free.pop())
+            local = Local(type, free.pop())
         else:
-            found = Local(type, len(self.types))
+            local = Local(type, len(self.types))
             self.types.append(type)
         if self._scopes:
-            self._scopes[-1].append(found)
-        return found
+            self._scopes[-1].append(local)
+        return local
 
     @contextmanager
     def scope(self) -> Iterator[None]:
@@ -280,33 +316,35 @@ class Function:
         for local in self._scopes.pop():
             self._free.setdefault(local.type, []).append(local.index)
 
-    def let(self, value: Value) -> Local:
-        """A new variable with a value."""
+    def let(self, value: Value | int) -> Local:
+        """A new variable with a value; a number is an i32."""
+        value = value if isinstance(value, Value) else const("i32", value)
         local = self.local(value.type)
         self.set(local, value)
         return local
 
     def do(self, value: Value) -> None:
-        """Run code that leaves nothing."""
+        """Run code, and drop what it leaves."""
         self.body += value.code
+        if value.type:
+            self.body += OPCODES["drop"]
 
-    def set(self, target: Local | Global, value: Value) -> None:
-        name = "local.set" if isinstance(target, Local) else "global.set"
-        self.body += value.code + OPCODES[name] + unsigned(target.index)
-
-    def store(self, name: str, address: Value, value: Value, offset: int = 0) -> None:
-        self.body += address.code + value.code + OPCODES[name] + _access(name, offset)
+    def set(self, target: Place, value: Value | int) -> None:
+        """Set a variable or an item in memory."""
+        self.body += target.before + _codes([value], target.type) + target.after
 
     def copy(self, target: Value, source: Value, size: Value) -> None:
         """Copy bytes in memory."""
-        self.body += target.code + source.code + size.code + OPCODES["memory.copy"] + b"\0\0"
+        self.body += op("memory.copy", target, source, size, tail=b"\0\0").code
 
-    def fill(self, target: Value, byte: Value, size: Value) -> None:
+    def fill(self, target: Value | int, byte: Value | int, size: Value | int) -> None:
         """Set bytes in memory."""
-        self.body += target.code + byte.code + size.code + OPCODES["memory.fill"] + b"\0"
+        self.body += op("memory.fill", target, byte, size, tail=b"\0").code
 
-    def give(self, value: Value) -> None:
-        """The result of the function is this."""
+    def give(self, value: Value | int) -> None:
+        """The result of the function is this; a number is an i32."""
+        value = value if isinstance(value, Value) else const("i32", value)
+        self.result = value.type
         self.body += value.code + OPCODES["return"]
 
     def leave(self) -> None:
@@ -344,14 +382,13 @@ class Function:
 
     def jump(self, label: int, condition: Value | None = None) -> None:
         """Jump to a block or loop, if a condition holds."""
-        depth = unsigned(self._depth - label)
-        if condition is None:
-            self.body += OPCODES["br"] + depth
-        else:
-            self.body += condition.code + OPCODES["br_if"] + depth
+        self.body += OPCODES["br"] if condition is None else condition.code + OPCODES["br_if"]
+        self.body += unsigned(self._depth - label)
 
     @contextmanager
-    def each(self, start: Value, stop: Value, step: int = 1, *, some: bool = True) -> Iterator[Local]:
+    def each(
+        self, start: Value | int, stop: Value | int, step: int = 1, *, some: bool = True
+    ) -> Iterator[Local]:
         """A loop over numbers from `start` to below `stop`; `some`: there is at least one."""
         number = self.let(start)
         with self.block() as out:
@@ -364,14 +401,9 @@ class Function:
 
     def code(self) -> bytes:
         """Locals and body, as in the code section."""
-        groups: list[list[int]] = []
-        for type in self.types[len(self.params) :]:
-            if groups and groups[-1][1] == TYPES[type]:
-                groups[-1][0] += 1
-            else:
-                groups.append([1, TYPES[type]])
-        declared = unsigned(len(groups)) + b"".join(unsigned(n) + bytes([t]) for n, t in groups)
-        return declared + bytes(self.body) + OPCODES["end"]
+        groups = groupby(self.types[len(self.params) :])
+        declared = [unsigned(len(list(group))) + bytes([TYPES[type]]) for type, group in groups]
+        return _vector(declared) + bytes(self.body) + OPCODES["end"]
 
 
 class Module:
@@ -387,23 +419,32 @@ class Module:
         self._data: list[bytes] = []
         self._custom: list[bytes] = []
 
+    def define(self, body: Body, name: str = "", *, export: bool = False) -> Callee:
+        """Add a function; `body` has its parameters, annotated with their types (`I32`), and usually its name."""
+        _, *params = inspect.signature(body).parameters.values()
+        function = Function([param.annotation.lower() for param in params])
+        result = body(function, *function.params)
+        if result is not None:
+            function.give(result)
+        return self.add(function, name or body.__name__.strip("_"), export=export)
+
     def add(self, function: Function, name: str, *, export: bool = False) -> Callee:
-        kind = b"\x60" + _vector([bytes([TYPES[t]]) for t in function.params])
-        kind += _vector([bytes([TYPES[t]]) for t in function.results])
+        params = [bytes([TYPES[param.type]]) for param in function.params]
+        kind = b"\x60" + _vector(params) + _vector([bytes([TYPES[type]]) for type in function.result.split()])
         key = (self._types.setdefault(kind, len(self._types)), function.code())
-        found = self._functions.setdefault(key, Callee(len(self._functions), function.results))
-        if found.index == len(self._names):
+        callee = self._functions.setdefault(key, Callee(len(self._functions), function.result))
+        if callee.index == len(self._names):
             self._names.append(name)
         if export:
-            self.export(found, name)
-        return found
+            self.export(callee, name)
+        return callee
 
     def export(self, function: Callee, name: str) -> None:
         self._exports.append(_text(name) + b"\x00" + unsigned(function.index))
 
     def variable(self, type: str, start: int = 0) -> Global:
         self._globals.append((type, start))
-        return Global(len(self._globals) - 1, type)
+        return Global(type, len(self._globals) - 1)
 
     def restart(self, variable: Global, start: int) -> None:
         """Another value that a variable begins with."""
@@ -421,38 +462,80 @@ class Module:
 
     def code(self) -> bytes:
         """The module in the binary format."""
-        functions = list(self._functions)
-        ends = [const(type, start).code + OPCODES["end"] for type, start in self._globals]
-        variables = [bytes([TYPES[t], 1]) + end for (t, _), end in zip(self._globals, ends, strict=True)]
-        sections = (
-            (1, list(self._types)),
-            (3, [unsigned(type) for type, _ in functions]),
-            (5, [b"\x01" + unsigned(self.pages) + unsigned(self.most)]),
-            (6, variables),
-            (7, self._exports),
-            (10, [unsigned(len(code)) + code for _, code in functions]),
-            *([(11, self._data)] if self._data else []),
-        )
-        found = [b"\0asm\1\0\0\0"]
-        for number, inner in (
-            *((number, _vector(items)) for number, items in sections),
-            *((0, one) for one in self._custom),
-        ):
-            found.append(bytes([number]) + unsigned(len(inner)) + inner)
-        return b"".join(found)
-
-    @property
-    def functions(self) -> list[tuple[str, bytes]]:
-        """The name and code of each function, by number."""
-        return [
-            (f"{name}_{i}", code)
-            for i, (name, (_, code)) in enumerate(zip(self._names, self._functions, strict=True))
+        variables = [
+            bytes([TYPES[type], 1]) + const(type, start).code + OPCODES["end"]
+            for type, start in self._globals
         ]
+        sections = [
+            (1, _vector(list(self._types))),
+            (3, _vector([unsigned(type) for type, _ in self._functions])),
+            (5, _vector([b"\x01" + unsigned(self.pages) + unsigned(self.most)])),
+            (6, _vector(variables)),
+            (7, _vector(self._exports)),
+            (10, _vector([unsigned(len(code)) + code for _, code in self._functions])),
+            *([(11, _vector(self._data))] if self._data else []),
+            *((0, section) for section in self._custom),
+        ]
+        return b"\0asm\1\0\0\0" + b"".join(
+            bytes([number]) + unsigned(len(section)) + section for number, section in sections
+        )
+
+    def listing(self, only: str | None = None) -> str:
+        """The functions in the notation of the text format; with `only`, one and those that it calls."""
+        names = [f"{name}_{i}" for i, name in enumerate(self._names)]
+        bodies = [_listing(BytesIO(code), names) for _, code in self._functions]
+        wanted = [i for i, name in enumerate(self._names) if only in (None, name)]
+        for i in wanted:  # grows
+            called = {int(line.rpartition("_")[2]) for line in bodies[i].splitlines() if " call $" in line}
+            wanted += sorted(called - set(wanted))
+        return "\n".join(f"(func ${names[i]}\n{bodies[i]})" for i in sorted(set(wanted)))
 
 
-def _vector(items: Sequence[bytes]) -> bytes:
-    return unsigned(len(items)) + b"".join(items)
+def _listing(code: BytesIO, names: Sequence[str]) -> str:
+    """The instructions of a function, one a line, read back from its code."""
+    kinds = {number: name for name, number in TYPES.items()}
+    lines = []
+    for _ in range(_read(code)):
+        count = _read(code)
+        lines.append(f"  (local {kinds[code.read(1)[0]]}) ;; {count}")
+    depth = 1
+    while depth:
+        number = code.read(1)[0]
+        name = NAMES[number if number not in (0xFC, 0xFD) else number << 8 | _read(code)]
+        depth -= name in ("end", "else")
+        if depth:
+            lines.append("  " * depth + name + _immediates(name, code, names))
+        depth += name in ("block", "loop", "if", "else")
+    return "\n".join(lines)
 
 
-def _text(text: str) -> bytes:
-    return unsigned(len(text.encode())) + text.encode()
+def _read(code: BytesIO, *, signed: bool = False) -> int:
+    """A number in LEB128."""
+    number = shift = 0
+    while True:
+        (octet,) = code.read(1)
+        number |= (octet & 127) << shift
+        shift += 7
+        if octet < 128:
+            return number - (1 << shift) if signed and octet & 64 else number
+
+
+def _immediates(name: str, code: BytesIO, names: Sequence[str]) -> str:
+    kind, _, rest = name.partition(".")
+    if name == "call":
+        return f" ${names[_read(code)]}"
+    if kind in ("br", "br_if", "local", "global"):
+        return f" {_read(code)}"
+    if rest == "const":
+        if kind in ("i32", "i64"):
+            return f" {_read(code, signed=True)}"
+        if kind == "v128":
+            return " i32x4 " + " ".join(f"{part:#x}" for part in struct.unpack("<4I", code.read(16)))
+        return f" {struct.unpack('<f' if kind == 'f32' else '<d', code.read(4 if kind == 'f32' else 8))[0]}"
+    if kind != "memory" and rest.startswith(("load", "store")):
+        code.read(1)
+        return f" offset={_read(code)}"
+    if rest.endswith("_lane"):
+        return f" {code.read(1)[0]}"
+    code.read(2 if name == "memory.copy" else kind in ("memory", "block", "loop", "if"))
+    return ""

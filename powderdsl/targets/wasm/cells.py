@@ -12,9 +12,20 @@ from powderdsl.ir.ops import REAL, SNAP, Node, ordered
 from powderdsl.schedule.types import Compute, alternatives, loaded
 from powderdsl.targets.layout import param_key
 from powderdsl.targets.values import CellValues, chains_of
-from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, floats, load, op, vector
-from powderdsl.targets.wasm.library import ZERO, Library, choose, counted, either, some, splat
-from powderdsl.targets.wasm.memory import HALOED, HEADER, SOME, WORD
+from powderdsl.targets.wasm.binary import I32, Callee, Function, Local, Value, const, floats, load, op, vector
+from powderdsl.targets.wasm.library import (
+    HALOED,
+    LIVE,
+    SOME,
+    WORD,
+    ZERO,
+    Library,
+    choose,
+    counted,
+    either,
+    some,
+    splat,
+)
 
 if TYPE_CHECKING:
     from powderdsl.targets.wasm.passes import Pass
@@ -37,7 +48,7 @@ def sweep(within: Pass, loop: Compute) -> None:
         elif loop.region is not None:
             condition = ZERO
             for part in alternatives(loop.region):
-                condition = condition | library.some(within.of(part.args[0] if part.op == "live" else part))
+                condition = condition | within.of(part.args[0] if part.op == "live" else part)[SOME]
             asked.enter_context(f.when(condition))
         if not copies:
             for out in loop.outs:
@@ -68,8 +79,8 @@ class CellLoop:
         self.keeps = bool(keeps)
         self.reads = list(dict.fromkeys(loaded([*roots, *region, *keeps])))
         self.f = f = Function(["i32"] * (len(self.reads) + len(loop.outs)))
-        self.held = {name: f.param(i) for i, name in enumerate(self.reads)}
-        self.outs = [f.param(len(self.reads) + i) for i in range(len(loop.outs))]
+        self.held = dict(zip(self.reads, f.params, strict=False))
+        self.outs = f.params[len(self.reads) :]
         self.nodes = ordered(roots)
         self.starts: dict[tuple[str, int, bool], Local] = {}
         self.choices = loop.over == "choices"
@@ -77,11 +88,11 @@ class CellLoop:
     def made(self) -> Callee:
         """The function."""
         f, library, memory = self.f, self.library, self.memory
-        line = self.line = f.let(ZERO)
-        self.somewhere = [f.let(ZERO) for _ in self.outs]
-        with f.each(ZERO, const("i32", 16), 8) as lane:
+        line = self.line = f.let(0)
+        self.somewhere = [f.let(0) for _ in self.outs]
+        with f.each(0, 16, 8) as lane:
             self.lane = lane
-            with f.each(lane, lane + library.cells.value, memory.row) as row:
+            with f.each(lane, lane + library.cells, memory.row) as row:
                 self.row = row
                 with f.scope(), f.block() as skip:
                     self.skip = skip
@@ -89,9 +100,9 @@ class CellLoop:
                     self.lay() if self.choices else self.body()
                 f.set(line, line + 1)
         for out, place, found in zip(self.loop.outs, self.outs, self.somewhere, strict=True):
-            f.store("i32.store", place, found, SOME)
+            f.set(place[SOME], found)
             if out.var.type != REAL:
-                f.store("i32.store", place, ZERO, HALOED)
+                f.set(place[HALOED], 0)
         return library.module.add(f, f"cells_{self.loop.place.rpartition('/')[2]}")
 
     # Lines
@@ -113,17 +124,17 @@ class CellLoop:
                 self.starts[key] = self.f.let(self.library.line(self.held[name], line))
 
     def live(self, field: Value, line: Value | None = None) -> Value:
-        return self.library.live(field, self.line if line is None else line)
+        return (field + (self.line if line is None else line))[LIVE]
 
     def set_live(self, place: int, value: Value) -> None:
         f = self.f
         value = f.let(value)
-        f.store("i32.store8", self.outs[place] + self.line, value, HEADER)
+        f.set((self.outs[place] + self.line)[LIVE], value)
         f.set(self.somewhere[place], self.somewhere[place] | value)
 
     def flags(self, plane: Value, at: Value) -> Value:
         """The word of a plane for this lane; `at`: bytes from its first word."""
-        return load("i64.load", plane + at, self.memory.base)
+        return (plane + at)[self.memory.half]
 
     def row_flags(self, planes: Sequence[str]) -> Value:
         """Whether planes hold a flag in this row of the lane."""
@@ -136,7 +147,7 @@ class CellLoop:
         f = self.f
         total = f.let(found)
         for name in planes:
-            with f.each(ZERO, const("i32", self.memory.row), 16) as at:
+            with f.each(0, self.memory.row, 16) as at:
                 f.set(total, total | self.flags(self.held[name], self.row + at))
         return op("i64.ne", total, const("i64", 0))
 
@@ -151,14 +162,14 @@ class CellLoop:
             )
 
     def copy_cells(self, to: Value, source: Value) -> None:
-        self.f.do(self.library.lazily("copy_line", self._copy_line)(to, source))
+        library = self.library
+        copy = library.lazily("copy_line", lambda: library.module.define(self._copy_line))
+        self.f.do(copy(to, source))
 
-    def _copy_line(self) -> Callee:
-        f, memory = Function(["i32", "i32"]), self.memory
-        begin = -4 * memory.halo
-        with f.each(ZERO, const("i32", 4 * memory.stride - 16), 16) as at:
-            f.store("v128.store", (f.param(0) + begin) + at, load("v128.load", (f.param(1) + begin) + at))
-        return self.library.module.add(f, "copy_line")
+    def _copy_line(self, f: Function, to: I32, source: I32) -> None:
+        begin = -4 * self.memory.halo
+        with f.each(0, 4 * self.memory.stride - 16, 16) as at:
+            f.set(load("v128.load", (to + begin) + at), load("v128.load", (source + begin) + at))
 
     # Values, chunk by chunk
 
@@ -187,7 +198,7 @@ class CellLoop:
                         f.set(self.somewhere[i], const("i32", 1))
                     for w in range(self.memory.words):
                         value = const("i64", self.valid(w) if out.otherwise.attr else 0)
-                        f.store("i64.store", self.outs[i] + self.row, value, self.memory.base + 16 * w)
+                        f.set(load("i64.load", self.outs[i] + self.row, self.memory.base + 16 * w), value)
             f.jump(self.skip)
 
     def valid(self, w: int) -> int:
@@ -212,7 +223,7 @@ class CellLoop:
                 found = [values.of(out.value) for out in self.loop.outs]
                 found = [v if isinstance(v, Local) else f.let(v) for v in found]
                 for i, _ in fields:
-                    f.store("v128.store", lines[i] + (column << 2), found[i])
+                    f.set(load("v128.load", lines[i] + (column << 2)), found[i])
                     kept = found[i]
                     if width % CHUNK:
                         kept = kept & load("v128.load", column << 2, memory.at("columns") + 4 * memory.halo)
@@ -226,13 +237,13 @@ class CellLoop:
                     value = value & self.valid_word(at)
                     f.set(bits[i], value)
                 f.set(self.somewhere[i], self.somewhere[i] | op("i64.ne", bits[i], const("i64", 0)))
-                f.store("i64.store", self.outs[i] + at, bits[i], memory.base)
+                f.set((self.outs[i] + at)[memory.half], bits[i])
         for i, _ in fields:
             self.set_live(i, some(op("i32x4.shl", alive[i], const("i32", 1))))
             library.finish_line(f, lines[i])
 
     def valid_word(self, at: Value) -> Value:
-        return load("i64.load", self.library.everything.value + at, self.memory.base)
+        return (self.library.everything + at)[self.memory.half]
 
     @contextmanager
     def each_word(self):  # type: ignore[no-untyped-def]
@@ -241,7 +252,7 @@ class CellLoop:
         if memory.words == 1:
             yield self.row, ZERO, const("i32", memory.width)
             return
-        at, x = f.let(self.row), f.let(ZERO)
+        at, x = f.let(self.row), f.let(0)
         with f.loop() as again:
             stop = x + WORD
             if not memory.whole:
@@ -291,12 +302,12 @@ class CellLoop:
                 with f.scope():
                     self.choose(at, x, mask, [chain[level] for chain in chains], running)
         if continued:
-            with f.each(ZERO, const("i32", memory.width), CHUNK) as self.column, f.scope():
+            with f.each(0, memory.width, CHUNK) as self.column, f.scope():
                 values = Chunks(self, {})
                 for chain, line in zip(chains, running, strict=True):
                     values.known[id(chain[-1])] = f.let(load("v128.load", line + (self.column << 2)))
                 for out, line in zip(outs, lines, strict=True):
-                    f.store("v128.store", line + (self.column << 2), values.of(out.value))
+                    f.set(load("v128.load", line + (self.column << 2)), values.of(out.value))
         for start in lines:
             library.finish_line(f, start)
 
@@ -317,7 +328,7 @@ class CellLoop:
                 values.known[id(choice.args[2])] = f.let(load("v128.load", place))
             for choice, place in zip(choices, places, strict=True):
                 new = choose(chosen, values.of(choice.args[1]), values.known[id(choice.args[2])])
-                f.store("v128.store", place, new)
+                f.set(load("v128.load", place), new)
             f.jump(again)
 
 
@@ -364,7 +375,7 @@ class Chunks(CellValues[Value]):
                 if node.type != REAL:
                     return self.spread(self.nibble(node))
                 number = memory.layout.param_reals[attr[0]]
-                return load("v128.load32_splat", loop.lane >> 1, memory.at("reals", number, 8))
+                return load("v128.load32_splat", loop.lane >> 1, memory.at("reals", number))
             case "draw":
                 return self.draw(node)
             case "shift":
@@ -395,7 +406,7 @@ class Chunks(CellValues[Value]):
 
     def draw(self, node: Node) -> Value:
         stream, bits = node.attr
-        keys = self.memory.at("keys", self.memory.layout.streams[stream], 32)
+        keys = self.memory.at("keys", self.memory.layout.streams[stream])
         loop, f = self.loop, self.f
         row = op("i32.sub", loop.row, loop.lane)
         y = f.let(row // self.memory.row)

@@ -1,20 +1,170 @@
-"""What generated passes call: memory for planes and fields, rows around the edges, draws."""
+"""The memory of a module, and what generated passes call: planes and fields, rows around the edges, draws.
+
+Addresses are bytes. Everything is aligned to 16 bytes. A group is two lanes of work: two worlds, or the two halves of one.
+
+    plane   refs, some, haloed, next: i32 each. Rows of words, lane by lane, with `around` rows above and below, which
+            hold the rows that follow on the torus if `haloed`. `some`: it may hold a flag; if not, all words are zero.
+    field   refs, some, –, next. A byte a line: whether it is `live`; other lines are zero and not to be read. Then the
+            lines, of both lanes one after the other, with `reach` columns of the torus on both sides.
+    batch   worlds, groups, next, size. Seeds, indices and steps, i64 a world each. The bits of parameters, a byte a
+            world each; then their float32 values. Then the groups.
+    group   the planes and fields of slots, i32 each; i64: the ids that are present, of those that passes ask for.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import NamedTuple
 
+from powderdsl.ir.ops import REAL, ordered
+from powderdsl.schedule.types import Move, Schedule, Sweeps, flat
 from powderdsl.system.random import MASK
-from powderdsl.targets.wasm.binary import Callee, Function, Local, Module, Value, const, load, op, vector
-from powderdsl.targets.wasm.memory import HALOED, HEADER, NEXT, REFS, SOME, WORD, Memory
+from powderdsl.targets.layout import Layout
+from powderdsl.targets.values import chains_of
+from powderdsl.targets.wasm.binary import (
+    I32,
+    I64,
+    V128,
+    Callee,
+    Function,
+    Global,
+    Local,
+    Member,
+    Module,
+    Place,
+    Value,
+    const,
+    load,
+    op,
+    vector,
+)
+
+WORD, LANES = 64, 2
+HEADER = 16
+"""Bytes of numbers before what planes, fields and batches hold."""
+
+REFS, SOME, HALOED, NEXT = (Member("i32.load", at) for at in (0, 4, 8, 12))
+REFS_SOME = Member("i64.load", 0)
+"""Both together."""
+
+LIVE = Member("i32.load8_u", HEADER)
+"""Of a line: beyond a field as many bytes as its number."""
+
+WORLDS, GROUPS, NEXT_BATCH, SIZE = (Member("i32.load", at) for at in (0, 4, 8, 12))
 
 PAGE = 1 << 16
 GOLDEN, FIRST, SECOND = 0x9E3779B1, 0x7FEB352D, 0x846CA68B
+MOST_BITS = 64
+"""Of a draw."""
+
 AHEAD = 4
 """Bits of a draw that are made together, since the multiplications of one wait for each other."""
 
 STILL, SWAPPED = bytes(range(16)), bytes([*range(8, 16), *range(8)])
 """For `i8x16.swizzle`: the lanes as they are, and exchanged."""
+
+ZERO = const("i32", 0)
+
+
+def aligned(count: int, by: int = 16) -> int:
+    return -(-count // by) * by
+
+
+class Extent(NamedTuple):
+    """The largest distances at which planes are read in rows (`around`), and fields in rows and columns; the most chains
+    of choices in a loop.
+    """
+
+    around: int
+    lines: int
+    reach: int
+    chains: int
+
+
+def extent_of(schedules: Sequence[Schedule]) -> Extent:
+    around = lines = reach = chains = 0
+    for statement in (statement for schedule in schedules for statement in flat(schedule.body)):
+        if isinstance(statement, Move):
+            around = max(around, abs(statement.offset[0]))
+            lines = max(lines, abs(statement.offset[0]) if statement.planes[0].new.type == REAL else 0)
+        elif isinstance(statement, Sweeps):
+            laid = (loop for loop in statement.loops if loop.over == "choices")
+            chains = max(chains, *(len(chains_of(loop)) for loop in laid), 0)
+        for node in ordered(statement.values()):
+            if node.op == "shift" and node.type != REAL:
+                around = max(around, abs(node.attr[0]))
+            elif node.op in ("shift", "live"):
+                lines = max(lines, abs(node.attr[0]))
+                reach = max(reach, abs(node.attr[1]) if node.op == "shift" else 0)
+    return Extent(around, lines, reach, chains)
+
+
+class Memory:
+    """The sizes of rows, and the static addresses, of a program for grids of one width."""
+
+    def __init__(self, width: int, extent: Extent, layout: Layout):
+        self.width, self.extent, self.layout = width, extent, layout
+        self.words = -(-width // WORD)
+        """The words of a row."""
+        self.whole = width % WORD == 0
+        """Whether all words of a row are full."""
+        self.row = 8 * LANES * self.words
+        """The bytes of a plane's row, both lanes."""
+        self.base = HEADER + extent.around * self.row
+        """Where a plane's first row lies."""
+        self.flags, self.half = Member("v128.load", self.base), Member("i64.load", self.base)
+        """A word of a plane, and what a lane has of it: beyond the plane's address as far as beyond its first word."""
+        self.halo = aligned(extent.reach, 4)
+        """The columns beside a line of a field for which there is room."""
+        self.stride = aligned(width, 4) + 2 * self.halo + 4
+        """The floats of a line, with both halos and what a chunk may overlap."""
+        self.slots = [(Member("i32.load", 4 * i), False) for i in range(len(layout.planes))]
+        """The planes and fields of a group, by number; and whether they are fields."""
+        self.slots += [
+            (Member("i32.load", 4 * (len(self.slots) + i)), True) for i in range(len(layout.reals))
+        ]
+        self.present = Member("i64.load", aligned(4 * len(self.slots), 8))
+        """The ids that are present in a group."""
+        self.group = aligned(self.present.offset + 8)
+        """The bytes of a group."""
+        self.top = 64
+        self._tables: dict[str, tuple[int, int]] = {}
+        for name, size, count in (
+            ("turn", 16, 1),
+            ("apart", 16, 1),
+            ("worlds", 16, 2),
+            ("clock", 16, 1),
+            ("keys", 32, len(layout.streams)),
+            ("params", 16, len(layout.param_planes)),
+            ("reals", 8, len(layout.param_reals)),
+            ("steps", 16, len(layout.step_planes)),
+            ("limits", 16, MOST_BITS + 1),
+            ("coins", 4, len(layout.streams)),
+            ("fixed", 4, len(layout.fixed)),
+            ("lines", 4, 2 * (2 * extent.lines + 1)),
+            ("moving", 4, len(layout.planes) + 1),
+            ("rows", 4, 1),
+            ("change", self.row, 2),
+            ("columns", 4 * self.stride, 1),
+            ("chains", 4 * self.stride, extent.chains),
+        ):
+            self._tables[name] = self.top, size
+            self.top = aligned(self.top + size * count)
+
+    def at(self, name: str, number: int = 0) -> int:
+        """The address of an item of a static table."""
+        start, size = self._tables[name]
+        return start + number * size
+
+    def slot(self, name: str, type: object) -> Member:
+        """The plane or field of a slot in a group."""
+        layout = self.layout
+        return self.slots[len(layout.planes) + layout.reals[name] if type == REAL else layout.planes[name]][0]
+
+    def table(self, dy: int, *, wraps: bool) -> int:
+        """Where the pointer to a table of lines lies: for each line, the one `dy` below it in its world."""
+        return self.at("lines", 2 * (dy + self.extent.lines) + (not wraps))
 
 
 def splat(number: Value) -> Value:
@@ -31,9 +181,11 @@ def some(flags: Value) -> Value:
     return op("v128.any_true", flags)
 
 
-def either(condition: Value, yes: Value, no: Value) -> Value:
-    """A choice between two integers."""
-    return Value(yes.type, yes.code + no.code + condition.code + op("select").code)
+def either(condition: Value, yes: Value | int, no: Value | int) -> Value:
+    """A choice between two numbers, one of which is not constant."""
+    type = yes.type if isinstance(yes, Value) else no.type if isinstance(no, Value) else "i32"
+    yes, no = (given if isinstance(given, Value) else const(type, given) for given in (yes, no))
+    return Value(type, yes.code + no.code + condition.code + op("select").code)
 
 
 def choose(mask: Value, yes: Value, no: Value) -> Value:
@@ -41,7 +193,7 @@ def choose(mask: Value, yes: Value, no: Value) -> Value:
     return op("v128.bitselect", yes, no, mask)
 
 
-def word(address: Value, offset: int = 0) -> Value:
+def word(address: Value | int, offset: int = 0) -> Place:
     return load("i32.load", address, offset)
 
 
@@ -50,15 +202,12 @@ def counted(value: Value) -> Value:
     return op("i64.extend_i32_u", value)
 
 
-ZERO = const("i32", 0)
-
-
 class Library:
     """The functions and variables of a module."""
 
     def __init__(self, memory: Memory, module: Module):
         self.memory, self.module = memory, module
-        variable = module.variable
+        variable, define = module.variable, module.define
         self.top = variable("i32", memory.top)
         """Where memory that was never used begins."""
         self.planes, self.fields, self.batches = variable("i32"), variable("i32"), variable("i32")
@@ -75,155 +224,129 @@ class Library:
         self.world_rows = variable("i32")
         """Rows of a world; 0 before the first batch."""
         self.scratch, self.scratch_end = variable("i32"), variable("i32")
-        self.bump = self._bump()
-        self.take = self._take("take", self.planes, self.plane_size.value)
-        self.take_field = self._take("take_field", self.fields, self.field_size.value)
-        self.give, self.give_field = self._give("give", self.planes), self._give("give_field", self.fields)
-        self.keep = self._keep()
-        self.own = self._own()
-        self.own_field = self._own_field()
-        self.edges = self._edges()
-        self.mix = self._mix()
-        self.draw_below, self.draw_below_planes = self._draw_below(), self._draw_below_planes()
-        self.coin = self._coin()
+        self.bump = define(self._bump)
+        self.take = define(partial(self._take, self.planes, self.plane_size), "take")
+        self.take_field = define(partial(self._take, self.fields, self.field_size), "take_field")
+        self.give = define(partial(self._give, self.planes), "give")
+        self.give_field = define(partial(self._give, self.fields), "give_field")
+        self.keep = define(self._keep)
+        self.own, self.own_field = define(self._own), define(self._own_field)
+        self.edges = define(self._edges)
+        self.mix = define(self._mix)
+        self.draw_below, self.draw_below_planes = define(self._draw_below), define(self._draw_below_planes)
+        self.coin = define(self._coin)
         self.made: dict[object, Callee] = {}
         """Functions that are made when they are first needed, by what they do."""
-
-    def function(self, params: str = "", results: str = "") -> Function:
-        return Function(params.split(), results.split())
 
     def lazily(self, key: object, make: Callable[[], Callee]) -> Callee:
         if key not in self.made:
             self.made[key] = make()
         return self.made[key]
 
+    def giver(self, real: bool) -> Callee:
+        """Releases a plane or a field."""
+        return self.give_field if real else self.give
+
     # Memory
 
-    def _bump(self) -> Callee:
+    def _bump(self, f: Function, size: I32) -> Value:
         """New memory: bytes, a multiple of 16 → address. Traps where the module's limit is reached."""
-        f = self.function("i32", "i32")
-        place = f.let(self.top.value)
-        with f.when(f.param(0) >= self.module.most * PAGE):
+        place = f.let(self.top)
+        with f.when(size >= self.module.most * PAGE):
             f.trap()
-        end = f.let(place + f.param(0))
-        pages, size = f.let((end + (PAGE - 1)) >> 16), op("memory.size", tail=b"\0")
-        with f.when(pages >= size + 1):
-            grown = op("memory.grow", pages - size, tail=b"\0")
-            with f.when(grown.equals(const("i32", -1))):
+        end = f.let(place + size)
+        pages, before = f.let((end + (PAGE - 1)) >> 16), op("memory.size", tail=b"\0")
+        with f.when(pages >= before + 1):
+            grown = op("memory.grow", pages - before, tail=b"\0")
+            with f.when(grown.equals(-1)):
                 f.trap()
         f.set(self.top, end)
-        f.give(place)
-        return self.module.add(f, "bump")
+        return place
 
     def trap_from(self, f: Function, count: Value, size: int) -> None:
         """Trap if items of a size, together with as much again, do not fit into the memory."""
-        bytes = counted(count) * size
-        with f.when(bytes >= self.module.most * PAGE // 2):
+        with f.when(counted(count) * size >= self.module.most * PAGE // 2):
             f.trap()
 
-    def _take(self, name: str, free, size: Value) -> Callee:  # type: ignore[no-untyped-def]
-        f = self.function("", "i32")
-        found = f.let(free.value)
-        with f.when(found):
-            f.set(free, word(found, NEXT))
+    def _take(self, free: Global, size: Global, f: Function) -> Value:
+        place = f.let(free)
+        with f.when(place):
+            f.set(free, place[NEXT])
             f.otherwise()
-            f.set(found, self.bump(size))
-        f.store("i64.store", found, const("i64", 1), REFS)
-        f.store("i32.store", found, ZERO, HALOED)
-        f.give(found)
-        return self.module.add(f, name)
+            f.set(place, self.bump(size))
+        f.set(place[REFS_SOME], 1)
+        f.set(place[HALOED], 0)
+        return place
 
-    def _give(self, name: str, free) -> Callee:  # type: ignore[no-untyped-def]
-        f = self.function("i32")
-        given = f.param(0)
-        left = f.let(word(given, REFS) - 1)
-        f.store("i32.store", given, left, REFS)
+    def _give(self, free: Global, f: Function, given: I32) -> None:
+        left = f.let(given[REFS] - 1)
+        f.set(given[REFS], left)
         with f.when(left.equals(0)):
-            f.store("i32.store", given, free.value, NEXT)
+            f.set(given[NEXT], free)
             f.set(free, given)
-        return self.module.add(f, name)
 
-    def _keep(self) -> Callee:
+    def _keep(self, f: Function, held: I32) -> Value:
         """One more owner of a plane or field, which is the result."""
-        f = self.function("i32", "i32")
-        f.store("i32.store", f.param(0), word(f.param(0), REFS) + 1, REFS)
-        f.give(f.param(0))
-        return self.module.add(f, "keep")
+        f.set(held[REFS], held[REFS] + 1)
+        return held
 
-    def _own(self) -> Callee:
+    def _own(self, f: Function, plane: I32) -> Value:
         """A plane of this owner alone, to be written over."""
-        f = self.function("i32", "i32")
-        with f.when(word(f.param(0), REFS).equals(1)):
-            f.store("i32.store", f.param(0), ZERO, HALOED)
-            f.give(f.param(0))
-        self._duplicate(f, self.take, self.give, self.memory.base, self.cells.value)
-        return self.module.add(f, "own")
+        with f.when(plane[REFS].equals(1)):
+            f.set(plane[HALOED], 0)
+            f.give(plane)
+        return self._copied(f, plane, self.take, self.give, self.memory.base, self.cells)
 
-    def _own_field(self) -> Callee:
+    def _own_field(self, f: Function, field: I32) -> Value:
         """A field of this owner alone, to be written over."""
-        f = self.function("i32", "i32")
-        with f.when(word(f.param(0), REFS).equals(1)):
-            f.give(f.param(0))
-        self._duplicate(f, self.take_field, self.give_field, HEADER, self.field_size.value - HEADER)
-        return self.module.add(f, "own_field")
+        with f.when(field[REFS].equals(1)):
+            f.give(field)
+        return self._copied(f, field, self.take_field, self.give_field, HEADER, self.field_size - HEADER)
 
-    def _duplicate(self, f: Function, take: Callee, give: Callee, first: int, size: Value) -> None:
-        """Return a copy of the plane or field that is the first parameter, whose owner gives it back."""
-        old, new = f.param(0), f.let(take())
-        start = const("i32", first)
+    def _copied(self, f: Function, old: Local, take: Callee, give: Callee, first: int, size: Value) -> Value:
+        """A copy of a plane or field, whose owner gives that back."""
+        new, start = f.let(take()), const("i32", first)
         f.copy(new + start, old + start, size)
-        f.store("i32.store", new, word(old, SOME), SOME)
+        f.set(new[SOME], old[SOME])
         f.do(give(old))
-        f.give(new)
-
-    def some(self, held: Value) -> Value:
-        """Whether a plane or field may hold anything."""
-        return word(held, SOME)
+        return new
 
     # Rows around the edges
 
-    def turned(self, row: Value) -> Value:
-        """A row of the lanes as those see it that lie beyond an edge: strips see the other strip."""
-        return op("i8x16.swizzle", row, load("v128.load", ZERO, self.memory.at("turn")))
-
-    def _edges(self) -> Callee:
-        """To be called before rows above and below are read."""
-        f = self.function("i32")
-        plane, memory, rows = f.param(0), self.memory, self.rows.value
-        with f.when(word(plane, HALOED)):
+    def _edges(self, f: Function, plane: I32) -> None:
+        """To be called before rows above and below are read. Beyond an edge, strips see the other strip."""
+        memory, rows, around = self.memory, self.rows, self.memory.extent.around
+        with f.when(plane[HALOED]):
             f.leave()
-        f.store("i32.store", plane, const("i32", 1), HALOED)
-        around = memory.extent.around
-        if around:
-            with f.each(const("i32", 1), const("i32", around + 1)) as k:
-                for target, source in (
-                    (const("i32", around) - k, (rows * around - k) % rows),
-                    (rows + (k + (around - 1)), (k - 1) % rows),
-                ):
-                    to, came = (f.let(plane + place * memory.row) for place in (target, source))
-                    with f.each(ZERO, const("i32", memory.row), 16) as w:
-                        seen = self.turned(load("v128.load", came + w, memory.base))
-                        f.store("v128.store", to + w, seen, HEADER)
-        return self.module.add(f, "edges")
+        f.set(plane[HALOED], 1)
+        if not around:
+            return
+        turn = load("v128.load", ZERO, memory.at("turn"))
+        with f.each(1, around + 1) as k:
+            for target, source in (
+                (around - k, (rows * around - k) % rows),
+                (rows + (k + (around - 1)), (k - 1) % rows),
+            ):
+                to, came = (f.let(plane + place * memory.row) for place in (target, source))
+                with f.each(0, memory.row, 16) as w:
+                    seen = op("i8x16.swizzle", (came + w)[memory.flags], turn)
+                    f.set(load("v128.load", to + w, HEADER), seen)
 
     # Draws
 
-    def _mix(self) -> Callee:
+    def _mix(self, f: Function, x: I32) -> Value:
         """The finalizer of keys."""
-        f = self.function("i32", "i32")
-        x = f.param(0)
         for by, factor in ((16, FIRST), (15, SECOND)):
             f.set(x, x ^ (x >> by))
             f.set(x, x * factor)
-        f.give(x ^ (x >> 16))
-        return self.module.add(f, "mix")
+        return x ^ (x >> 16)
 
     def mixed(self, f: Function, numbers: Value, key: Value | None = None) -> Local:
         """The finalizer of keys, on a vector; with a second key added between the multiplications, that of draws."""
         h = f.let(numbers)
 
         def fold(by: int) -> None:
-            f.set(h, h ^ op("i32x4.shr_u", h, const("i32", by)))
+            f.set(h, h ^ op("i32x4.shr_u", h, by))
 
         fold(16)
         f.set(h, op("i32x4.mul", h, integers(FIRST)))
@@ -232,50 +355,43 @@ class Library:
         fold(16)
         return h
 
-    def drawn(self, f: Function, number: Value, keys: Value) -> Local:
-        """A bit of the draws of a word: `number` is that of the word and bit times GOLDEN, with the first key."""
-        return self.mixed(f, number, load("v128.load", keys, 16))
-
     def first_number(self, word_number: Value, keys: Value) -> Value:
-        """What `drawn` takes for bit 0 of a word; `number` of the word in the hash."""
+        """What `ahead` takes for bit 0 of a word, by the number of the word in the hash."""
         return op("i32x4.add", splat(word_number * GOLDEN), load("v128.load", keys))
 
     def ahead(self, f: Function, number: Local, keys: Value, count: int) -> list[Local]:
-        """The next bits of the draws of a word."""
-        found = []
+        """The next bits of the draws of a word: `number` is the word's and the bit's times GOLDEN, with the first key."""
+        drawn = []
         for i in range(count):
             at = op("i32x4.add", number, integers(i * GOLDEN)) if i else number
-            found.append(self.drawn(f, at, keys))
+            drawn.append(self.mixed(f, at, load("v128.load", keys, 16)))
         f.set(number, op("i32x4.add", number, integers(count * GOLDEN)))
-        return found
+        return drawn
 
-    def _draw_below(self) -> Callee:
-        """Which of the wanted cells draw below a constant: number of the word, wanted, keys, the limit's bits from the
-        highest. Of the cells still open, those whose draw has a 0 where the limit has a 1 are below it; equal bits leave
-        a cell open.
+    def _draw_below(self, f: Function, at: I32, wanted: V128, keys: I32, limit: I64) -> Value:
+        """Which of the wanted cells draw below a constant, given as its bits from the highest, in the word numbered `at`.
+
+        Of the cells still open, those whose draw has a 0 where the limit has a 1 are below it; equal bits leave a cell open.
         """
-        f = self.function("i32 v128 i32 i64", "v128")
-        at, wanted, keys, limit = (f.param(i) for i in range(4))
         number = f.let(self.first_number(at, keys))
         below = f.let(const("v128", 0))
         with f.block() as done, f.loop() as again:
             for drawn in self.ahead(f, number, keys, AHEAD):
-                wants = f.let(op("i64x2.splat", op("i64.shr_s", limit, const("i64", 63))))
+                wants = f.let(op("i64x2.splat", op("i64.shr_s", limit, 63)))
                 self._compare(f, below, wanted, drawn, wants)
                 f.set(limit, limit << 1)
             f.jump(done, limit.equals(0))
             f.jump(again, some(wanted))
-        f.give(below)
-        return self.module.add(f, "draw_below")
+        return below
 
     def _compare(self, f: Function, below: Local, still_open: Local, drawn: Value, limit: Value) -> None:
         f.set(below, below | op("v128.andnot", still_open & limit, drawn))
         f.set(still_open, op("v128.andnot", still_open, limit ^ drawn))
 
-    def _draw_below_planes(self) -> Callee:
-        """The same with a limit given plane by plane: number, wanted, keys, the limit's address, its end."""
-        f = self.function("i32 v128 i32 i32 i32", "v128")
-        at, wanted, keys, limit, end = (f.param(i) for i in range(5))
+    def _draw_below_planes(
+        self, f: Function, at: I32, wanted: V128, keys: I32, limit: I32, end: I32
+    ) -> Value:
+        """The same with a limit given plane by plane, from an address to an end."""
         number = f.let(self.first_number(at, keys))
         below = f.let(wanted & load("v128.load", limit))
         f.set(wanted, op("v128.andnot", wanted, load("v128.load", limit)))
@@ -289,8 +405,7 @@ class Library:
                             self._compare(f, below, wanted, drawn, load("v128.load", limit, 16 * (i + 1)))
                     f.set(limit, limit + 16 * count)
                     f.jump(again)
-        f.give(below)
-        return self.module.add(f, "draw_below_planes")
+        return below
 
     def word_number(self, at: Value, y: Value | None) -> Value:
         """The number of a word in the hash; `at`: bytes from the first word of the plane, `y`: its row."""
@@ -302,43 +417,38 @@ class Library:
         assert y is not None
         return (at << 2) - (y << 5)
 
-    def _coin(self) -> Callee:
+    def _coin(self, f: Function, place: I32, keys: I32) -> Value:
         """The plane of the highest bit of a stream's draws. Several passes ask for it: it is made once a step."""
-        f = self.function("i32 i32", "i32")
-        place, keys = f.param(0), f.param(1)
         plane = f.let(word(place))
         with f.when(plane.equals(0)):
             f.set(plane, self.take())
-            f.store("i32.store", place, plane)
-            f.store("i32.store", plane, const("i32", 1), SOME)
-            y = f.let(ZERO)
-            with f.each(ZERO, self.cells.value, self.memory.row) as row:
+            f.set(word(place), plane)
+            f.set(plane[SOME], 1)
+            y = f.let(0)
+            with f.each(0, self.cells, self.memory.row) as row:
                 with f.each(row, row + self.memory.row, 16) as at, f.scope():
-                    bit = self.drawn(f, self.first_number(self.word_number(at, y), keys), keys)
-                    f.store("v128.store", plane + at, bit, self.memory.base)
+                    number = self.first_number(self.word_number(at, y), keys)
+                    bit = self.mixed(f, number, load("v128.load", keys, 16))
+                    f.set((plane + at)[self.memory.flags], bit)
                 f.set(y, y + 1)
-        f.give(plane)
-        return self.module.add(f, "coin")
+        return plane
 
     def draw_float(self) -> Callee:
         """A draw of a cell as float32: number of the word, lane in bytes, column in the word, keys, bits."""
-        return self.lazily("draw_float", self._draw_float)
+        return self.lazily("draw_float", lambda: self.module.define(self._draw_float))
 
-    def _draw_float(self) -> Callee:
-        f = self.function("i32 i32 i32 i32 i32", "f32")
-        at, lane, column, keys, bits = (f.param(i) for i in range(5))
+    def _draw_float(self, f: Function, at: I32, lane: I32, column: I32, keys: I32, bits: I32) -> Value:
         number = f.let(self.first_number(at, keys))
         total = f.let(const("i64", 0))
         scratch = const("i32", self.memory.at("limits"))
-        with f.each(ZERO, bits):
+        with f.each(0, bits):
             (drawn,) = self.ahead(f, number, keys, 1)
-            f.store("v128.store", scratch, drawn)
+            f.set(load("v128.load", scratch), drawn)
             bit = (load("i64.load", scratch + lane) >> counted(column)) & 1
             f.set(total, (total << 1) + bit)
         half = op("f64.add", op("f64.convert_i64_u", total), const("f64", 0.5))
-        count = op("f64.convert_i64_u", const("i64", 1) << counted(bits))
-        f.give(op("f32.demote_f64", op("f64.div", half, count)))
-        return self.module.add(f, "draw_float")
+        count = op("f64.convert_i64_u", 1 << counted(bits))
+        return op("f32.demote_f64", op("f64.div", half, count))
 
     # Columns
 
@@ -351,54 +461,51 @@ class Library:
             x: the column of the word's first flag, as an i32.
         """
         memory = self.memory
-        if memory.whole and abs(dx) < WORD:
-            last = const("i32", memory.row - 16)
-            here = load("v128.load", row + at)
-            if dx > 0:
-                next_at = either(at.equals(last), ZERO, at + 16)
-                beyond = load("v128.load", row + next_at)
-                if not wraps:
-                    beyond = beyond & op("i64x2.splat", op("i64.extend_i32_s", ZERO - (at < last)))
-                return (here >> dx) | (beyond << (WORD - dx))
-            next_at = either(at, at - 16, last)
-            beyond = load("v128.load", row + next_at)
-            if not wraps:
-                beyond = beyond & op("i64x2.splat", op("i64.extend_i32_s", ZERO - (ZERO < at)))
-            return (here << -dx) | (beyond >> (WORD + dx))
-        return self.lazily(("columns", wraps), lambda: self._columns(wraps))(row, x + dx)
-
-    def _columns(self, wraps: bool) -> Callee:
-        """64 columns of a row from a column on: address of the row, column."""
-        f = self.function("i32 i32", "v128")
-        row, first = f.param(0), f.param(1)
-        width = self.memory.width
-        filled = f.let(ZERO)
-        found = f.let(const("v128", 0))
-        if wraps:
-            f.set(first, op("i32.rem_s", first, const("i32", width)))
-            with f.when(op("i32.lt_s", first, ZERO)):
-                f.set(first, first + width)
+        if not memory.whole or abs(dx) >= WORD:
+            columns = self.lazily(("columns", wraps), lambda: self._columns(wraps=wraps))
+            return columns(row, x + dx)
+        last = const("i32", memory.row - 16)
+        here = load("v128.load", row + at)
+        if dx > 0:
+            other, inside = either(at.equals(last), 0, at + 16), at < last
         else:
-            with f.when(op("i32.lt_s", first, ZERO)):
-                f.set(filled, ZERO - first)
-                f.set(first, ZERO)
-        with f.block() as out, f.loop() as again:
-            f.jump(out, filled >= WORD)
-            if not wraps:
-                f.jump(out, first >= width)
-            within = f.let(first & (WORD - 1))
-            part = load("v128.load", row + ((first >> 6) << 4)) >> within
-            f.set(found, found | (part << filled))
-            left = f.let(const("i32", WORD) - within)
-            rest = f.let(const("i32", width) - first)
-            f.set(left, either(left < rest, left, rest))
-            f.set(filled, filled + left)
-            f.set(first, first + left)
+            other, inside = either(at, at - 16, last), ZERO < at
+        beyond: Value = load("v128.load", row + other)
+        if not wraps:
+            beyond = beyond & op("i64x2.splat", op("i64.extend_i32_s", 0 - inside))
+        if dx > 0:
+            return (here >> dx) | (beyond << (WORD - dx))
+        return (here << -dx) | (beyond >> (WORD + dx))
+
+    def _columns(self, *, wraps: bool) -> Callee:
+        """64 columns of a row from a column on: address of the row, column."""
+        width = self.memory.width
+
+        def columns(f: Function, row: I32, first: I32) -> Value:
+            filled, flags = f.let(0), f.let(const("v128", 0))
             if wraps:
-                f.set(first, either(first < width, first, ZERO))
-            f.jump(again)
-        f.give(found)
-        return self.module.add(f, "columns" if wraps else "columns_inside")
+                f.set(first, op("i32.rem_s", first, width))
+            with f.when(op("i32.lt_s", first, 0)):
+                if not wraps:
+                    f.set(filled, 0 - first)
+                f.set(first, first + width if wraps else 0)
+            with f.block() as out, f.loop() as again:
+                f.jump(out, filled >= WORD)
+                if not wraps:
+                    f.jump(out, first >= width)
+                within = f.let(first & (WORD - 1))
+                part = load("v128.load", row + ((first >> 6) << 4)) >> within
+                f.set(flags, flags | (part << filled))
+                left, rest = f.let(WORD - within), f.let(width - first)
+                f.set(left, either(left < rest, left, rest))
+                f.set(filled, filled + left)
+                f.set(first, first + left)
+                if wraps:
+                    f.set(first, either(first < width, first, 0))
+                f.jump(again)
+            return flags
+
+        return self.module.define(columns, "columns" if wraps else "columns_inside")
 
     def rotated(self, f: Function, row: Value, dx: int, *, wraps: bool) -> Value:
         """The flags `dx` columns to the right, of rows of one word. Beyond the width they are garbage."""
@@ -417,27 +524,15 @@ class Library:
 
     def line(self, field: Value, line: Value) -> Value:
         """The first column of a line, or of zeros."""
-        start = field + self.live_size.value + line * (4 * self.memory.stride)
-        return either(
-            load("i32.load8_u", field + line, HEADER),
-            start + (HEADER + 4 * self.memory.halo),
-            self.zeros.value,
-        )
-
-    def live(self, field: Value, line: Value) -> Value:
-        """Whether a line of a field may hold anything."""
-        return load("i32.load8_u", field + line, HEADER)
+        return either((field + line)[LIVE], self.line_start(field, line), self.zeros)
 
     def line_start(self, field: Value, line: Value) -> Value:
-        return (
-            field + self.live_size.value + line * (4 * self.memory.stride) + (HEADER + 4 * self.memory.halo)
-        )
+        memory = self.memory
+        return field + self.live_size + line * (4 * memory.stride) + (HEADER + 4 * memory.halo)
 
     def other_line(self, line: Value, dy: int, *, wraps: bool) -> Value:
         """The line `dy` below; outside the world, one that is never live."""
-        if not dy:
-            return line
-        return word(word(ZERO, self.memory.table(dy, wraps=wraps)) + (line << 2))
+        return word(word(ZERO, self.memory.table(dy, wraps=wraps)) + (line << 2)) if dy else line
 
     def finish_line(self, f: Function, start: Value) -> None:
         """Fill the columns of the torus beside a line."""
@@ -445,4 +540,4 @@ class Library:
         before = f.let(start - 4 * halo) if reach else start
         for i in range(reach):
             for at, source in ((width + i, i % width), (-1 - i, (width - 1 - i) % width)):
-                f.store("i32.store", before, word(before, 4 * (halo + source)), 4 * (halo + at))
+                f.set(word(before, 4 * (halo + at)), word(before, 4 * (halo + source)))

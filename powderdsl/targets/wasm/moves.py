@@ -11,8 +11,18 @@ from collections.abc import Sequence
 
 from powderdsl.schedule.types import Leftover, Move
 from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, load, op
-from powderdsl.targets.wasm.library import ZERO, Library, choose, either, some, word
-from powderdsl.targets.wasm.memory import HALOED, HEADER, SOME, WORD
+from powderdsl.targets.wasm.library import (
+    HALOED,
+    LIVE,
+    SOME,
+    WORD,
+    ZERO,
+    Library,
+    choose,
+    either,
+    some,
+    word,
+)
 
 TOGETHER = 4
 """Planes that a loop over rows of one word changes, since each waits for what it reads."""
@@ -33,12 +43,12 @@ def rows_that_move(library: Library, downwards: bool) -> Callee:
 
 
 def _rows_that_move(library: Library, downwards: bool) -> Callee:
-    f, memory = library.function("i32 i32", "i32"), library.memory
-    movers, targets = f.param(0), f.param(1)
+    memory, f = library.memory, Function(["i32", "i32"])
+    movers, targets = f.params
     end = f.let(word(ZERO, memory.at("rows")))
-    cells = library.cells.value
+    cells = library.cells
     at = f.let(cells - memory.row if downwards else ZERO)
-    with f.each(ZERO, cells, memory.row), f.scope():
+    with f.each(0, cells, memory.row), f.scope():
         found = const("v128", 0)
         if memory.words <= 4:
             for w in range(memory.words):
@@ -48,9 +58,9 @@ def _rows_that_move(library: Library, downwards: bool) -> Callee:
             total = f.let(found)
             with f.each(at, at + memory.row, 16) as one:
                 for plane in (movers, targets):
-                    f.set(total, total | load("v128.load", plane + one, memory.base))
+                    f.set(total, total | (plane + one)[memory.flags])
             found = total
-        f.store("i32.store", end, at)
+        f.set(word(end), at)
         f.set(end, end + (some(found) << 2))
         f.set(at, at - memory.row if downwards else at + memory.row)
     f.give(end)
@@ -67,8 +77,8 @@ class _Mover:
     def __init__(self, library: Library, kind: str, offset: tuple[int, int], leaves: Leftover):
         self.library, self.memory, self.kind, self.leaves = library, library.memory, kind, leaves
         self.dy, self.dx = offset
-        self.f = library.function("i32 i32 i32 i32")
-        self.movers, self.targets, self.rows_end, self.end = (self.f.param(i) for i in range(4))
+        self.f = Function(["i32"] * 4)
+        self.movers, self.targets, self.rows_end, self.end = self.f.params
 
     def made(self) -> Callee:
         f, memory = self.f, self.memory
@@ -79,7 +89,7 @@ class _Mover:
                 planes = [f.let(word(place, 4 * i)) for i in range(count)]
                 self.rows(planes)
                 for plane in planes:
-                    f.store("i32.store", plane, ZERO, HALOED)
+                    f.set(plane[HALOED], 0)
                 f.set(place, place + 4 * count)
                 f.jump(again)
         name = f"{self.kind}_{self.dy}_{self.dx}_{self.leaves}"
@@ -88,7 +98,7 @@ class _Mover:
     def rows(self, planes: Sequence[Local]) -> None:
         f, memory = self.f, self.memory
         carries = self.kind == "swap" and self.dy != 0
-        edge = self.library.cells.value if self.dy > 0 else const("i32", -memory.row)
+        edge = self.library.cells if self.dy > 0 else const("i32", -memory.row)
         edges = [plane + edge + memory.base for plane in planes]
         if memory.words == 1:
             before = [f.let(load("v128.load", edge)) for edge in edges] if carries else []
@@ -106,15 +116,15 @@ class _Mover:
     def row(self, planes: Sequence[Local], before: Sequence[Local], at: Local) -> None:
         """A row of one word, in several planes."""
         f, memory, dx = self.f, self.memory, self.dx
-        m, t = (f.let(load("v128.load", plane + at, memory.base)) for plane in (self.movers, self.targets))
-        olds = [f.let(load("v128.load", plane + at, memory.base)) for plane in planes]
+        m, t = (f.let((plane + at)[memory.flags]) for plane in (self.movers, self.targets))
+        olds = [f.let((plane + at)[memory.flags]) for plane in planes]
         for i, (plane, old) in enumerate(zip(planes, olds, strict=True)):
             source = old
             if self.dy:
                 source = f.let(load("v128.load", plane + at, memory.base - self.dy * memory.row))
             back = self.library.rotated(f, source, -dx, wraps=True)
             there = self.library.rotated(f, before[i] if before else old, dx, wraps=True)
-            f.store("v128.store", plane + at, self.moved(m, t, old, there, back), memory.base)
+            f.set((plane + at)[memory.flags], self.moved(m, t, old, there, back))
             if before:
                 f.set(before[i], old)
 
@@ -122,12 +132,12 @@ class _Mover:
         """A row of several words, of which the old ones are kept beside the planes."""
         f, memory, library, dx = self.f, self.memory, self.library, self.dx
         start = f.let(plane + at + memory.base)
-        with f.each(ZERO, const("i32", memory.row), 16) as w:
-            f.store("v128.store", self.here + w, load("v128.load", start + w))
+        with f.each(0, memory.row, 16) as w:
+            f.set(load("v128.load", self.here + w), load("v128.load", start + w))
         source = f.let(start - self.dy * memory.row) if self.dy else self.here
         other = before if self.dy else self.here
-        with f.each(ZERO, const("i32", memory.row), 16) as w, f.scope():
-            m, t = (f.let(load("v128.load", p + at + w, memory.base)) for p in (self.movers, self.targets))
+        with f.each(0, memory.row, 16) as w, f.scope():
+            m, t = (f.let((p + at + w)[memory.flags]) for p in (self.movers, self.targets))
             old = f.let(load("v128.load", self.here + w))
             x = f.let(w << 2)
 
@@ -138,7 +148,7 @@ class _Mover:
 
             there = f.let(seen(other, dx)) if self.kind == "swap" else old
             back = f.let(seen(source, -dx))
-            f.store("v128.store", start + w, self.moved(m, t, old, there, back))
+            f.set(load("v128.load", start + w), self.moved(m, t, old, there, back))
         f.set(before, self.here)
         f.set(self.here, self.here ^ (memory.at("change") ^ memory.at("change") + memory.row))
 
@@ -166,13 +176,13 @@ def move(
     for kind, several in by_kind.items():
         end = f.let(const("i32", memory.at("moving")))
         for held in several:
-            with f.when(const("i32", 1) if kind == "everything" else library.some(held)):
+            with f.when(const("i32", 1) if kind == "everything" else held[SOME]):
                 f.set(held, library.own(held))
                 f.do(library.edges(held))
-                f.store("i32.store", end, held)
+                f.set(word(end), held)
                 f.set(end, end + 4)
                 if kind == "everything":
-                    f.store("i32.store", held, const("i32", 1), SOME)
+                    f.set(held[SOME], 1)
         f.do(mover(library, moved.op, moved.offset, kind)(movers, entered, rows, end))
     f.do(library.give(entered))
 
@@ -183,29 +193,29 @@ def exchanger(library: Library, offset: tuple[int, int]) -> Callee:
 
 
 def _exchanger(library: Library, dy: int, dx: int) -> Callee:
-    f, memory = library.function("i32 i32"), library.memory
-    movers, field = f.param(0), f.param(1)
-    line = f.let(ZERO)
+    memory, f = library.memory, Function(["i32", "i32"])
+    movers, field = f.params
+    line = f.let(0)
     with (
-        f.each(ZERO, const("i32", 16), 8) as lane,
-        f.each(lane, lane + library.cells.value, memory.row) as row,
+        f.each(0, 16, 8) as lane,
+        f.each(lane, lane + library.cells, memory.row) as row,
     ):
         with f.scope(), f.block() as skip:
             found = f.let(const("i64", 0))
             with f.each(row, row + memory.row, 16) as at:
-                f.set(found, found | load("i64.load", movers + at, memory.base))
+                f.set(found, found | (movers + at)[memory.half])
             f.jump(skip, op("i64.eqz", found))
             other = f.let(library.other_line(line, dy, wraps=True))
-            f.jump(skip, op("i32.eqz", library.live(field, line) | library.live(field, other)))
+            f.jump(skip, op("i32.eqz", (field + line)[LIVE] | (field + other)[LIVE]))
             here, there = (f.let(library.line_start(field, number)) for number in (line, other))
             for number, start in ((line, here), (other, there)):
-                with f.when(op("i32.eqz", library.live(field, number))):
-                    with f.each(ZERO, const("i32", 4 * memory.width), 16) as at:
-                        f.store("v128.store", start + at, const("v128", 0))
-                    f.store("i32.store8", field + number, const("i32", 1), HEADER)
-            x = f.let(ZERO)
+                with f.when(op("i32.eqz", (field + number)[LIVE])):
+                    with f.each(0, 4 * memory.width, 16) as at:
+                        f.set(load("v128.load", start + at), 0)
+                    f.set((field + number)[LIVE], 1)
+            x = f.let(0)
             with f.each(row, row + memory.row, 16) as at:
-                left = f.let(load("i64.load", movers + at, memory.base))
+                left = f.let((movers + at)[memory.half])
                 _exchange_word(f, left, x, here, there, dx % memory.width, memory.width)
                 f.set(x, x + WORD)
             library.finish_line(f, here)
@@ -227,6 +237,6 @@ def _exchange_word(
             f.set(target, either(target < width, target, target - width))
         own, other = f.let(here + (column << 2)), f.let(there + (target << 2))
         kept = f.let(word(own))
-        f.store("i32.store", own, word(other))
-        f.store("i32.store", other, kept)
+        f.set(word(own), word(other))
+        f.set(word(other), kept)
         f.jump(again)

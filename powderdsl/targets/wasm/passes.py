@@ -19,7 +19,7 @@ from powderdsl.schedule.words import is_cleared
 from powderdsl.targets.statements import printed
 from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, op
 from powderdsl.targets.wasm.cells import sweep
-from powderdsl.targets.wasm.library import ZERO, Library, word
+from powderdsl.targets.wasm.library import SOME, ZERO, Library, word
 from powderdsl.targets.wasm.moves import exchanger, moves_in_place
 from powderdsl.targets.wasm.moves import move as in_place
 from powderdsl.targets.wasm.words import WordLoop
@@ -48,7 +48,7 @@ class Pass:
 
     def made(self) -> Function:
         f, library, schedule = self.f, self.library, self.schedule
-        memory, group = library.memory, library.group.value
+        memory, group = library.memory, library.group
         changed = {slot for slot, _ in schedule.leaves}
         if schedule.when is not None:
             with f.when(op("i32.eqz", self.answer(schedule.when))):
@@ -56,19 +56,19 @@ class Pass:
         for slot, var in schedule.finds:
             at = memory.slot(slot, var.type)
             if slot in changed:  # nothing else refers to it while the pass runs, so it may be overwritten
-                self.define(var, word(group, at))
-                f.store("i32.store", group, ZERO, at)
+                self.define(var, group[at])
+                f.set(group[at], 0)
             else:
-                self.define(var, library.keep(word(group, at)))
+                self.define(var, library.keep(group[at]))
         self.block(schedule.body)
         left = []
         for slot, node in schedule.leaves:
             left.append((memory.slot(slot, node.type), f.let(self.kept(node)), node))
         for at, value, node in left:
-            old = f.let(word(group, at))
+            old = f.let(group[at])
             with f.when(old):
-                f.do(self.giver(node.type == REAL)(old))
-            f.store("i32.store", group, value, at)
+                f.do(library.giver(node.type == REAL)(old))
+            f.set(group[at], value)
         names = dict.fromkeys(str(node.attr) for _, node in schedule.leaves if node.op == "load")
         self.release(names)
         return f
@@ -89,20 +89,17 @@ class Pass:
     def of(self, node: Node) -> Local:
         return self.vars[str(node.attr)]
 
-    def giver(self, real: bool) -> Callee:
-        return self.library.give_field if real else self.library.give
-
     def release(self, names: Iterable[str]) -> None:
         for name in names:
-            self.f.do(self.giver(self.types[name])(self.vars[name]))
+            self.f.do(self.library.giver(self.types[name])(self.vars[name]))
 
     def held(self, node: Node) -> Value:
         """The plane or field of a load or a constant."""
         if node.op == "load":
             return self.of(node)
         if node.type == REAL:
-            return self.library.calm.value
-        return (self.library.everything if node.attr else self.library.nothing).value
+            return self.library.calm
+        return self.library.everything if node.attr else self.library.nothing
 
     def kept(self, node: Node) -> Value:
         return self.library.keep(self.held(node))
@@ -113,9 +110,9 @@ class Pass:
         """A condition: i32, not zero if it holds."""
         match node.op:
             case "any":
-                return self.library.some(self.of(node.args[0]))
+                return self.of(node.args[0])[SOME]
             case "present":
-                return op("i64.ne", self.library.present.value & node.attr, const("i64", 0))
+                return op("i64.ne", self.library.present & node.attr, const("i64", 0))
             case "const":
                 return const("i32", bool(node.attr))
         first, second = (self.answer(arg) for arg in node.args)
@@ -142,11 +139,7 @@ class Pass:
         f = self.f
         asked = ZERO
         for node in guard.when:
-            asked = (
-                self.library.some(self.of(node))
-                if asked is ZERO
-                else asked | self.library.some(self.of(node))
-            )
+            asked = self.of(node)[SOME] if asked is ZERO else asked | self.of(node)[SOME]
         for var, _ in guard.keeps:
             self.declare(var)
         with f.when(asked):
@@ -166,7 +159,7 @@ class Pass:
             self.loop(loop)
             f.otherwise()
             for out in loop.outs:
-                self.define(out.var, library.keep(library.nothing.value))
+                self.define(out.var, library.keep(library.nothing))
 
     def loop(self, loop: Compute) -> None:
         """Planes that are all computed anew."""
@@ -184,10 +177,10 @@ class Pass:
         if isinstance(name, str):
             return self.vars[name]
         memory, (table, number) = self.library.memory, name
-        place = memory.at(table, number, 4)
+        place = memory.at(table, number)
         if table == "fixed":
             return word(ZERO, place)
-        return self.library.coin(const("i32", place), const("i32", memory.at("keys", number, 32)))
+        return self.library.coin(const("i32", place), const("i32", memory.at("keys", number)))
 
     def update(self, loop: Compute) -> None:
         """Planes that change only in words where a mask holds."""
@@ -199,11 +192,11 @@ class Pass:
         made = WordLoop(library, loop)
         asked = ZERO
         for name in made.mask_names:
-            asked = asked | library.some(self.vars[name])
+            asked = asked | self.vars[name][SOME]
         with f.when(asked):
             for out in loop.outs:
                 plane = self.vars[out.var.name]
-                needed = library.some(plane) if is_cleared(out, self.schedule.graph) else ONE  # 0 stays 0
+                needed = plane[SOME] if is_cleared(out, self.schedule.graph) else ONE  # 0 stays 0
                 with f.when(needed):
                     f.set(plane, library.own(plane))
             for name in made.haloed:
@@ -234,7 +227,7 @@ class Pass:
             first, second = map(self.of, args)
             tests = [(second, first), (first, second)]
         else:
-            tests = [(self.of(args[0]), library.nothing.value)]
+            tests = [(self.of(args[0]), library.nothing)]
         self.declare(out.var)
         self._tested(tests, out)
 
@@ -243,7 +236,7 @@ class Pass:
             self.loop(Compute((out,), "", "words"))
             return
         (plane, rest), *others = tests
-        with self.f.when(self.library.some(plane)):
+        with self.f.when(plane[SOME]):
             self._tested(others, out)
             self.f.otherwise()
             self.define(out.var, self.library.keep(rest))
@@ -263,7 +256,7 @@ class Pass:
             return
         for plane in move.planes:
             self.define(plane.new, self.of(plane.old) if plane.into is not None else self.kept(plane.old))
-        with f.when(library.some(movers)), f.scope():
+        with f.when(movers[SOME]), f.scope():
             targets = self.shifted(move.movers, move.offset)
             in_place(library, f, move, movers, [self.vars[plane.new.name] for plane in move.planes], targets)
 
@@ -274,7 +267,7 @@ class Pass:
             old = self.of(field.old) if field.into is not None else self.kept(field.old)
             self.define(field.new, old)
             held = self.vars[field.new.name]
-            with f.when(library.some(self.of(move.movers)) & library.some(held)):
+            with f.when(self.of(move.movers)[SOME] & held[SOME]):
                 f.set(held, library.own_field(held))
                 f.do(exchanger(library, move.offset)(self.of(move.movers), held))
 

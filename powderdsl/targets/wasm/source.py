@@ -14,9 +14,8 @@ from powderdsl.schedule.types import Schedule
 from powderdsl.system.memo import Memo, collection_paused
 from powderdsl.targets.layout import Layout, layout_of
 from powderdsl.targets.wasm.binary import Module
-from powderdsl.targets.wasm.driver import add_driver
-from powderdsl.targets.wasm.library import PAGE, Library
-from powderdsl.targets.wasm.memory import Memory, extent_of
+from powderdsl.targets.wasm.driver import Driver
+from powderdsl.targets.wasm.library import PAGE, Library, Memory, extent_of
 from powderdsl.targets.wasm.passes import pass_function
 from powderdsl.targets.wasm.standalone import Face, Standalone
 
@@ -54,9 +53,9 @@ def wasm_module(
     library = Library(memory, module)
     passes = [pass_function(schedule, library) for schedule in schedules]
     asked = reduce(or_, map(asked_ids, schedules), 0)
-    added = add_driver(library, program, passes, asked, export=face is None)
+    calls = Driver(library, program, passes, asked).add(export=face is None)
     if face is not None:
-        Standalone(library, face, added).add()
+        Standalone(library, face, calls).add()
     return WasmModule(module, layout, width)
 
 

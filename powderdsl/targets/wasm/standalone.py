@@ -20,26 +20,22 @@ The section `powderdsl` of the module is JSON: the size, and elements, fields an
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 
-from powderdsl.ir.ops import Threshold
+from powderdsl.ir.ops import SNAP, Threshold
 from powderdsl.targets.codec import Piece
-from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, load, op
-from powderdsl.targets.wasm.library import PAGE, ZERO, Library, either, word
-from powderdsl.targets.wasm.memory import HEADER, aligned
-from powderdsl.targets.wasm.transfer import Transfer
-
-Box = tuple[Local, Local, Local, Local]
+from powderdsl.targets.wasm.binary import F64, I32, Callee, Function, Local, Value, const, load, op
+from powderdsl.targets.wasm.driver import Batches
+from powderdsl.targets.wasm.library import HEADER, PAGE, Library, aligned, either, word
 
 
 @dataclass(frozen=True)
 class Stored:
-    """An array of the state: its parts, and the values that cells may have.
+    """An array of the state: its parts, the bytes of a cell, and the values that cells may have.
 
     `usual`: by component and id, the value of a fresh cell. `holders`: the ids of elements whose cells can have another
-    one; None for all. `of_element`: it comes and goes with the element. `snap`: smaller floats are zero.
+    one; None for all. `of_element`: it comes and goes with the element.
     """
 
     name: str
@@ -50,8 +46,7 @@ class Stored:
     high: float
     holders: frozenset[int] | None
     of_element: bool
-    names_element: bool = False
-    snap: float = 0.0
+    names_element: bool
 
 
 @dataclass(frozen=True)
@@ -77,26 +72,28 @@ class Face:
     about: bytes
 
 
-class Standalone(Transfer):
-    """Makes the functions of one world, on those of batches."""
+class Standalone(Batches):
+    """Makes the functions of one world, on those of batches (`calls`)."""
 
-    def __init__(self, library: Library, face: Face, batch: dict[str, Callee]):
+    def __init__(self, library: Library, face: Face, calls: dict[str, Callee]):
         super().__init__(library)
-        self.face, self.batch_calls = face, batch
-        self.module = library.module
-        self.batch = self.module.variable("i32")
-        self.at, self.end = library.memory.top, library.memory.top
-        self.buffers: dict[str, int] = {}
+        self.face, self.calls = face, calls
+        self.batch = library.module.variable("i32")
+        self.end = library.memory.top
         self.count = face.rows * self.memory.width
-        self.valid = self._table([i if i in face.ids else face.ids[0] for i in range(256)])
-        self.usual = {one.name: [self._values(one, part) for part in one.usual] for one in face.fields}
+        self.valid = self._data(bytes(i if i in face.ids else face.ids[0] for i in range(256)))
+        self.usual = {
+            one.name: [self._values(one.pieces[0], values) for values in one.usual] for one in face.fields
+        }
         self.holders = {
-            one.name: self._table([i in one.holders for i in range(256)])
+            one.name: self._data(bytes(i in one.holders for i in range(256)))
             for one in face.fields
             if one.holders is not None
         }
+        self.buffers: dict[str, int] = {}
         for one in (face.element, *face.fields):
             self.buffers[one.name] = self._place(self.count * one.size * len(one.usual))
+        self.cells_at = const("i32", self.buffers["element"])
         self.wide = self._place(4 * self.count)
         """Cells of 4 bytes, while fresh values are spread."""
 
@@ -106,220 +103,178 @@ class Standalone(Transfer):
 
     def _data(self, octets: bytes) -> int:
         place = self._place(len(octets))
-        self.module.data(place, octets)
+        self.library.module.data(place, octets)
         return place
 
-    def _table(self, octets: Sequence[int]) -> int:
-        return self._data(bytes(octets))
-
-    def _values(self, one: Stored, values: tuple[float, ...]) -> int:
-        real = one.pieces[0].is_real
-        return self._data(
-            struct.pack(f"<{len(values)}{'f' if real else 'i'}", *(values if real else map(int, values)))
-        )
+    def _values(self, piece: Piece, values: tuple[float, ...]) -> int:
+        kind, numbers = ("f", values) if piece.is_real else ("i", tuple(map(int, values)))
+        return self._data(struct.pack(f"<{len(numbers)}{kind}", *numbers))
 
     def add(self) -> None:
         """Add all functions, and grow the memory by what they need."""
-        ready = self._ready()
-        show = self._show(ready)
-        reads = [self._read(one) for one in self.face.fields]
-        takes = [self._take_values(one) for one in self.face.fields]
-        self._export("cells", "", "i32", lambda f: self._cells(f, ready))
-        self._export("begin", "i32", "", lambda f: self._begin(f, ready))
-        self._export("step", "i32", "", lambda f: self._step(f, ready))
-        self.module.export(show, "show")
-        self._export("field", "i32", "i32", lambda f: self._field(f, ready, reads))
-        self._export("take", "i32", "", lambda f: self._take_number(f, show, takes))
-        self._export("paint", "i32 " * 5, "", lambda f: self._paint(f, ready))
-        self._export("set", "i32 " * 6 + "f64", "", lambda f: self._set(f, show, reads, takes))
-        self._export("parameter", "i32 f64", "", lambda f: self._parameter(f, ready))
-        self._export("clock", "", "i32", lambda f: self._clock(f, ready))
-        self.module.custom("powderdsl", self.face.about)
-        self.module.pages = self.end // PAGE + 1
-        self.module.restart(self.library.top, self.end)
-
-    def _export(self, name: str, params: str, results: str, fill: Callable[[Function], None]) -> None:
-        f = self.library.function(params, results)
-        fill(f)
-        self.module.add(f, name, export=True)
+        module, fields = self.library.module, self.face.fields
+        self.ready = module.define(self._ready)
+        self.shown = module.define(self.show)
+        self.reads = [module.define(partial(self._read, one), "read") for one in fields]
+        self.takes = [module.define(partial(self._take_values, one), "take_values") for one in fields]
+        for body in (
+            self.cells,
+            self.begin,
+            self.step,
+            self.show,
+            self.field,
+            self.take,
+            self.paint,
+            self.set,
+        ):
+            module.define(body, export=True)
+        module.define(self.parameter, export=True)
+        module.define(self.clock_at, "clock", export=True)
+        module.custom("powderdsl", self.face.about)
+        module.pages = self.end // PAGE + 1
+        module.restart(self.library.top, self.end)
 
     # The world
 
-    def _ready(self) -> Callee:
+    def _ready(self, f: Function) -> None:
         """Makes the world where there is none: of the first element, with seed 0."""
-        f = self.library.function()
-        with f.when(self.batch.value):
+        with f.when(self.batch):
             f.leave()
-        f.set(self.batch, self.batch_calls["allocate"](const("i32", 1), const("i32", self.face.rows)))
+        f.set(self.batch, self.calls["allocate"](1, self.face.rows))
         for number, knob in enumerate(self.face.knobs):
-            f.do(self._knob(number, knob)(const("f64", knob.default)))
-        cells = const("i32", self.buffers["element"])
-        f.fill(cells, const("i32", self.face.ids[0]), const("i32", self.count))
-        f.do(self._fresh()(ZERO))
-        return self.module.add(f, "ready")
+            f.do(self._knob(number)(const("f64", knob.default)))
+        f.fill(self.cells_at, self.face.ids[0], self.count)
+        f.do(self._fresh()(0))
 
     def _fresh(self) -> Callee:
         """The ids in the buffer become a world of a seed, with fresh cells."""
 
-        def make() -> Callee:
-            f, batch = self.library.function("i32"), self.batch.value
-            cells = const("i32", self.buffers["element"])
-            with f.each(ZERO, const("i32", self.count)) as i:
-                found = load("i32.load8_u", load("i32.load8_u", cells + i), self.valid)
-                f.store("i32.store8", cells + i, found)
+        def fresh(f: Function, seed: I32) -> None:
+            with f.each(0, self.count) as i:
+                cell = load("i32.load8_u", self.cells_at + i)
+                f.set(cell, load("i32.load8_u", cell, self.valid))
             (piece,) = self.face.element.pieces
-            f.do(self._load(piece, cells, 1))
+            f.do(self._load(piece, self.cells_at, 1))
             for one in self.face.fields:
                 for piece, table in zip(one.pieces, self.usual[one.name], strict=True):
-                    with f.each(ZERO, const("i32", self.count)) as i:
-                        value = word(load("i32.load8_u", cells + i) << 2, table)
-                        f.store("i32.store", i << 2, value, self.wide)
+                    with f.each(0, self.count) as i:
+                        value = word(load("i32.load8_u", self.cells_at + i) << 2, table)
+                        f.set(word(i << 2, self.wide), value)
                     f.do(self._load(piece, const("i32", self.wide), 4))
-            f.store("i64.store", batch, op("i64.extend_i32_u", f.param(0)), HEADER)
-            f.store("i64.store", batch, const("i64", 0), HEADER + 8)
-            f.store("i64.store", batch, const("i64", 0), HEADER + 16)
-            return self.module.add(f, "fresh")
+            for number, start in enumerate((op("i64.extend_i32_u", seed), const("i64", 0), const("i64", 0))):
+                f.set(load("i64.load", self.batch, HEADER + 8 * number), start)
 
-        return self.library.lazily("fresh", make)
+        return self.library.lazily("fresh", lambda: self.library.module.define(fresh))
 
     def _load(self, piece: Piece, address: Value, size: int) -> Value:
-        batch, layout = self.batch.value, self.layout
         if piece.is_real:
-            return self.batch_calls["load_real"](batch, const("i32", layout.reals[piece.slot]), address, ZERO)
-        first, count = const("i32", layout.planes[piece.planes[0]]), const("i32", len(piece.planes))
-        return self.batch_calls["load"](batch, first, count, const("i32", size), address)
+            return self.calls["load_real"](self.batch, self.layout.reals[piece.slot], address, 0)
+        first = self.layout.planes[piece.planes[0]]
+        return self.calls["load"](self.batch, first, len(piece.planes), size, address)
 
-    def _store(self, piece: Piece, address: Value, size: int) -> Value:
-        batch, layout = self.batch.value, self.layout
+    def _store(self, piece: Piece, address: int, size: int) -> Value:
         if piece.is_real:
-            return self.batch_calls["store_real"](
-                batch, const("i32", layout.reals[piece.slot]), address, ZERO
-            )
-        first, count = const("i32", layout.planes[piece.planes[0]]), const("i32", len(piece.planes))
-        signed = const("i32", int(piece.signed))
-        return self.batch_calls["store"](batch, first, count, signed, const("i32", size), address)
+            return self.calls["store_real"](self.batch, self.layout.reals[piece.slot], address, 0)
+        first = self.layout.planes[piece.planes[0]]
+        return self.calls["store"](self.batch, first, len(piece.planes), int(piece.signed), size, address)
 
-    def _cells(self, f: Function, ready: Callee) -> None:
-        f.do(ready())
-        f.give(const("i32", self.buffers["element"]))
+    def cells(self, f: Function) -> Value:
+        f.do(self.ready())
+        return self.cells_at
 
-    def _begin(self, f: Function, ready: Callee) -> None:
-        f.do(ready())
-        f.do(self._fresh()(f.param(0)))
+    def begin(self, f: Function, seed: I32) -> None:
+        f.do(self.ready())
+        f.do(self._fresh()(seed))
 
-    def _step(self, f: Function, ready: Callee) -> None:
-        f.do(ready())
-        f.do(self.batch_calls["run"](self.batch.value, f.param(0)))
+    def step(self, f: Function, count: I32) -> None:
+        f.do(self.ready())
+        f.do(self.calls["run"](self.batch, count))
 
-    def _clock(self, f: Function, ready: Callee) -> None:
-        f.do(ready())
-        f.give(self.batch.value + HEADER)
+    def clock_at(self, f: Function) -> Value:
+        f.do(self.ready())
+        return self.batch + HEADER
 
-    def _show(self, ready: Callee) -> Callee:
-        f = self.library.function("", "i32")
-        f.do(ready())
-        cells = const("i32", self.buffers["element"])
+    def show(self, f: Function) -> Value:
+        f.do(self.ready())
         (piece,) = self.face.element.pieces
-        f.do(self._store(piece, cells, 1))
-        f.give(cells)
-        return self.module.add(f, "show")
+        f.do(self._store(piece, self.buffers["element"], 1))
+        return self.cells_at
 
     # Fields
-
-    @contextmanager
-    def _chosen(self, f: Function, number: Value, which: int) -> Iterator[None]:
-        with f.when(number.equals(which)):
-            yield
 
     def _at(self, one: Stored, component: int) -> int:
         return self.buffers[one.name] + component * self.count * one.size
 
-    def _read(self, one: Stored) -> Callee:
+    def _read(self, one: Stored, f: Function) -> None:
         """Writes the values of a field into its buffer."""
-        f = self.library.function()
         for component, piece in enumerate(one.pieces):
-            f.do(self._store(piece, const("i32", self._at(one, component)), one.size))
-        return self.module.add(f, "read")
+            f.do(self._store(piece, self._at(one, component), one.size))
 
-    def _take_values(self, one: Stored) -> Callee:
+    def _take_values(self, one: Stored, f: Function) -> None:
         """The values in a field's buffer become the field's, cut to what cells can have; the ids have been shown."""
-        f = self.library.function()
-        cells = const("i32", self.buffers["element"])
         for component, piece in enumerate(one.pieces):
             at, table = self._at(one, component), self.usual[one.name][component]
-            with f.scope(), f.each(ZERO, const("i32", self.count)) as i:
+            with f.scope(), f.each(0, self.count) as i:
                 place = f.let(i * one.size)
-                identity = f.let(load("i32.load8_u", cells + i))
+                identity = f.let(load("i32.load8_u", self.cells_at + i))
                 if piece.is_real:
-                    self._cut_float(f, one, place, at)
+                    cell, value = load("f32.load", place, at), f.let(load("f32.load", place, at))
+                    low, high = const("f32", one.low), const("f32", one.high)
+                    f.set(value, op("f32.min", op("f32.max", value, low), high))
+                    # Without a number, and for small ones, the comparison does not hold.
+                    large = op("f32.ge", op("f32.abs", value), const("f32", SNAP))
+                    f.set(cell, either(large, value, const("f32", 0)))
                 else:
-                    self._cut_integer(f, one, piece, place, at)
+                    name = "i32.load8_s" if piece.signed and one.size == 1 else _LOADS[one.size]
+                    cell = load(name, place, at)
+                    value = f.let(cell)
+                    if one.names_element:
+                        f.set(value, load("i32.load8_u", value, self.valid))
+                    else:
+                        self._bound(f, value, one)
+                    f.set(cell, value)
                 if one.name in self.holders:
                     holds = load("i32.load8_u", identity, self.holders[one.name])
-                    with f.when(op("i32.eqz", holds)):
-                        f.store(_STORES[one.size], place, word(identity << 2, table), at)
+                    with f.when(holds.equals(0)):
+                        f.set(load(_LOADS[one.size], place, at), word(identity << 2, table))
             f.do(self._load(piece, const("i32", at), one.size))
-        return self.module.add(f, "take_values")
-
-    def _cut_float(self, f: Function, one: Stored, place: Value, at: int) -> None:
-        value = f.let(load("f32.load", place, at))
-        low, high = const("f32", one.low), const("f32", one.high)
-        f.set(value, op("f32.min", op("f32.max", value, low), high))
-        # Without a number, and for small ones, the comparison does not hold.
-        keeps = op("f32.ge", op("f32.abs", value), const("f32", one.snap))
-        f.store("f32.store", place, either(keeps, value, const("f32", 0)), at)
-
-    def _cut_integer(self, f: Function, one: Stored, piece: Piece, place: Value, at: int) -> None:
-        name = {1: "i32.load8_s" if piece.signed else "i32.load8_u", 2: "i32.load16_s", 4: "i32.load"}[
-            one.size
-        ]
-        value = f.let(load(name, place, at))
-        if one.names_element:
-            f.set(value, load("i32.load8_u", value, self.valid))
-        else:
-            self._bound(f, value, one)
-        f.store(_STORES[one.size], place, value, at)
 
     def _bound(self, f: Function, value: Local, one: Stored) -> None:
-        low, high = const("i32", int(one.low)), const("i32", int(one.high))
+        low, high = int(one.low), int(one.high)
         f.set(value, either(op("i32.lt_s", value, low), low, value))
         f.set(value, either(op("i32.gt_s", value, high), high, value))
 
-    def _field(self, f: Function, ready: Callee, reads: Sequence[Callee]) -> None:
-        f.do(ready())
-        for number, one in enumerate(self.face.fields):
-            with self._chosen(f, f.param(0), number):
-                f.do(reads[number]())
-                f.give(const("i32", self.buffers[one.name]))
-        f.give(ZERO)
+    def field(self, f: Function, number: I32) -> int:
+        f.do(self.ready())
+        for i, one in enumerate(self.face.fields):
+            with f.when(number.equals(i)):
+                f.do(self.reads[i]())
+                f.give(self.buffers[one.name])
+        return 0
 
-    def _take_number(self, f: Function, show: Callee, takes: Sequence[Callee]) -> None:
-        f.body += show().code + op("drop").code
-        for number in range(len(self.face.fields)):
-            with self._chosen(f, f.param(0), number):
-                f.do(takes[number]())
+    def take(self, f: Function, number: I32) -> None:
+        f.do(self.shown())
+        for i, take in enumerate(self.takes):
+            with f.when(number.equals(i)):
+                f.do(take())
 
     # Boxes
 
-    def _box(self, f: Function, first: int) -> Box:
-        """Top, bottom, left and right of a box, from parameters on, within the grid."""
-        top, bottom, left, right = (f.param(first + i) for i in range(4))
-        for start, stop, most in ((top, bottom, self.face.rows), (left, right, self.memory.width)):
-            f.set(stop, either(op("i32.gt_s", stop, const("i32", most)), const("i32", most), stop))
-            f.set(start, either(op("i32.lt_s", start, ZERO), ZERO, start))
-            with f.when(op("i32.ge_s", start, stop)):
-                f.leave()
-        return top, bottom, left, right
+    def _cut(self, f: Function, start: Local, stop: Local, most: int) -> None:
+        """A side of a box, within the grid; nothing is done with an empty one."""
+        f.set(stop, either(op("i32.gt_s", stop, most), most, stop))
+        f.set(start, either(op("i32.lt_s", start, 0), 0, start))
+        with f.when(op("i32.ge_s", start, stop)):
+            f.leave()
 
-    def _paint(self, f: Function, ready: Callee) -> None:
-        f.do(ready())
-        top, bottom, left, right = self._box(f, 1)
-        element = f.param(0)
+    def paint(self, f: Function, element: I32, top: I32, bottom: I32, left: I32, right: I32) -> None:
+        f.do(self.ready())
+        self._cut(f, top, bottom, self.face.rows)
+        self._cut(f, left, right, self.memory.width)
         with f.when(element >= 256):
             f.leave()
         with f.when(op("i32.ne", load("i32.load8_u", element, self.valid), element)):
             f.leave()
-        batch, layout = self.batch.value, self.layout
         parts: list[tuple[Piece, Value]] = [(self.face.element.pieces[0], element)]
         for one in self.face.fields:
             for piece, table in zip(one.pieces, self.usual[one.name], strict=True):
@@ -329,43 +284,50 @@ class Standalone(Transfer):
         for piece, value in parts:
             box = (top, bottom, left, right, value)
             if piece.is_real:
-                f.do(self.batch_calls["fill_real"](batch, ZERO, const("i32", layout.reals[piece.slot]), *box))
+                f.do(self.calls["fill_real"](self.batch, 0, self.layout.reals[piece.slot], *box))
             else:
-                first, count = const("i32", layout.planes[piece.planes[0]]), const("i32", len(piece.planes))
-                f.do(self.batch_calls["fill"](batch, ZERO, first, count, *box))
+                first, count = self.layout.planes[piece.planes[0]], len(piece.planes)
+                f.do(self.calls["fill"](self.batch, 0, first, count, *box))
 
-    def _set(self, f: Function, show: Callee, reads: Sequence[Callee], takes: Sequence[Callee]) -> None:
-        f.body += show().code + op("drop").code
-        top, bottom, left, right = self._box(f, 2)
-        component, given = f.param(1), f.param(6)
-        for number, one in enumerate(self.face.fields):
-            with self._chosen(f, f.param(0), number), f.scope():
+    def set(
+        self,
+        f: Function,
+        number: I32,
+        component: I32,
+        top: I32,
+        bottom: I32,
+        left: I32,
+        right: I32,
+        given: F64,
+    ) -> None:
+        f.do(self.shown())
+        self._cut(f, top, bottom, self.face.rows)
+        self._cut(f, left, right, self.memory.width)
+        for i, one in enumerate(self.face.fields):
+            with f.when(number.equals(i)), f.scope():
                 with f.when(component >= len(one.pieces)):
                     f.leave()
-                f.do(reads[number]())
+                f.do(self.reads[i]())
                 real = one.pieces[0].is_real
-                if real:
-                    value = f.let(op("f32.demote_f64", given))
-                else:
-                    value = f.let(op("i32.trunc_sat_f64_s", given))
-                    if not one.names_element:
-                        self._bound(f, value, one)
-                    else:
-                        f.set(value, either(value >= 256, const("i32", 255), value))
+                value = f.let(op("f32.demote_f64" if real else "i32.trunc_sat_f64_s", given))
+                if one.names_element:
+                    f.set(value, either(value >= 256, 255, value))
+                elif not real:
+                    self._bound(f, value, one)
                 base = f.let(component * (self.count * one.size))
                 with f.each(top, bottom) as y, f.each(left, right) as x:
                     place = base + (y * self.memory.width + x) * one.size
-                    f.store("f32.store" if real else _STORES[one.size], place, value, self.buffers[one.name])
-                f.do(takes[number]())
+                    kind = "f32.load" if real else _LOADS[one.size]
+                    f.set(load(kind, place, self.buffers[one.name]), value)
+                f.do(self.takes[i]())
 
     # Parameters
 
-    def _knob(self, number: int, knob: Knob) -> Callee:
+    def _knob(self, number: int) -> Callee:
         """Sets a parameter: its value, cut to its range, as bits and floats."""
+        knob, layout = self.face.knobs[number], self.layout
 
-        def make() -> Callee:
-            f, layout, batch = self.library.function("f64"), self.layout, self.batch.value
-            value = f.param(0)
+        def set_knob(f: Function, value: F64) -> None:
             with f.when(op("f64.ne", value, value)):
                 f.leave()
             f.set(value, op("f64.min", op("f64.max", value, const("f64", knob.low)), const("f64", knob.high)))
@@ -376,38 +338,33 @@ class Standalone(Transfer):
                 if name == knob.name:
                     views.setdefault(threshold, []).append((bit, place))
             for threshold, bits in views.items():
-                limit = f.let(
-                    op("i64.trunc_sat_f64_s", value if threshold is None else _limit(value, threshold))
-                )
+                limit = value if threshold is None else _limit(value, threshold)
+                limit = f.let(op("i64.trunc_sat_f64_s", limit))
                 for bit, place in bits:
-                    f.store("i64.store8", self.bits(batch) + place, (limit >> bit) & 1)
+                    f.set(load("i64.load8_u", self.bits(self.batch) + place), (limit >> bit) & 1)
             if knob.name in layout.param_reals:
-                f.store(
-                    "f32.store",
-                    self.values(batch) + 4 * layout.param_reals[knob.name],
-                    op("f32.demote_f64", value),
-                )
-            return self.module.add(f, "knob")
+                at = self.values(self.batch) + 4 * layout.param_reals[knob.name]
+                f.set(load("f32.load", at), op("f32.demote_f64", value))
 
-        return self.library.lazily(("knob", number), make)
+        return self.library.lazily(("knob", number), lambda: self.library.module.define(set_knob, "knob"))
 
-    def _parameter(self, f: Function, ready: Callee) -> None:
-        f.do(ready())
-        for number, knob in enumerate(self.face.knobs):
-            with self._chosen(f, f.param(0), number):
-                f.do(self._knob(number, knob)(f.param(1)))
+    def parameter(self, f: Function, number: I32, value: F64) -> None:
+        f.do(self.ready())
+        for i in range(len(self.face.knobs)):
+            with f.when(number.equals(i)):
+                f.do(self._knob(i)(value))
 
 
-_STORES = {1: "i32.store8", 2: "i32.store16", 4: "i32.store"}
+_LOADS = {1: "i32.load8_u", 2: "i32.load16_s", 4: "i32.load"}
+"""The instruction that loads an integer of some bytes; one of a byte may also have a sign."""
 
 
 def _limit(value: Value, threshold: Threshold) -> Value:
     """As `codec.limits`: how many draws lie below a chance, or not above it."""
     count = 1 << threshold.bits
     scaled = op("f64.sub", op("f64.mul", value, const("f64", count)), const("f64", 0.5))
-    one = (
-        op("f64.ceil", scaled)
-        if threshold.strict
-        else op("f64.add", op("f64.floor", scaled), const("f64", 1))
-    )
-    return op("f64.min", op("f64.max", one, const("f64", 0)), const("f64", count))
+    if threshold.strict:
+        limit = op("f64.ceil", scaled)
+    else:
+        limit = op("f64.add", op("f64.floor", scaled), const("f64", 1))
+    return op("f64.min", op("f64.max", limit, const("f64", 0)), const("f64", count))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from functools import reduce
+from operator import or_
 
 from powderdsl.ir.ops import Node, ordered
 from powderdsl.schedule.costs import is_coin
@@ -11,8 +13,7 @@ from powderdsl.schedule.types import Compute, loaded
 from powderdsl.schedule.words import asked
 from powderdsl.targets.layout import param_key
 from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, load, op
-from powderdsl.targets.wasm.library import ZERO, Library, choose, some
-from powderdsl.targets.wasm.memory import SOME, WORD
+from powderdsl.targets.wasm.library import SOME, WORD, ZERO, Library, choose, some
 
 _DRAWS = ("chance", "below_param", "below_planes")
 
@@ -53,8 +54,8 @@ class WordLoop:
         """The planes of which other rows are read."""
         count = len(self.reads) + len(loop.outs)
         self.f = Function(["i32"] * count)
-        self.planes = {name: self.f.param(i) for i, name in enumerate(self.reads)}
-        self.outs = [self.f.param(len(self.reads) + i) for i in range(len(loop.outs))]
+        self.planes = dict(zip(self.reads, self.f.params, strict=False))
+        self.outs = self.f.params[len(self.reads) :]
         for out, place in zip(loop.outs, self.outs, strict=True):
             if out.into in olds:  # what is overwritten holds the old value
                 self.planes[str(out.into)] = place
@@ -64,17 +65,17 @@ class WordLoop:
         """The function."""
         f, library = self.f, self.library
         memory = library.memory
-        stop = f.let(library.cells.value)
+        stop = f.let(library.cells)
         kept = [f.let(const("v128", 0)) for _ in self.outs]
         self.y = self.row = self.x = None
         if memory.words == 1:
-            with f.each(ZERO, stop, 16) as at:
+            with f.each(0, stop, 16) as at:
                 self.at = at
                 self.body(kept)
         else:
-            y = f.let(ZERO)
-            with f.each(ZERO, stop, memory.row) as row:
-                within, x = f.let(ZERO), f.let(ZERO)
+            y = f.let(0)
+            with f.each(0, stop, memory.row) as row:
+                within, x = f.let(0), f.let(0)
                 self.y, self.row, self.x, self.within = y, row, x, within
                 with f.loop() as again:
                     self.at = f.let(row + within)
@@ -84,19 +85,17 @@ class WordLoop:
                     f.jump(again, within < memory.row)
                 f.set(y, y + 1)
         for place, any_flag in zip(self.outs, kept, strict=True):
-            before = library.some(place) if self.updates else ZERO
-            f.store("i32.store", place, before | some(any_flag), SOME)
+            before = place[SOME] if self.updates else ZERO
+            f.set(place[SOME], before | some(any_flag))
         return library.module.add(f, f"words_{self.loop.place.rpartition('/')[2]}")
 
     def body(self, kept: Sequence[Local]) -> None:
-        f = self.f
+        f, flags = self.f, self.library.memory.flags
         values = WordValues(self)
         with f.scope(), f.block() as skip:
             if self.updates:
-                first, *rest = [load("v128.load", mask + self.at, self.base) for mask in self.masks]
-                for mask in rest:
-                    first = first | mask
-                f.jump(skip, some(first).equals(0))
+                wanted = reduce(or_, [(mask + self.at)[flags] for mask in self.masks])
+                f.jump(skip, some(wanted).equals(0))
             found = []
             for out in self.loop.outs:
                 value = values.clean(out.value)
@@ -104,11 +103,7 @@ class WordLoop:
             for i, (place, value) in enumerate(zip(self.outs, found, strict=True)):
                 value = value if isinstance(value, Local) else f.let(value)
                 f.set(kept[i], kept[i] | value)
-                f.store("v128.store", place + self.at, value, self.base)
-
-    @property
-    def base(self) -> int:
-        return self.library.memory.base
+                f.set((place + self.at)[flags], value)
 
 
 class WordValues:
@@ -152,7 +147,7 @@ class WordValues:
     def valid(self) -> Value:
         if self.memory.words == 1:
             return const("v128", (1 << self.memory.width) - 1)
-        return load("v128.load", self.library.everything.value + self.loop.at, self.memory.base)
+        return (self.library.everything + self.loop.at)[self.memory.flags]
 
     def node(self, node: Node) -> Value:
         args = node.args
@@ -166,7 +161,7 @@ class WordValues:
         known = [self.known[id(arg)] for arg in args] if node.op not in ("shift", "when") else []
         match node.op:
             case "load":
-                return load("v128.load", self.loop.planes[str(node.attr)] + self.loop.at, self.memory.base)
+                return (self.loop.planes[str(node.attr)] + self.loop.at)[self.memory.flags]
             case "and" | "or" | "xor":
                 return op(f"v128.{node.op}", *known)
             case "not":
@@ -194,7 +189,7 @@ class WordValues:
     def made_plane(self, node: Node) -> Value:
         name = plane_name(node, self.library)
         assert name is not None
-        return load("v128.load", self.loop.planes[name] + self.loop.at, self.memory.base)
+        return (self.loop.planes[name] + self.loop.at)[self.memory.flags]
 
     def lazy(self, node: Node) -> Value:
         """A conjunction whose second part is computed only where the first holds somewhere in the word."""
@@ -221,7 +216,7 @@ class WordValues:
         else:
             value = load("v128.load", plane + loop.at, offset)
         if dy and not wraps:
-            return value & load("v128.load", self.library.inside.value + loop.at, offset)
+            return value & load("v128.load", self.library.inside + loop.at, offset)
         if dx and not memory.whole:
             return value & self.valid()
         return value
@@ -230,7 +225,7 @@ class WordValues:
         layout, memory = self.memory.layout, self.memory
         stream, bits, *rest = node.attr
         number = layout.streams[stream]
-        keys = const("i32", memory.at("keys", number, 32))
+        keys = const("i32", memory.at("keys", number))
         given = node.args[-1:] if node.op != "below_planes" else node.args[bits + 1 :]
         wanted = self.clean(given[0]) if given else self.valid() if not memory.whole else const("v128", -1)
         if plane_name(node, self.library) is not None:
@@ -245,7 +240,7 @@ class WordValues:
                 return self.below(at, wanted, keys, memory.at("params", numbers[0]), bits)
             known = [load("v128.load", ZERO, memory.at("params", n)) for n in numbers]
         for i in range(bits + 1):
-            self.f.store("v128.store", ZERO, known[i], memory.at("limits", i))
+            self.f.set(load("v128.load", ZERO, memory.at("limits", i)), known[i])
         return self.f.let(self.below(at, wanted, keys, memory.at("limits"), bits))
 
     def below(self, at: Value, wanted: Value, keys: Value, limit: int, bits: int) -> Value:
