@@ -154,6 +154,16 @@ class Move(Statement):
     def unchanged(self) -> Iterator[tuple[Var, Node]]:
         return ((plane.new, plane.old) for plane in self.planes)
 
+    def leftovers(self) -> dict[Leftover, list[Carried]] | None:
+        """The planes by the flags that movers leave behind; None if these are any others in some plane."""
+        groups: dict[Leftover, list[Carried]] = {}
+        for plane in self.planes:
+            leftover = plane.leftover(self.movers)
+            if leftover is None:
+                return None
+            groups.setdefault(leftover, []).append(plane)
+        return groups
+
 
 @dataclass(frozen=True)
 class Guard(Statement):

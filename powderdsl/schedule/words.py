@@ -15,10 +15,12 @@ from powderdsl.schedule.types import (
     ANSWER,
     Compute,
     Guard,
+    Move,
     Namer,
     Out,
     Schedule,
     Statement,
+    Var,
     combined,
     conjuncts,
     flat,
@@ -173,6 +175,12 @@ def is_whole(value: Node) -> bool:
             gone = [arg for arg in args if arg.op == "not" and arg.args[0].op == "load"]
             return len(gone) == 1 and any(arg.op == "load" for arg in args)
     return False
+
+
+def difference(value: Node) -> tuple[Node, Node]:
+    """The planes `a` and `b` of `a & ~b`."""
+    first, second = value.args
+    return (first, second.args[0]) if second.op == "not" else (second, first.args[0])
 
 
 def _asked(loop: Compute, graph: Graph) -> Compute:
@@ -358,10 +366,31 @@ def _folded(node: Node, args: Sequence[Node], graph: Graph) -> Node | None:
     return None
 
 
+def moved(move: Move, graph: Graph) -> Compute:
+    """A movement as a loop over words."""
+    dy, dx = move.offset
+    outs = []
+    for plane in move.planes:
+        entering = _at_neighbor(plane.old, -dy, -dx, graph)
+        entered = _at_neighbor(move.movers, -dy, -dx, graph)
+        value = graph.node("select", FLAG, (entered, entering, plane.leaves))
+        if move.op == "swap":
+            value = graph.node("select", FLAG, (move.movers, _at_neighbor(plane.old, dy, dx, graph), value))
+        outs.append(Out(plane.new, value))
+    return Compute(tuple(outs), move.place, "words")
+
+
+def targets(move: Move, graph: Graph) -> Compute:
+    """A loop that computes the cells which movers enter."""
+    dy, dx = move.offset
+    return Compute((Out(Var("targets", FLAG), _at_neighbor(move.movers, -dy, -dx, graph)),), "", "words")
+
+
+def _at_neighbor(plane: Node, dy: int, dx: int, graph: Graph) -> Node:
+    return graph.node("shift", FLAG, (plane,), (dy, dx, True))
+
+
 def asked(loop: Compute) -> list[Node]:
     """The masks of an update."""
     assert loop.region is not None
     return [node for node in ordered([loop.region]) if node.op == "load"]
-
-
-__all__ = ["asked", "is_cleared", "updates", "without"]

@@ -1,7 +1,8 @@
-"""The numbers of a program's slots, streams, parameters and fixed planes in a native context."""
+"""The numbers of a program's slots, streams, parameters and fixed planes in compiled code."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from powderdsl.ir.ops import Node, Program, Threshold, nodes_of
@@ -9,7 +10,7 @@ from powderdsl.ir.ops import Node, Program, Threshold, nodes_of
 
 @dataclass
 class Layout:
-    """The numbers of slots, streams, parameters and fixed planes, and the sizes of a context's tables."""
+    """The numbers of slots, streams, parameters and fixed planes."""
 
     planes: dict[str, int] = field(default_factory=dict)
     reals: dict[str, int] = field(default_factory=dict)
@@ -18,66 +19,83 @@ class Layout:
     param_reals: dict[str, int] = field(default_factory=dict)
     step_planes: dict[tuple[int, int], int] = field(default_factory=dict)
     fixed: dict[tuple[int, int, int], int] = field(default_factory=dict)
+
+    def limit(self, draw: Node) -> list[int]:
+        """The planes of the parameter that a draw is compared with, the highest bit first."""
+        _, bits, name, threshold = draw.attr
+        return [self.param_planes[name, threshold, bit] for bit in range(bits, -1, -1)]
+
+
+@dataclass
+class NativeLayout(Layout):
+    """The layout of a native context, and the sizes of its tables: the largest numbers and distances in any pass."""
+
     coins: dict[int, int] = field(default_factory=dict)
     """By stream: the draws of one bit, each of which is made once a step."""
-    turned: int = 0
-    """The largest number of masks of choices that a loop applies."""
-    waiting: int = 0
-    """The largest number of rows of floats that wait for loops some rows behind."""
-    marks: int = 0
-    """The largest number of loops over cells that run together and ask planes in which rows to run."""
-    marked: int = 0
-    """The largest number of planes that such a loop asks."""
     moving: int = 0
-    """The largest number of planes in a movement."""
+    """Planes in a movement."""
+    turned: int = 0
+    """Masks of choices that a loop applies."""
+    waiting: int = 0
+    """Rows of floats that wait for loops some rows behind."""
+    marks: int = 0
+    """Loops over cells that run together and ask planes in which rows to run."""
+    marked: int = 0
+    """Planes that such a loop asks."""
     reach: int = 1
-    """The largest distance in columns at which a row of floats is read around the edges."""
-    rows: int = 1
-    """The largest distance in rows at which floats are read."""
+    """Columns beyond the edges at which a row of floats is read."""
+    real_rows: int = 1
+    """Rows away at which floats are read."""
     halo: int = 16
     """Rows and columns beyond the grid for which tables and rows of floats have room."""
-    around: int = 0
-    """The largest distance in rows at which planes are read, wrapping at the edges."""
-    beyond: int = 0
+    around_rows: int = 0
+    """Rows away at which planes are read, wrapping at the edges."""
+    beyond_rows: int = 0
     """The same with zeros outside the grid."""
+
+    def cover(self, **sizes: int) -> None:
+        """Make tables as large as this, if they are smaller."""
+        for name, size in sizes.items():
+            setattr(self, name, max(getattr(self, name), size))
 
 
 def layout_of(program: Program) -> Layout:
     """The layout of a program on planes."""
     layout = Layout()
     for slot in program.slots:
-        table = layout.reals if slot.type.name == "real" else layout.planes
-        table[slot.name] = len(table)
-    for i, (name, _, _) in enumerate(program.streams):
-        layout.streams[name] = i
+        number(layout.reals if slot.type.name == "real" else layout.planes, slot.name)
+    for name, _, _ in program.streams:
+        number(layout.streams, name)
     for pass_ in program.passes:
         for node in nodes_of(pass_):
-            _place(node, layout)
+            match node.op:
+                case "param" if node.type.name == "real":
+                    number(layout.param_reals, node.attr[0])
+                case "param":
+                    number(layout.param_planes, param_key(node))
+                case "coordinate" if node.attr[0] == "step":
+                    number(layout.step_planes, node.attr[1:])
+                case "coordinate" | "inside":
+                    number(layout.fixed, fixed_key(node))
     return layout
 
 
-def _place(node: Node, layout: Layout) -> None:
-    attr = node.attr
-    match node.op:
-        case "param" if node.type.name == "real":
-            number(layout.param_reals, attr[0])
-        case "param":
-            number(layout.param_planes, param_key(node))
-        case "coordinate" if attr[0] == "step":
-            number(layout.step_planes, (attr[1], attr[2]))
-        case "coordinate":
-            number(layout.fixed, (0 if attr[0] == "row" else 1, attr[1], attr[2]))
-        case "inside":
-            number(layout.fixed, (2, attr[0], attr[1]))
-        case "shift" | "swap" | "arrive":
+def native_layout(program: Program) -> NativeLayout:
+    """The layout of a program on planes, with the distances at which it reads."""
+    layout = NativeLayout(**vars(layout_of(program)))
+    for node in (node for pass_ in program.passes for node in nodes_of(pass_)):
+        if node.op in ("shift", "swap", "arrive"):
+            dy, dx, *wraps = node.attr
             # A value recomputed at a neighbor reads neighbors itself, up to a few levels deep.
-            layout.halo = max(layout.halo, -(-4 * max(abs(attr[0]), abs(attr[1])) // 16) * 16)
-            if node.type.name == "real":
-                return
-            if node.op == "shift" and not attr[2]:
-                layout.beyond = max(layout.beyond, abs(attr[0]))
-            else:
-                layout.around = max(layout.around, abs(attr[0]))
+            layout.cover(halo=-(-4 * max(abs(dy), abs(dx)) // 16) * 16)
+            if node.type.name != "real":
+                layout.cover(**{"beyond_rows" if wraps == [False] else "around_rows": abs(dy)})
+    return layout
+
+
+def is_run(numbers: Sequence[int]) -> bool:
+    """Whether each number follows on the one before."""
+    return [*numbers] == [*range(numbers[0], numbers[0] + len(numbers))]
 
 
 def number(table: dict, key: object) -> int:
@@ -89,6 +107,14 @@ def param_key(node: Node) -> tuple[str, Threshold | None, int]:
     """Name, threshold and bit of a parameter's plane."""
     name, threshold, *bit = node.attr
     return name, threshold, bit[0] if bit else 0
+
+
+def fixed_key(node: Node) -> tuple[int, int, int]:
+    """What a plane that never changes depends on: the row (0) or column (1) and a bit of it, or a neighbor (2)."""
+    if node.op == "inside":
+        return 2, node.attr[0], node.attr[1]
+    axis, modulus, bit = node.attr
+    return 0 if axis == "row" else 1, modulus, bit
 
 
 def literal(value: float) -> str:

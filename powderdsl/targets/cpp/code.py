@@ -15,7 +15,7 @@ from powderdsl.targets import cache
 from powderdsl.targets.codec import Piece, pieces
 from powderdsl.targets.cpp.build import current, open_library
 from powderdsl.targets.cpp.source import native_source
-from powderdsl.targets.layout import Layout
+from powderdsl.targets.layout import NativeLayout
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class NativeCode:
 
     library: Path
     width: int
-    layout: Layout
+    layout: NativeLayout
     pieces: Mapping[str, tuple[Piece, ...]]
     passes: tuple[str, ...]
 
@@ -64,7 +64,7 @@ def remember(key: str, code: NativeCode) -> None:
 
 def _encode(code: NativeCode) -> dict[str, Any]:
     """The code as JSON. Tables become lists of pairs, since their keys are tuples; thresholds become lists."""
-    layout = {f.name: getattr(code.layout, f.name) for f in fields(Layout)}
+    layout = {f.name: getattr(code.layout, f.name) for f in fields(NativeLayout)}
     tables = {k: list(v.items()) if isinstance(v, dict) else v for k, v in layout.items()}
     tables["param_planes"] = [
         ((name, threshold and [threshold.bits, threshold.strict], bit), number)
@@ -92,7 +92,7 @@ def _decode(facts: dict[str, Any], library: Path) -> NativeCode:
     for row in facts["pieces"]:
         piece = Piece(**row | {"type": Type(**row["type"])})
         found[piece.state] = (*found.get(piece.state, ()), piece)
-    return NativeCode(library, int(facts["width"]), Layout(**tables), found, tuple(facts["passes"]))
+    return NativeCode(library, int(facts["width"]), NativeLayout(**tables), found, tuple(facts["passes"]))
 
 
 def _key(key: Any) -> Any:

@@ -13,7 +13,7 @@ from powderdsl.schedule.presence import asked_ids
 from powderdsl.schedule.stages import CPU, plan
 from powderdsl.system.memo import collection_paused
 from powderdsl.targets.cpp.text import pass_text
-from powderdsl.targets.layout import Layout, layout_of, literal
+from powderdsl.targets.layout import NativeLayout, literal, native_layout
 
 GENERATOR_VERSION = 11
 """Part of every cache key; increase it when generated code changes meaning."""
@@ -32,7 +32,7 @@ class NativeSource(NamedTuple):
     """A source file, its layout, and the number of units: with UNIT defined as its number, a unit's part is compiled."""
 
     text: str
-    layout: Layout
+    layout: NativeLayout
     units: int
 
 
@@ -52,7 +52,7 @@ def native_source(program: Program, width: int = 0) -> NativeSource:
     Args:
         width: see `known_width`.
     """
-    layout = layout_of(program)
+    layout = native_layout(program)
     schedules = [plan(pass_, CPU) for pass_ in program.passes]
     passes = [pass_text(schedule, i, layout) for i, schedule in enumerate(schedules)]
     asked = reduce(or_, map(asked_ids, schedules), 0)
@@ -79,16 +79,7 @@ def native_source(program: Program, width: int = 0) -> NativeSource:
         f"#define SLOTS {len(layout.planes)}",
         f"#define COINS {len(layout.coins)}",
         f"#define REALS {len(layout.reals)}",
-        f"#define MOVING {layout.moving}",
-        f"#define TURNED {layout.turned}",
-        f"#define WAITING {layout.waiting}",
-        f"#define MARKS {layout.marks}",
-        f"#define MARKED {layout.marked}",
-        f"#define REACH {layout.reach}",
-        f"#define REAL_ROWS {layout.rows}",
-        f"#define HALO {layout.halo}",
-        f"#define AROUND_ROWS {layout.around}",
-        f"#define BEYOND_ROWS {layout.beyond}",
+        *(f"#define {name.upper()} {size}" for name, size in vars(layout).items() if isinstance(size, int)),
         f"#define SNAP {literal(SNAP)}",
         f"#define PASSES {len(program.passes)}",
     ])  # fmt: skip
@@ -134,7 +125,7 @@ def _in_units(passes: Sequence[str], units: int, driver: int) -> str:
 ELEMENT = "element:"
 
 
-def look(layout: Layout, asked: int) -> str:
+def look(layout: NativeLayout, asked: int) -> str:
     """The function that finds which of the ids in `asked` are present, from products of their low and high bits."""
     count = sum(name.startswith(ELEMENT) for name in layout.planes)
     ids = [code for code in range(1 << count) if asked >> code & 1]

@@ -2,16 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
-from powderdsl.ir.ops import FLAG, REAL, Node
-from powderdsl.schedule.costs import is_coin
-from powderdsl.schedule.types import Compute, Guard, Move, Out, Schedule, Statement, Sweeps, Var, variables
-from powderdsl.schedule.words import asked, is_cleared
-from powderdsl.targets.cpp.cells import reaches_of, sweeps_text
-from powderdsl.targets.layout import Layout, number, param_key
-from powderdsl.targets.statements import printed
-from powderdsl.targets.values import WordValues
+from powderdsl.ir.ops import REAL, Node
+from powderdsl.schedule.costs import DRAWS, is_coin
+from powderdsl.schedule.rows import reaches_of
+from powderdsl.schedule.types import (
+    Carried,
+    Compute,
+    Forget,
+    Guard,
+    Move,
+    Out,
+    Release,
+    Schedule,
+    Statement,
+    Sweeps,
+    Var,
+    variables,
+)
+from powderdsl.schedule.words import asked, difference, is_cleared
+from powderdsl.targets.cpp.cells import sweeps_text
+from powderdsl.targets.layout import NativeLayout, fixed_key, is_run, number, param_key
+from powderdsl.targets.printing import Printer, WordText, drawn_where, limited_draw
 
 _LOGIC = {"and": "&", "or": "|", "xor": "^"}
 LOOP = (
@@ -20,7 +33,7 @@ LOOP = (
 )
 
 
-def pass_text(schedule: Schedule, number: int, layout: Layout) -> str:
+def pass_text(schedule: Schedule, number: int, layout: NativeLayout) -> str:
     """The function of a pass."""
     printer = _Printer(layout, schedule)
     changed = {slot for slot, _ in schedule.leaves}
@@ -62,8 +75,8 @@ def answer(node: Node) -> str:
     return f"({sign.join(map(answer, node.args))})"
 
 
-class _Printer:
-    def __init__(self, layout: Layout, schedule: Schedule):
+class _Printer(Printer):
+    def __init__(self, layout: NativeLayout, schedule: Schedule):
         self.layout, self.graph, self.reaches = layout, schedule.graph, reaches_of(schedule)
 
     def slot(self, name: str, var: Var) -> str:
@@ -73,43 +86,42 @@ class _Printer:
 
     def block(self, body: Sequence[Statement]) -> Iterator[str]:
         for statement in body:
-            yield from printed(self, statement)
+            yield from self.printed(statement)
 
     def whole(self, out: Out) -> Iterator[str]:
         """An operation on whole planes that tests for empty ones itself."""
-        yield f"{out.var.name} = {self.of_planes(out.value)};"
-
-    def of_planes(self, value: Node) -> str:
-        args = value.args
+        value, args = out.value, out.value.args
         match value.op:
             case "load" | "const":
-                return f"keep({_held(value)})"
+                call = f"keep({_held(value)})"
             case "shift":
                 dy, dx, _ = value.attr
-                self.layout.around = max(self.layout.around, abs(dy))
-                return f"shifted(c, {args[0].attr}, {dy}, {dx})"
+                self.layout.cover(around_rows=abs(dy))
+                call = f"shifted(c, {args[0].attr}, {dy}, {dx})"
             case "or":
-                return f"joined(c, {args[0].attr}, {args[1].attr})"
-        kept, gone = args if args[1].op == "not" else args[::-1]
-        return f"cleared(c, {kept.attr}, {gone.args[0].attr})"
+                call = f"joined(c, {args[0].attr}, {args[1].attr})"
+            case _:
+                stays, gone = difference(value)
+                call = f"cleared(c, {stays.attr}, {gone.attr})"
+        yield f"{out.var.name} = {call};"
 
     def sweeps(self, sweeps: Sweeps) -> Iterator[str]:
         yield sweeps_text(sweeps, self.layout, self.reaches)
 
-    def release(self, names: Iterable[str]) -> Iterator[str]:
-        yield " ".join(f"give(c, {name});" for name in names)
+    def release(self, release: Release) -> Iterator[str]:
+        yield " ".join(f"give(c, {name});" for name in release.names)
 
-    def forget(self) -> Iterator[str]:
+    def forget(self, _: Forget) -> Iterator[str]:
         yield "c.present = ~0ull;"
 
     def leave(self, schedule: Schedule) -> Iterator[str]:
         """The new values of slots; all are read before any is stored."""
-        left = []
+        places = []
         for i, (slot, node) in enumerate(schedule.leaves):
-            value = node.attr if node.op == "load" else "c.everything" if node.attr else "c.nothing"
-            yield f"{'Field' if node.type == REAL else 'Plane'}* s{i} = keep({value});"
-            left.append(self.slot(slot, Var(value, node.type)))
-        for i, place in enumerate(left):
+            var = Var(_held(node), node.type)
+            yield f"{kind(var)}* s{i} = keep({var.name});"
+            places.append(self.slot(slot, var))
+        for i, place in enumerate(places):
             yield f"if ({place}) give(c, {place}); {place} = s{i};"
         names = dict.fromkeys(str(node.attr) for _, node in schedule.leaves if node.op == "load")
         yield " ".join(f"give(c, {name});" for name in names)
@@ -121,18 +133,17 @@ class _Printer:
         if guard.keeps:
             yield "} else {"
             for var, value in guard.keeps:
-                yield f"{var.name} = {_kept(value)};"
+                yield f"{var.name} = keep({_held(value)});"
         yield "}"
 
     def move(self, move: Move) -> Iterator[str]:
+        """Planes that move, or fields that exchange values; as few as possible are copied."""
         dy, dx = move.offset
-        self.layout.around = max(self.layout.around, abs(dy))
-        movers = str(move.movers.attr)
-        if move.planes[0].new.type == REAL:
-            yield from self.exchange(move)
-            return
-        far = move.op == "arrive" and abs(dy) > 1  # `arrive_planes` moves by one row
-        copies = far or any(plane.leftover(move.movers) is None for plane in move.planes)
+        self.layout.cover(around_rows=abs(dy))
+        movers, fields = str(move.movers.attr), move.planes[0].new.type == REAL
+        groups = move.leftovers()
+        # `arrive_planes` moves by one row.
+        copies = not fields and (groups is None or (move.op == "arrive" and abs(dy) > 1))
         if copies and move.op == "swap":
             target = f"shifted(c, {movers}, {-dy}, {-dx})"
             for plane in move.planes:
@@ -142,33 +153,23 @@ class _Printer:
                 if plane.into:
                     yield f"give(c, {plane.into});"
             return
-        self.layout.moving = max(self.layout.moving, len(move.planes))
-        kinds: dict[str, list[str]] = {}
         for plane in move.planes:
-            kept = f"keep({_held(plane.leaves) if copies else plane.old.attr})"
-            yield f"{plane.new.name} = {plane.into or kept};"
-            if copies:
-                continue
-            kinds.setdefault(str(plane.leftover(move.movers)), []).append(f"&{plane.new.name}")
+            held = _held(plane.leaves) if copies else plane.old.attr
+            yield f"{plane.new.name} = {plane.into or f'keep({held})'};"
+        if fields:
+            yield _call(
+                "Field", move.planes, f"swap_fields<{len(move.planes)}>(c, {movers}, {dy}, {dx}, all);"
+            )
+            return
+        self.layout.cover(moving=len(move.planes))
         if copies:
             olds = ", ".join(str(plane.old.attr) for plane in move.planes)
             news = ", ".join(f"&{plane.new.name}" for plane in move.planes)
             call = f"arrive_over(c, {movers}, {dy}, {dx}, olds, news, {len(move.planes)});"
             yield f"{{ Plane* const olds[] = {{{olds}}}; Plane** const news[] = {{{news}}}; {call} }}"
-        for leaves, targets in kinds.items():
+        for leaves, planes in groups.items() if groups and not copies else ():
             function = "swap_planes" if move.op == "swap" else f"arrive_planes<{leaves.upper()}>"
-            call = f"{function}(c, {movers}, {dy}, {dx}, all, {len(targets)});"
-            yield f"{{ Plane** const all[] = {{{', '.join(targets)}}}; {call} }}"
-
-    def exchange(self, move: Move) -> Iterator[str]:
-        """Fields that exchange values."""
-        dy, dx = move.offset
-        for field in move.planes:
-            value = field.into or f"keep({field.old.attr})"
-            yield f"{field.new.name} = {value};"
-        fields = ", ".join(f"&{field.new.name}" for field in move.planes)
-        call = f"swap_fields<{len(move.planes)}>(c, {move.movers.attr}, {dy}, {dx}, all);"
-        yield f"{{ Field** const all[] = {{{fields}}}; {call} }}"
+            yield _call("Plane", planes, f"{function}(c, {movers}, {dy}, {dx}, all, {len(planes)});")
 
     def update(self, loop: Compute) -> Iterator[str]:
         """Planes that change only in words where a mask holds. Empty ones that can only lose flags need no copy."""
@@ -218,22 +219,29 @@ class _Printer:
 
 
 def _held(value: Node) -> str:
-    """The variable that holds a plane, or a constant plane of the context."""
-    return str(value.attr) if value.op == "load" else "c.everything" if value.attr else "c.nothing"
+    """The variable that holds a plane or field, or a constant one of the context."""
+    if value.op == "load":
+        return str(value.attr)
+    if value.type == REAL:
+        return "c.calm"
+    return "c.everything" if value.attr else "c.nothing"
 
 
-def _kept(value: Node) -> str:
-    if value.op == "load" or value.type == FLAG:
-        return f"keep({_held(value)})"
-    return "keep(c.calm)"
+def _call(type: str, planes: Sequence[Carried], call: str) -> str:
+    """A call on the new variables of a movement."""
+    return f"{{ {type}** const all[] = {{{', '.join(f'&{plane.new.name}' for plane in planes)}}}; {call} }}"
 
 
-class _Words(WordValues):
+CLEAN = ("load", "const", "inside", "when", "shift", *DRAWS)
+"""Operations that give no flags beyond the width."""
+
+
+class _Words(WordText):
     """Values of a word of columns in as many worlds as a vector holds."""
 
-    type, leaf = "V", "shift"
+    type = "V"
 
-    def __init__(self, layout: Layout):
+    def __init__(self, layout: NativeLayout):
         super().__init__()
         self.layout = layout
         self.edges: dict[tuple[str, str], int] = {}
@@ -253,9 +261,7 @@ class _Words(WordValues):
         return self.pointer(f"{self.places.get(name, name)}->data")
 
     def pointer(self, words: str) -> str:
-        if words not in self.read:
-            self.read[words] = f"r{len(self.read)}"
-        return self.read[words]
+        return self.read.setdefault(words, f"r{len(self.read)}")
 
     def pointers(self) -> str:
         """Statements before the loop that name what it points to."""
@@ -263,17 +269,11 @@ class _Words(WordValues):
 
     def lazy(self, node: Node) -> str:
         """A conjunction whose second part is computed only where the first holds somewhere in the word."""
-        self.count += 1
-        name = f"g{self.count}"
-        first = self.known[id(node.args[0])]
-        outer, self.lines = self.lines, []
-        known = dict(self.known)
-        value = self.clean(node.args[1])
-        inner, self.lines = self.lines, outer
-        self.known = known
-        self.lines.append(
-            f"V {name} = splat(0);\nif (any({first})) {{ {' '.join(inner)} {name} = {value}; }}"
-        )
+        name, first = self.fresh("g"), self.known[id(node.args[0])]
+        with self.inner() as lines:
+            value = self.clean(node.args[1])
+        inner = " ".join(lines)
+        self.lines.append(f"V {name} = splat(0);\nif (any({first})) {{ {inner} {name} = {value}; }}")
         return name
 
     def clean(self, node: Node) -> str:
@@ -285,41 +285,23 @@ class _Words(WordValues):
         """Whether bits beyond the width are known to be zero."""
         if id(node) not in self.clear:
             match node.op:
-                case (
-                    "load" | "const" | "inside" | "chance" | "below_planes" | "below_param" | "when" | "shift"
-                ):
-                    found = True
                 case "coordinate":
-                    found = node.attr[0] != "step"
+                    clear = node.attr[0] != "step"
                 case "and":
-                    found = any(self.is_clean(arg) for arg in node.args)
+                    clear = any(map(self.is_clean, node.args))
                 case "or" | "xor":
-                    found = all(self.is_clean(arg) for arg in node.args)
+                    clear = all(map(self.is_clean, node.args))
                 case "select":
-                    found = all(self.is_clean(arg) for arg in node.args[1:])
+                    clear = all(map(self.is_clean, node.args[1:]))
                 case _:
-                    found = False
-            self.clear[id(node)] = found
+                    clear = node.op in CLEAN
+            self.clear[id(node)] = clear
         return self.clear[id(node)]
 
-    def row(self, plane: str, dy: int) -> str:
-        if dy == 0:
-            return "y * words"
-        self.reads("edges", plane, dy)
-        self.layout.around = max(self.layout.around, abs(dy))
-        return f"rows[y + {dy}]"
-
-    def reads(self, call: str, plane: str, dy: int) -> None:
-        if dy:
-            self.edges[call, plane] = max(self.edges.get((call, plane), 0), abs(dy))
-
     def node(self, node: Node) -> str:
-        attr = node.attr
-        if node.op == "and":
-            for value, draw in (node.args, node.args[::-1]):
-                if draw.op in ("chance", "below_param", "below_planes") and draw.args[-1:] == (value,):
-                    return self.known[id(draw)]  # it holds only where it is drawn
-        args = [self.known[id(arg)] for arg in node.args] if node.op != "shift" else []
+        if (draw := limited_draw(node)) is not None:
+            return self.known[id(draw)]
+        attr, args = node.attr, self.args(node)
         if node.op in _LOGIC:
             return f"{args[0]} {_LOGIC[node.op]} {args[1]}"
         match node.op:
@@ -331,57 +313,46 @@ class _Words(WordValues):
                 return self.name("valid" if attr else "splat(0)")
             case "param":
                 return f"c.param_bits[{self.layout.param_planes[param_key(node)]}]"
-            case "coordinate":
-                axis, modulus, bit = attr
-                if axis == "step":
-                    return f"c.step_bits[{self.layout.step_planes[modulus, bit]}]"
-                fixed = self.layout.fixed[0 if axis == "row" else 1, modulus, bit]
-                return f"{self.pointer(f'c.fixed[{fixed}]')}[i]"
-            case "inside":
-                return f"{self.pointer(f'c.fixed[{self.layout.fixed[2, attr[0], attr[1]]}]')}[i]"
-            case "chance":
-                stream, bits, limit = attr
-                wanted = self.clean(node.args[0]) if args else "valid"
-                if is_coin(node):
-                    coin = number(self.layout.coins, self.layout.streams[stream])
-                    plane = self.pointer(f"coin_plane(c, {coin}, {self.layout.streams[stream]})")
-                    return f"{wanted} & ~{plane}[i]"
-                return f"draw_below(c, {self.layout.streams[stream]}, y, w, {wanted}, {bits}, {limit}ull)"
-            case "below_planes":
-                bits = attr[1]
-                return self.below(node, args[: bits + 1], node.args[bits + 1 :])
-            case "below_param":
-                _, bits, name, view = attr
-                numbers = [self.layout.param_planes[name, view, i] for i in range(bits, -1, -1)]
-                limit = [f"c.param_bits[{number}]" for number in numbers]
-                return self.below(node, limit, node.args, numbers)
+            case "coordinate" if attr[0] == "step":
+                return f"c.step_bits[{self.layout.step_planes[attr[1:]]}]"
+            case "coordinate" | "inside":
+                return f"{self.pointer(f'c.fixed[{self.layout.fixed[fixed_key(node)]}]')}[i]"
+            case "chance" | "below_planes" | "below_param":
+                return self.draw(node, args)
             case "not":
                 return f"~{args[0]}"
             case "select":
                 return f"mux({', '.join(args)})"
         raise AssertionError(f"no C++ kernel for {node.op}")
 
-    def below(
-        self, node: Node, limit: Sequence[str], where: Sequence[Node], numbers: Sequence[int] = ()
-    ) -> str:
-        """A draw below a limit, given plane by plane from the highest. `numbers`: where they lie among parameters."""
-        stream, bits = node.attr[:2]
-        wanted = self.clean(where[0]) if where else "valid"
-        first = numbers[0] if numbers else -1
-        if numbers and list(numbers) == list(range(first, first + bits + 1)):
-            return f"draw_below_planes(c, {self.layout.streams[stream]}, y, w, {wanted}, {bits}, c.param_bits + {first})"
-        self.count += 1
-        name = f"limit{self.count}"
-        self.lines.append(f"const V {name}[] = {{{', '.join(limit)}}};")
-        return f"draw_below_planes(c, {self.layout.streams[stream]}, y, w, {wanted}, {bits}, {name})"
+    def draw(self, node: Node, args: Sequence[str]) -> str:
+        """A draw below a limit, which is a number, or is given plane by plane from the highest."""
+        stream, bits = self.layout.streams[node.attr[0]], node.attr[1]
+        where = drawn_where(node)
+        wanted = "valid" if where is None else self.clean(where)
+        if is_coin(node):
+            coin = number(self.layout.coins, stream)
+            return f"{wanted} & ~{self.pointer(f'coin_plane(c, {coin}, {stream})')}[i]"
+        if node.op == "chance":
+            return f"draw_below(c, {stream}, y, w, {wanted}, {bits}, {node.attr[2]}ull)"
+        planes = self.layout.limit(node) if node.op == "below_param" else ()
+        if planes and is_run(planes):
+            limit = f"c.param_bits + {planes[0]}"
+        else:
+            limit = self.fresh("limit")
+            of_params = [f"c.param_bits[{plane}]" for plane in planes]
+            self.lines.append(f"const V {limit}[] = {{{', '.join(of_params or args[: bits + 1])}}};")
+        return f"draw_below_planes(c, {stream}, y, w, {wanted}, {bits}, {limit})"
 
     def shift(self, node: Node) -> str:
         dy, dx, wraps = node.attr
         plane = str(node.args[0].attr)
-        if wraps:
-            if not dx:
-                return f"{self.plane(plane)}[{self.row(plane, dy)} + w]"
-            return f"columns(c, {self.plane(plane)} + {self.row(plane, dy)}, w, {dx})"
-        self.reads("bare_edges", plane, dy)
-        row = f"row_or_nothing(c, {plane}, y + {dy})"
-        return f"columns_zero(c, {row}, w, {dx})" if dx else f"{row}[w]"
+        if dy:
+            key = "edges" if wraps else "bare_edges", plane
+            self.edges[key] = max(self.edges.get(key, 0), abs(dy))
+        if not wraps:
+            row = f"row_or_nothing(c, {plane}, y + {dy})"
+            return f"columns_zero(c, {row}, w, {dx})" if dx else f"{row}[w]"
+        self.layout.cover(around_rows=abs(dy))
+        row, words = f"rows[y + {dy}]" if dy else "y * words", self.plane(plane)
+        return f"columns(c, {words} + {row}, w, {dx})" if dx else f"{words}[{row} + w]"

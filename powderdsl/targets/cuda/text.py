@@ -8,7 +8,7 @@ from powderdsl.ir.ops import REAL, Node, ordered
 from powderdsl.schedule.lifetimes import Buffer
 from powderdsl.schedule.types import ANSWER, Compute, Guard, Out, Schedule, Statement, Sync
 from powderdsl.targets.layout import Layout, literal, param_key
-from powderdsl.targets.values import CellValues, WordValues
+from powderdsl.targets.printing import CellValues, Printer, WordText
 
 _LOGIC = {"and": "&", "or": "|", "xor": "^"}
 _ARITHMETIC = {"add": "+", "sub": "-", "mul": "*", "eq": "==", "lt": "<", "le": "<="}
@@ -20,7 +20,7 @@ def pass_text(schedule: Schedule, layout: Layout) -> str:
     return "\n".join(_Printer(dict(schedule.buffers), layout).block(schedule.body))
 
 
-class _Printer:
+class _Printer(Printer):
     def __init__(self, buffers: dict[str, Buffer], layout: Layout):
         self.buffers, self.layout = buffers, layout
 
@@ -29,22 +29,22 @@ class _Printer:
 
     def block(self, body: Sequence[Statement]) -> Iterator[str]:
         for statement in body:
-            match statement:
-                case Sync():
-                    yield "SYNC();"
-                case Compute() if statement.over == "words":
-                    yield from self.words(statement)
-                case Compute():
-                    yield from self.cells(statement)
-                case Guard((when,), inner, _, _, otherwise):
-                    yield f"if ({when.attr}) {{"
-                    yield from self.block(inner)
-                    if otherwise:
-                        yield "} else {"
-                        yield from self.block(otherwise)
-                    yield "}"
-                case _:
-                    raise AssertionError("no such statement on the GPU")
+            yield from self.printed(statement)
+
+    def sync(self, _: Sync) -> Iterator[str]:
+        yield "SYNC();"
+
+    def compute(self, loop: Compute) -> Iterator[str]:
+        return self.words(loop) if loop.over == "words" else self.cells(loop)
+
+    def guard(self, guard: Guard) -> Iterator[str]:
+        (when,) = guard.when
+        yield f"if ({when.attr}) {{"
+        yield from self.block(guard.body)
+        if guard.otherwise:
+            yield "} else {"
+            yield from self.block(guard.otherwise)
+        yield "}"
 
     def words(self, loop: Compute) -> Iterator[str]:
         answers = [out for out in loop.outs if out.var.type == ANSWER]
@@ -110,7 +110,7 @@ class _Printer:
         return f"{lines} if (({busy}) != 0{''.join(dirty)}) return true; {' '.join(quiet)} return false;"
 
 
-class _Words(WordValues):
+class _Words(WordText):
     """Values of a word of 32 columns, each as an expression or the name of a constant."""
 
     type, leaf = "u32", "live"
@@ -118,31 +118,24 @@ class _Words(WordValues):
     def __init__(self, printer: _Printer):
         super().__init__()
         self.printer, self.layout = printer, printer.layout
-        self.rows: dict[int, str] = {}
 
     def lazy(self, node: Node) -> str:
         """A conjunction whose second part is computed only where the first holds somewhere in the word."""
-        self.count += 1
-        name = f"t{self.count}"
+        name = self.fresh("t")
         self.lines.append(f"u32 {name} = {self.known[id(node.args[0])]} & valid;")
-        outer, self.lines = self.lines, []
-        known, rows = dict(self.known), dict(self.rows)
-        value = self.of(node.args[1])
-        inner, self.lines = self.lines, outer
-        self.known, self.rows = known, rows
-        self.lines.append("\n".join([f"if ({name}) {{", *inner, f"{name} &= {value};", "}"]))
+        with self.inner() as lines:
+            value = self.of(node.args[1])
+        self.lines.append("\n".join([f"if ({name}) {{", *lines, f"{name} &= {value};", "}"]))
         return name
 
     def row(self, dy: int) -> str:
-        if dy not in self.rows:
-            self.count += 1
-            self.lines.append(f"const int r{self.count} = row(l, y, {dy});")
-            self.rows[dy] = f"r{self.count}"
-        return self.rows[dy]
+        if ("row", dy) not in self.known:
+            self.known["row", dy] = name = self.fresh("r")
+            self.lines.append(f"const int {name} = row(l, y, {dy});")
+        return self.known["row", dy]
 
     def node(self, node: Node) -> str:
-        args = [self.known[id(arg)] for arg in node.args] if node.op != "live" else []
-        attr = node.attr
+        args, attr = self.args(node), node.attr
         if node.op in _LOGIC:
             return f"{args[0]} {_LOGIC[node.op]} {args[1]}"
         match node.op:
@@ -195,8 +188,7 @@ class _Words(WordValues):
         """A draw below a limit, given plane by plane from the highest."""
         stream, bits = node.attr[:2]
         wanted = f"{where[0]} & valid" if where else "valid"
-        self.count += 1
-        name = f"limit{self.count}"
+        name = self.fresh("limit")
         self.lines.append(f"const u32 {name}[] = {{{', '.join(limit)}}};")
         return f"draw_below_planes({self.layout.streams[stream]}, l, y, w, {wanted}, {bits}, {name})"
 
@@ -209,28 +201,13 @@ class _Cells(CellValues[str]):
         self.printer, self.layout = printer, printer.layout
         self.masks: dict[int, str] = {}
         """Words of flags by buffer, read before the cells."""
-        self.places: dict[tuple[str, int], str] = {}
         nodes = ordered(out.value for out in outs)
         self.choices = [node for node in nodes if node.op == "select"]
-
-    def fresh(self, prefix: str) -> str:
-        self.count += 1
-        return f"{prefix}{self.count}"
 
     def name(self, text: str) -> str:
         name = self.fresh("v")
         self.lines.append(f"const float {name} = {text};")
         return name
-
-    def nested(self, root: Node, known: dict[int, str]) -> tuple[list[str], str]:
-        """Statements of a block, and the value that it computes."""
-        outer, self.lines = self.lines, []
-        before, places = self.known, dict(self.places)
-        self.known = known
-        value = self.of(root)
-        inner, self.lines = self.lines, outer
-        self.known, self.places = before, places
-        return inner, value
 
     def node(self, node: Node) -> str:
         attr = node.attr
@@ -273,11 +250,11 @@ class _Cells(CellValues[str]):
 
     def place(self, axis: str, by: int) -> str:
         """The row's first cell or the column at a neighbor."""
-        if (axis, by) not in self.places:
-            self.places[axis, by] = name = self.fresh("a")
+        if (axis, by) not in self.known:
+            self.known[axis, by] = name = self.fresh("a")
             what = f"row(l, y, {by}) / ROW_WORDS * WIDTH" if axis == "row" else f"around(x, {by}, WIDTH)"
             self.lines.append(f"const int {name} = {what};")
-        return self.places[axis, by]
+        return self.known[axis, by]
 
     def mask(self, node: Node) -> str:
         """The word of a flag."""
@@ -289,34 +266,24 @@ class _Cells(CellValues[str]):
         """A comparison, computed only where another one holds."""
         leader, comparison = node.args
         first = f"BIT({self.mask(leader)})" if leader.op == "load" else self.of(leader)
-        lines, value = self.nested(comparison, dict(self.known))
+        with self.inner() as lines:
+            value = self.of(comparison)
         name = self.fresh("b")
         self.lines.append(
             "\n".join([f"bool {name} = false; if ({first}) {{", *lines, f"{name} = {value}; }}"])
         )
         return name
 
-    def choice(self, node: Node) -> None:
-        """A chain of choices. A choice is computed only if it chooses some cell of the word."""
-        chains = self.alike(node)
-        masks = [choice.args[0] for choice in chains[0]]
-        names = []
-        for one in chains:
-            base = self.of(one[-1].args[2])
-            names.append(self.fresh("v"))
-            self.lines.append(f"float {names[-1]} = {base};")
-        for level in reversed(range(len(masks))):
-            running = {id(one[level].args[2]): name for one, name in zip(chains, names, strict=True)}
-            known = self.known | running  # valid only here, since the variables change
-            mask = self.mask(masks[level])
-            lines: list[str] = []
-            blends: list[str] = []
-            outer, self.lines = self.lines, lines
-            before, places = self.known, dict(self.places)
-            self.known = known
-            for one, name in zip(chains, names, strict=True):
-                blends.append(f"if (BIT({mask})) {name} = {self.of(one[level].args[1])};")
-            self.lines, self.known, self.places = outer, before, places
-            self.lines.append("\n".join([f"if ({mask}) {{", *lines, *blends, "}"]))
-        for one, name in zip(chains, names, strict=True):
-            self.known[id(one[0])] = name
+    def variable(self, value: str) -> str:
+        name = self.fresh("v")
+        self.lines.append(f"float {name} = {value};")
+        return name
+
+    def chosen(self, mask: Node, variables: Sequence[str], values: Sequence[Node]) -> None:
+        word = self.mask(mask)
+        with self.inner() as lines:
+            blends = [
+                f"if (BIT({word})) {name} = {self.of(value)};"
+                for name, value in zip(variables, values, strict=True)
+            ]
+        self.lines.append("\n".join([f"if ({word}) {{", *lines, *blends, "}"]))

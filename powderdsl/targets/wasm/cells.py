@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from collections.abc import Sequence
-from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 from powderdsl.ir.ops import REAL, SNAP, Node, ordered
-from powderdsl.schedule.types import Compute, alternatives, loaded
+from powderdsl.schedule.rows import chains_of, region_of
+from powderdsl.schedule.types import Compute, loaded
 from powderdsl.targets.layout import param_key
-from powderdsl.targets.values import CellValues, chains_of
+from powderdsl.targets.printing import CellValues
 from powderdsl.targets.wasm.binary import I32, Callee, Function, Local, Value, const, floats, load, op, vector
 from powderdsl.targets.wasm.library import (
     HALOED,
@@ -27,43 +27,9 @@ from powderdsl.targets.wasm.library import (
     splat,
 )
 
-if TYPE_CHECKING:
-    from powderdsl.targets.wasm.passes import Pass
-
 CHUNK = 4
 BITS = struct.pack("<4I", 1, 2, 4, 8)
 _ARITHMETIC = {"add", "sub", "mul", "neg", "abs", "sqrt", "eq", "lt", "le"}
-
-
-def sweep(within: Pass, loop: Compute) -> None:
-    """The statements of a pass for a loop over cells."""
-    f, library = within.f, within.library
-    for out in loop.outs:
-        within.declare(out.var)
-    copies = all(out.value.op == "load" and out.var.type == REAL for out in loop.outs)
-    with ExitStack() as asked:
-        if copies:  # fields are shared, not copied
-            for out in loop.outs:
-                within.define(out.var, within.kept(out.value))
-        elif loop.region is not None:
-            condition = ZERO
-            for part in alternatives(loop.region):
-                condition = condition | within.of(part.args[0] if part.op == "live" else part)[SOME]
-            asked.enter_context(f.when(condition))
-        if not copies:
-            for out in loop.outs:
-                within.define(out.var, (library.take_field if out.var.type == REAL else library.take)())
-            made = CellLoop(library, loop)
-            outs = [within.vars[out.var.name] for out in loop.outs]
-            f.do(made.made()(*(within.read(name) for name in made.reads), *outs))
-            if loop.region is not None:
-                f.otherwise()
-                for out in loop.outs:
-                    assert out.otherwise is not None
-                    within.define(out.var, within.kept(out.otherwise))
-    for out in loop.outs:
-        if out.into is not None:
-            f.do(library.give_field(within.vars[out.into]))
 
 
 class CellLoop:
@@ -71,19 +37,15 @@ class CellLoop:
 
     def __init__(self, library: Library, loop: Compute):
         self.library, self.loop, self.memory = library, loop, library.memory
-        roots = [out.value for out in loop.outs]
+        values = [out.value for out in loop.outs]
+        olds = [old for _, old in loop.unchanged() if old.op == "load"]
         region = [] if loop.region is None else [loop.region]
-        keeps = [
-            out.otherwise for out in loop.outs if out.otherwise is not None and out.otherwise.op == "load"
-        ]
-        self.keeps = bool(keeps)
-        self.reads = list(dict.fromkeys(loaded([*roots, *region, *keeps])))
+        self.reads = list(dict.fromkeys(loaded([*values, *region, *olds])))
         self.f = f = Function(["i32"] * (len(self.reads) + len(loop.outs)))
         self.held = dict(zip(self.reads, f.params, strict=False))
         self.outs = f.params[len(self.reads) :]
-        self.nodes = ordered(roots)
+        self.nodes = ordered(values)
         self.starts: dict[tuple[str, int, bool], Local] = {}
-        self.choices = loop.over == "choices"
 
     def made(self) -> Callee:
         """The function."""
@@ -97,7 +59,7 @@ class CellLoop:
                 with f.scope(), f.block() as skip:
                     self.skip = skip
                     self.starts = {}
-                    self.lay() if self.choices else self.body()
+                    self.lay() if self.loop.over == "choices" else self.body()
                 f.set(line, line + 1)
         for out, place, found in zip(self.loop.outs, self.outs, self.somewhere, strict=True):
             f.set(place[SOME], found)
@@ -178,13 +140,11 @@ class CellLoop:
         f, loop = self.f, self.loop
         if loop.region is None:
             return
-        parts = alternatives(loop.region)
+        fields, planes = region_of(loop)
         busy = ZERO
-        for part in parts:
-            if part.op == "live":
-                line = self.library.other_line(self.line, part.attr[0], wraps=True)
-                busy = busy | self.live(self.held[str(part.args[0].attr)], line)
-        planes = [str(part.attr) for part in parts if part.op == "load"]
+        for part in fields:
+            line = self.library.other_line(self.line, part.attr[0], wraps=True)
+            busy = busy | self.live(self.held[str(part.args[0].attr)], line)
         busy = busy | self.row_flags(planes) if planes else busy
         with f.when(op("i32.eqz", busy)):
             for i, out in enumerate(loop.outs):
@@ -216,7 +176,8 @@ class CellLoop:
         alive = {i: f.let(const("v128", 0)) for i, _ in fields}
         with self.each_word() as (at, x, stop):
             bits = {i: f.let(const("i64", 0)) for i, _ in flags}
-            words = {name: f.let(self.flags(self.held[name], at)) for name in self.plane_names()}
+            planes = [str(node.attr) for node in self.nodes if node.op == "load" and node.type != REAL]
+            words = {name: f.let(self.flags(self.held[name], at)) for name in dict.fromkeys(planes)}
             with f.each(x, stop, CHUNK) as column, f.scope():
                 self.column, self.at = column, at
                 values = Chunks(self, words)
@@ -246,7 +207,7 @@ class CellLoop:
         return (self.library.everything + at)[self.memory.half]
 
     @contextmanager
-    def each_word(self):  # type: ignore[no-untyped-def]
+    def each_word(self) -> Iterator[tuple[Value, Value, Value]]:
         """The words of a row: bytes from the plane's first word, the first column, the column after the last."""
         f, memory = self.f, self.memory
         if memory.words == 1:
@@ -263,10 +224,6 @@ class CellLoop:
             f.set(x, x + WORD)
             f.jump(again, x < memory.width)
 
-    def plane_names(self) -> list[str]:
-        """The planes that values read."""
-        return list(dict.fromkeys(str(n.attr) for n in self.nodes if n.op == "load" and n.type != REAL))
-
     # Chains of choices
 
     def lay(self) -> None:
@@ -275,7 +232,7 @@ class CellLoop:
         What follows from the results comes last, if they are not the new fields themselves.
         """
         f, library, memory, outs = self.f, self.library, self.memory, self.loop.outs
-        chains = [chain[::-1] for chain in chains_of(self.loop)]
+        chains = chains_of(self.loop)
         bases = [self.held[str(chain[0].args[2].attr)] for chain in chains]
         masks = [str(choice.args[0].attr) for choice in chains[0]]
         continued = [chain[-1] for chain in chains] != [out.value for out in outs]
@@ -354,26 +311,21 @@ class Chunks(CellValues[Value]):
         return op("i32x4.eq", splat(bits) & vector(BITS), vector(BITS))
 
     def node(self, node: Node) -> Value:
-        value = self._node(node)
-        return (
-            value
-            if isinstance(value, Local) or node.op == "const" or self.uses[id(node)] < 2
-            else self.f.let(value)
-        )
+        value = self.made_of(node)
+        once = isinstance(value, Local) or node.op == "const" or self.uses[id(node)] < 2
+        return value if once else self.f.let(value)
 
-    def _node(self, node: Node) -> Value:
+    def made_of(self, node: Node) -> Value:
         attr, args = node.attr, [self.known[id(arg)] for arg in node.args if id(arg) in self.known]
         memory, loop = self.memory, self.loop
         match node.op:
             case "const":
                 return floats(float(attr))
-            case "load" if node.type != REAL:
+            case "load" | "param" if node.type != REAL:
                 return self.spread(self.nibble(node))
             case "load":
                 return load("v128.load", loop.start(str(attr)) + (loop.column << 2))
             case "param":
-                if node.type != REAL:
-                    return self.spread(self.nibble(node))
                 number = memory.layout.param_reals[attr[0]]
                 return load("v128.load32_splat", loop.lane >> 1, memory.at("reals", number))
             case "draw":
@@ -424,32 +376,23 @@ class Chunks(CellValues[Value]):
         first = self.of(leader)
         first = self.known[id(leader)] = first if isinstance(first, Local) else self.f.let(first)
         led = [one for one in self.loop.nodes if one.op == "led" and one.args[0] is leader]
-        found = [self.f.let(const("v128", 0)) for _ in led]
-        with self.f.when(some(first)):
-            known = dict(self.known)
-            for one, local in zip(led, found, strict=True):
-                self.f.set(local, self.of(one.args[1]) & first)
-            self.known = known
-        self.known |= {id(one): local for one, local in zip(led, found, strict=True)}
+        values = [self.f.let(const("v128", 0)) for _ in led]
+        with self.f.when(some(first)), self.inner():
+            for one, value in zip(led, values, strict=True):
+                self.f.set(value, self.of(one.args[1]) & first)
+        self.known |= {id(one): value for one, value in zip(led, values, strict=True)}
         return self.known[id(node)]
 
-    def choice(self, node: Node) -> None:
-        """A chain of choices. A choice is computed only if it chooses some cell of the chunk."""
+    def variable(self, value: Value) -> Value:
+        return self.f.let(value)
+
+    def chosen(self, mask: Node, variables: Sequence[Value], values: Sequence[Node]) -> None:
         f = self.f
-        chains = self.alike(node)
-        masks = [choice.args[0] for choice in chains[0]]
-        names = [f.let(self.of(one[-1].args[2])) for one in chains]
-        for level in reversed(range(len(masks))):
-            before = self.known
-            running = {id(one[level].args[2]): name for one, name in zip(chains, names, strict=True)}
-            self.known = before | running  # valid only here, since the variables change
-            bits = f.let(self.nibble(masks[level]) & 15)
-            with f.when(bits):
-                mask = f.let(self.spread(bits))
-                chosen = [self.of(one[level].args[1]) for one in chains]
-                chosen = [value if len(chains) == 1 else f.let(value) for value in chosen]
-                for name, value in zip(names, chosen, strict=True):
-                    f.set(name, choose(mask, value, name))
-            self.known = before
-        for one, name in zip(chains, names, strict=True):
-            self.known[id(one[0])] = name
+        bits = f.let(self.nibble(mask) & 15)
+        with f.when(bits):
+            lanes = f.let(self.spread(bits))
+            new = [self.of(value) for value in values]
+            new = [value if len(new) == 1 else f.let(value) for value in new]
+            for variable, value in zip(variables, new, strict=True):
+                assert isinstance(variable, Local)
+                f.set(variable, choose(lanes, value, variable))

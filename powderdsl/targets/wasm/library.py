@@ -18,10 +18,10 @@ from functools import partial
 from typing import NamedTuple
 
 from powderdsl.ir.ops import REAL, ordered
+from powderdsl.schedule.rows import chains_of
 from powderdsl.schedule.types import Move, Schedule, Sweeps, flat
 from powderdsl.system.random import MASK
 from powderdsl.targets.layout import Layout
-from powderdsl.targets.values import chains_of
 from powderdsl.targets.wasm.binary import (
     I32,
     I64,

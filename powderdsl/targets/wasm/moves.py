@@ -7,9 +7,9 @@ comes around the edge waits in the planes' halos.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
-from powderdsl.schedule.types import Leftover, Move
+from powderdsl.schedule.types import Carried, Leftover, Move
 from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, load, op
 from powderdsl.targets.wasm.library import (
     HALOED,
@@ -28,11 +28,11 @@ TOGETHER = 4
 """Planes that a loop over rows of one word changes, since each waits for what it reads."""
 
 
-def moves_in_place(move: Move) -> bool:
-    """Whether a movement needs no copies: swaps reach the next row only."""
-    near = move.op == "arrive" or abs(move.offset[0]) <= 1
-    kinds = {plane.leftover(move.movers) for plane in move.planes}
-    return near and None not in kinds and (move.op == "arrive" or kinds == {"same"})
+def groups_in_place(move: Move) -> dict[Leftover, list[Carried]] | None:
+    """The planes of a movement by what movers leave behind; None if it needs copies: swaps reach the next row only."""
+    groups = move.leftovers()
+    near = groups is not None and abs(move.offset[0]) <= 1 and groups.keys() == {"same"}
+    return groups if near or move.op == "arrive" else None
 
 
 def rows_that_move(library: Library, downwards: bool) -> Callee:
@@ -159,31 +159,30 @@ class _Mover:
         return choose(t, back, left)
 
 
-def move(
-    library: Library, f: Function, moved: Move, movers: Local, planes: Sequence[Local], targets: Callee
+def move_groups(
+    library: Library,
+    f: Function,
+    move: Move,
+    movers: Local,
+    groups: Mapping[Leftover, Sequence[Local]],
+    targets: Callee,
 ) -> None:
-    """Move planes, of which there is one owner, in place. `targets` makes the plane of targets: movers, it."""
-    memory, (dy, _) = library.memory, moved.offset
+    """Move planes in place, by what their movers leave behind. `targets` makes the plane of targets: movers, it."""
     entered = f.let(library.take())
     f.do(library.edges(movers))
     f.do(targets(movers, entered))
-    rows = f.let(rows_that_move(library, dy > 0)(movers, entered))
-    by_kind: dict[Leftover, list[Local]] = {}
-    for plane, local in zip(moved.planes, planes, strict=True):
-        kind = plane.leftover(moved.movers)
-        assert kind is not None
-        by_kind.setdefault(kind, []).append(local)
-    for kind, several in by_kind.items():
-        end = f.let(const("i32", memory.at("moving")))
-        for held in several:
-            with f.when(const("i32", 1) if kind == "everything" else held[SOME]):
-                f.set(held, library.own(held))
-                f.do(library.edges(held))
-                f.set(word(end), held)
+    rows = f.let(rows_that_move(library, move.offset[0] > 0)(movers, entered))
+    for kind, planes in groups.items():
+        end = f.let(library.memory.at("moving"))
+        for plane in planes:
+            with f.when(const("i32", 1) if kind == "everything" else plane[SOME]):
+                f.set(plane, library.own(plane))
+                f.do(library.edges(plane))
+                f.set(word(end), plane)
                 f.set(end, end + 4)
                 if kind == "everything":
-                    f.set(held[SOME], 1)
-        f.do(mover(library, moved.op, moved.offset, kind)(movers, entered, rows, end))
+                    f.set(plane[SOME], 1)
+        f.do(mover(library, move.op, move.offset, kind)(movers, entered, rows, end))
     f.do(library.give(entered))
 
 

@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import reduce
+from operator import or_
 
-from powderdsl.ir.ops import FLAG, REAL, Node, Offset
+from powderdsl.ir.ops import REAL, Node
+from powderdsl.schedule.rows import is_copy
 from powderdsl.schedule.types import (
     Compute,
+    Forget,
     Guard,
     Move,
     Out,
+    Release,
     Schedule,
     Statement,
     Sweeps,
     Var,
+    alternatives,
 )
-from powderdsl.schedule.words import is_cleared
-from powderdsl.targets.statements import printed
+from powderdsl.schedule.words import difference, is_cleared, moved, targets
+from powderdsl.targets.printing import Printer
 from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, op
-from powderdsl.targets.wasm.cells import sweep
+from powderdsl.targets.wasm.cells import CellLoop
 from powderdsl.targets.wasm.library import SOME, ZERO, Library, word
-from powderdsl.targets.wasm.moves import exchanger, moves_in_place
-from powderdsl.targets.wasm.moves import move as in_place
+from powderdsl.targets.wasm.moves import exchanger, groups_in_place, move_groups
 from powderdsl.targets.wasm.words import WordLoop
 
 ONE = const("i32", 1)
@@ -38,7 +43,7 @@ def pass_function_name(name: str) -> str:
     return f"pass_{name}"
 
 
-class Pass:
+class Pass(Printer):
     """Variables are locals that hold the addresses of planes and fields."""
 
     def __init__(self, schedule: Schedule, library: Library):
@@ -61,35 +66,34 @@ class Pass:
             else:
                 self.define(var, library.keep(group[at]))
         self.block(schedule.body)
-        left = []
-        for slot, node in schedule.leaves:
-            left.append((memory.slot(slot, node.type), f.let(self.kept(node)), node))
-        for at, value, node in left:
+        values = [f.let(self.kept(node)) for _, node in schedule.leaves]
+        for (slot, node), value in zip(schedule.leaves, values, strict=True):
+            at = memory.slot(slot, node.type)
             old = f.let(group[at])
             with f.when(old):
                 f.do(library.giver(node.type == REAL)(old))
             f.set(group[at], value)
-        names = dict.fromkeys(str(node.attr) for _, node in schedule.leaves if node.op == "load")
-        self.release(names)
+        self.give(dict.fromkeys(str(node.attr) for _, node in schedule.leaves if node.op == "load"))
         return f
 
     # Variables
 
     def define(self, var: Var, value: Value) -> Local:
-        self.declare(var)
+        self.declare([var])
         self.f.set(self.vars[var.name], value)
         return self.vars[var.name]
 
-    def declare(self, var: Var) -> None:
-        """A variable that is set later."""
-        if var.name not in self.vars:
-            self.vars[var.name] = self.f.local("i32")
-        self.types[var.name] = var.type == REAL
+    def declare(self, variables: Iterable[Var]) -> None:
+        """Variables that are set later."""
+        for var in variables:
+            if var.name not in self.vars:
+                self.vars[var.name] = self.f.local("i32")
+            self.types[var.name] = var.type == REAL
 
     def of(self, node: Node) -> Local:
         return self.vars[str(node.attr)]
 
-    def release(self, names: Iterable[str]) -> None:
+    def give(self, names: Iterable[str]) -> None:
         for name in names:
             self.f.do(self.library.giver(self.types[name])(self.vars[name]))
 
@@ -116,33 +120,68 @@ class Pass:
             case "const":
                 return const("i32", bool(node.attr))
         first, second = (self.answer(arg) for arg in node.args)
-        return self.both(first, second) if node.op == "and" else first | second
-
-    def both(self, first: Value, second: Value) -> Value:
-        return op("i32.ne", first, ZERO) & op("i32.ne", second, ZERO)
+        return op("i32.ne", first, ZERO) & op("i32.ne", second, ZERO) if node.op == "and" else first | second
 
     # Statements
 
     def block(self, body: Sequence[Statement]) -> None:
         for statement in body:
-            printed(self, statement)
+            self.printed(statement)
+
+    def release(self, release: Release) -> None:
+        self.give(release.names)
+
+    def forget(self, _: Forget) -> None:
+        self.f.set(self.library.present, const("i64", -1))
 
     def sweeps(self, sweeps: Sweeps) -> None:
         for loop in sweeps.loops:
-            sweep(self, loop)
-        self.release(sweeps.passing)
+            self.copies(loop) if is_copy(loop) else self.cells(loop)
+            for out in loop.outs:
+                if out.into is not None:
+                    self.f.do(self.library.give_field(self.vars[out.into]))
+        self.give(sweeps.passing)
 
-    def forget(self) -> None:
-        self.f.set(self.library.present, const("i64", -1))
+    def copies(self, loop: Compute) -> None:
+        """Fields that are shared, not copied."""
+        self.declare(loop.defined())
+        for out in loop.outs:
+            self.define(out.var, self.kept(out.value))
+
+    def cells(self, loop: Compute) -> None:
+        """A loop over cells, if its region holds anywhere."""
+        f = self.f
+        self.declare(loop.defined())
+        if loop.region is None:
+            self.run(loop)
+            return
+        parts = alternatives(loop.region)
+        fields_and_planes = (self.of(part.args[0] if part.op == "live" else part) for part in parts)
+        with f.when(reduce(or_, (held[SOME] for held in fields_and_planes), ZERO)):
+            self.run(loop)
+            f.otherwise()
+            for out in loop.outs:
+                assert out.otherwise is not None
+                self.define(out.var, self.kept(out.otherwise))
+
+    def run(self, loop: Compute) -> None:
+        """Call a loop over cells that gives new planes and fields."""
+        library = self.library
+        for out in loop.outs:
+            self.define(out.var, (library.take_field if out.var.type == REAL else library.take)())
+        self.call(CellLoop(library, loop))
+
+    def call(self, made: CellLoop | WordLoop) -> None:
+        """Call a loop with what it reads and what it writes."""
+        function = made.made()
+        outs = (self.vars[out.var.name] for out in made.loop.outs)
+        self.f.do(function(*map(self.read, made.reads), *outs))
 
     def guard(self, guard: Guard) -> None:
         f = self.f
-        asked = ZERO
-        for node in guard.when:
-            asked = self.of(node)[SOME] if asked is ZERO else asked | self.of(node)[SOME]
-        for var, _ in guard.keeps:
-            self.declare(var)
-        with f.when(asked):
+        asked = [self.of(node)[SOME] for node in guard.when]
+        self.declare(guard.defined())
+        with f.when(reduce(or_, asked) if asked else ZERO):
             self.block(guard.body)
             if guard.keeps:
                 f.otherwise()
@@ -150,28 +189,26 @@ class Pass:
                     self.define(var, self.kept(value))
 
     def words(self, loop: Compute) -> None:
-        f, library = self.f, self.library
-        if loop.when is None:
-            return self.loop(loop)
-        for out in loop.outs:
-            self.declare(out.var)
-        with f.when(self.answer(loop.when)):
-            self.loop(loop)
-            f.otherwise()
-            for out in loop.outs:
-                self.define(out.var, library.keep(library.nothing))
-
-    def loop(self, loop: Compute) -> None:
         """Planes that are all computed anew."""
+        if loop.when is None:
+            self.all_words(loop)
+            return
+        self.declare(loop.defined())
+        with self.f.when(self.answer(loop.when)):
+            self.all_words(loop)
+            self.f.otherwise()
+            for out in loop.outs:
+                self.define(out.var, self.library.keep(self.library.nothing))
+
+    def all_words(self, loop: Compute) -> None:
         for out in loop.outs:
             self.define(out.var, self.library.take())
-        self.call(loop, [self.vars[out.var.name] for out in loop.outs])
+        self.call_words(WordLoop(self.library, loop))
 
-    def call(self, loop: Compute, outs: Sequence[Value]) -> None:
-        made = WordLoop(self.library, loop)
+    def call_words(self, made: WordLoop) -> None:
         for name in made.haloed:
             self.f.do(self.library.edges(self.vars[name]))
-        self.f.do(made.made()(*(self.read(name) for name in made.reads), *outs))
+        self.call(made)
 
     def read(self, name: str | tuple[str, int]) -> Value:
         if isinstance(name, str):
@@ -190,50 +227,36 @@ class Pass:
             assert out.otherwise is not None
             self.define(out.var, self.of(out.otherwise) if out.into else self.kept(out.otherwise))
         made = WordLoop(library, loop)
-        asked = ZERO
-        for name in made.mask_names:
-            asked = asked | self.vars[name][SOME]
-        with f.when(asked):
+        with f.when(reduce(or_, (self.vars[name][SOME] for name in made.mask_names), ZERO)):
             for out in loop.outs:
                 plane = self.vars[out.var.name]
                 needed = plane[SOME] if is_cleared(out, self.schedule.graph) else ONE  # 0 stays 0
                 with f.when(needed):
                     f.set(plane, library.own(plane))
-            for name in made.haloed:
-                f.do(library.edges(self.vars[name]))
-            function = made.made()
-            f.do(
-                function(
-                    *(self.read(name) for name in made.reads), *(self.vars[o.var.name] for o in loop.outs)
-                )
-            )
+            self.call_words(made)
 
     def whole(self, out: Out) -> None:
         """An operation on whole planes that tests for empty ones first."""
-        library, value = self.library, out.value
-        if value.op in ("load", "const"):
-            self.define(out.var, self.kept(value))
-            return
-        args = value.args
-        tests: list[tuple[Value, Value]]
-        if value.op == "and":  # kept and not gone
-            kept, gone = (
-                (self.of(args[0]), args[1].args[0])
-                if args[1].op == "not"
-                else (self.of(args[1]), args[0].args[0])
-            )
-            tests = [(kept, kept), (self.of(gone), kept)]
-        elif value.op == "or":
-            first, second = map(self.of, args)
-            tests = [(second, first), (first, second)]
-        else:
-            tests = [(self.of(args[0]), library.nothing)]
-        self.declare(out.var)
+        value = out.value
+        tests: list[tuple[Value, Value]]  # planes, and what the result is if one is empty
+        match value.op:
+            case "load" | "const":
+                self.define(out.var, self.kept(value))
+                return
+            case "and":
+                stays, gone = map(self.of, difference(value))
+                tests = [(stays, stays), (gone, stays)]
+            case "or":
+                first, second = map(self.of, value.args)
+                tests = [(second, first), (first, second)]
+            case _:
+                tests = [(self.of(value.args[0]), self.library.nothing)]
+        self.declare([out.var])
         self._tested(tests, out)
 
     def _tested(self, tests: Sequence[tuple[Value, Value]], out: Out) -> None:
         if not tests:
-            self.loop(Compute((out,), "", "words"))
+            self.all_words(Compute((out,), "", "words"))
             return
         (plane, rest), *others = tests
         with self.f.when(plane[SOME]):
@@ -242,53 +265,27 @@ class Pass:
             self.define(out.var, self.library.keep(rest))
 
     def move(self, move: Move) -> None:
-        """Planes that move; those that nothing moves stay as they are."""
-        f, library = self.f, self.library
-        movers = self.of(move.movers)
-        if move.planes[0].new.type == REAL:
-            self.exchange(move)
-            return
-        if not moves_in_place(move):
-            self.loop(self.moved(move))
+        """Planes that move, or fields that exchange values; those that nothing moves stay as they are."""
+        f, library, graph = self.f, self.library, self.schedule.graph
+        movers, fields = self.of(move.movers), move.planes[0].new.type == REAL
+        groups = None if fields else groups_in_place(move)
+        if groups is None and not fields:
+            self.all_words(moved(move, graph))
             for plane in move.planes:
                 if plane.into is not None:
                     f.do(library.give(self.vars[plane.into]))
             return
         for plane in move.planes:
-            self.define(plane.new, self.of(plane.old) if plane.into is not None else self.kept(plane.old))
-        with f.when(movers[SOME]), f.scope():
-            targets = self.shifted(move.movers, move.offset)
-            in_place(library, f, move, movers, [self.vars[plane.new.name] for plane in move.planes], targets)
-
-    def exchange(self, move: Move) -> None:
-        """Fields that exchange values."""
-        f, library = self.f, self.library
-        for field in move.planes:
-            old = self.of(field.old) if field.into is not None else self.kept(field.old)
-            self.define(field.new, old)
-            held = self.vars[field.new.name]
-            with f.when(self.of(move.movers)[SOME] & held[SOME]):
-                f.set(held, library.own_field(held))
-                f.do(exchanger(library, move.offset)(self.of(move.movers), held))
-
-    def shifted(self, movers: Node, offset: Offset) -> Callee:
-        """A function that makes the plane of targets: movers, it."""
-        value = self.seen(movers, -offset[0], -offset[1])
-        loop = Compute((Out(Var("targets", FLAG), value),), "", "words")
-        return WordLoop(self.library, loop).made()
-
-    def seen(self, node: Node, dy: int, dx: int) -> Node:
-        """A plane at a neighbor."""
-        return self.schedule.graph.node("shift", FLAG, (node,), (dy, dx, True))
-
-    def moved(self, move: Move) -> Compute:
-        """A movement as a loop over words."""
-        graph, (dy, dx) = self.schedule.graph, move.offset
-        outs = []
-        targets = self.seen(move.movers, -dy, -dx)
-        for plane in move.planes:
-            value = graph.node("select", FLAG, (targets, self.seen(plane.old, -dy, -dx), plane.leaves))
-            if move.op == "swap":
-                value = graph.node("select", FLAG, (move.movers, self.seen(plane.old, dy, dx), value))
-            outs.append(Out(plane.new, value))
-        return Compute(tuple(outs), move.place, "words")
+            old = self.of(plane.old) if plane.into is not None else self.kept(plane.old)
+            held = self.define(plane.new, old)
+            if fields:
+                with f.when(movers[SOME] & held[SOME]):
+                    f.set(held, library.own_field(held))
+                    f.do(exchanger(library, move.offset)(movers, held))
+        if groups is not None:
+            with f.when(movers[SOME]), f.scope():
+                entered = WordLoop(library, targets(move, graph)).made()
+                by_kind = {
+                    kind: [self.vars[plane.new.name] for plane in planes] for kind, planes in groups.items()
+                }
+                move_groups(library, f, move, movers, by_kind, entered)

@@ -11,23 +11,19 @@ from powderdsl.ir.ops import Node, ordered
 from powderdsl.schedule.costs import is_coin
 from powderdsl.schedule.types import Compute, loaded
 from powderdsl.schedule.words import asked
-from powderdsl.targets.layout import param_key
+from powderdsl.targets import printing
+from powderdsl.targets.layout import Layout, fixed_key, is_run, param_key
+from powderdsl.targets.printing import drawn_where, limited_draw
 from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, load, op
 from powderdsl.targets.wasm.library import SOME, WORD, ZERO, Library, choose, some
 
-_DRAWS = ("chance", "below_param", "below_planes")
 
-
-def plane_name(node: Node, library: Library) -> tuple[str, int] | None:
+def plane_name(node: Node, layout: Layout) -> tuple[str, int] | None:
     """The table, and the number in it, of a plane that a leaf other than a variable stands for."""
-    layout = library.memory.layout
-    match node.op:
-        case "chance" if is_coin(node):
-            return "coins", layout.streams[node.attr[0]]
-        case "coordinate" if node.attr[0] != "step":
-            return "fixed", layout.fixed[0 if node.attr[0] == "row" else 1, node.attr[1], node.attr[2]]
-        case "inside":
-            return "fixed", layout.fixed[2, node.attr[0], node.attr[1]]
+    if is_coin(node):
+        return "coins", layout.streams[node.attr[0]]
+    if node.op == "inside" or (node.op == "coordinate" and node.attr[0] != "step"):
+        return "fixed", layout.fixed[fixed_key(node)]
     return None
 
 
@@ -38,33 +34,29 @@ class WordLoop:
     """
 
     def __init__(self, library: Library, loop: Compute):
-        self.library, self.loop = library, loop
+        self.library, self.loop, self.memory = library, loop, library.memory
         roots = [out.value for out in loop.outs]
         self.nodes = ordered(roots)
         self.updates = loop.region is not None
         olds = {out.into for out in loop.outs if self.updates and out.into is not None}
-        names = [name for name in dict.fromkeys(loaded(roots)) if name not in olds]
-        made = [name for node in self.nodes if (name := plane_name(node, library)) is not None]
-        self.reads: list[str | tuple[str, int]] = [*names, *dict.fromkeys(made)]
-        masks = self.mask_names = [str(node.attr) for node in asked(loop)] if self.updates else []
-        self.reads += [name for name in masks if name not in self.reads]
-        self.haloed = list(
-            dict.fromkeys(str(n.args[0].attr) for n in self.nodes if n.op == "shift" and n.attr[0])
-        )
+        made = [plane_name(node, self.memory.layout) for node in self.nodes]
+        self.mask_names = [str(node.attr) for node in asked(loop)] if self.updates else []
+        self.reads: list[str | tuple[str, int]] = [name for name in loaded(roots) if name not in olds]
+        self.reads = list(dict.fromkeys([*self.reads, *filter(None, made), *self.mask_names]))
+        shifts = (node for node in self.nodes if node.op == "shift" and node.attr[0])
+        self.haloed = list(dict.fromkeys(str(node.args[0].attr) for node in shifts))
         """The planes of which other rows are read."""
-        count = len(self.reads) + len(loop.outs)
-        self.f = Function(["i32"] * count)
+        self.f = Function(["i32"] * (len(self.reads) + len(loop.outs)))
         self.planes = dict(zip(self.reads, self.f.params, strict=False))
         self.outs = self.f.params[len(self.reads) :]
         for out, place in zip(loop.outs, self.outs, strict=True):
             if out.into in olds:  # what is overwritten holds the old value
                 self.planes[str(out.into)] = place
-        self.masks = [self.planes[name] for name in masks]
+        self.masks = [self.planes[name] for name in self.mask_names]
 
     def made(self) -> Callee:
         """The function."""
-        f, library = self.f, self.library
-        memory = library.memory
+        f, library, memory = self.f, self.library, self.memory
         stop = f.let(library.cells)
         kept = [f.let(const("v128", 0)) for _ in self.outs]
         self.y = self.row = self.x = None
@@ -90,7 +82,7 @@ class WordLoop:
         return library.module.add(f, f"words_{self.loop.place.rpartition('/')[2]}")
 
     def body(self, kept: Sequence[Local]) -> None:
-        f, flags = self.f, self.library.memory.flags
+        f, flags = self.f, self.memory.flags
         values = WordValues(self)
         with f.scope(), f.block() as skip:
             if self.updates:
@@ -106,38 +98,18 @@ class WordLoop:
                 f.set((place + self.at)[flags], value)
 
 
-class WordValues:
+class WordValues(printing.WordValues[Value]):
     """Flags of a word. Values that are used once are not named."""
 
     def __init__(self, loop: WordLoop):
-        self.loop, self.f, self.library = loop, loop.f, loop.library
-        self.memory = loop.library.memory
-        self.known: dict[int, Value] = {}
+        super().__init__()
+        self.loop, self.f, self.library, self.memory = loop, loop.f, loop.library, loop.memory
         self.uses = Counter(id(arg) for node in loop.nodes for arg in node.args)
         self.uses.update(id(out.value) for out in loop.loop.outs)
 
-    def of(self, root: Node) -> Value:
-        stack = [(root, False)]
-        while stack:
-            node, ready = stack.pop()
-            if id(node) in self.known:
-                continue
-            if not ready:
-                stack.append((node, True))
-                below = node.args[:1] if node.op == "when" else () if node.op == "shift" else node.args
-                stack.extend((arg, False) for arg in reversed(below))
-                continue
-            value = self.node(node)
-            if self.uses[id(node)] > 1 and not isinstance(value, Local) and node.op != "const":
-                value = self.f.let(value)
-            self.known[id(node)] = value
-        return self.known[id(root)]
-
-    def named(self, node: Node) -> Local:
-        value = self.of(node)
-        if not isinstance(value, Local):
-            value = self.known[id(node)] = self.f.let(value)
-        return value
+    def named(self, node: Node, value: Value) -> Value:
+        again = self.uses[id(node)] > 1 and not isinstance(value, Local) and node.op != "const"
+        return self.f.let(value) if again else value
 
     def clean(self, node: Node) -> Value:
         """The value with zeros beyond the grid's width."""
@@ -150,55 +122,48 @@ class WordValues:
         return (self.library.everything + self.loop.at)[self.memory.flags]
 
     def node(self, node: Node) -> Value:
-        args = node.args
-        if node.op == "and":
-            for value, draw in (args, args[::-1]):
-                if draw.op in _DRAWS and draw.args[-1:] == (value,):
-                    return self.known[id(draw)]  # it holds only where it is drawn
-            for value, other in (args, args[::-1]):
-                if other.op == "not" and self.uses[id(other)] == 1:
-                    return op("v128.andnot", self.known[id(value)], self.known[id(other.args[0])])
-        known = [self.known[id(arg)] for arg in args] if node.op not in ("shift", "when") else []
+        if (draw := limited_draw(node)) is not None:
+            return self.known[id(draw)]
+        args = self.args(node)
         match node.op:
-            case "load":
-                return (self.loop.planes[str(node.attr)] + self.loop.at)[self.memory.flags]
+            case "load" | "inside":
+                return self.plane(node)
+            case "coordinate" if node.attr[0] == "step":
+                number = self.memory.layout.step_planes[node.attr[1:]]
+                return load("v128.load", ZERO, self.memory.at("steps", number))
+            case "coordinate":
+                return self.plane(node)
             case "and" | "or" | "xor":
-                return op(f"v128.{node.op}", *known)
+                for value, other in (node.args, node.args[::-1]) if node.op == "and" else ():
+                    if other.op == "not" and self.uses[id(other)] == 1:
+                        return op("v128.andnot", self.known[id(value)], self.known[id(other.args[0])])
+                return op(f"v128.{node.op}", *args)
             case "not":
-                return ~known[0]
+                return ~args[0]
             case "select":
-                return choose(*known)
+                return choose(*args)
             case "const":
                 return const("v128", -1 if node.attr else 0)
             case "shift":
                 return self.shift(node)
-            case "when":
-                return self.lazy(node)
             case "param":
                 number = self.memory.layout.param_planes[param_key(node)]
                 return load("v128.load", ZERO, self.memory.at("params", number))
-            case "coordinate" if node.attr[0] == "step":
-                number = self.memory.layout.step_planes[node.attr[1], node.attr[2]]
-                return load("v128.load", ZERO, self.memory.at("steps", number))
-            case "coordinate" | "inside":
-                return self.made_plane(node)
             case "chance" | "below_planes" | "below_param":
-                return self.draw(node, known)
+                return self.draw(node, args)
         raise AssertionError(f"no function for {node.op} of flags")
 
-    def made_plane(self, node: Node) -> Value:
-        name = plane_name(node, self.library)
-        assert name is not None
+    def plane(self, node: Node) -> Value:
+        """A word of a plane that is there."""
+        name = plane_name(node, self.memory.layout) or str(node.attr)
         return (self.loop.planes[name] + self.loop.at)[self.memory.flags]
 
     def lazy(self, node: Node) -> Value:
         """A conjunction whose second part is computed only where the first holds somewhere in the word."""
-        found = self.f.let(const("v128", 0))
-        with self.f.when(some(self.of(node.args[0]))):
-            known = dict(self.known)
-            self.f.set(found, self.of(node.args[1]))
-            self.known = known
-        return found
+        value = self.f.let(const("v128", 0))
+        with self.f.when(some(self.of(node.args[0]))), self.inner():
+            self.f.set(value, self.of(node.args[1]))
+        return value
 
     def shift(self, node: Node) -> Value:
         dy, dx, wraps = node.attr
@@ -221,28 +186,27 @@ class WordValues:
             return value & self.valid()
         return value
 
-    def draw(self, node: Node, known: Sequence[Value]) -> Value:
-        layout, memory = self.memory.layout, self.memory
-        stream, bits, *rest = node.attr
-        number = layout.streams[stream]
-        keys = const("i32", memory.at("keys", number))
-        given = node.args[-1:] if node.op != "below_planes" else node.args[bits + 1 :]
-        wanted = self.clean(given[0]) if given else self.valid() if not memory.whole else const("v128", -1)
-        if plane_name(node, self.library) is not None:
-            return op("v128.andnot", wanted, self.made_plane(node))
+    def draw(self, node: Node, args: Sequence[Value]) -> Value:
+        """A draw below a limit, which is a number, or is given plane by plane from the highest."""
+        layout, memory, bits = self.memory.layout, self.memory, node.attr[1]
+        keys = const("i32", memory.at("keys", layout.streams[node.attr[0]]))
+        where = drawn_where(node)
+        if where is not None:
+            wanted = self.clean(where)
+        else:
+            wanted = const("v128", -1) if memory.whole else self.valid()
+        if is_coin(node):
+            return op("v128.andnot", wanted, self.plane(node))
         at = self.library.word_number(self.loop.at, self.loop.y)
         if node.op == "chance":
-            return self.library.draw_below(at, wanted, keys, const("i64", rest[0] << (64 - bits)))
-        if node.op == "below_param":
-            name, view = rest
-            numbers = [layout.param_planes[name, view, i] for i in range(bits, -1, -1)]
-            if numbers == list(range(numbers[0], numbers[0] + bits + 1)):
-                return self.below(at, wanted, keys, memory.at("params", numbers[0]), bits)
-            known = [load("v128.load", ZERO, memory.at("params", n)) for n in numbers]
-        for i in range(bits + 1):
-            self.f.set(load("v128.load", ZERO, memory.at("limits", i)), known[i])
-        return self.f.let(self.below(at, wanted, keys, memory.at("limits"), bits))
-
-    def below(self, at: Value, wanted: Value, keys: Value, limit: int, bits: int) -> Value:
+            return self.library.draw_below(at, wanted, keys, const("i64", node.attr[2] << (64 - bits)))
+        planes = layout.limit(node) if node.op == "below_param" else []
+        together = bool(planes) and is_run(planes)
+        limit = memory.at("params", planes[0]) if together else memory.at("limits")
+        if not together:
+            of_params = [load("v128.load", ZERO, memory.at("params", plane)) for plane in planes]
+            for i, plane in enumerate(of_params or args[: bits + 1]):
+                self.f.set(load("v128.load", ZERO, memory.at("limits", i)), plane)
         end = const("i32", limit + 16 * (bits + 1))
-        return self.library.draw_below_planes(at, wanted, keys, const("i32", limit), end)
+        drawn = self.library.draw_below_planes(at, wanted, keys, const("i32", limit), end)
+        return drawn if together else self.f.let(drawn)

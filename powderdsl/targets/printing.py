@@ -1,0 +1,206 @@
+"""What the printers of C++, CUDA and WebAssembly share: a method for each kind of statement, and values that are computed once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any, Generic, TypeVar
+
+from powderdsl.ir.ops import Node, ordered
+from powderdsl.schedule.costs import DRAWS
+from powderdsl.schedule.types import Compute, Out, Statement
+from powderdsl.schedule.words import is_whole
+
+Named = TypeVar("Named")
+"""What stands for a value in the text of a target: its name, or its code."""
+
+
+class Printer:
+    """Prints each statement by the method that is named after its class."""
+
+    def printed(self, statement: Statement) -> Any:
+        """What a statement's method makes of it."""
+        return getattr(self, type(statement).__name__.lower())(statement)
+
+    def compute(self, loop: Compute) -> Any:
+        """A loop over words: an operation on whole planes, planes that are computed anew, or an update where a mask holds."""
+        if len(loop.outs) == 1 and loop.over == "words" and is_whole(loop.outs[0].value):
+            return self.whole(loop.outs[0])
+        return self.words(loop) if loop.region is None else self.update(loop)
+
+    def whole(self, out: Out) -> Any:
+        raise NotImplementedError
+
+    def words(self, loop: Compute) -> Any:
+        raise NotImplementedError
+
+    def update(self, loop: Compute) -> Any:
+        raise NotImplementedError
+
+
+class Values(Generic[Named]):
+    """Statements of a block, and the names of what they compute: of values by the id of their node, of anything else by a key."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self.known: dict[object, Named] = {}
+        self.count = 0
+
+    def needed(self, node: Node) -> Sequence[Node]:
+        """The arguments that get names before a node does."""
+        raise NotImplementedError
+
+    def made(self, node: Node) -> None:
+        """Name a node, by adding it to `known`."""
+        raise NotImplementedError
+
+    def of(self, root: Node) -> Named:
+        """The name of a value."""
+        stack = [(root, False)]
+        while stack:
+            node, ready = stack.pop()
+            if id(node) in self.known:
+                continue
+            needed = () if ready else self.needed(node)
+            if needed:
+                stack.append((node, True))
+                stack.extend((arg, False) for arg in reversed(needed))
+            else:
+                self.made(node)
+        return self.known[id(root)]
+
+    def fresh(self, prefix: str) -> str:
+        """A name that the block does not have yet."""
+        self.count += 1
+        return f"{prefix}{self.count}"
+
+    @contextmanager
+    def inner(self, more: Mapping[object, Named] | None = None) -> Iterator[list[str]]:
+        """A block in this one: its lines, and names that are valid only there, such as `more`."""
+        outer, known = self.lines, self.known
+        self.lines, self.known = [], {**known, **(more or {})}
+        yield self.lines
+        self.lines, self.known = outer, known
+
+
+class WordValues(Values[Named]):
+    """Flags, a word at a time. `leaf` is the operation whose arguments are read directly."""
+
+    leaf = "shift"
+
+    def node(self, node: Node) -> Named:
+        """The expression of a node whose arguments have names."""
+        raise NotImplementedError
+
+    def lazy(self, node: Node) -> Named:
+        """The name of a `when`; its second argument is computed only where the first holds."""
+        raise NotImplementedError
+
+    def named(self, node: Node, value: Named) -> Named:
+        """A node's expression, or a name for it."""
+        raise NotImplementedError
+
+    def needed(self, node: Node) -> Sequence[Node]:
+        return node.args[:1] if node.op == "when" else () if node.op == self.leaf else node.args
+
+    def made(self, node: Node) -> None:
+        value = self.lazy(node) if node.op == "when" else self.node(node)
+        self.known[id(node)] = self.named(node, value)
+
+    def args(self, node: Node) -> list[Named]:
+        """The names of the arguments of a node that needs them."""
+        return [self.known[id(arg)] for arg in self.needed(node)]
+
+
+class WordText(WordValues[str]):
+    """Flags as text. `type` is the type of a word."""
+
+    type: str
+
+    def named(self, node: Node, value: str) -> str:
+        return value if value.isidentifier() else self.name(value)
+
+    def name(self, text: str) -> str:
+        name = self.fresh("t")
+        self.lines.append(f"const {self.type} {name} = {text};")
+        return name
+
+
+def limited_draw(node: Node) -> Node | None:
+    """The draw that a conjunction is equal to, since it is only made where the other flag holds."""
+    for value, draw in (node.args, node.args[::-1]) if node.op == "and" else ():
+        if draw.op in DRAWS and draw.args[-1:] == (value,):
+            return draw
+    return None
+
+
+def drawn_where(draw: Node) -> Node | None:
+    """The flag where the result of a draw matters."""
+    args = draw.args[draw.attr[1] + 1 :] if draw.op == "below_planes" else draw.args
+    return args[0] if args else None
+
+
+class CellValues(Values[Named]):
+    """Floats, and flags that compare them. `choices` are all choices that the block computes."""
+
+    choices: list[Node]
+
+    def node(self, node: Node) -> Named:
+        """The name or expression of a node whose arguments have names; a shift reads its argument directly."""
+        raise NotImplementedError
+
+    def led(self, node: Node) -> Named:
+        """The name of a comparison that is computed only where its leader holds."""
+        raise NotImplementedError
+
+    def variable(self, value: Named) -> Named:
+        """A new variable, which choices change."""
+        raise NotImplementedError
+
+    def chosen(self, mask: Node, variables: Sequence[Named], values: Sequence[Node]) -> None:
+        """Set variables to other values where a mask holds; these are computed only if it holds in some cell."""
+        raise NotImplementedError
+
+    def needed(self, node: Node) -> Sequence[Node]:
+        return () if node.op in ("select", "led", "shift") else node.args
+
+    def made(self, node: Node) -> None:
+        if node.op == "select":
+            self.choice(node)
+        else:
+            self.known[id(node)] = self.led(node) if node.op == "led" else self.node(node)
+
+    def choice(self, node: Node) -> None:
+        """Name a chain of choices, and others on the same masks: the components of a vector share their tests."""
+        chains = self.alike(node)
+        variables = [self.variable(self.of(chain[-1].args[2])) for chain in chains]
+        for choices in reversed(list(zip(*chains, strict=True))):
+            known = self.known
+            olds = {id(one.args[2]): name for one, name in zip(choices, variables, strict=True)}
+            self.known = known | olds  # valid only here, since the variables change
+            self.chosen(choices[0].args[0], variables, [choice.args[1] for choice in choices])
+            self.known = known
+        self.known |= {id(chain[0]): name for chain, name in zip(chains, variables, strict=True)}
+
+    def chain(self, node: Node) -> list[Node]:
+        """A choice and those below it in its third argument, the outermost first."""
+        chain: list[Node] = []
+        while node.op == "select" and id(node) not in self.known:
+            chain.append(node)
+            node = node.args[2]
+        return chain
+
+    def alike(self, node: Node) -> list[list[Node]]:
+        """The chain of a choice, and others on the same masks. None of them depends on another."""
+        chains = [self.chain(node)]
+        masks = [choice.args[0] for choice in chains[0]]
+        for other in self.choices:
+            chain = [] if other is node or id(other) in self.known else self.chain(other)
+            same = len(chain) > 1 and [choice.args[0] for choice in chain] == masks
+            if same and not any(_depends(other, one[0]) or _depends(one[0], other) for one in chains):
+                chains.append(chain)
+        return chains
+
+
+def _depends(value: Node, on: Node) -> bool:
+    return any(node is on for node in ordered([value]))
