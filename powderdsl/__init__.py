@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "load": "powderdsl.compiler",
-    "compile": "powderdsl.simulation.compiling",
+    "compile": "powderdsl.simulation.simulator",
     "CompileError": "powderdsl.diagnostics",
     "ledger": "powderdsl.analysis.ledger",
     "Simulator": "powderdsl.simulation.simulator",

@@ -1,13 +1,12 @@
 """The sequence: text → located tree → checked model → IR → passes → program. Each stage takes one value and gives one.
 
-`load` stops at the checked model, `lower` at optimized IR; neither needs torch. `simulation.simulator.compile` continues from there.
+`load` stops at the checked model, `lower` at optimized IR; neither needs torch. `simulation.simulator` continues from there.
 """
 
 from __future__ import annotations
 
 import os
 import re
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -31,7 +30,6 @@ from powderdsl.syntax.sources import path_beside, read_source
 from powderdsl.syntax.yaml_tree import parse_yaml
 from powderdsl.system.memo import Memo, collection_paused
 from powderdsl.system.reading import inside, is_path
-from powderdsl.system.writing import failure
 
 if TYPE_CHECKING:
     from powderdsl.diagnostics import Diagnostic
@@ -47,34 +45,6 @@ BACKENDS = {
     "reference": "the slow oracle in NumPy that defines what rules mean",
 }
 """All of them give the same worlds, bit for bit."""
-
-
-def checked_request(ruleset: Ruleset | str, backend: str) -> Ruleset:
-    """A loaded ruleset. Raises TypeError, CompileError (PD701 for unknown backends)."""
-    model = load(ruleset) if isinstance(ruleset, str) else ruleset
-    if not isinstance(model, Ruleset):
-        raise TypeError(f"ruleset must be a Ruleset or a name, found {type(model).__name__}")
-    if backend not in BACKENDS:
-        raise failure("PD701", f"no backend `{backend}`", helps=("backends: " + ", ".join(BACKENDS),))
-    return model
-
-
-def starting_backend(device: str) -> str:
-    """The backend that runs rules on a torch device at once, without a compiler of C++."""
-    on_cpu = str(device).partition(":")[0] == "cpu"
-    return "wasm" if on_cpu and has_webassembly() else "torch"
-
-
-@cache
-def has_webassembly() -> bool:
-    """Whether there is a host for modules: Pyodide's, or wasmtime, which some machines can install but not import."""
-    if sys.platform == "emscripten":
-        return True
-    try:
-        import wasmtime  # noqa: F401  only whether it can be imported
-    except (ImportError, OSError, RuntimeError):
-        return False
-    return True
 
 
 MAX_BASES = 8

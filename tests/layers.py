@@ -11,13 +11,10 @@ _BACK = (*_COMPILER, "model.reference", *_TARGETS)
 _STEPS = (
     "simulation.draw",
     "simulation.state_checks",
-    "simulation.any_arrays",
-    "simulation.reference_program",
-    "simulation.array_worlds",
+    "simulation.native",
     "simulation.programs",
     "simulation.observe",
     "simulation.simulator",
-    "simulation.compiling",
 )
 _SIMULATION = (*_STEPS, "simulation.provenance", "simulation.tracing", "simulation.media")
 _WORLDS = ("worlds", "worlds.store")
@@ -67,35 +64,26 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "simulation": (),
     "simulation.draw": _FRONT,
     "simulation.state_checks": (*_FRONT, "targets"),
-    "simulation.any_arrays": (*_FRONT, "targets", "simulation.state_checks"),
-    "simulation.reference_program": (*_FRONT, "model.reference", "targets"),
-    "simulation.programs": (*_BACK, "simulation.reference_program"),
-    "simulation.observe": (*_BACK, "simulation.draw", "simulation.any_arrays", "simulation.state_checks"),
-    "simulation.array_worlds": (
+    "simulation.native": _BACK,
+    "simulation.programs": (*_BACK, "simulation.native"),
+    "simulation.observe": (*_BACK, "simulation.draw"),
+    "simulation.simulator": (
         *_BACK,
-        "simulation.any_arrays",
-        "simulation.reference_program",
         "simulation.state_checks",
+        "simulation.programs",
+        "simulation.observe",
     ),
-    "simulation.simulator": (*_BACK, "simulation.programs", "simulation.observe", "simulation.any_arrays"),
     "simulation.standalone": _BACK,
-    "simulation.compiling": (
-        *_FRONT,
-        "compiler",
-        "simulation.any_arrays",
-        "simulation.array_worlds",
-        "simulation.simulator",
-    ),
-    "simulation.provenance": (*_FRONT, "targets", "simulation.any_arrays"),
+    "simulation.provenance": (*_FRONT, "targets", "simulation.simulator"),
     "simulation.tracing": (
         *_FRONT,
         "model.reference",
         "simulation.provenance",
-        "simulation.any_arrays",
+        "simulation.simulator",
     ),  # explains by what the oracle does
     "simulation.media": ("arrays", "system", "simulation.draw"),
     "worlds": (*_FRONT, "analysis", "simulation.draw"),
-    "worlds.store": (*_FRONT, "worlds", "simulation.any_arrays"),  # saved worlds are values of the simulator
+    "worlds.store": (*_FRONT, "worlds", "simulation.simulator"),  # saved worlds are values of the simulator
     "testing.generators": _SCREEN,
     "testing": ("system", "testing.generators"),  # the public names
     "testing.pack_tests": (*_SCREEN, "testing.generators"),
@@ -154,9 +142,8 @@ _TORCH = (
     "targets.cpp.program",
     "targets.cuda.program",
     "targets.cpp.counts",
-    "simulation.programs",
+    "simulation.native",
     "simulation.observe",
-    "simulation.simulator",
     "testing.mutation",
     "tasks.tensors",
     "tasks.episodes",
@@ -178,6 +165,7 @@ THIRD_PARTIES: dict[str, Home] = {
             *_TORCH,
             "system.random",
             "targets.job",
+            "simulation.programs",
             "simulation.draw",
             "simulation.media",
             "experiments.bench",
@@ -189,7 +177,7 @@ THIRD_PARTIES: dict[str, Home] = {
     "minari": Home(("datasets.minari",), ()),
     "h5py": Home(("datasets.minari",), ()),
     "stable_baselines3": Home(("envs", "rl"), ("envs", "rl")),
-    "wasmtime": Home(("compiler", "targets.wasm.wasmtime_host"), ("targets.wasm.wasmtime_host",)),
+    "wasmtime": Home(("targets.wasm.wasmtime_host",), ("targets.wasm.wasmtime_host",)),
     "js": Home(("targets.wasm.browser_host",), ()),
     "pyodide": Home(("targets.wasm.browser_host",), ()),
     "click": Home(("cli",), ("cli",)),

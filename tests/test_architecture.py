@@ -325,7 +325,7 @@ def test_each_rule_can_fail(
     ("rule", "module", "source"),
     [
         (layer_faults, "ir.lower", "from powderdsl.model import types"),
-        (layer_faults, "worlds.store", "from powderdsl.simulation.any_arrays import AnyWorld"),
+        (layer_faults, "worlds.store", "from powderdsl.simulation.simulator import World"),
         (layer_faults, "__init__", "def f():\n    import powderdsl.simulation.simulator"),
         (layer_faults, "cli.run", "from powderdsl import worlds, compiler"),
         (layer_faults, "simulation.simulator", "from powderdsl.simulation.programs import make_program"),

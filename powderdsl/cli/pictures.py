@@ -19,14 +19,14 @@ from powderdsl.simulation.draw import contact_sheet, palette, ramps, rgb, scale,
 from powderdsl.worlds.ascii import write_ascii
 
 if TYPE_CHECKING:
-    from powderdsl.simulation.any_arrays import AnyWorld
+    from powderdsl.simulation.simulator import World
 
 USUAL_SIDE = 400
 MAX_SIDE = 16_384
 """Pixels a side. More would take gigabytes before the first one is written."""
 
 
-def pictures(world: AnyWorld, *, most: int, factor: int | None) -> NDArray[np.uint8]:
+def pictures(world: World, *, most: int, factor: int | None) -> NDArray[np.uint8]:
     """A batch as one picture, uint8 [H', W', 3]: up to `most` worlds side by side, cells of `factor` pixels.
 
     Colors follow fields, and vectors tint cells, as the rules declare. Without a factor a side has about USUAL_SIDE pixels. Raises
@@ -46,12 +46,12 @@ def pictures(world: AnyWorld, *, most: int, factor: int | None) -> NDArray[np.ui
     return images[0] if shown == 1 else contact_sheet(images, columns=columns)
 
 
-def first_world(world: AnyWorld) -> dict[str, Any]:
+def first_world(world: World) -> dict[str, Any]:
     """The first world of a batch, as `LiveView.show` takes it: `ids` [H, W] and `fields`."""
     return {"ids": world.ids[0], "fields": {name: values[0] for name, values in fields_of(world).items()}}
 
 
-def fields_of(world: AnyWorld) -> dict[str, Any]:
+def fields_of(world: World) -> dict[str, Any]:
     """The fields that pictures show, [B, H, W] or of vectors [B, 2, H, W], by name."""
     return {name: world[name] for name in shown_fields(world.sim.ruleset)}
 

@@ -16,7 +16,7 @@ from powderdsl.worlds.scene import Start, load_start
 from powderdsl.worlds.strewn import check_cells, strew
 
 if TYPE_CHECKING:
-    from powderdsl.simulation.any_arrays import AnyWorld
+    from powderdsl.simulation.simulator import World
 
 DEFAULT_SIDE = 64
 
@@ -25,19 +25,19 @@ KINDS = "worlds are .npz, .png, .txt and .yaml files, FILE.yaml#NAME, or a shipp
 
 def start(
     ruleset: Ruleset, name: str | None, size: Size | None, batch: int | None, seed: int | None, **how: Any
-) -> AnyWorld:
+) -> World:
     """The worlds that a run starts from; each has random numbers of its own.
 
     Args:
-        how: passed on to `compiling.compile_any`.
+        how: passed on to `simulator.compile`.
 
     Raises CompileError for files and names that cannot be used, BadInput for options that do not go together.
     """
     # A drawn world comes first: compiling may import torch, and whoever mistyped a name should not wait for that.
     drawn = start_drawn(ruleset, name, size, batch, seed)
-    from powderdsl.simulation.compiling import compile_any
+    from powderdsl.simulation.simulator import compile
 
-    sim = compile_any(ruleset, **how)
+    sim = compile(ruleset, tensors=False, **how)
     with user_values():
         if drawn is None:
             from powderdsl.worlds.store import load_world

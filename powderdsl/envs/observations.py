@@ -10,6 +10,7 @@ from gymnasium.spaces import Box
 from torch import Tensor
 
 from powderdsl.diagnostics import suggest
+from powderdsl.model.state import property_values
 from powderdsl.simulation.observe import Observer
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.worlds.raster import Size
@@ -66,6 +67,6 @@ def observation_of(kind: str, simulator: Simulator, size: Size) -> Observation:
         # Bytes, 0..255 whatever occurs: what Stable-Baselines3 takes for pictures, and stores as such.
         return Observation(kind, Box(0, 255, shape, np.uint8), channels)
     bounds = [abs(one) for slot in observer.slots.values() for one in (slot.kind.lo, slot.kind.hi)]
-    bounds += [float(observer.table(prop.name).abs().max()) for prop in ruleset.properties]
+    bounds += [max(map(abs, property_values(ruleset, prop.name))) for prop in ruleset.properties]
     limit = max(ruleset.slots, *bounds)
     return Observation(kind, Box(-limit, limit, shape, np.float32), channels)

@@ -19,6 +19,7 @@ from powderdsl.diagnostics import suggest
 from powderdsl.model.types import Ruleset
 from powderdsl.ogbench.levels import GoalTask, Level, read_task
 from powderdsl.simulation.draw import palette
+from powderdsl.simulation.programs import BackendProgram
 from powderdsl.simulation.simulator import Simulator, World, compile
 from powderdsl.system.random import MASK, base_keys, mix, name_number
 from powderdsl.targets.cpp.program import PackedState
@@ -33,7 +34,8 @@ class _WithoutSnap(Simulator):
 
     def __init__(self, ruleset: Ruleset, backend: str, device: str | torch.device, threads: int):
         super().__init__(ruleset, backend, device, threads)
-        self._program = TorchProgram(lower(ruleset), self.device, snap=0.0)
+        program = TorchProgram(lower(ruleset), self.device, snap=0.0)
+        self._program = BackendProgram("torch", program)
 
 
 class LevelProgram:

@@ -17,10 +17,9 @@ from torch import Tensor
 from powderdsl.ir.gates import width as width_of
 from powderdsl.ir.lower import ir_type, slot_names
 from powderdsl.ir.ops import component_of
-from powderdsl.model.state import Slot, property_dtype, property_values, slot_name, slots
+from powderdsl.model.state import Slot, property_dtype, property_values, slots
 from powderdsl.model.types import MatrixChannel, Ruleset
 from powderdsl.simulation.draw import CellTint, Ramp, palette, ramps, tint_cells, tints
-from powderdsl.simulation.state_checks import unknown_slot
 from powderdsl.targets.cpp.program import PackedState, address
 from powderdsl.targets.job import shape_of
 from powderdsl.targets.words import pack, word_count
@@ -55,35 +54,19 @@ class Observer:
         self.ruleset = ruleset
         self.device = torch.empty(0, device=device).device  # with its number
         self.slots: dict[str, Slot] = {slot.name: slot for slot in slots(ruleset)}
-        self._tables: dict[str, Tensor] = {}
         self._tints = tints(ruleset.fields)
 
     @torch.no_grad()
     def read(self, state: State, name: str, out: Any = None) -> Tensor:
-        """A field or property: what `World.__getitem__` returns, or a copy of it in `out`.
-
-        Raises:
-            KeyError: the ruleset has no such name. ValueError, TypeError: the buffer does not fit.
-        """
-        if name not in self.slots:
-            name = slot_name(self.ruleset, name)
-        slot = self.slots.get(name)
-        batch, height, width = shape_of(state)
-        if slot is not None:
-            if out is None:
-                return state[name]
-            shape = (batch, 2, height, width) if slot.planes == 2 else (batch, height, width)
-            return _write_slot(state, name, self._buffer(out, shape, getattr(torch, slot.dtype)))
-        prop = self.ruleset.property(name)
-        if prop is None:
-            raise unknown_slot(self.ruleset, name)
-        out = self._buffer(out, (batch, height, width), getattr(torch, property_dtype(prop)))
-        return out.copy_(self.table(name)[state["element"].int()])
+        """A slot. Raises ValueError, TypeError: the buffer does not fit."""
+        slot, (batch, height, width) = self.slots[name], shape_of(state)
+        shape = (batch, 2, height, width) if slot.planes == 2 else (batch, height, width)
+        return _write_slot(state, name, self.buffer(out, shape, getattr(torch, slot.dtype)))
 
     @torch.no_grad()
     def rgb(self, state: State, out: Any = None) -> Tensor:
         """Pictures uint8 [B, H, W, 3], a pixel a cell, in the elements' colors, which may follow fields; then tints."""
-        out, colors = self._buffer(out, (*shape_of(state), 3), torch.uint8), self._palette
+        out, colors = self.buffer(out, (*shape_of(state), 3), torch.uint8), self._palette
         if isinstance(state, PackedState):
             library, (slot, bits, _) = state.program.library, state.program.planes_of("element")
             library.pd_rgb(state.handle, slot, bits, address(colors), address(out), out.stride(0))
@@ -101,7 +84,7 @@ class Observer:
         """Channels float32 [B, C, H, W], as the ruleset's `matrix:` names them."""
         batch, height, width = shape_of(state)
         channels, tables = self._channels
-        out = self._buffer(out, (batch, len(channels), height, width), torch.float32)
+        out = self.buffer(out, (batch, len(channels), height, width), torch.float32)
         if isinstance(state, PackedState):
             wanted = torch.tensor([_native_channel(one, state) for one in channels], dtype=torch.int32)
             state.program.library.pd_channels(
@@ -132,7 +115,7 @@ class Observer:
     def compact(self, state: State, out: Any = None) -> Tensor:
         """Everything that lasts from step to step, as bytes: uint8 [B, C, H, W], C those of `compact_names`."""
         batch, height, width = shape_of(state)
-        out = self._buffer(out, (batch, len(self._coded), height, width), torch.uint8)
+        out = self.buffer(out, (batch, len(self._coded), height, width), torch.uint8)
         for at, (name, slot) in enumerate(self._coded):
             _write_codes(state, slot, name, out[:, at])
         return out
@@ -141,7 +124,7 @@ class Observer:
     def planes(self, state: State, out: Any = None) -> Tensor:
         """Packed planes int64 [B, P, H, ⌈W/64⌉], in the order of `plane_names`."""
         batch, height, width = shape_of(state)
-        out = self._buffer(out, (batch, len(self._bits), height, word_count(width)), torch.int64)
+        out = self.buffer(out, (batch, len(self._bits), height, word_count(width)), torch.int64)
         if isinstance(state, PackedState):
             program = state.program
             slots = [program.planes_of(name)[0] + bit for name, bit in self._bits]
@@ -196,13 +179,6 @@ class Observer:
             name if self.slots[name].kind.name == "flag" else f"{name}:{bit}" for name, bit in self._bits
         )
 
-    def table(self, name: str) -> Tensor:
-        """A property's values by id, parameters at their defaults: float64 [256]."""
-        if name not in self._tables:
-            values = property_values(self.ruleset, name)
-            self._tables[name] = torch.tensor(values, dtype=torch.float64, device=self.device)
-        return self._tables[name]
-
     @cached_property
     def _coded(self) -> tuple[tuple[str, Slot], ...]:
         """The channels of `compact`: names, and the slots that they are codes of, which a step does not restart."""
@@ -256,10 +232,11 @@ class Observer:
         prop = self.ruleset.property(name)
         if prop is None:
             return Channel("zero")
-        tables.append(self.table(name).to(getattr(torch, property_dtype(prop))).float())
+        values = torch.tensor(property_values(self.ruleset, name), dtype=torch.float64)
+        tables.append(values.to(getattr(torch, property_dtype(prop))).float().to(self.device))
         return Channel("table", "element", len(tables) - 1)
 
-    def _buffer(self, out: Any, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+    def buffer(self, out: Any, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
         """The given buffer, if it fits, or a new one."""
         if out is None:
             return torch.empty(shape, dtype=dtype, device=self.device)

@@ -1,72 +1,70 @@
-"""Backends by name: makes the program of a checked model, a `Runnable`; native code by the width of grids.
-
-Each width has a library of its own, or shares one with others (`known_width`). A library is made when the first grid of
-its width is stepped, so that nobody waits for code that is not needed. If the same model was compiled before, its code
-comes from the cache and nothing is lowered. The cache's key depends on the model, on every source file that turns models
-into C++, on the compiler, the processor and the width. Values of parameters are inputs of a step, so they take no part.
-
-The backend `auto` starts on WebAssembly, or on torch where wasmtime has no wheel. Once the work done and asked for is
-worth it, a thread compiles. The change comes between two steps, with the same worlds: long calls are cut into slices for
-it. Short scripts never start a compiler.
-"""
+"""Backends by name: which arrays a simulator has, and the program that runs its rules."""
 
 from __future__ import annotations
 
-import hashlib
-import threading
-import time
-import warnings
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext, suppress
-from contextvars import copy_context
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from functools import cache
-from math import prod
-from pathlib import Path
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
 
-import torch
-from torch import Tensor
-
-from powderdsl.compiler import has_webassembly, lower, starting_backend
+from powderdsl.compiler import BACKENDS, lower, parts
 from powderdsl.diagnostics import CompileError
 from powderdsl.ir.ops import Program
-from powderdsl.ir.segments import segments
-from powderdsl.model.fingerprint import fingerprint
+from powderdsl.model import reference
 from powderdsl.model.types import Ruleset
-from powderdsl.simulation.reference_program import ReferenceProgram
+from powderdsl.system.memo import Memo, collection_paused
 from powderdsl.system.writing import failure
-from powderdsl.targets.cache import turn
-from powderdsl.targets.cpp.build import building, cache_key, current
-from powderdsl.targets.cpp.code import compile_program, recall, remember
-from powderdsl.targets.cpp.compilers import (
-    INSTALL,
-    MISSING,
-    NoCompiler,
-    NoCompilerWarning,
-    find_compiler,
-    flags_for,
-)
-from powderdsl.targets.cpp.program import NativeProgram
-from powderdsl.targets.cpp.source import known_width
-from powderdsl.targets.job import Job, Runnable, shape_of
-from powderdsl.targets.tensor_kind import Tensors
-from powderdsl.targets.torch.mixed import mixed_program, packed_program
+from powderdsl.targets.array_kind import Array, ArrayKind
+from powderdsl.targets.job import Job, Runnable, unavailable
+from powderdsl.targets.mixed import mixed_program
+from powderdsl.targets.wasm.host import this_host
+from powderdsl.targets.wasm.program import WasmProgram
 
-Lowered = Callable[[], Program]
-"""Returns a ruleset in IR; the first call does the work."""
+if TYPE_CHECKING:
+    import torch
 
-SOURCES = ("compiler.py", "simulation/programs.py", "model", "analysis", "ir", "schedule", "targets")
+WITHOUT_TORCH = ("wasm", "reference")
+"""Backends that need no torch; where it is missing, `auto` is the first one that runs."""
 
-WORTH = 2.0
-"""Native code is compiled once work on the first backend, done or expected in the current call, exceeds this many seconds.
-Compiling takes longer, but runs in another thread, and its result is cached."""
 
-SLICE = 0.25
-"""Seconds on the first backend between two checks for native code."""
+@cache
+def has_torch() -> bool:
+    """Whether torch can be imported. It is not imported."""
+    try:
+        return find_spec("torch") is not None
+    except ImportError:
+        return False
+
+
+def array_kind(backend: str, device: Any, tensors: bool) -> ArrayKind:
+    """The arrays of a simulator: torch tensors, or `powderdsl.arrays` where torch is missing or not wanted.
+
+    Args:
+        tensors: use torch wherever it is installed, not only where the backend or the device needs it.
+
+    Raises:
+        CompileError: PD701 if the backend or the device is not known, or needs torch, which is missing.
+    """
+    if backend not in BACKENDS:
+        raise failure("PD701", f"no backend `{backend}`", helps=("backends: " + ", ".join(BACKENDS),))
+    needed = backend not in WITHOUT_TORCH or str(device) != "cpu"
+    if has_torch() and (tensors or needed):
+        from powderdsl.targets.tensor_kind import Tensors
+
+        return Tensors(find_device(device))
+    if backend not in (*WITHOUT_TORCH, "auto"):
+        raise unavailable(backend, "torch is not installed", _CPU)
+    if str(device) != "cpu":
+        raise failure("PD701", f"no device `{device}`", notes=("torch is not installed",), helps=(_CPU,))
+    return ArrayKind()
 
 
 def find_device(name: str | torch.device) -> torch.device:
     """The torch device of a name. Raises CompileError (PD701) if it is not available."""
+    import torch
+
     try:
         device = torch.device(name)
         if device.type == "meta":
@@ -78,364 +76,174 @@ def find_device(name: str | torch.device) -> torch.device:
     return device
 
 
-class CompiledProgram:
-    """Compiled code for whole steps; torch tensors where draws are given or passes chosen."""
-
-    def __init__(self, native: Runnable, rest: Callable[[], Runnable], running: str = "native"):
-        self._native, self._rest, self.running = native, rest, running
-
-    def run(self, job: Job) -> Mapping[str, Tensor]:
-        """The state `job.steps` later."""
-        runnable = self._rest() if job.draws or job.passes is not None else self._native
-        return runnable.run(job)
+_CPU = "install torch, or run on the device `cpu` and the backend `wasm` or `reference`"
+_WASMTIME = "`pip install wasmtime`, or run on the backend `torch` or `native`"
 
 
-def make_program(ruleset: Ruleset, backend: str, device: torch.device, threads: int = 1) -> Runnable:
-    """The program of a ruleset on a backend, for an available device.
+def starting_backend(device: str) -> str:
+    """The backend that runs rules on a torch device at once, without a compiler of C++."""
+    on_cpu = device.partition(":")[0] == "cpu"
+    return "torch" if not on_cpu or _wasm_problem() else "wasm"
+
+
+def make_program(
+    ruleset: Ruleset, backend: str, kind: ArrayKind, threads: int = 1, memo: Memo | None = None
+) -> BackendProgram:
+    """The program of a ruleset on a backend.
+
+    | arrays  | backend   | whole steps            | chosen passes | given draws |
+    |---------|-----------|------------------------|---------------|-------------|
+    | any     | reference | oracle                 | oracle        | oracle      |
+    | plain   | wasm      | wasm                   | wasm          | oracle      |
+    | tensors | wasm      | wasm                   | torch         | torch       |
+    | tensors | native    | native                 | torch         | torch       |
+    | tensors | cuda      | cuda                   | torch         | torch       |
+    | tensors | torch     | torch                  | torch         | torch       |
+
+    `auto` is wasm and later native code on the CPU, cuda, or else torch, on other devices, and with plain arrays wasm,
+    or else the oracle.
 
     Raises:
         CompileError: PD701 if the backend is not available.
     """
+    device, plain = kind.device, kind.xp.__name__ != "torch"
+    problem = "" if backend in ("reference", "torch", "native", "cuda") else _wasm_problem()
+    if backend == "reference" or (plain and backend == "auto" and problem):
+        return BackendProgram("reference", ReferenceProgram(ruleset, kind))
+    if backend in ("wasm", "native") and not kind.on_cpu:
+        runs = {"wasm": "wasmtime", "native": "native code"}[backend]
+        raise unavailable(
+            backend,
+            f"{runs} runs on the CPU",
+            f"run on the device `cpu`, or on the backend `torch` or `auto` on `{device}`",
+        )
+    if backend == "wasm" and problem:
+        raise unavailable("wasm", problem, _CPU if plain else _WASMTIME)
+    if plain:
+        return BackendProgram("wasm", _Modules(ruleset, lower(ruleset, memo), kind, memo or Memo()))
+    from powderdsl.targets.torch.mixed import packed_program
     from powderdsl.targets.torch.program import TorchProgram
 
-    if backend == "reference":
-        return ReferenceProgram(ruleset, Tensors(device))
-    # Both are made when first needed: code that was compiled before needs neither.
+    # These are made when first needed: native code that was compiled before needs none of them.
     lowered = cache(lambda: lower(ruleset))
     cells = cache(lambda: TorchProgram(lowered(), device))
-    if backend == "torch":
-        return cells()
+    wasm = cache(
+        lambda: packed_program(lowered(), device, lambda program, planes: WasmProgram(program, planes, kind))
+    )
     if backend == "wasm":
-        return CompiledProgram(_wasm_program(lowered(), device), cells, "wasm")
-    if backend == "native":
-        return CompiledProgram(_native(ruleset, lowered, device, threads), cells)
+        return BackendProgram("wasm", wasm(), cells)
+    if backend == "native" or (backend == "auto" and kind.on_cpu):
+        from powderdsl.simulation.native import auto_by_width, native_by_width
+
+        if backend == "native":
+            return BackendProgram("native", native_by_width(ruleset, lowered, threads), cells)
+        first = ("torch", cells) if problem else ("wasm", wasm)
+        return BackendProgram(backend, auto_by_width(ruleset, lowered, threads, first, cells), cells)
     if backend == "cuda" or (backend == "auto" and device.type == "cuda"):
         from powderdsl.targets.cuda.program import cuda_program
 
         with suppress(CompileError) if backend == "auto" else nullcontext():
-            return CompiledProgram(cuda_program(lowered(), device), cells, "cuda")
-    if backend == "auto" and device.type == "cpu":
-        first = starting_backend(device.type)
-        begin = cache(lambda: _wasm_program(lowered(), device)) if first == "wasm" else cells
-        return auto_by_width(ruleset, lowered, threads, (first, begin), cells)
-    return cells()
-
-
-def _wasm_program(program: Program, device: torch.device) -> Runnable:
-    """On the CPU only; passes that do not fit bit planes run on torch tensors."""
-    if device.type != "cpu":
-        raise _refusal("wasm", "wasmtime runs on the CPU", _ELSEWHERE.format(device))
-    if not has_webassembly():
-        problem = "the package `wasmtime` is missing, or does not run on this machine"
-        raise _refusal("wasm", problem, "`pip install wasmtime`, or run on the backend `torch` or `native`")
-    from powderdsl.targets.wasm.program import WasmProgram
-
-    kind = Tensors(device)
-    return packed_program(program, device, lambda numbers, planes: WasmProgram(numbers, planes, kind))
-
-
-def _native(ruleset: Ruleset, lowered: Callable[[], Program], device: torch.device, threads: int) -> Runnable:
-    """Native code for the width of each grid. Without a compiler, there is an error at once."""
-    if device.type != "cpu":
-        raise _refusal("native", "native code runs on the CPU", _ELSEWHERE.format(device))
-    with _compiler_needed():
-        latest_width(ruleset, lowered)
-
-    def make(width: int) -> Runnable:
-        with _compiler_needed():
-            return native_program(ruleset, lowered, threads, width)
-
-    return ByWidth(make)
-
-
-@contextmanager
-def _compiler_needed() -> Iterator[None]:
-    try:
-        yield
-    except NoCompiler as error:
-        help = f"run on the backend `wasm`, or {INSTALL}"
-        raise _refusal("native", str(error), help) from None
-
-
-_ELSEWHERE = "run on the device `cpu`, or on the backend `torch` or `auto` on `{}`"
-
-
-def _refusal(backend: str, problem: str, help: str) -> CompileError:
-    message = f"the {backend} backend is not available"
-    return failure("PD701", message, notes=tuple(problem.splitlines()), helps=(help,))
-
-
-# Native code
-
-
-def start_key(ruleset: Ruleset, width: int | None = None) -> str:
-    """The cache's key for the native code of a ruleset; without `width`, for the code compiled last.
-
-    Raises NoCompiler if there is no compiler.
-    """
-    compiler = find_compiler()
-    params = tuple(replace(param, default=0, about="") for param in ruleset.params)
-    said = fingerprint(replace(ruleset, params=params))
-    return cache_key(f"{said}{generator()} {width}", compiler, flags_for(compiler, current().level))
+            return BackendProgram("cuda", cuda_program(lowered(), device), cells)
+    return BackendProgram("torch", cells())
 
 
 @cache
-def generator() -> str:
-    """A hash of the source files that generate C++."""
-    here = Path(__file__).resolve().parents[1]
-    found = hashlib.sha256()
-    for name in SOURCES:
-        files = sorted(p for p in (here / name).rglob("*") if p.suffix in (".py", ".hpp")) or [here / name]
-        for path in files:
-            found.update(path.read_bytes())
-    return found.hexdigest()
-
-
-def latest_width(ruleset: Ruleset, lowered: Lowered) -> int:
-    """What the code compiled last is for, or 0. Without any, what cannot be lowered is reported here.
-
-    Raises NoCompiler if there is no compiler.
-    """
-    code = recall(start_key(ruleset))
-    if code is None:
-        lowered()
-    return 0 if code is None else code.width
-
-
-def native_program(ruleset: Ruleset, lowered: Lowered, threads: int, width: int) -> Runnable:
-    """A program, from the cache or compiled now; passes that do not fit bit planes run on cells.
-
-    Raises:
-        NoCompiler: there is no C++ compiler, or it failed.
-    """
-    key = start_key(ruleset, width)
-    code = recall(key)
-    if code is None:
-        with turn(current().place(), key):
-            code = recall(key)  # from another process, while this one waited
-            if code is None:
-                found = segments(lowered())
-                if len(found) > 1 or found[0].planes is None:
-                    return mixed_program(
-                        found,
-                        torch.device("cpu"),
-                        lambda cells, planes: _compiled(cells, planes, threads, width),
-                    )
-                code = compile_program(found[0].program, found[0].planes, width)
-                remember(key, code)
-                remember(start_key(ruleset), code)
-    return NativeProgram(code, threads)
-
-
-def _compiled(cells: Program, planes: Program, threads: int, width: int) -> Runnable:
-    return NativeProgram(compile_program(cells, planes, width), threads)
-
-
-class ByWidth:
-    """A program for each known width of grids, and one for all others (`known_width`), made when the first such grid comes.
-
-    It is built with the settings that are in effect now. What it tells is about the width stepped last.
-    """
-
-    def __init__(self, make: Callable[[int], Runnable], width: int | None = None):
-        """`width`: the program for it is made at once."""
-        self._make, self._how = make, current()
-        self._programs: dict[int, Runnable] = {}
-        self._latest = None if width is None else self.of(width)
-
-    def of(self, width: int) -> Runnable:
-        """The program for a known width; 0 for all others."""
-        program = self._programs.get(width)
-        if program is None:
-            with building(self._how):
-                program = self._programs.setdefault(width, self._make(width))
-        return program
-
-    @property
-    def running(self) -> str:
-        """What the next step runs on: ``wasm``, ``torch`` or ``native``."""
-        return str(getattr(self._latest, "running", "native"))
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Sentences about which backend ran, and why."""
-        return tuple(getattr(self._latest, "notes", ()))
-
-    def run(self, job: Job) -> Mapping[str, Tensor]:
-        """The state `job.steps` later."""
-        self._latest = program = self.of(known_width(shape_of(job.state)[-1]))
-        return program.run(job)
-
-
-def auto_by_width(
-    ruleset: Ruleset,
-    lowered: Lowered,
-    threads: int,
-    first: tuple[str, Callable[[], Runnable]],
-    asked: Callable[[], Runnable],
-) -> ByWidth:
-    """`AutoProgram` for every width."""
+def _wasm_problem() -> str:
+    """Why no WebAssembly runs in this process; empty if it does."""
     try:
-        latest = latest_width(ruleset, lowered)
-    except NoCompiler:
-        latest = 0
-        lowered()
-
-    def make(width: int) -> AutoProgram:
-        def ready() -> Runnable | None:
-            code = recall(start_key(ruleset, width))
-            return None if code is None else NativeProgram(code, threads)
-
-        return AutoProgram(first, asked, ready, lambda: native_program(ruleset, lowered, threads, width))
-
-    return ByWidth(make, latest)
+        this_host()
+    except (ImportError, OSError, RuntimeError) as error:  # wasmtime can be installed where it does not run
+        return " ".join(str(error).split())[:200] or type(error).__name__
+    return ""
 
 
-class AutoProgram:
-    """Runs on a backend that starts at once until native code has been compiled.
+class BackendProgram:
+    """The programs of one backend.
 
     Args:
-        first: the name of that backend, and a function that gives its program, the same at each call.
-        asked: gives the program for jobs with given draws or chosen passes.
-        ready: native code that was compiled before, or None; raises NoCompiler if none could be made.
-        make: native code, compiled; raises NoCompiler.
+        name: the backend's, if `whole` does not tell which one is running.
+        whole: the program of whole steps.
+        rest: gives the program for chosen passes and given draws, if that is another one.
     """
 
-    def __init__(
-        self,
-        first: tuple[str, Callable[[], Runnable]],
-        asked: Callable[[], Runnable],
-        ready: Callable[[], Runnable | None],
-        make: Callable[[], Runnable],
-    ):
-        (self._name, self._first), self._asked, self._make = first, asked, make
-        self._thread: threading.Thread | None = None
-        self._began = 0.0
-        self._took: float | None = None
-        self._native: Runnable | None = None
-        self._problem = ""
-        self._beginning = threading.Lock()
-        self._spent = 0.0
-        self._pace: tuple[int, float] | None = None  # cells of a batch, seconds a step on the first backend
-        self._steps = {"first": 0, "native": 0, "asked": 0}
-        try:
-            self._native = ready()
-        except NoCompiler as error:
-            self._problem = str(error)
+    def __init__(self, name: str, whole: Runnable, rest: Callable[[], Runnable] | None = None):
+        self._name, self.whole, self._rest = name, whole, rest
+        self._others = 0
 
     @property
     def running(self) -> str:
-        """What the next step runs on: ``wasm``, ``torch`` or ``native``."""
-        return self._name if self._native is None else "native"
+        """What the next step runs on."""
+        return str(getattr(self.whole, "running", self._name))
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Sentences about which backend ran, and why."""
-        thread, steps, first = self._thread, self._steps, self._name
-        seconds = time.perf_counter() - self._began if self._took is None else self._took
-        if self._native is not None and thread is None:
-            sentences = ["native: it was compiled before"]
-        elif self._native is not None:
-            ready = f"while native was made ready ({seconds:.0f} s), then native for {steps['native']}"
-            sentences = [f"{first} for {steps['first']} steps {ready}"]
-        elif self._problem:
-            sentences = [f"{first}: {self._problem}", f"native code is faster: {INSTALL}"]
-        elif thread is not None and thread.is_alive():
-            ready = f"native is being made ready ({seconds:.0f} s)"
-            sentences = [f"{first} for {steps['first']} steps; {ready}"]
-        else:
-            sentences = [f"{first}: native is compiled from {WORTH:g} s of work, or by --backend native"]
-        if steps["asked"]:
-            sentences.append(f"torch for {steps['asked']} steps with given draws or chosen passes")
-        return tuple(sentences)
+        notes = tuple(getattr(self.whole, "notes", ()))
+        if self._others:
+            notes += (f"torch for {self._others} steps with given draws or chosen passes",)
+        return notes
 
-    def run(self, job: Job) -> Mapping[str, Tensor]:
+    def run(self, job: Job) -> Mapping[str, Array]:
         """The state `job.steps` later."""
-        if job.draws or job.passes is not None:
-            self._steps["asked"] += job.steps
-            return self._asked().run(job)
-        if job.timing is not None:
-            return (self._native or self._first()).run(job)
-        clock, part, done, cells = job.clock, job, 0, prod(shape_of(job.state))
-        while True:
-            native = self._native
-            if native is not None:
-                self._steps["native"] += part.steps
-                return native.run(part)
-            count = self._slice(cells, job.steps - done)
-            began = time.perf_counter()
-            try:
-                state = self._first().run(part._replace(steps=count))
-            except MemoryError:
-                return self._large(part)
-            done += count
-            later = clock._replace(since=clock.since + done)
-            part = part._replace(state=state, clock=later, steps=job.steps - done)
-            self._account(cells, count, job.steps - done, time.perf_counter() - began)
-            if done == job.steps:
-                return state
-
-    def _large(self, job: Job) -> Mapping[str, Tensor]:
-        """Worlds that do not fit into WebAssembly's memory: native code is waited for, without a compiler torch runs."""
-        self._begin()
-        if self._thread is not None:
-            self._thread.join()
-        self._steps["native"] += job.steps
-        return (self._native or self._asked()).run(job)
-
-    def _slice(self, cells: int, left: int) -> int:
-        """The number of steps to run on the first backend before the next check: one until their speed is known."""
-        if self._problem:
-            return left
-        if self._pace is None or self._pace[0] != cells:
-            return min(left, 1)
-        return min(left, max(1, int(SLICE / max(self._pace[1], 1e-9))))
-
-    def _account(self, cells: int, count: int, left: int, seconds: float) -> None:
-        """Count steps that ran on the first backend, and start to compile once that is worth it."""
-        if count == 0:
-            return
-        self._steps["first"] += count
-        self._spent += seconds
-        # The first step makes what later ones reuse: its duration does not predict theirs.
-        first = self._pace is None or self._pace[0] != cells
-        self._pace = (cells, seconds / count)
-        expected = 0.0 if first else left * self._pace[1]
-        if self._spent + expected >= WORTH:
-            self._begin()
-
-    def _begin(self) -> None:
-        """Start to compile, unless a build has started. Concurrent callers do not wait."""
-        if self._problem:
-            _tell_of_compilers(self._problem)
-            return
-        if not self._beginning.acquire(blocking=False):
-            return
-        try:
-            # A fork has its parent's memory, but not its threads: there the thread is lost.
-            lost = self._thread is not None and self._took is None and not self._thread.is_alive()
-            if self._native is None and (self._thread is None or lost):
-                self._began = time.perf_counter()
-                context = copy_context()
-                self._thread = threading.Thread(target=context.run, args=(self._compile,), daemon=True)
-                self._thread.start()
-        finally:
-            self._beginning.release()
-
-    def _compile(self) -> None:
-        try:
-            self._native = self._make()
-        except NoCompiler as error:
-            self._problem = str(error)
-        except Exception as error:  # what runs continues; `--backend native` shows what is wrong
-            self._problem = f"{type(error).__name__}: {error}"
-        self._took = time.perf_counter() - self._began
+        if self._rest is None or (job.passes is None and not job.draws):
+            return self.whole.run(job)
+        self._others += job.steps
+        return self._rest().run(job)
 
 
-@cache
-def _tell_of_compilers(problem: str) -> None:
-    """Warn once in a process if work that is worth compiling meets no compiler. Other problems stand in `notes`."""
-    if problem.startswith(MISSING):
-        warnings.warn(
-            f"{problem}; native code is many times faster: {INSTALL}", NoCompilerWarning, stacklevel=2
+class ReferenceProgram:
+    """The oracle, on arrays of `powderdsl.arrays`, whatever kind those of its jobs are of.
+
+    Args:
+        part: some passes in a row, if only these run. Only the first ones of a step restart the fields that restart.
+    """
+
+    def __init__(self, ruleset: Ruleset, kind: ArrayKind, part: Program | None = None):
+        self._passes = None if part is None else frozenset(pass_.name for pass_ in part.passes)
+        if part is not None and not any(slot.resets for slot in part.slots):
+            ruleset = replace(ruleset, fields=tuple(replace(field, resets=False) for field in ruleset.fields))
+        self._ruleset, self._kind = ruleset, kind
+        self._bits = {stream.name: stream.bits for stream in ruleset.streams}
+
+    def run(self, job: Job) -> Mapping[str, Array]:
+        """The state `job.steps` later. The time before a step's first pass counts for that pass."""
+        host = self._kind.to_numpy
+        seed, index, start = map(host, (*job.clock[:2], job.clock.step))
+        arrays = {name: host(value) for name, value in job.state.items()}
+        given_params = {name: host(value) for name, value in job.params.items()}
+        numbers = reference.parameters(self._ruleset, len(seed), given_params)
+        given = {name: (host(value) + 0.5) / 2.0 ** self._bits[name] for name, value in job.draws.items()}
+        passes = self._passes if job.passes is None else job.passes
+        for i in range(job.steps):
+            at = reference.Clock(seed, index, start + i)
+            job.tick("")
+            arrays = reference.step(
+                self._ruleset, arrays, at, numbers, passes=passes, draws=given, tick=job.tick
+            )
+        return {name: self._kind.from_numpy(value.copy()) for name, value in arrays.items()}
+
+
+class _Modules:
+    """WebAssembly without torch: modules of whole steps and of chosen passes; the oracle for what they cannot run."""
+
+    def __init__(self, ruleset: Ruleset, program: Program, kind: ArrayKind, memo: Memo):
+        self._ruleset, self._program, self._kind, self._memo = ruleset, program, kind, memo
+        self._made: dict[frozenset[str] | None, Runnable] = {}
+
+    def run(self, job: Job) -> Mapping[str, Array]:
+        """The state `job.steps` later."""
+        if job.draws:
+            return ReferenceProgram(self._ruleset, self._kind).run(job)
+        chosen = job.passes
+        if chosen not in self._made:
+            self._made[chosen] = self._make(chosen)
+        return self._made[chosen].run(job if chosen is None else job._replace(passes=None))
+
+    @collection_paused()
+    def _make(self, chosen: frozenset[str] | None) -> Runnable:
+        passes = tuple(pass_ for pass_ in self._program.passes if chosen is None or pass_.name in chosen)
+        return mixed_program(
+            parts(replace(self._program, passes=passes), self._memo),
+            lambda program, planes: WasmProgram(program, planes, self._kind, self._memo),
+            lambda program: ReferenceProgram(self._ruleset, self._kind, program),
         )

@@ -25,7 +25,7 @@ from powderdsl.model.types import (
     Transform,
     integer,
 )
-from powderdsl.simulation.any_arrays import AnySimulator, AnyWorld
+from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.targets.array_kind import Array
 
 SLOT = "last writer"
@@ -77,7 +77,7 @@ class Provenance:
     of a cell in the last step, 0 where none did. A rule that writes the element that was there counts too.
     """
 
-    world: AnyWorld
+    world: World
     numbers: Array
     rules: tuple[NumberedRule, ...]
 
@@ -90,12 +90,12 @@ class Provenance:
 class Recorder:
     """Steps worlds of a simulator and records which rules wrote their elements. Compiles the rules once more."""
 
-    def __init__(self, sim: AnySimulator[Any]):
+    def __init__(self, sim: Simulator):
         self.sim = sim
         self.rules = numbered_rules(sim.ruleset)
         self._marked = sim.of(marked(sim.ruleset))
 
-    def step(self, world: AnyWorld, steps: int = 1, **options: Any) -> Provenance:
+    def step(self, world: World, steps: int = 1, **options: Any) -> Provenance:
         """Like `Simulator.step`, which takes the same options, gives the same worlds and raises the same errors.
 
         After 0 steps no rule has written.

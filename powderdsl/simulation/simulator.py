@@ -1,61 +1,114 @@
-"""Worlds and the simulator on torch tensors."""
+"""Worlds and simulators: state in, state out, on torch tensors or on arrays without torch.
+
+Worlds are immutable; every method returns a new one. Arrays are in the storage dtypes of `model.state`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from operator import index
+from typing import TYPE_CHECKING, Any
 
-import torch
-from torch import Tensor
-
-from powderdsl.compiler import checked_request, starting_backend
+from powderdsl.compiler import load
+from powderdsl.model.state import Slot, check_sides, property_dtype, property_values, slot_name, slots
 from powderdsl.model.types import Ruleset
-from powderdsl.simulation.any_arrays import MAX_CELLS, AnySimulator, AnyWorld, clock_of, whole_count
-from powderdsl.simulation.observe import Observer
-from powderdsl.simulation.programs import find_device, make_program
-from powderdsl.targets.job import Job, profile_of
-from powderdsl.targets.tensor_kind import Tensors
+from powderdsl.simulation.programs import array_kind, make_program
+from powderdsl.simulation.state_checks import (
+    Parameters,
+    check_ids,
+    checked_values,
+    given_mapping,
+    looked_up,
+    unknown_name,
+    unknown_slot,
+)
+from powderdsl.system.memo import Memo
+from powderdsl.targets.array_kind import Array
+from powderdsl.targets.job import Clock, Job, profile_of, shape_of
 
-__all__ = ["MAX_CELLS", "Simulator", "World", "compile"]
+if TYPE_CHECKING:
+    from powderdsl.simulation.observe import Observer
+
+MAX_CELLS = 1 << 31
 
 
-class World(AnyWorld):
-    """A batch of worlds of one ruleset, as torch tensors on the simulator's device.
+@dataclass(frozen=True)
+class World:
+    """A batch of worlds of one ruleset, as arrays of the simulator's kind: torch tensors, or arrays without torch.
 
-    `state` has one tensor a slot; `seed`, `index` and `step` (int64 [B]) decide the random numbers: the same three
+    `state` has one array a slot; `seed`, `index` and `step` (int64 [B]) decide the random numbers: the same three
     give the same future, alone or in any batch.
     """
 
     sim: Simulator
-    state: Mapping[str, Tensor]
-    seed: Tensor
-    index: Tensor
-    step: Tensor
+    state: Mapping[str, Array]
+    seed: Array
+    index: Array
+    step: Array
 
-    def read(self, name: str, out: Tensor | None = None) -> Tensor:
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Array:
+            """The step of a world that a simulator has made, counted when it is first read."""
+            clock = self.__dict__.get("_clock")
+            if name != "step" or clock is None:
+                raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+            return self.__dict__.setdefault("step", clock.start + clock.since)
+
+    @property
+    def ids(self) -> Array:
+        """Element ids, uint8 [B, H, W]."""
+        return self.state["element"]
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(worlds, rows, columns)."""
+        return shape_of(self.state)
+
+    def __len__(self) -> int:
+        return int(self.seed.shape[0])  # without unpacking anything, nor torch's Python
+
+    def __getitem__(self, name: str) -> Array:
+        """A field or property by name, or KeyError: [B, H, W], or float32 [B, 2, H, W] as (rows, columns) of vectors."""
+        return self.read(name)
+
+    def read(self, name: str, out: Array | None = None) -> Array:
         """`world[name]`, written into `out`.
 
         Args:
-            out: written to and returned, instead of a new tensor or the world's own: of the same shape, dtype and
-                device, each of its worlds contiguous. The methods below take one too.
+            out: a tensor that is written to and returned, instead of a new one or the world's own: of the same shape,
+                dtype and device, each of its worlds contiguous. The methods below take one too.
 
         Raises:
             KeyError: an unknown name. TypeError, ValueError: `out` is not a tensor, or does not fit.
         """
-        return self.sim.observer.read(self.state, name, out)
+        sim = self.sim
+        if name not in sim.slot_by_name:
+            name = slot_name(sim.ruleset, name)
+        if name in sim.slot_by_name:
+            return self.state[name] if out is None else sim.observer.read(self.state, name, out)
+        prop = sim.ruleset.property(name)
+        if prop is None:
+            raise unknown_slot(sim.ruleset, name)
+        dtype = getattr(sim.kind.xp, property_dtype(prop))
+        values = sim.kind.xp.asarray(sim.kind.entries(sim.table(name), self.ids), dtype=dtype)
+        return values if out is None else sim.observer.buffer(out, self.shape, dtype).copy_(values)
 
-    def matrix(self, out: Tensor | None = None) -> Tensor:
+    def matrix(self, out: Array | None = None) -> Array:
         """All channels of the ruleset's `matrix:` as float32 [B, C, H, W]: elements one-hot, then fields."""
         return self.sim.observer.matrix(self.state, out)
 
-    def rgb(self, out: Tensor | None = None) -> Tensor:
+    def rgb(self, out: Array | None = None) -> Array:
         """Pictures in the elements' colors, a pixel a cell: uint8 [B, H, W, 3]."""
         return self.sim.observer.rgb(self.state, out)
 
-    def compact(self, out: Tensor | None = None) -> Tensor:
+    def compact(self, out: Array | None = None) -> Array:
         """Everything that lasts from step to step, as bytes: uint8 [B, C, H, W]. `sim.observer.compact_names` has their names."""
         return self.sim.observer.compact(self.state, out)
 
-    def planes(self, out: Tensor | None = None) -> Tensor:
+    def planes(self, out: Array | None = None) -> Array:
         """Flags and integers in bits: int64 [B, P, H, ⌈W/64⌉].
 
         Bit x % 64 of word x // 64 is column x; bits beyond the width are zero. The planes are those of
@@ -63,38 +116,329 @@ class World(AnyWorld):
         """
         return self.sim.observer.planes(self.state, out)
 
+    def with_state(self, state: Mapping[str, Array]) -> World:
+        """These worlds in another state, at the same step with the same random futures."""
+        world = object.__new__(World)
+        world.__dict__.update(self.__dict__, state=state)
+        return world
 
-class Simulator(AnySimulator[World]):
-    """Runs one ruleset on one backend and device. Made by `powderdsl.compile`."""
+    def select(self, worlds: int | slice | Sequence[int] | Array) -> World:
+        """Some worlds of the batch, with their random futures unchanged."""
+        keys = [worlds] if isinstance(worlds, int) else worlds
+        chosen = {name: value[keys] for name, value in self.state.items()}
+        return replace(self, state=chosen, seed=self.seed[keys], index=self.index[keys], step=self.step[keys])
 
-    world_type = World
 
-    def __init__(self, ruleset: Ruleset, backend: str, device: str | torch.device, threads: int = 1):
-        self.backend = backend
-        self.device = find_device(device)
-        super().__init__(ruleset, Tensors(self.device))
-        self.observer = Observer(ruleset, self.device)
-        self._program = make_program(ruleset, backend, self.device, threads)
-        self._threads = threads
+class Simulator:
+    """Runs one ruleset on one backend and device. Made by `powderdsl.compile`, which takes the same arguments."""
+
+    def __init__(
+        self,
+        ruleset: Ruleset,
+        backend: str = "auto",
+        device: Any = "cpu",
+        threads: int = 1,
+        *,
+        tensors: bool = True,
+        memo: Memo | None = None,
+    ):
+        self.ruleset, self.backend = ruleset, backend
+        self.kind = array_kind(backend, device, tensors)
+        self.device = self.kind.device
+        self.slot_by_name: dict[str, Slot] = {slot.name: slot for slot in slots(ruleset)}
+        self._how: dict[str, Any] = {"threads": threads, "tensors": tensors, "memo": memo}
+        self._params = Parameters(ruleset, self.kind)
+        self._tables: dict[str, Array] = {}
+        self._program = make_program(ruleset, backend, self.kind, threads, memo)
 
     def of(self, ruleset: Ruleset) -> Simulator:
-        return Simulator(ruleset, self.backend, self.device, self._threads)
+        """A simulator of other rules on the same backend and device."""
+        return Simulator(ruleset, self.backend, self.device, **self._how)
 
     @property
     def running(self) -> str:
         """The backend that the next step runs on: for ``auto`` on the CPU, ``wasm`` (or ``torch``) or ``native``."""
-        at_once = starting_backend(self.device.type) if self.backend == "auto" else self.backend
-        return str(getattr(self._program, "running", at_once))
+        return self._program.running
 
     @property
     def notes(self) -> tuple[str, ...]:
         """For ``auto``: sentences about which backend ran, and why."""
-        return tuple(getattr(self._program, "notes", ()))
+        return self._program.notes
+
+    @cached_property
+    def observer(self) -> Observer:
+        """Reads observations of worlds of tensors."""
+        from powderdsl.simulation.observe import Observer
+
+        if self.kind.xp.__name__ != "torch":
+            raise TypeError("observations are torch tensors, and these worlds are compiled without torch")
+        return Observer(self.ruleset, self.device)
 
     @property
     def plane_names(self) -> tuple[str, ...]:
         """What the planes are: a flag's name, or ``name:bit`` from bit 0; the last bit of a signed number is its sign."""
         return self.observer.plane_names
+
+    @property
+    def elements(self) -> tuple[str, ...]:
+        """The elements' names in id order."""
+        return tuple(element.name for element in self.ruleset.elements)
+
+    @property
+    def passes(self) -> tuple[str, ...]:
+        """The passes' names in the order they run."""
+        return tuple(p.name for p in self.ruleset.passes)
+
+    @property
+    def slots(self) -> tuple[Slot, ...]:
+        """The arrays of a world's state."""
+        return tuple(self.slot_by_name.values())
+
+    def table(self, name: str) -> Array:
+        """A property's values by id, parameters at their defaults: float64 [256]."""
+        if name not in self._tables:
+            self._tables[name] = self.kind.put(property_values(self.ruleset, name), "float64")
+        return self._tables[name]
+
+    # Making worlds
+
+    def world(self, ids: Any, seed: Any = 0, *, index: Any = None) -> World:
+        """Fresh worlds from element ids.
+
+        Args:
+            ids: integers [B, H, W] or [H, W]; NumPy, torch or nested lists.
+            seed: one integer for all, or one a world.
+            index: which world of its seed each is; 0, 1, … for one common seed, 0 for seeds of their own.
+
+        Raises:
+            TypeError: ids are not integers. ValueError: wrong shape, or ids that the ruleset does not have.
+        """
+        given, xp = self._integers(ids, "ids"), self.kind.xp
+        if given.ndim == 2:
+            given = given[None]
+        shape = tuple(given.shape)
+        if given.ndim != 3 or 0 in shape:
+            raise ValueError(f"ids must have the shape [worlds, rows, columns], found {list(shape)}")
+        batch, height, width = shape
+        check_sides(self.ruleset, (height, width))
+        if batch * height * width > MAX_CELLS:
+            raise ValueError(f"{batch * height * width:,} cells are more than {MAX_CELLS:,}")
+        check_ids(self.kind, given, "ids", self.ruleset)
+        element = xp.asarray(given, dtype=xp.uint8)
+        seeds = self._integers(seed, "seed")
+        if index is None:
+            index = range(batch) if seeds.ndim == 0 else [0] * batch
+        return World(
+            self,
+            {name: self._fresh(slot, element) for name, slot in self.slot_by_name.items()},
+            self._numbers(seeds, "seed", batch),
+            self._numbers(self._integers(index, "index"), "index", batch),
+            self.kind.put([0] * batch, "int64"),
+        )
+
+    def _fresh(self, slot: Slot, ids: Array) -> Array:
+        """A slot's values in new cells of these elements."""
+        if slot.name == "element":
+            return self.kind.copied(ids)
+        if self.ruleset.property(slot.name) is not None:
+            return looked_up(self.kind, self.table(slot.name), ids, slot.dtype)
+        values = self.kind.put([slot.fresh(i) for i in range(256)], slot.dtype)
+        return looked_up(self.kind, values, ids, slot.dtype)
+
+    def _renewed(self, state: Mapping[str, Array], ids: Array, cells: Array) -> dict[str, Array]:
+        """A state with fresh cells of the elements `ids`, uint8 [B, H, W], where `cells` is set."""
+        return {
+            name: self._where(slot, cells, self._fresh(slot, ids), state[name])
+            if slot.travels
+            else state[name]
+            for name, slot in self.slot_by_name.items()
+        }
+
+    def _where(self, slot: Slot, cells: Array, yes: Array, no: Array) -> Array:
+        """The values of a slot, by cells bool [B, H, W]."""
+        return self.kind.xp.where(cells[:, None] if slot.planes == 2 else cells, yes, no)
+
+    def _integers(self, value: Any, name: str) -> Array:
+        array = self.kind.given(value, name)
+        if self.kind.sort(array) != "int":
+            raise TypeError(f"{name} must be integers, found {array.dtype}")
+        return array
+
+    def _numbers(self, array: Array, name: str, batch: int) -> Array:
+        """Integers of 0 or more, one a world: int64 [B] in memory of their own."""
+        xp = self.kind.xp
+        array = xp.asarray(array, dtype=xp.int64)
+        if array.ndim == 0:
+            array = xp.broadcast_to(array, (batch,))
+        if tuple(array.shape) != (batch,) or bool((array < 0).any()):
+            raise ValueError(
+                f"{name} must be one number of 0 or more, or {batch} of them, found shape {list(array.shape)}"
+            )
+        return self.kind.copied(array)
+
+    # Changing worlds
+
+    def replace(self, world: World, **fields: Any) -> World:
+        """The world with these fields set. New ids make fresh cells; other fields are set after that.
+
+        Args:
+            fields: by name: [B, H, W] (or [H, W], or one number for all); vectors [B, 2, H, W] as (rows, columns).
+
+        Raises:
+            KeyError: an unknown field. TypeError, ValueError: wrong dtype, shape, range, NaN, or a value where the
+                element cannot hold one.
+        """
+        state, xp = dict(world.state), self.kind.xp
+        if "ids" in fields or "element" in fields:
+            given = fields.pop("ids", None) if "ids" in fields else fields.pop("element")
+            ids = self._shaped(self._integers(given, "ids"), "ids", world.shape)
+            check_ids(self.kind, ids, "ids", self.ruleset)
+            element = xp.asarray(ids, dtype=xp.uint8)
+            state = self._renewed(state, element, element != state["element"])
+        for name, value in fields.items():
+            slot = self.slot_by_name.get(name)
+            if slot is None:
+                if self.ruleset.property(name) is None:
+                    world.read(name)
+                wanted = self._shaped(value, name, world.shape)
+                held = self.kind.entries(self.table(name), state["element"])
+                if not bool((xp.asarray(wanted, dtype=xp.float64) == held).all()):
+                    raise ValueError(
+                        f"`{name}` follows from the element here: no rule of {self.ruleset.name} changes it"
+                    )
+                continue
+            array = self._shaped(value, name, world.shape, slot.planes == 2)
+            usual = None if self.ruleset.property(name) is None else self.table(name)
+            state[name] = checked_values(self.kind, array, state["element"], slot, usual, self.ruleset)
+        return replace(world, state=state)
+
+    def _shaped(self, value: Any, name: str, shape: tuple[int, ...], vector: bool = False) -> Array:
+        array = self.kind.given(value, name)
+        target = (shape[0], 2, *shape[1:]) if vector else shape
+        if vector and array.ndim == 1 and len(array) == 2:
+            array = array[None, :, None, None]
+        try:
+            return self.kind.xp.broadcast_to(array, target)
+        except (RuntimeError, ValueError):
+            raise ValueError(
+                f"{name} must have the shape {list(target)}, found {list(array.shape)}"
+            ) from None
+
+    def paint(self, world: World, *, where: Any, element: str | None = None, **fields: Any) -> World:
+        """Set cells of a mask: fresh cells of an element, and values of fields.
+
+        Args:
+            where: bool [B, H, W] or [H, W].
+            element: the element's name, plain or qualified.
+            fields: values by field name; vectors as (rows, columns).
+
+        Raises:
+            KeyError: an unknown element or field. ValueError: a wrong shape or value.
+        """
+        xp = self.kind.xp
+        mask = self._shaped(where, "where", world.shape)
+        if self.kind.sort(mask) != "bool":
+            raise TypeError(f"where must be a bool mask, found {mask.dtype}")
+        if element is not None:
+            found = self.ruleset.element(element)
+            if found is None:
+                raise unknown_name("element", element, self.elements)
+            element_ids = xp.full_like(world.ids, found.id)
+            world = replace(world, state=self._renewed(world.state, element_ids, mask))
+        for name, value in fields.items():
+            if name not in self.slot_by_name:
+                world.read(name)
+                raise ValueError(f"`{name}` follows from the element: it cannot be painted")
+            slot = self.slot_by_name[name]
+            new = self._shaped(value, name, world.shape, slot.planes == 2)
+            both = (xp.asarray(values, dtype=xp.float64) for values in (new, world.state[name]))
+            world = self.replace(world, **{name: self._where(slot, mask, *both)})
+        return world
+
+    # Running
+
+    def step(
+        self,
+        world: World,
+        steps: int = 1,
+        *,
+        random: Mapping[str, Any] | None = None,
+        passes: Sequence[str] | None = None,
+        params: Mapping[str, Any] | None = None,
+        reuse: bool = False,
+    ) -> World:
+        """The world some steps later; the argument stays as it was.
+
+        Args:
+            steps: how many, 0 or more.
+            random: draws to use instead of our own, by stream: [B, H, W] in [0, 1). A draw r counts as the draw of
+                the stream's resolution that it falls into. The same draws serve every step.
+            passes: run only these passes, in the ruleset's order.
+            params: parameter values for this call, one number each or [B] values, one a world.
+            reuse: the memory of `world` may be written to, and it must not be used afterwards: saves a copy.
+
+        Raises:
+            KeyError: unknown streams, passes or parameters. ValueError: wrong shapes or values.
+        """
+        self.check(world)
+        steps = _whole_count(steps)
+        draws: Mapping[str, Array] = _NOTHING
+        chosen = None
+        clock = _clock_of(world)
+        batch = clock.seed.shape[0]
+        if params is None:
+            values = self._params.defaults(batch)
+        else:
+            values = self._params.checked(given_mapping("params", params), batch)
+        if random is not None:
+            draws = self._draws(given_mapping("random", random), world)
+        if passes is not None:
+            chosen = self._chosen(passes)
+        state = self._program.run(Job(world.state, clock, steps, values, draws, chosen, reuse))
+        # Made without the calls that a frozen dataclass takes.
+        after = object.__new__(World)
+        known = after.__dict__
+        known["sim"], known["state"], known["seed"], known["index"] = self, state, clock.seed, clock.world
+        known["_clock"] = Clock(clock.seed, clock.world, clock.start, clock.since + steps)
+        return after
+
+    def _chosen(self, passes: Sequence[str]) -> frozenset[str]:
+        if isinstance(passes, str):
+            raise TypeError(f"passes takes a list of names: [{passes!r}]")
+        unknown = [name for name in passes if name not in self.passes]
+        if unknown:
+            raise unknown_name("pass", unknown[0], self.passes, "passes")
+        return frozenset(passes)
+
+    def check(self, world: Any) -> None:
+        """Raises TypeError for what is not a world of these arrays, ValueError for a world of other rules."""
+        if not isinstance(world, World):
+            raise TypeError(f"world must be a World, found {type(world).__name__}")
+        if world.sim is self:
+            return
+        if world.sim.kind.xp is not self.kind.xp:
+            raise TypeError(f"this world has arrays of {world.sim.kind.xp.__name__}")
+        if world.sim.ruleset is not self.ruleset and world.sim.ruleset != self.ruleset:
+            raise ValueError(f"this world belongs to {world.sim.ruleset.name}, not to {self.ruleset.name}")
+
+    def _draws(self, random: Mapping[str, Any], world: World) -> dict[str, Array]:
+        """Given draws as integers k below 2^bits, which stand for (k + ½) / 2^bits: int64 [B, H, W]."""
+        bits = {stream.name: stream.bits for stream in self.ruleset.streams}
+        draws, xp = {}, self.kind.xp
+        for name, value in random.items():
+            if name not in bits:
+                raise unknown_name("stream", name, bits)
+            given = self._shaped(value, f"random[{name!r}]", world.shape)
+            array = xp.asarray(given, dtype=xp.float64)
+            if not bool(((array >= 0) & (array < 1)).all()):
+                raise ValueError(f"random[{name!r}] must lie in [0, 1)")
+            draws[name] = xp.asarray(xp.floor(array * float(1 << bits[name])), dtype=xp.int64)
+        return draws
+
+    def parameters(self, params: Mapping[str, Any], batch: int) -> dict[str, Array]:
+        """All parameters as float64 [B]: given values, and defaults. Raises KeyError, TypeError, ValueError."""
+        checked = self._params.checked(params, batch)
+        return {name: self.kind.copied(value) for name, value in checked.items()}
 
     def profile(self, world: World, steps: int = 1) -> dict[str, float]:
         """Seconds that each pass takes over some steps, in the order they run; empty if the backend cannot report them.
@@ -102,14 +446,70 @@ class Simulator(AnySimulator[World]):
         Native code counts processor time on one thread.
         """
         params = self._params.defaults(len(world))
-        job = Job(world.state, clock_of(world), whole_count(steps), params, {}, None)
+        job = Job(world.state, _clock_of(world), _whole_count(steps), params, {}, None)
         seconds = profile_of(self._program, job)
         return {name: seconds.get(name, 0.0) for name in self.passes} if seconds else {}
 
 
 def compile(
-    ruleset: Ruleset | str, backend: str = "auto", device: str = "cpu", threads: int = 1
+    ruleset: Ruleset | str,
+    backend: str = "auto",
+    device: Any = "cpu",
+    threads: int = 1,
+    *,
+    tensors: bool = True,
+    memo: Memo | None = None,
 ) -> Simulator:
-    """`simulation.compiling.compile`, on torch. Raises CompileError (PD701)."""
-    model = checked_request(ruleset, backend)
-    return Simulator(model, backend, device, threads)
+    """A simulator that runs a ruleset.
+
+    Args:
+        ruleset: from `load` (or a name to load).
+        backend: one of `BACKENDS`; all give the same worlds, bit for bit.
+        device: a torch device: ``"cpu"``, ``"cuda"``, ``"cuda:1"``.
+        threads: for native code, which shares a batch out among them. Torch has its own setting.
+        tensors: worlds have torch tensors wherever torch is installed; otherwise only where the backend or the device
+            needs torch.
+        memo: where passes are kept that other rulesets may have, too.
+
+    Raises:
+        CompileError: PD701 if the backend or the device is not available.
+    """
+    model = load(ruleset) if isinstance(ruleset, str) else ruleset
+    if not isinstance(model, Ruleset):
+        raise TypeError(f"ruleset must be a Ruleset or a name, found {type(model).__name__}")
+    return Simulator(model, backend, device, threads, tensors=tensors, memo=memo)
+
+
+_NOTHING: Mapping[str, Array] = {}
+
+
+def _clock_of(world: World) -> Clock:
+    """What decides the random numbers of a world's next step. Raises ValueError for arrays that do not fit.
+
+    `step` is computed lazily. Once somebody has read it, it counts: they may have modified it in place.
+    """
+    known = world.__dict__
+    clock: Clock | None = known.get("_clock")
+    if clock is not None and "step" not in known:
+        return clock
+    kind, batch = world.sim.kind, shape_of(world.state)[0]
+    device = getattr(world.seed, "device", None)
+    for name in ("seed", "index", "step"):
+        array = getattr(world, name)
+        fits = tuple(array.shape) == (batch,) and array.dtype == kind.xp.int64
+        if not fits or getattr(array, "device", None) != device:
+            raise ValueError(
+                f"a world's {name} must be int64 [{batch}], found {array.dtype} {list(array.shape)}"
+            )
+    return Clock(world.seed, world.index, kind.copied(world.step))
+
+
+def _whole_count(value: Any) -> int:
+    """An integer of 0 or more, Python's or NumPy's."""
+    try:
+        number = index(value)
+    except TypeError:
+        number = -1
+    if number < 0 or isinstance(value, bool):
+        raise ValueError(f"steps must be an integer of 0 or more, found {value!r}")
+    return number

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache
 from typing import Any
 
@@ -37,44 +37,38 @@ def unknown_slot(ruleset: Ruleset, name: str) -> KeyError:
 
 def check_ids(kind: ArrayKind, ids: Array, name: str, ruleset: Ruleset) -> None:
     """Raises ValueError for ids that a ruleset does not have."""
-    xp, known = kind.xp, _holders(kind, (element.id for element in ruleset.elements))
+    xp, known = kind.xp, _flags_by_id(kind, (element.id for element in ruleset.elements))
     flat = ids.reshape(-1)
     for start in range(0, len(flat), CHUNK):
         values = flat[start : start + CHUNK]
         if values.dtype == xp.uint8:
-            good = known[kind.as_index(values)]
+            good = kind.entries(known, values)
         else:
             values = xp.asarray(values, dtype=xp.int64)
             good = (values >= 0) & (values < 256) & known[xp.clip(values, 0, 255)]
         if not bool(good.all()):
             at = good.tolist().index(False)
-            place = _place(start + at, tuple(ids.shape))
+            index, place = start + at, list[int]()
+            for side in reversed(ids.shape):
+                index, rest = divmod(index, side)
+                place.insert(0, rest)
             raise ValueError(f"{name}{place} is {int(values[at])}: no element of {ruleset.name} has this id")
 
 
-def _holders(kind: ArrayKind, ids: Iterable[int]) -> Array:
+def _flags_by_id(kind: ArrayKind, ids: Iterable[int]) -> Array:
     """Flags by id: bool [256]."""
     some = set(ids)
     return kind.put([number in some for number in range(256)])
 
 
-def _place(index: int, shape: tuple[int, ...]) -> list[int]:
-    """The place of the n-th cell in C order."""
-    found = []
-    for side in reversed(shape):
-        index, rest = divmod(index, side)
-        found.append(rest)
-    return found[::-1]
-
-
-def looked_up(kind: ArrayKind, table: Array, ids: Array, dtype: Any) -> Array:
+def looked_up(kind: ArrayKind, table: Array, ids: Array, dtype: str) -> Array:
     """The entry of a table [256] or [256, 2] for each of the ids [B, H, W]: of `dtype`, [B, H, W] or [B, 2, H, W]."""
     vectors = table.ndim == 2
     shape = tuple(ids.shape)
-    out = kind.empty(dtype, (shape[0], 2, *shape[1:]) if vectors else shape)
+    out = kind.zeros(dtype, (shape[0], 2, *shape[1:]) if vectors else shape)
     for rows in _rows(shape):
-        found = table[kind.as_index(ids[:, rows])]
-        out[..., rows, :] = kind.xp.moveaxis(found, -1, 1) if vectors else found
+        entries = kind.entries(table, ids[:, rows])
+        out[..., rows, :] = kind.xp.moveaxis(entries, -1, 1) if vectors else entries
     return out
 
 
@@ -84,71 +78,60 @@ def _rows(shape: tuple[int, ...]) -> Iterator[slice]:
     return (slice(start, start + step) for start in range(0, shape[-2], step))
 
 
-def checked_floats(kind: ArrayKind, array: Array, ids: Array, slot: Slot, ruleset: Ruleset) -> Array:
-    """Values as a float32 slot holds them, in memory of their own. Raises ValueError.
-
-    `ids` are the elements of the cells, of which some may not have the field.
-    """
-    xp = kind.xp
-    if not bool(xp.isfinite(array).all()):
-        raise ValueError(f"{slot.name} has values that are not finite")
-    floats = kind.empty(xp.float32, tuple(array.shape))
-    for rows in _rows(floats.shape):
-        part = xp.clip(xp.asarray(array[..., rows, :], dtype=xp.float32), slot.kind.lo, slot.kind.hi)
-        floats[..., rows, :] = xp.where(xp.abs(part) < SNAP, 0, part)
-        if slot.of is not None:
-            without = ~_holders(kind, slot.of)[kind.as_index(ids[:, rows])]
-            defaults = slot.default if isinstance(slot.default, tuple) else (slot.default,)
-            parts = [floats[:, i, rows, :] for i in range(2)] if slot.planes == 2 else [floats[:, rows, :]]
-            for values, default in zip(parts, defaults, strict=True):
-                if bool(((values != default) & without).any()):
-                    raise _misplaced(slot, slot.of, ruleset)
-    return floats
-
-
-def _misplaced(slot: Slot, limited: Collection[int], ruleset: Ruleset) -> ValueError:
-    names = ", ".join(e.name for e in ruleset.elements if e.id in limited)
-    return ValueError(f"{slot.name} can only differ from its default in cells of: {names}")
-
-
-def checked_integers(
+def checked_values(
     kind: ArrayKind, array: Array, ids: Array, slot: Slot, usual: Array | None, ruleset: Ruleset
 ) -> Array:
-    """Values [B, H, W] as a slot of integers holds them, in memory of their own.
+    """Values [B, H, W] or [B, 2, H, W] as a slot holds them, in memory of their own.
 
     Args:
-        ids: the elements of the cells.
-        usual: the value in cells that cannot hold one of their own, [256] by id; None for the slot's default.
+        ids: the elements of the cells, of which some may not have the field or property.
+        usual: a property's value in these cells, [256] by id; None for the default of a field.
 
     Raises:
         TypeError, ValueError: values that the slot cannot hold, or not in these cells.
     """
-    out = kind.empty(getattr(kind.xp, slot.dtype), tuple(array.shape))
+    if kind.sort(array) == "complex":
+        raise TypeError(f"{slot.name} takes floats, found {array.dtype}")
+    if slot.is_real and not bool(kind.xp.isfinite(array).all()):
+        raise ValueError(f"{slot.name} has values that are not finite")
+    convert = _floats if slot.is_real else _integers
+    prop = ruleset.property(slot.name)
+    limited = slot.of if prop is None else prop.stored
+    out = kind.zeros(slot.dtype, tuple(array.shape))
     for rows in _rows(out.shape):
-        out[:, rows] = _integers(kind, array[:, rows], ids[:, rows], slot, usual, ruleset)
+        values = convert(kind, array[..., rows, :], slot, ruleset)
+        out[..., rows, :] = values
+        if limited is None:
+            continue
+        if usual is None:
+            default = kind.put(slot.default, slot.dtype)
+            default = default[:, None, None] if slot.planes == 2 else default
+        else:
+            default = kind.xp.asarray(kind.entries(usual, ids[:, rows]), dtype=kind.xp.int64)
+        without = ~kind.entries(_flags_by_id(kind, limited), ids[:, rows])
+        if bool(((values != default) & (without[:, None] if slot.planes == 2 else without)).any()):
+            names = ", ".join(element.name for element in ruleset.elements if element.id in limited)
+            raise ValueError(f"{slot.name} can only differ from its default in cells of: {names}")
     return out
 
 
-def _integers(
-    arrays: ArrayKind, array: Array, ids: Array, slot: Slot, usual: Array | None, ruleset: Ruleset
-) -> Array:
-    xp, kind = arrays.xp, slot.kind
-    if arrays.sort(array) == "float" and not bool((array == xp.floor(array)).all()):
+def _floats(kind: ArrayKind, array: Array, slot: Slot, ruleset: Ruleset) -> Array:
+    xp = kind.xp
+    values = xp.clip(xp.asarray(array, dtype=xp.float32), slot.kind.lo, slot.kind.hi)
+    return xp.where(xp.abs(values) < SNAP, 0, values)
+
+
+def _integers(kind: ArrayKind, array: Array, slot: Slot, ruleset: Ruleset) -> Array:
+    xp = kind.xp
+    if kind.sort(array) == "float" and not bool((array == xp.floor(array)).all()):
         raise TypeError(f"{slot.name} takes integers, found {array.dtype}")
     values = xp.asarray(array, dtype=xp.int64)
-    if kind.name == "element":
-        check_ids(arrays, array if array.dtype == xp.uint8 else values, slot.name, ruleset)
-    lo, hi = stored_range(kind)
+    if slot.kind.name == "element":
+        check_ids(kind, array if array.dtype == xp.uint8 else values, slot.name, ruleset)
+    lo, hi = stored_range(slot.kind)
     least, most = int(values.min()), int(values.max())
     if least < lo or most > hi:
         raise ValueError(f"{slot.name} takes {lo:g}..{hi:g}, found {least}..{most}")
-    prop = ruleset.property(slot.name)
-    limited = prop.stored if prop is not None else slot.of
-    if limited is not None:
-        places = arrays.as_index(ids)
-        default = int(slot.default) if usual is None else xp.asarray(usual[places], dtype=xp.int64)
-        if bool(((values != default) & ~_holders(arrays, limited)[places]).any()):
-            raise _misplaced(slot, limited, ruleset)
     return values
 
 

@@ -33,8 +33,8 @@ from powderdsl.model.types import (
     Ruleset,
     Swap,
 )
-from powderdsl.simulation.any_arrays import AnyWorld
 from powderdsl.simulation.provenance import NumberedRule, numbered_rules
+from powderdsl.simulation.simulator import World
 
 Cell = tuple[int, int]
 """(row, column)."""
@@ -158,7 +158,7 @@ class RecordedStep:
             self.writes.append(Write(change.slot, *values, change.how, substep, rule, asked, source))
 
 
-def record_step(world: AnyWorld, cell: Cell) -> RecordedStep:
+def record_step(world: World, cell: Cell) -> RecordedStep:
     """The next step of a batch of one world, with default parameters, recorded."""
     ruleset, to_numpy = world.sim.ruleset, world.sim.kind.to_numpy
     state = {name: to_numpy(value) for name, value in world.state.items()}
@@ -287,7 +287,7 @@ class Trace:
 
 
 def trace(
-    world: AnyWorld,
+    world: World,
     row: int,
     column: int,
     step: int = 1,
@@ -339,7 +339,7 @@ def trace(
     )
 
 
-def _slots(world: AnyWorld, names: Iterable[str] | None) -> list[Slot]:
+def _slots(world: World, names: Iterable[str] | None) -> list[Slot]:
     """The slots of some names, or all of the state. Raises KeyError."""
     known, ruleset = {slot.name: slot for slot in world.sim.slots}, world.sim.ruleset
     if names is None:

@@ -7,6 +7,10 @@ from collections import defaultdict
 from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
+from powderdsl.diagnostics import CompileError
+from powderdsl.system.writing import failure
+from powderdsl.targets.array_kind import Array
+
 
 class PassClock:
     """Seconds by pass. Work before the first pass has the name ``""``."""
@@ -45,10 +49,6 @@ def profile_of(program: Runnable, job: Job) -> Mapping[str, float]:
     clock = PassClock(getattr(job.clock.seed, "device", None))
     program.run(job._replace(timing=clock))
     return clock.passes()
-
-
-Array = Any
-"""A torch tensor, or an array of `powderdsl.arrays`: all arrays of a job are of one library."""
 
 
 class Clock(NamedTuple):
@@ -98,6 +98,12 @@ class Job(NamedTuple):  # made faster than a frozen dataclass, at each call
         """Called by programs after each pass, and with ``""`` before the first one of a step."""
         if self.timing is not None:
             self.timing.tick(name)
+
+
+def unavailable(backend: str, problem: str, help: str) -> CompileError:
+    """The error (PD701) for a backend that does not run here."""
+    notes = tuple(problem.splitlines())
+    return failure("PD701", f"the {backend} backend is not available", notes=notes, helps=(help,))
 
 
 class Runnable(Protocol):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -11,15 +10,15 @@ import torch
 from torch import Tensor
 
 from powderdsl.arrays import np
+from powderdsl.targets.array_kind import ArrayKind
 
 
 @dataclass(frozen=True)
-class Tensors:
-    """An `array_kind.ArrayKind`."""
+class Tensors(ArrayKind):
+    """The other kind of arrays: see `ArrayKind`, whose methods these are."""
 
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     xp: ClassVar[Any] = torch
-    flags: ClassVar[Any] = torch.bool
 
     @property
     def on_cpu(self) -> bool:
@@ -39,9 +38,6 @@ class Tensors:
             values, dtype=None if dtype is None else getattr(torch, dtype), device=self.device
         )
 
-    def empty(self, dtype: torch.dtype, shape: tuple[int, ...]) -> Tensor:
-        return torch.empty(shape, dtype=dtype, device=self.device)
-
     def zeros(self, dtype: str, shape: tuple[int, ...]) -> Tensor:
         return torch.zeros(shape, dtype=getattr(torch, dtype), device=self.device)
 
@@ -54,20 +50,15 @@ class Tensors:
     def contiguous(self, array: Tensor) -> Tensor:
         return array.contiguous()
 
-    def as_index(self, ids: Tensor) -> Tensor:
-        return ids.int()
-
     def entries(self, table: Tensor, index: Tensor) -> Tensor:
-        return table.index_select(0, index.int())
+        rows = table.index_select(0, index.flatten().int())  # faster than an index
+        return rows.view(*index.shape, *table.shape[1:])
 
     def sort(self, array: Tensor) -> str:
         dtype = array.dtype
         if dtype.is_complex:
             return "complex"
         return "float" if dtype.is_floating_point else "bool" if dtype == torch.bool else "int"
-
-    def unbound(self, array: Tensor, axis: int) -> Sequence[Tensor]:
-        return array.unbind(axis)
 
     def as_bytes(self, array: Tensor) -> Tensor:
         return array.reshape(-1).view(torch.uint8)

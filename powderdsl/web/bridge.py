@@ -191,7 +191,7 @@ class Session:
 
     def trace(self, world: dict[str, Any], row: int, column: int, params: dict[str, float]) -> str:
         """Why a cell holds what it holds one step after a world, with other values for some parameters."""
-        from powderdsl.simulation.array_worlds import ArraySimulator
+        from powderdsl.simulation.simulator import Simulator
         from powderdsl.simulation.tracing import trace, trace_text
 
         reporter, sim = Reporter(), self._simulator()
@@ -200,7 +200,7 @@ class Session:
         if changed := {name: value for name, value in params.items() if value != usual.get(name)}:
             rules = set_params(rules, changed, reporter)
             reporter.raise_if_errors()
-            sim = ArraySimulator(rules, memo=self.memo)
+            sim = Simulator(rules, "wasm", tensors=False, memo=self.memo)
         return trace_text(trace(self._world(world, sim), int(row), int(column), 1)).replace(
             f"{self.folder}/", ""
         )
@@ -227,11 +227,11 @@ class Session:
 
     def _simulator(self) -> Any:
         """One for each rules: compiling takes a while."""
-        from powderdsl.simulation.array_worlds import ArraySimulator
+        from powderdsl.simulation.simulator import Simulator
 
         rules = self._rules()
         if self._made is None or self._made.ruleset is not rules:
-            self._made = ArraySimulator(rules, memo=self.memo)
+            self._made = Simulator(rules, "wasm", tensors=False, memo=self.memo)
         return self._made
 
     def _world(self, data: dict[str, Any], sim: Any) -> Any:

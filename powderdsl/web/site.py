@@ -28,7 +28,7 @@ from powderdsl.simulation.standalone import standalone_module
 from powderdsl.system.memo import Memo
 from powderdsl.system.user_cache import cache_folder
 from powderdsl.system.writing import replacing
-from powderdsl.targets.array_kind import PlainArrays
+from powderdsl.targets.array_kind import ArrayKind
 from powderdsl.tasks.shipped import load_task, shipped_tasks
 from powderdsl.tasks.tensors.generator import StartWorlds
 from powderdsl.web.worlds import world_data
@@ -390,7 +390,7 @@ def _scenes(ruleset: Ruleset) -> Iterator[dict[str, Any]]:
 
 def task_worlds() -> dict[str, list[dict[str, Any]]]:
     """The first world of each shipped task's first split, by the rules of the tasks."""
-    kind = PlainArrays()
+    kind = ArrayKind()
     found: dict[str, list[dict[str, Any]]] = {}
     for name in shipped_tasks():
         task = load_task(name)

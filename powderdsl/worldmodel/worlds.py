@@ -9,11 +9,12 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from powderdsl.compiler import load, starting_backend
+from powderdsl.compiler import load
 from powderdsl.diagnostics import CompileError, Reporter, Span, suggest
 from powderdsl.model.composition.palette import Palette
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
+from powderdsl.simulation.programs import starting_backend
 from powderdsl.simulation.simulator import World
 from powderdsl.system.writing import failure
 from powderdsl.tasks.episodes import TaskProgram, compile_task

@@ -12,7 +12,7 @@ from powderdsl.arrays import np
 from powderdsl.diagnostics import CompileError
 from powderdsl.model.state import qualified_slots, slot_name
 from powderdsl.model.types import ELEMENT
-from powderdsl.simulation.any_arrays import AnySimulator, AnyWorld, W
+from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.system.archives import Archive, BadArchive, open_archive, write_archive
 from powderdsl.system.reading import parse_json
 from powderdsl.system.writing import failure, replacing
@@ -27,14 +27,14 @@ MORE = 1 << 24
 """Bytes that arrays may take beyond those of twice the worlds: fields of packs that are not loaded."""
 
 
-def save(world: AnyWorld, path: str | Path) -> None:
+def save(world: World, path: str | Path) -> None:
     """Write worlds with everything that later steps depend on. The file appears whole or not at all.
 
     Raises:
         CompileError: PD613 if the place cannot be written, PD602 if the disk is full, PD607 if there are more than
             MAX_CELLS cells. TypeError: `world` is not a world.
     """
-    if not isinstance(world, AnyWorld):
+    if not isinstance(world, World):
         raise TypeError(f"save takes a World, found {type(world).__name__}")
     target = Path(path)
     check_saved(target, world.shape)
@@ -58,14 +58,14 @@ def save(world: AnyWorld, path: str | Path) -> None:
             raise _bad(target, f"cannot be written: {error.strerror}") from None
 
 
-def load_world(path: str | Path, sim: AnySimulator[W]) -> W:
+def load_world(path: str | Path, sim: Simulator) -> World:
     """Worlds from a file, for a simulator whose ruleset may number its elements differently.
 
     Raises:
         CompileError: PD602 if the file is not a saved world; PD603 if the ruleset lacks one of its elements or fields;
             PD607 if it has more than MAX_CELLS cells. TypeError: `sim` is not a simulator.
     """
-    if not isinstance(sim, AnySimulator):
+    if not isinstance(sim, Simulator):
         raise TypeError(f"load_world takes a Simulator, from powderdsl.compile; found {type(sim).__name__}")
     source = Path(path)
     try:
@@ -79,7 +79,7 @@ def load_world(path: str | Path, sim: AnySimulator[W]) -> W:
         raise _bad(source, f"is not a saved world: {error}") from None
 
 
-def _loaded(archive: Archive, sim: AnySimulator[W], source: Path) -> W:
+def _loaded(archive: Archive, sim: Simulator, source: Path) -> World:
     palette, qualified, saved_in = _about(archive, source)
     shape = _shape(archive, sim, source)
     clock = {name: sim.kind.from_numpy(_clock(archive, name, source)) for name in CLOCK}
@@ -104,7 +104,7 @@ def _loaded(archive: Archive, sim: AnySimulator[W], source: Path) -> W:
         fields[slot.name] = _translated(palette, value, sim, source) if slot.kind == ELEMENT else value
     try:
         world = sim.replace(sim.world(_translated(palette, ids, sim, source)), **fields)
-        return sim.world_type(sim, world.state, **clock)
+        return World(sim, world.state, **clock)
     except (ValueError, TypeError) as error:
         raise _bad(source, str(error)) from None
 
@@ -126,7 +126,7 @@ def _about(archive: Archive, path: Path) -> tuple[dict[int, str], dict[str, str]
     return palette, fields, str(about.get("ruleset"))[:100]
 
 
-def _shape(archive: Archive, sim: AnySimulator[Any], path: Path) -> tuple[int, ...]:
+def _shape(archive: Archive, sim: Simulator, path: Path) -> tuple[int, ...]:
     """[worlds, rows, columns], if the arrays are not larger than those of such worlds can be."""
     header = archive.headers.get(IDS)
     if header is None or header.dtype != "uint8" or len(header.shape) != 3 or 0 in header.shape:
@@ -159,7 +159,7 @@ def _clock(archive: Archive, name: str, path: Path) -> Any:
     return values
 
 
-def _translated(palette: dict[int, str], ids: Any, sim: AnySimulator[Any], path: Path) -> Any:
+def _translated(palette: dict[int, str], ids: Any, sim: Simulator, path: Path) -> Any:
     """The file's ids as ours, uint8; reports elements that we do not have."""
     if ids.dtype != np.uint8:
         raise _bad(path, f"is not a saved world: elements are bytes, found {ids.dtype}")

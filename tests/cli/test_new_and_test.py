@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 import powderdsl as package
-from powderdsl.simulation.compiling import compile_any
+from powderdsl.simulation.simulator import compile
 from powderdsl.testing.pack_tests.runner import SEEDS, run_examples
 from tests.cli.commands import PACK, powderdsl
 
@@ -178,7 +178,9 @@ def test_conditions_may_read_fields_draws_and_parameters(folder):
 def test_both_backends_agree(folder):
     (folder / "grit.yaml").write_text(PACK + TESTS.replace(". x x .", ". x . ."))
     rules = package.load("core", "grit.yaml")
-    first, second = (run_examples(rules, sim=compile_any(rules, name)) for name in ("wasm", "reference"))
+    first, second = (
+        run_examples(rules, sim=compile(rules, name, tensors=False)) for name in ("wasm", "reference")
+    )
     assert first == second
 
 

@@ -12,7 +12,7 @@ import pytest
 import powderdsl
 from powderdsl.diagnostics import CompileError
 from powderdsl.envs.tensor_env import TensorEnv
-from powderdsl.simulation.array_worlds import ArraySimulator
+from powderdsl.simulation.simulator import Simulator
 
 NAN = float("nan")
 SHAPE = (2, 4, 5)
@@ -30,7 +30,7 @@ def simulator() -> Any:
 def simulator_of(library: str) -> Any:
     ruleset = powderdsl.load("powderworld")
     if library == "arrays":
-        return ArraySimulator(ruleset, backend="reference")
+        return Simulator(ruleset, backend="reference", tensors=False)
     return powderdsl.compile(ruleset, backend="reference")
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from powderdsl.compiler import lower
 from powderdsl.model.types import Ruleset
+from powderdsl.simulation.programs import BackendProgram
 from powderdsl.simulation.simulator import Simulator
 from powderdsl.targets.cpp.compilers import find_compiler
 from powderdsl.targets.cuda.program import Arguments, Compile, CudaProgram, Launch, worlds_of
@@ -67,11 +68,12 @@ class EmulatedSimulator(Simulator):
         self.backend = EMULATED
         self._how = folder, order, shared_limit
         compile = compiler_for(folder, order)
-        self._program = packed_program(
+        program = packed_program(
             lower(ruleset),
             self.device,
             lambda cells, planes: CudaProgram(cells, planes, compile, shared_limit),
         )
+        self._program = BackendProgram(EMULATED, program)
 
     def like(self, ruleset: Ruleset) -> EmulatedSimulator:
         """Another ruleset, emulated in the same way."""

@@ -11,7 +11,6 @@ import torch
 import powderdsl
 from powderdsl.compiler import shipped_tests
 from powderdsl.model.types import Ruleset
-from powderdsl.simulation.array_worlds import ArraySimulator, ArrayWorld
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.simulation.simulator import compile as compile_rules
 from powderdsl.targets.mixed import MixedProgram
@@ -20,10 +19,10 @@ from powderdsl.testing.generators.cases import load_text
 from tests.semantics.test_mixed import HEAVY
 from tests.tiers import tiered
 
-Both = tuple[ArrayWorld, World]
+Both = tuple[World, World]
 
 
-def assert_same(found: ArrayWorld, wanted: World) -> None:
+def assert_same(found: World, wanted: World) -> None:
     assert list(found.state) == list(wanted.state)
     for name in (*found.state, "seed", "index", "step"):
         kept = name in found.state
@@ -33,11 +32,11 @@ def assert_same(found: ArrayWorld, wanted: World) -> None:
         assert a.tobytes() == b.tobytes(), name
 
 
-def simulators(ruleset: Ruleset, backend: str = "wasm") -> tuple[ArraySimulator, Simulator]:
-    return ArraySimulator(ruleset, backend), compile_rules(ruleset, backend)
+def simulators(ruleset: Ruleset, backend: str = "wasm") -> tuple[Simulator, Simulator]:
+    return compile_rules(ruleset, backend, tensors=False), compile_rules(ruleset, backend)
 
 
-def starts(sims: tuple[ArraySimulator, Simulator], shape: tuple[int, ...], **how: Any) -> Both:
+def starts(sims: tuple[Simulator, Simulator], shape: tuple[int, ...], **how: Any) -> Both:
     """Random elements, and random values of fields that every cell has."""
     ruleset, random = sims[0].ruleset, np.random.default_rng(1)
     ids = np.array([one.id for one in ruleset.elements])[random.integers(0, len(ruleset.elements), shape)]
@@ -64,11 +63,11 @@ def test_shipped_rules_give_the_same_worlds(name: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def powderworld() -> tuple[ArraySimulator, Simulator]:
+def powderworld() -> tuple[Simulator, Simulator]:
     return simulators(powderdsl.load("powderworld"))
 
 
-def test_worlds_are_changed_alike(powderworld: tuple[ArraySimulator, Simulator]) -> None:
+def test_worlds_are_changed_alike(powderworld: tuple[Simulator, Simulator]) -> None:
     shape = (2, 9, 33)
     mask = np.random.default_rng(2).random(shape) < 0.3
     worlds = starts(powderworld, shape, seed=[4, 1 << 62], index=[0, 7])
@@ -92,7 +91,7 @@ def test_worlds_are_changed_alike(powderworld: tuple[ArraySimulator, Simulator])
         assert (first.dtype, first.tobytes()) == (second.numpy().dtype, second.numpy().tobytes())
 
 
-def test_a_world_stays_as_it_was(powderworld: tuple[ArraySimulator, Simulator]) -> None:
+def test_a_world_stays_as_it_was(powderworld: tuple[Simulator, Simulator]) -> None:
     sim = powderworld[0]
     first = sim.step(starts(powderworld, (2, 8, 40))[0])
     before = {name: value.copy() for name, value in first.state.items()}
@@ -109,7 +108,7 @@ def test_passes_that_fit_no_planes_run_on_the_oracle() -> None:
     for _ in range(3):
         found, wanted = sims[0].step(found), sims[1].step(wanted)
         assert_same(found, wanted)
-    assert any(isinstance(one, MixedProgram) for one in sims[0]._program._made.values())  # type: ignore[attr-defined]
+    assert any(isinstance(one, MixedProgram) for one in sims[0]._program.whole._made.values())  # type: ignore[attr-defined]
 
 
 def test_the_oracle_gives_the_same_worlds() -> None:

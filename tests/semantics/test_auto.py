@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -24,8 +24,9 @@ from powderdsl.compiler import lower
 from powderdsl.ir.text import print_program
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
-from powderdsl.simulation import programs
-from powderdsl.simulation.programs import AutoProgram, start_key
+from powderdsl.simulation import native
+from powderdsl.simulation.native import AutoProgram, start_key
+from powderdsl.simulation.programs import BackendProgram
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.targets import cache
 from powderdsl.targets.cpp.build import Building, building
@@ -100,7 +101,7 @@ def made(seconds: float) -> tuple[AutoProgram, Compiler, list[tuple[str, int, in
     first = Counter("wasm", seconds, log)
     compiler = Compiler(Counter("native", 0, log))
     return (
-        AutoProgram(("wasm", lambda: first), lambda: Counter("torch", 0, log), lambda: None, compiler),
+        AutoProgram("wasm", lambda: first, lambda: Counter("torch", 0, log), lambda: None, compiler),
         compiler,
         log,
     )
@@ -121,7 +122,7 @@ def test_little_work_starts_no_compiler() -> None:
 
 def test_long_calls_change_over_between_two_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """It compiles as soon as the pace shows what is to come, and changes over within the call."""
-    monkeypatch.setattr(programs, "SLICE", 0.02)
+    monkeypatch.setattr(native, "SLICE", 0.02)
     program, compiler, log = made(0.005)
     threading.Timer(0.3, compiler.go.set).start()
     state = program.run(job(5000))  # 25 s on the first backend
@@ -139,7 +140,7 @@ def test_long_calls_change_over_between_two_steps(monkeypatch: pytest.MonkeyPatc
 
 
 def test_many_short_calls_are_worth_it_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(programs, "WORTH", 0.05)
+    monkeypatch.setattr(native, "WORTH", 0.05)
     program, compiler, _ = made(0.005)
     for start in range(30):
         program.run(job(1, start))
@@ -156,8 +157,11 @@ class Full(Counter):
 
 def test_worlds_too_large_for_webassembly_wait_for_native_code() -> None:
     log: list[tuple[str, int, int]] = []
-    first, torch_ = ("wasm", lambda: Full("wasm")), lambda: Counter("torch", 0, log)
-    program = AutoProgram(first, torch_, lambda: None, lambda: Counter("native", 0, log))
+
+    def made(make: Callable[[], Counter]) -> AutoProgram:
+        return AutoProgram("wasm", lambda: Full("wasm"), lambda: Counter("torch", 0, log), lambda: None, make)
+
+    program = made(lambda: Counter("native", 0, log))
     program.run(job(3))
     program.run(job(4, 3))
     assert log == [("native", 0, 3), ("native", 3, 4)]
@@ -165,18 +169,21 @@ def test_worlds_too_large_for_webassembly_wait_for_native_code() -> None:
     def fails() -> Counter:
         raise NoCompiler("no C++ compiler")
 
-    AutoProgram(first, torch_, lambda: None, fails).run(job(5, 7))
+    made(fails).run(job(5, 7))
     assert log[2:] == [("torch", 7, 5)]
 
 
 def test_given_draws_and_chosen_passes_stay_with_torch() -> None:
     log: list[tuple[str, int, int]] = []
-    program = AutoProgram(
-        ("wasm", lambda: Counter("wasm", 0, log)),
-        lambda: Counter("torch", 0, log),
+    cells = Counter("torch", 0, log)
+    auto = AutoProgram(
+        "wasm",
+        lambda: Counter("wasm", 0, log),
+        lambda: cells,
         lambda: Counter("native", 0, log),
         lambda: Counter("", 0, log),
     )
+    program = BackendProgram("", auto, lambda: cells)
     program.run(job(3))
     program.run(job(4, draws={"coin": torch.zeros(1, 2, 2)}))
     program.run(job(5, passes=frozenset({"fall"})))
@@ -191,7 +198,7 @@ def test_given_draws_and_chosen_passes_stay_with_torch() -> None:
 def test_without_native_code_the_first_backend_continues(
     problem: Exception, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(programs, "WORTH", 0.0)
+    monkeypatch.setattr(native, "WORTH", 0.0)
     log: list[tuple[str, int, int]] = []
     asked = []
 
@@ -200,9 +207,13 @@ def test_without_native_code_the_first_backend_continues(
         raise problem
 
     program = AutoProgram(
-        ("wasm", lambda: Counter("wasm", 0.001, log)), lambda: Counter("torch", 0, log), lambda: None, fails
+        "wasm",
+        lambda: Counter("wasm", 0.001, log),
+        lambda: Counter("torch", 0, log),
+        lambda: None,
+        fails,
     )
-    programs._tell_of_compilers.cache_clear()
+    native._tell_of_compilers.cache_clear()
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         for start in range(50):
@@ -216,7 +227,7 @@ def test_without_native_code_the_first_backend_continues(
 
 
 def test_threads_share_one_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(programs, "WORTH", 0.0)
+    monkeypatch.setattr(native, "WORTH", 0.0)
     program, compiler, _ = made(0.0001)
     results = []
 
@@ -277,7 +288,7 @@ def test_every_compiler_gives_the_oracles_worlds(
 def test_auto_changes_over_to_the_same_worlds_and_remembers(
     rules: Ruleset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(programs, "WORTH", 0.0)
+    monkeypatch.setattr(native, "WORTH", 0.0)
     with building(Building("-O0", tmp_path)):
         sims = [powderdsl.compile(rules) for _ in range(3)]
         assert [sim.running for sim in sims] == ["wasm"] * 3
@@ -362,7 +373,7 @@ def test_forks_run_native_code_too(rules: Ruleset, tmp_path: Path) -> None:
     program = """
 import os, sys, time
 from pathlib import Path
-from powderdsl.simulation import programs as auto_program
+from powderdsl.simulation import native as auto_program
 from powderdsl.targets import cache
 from powderdsl.targets.cpp.build import Building, building
 from powderdsl.testing.generators.cases import load_text
@@ -409,7 +420,7 @@ def test_the_end_does_not_wait_for_the_compiler(tmp_path: Path) -> None:
     program = """
 import sys, time
 from pathlib import Path
-from powderdsl.simulation import programs as auto_program
+from powderdsl.simulation import native as auto_program
 from powderdsl.targets import cache
 from powderdsl.targets.cpp.build import Building, building
 from powderdsl.testing.generators.cases import load_text

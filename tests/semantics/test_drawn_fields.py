@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import powderdsl as package
-from powderdsl.simulation.compiling import compile_any
 from powderdsl.simulation.draw import to_numpy
+from powderdsl.simulation.simulator import compile
 from powderdsl.testing.pack_tests.runner import run_examples
 
 FIELDS = """\
@@ -62,7 +62,7 @@ def results(tmp_path, *, expected: str, drawn: str = DRAWN, rules: str = FIELDS)
     path.write_text(f"{rules}tests:\n  - drawn:\n  {body}\n")
     worlds = []
     rules = package.load(path)
-    found = run_examples(rules, sim=compile_any(rules, "reference"), seen=worlds.append)
+    found = run_examples(rules, sim=compile(rules, "reference", tensors=False), seen=worlds.append)
     return found[0], worlds[0]
 
 

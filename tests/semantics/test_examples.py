@@ -12,8 +12,7 @@ import torch
 
 import powderdsl
 from powderdsl.model.types import Ruleset
-from powderdsl.simulation.compiling import compile_any
-from powderdsl.simulation.simulator import Simulator, World
+from powderdsl.simulation.simulator import Simulator, World, compile
 from powderdsl.testing.pack_tests.runner import run_examples
 from powderdsl.worlds.ascii import read_ascii, write_ascii
 
@@ -49,7 +48,7 @@ def failures(rules: Ruleset, pack: str, backend: str) -> list[str]:
     """The tests of one pack that fail with all of these rules; changes by packs beside it are not failures."""
     own = tuple(example for example in rules.tests if example.pack == pack)
     assert own, f"{pack} has no tests"
-    results = run_examples(replace(rules, tests=own), sim=compile_any(rules, backend))
+    results = run_examples(replace(rules, tests=own), sim=compile(rules, backend, tensors=False))
     return [f"{result.example.name}: {result.problem}" for result in results if result.failed]
 
 

@@ -7,8 +7,8 @@ import pytest
 
 import powderdsl as package
 from powderdsl.diagnostics import CompileError
-from powderdsl.simulation.compiling import compile_any
 from powderdsl.simulation.draw import to_numpy
+from powderdsl.simulation.simulator import compile
 from powderdsl.testing.pack_tests.runner import run_examples
 
 HEAD = """\
@@ -81,7 +81,10 @@ def rules(tmp_path_factory):
 
 @pytest.mark.parametrize("backend", ["reference", "torch", "native", "wasm"])
 def test_fresh_cells_have_their_elements_default(rules, backend):
-    assert [result.problem for result in run_examples(rules, sim=compile_any(rules, backend))] == ["", ""]
+    assert [result.problem for result in run_examples(rules, sim=compile(rules, backend, tensors=False))] == [
+        "",
+        "",
+    ]
 
 
 def test_painted_cells_are_fresh(rules):

@@ -11,10 +11,10 @@ from powderdsl.ir.build import Builder
 from powderdsl.ir.ops import FLAG, PassGraph, Program, SlotType, integer
 from powderdsl.ir.segments import Carried, carry, segments
 from powderdsl.model.types import Ruleset
-from powderdsl.simulation.programs import CompiledProgram
+from powderdsl.simulation.programs import BackendProgram
 from powderdsl.simulation.simulator import Simulator, World
+from powderdsl.targets.mixed import MixedProgram, mixed_program
 from powderdsl.targets.tensor_kind import Tensors
-from powderdsl.targets.torch.mixed import MixedProgram, mixed_program
 from powderdsl.targets.torch.program import TorchProgram
 from powderdsl.targets.wasm.program import WasmProgram
 from powderdsl.testing.generators.cases import load_text, random_start
@@ -131,10 +131,12 @@ def with_refused(rules: Ruleset, program: Program, refused: list[str]) -> Simula
 
     sim = powderdsl.compile(rules, backend="torch")
     mixed = mixed_program(
-        segments(program, choose), sim.device, lambda *parts: WasmProgram(*parts, Tensors())
+        segments(program, choose),
+        lambda *parts: WasmProgram(*parts, Tensors()),
+        lambda cells: TorchProgram(cells, sim.device),
     )
     assert isinstance(mixed, MixedProgram)
-    sim._program = CompiledProgram(mixed, lambda: TorchProgram(program, sim.device), "wasm")
+    sim._program = BackendProgram("wasm", mixed, lambda: TorchProgram(program, sim.device))
     return sim
 
 

@@ -204,7 +204,7 @@ def test_no_value_is_asked_for(torch) -> None:  # type: ignore[no-untyped-def]
     ):
         found, wanted = look(state), real()
         assert (found.shape, found.dtype, found.device.type) == (wanted.shape, wanted.dtype, "meta")
-    assert observer.read(state, "density").shape == (2, 3, 70)
+    assert observer.read(state, "gravity").shape == (2, 3, 70)
 
 
 def test_packed_worlds_are_not_unpacked(torch) -> None:  # type: ignore[no-untyped-def]

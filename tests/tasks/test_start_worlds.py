@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from powderdsl.targets.array_kind import PlainArrays
+from powderdsl.targets.array_kind import ArrayKind
 from powderdsl.tasks.shipped import load_task, shipped_tasks
 from powderdsl.tasks.tensors.generator import Made, StartWorlds
 from tests.unit.test_without_numpy import BLOCK
@@ -23,12 +23,12 @@ SEEDS = (0, 3, 1 << 40, 17, 18)
 ALONE = f"""{BLOCK}
 import hashlib
 from powderdsl.arrays import np
-from powderdsl.targets.array_kind import PlainArrays
+from powderdsl.targets.array_kind import ArrayKind
 from powderdsl.tasks.shipped import load_task
 from powderdsl.tasks.tensors.generator import StartWorlds
 
 for name in {SOME!r}:
-    made = StartWorlds(load_task(name), "train", PlainArrays()).make(np.array([{SEEDS[1]}], np.int64))
+    made = StartWorlds(load_task(name), "train", ArrayKind()).make(np.array([{SEEDS[1]}], np.int64))
     print(hashlib.sha256(made.ids.tobytes()).hexdigest())
 """
 
@@ -44,7 +44,7 @@ def test_arrays_make_the_worlds_of_tensors(torch, name):
 
     task = load_task(name)
     for split in task.splits:
-        starts = [StartWorlds(task, split.name, kind) for kind in (PlainArrays(), Tensors())]
+        starts = [StartWorlds(task, split.name, kind) for kind in (ArrayKind(), Tensors())]
         for seeds in (SEEDS, SEEDS[:1]):
             found = values(starts[0].make(np.array(seeds, np.int64)))
             wanted = values(starts[1].make(torch.tensor(seeds)))
@@ -59,6 +59,6 @@ def test_worlds_are_made_without_torch_and_numpy():
     assert ended.stderr == ""
     expected = []
     for name in SOME:
-        made = StartWorlds(load_task(name), "train", PlainArrays()).make(np.array([SEEDS[1]]))
+        made = StartWorlds(load_task(name), "train", ArrayKind()).make(np.array([SEEDS[1]]))
         expected.append(hashlib.sha256(made.ids.tobytes()).hexdigest())
     assert ended.stdout.split() == expected

@@ -6,22 +6,21 @@ import pytest
 import torch
 
 import powderdsl
-from powderdsl.compiler import starting_backend
 from powderdsl.diagnostics import CompileError
-from powderdsl.simulation.programs import make_program
-from powderdsl.targets.torch.program import TorchProgram
+from powderdsl.simulation.programs import make_program, starting_backend
+from powderdsl.targets.tensor_kind import Tensors
 
 
 @pytest.mark.parametrize("backend", ["wasm", "native"])
 def test_what_runs_on_the_cpu_is_refused_elsewhere(backend: str) -> None:
     with pytest.raises(CompileError, match=f"the {backend} backend is not available") as found:
-        make_program(powderdsl.load("life"), backend, torch.device("meta"))
+        make_program(powderdsl.load("life"), backend, Tensors(torch.device("meta")))
     assert "on the backend `torch` or `auto` on `meta`" in str(found.value)
 
 
 def test_other_devices_run_tensors() -> None:
-    program = make_program(powderdsl.load("life"), "auto", torch.device("meta"))
-    assert type(program) is TorchProgram
+    program = make_program(powderdsl.load("life"), "auto", Tensors(torch.device("meta")))
+    assert program.running == "torch"
 
 
 def test_without_a_compiler_native_names_what_needs_none(monkeypatch: pytest.MonkeyPatch) -> None:

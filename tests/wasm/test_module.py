@@ -124,11 +124,11 @@ def test_a_full_memory_is_followed_by_another(monkeypatch: pytest.MonkeyPatch, t
 LIMITED = """
 import resource
 from powderdsl.arrays import np
-from powderdsl.simulation.compiling import compile_arrays
+from powderdsl.simulation.simulator import compile
 
 resource.setrlimit(resource.RLIMIT_AS, (2 << 30, 2 << 30))
 for name in ("life", "core+sand"):
-    sim = compile_arrays(name, "wasm")
+    sim = compile(name, "wasm", tensors=False)
     print(int(sim.step(sim.world(np.ones((2, 8, 64), np.uint8)), 3).ids.sum()))
 """
 

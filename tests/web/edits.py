@@ -12,7 +12,7 @@ from js import cpu
 begin, began = cpu(), time.perf_counter()
 from powderdsl.arrays import np  # noqa: E402
 from powderdsl.compiler import load_with_diagnostics, shipped  # noqa: E402
-from powderdsl.simulation.array_worlds import ArraySimulator  # noqa: E402
+from powderdsl.simulation.simulator import Simulator  # noqa: E402
 from powderdsl.syntax.parse import parser  # noqa: E402
 from powderdsl.system.memo import Memo  # noqa: E402
 
@@ -31,7 +31,7 @@ def laps(memo: Memo) -> dict[str, float]:
     start, clock = cpu(), time.perf_counter()
     model, _ = load_with_diagnostics(FOLDER / "powderworld.yaml")
     loaded = cpu()
-    sim = ArraySimulator(model, memo=memo)
+    sim = Simulator(model, "wasm", tensors=False, memo=memo)
     lowered = cpu()
     world = sim.step(sim.world(np.zeros((1, 64, 64), np.uint8), seed=1))
     assert world.ids.shape == (1, 64, 64)

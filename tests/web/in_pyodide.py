@@ -10,9 +10,9 @@ from pathlib import Path
 from powderdsl.arrays import np
 from powderdsl.cli.dispatch import main
 from powderdsl.compiler import load, lower, parts, shipped
-from powderdsl.simulation.array_worlds import ArraySimulator
+from powderdsl.simulation.simulator import Simulator
 from powderdsl.system.memo import Memo
-from powderdsl.targets.array_kind import PlainArrays
+from powderdsl.targets.array_kind import ArrayKind
 from powderdsl.targets.wasm.source import wasm_module
 from powderdsl.tasks.shipped import load_task
 from powderdsl.tasks.tensors.generator import StartWorlds
@@ -50,7 +50,7 @@ model = load("powderworld")
 assert part.planes is not None
 Path("module.wasm").write_bytes(wasm_module(part.planes, 64, memo=memo).code)
 
-sim = ArraySimulator(model, memo=memo)
+sim = Simulator(model, memo=memo)
 ids = np.frombuffer(Path("ids").read_bytes(), np.uint8).reshape(2, 64, 64)
 velocity = np.frombuffer(Path("velocity").read_bytes(), np.float32).reshape(2, 2, 64, 64)
 world = sim.step(sim.replace(sim.world(ids, seed=3), velocity=velocity), STEPS)
@@ -64,6 +64,6 @@ Path("world.npz").unlink()
 drawn = load_start("garden", model, size=(40, 70)).ids
 scattered = strew(model, (33, 20), 2, 7)
 painted = sim.paint(sim.world(scattered), where=scattered > 2, element="sand", velocity=(1, 2.5))
-made = StartWorlds(load_task("sort-sand-and-stone"), "train", PlainArrays()).make(np.array([5, 9], np.int64))
+made = StartWorlds(load_task("sort-sand-and-stone"), "train", ArrayKind()).make(np.array([5, 9], np.int64))
 arrays = [*again.state.values(), again.step, drawn, scattered, *painted.state.values(), made.ids]
 Path("worlds").write_text("".join(f"{sha256(value.tobytes()).hexdigest()}\n" for value in arrays))

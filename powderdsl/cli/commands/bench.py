@@ -11,7 +11,6 @@ import click
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import OK, user_values
 from powderdsl.cli.output import print_json, progress
-from powderdsl.compiler import starting_backend
 from powderdsl.experiments.bench import (
     WORKLOADS,
     CellFigures,
@@ -117,6 +116,8 @@ def command(
 
 def _usual_backends(device: str) -> tuple[str, ...]:
     """The default backends: the one that starts at once, and the fastest one for the device if it can be compiled."""
+    from powderdsl.simulation.programs import starting_backend
+
     first = starting_backend(device)
     if device != "cpu":
         return ("torch", "cuda") if device.startswith("cuda") else ("torch",)

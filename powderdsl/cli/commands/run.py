@@ -18,7 +18,7 @@ from powderdsl.cli.exits import user_values
 from powderdsl.cli.output import counted, progress
 
 if TYPE_CHECKING:
-    from powderdsl.simulation.any_arrays import AnyWorld
+    from powderdsl.simulation.simulator import World
 
 ANIMATIONS = (".gif", ".mp4")
 SUFFIXES = (".png", *ANIMATIONS, ".npz")
@@ -107,11 +107,9 @@ def command(
         click.echo(_populations(first, last), err=True)
 
 
-def _set_threads(threads: int | None, world: AnyWorld) -> int:
+def _set_threads(threads: int | None, world: World) -> int:
     """Set and return how many threads torch uses, if it runs: `threads`, or one for small batches."""
-    from powderdsl.simulation.array_worlds import ArrayWorld
-
-    if isinstance(world, ArrayWorld):
+    if world.sim.kind.xp.__name__ != "torch":
         return 1
     import torch
 
@@ -122,7 +120,7 @@ def _set_threads(threads: int | None, world: AnyWorld) -> int:
     return torch.get_num_threads()
 
 
-def _populations(start: AnyWorld, end: AnyWorld) -> str:
+def _populations(start: World, end: World) -> str:
     """How many cells each element has, before and after."""
     cells = [world.sim.kind.to_numpy(world.ids).tobytes() for world in (start, end)]
     elements = start.sim.ruleset.elements
@@ -131,7 +129,7 @@ def _populations(start: AnyWorld, end: AnyWorld) -> str:
     return "\n".join(f"  {name:<{width}}  {old:>9,} -> {new:>9,}" for name, old, new in rows if old or new)
 
 
-def play(start: AnyWorld, plan: Playback) -> AnyWorld:
+def play(start: World, plan: Playback) -> World:
     """Run to the end; the last world. Nothing half-written stays behind when it is interrupted."""
     from powderdsl.cli.pictures import LiveView, first_world, pictures
 
@@ -140,7 +138,7 @@ def play(start: AnyWorld, plan: Playback) -> AnyWorld:
     looking = plan.watch or plan.suffix in ANIMATIONS
     stride = plan.every if looking else max(1, min(64, plan.steps // 50))
 
-    def stream() -> Iterator[AnyWorld]:
+    def stream() -> Iterator[World]:
         """The world each time it is shown."""
         nonlocal world
         done = 0
@@ -151,7 +149,7 @@ def play(start: AnyWorld, plan: Playback) -> AnyWorld:
             show(step)
             yield world
 
-    def picture(world: AnyWorld) -> Any:
+    def picture(world: World) -> Any:
         return pictures(world, most=MOST_PICTURES, factor=plan.scale)
 
     with ExitStack() as stack:

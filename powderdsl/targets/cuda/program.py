@@ -8,13 +8,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from powderdsl.diagnostics import CompileError, Reporter
 from powderdsl.ir.ops import Program
 from powderdsl.targets import words as torch_words
 from powderdsl.targets.codec import parameters, pieces
 from powderdsl.targets.cuda import build
 from powderdsl.targets.cuda.source import KernelSource, cuda_source
-from powderdsl.targets.job import Job, Runnable
+from powderdsl.targets.job import Job, Runnable, unavailable
 from powderdsl.targets.torch.mixed import packed_program
 
 
@@ -41,6 +40,8 @@ class Arguments:
         return self.planes, self.reals, self.scratch, *self.clock, self.flags, self.numbers
 
 
+_HELP = "run on the device `cuda`, or on the backend `torch`, or on `native` on the CPU"
+
 Launch = Callable[[Arguments], None]
 """Runs a kernel on the current stream."""
 
@@ -60,7 +61,7 @@ def compiler_for(device: torch.device) -> Compile:
                 code = build.machine_code(source, architecture, version)
                 start = build.load_kernel(code, source)
         except build.NoCuda as error:
-            raise refusal(str(error)) from None
+            raise unavailable("cuda", str(error), _HELP) from None
 
         def launch(arguments: Arguments) -> None:
             with torch.cuda.device(device):
@@ -97,17 +98,7 @@ def cuda_program(program: Program, device: torch.device) -> Runnable:
             )
     except build.NoCuda as error:
         problem = str(error)
-    raise refusal(problem)
-
-
-def refusal(problem: str) -> CompileError:
-    """The error for users without this backend."""
-    reporter = Reporter()
-    helps = ["run on the device `cuda`, or on the backend `torch`, or on `native` on the CPU"]
-    reporter.error(
-        "PD701", "the cuda backend is not available", None, notes=problem.splitlines(), helps=helps
-    )
-    return CompileError(reporter.diagnostics)
+    raise unavailable("cuda", problem, _HELP)
 
 
 class DeviceState(Mapping[str, Tensor]):

@@ -168,7 +168,7 @@ class _Draws:
     def uniform(self, low: Array | int, high: Array | int) -> Array:
         """Integers from `low` to `high`, both included; where there are none, `low`."""
         if self.drawn is None:
-            self.drawn = self.kind.unbound(self.hashes.block(self.statement, self.repeats), -1)
+            self.drawn = list(self.kind.xp.moveaxis(self.hashes.block(self.statement, self.repeats), -1, 0))
         drawn = self.drawn[self.used]
         self.used += 1
         return low + ((drawn * (high - low + 1)) >> 32)
@@ -245,7 +245,7 @@ class WorldMaker:
 
     def _cells(self, planes: Sequence[Array]) -> Array:
         """The cells of one plane of words: bool [..., H, W]."""
-        return self.kind.xp.asarray(unpack(self.kind, planes, self.size[0]), dtype=self.kind.flags)
+        return unpack(self.kind, planes, self.size[0]) != 0
 
     def make(self, seeds: Array) -> Made:
         """The worlds of some seeds, int64 [B]."""
@@ -368,7 +368,7 @@ class _Painter:
             bits = _plane_bits(kind, ids, planes, maker.planes)
         else:  # those of stamps stand in their pictures
             bits = maker.fixed_bits(drawing.ids[0] if drawing.ids else 0, planes)
-        some = kind.unbound(bits, 2)
+        some = list(kind.xp.moveaxis(bits, 2, 0))
         self.bits = some if len(some) > 1 else some * repeats
         self.numbers: list[Array | None] = []
         words = once
@@ -381,7 +381,7 @@ class _Painter:
                 self.numbers.append(None if value is None else kind.xp.broadcast_to(value, shape))
             if drawing.kind not in _LIMITED:
                 words = maker.drawn_words(drawing, self.numbers) & once
-        self.words = kind.unbound(words, 1)
+        self.words = list(kind.xp.moveaxis(words, 1, 0))
 
     def paint(self, planes: Array, repeat: int, regions: Mapping[str, Array]) -> None:
         """Paint one repetition on planes, in place."""
@@ -442,7 +442,7 @@ class _Painter:
             bit = -(limit >> place & 1)
             below = (bit & ~drawn) | (~(bit ^ drawn) & below)
         below = kind.xp.where(limit >> CHANCE_BITS > 0, -1, below) & MASK
-        low, high = kind.unbound(below.reshape(-1, width, words, 2), -1)
+        low, high = kind.xp.moveaxis(below.reshape(-1, width, words, 2), -1, 0)
         return low | high << 32
 
 

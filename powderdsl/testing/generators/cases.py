@@ -19,7 +19,7 @@ from powderdsl.model.types import Kind, Property, Ruleset
 from powderdsl.testing.generators.choices import Choices
 
 if TYPE_CHECKING:
-    from powderdsl.simulation.any_arrays import AnySimulator, W
+    from powderdsl.simulation.simulator import Simulator, World
 
 Array = np.ndarray[Any, Any]
 
@@ -118,7 +118,7 @@ class Start:
         fields = {name: kept(values) if name in names else values for name, values in self.fields.items()}
         return replace(self, ids=kept(self.ids), fields=fields)
 
-    def world(self, simulator: AnySimulator[W]) -> W:
+    def world(self, simulator: Simulator) -> World:
         """The same worlds for any simulator of the ruleset."""
         world = simulator.world(self.ids, self.seed, index=self.index)
         world = replace(world, step=simulator.kind.from_numpy(self.step.copy()))

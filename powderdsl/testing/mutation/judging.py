@@ -21,7 +21,7 @@ from threading import Thread
 import numpy as np
 
 from powderdsl.analysis.proofs import horizon
-from powderdsl.compiler import lower, read, starting_backend
+from powderdsl.compiler import lower, read
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Severity, Source
 from powderdsl.ir.text import print_program
 from powderdsl.model.check import check
@@ -32,6 +32,7 @@ from powderdsl.model.parameter_values import set_params
 from powderdsl.model.state import slots
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Example, Invariant, Local, Ruleset, Symmetric
+from powderdsl.simulation.programs import starting_backend
 from powderdsl.simulation.simulator import Simulator, compile
 from powderdsl.system.interrupts import held_back
 from powderdsl.testing.generators.cases import Array, Start

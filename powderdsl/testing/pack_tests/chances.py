@@ -18,7 +18,7 @@ from powderdsl.model.text import one_line
 from powderdsl.model.types import Expr, Often
 
 if TYPE_CHECKING:
-    from powderdsl.simulation.any_arrays import AnyWorld
+    from powderdsl.simulation.simulator import World
 
 ERROR_RATE = 1e-6
 """How likely a correct chance fails a test, at most; and how likely one passes that is off by `OFF`."""
@@ -62,7 +62,7 @@ def trials_for(chance: float) -> int:
     return max(needed)
 
 
-def chance_problem(start: AnyWorld, steps: int, claims: Sequence[Often], seed: int) -> str:
+def chance_problem(start: World, steps: int, claims: Sequence[Often], seed: int) -> str:
     """A sentence about the first claim that counts contradict, or nothing.
 
     Args:
@@ -98,7 +98,7 @@ def chance_problem(start: AnyWorld, steps: int, claims: Sequence[Often], seed: i
     return ""
 
 
-def world_context(world: AnyWorld, *conditions: Expr) -> reference.Context:
+def world_context(world: World, *conditions: Expr) -> reference.Context:
     """The values that some conditions read: a world's state as the oracle holds it, parameters, the clock."""
     ruleset, to_numpy = world.sim.ruleset, world.sim.kind.to_numpy
     read = {part.value for one in conditions for part in one.walk() if part.op in ("field", "property")}

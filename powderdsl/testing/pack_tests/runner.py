@@ -8,19 +8,19 @@ from itertools import accumulate
 from typing import TYPE_CHECKING, Any
 
 from powderdsl.arrays import NDArray, np
-from powderdsl.compiler import starting_backend
 from powderdsl.diagnostics import Span
 from powderdsl.model import reference
 from powderdsl.model.fields import direction_word
 from powderdsl.model.restrict import restricted, without
 from powderdsl.model.text import one_line, show_number, show_single, show_value
 from powderdsl.model.types import Cell, Example, FieldGrid, Kind, Ruleset
-from powderdsl.simulation.compiling import compile_any
+from powderdsl.simulation.programs import starting_backend
+from powderdsl.simulation.simulator import compile
 from powderdsl.testing.generators.cases import holding
 from powderdsl.testing.pack_tests.chances import chance_problem, world_context
 
 if TYPE_CHECKING:
-    from powderdsl.simulation.any_arrays import AnySimulator, AnyWorld, W
+    from powderdsl.simulation.simulator import Simulator, World
 
 SEEDS = (0, 1, 2, 3, 4)
 """Seeds of a test that names none: several, since a rule that depends on chance should not pass by luck."""
@@ -65,7 +65,7 @@ class ExampleResult:
 
 
 def run_examples(
-    ruleset: Ruleset, *, sim: AnySimulator[Any] | None = None, seen: Callable[[Any], None] | None = None
+    ruleset: Ruleset, *, sim: Simulator | None = None, seen: Callable[[Any], None] | None = None
 ) -> list[ExampleResult]:
     """Run every test of a ruleset's packs, in the order of the files.
 
@@ -78,7 +78,7 @@ def run_examples(
         sim: what runs them, instead of a new simulator of this ruleset on a backend that starts at once.
         seen: called with the worlds of each batch at its end.
     """
-    sim = sim or compile_any(ruleset, starting_backend("cpu"))
+    sim = sim or compile(ruleset, starting_backend("cpu"), tensors=False)
     sizes: dict[tuple[int, int], list[int]] = {}
     for number, example in enumerate(ruleset.tests):
         sizes.setdefault((len(example.given), len(example.given[0])), []).append(number)
@@ -90,7 +90,7 @@ def run_examples(
     return _judged([results[number] for number in range(len(ruleset.tests))], ruleset, sim)
 
 
-def _judged(results: list[ExampleResult], ruleset: Ruleset, sim: AnySimulator[Any]) -> list[ExampleResult]:
+def _judged(results: list[ExampleResult], ruleset: Ruleset, sim: Simulator) -> list[ExampleResult]:
     """The results; a test that fails only with packs outside its scope names these packs."""
     scopes: dict[tuple[str, ...], list[ExampleResult]] = {}
     for result in results:
@@ -113,7 +113,7 @@ def _judged(results: list[ExampleResult], ruleset: Ruleset, sim: AnySimulator[An
     return [replace(one, added=added.get(one.example.span, ())) for one in results]
 
 
-def _passing(ruleset: Ruleset | None, places: Collection[Span], sim: AnySimulator[Any]) -> tuple[Span, ...]:
+def _passing(ruleset: Ruleset | None, places: Collection[Span], sim: Simulator) -> tuple[Span, ...]:
     """The places of the tests that pass with other rules."""
     tests = tuple(replace(one, scope=()) for one in ruleset.tests if one.span in places) if ruleset else ()
     if ruleset is None or not tests:
@@ -122,12 +122,12 @@ def _passing(ruleset: Ruleset | None, places: Collection[Span], sim: AnySimulato
     return tuple(dict.fromkeys(result.example.span for result in results if result.passed))
 
 
-def start_of(example: Example, sim: AnySimulator[W], seed: int) -> W:
+def start_of(example: Example, sim: Simulator, seed: int) -> World:
     """The start world of a test, one of a seed."""
     return _started([(example, seed)], sim)
 
 
-def _started(worlds: Sequence[tuple[Example, int]], sim: AnySimulator[W]) -> W:
+def _started(worlds: Sequence[tuple[Example, int]], sim: Simulator) -> World:
     """The start worlds of some tests of one size, with a seed each."""
     grids = []
     for example, _ in worlds:
@@ -152,7 +152,7 @@ class _Running:
     seeds: tuple[int, ...]
 
     @classmethod
-    def of(cls, example: Example, sim: AnySimulator[Any]) -> _Running:
+    def of(cls, example: Example, sim: Simulator) -> _Running:
         return cls(example, _ids(example, sim.ruleset), SEEDS if example.seed is None else (example.seed,))
 
     def stops(self) -> set[int]:
@@ -160,7 +160,7 @@ class _Running:
         steps = self.example.steps
         return {steps, *(range(1, steps) if self.example.always else ())}
 
-    def look(self, world: AnyWorld, step: int) -> ExampleResult | None:
+    def look(self, world: World, step: int) -> ExampleResult | None:
         """The failure after a step, if any; `world` holds this test's worlds alone."""
         for index, problem, field in self._problems(world, step):
             after = _rows(world.sim.kind.to_numpy(world.ids)[index], self.ids, self.example)
@@ -170,7 +170,7 @@ class _Running:
             )
         return None
 
-    def _problems(self, world: AnyWorld, step: int) -> Iterator[tuple[int, str, str]]:
+    def _problems(self, world: World, step: int) -> Iterator[tuple[int, str, str]]:
         """The world that is wrong, how, and the field that is not as expected, if one is."""
         example = self.example
         for condition in example.always if step else ():
@@ -201,9 +201,7 @@ class _Running:
         )
 
 
-def _run(
-    batch: list[_Running], sim: AnySimulator[Any], seen: Callable[[Any], None] | None
-) -> list[ExampleResult]:
+def _run(batch: list[_Running], sim: Simulator, seen: Callable[[Any], None] | None) -> list[ExampleResult]:
     """Tests of one size, all at once: each has a slice of the batch."""
     world = _started([(one.example, seed) for one in batch for seed in one.seeds], sim)
     ends = list(accumulate(len(one.seeds) for one in batch))
@@ -240,7 +238,7 @@ def _rows(world: NDArray[np.uint8], ids: Mapping[str, int], example: Example) ->
     return tuple("".join(characters[number] for number in row) for row in world.tolist())
 
 
-def with_fields(world: W, examples: Sequence[Example]) -> W:
+def with_fields(world: World, examples: Sequence[Example]) -> World:
     """Fresh worlds with the fields that their tests draw; `examples` has the test of each world."""
     names = dict.fromkeys(grid.name for example in examples for grid in example.fields)
     slots = {slot.name: slot for slot in world.sim.slots}
@@ -254,7 +252,7 @@ def with_fields(world: W, examples: Sequence[Example]) -> W:
                 if grid.name == name:
                     _draw(grid, values, index, may_hold[index])
         changed[name] = values
-    found: W = world.sim.replace(world, **changed) if changed else world
+    found = world.sim.replace(world, **changed) if changed else world
     return found
 
 
@@ -267,7 +265,7 @@ def _draw(grid: FieldGrid, values: NDArray[Any], world: int, may_hold: NDArray[n
                 values[(world, ..., row, column)] = drawn
 
 
-def field_problem(grid: FieldGrid, world: AnyWorld) -> tuple[int, str] | None:
+def field_problem(grid: FieldGrid, world: World) -> tuple[int, str] | None:
     """The first of some worlds that is not as the grid says: its number, and `row 1, column 2 is 3, not 4`."""
     slot = next(slot for slot in world.sim.slots if slot.name == grid.name)
     to_numpy = world.sim.kind.to_numpy
@@ -297,7 +295,7 @@ def field_problem(grid: FieldGrid, world: AnyWorld) -> tuple[int, str] | None:
     )
 
 
-def field_rows(name: str, world: AnyWorld, index: int) -> tuple[str, ...]:
+def field_rows(name: str, world: World, index: int) -> tuple[str, ...]:
     """A field of one world as tests draw it: rows of words, in columns. Floats with all their digits."""
     kind = next(slot.kind for slot in world.sim.slots if slot.name == name)
     values = world.sim.kind.to_numpy(world.state[name])[index]

@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING, Any
 
 from powderdsl.analysis.changes import unchanging_ids
 from powderdsl.arrays import np
-from powderdsl.compiler import starting_backend
 from powderdsl.diagnostics import Span
 from powderdsl.model import reference
 from powderdsl.model.expressions.operators import TRUE
 from powderdsl.model.state import Slot, slots
 from powderdsl.model.types import FLAG, Assign, Field, Moment, Pass, Rule, Ruleset
-from powderdsl.simulation.compiling import compile_any
+from powderdsl.simulation.programs import starting_backend
+from powderdsl.simulation.simulator import compile
 from powderdsl.testing.generators.cases import Array, Start, clamped_to_holders, fresh, random_start
 from powderdsl.testing.generators.choices import Choices
 
 if TYPE_CHECKING:
-    from powderdsl.simulation.any_arrays import AnySimulator, W
+    from powderdsl.simulation.simulator import Simulator, World
 
 MARK = "happened "
 """How the flags are called that lines of rules set. No rule file can have a name with a blank."""
@@ -32,7 +32,7 @@ class Runner:
     `sim`: one that exists already, which sets no flags: then no line is known to happen.
     """
 
-    def __init__(self, ruleset: Ruleset, backend: str | None = None, sim: AnySimulator[Any] | None = None):
+    def __init__(self, ruleset: Ruleset, backend: str | None = None, sim: Simulator | None = None):
         self.ruleset = ruleset
         self.backend = backend or starting_backend("cpu")
         self.lines = () if sim else rule_spans(ruleset)
@@ -42,9 +42,9 @@ class Runner:
         self.worlds_run = 0
 
     @cached_property
-    def sim(self) -> AnySimulator[Any]:
+    def sim(self) -> Simulator:
         """Runs the rules and sets flags for the lines that happen."""
-        return compile_any(marked(self.ruleset), self.backend)
+        return compile(marked(self.ruleset), self.backend, tensors=False)
 
     def of(self, ruleset: Ruleset) -> Runner:
         """Runs other rules in the same way."""
@@ -65,12 +65,12 @@ class Runner:
 
 
 def run_sample(
-    sim: AnySimulator[W],
+    sim: Simulator,
     sample: Start,
     steps: int,
     random: Mapping[str, Array] | None = None,
     ruleset: Ruleset | None = None,
-) -> tuple[list[State], W]:
+) -> tuple[list[State], World]:
     """The state at the start and after each step, in storage dtypes, and the world after the last one.
 
     `ruleset`: whose slots are kept, if the simulator has more.
