@@ -6,7 +6,7 @@ Everything found here is an upper bound. What a rule is not said to do, it canno
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 from powderdsl.diagnostics import Span
@@ -68,10 +68,10 @@ class Asked:
         """Whether the rule may happen while these conditions hold too. False is a proof."""
         assert rule.mask is not None
         first = ((rule.mask, HERE), *more)
-        if not possible(self.facts, first, self.lets):
+        if not satisfiable(self.facts, first, self.lets):
             return False
         rivals = self.rivals(rule)
-        return not rivals or possible(self.facts, (*first, *rivals), self.lets)
+        return not rivals or satisfiable(self.facts, (*first, *rivals), self.lets)
 
     def rivals(self, rule: Rule) -> list[Condition]:
         """The conditions that must not hold for the rule to happen, by the substep's conflict policy.
@@ -100,12 +100,6 @@ class Asked:
                 for y, x in cells:
                     found += [(negation(other.mask), (y - dy, x - dx)) for dy, dx in footprint(other)]
         return found
-
-
-def possible(facts: Facts, conditions: Sequence[Condition], lets: dict[str, Expr]) -> bool:
-    """Whether the conditions may hold together. False is a proof; hard questions are given up, easy ones continue."""
-    with facts.budget.question(MAX_QUESTION):
-        return satisfiable(facts, conditions, lets)
 
 
 def footprint(rule: Rule) -> tuple[Offset, ...]:

@@ -14,7 +14,7 @@ from operator import gt, lt, ne
 from typing import Any
 
 from powderdsl.analysis.absent import Wants, find_wants, named_by_fields
-from powderdsl.analysis.changes import Found, RuleLine, facts_of, find_changes
+from powderdsl.analysis.changes import MAX_QUESTION, Found, RuleLine, facts_of, find_changes
 from powderdsl.analysis.overlaps import Overlap, find_overlaps
 from powderdsl.model.logic.satisfy import Budget
 from powderdsl.model.text import element_name, show_value
@@ -302,7 +302,7 @@ def ledger(ruleset: Ruleset) -> Ledger:
     """The ledger of a checked ruleset: decided from its rules, no world is run. Raises TypeError for anything else."""
     if not isinstance(ruleset, Ruleset):
         raise TypeError(f"ledger takes a Ruleset, from powderdsl.load; found {type(ruleset).__name__}")
-    parts = [replace(facts_of(ruleset), budget=Budget(BUDGET)) for _ in range(3)]
+    parts = [replace(facts_of(ruleset), budget=Budget(BUDGET, MAX_QUESTION)) for _ in range(3)]
     names = {element.id: element.name for element in ruleset.elements}
     found = find_changes(ruleset, parts[0])
     wants = find_wants(ruleset, parts[1])

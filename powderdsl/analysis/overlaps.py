@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
-from powderdsl.analysis.changes import HERE, Asked, RuleLine, footprint, is_not, possible, rule_line
-from powderdsl.model.logic.satisfy import Facts
+from powderdsl.analysis.changes import HERE, Asked, RuleLine, footprint, is_not, rule_line
+from powderdsl.model.logic.satisfy import Facts, satisfiable
 from powderdsl.model.types import Assign, Expr, Move, Offset, Pass, Rule, Ruleset, Transform
 
 T = TypeVar("T")
@@ -54,7 +54,7 @@ def find_overlaps(ruleset: Ruleset, facts: Facts) -> tuple[Overlap, ...]:
 
 
 def _meet(first: Expr, second: Expr, at: Offset, asked: Asked) -> bool:
-    return possible(asked.facts, [(first, HERE), (second, at)], asked.lets)
+    return satisfiable(asked.facts, [(first, HERE), (second, at)], asked.lets)
 
 
 def _claims(asked: Asked, pass_: Pass, known: dict[Overlap, None]) -> Iterator[Overlap]:
@@ -152,7 +152,7 @@ def _in_turn(ruleset: Ruleset, facts: Facts, known: dict[Overlap, None]) -> Iter
         overlap = Overlap("first in turn", rule_line(earlier, other_pass), rule_line(rule, pass_))
         changing = [is_not(t.value) for t in (rule.target, earlier.target) if t.op == "const"]
         conditions = [(other_mask, HERE), (mask, HERE), *changing]
-        if overlap not in seen and possible(facts, conditions, {**other_lets, **lets}):
+        if overlap not in seen and satisfiable(facts, conditions, {**other_lets, **lets}):
             seen.add(overlap)
             yield overlap
 

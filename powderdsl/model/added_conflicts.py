@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from powderdsl.diagnostics import CompileError, Diagnostic, Label, Reporter, Span
 from powderdsl.model.composition.compose import Composition
-from powderdsl.model.logic.unused import pack_words
+from powderdsl.model.logic.needless import pack_words
 from powderdsl.model.types import Moment, Move, Transform
 
 CODES = ("PD501", "PD502")

@@ -24,14 +24,15 @@ from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.invariants import check_invariants
 from powderdsl.model.logic.conflicts import check_logic
 from powderdsl.model.logic.needless import (
-    report_lost_writes,
+    overridden_ids,
+    produced_ids,
     report_needless,
     report_undecided,
     report_undrawn,
-    silent_rules,
+    report_unused,
+    without_dead_overrides,
 )
 from powderdsl.model.logic.satisfy import Facts
-from powderdsl.model.logic.unused import overridden_ids, produced_ids, report_unused, without_dead_overrides
 from powderdsl.model.ramps import element_ramps
 from powderdsl.model.types import (
     Declared,
@@ -109,8 +110,7 @@ def check(
     report_unused(composition, typer, produced_ids(passes, facts))
     matrix = matrix_channels(composition, symbols, passes, reporter)
     reporter.raise_if_errors()
-    undecided += report_needless(passes, facts, reporter)
-    undecided += report_lost_writes(passes, symbols.fields, facts, silent_rules(reporter), reporter)
+    undecided += report_needless(passes, symbols.fields, facts, reporter)
     found = Ruleset(
         name=composition.name,
         about=composition.about,

@@ -33,6 +33,7 @@ from powderdsl.model.logic.satisfy import (
     decide,
     example,
     satisfiable,
+    some,
     substeps,
 )
 from powderdsl.model.operations import OPS
@@ -55,7 +56,10 @@ MAX_PARTS = 64
 
 @dataclass(frozen=True)
 class Conflict:
-    """Two rules (or two copies of one) that may claim one cell. Rounds of a loop repeat it, so it is a value."""
+    """Two rules (or two copies of one) that may claim one cell. Rounds of a loop repeat it, so it is a value.
+
+    `first` and `second` are what the rules do, without their conditions; it is reported at the second.
+    """
 
     code: str
     message: str
@@ -63,11 +67,6 @@ class Conflict:
     second: Span
     notes: tuple[str, ...]
     helps: tuple[str, ...]
-
-    @property
-    def claims(self) -> tuple[Span, Span]:
-        """What the two rules claim: the second is where it is reported."""
-        return claim(self.first), claim(self.second)
 
     def report(self, labels: list[str], example: str, reporter: Reporter) -> None:
         """Report it once for all rounds that have it. `example` is for the first of them."""
@@ -78,13 +77,14 @@ class Conflict:
             notes.append(f"the same in {more} of the rule that its loop or symmetry makes")
         one = self.first == self.second
         reporter.error(
-            self.code, self.message + where, claim(self.second), "two of these can overlap" if one else "claims it too",
-            secondary=[] if one else [Label(claim(self.first), "claims a cell")], notes=notes, helps=self.helps,
+            self.code, self.message + where, self.second, "two of these can overlap" if one else "claims it too",
+            secondary=[] if one else [Label(self.first, "claims a cell")], notes=notes, helps=self.helps,
         )  # fmt: skip
 
 
-def claim(span: Span) -> Span:
+def _claim(rule: Rule) -> Span:
     """The part of a rule's text to underline: what it does, without its condition."""
+    span = rule.span
     rest = re.search(r",?\s+(if|where|with|then)\b", span.text)
     return Span(span.source, span.start, span.start + rest.start()) if rest and rest.start() else span
 
@@ -146,7 +146,7 @@ def check_logic(
                 fires = rule.mask is None or decide(facts, [(rule.mask, HERE)], lets)
                 changes = _changes(rule, facts, lets) if fires else fires is False or None
                 fate = fates.setdefault(rule.span, _Fate())
-                fate.fires, fate.useful = _either(fate.fires, fires), _either(fate.useful, changes)
+                fate.fires, fate.useful = some((fate.fires, fires)), some((fate.useful, changes))
                 if fires is not False:
                     live.append(rule)
                 elif rule.mask is not None:
@@ -206,8 +206,8 @@ def _report_conflicts(
     for conflict, found in conflicts.items():
         words = _in_words(facts, found.example)
         pass_ = passes[found.places[0][0]]
-        place, ids = conflict.claims[1], list(found.example.values())
-        causes = added.causes(pass_.pack, place, ids or facts.ids) if added else ()
+        ids = list(found.example.values())
+        causes = added.causes(pass_.pack, conflict.second, ids or facts.ids) if added else ()
         if not causes:
             conflict.report(found.labels, words, reporter)
             continue
@@ -216,18 +216,22 @@ def _report_conflicts(
         if resolves and not assigns:
             resolved.update(found.places)
         notes = [words] if words else []
-        report_added(conflict.code, conflict.claims, notes, causes, pass_.name, resolves, assigns, reporter)
+        report_added(
+            conflict.code,
+            (conflict.first, conflict.second),
+            notes,
+            causes,
+            pass_.name,
+            resolves,
+            assigns,
+            reporter,
+        )
     changed = list(passes)
     for at, number in sorted(resolved):
         moments = list(changed[at].moments)
         moments[number] = replace(moments[number], policy="first_wins")
         changed[at] = replace(changed[at], moments=tuple(moments))
     return tuple(changed)
-
-
-def _either(first: bool | None, second: bool | None) -> bool | None:
-    """Whether one of two copies does; None if neither is known to, and one may."""
-    return first or second or (None if None in (first, second) else False)
 
 
 def _too_much(work: list[tuple[int, int, Pass]], reporter: Reporter) -> bool:
@@ -262,70 +266,41 @@ def _changes(rule: Rule, facts: Facts, lets: Lets) -> bool | None:
 def _check_substep(
     rules: list[Rule], facts: Facts, lets: Lets
 ) -> Iterator[tuple[Conflict, dict[Offset, int]]]:
-    """The conflicts of one substep, with an example: for each rule the first one, maybe itself, that it meets."""
+    """The conflicts of one substep, with an example: of rules that move or transform, of assignments, of effects."""
     movers = [rule for rule in rules if not isinstance(rule, Assign)]
-    glances = Glances([rule.mask for rule in movers], facts, lets)
-    for i, second in enumerate(movers):
+    yield from _meetings([(rule, rule.mask) for rule in movers], facts, lets)
+    sets = [(one, one.mask) for one in rules if isinstance(one, Assign) and one.op == ":=" and one.mask]
+    yield from _meetings(sets, facts, lets)
+    effects = [(one, rule.mask) for rule in movers for one in rule.effects if one.op == ":="]
+    yield from _meetings(effects, facts, lets)
+
+
+def _meetings(
+    rules: Sequence[tuple[Rule, Expr]], facts: Facts, lets: Lets
+) -> Iterator[tuple[Conflict, dict[Offset, int]]]:
+    """For each rule, given with its condition, the first one, maybe itself, with which it may claim one cell."""
+    glances = Glances([mask for _, mask in rules], facts, lets)
+    for i, (second, mask) in enumerate(rules):
         undecided = None
-        for first in (second, *movers[:i]):
+        pairs = (
+            (first, ((other, HERE), (mask, at)))
+            for first, other in ((second, mask), *rules[:i])
+            for at in _claims(first, second)
+            if not glances.apart(other, mask, at)
+        )
+        for first, question in pairs:
             if facts.budget.is_exhausted:
                 return
-            answer, question = _meet(first, second, glances, facts, lets)
+            answer = decide(facts, question, lets)
             if answer:
-                conflict = _parity(_conflict(first, second), question, facts, lets)
-                yield conflict, example(facts, question, lets)
+                conflict = _conflict(first, second)
+                yield _parity(conflict, question, facts, lets), example(facts, question, lets)
                 break
             if answer is None and undecided is None:
                 undecided = first
         else:
             if undecided is not None and not facts.budget.is_exhausted:
                 yield _undecided(_conflict(undecided, second)), {}
-    yield from _check_assigns([(one, one.mask) for one in rules if isinstance(one, Assign)], facts, lets)
-    yield from _check_assigns([(one, rule.mask) for rule in movers for one in rule.effects], facts, lets)
-
-
-def _meet(
-    first: Rule, second: Rule, glances: Glances, facts: Facts, lets: Lets
-) -> tuple[bool | None, Conditions]:
-    """Whether two rules may claim one cell, and the conditions with which they do; None if that is too hard."""
-    answer: bool | None = False
-    assert first.mask is not None
-    assert second.mask is not None
-    for at in _claims(first, second):
-        if glances.apart(first.mask, second.mask, at):
-            continue
-        question = ((first.mask, HERE), (second.mask, at))
-        found = decide(facts, question, lets)
-        if found:
-            return True, question
-        if found is None:
-            answer = None
-    return answer, ()
-
-
-def _check_assigns(
-    assigns: Sequence[tuple[Assign, Expr | None]], facts: Facts, lets: Lets
-) -> Iterator[tuple[Conflict, dict[Offset, int]]]:
-    """Two `:=` of one field must not meet in a cell with different values."""
-    sets = [(assign, mask) for assign, mask in assigns if assign.op == ":=" and mask is not None]
-    glances = Glances([mask for _, mask in sets], facts, lets)
-    for i, (b, second) in enumerate(sets):
-        for a, first in sets[:i]:
-            if a.field != b.field or a.value == b.value or facts.budget.is_exhausted:
-                continue
-            shift = (a.offset[0] - b.offset[0], a.offset[1] - b.offset[1])
-            if glances.apart(first, second, shift):
-                continue
-            question = ((first, HERE), (second, shift))
-            answer = decide(facts, question, lets)
-            if answer is not False and not facts.budget.is_exhausted:
-                message = f"{ASSIGN} `{a.field}` of one cell in the same substep"
-                conflict = Conflict("PD502", message, a.span, b.span, (), (_EXCLUDE,))
-                if answer:
-                    yield conflict, example(facts, question, lets)
-                else:
-                    yield _undecided(conflict), {}
-                break
 
 
 _PLACES = {(0, 0): "here", (-1, 0): "above", (1, 0): "below", (0, -1): "on the left", (0, 1): "on the right"}
@@ -342,6 +317,12 @@ def _in_words(facts: Facts, elements: dict[Offset, int]) -> str:
 
 def _claims(first: Rule, second: Rule) -> Iterator[Offset]:
     """Where, relative to the first rule's cell, the second would claim one of the same cells."""
+    if isinstance(first, Assign) or isinstance(second, Assign):
+        assert isinstance(first, Assign)
+        assert isinstance(second, Assign)
+        if first.field == second.field and first.value != second.value:
+            yield (first.offset[0] - second.offset[0], first.offset[1] - second.offset[1])
+        return
     if isinstance(first, Transform) and isinstance(second, Transform):
         if first is not second and first.target != second.target:
             yield HERE
@@ -369,6 +350,10 @@ _EXCLUDE = "make their conditions exclude each other, or put one under `then:`"
 
 
 def _conflict(first: Rule, second: Rule) -> Conflict:
+    here, there = _claim(first), _claim(second)
+    if isinstance(first, Assign):
+        message = f"{ASSIGN} `{first.field}` of one cell in the same substep"
+        return Conflict("PD502", message, here, there, (), (_EXCLUDE,))
     if first is second or first.span == second.span:
         message = "a cell may be both mover and target"
         note = "the moves of one substep happen at once: no cell may take part in two of them"
@@ -376,11 +361,11 @@ def _conflict(first: Rule, second: Rule) -> Conflict:
             "add a condition that a target cannot meet, such as a comparison of densities",
             "or choose a policy: `conflicts: drop_both`",
         )
-        return Conflict("PD501", message, first.span, first.span, (note,), helps)
+        return Conflict("PD501", message, here, here, (note,), helps)
     code = "PD501" if isinstance(first, (Swap, Move)) or isinstance(second, (Swap, Move)) else "PD502"
     message = "two rules may claim the same cell in one substep"
     choice = "or choose a policy: `conflicts: first_wins` or `conflicts: drop_both`"
-    return Conflict(code, message, first.span, second.span, (), (_EXCLUDE, choice))
+    return Conflict(code, message, here, there, (), (_EXCLUDE, choice))
 
 
 def _parity(conflict: Conflict, question: Conditions, facts: Facts, lets: Lets) -> Conflict:

@@ -1,5 +1,5 @@
-"""Rules and parts of them that decide nothing: comparisons with one outcome, rules that others always overrule, writes
-that no cell keeps.
+"""Warnings about rules and definitions that decide nothing: comparisons with one outcome, rules that others always
+overrule, writes that no cell keeps, chances and names that nothing uses.
 
 Rules are legal with these, so they are warnings. Loops and symmetries write a rule out many times: a warning is
 given only if all its copies deserve it.
@@ -8,18 +8,22 @@ given only if all its copies deserve it.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from powderdsl.diagnostics import Label, Reporter, Span
+from powderdsl.model.composition.claim_scopes import words_of
+from powderdsl.model.composition.compose import Composition
+from powderdsl.model.declarations import PackDecl
 from powderdsl.model.expressions.operators import ELEMENT_HERE, look, member, negation
 from powderdsl.model.logic.satisfy import (
     HERE,
     Budget,
-    Exhausted,
     Facts,
     Lets,
-    can_hold,
     decide,
+    satisfiable,
+    some,
     substeps,
     writes_of,
 )
@@ -41,6 +45,9 @@ from powderdsl.model.types import (
 )
 from powderdsl.syntax.ast import Syntax
 
+if TYPE_CHECKING:
+    from powderdsl.model.expressions.typer import Typer
+
 BUDGET = 100_000
 """Nodes evaluated for each kind of these warnings: a quarter of a second. After that nothing more is found, and a note
 reports it."""
@@ -55,71 +62,63 @@ SILENT = ("PD503", "PD506", "PD509")
 """Rules already reported with these codes get no second warning."""
 
 
-def report_needless(passes: tuple[Pass, ...], facts: Facts, reporter: Reporter) -> list[Span]:
-    """Report comparisons that ranges decide, and rules that others always overrule.
+def report_needless(
+    passes: tuple[Pass, ...], fields: dict[str, Field], facts: Facts, reporter: Reporter
+) -> list[Span]:
+    """Report comparisons that ranges decide, rules that others always overrule, and writes that are always lost.
 
     Returns:
-        The rules that may be overruled, which takes too much work to decide.
+        The rules and writes that may have no effect, which takes too much work to decide.
     """
-    known = silent_rules(reporter)
-    _report_decided(passes, known, reporter)
-    return _report_overruled(passes, _quick(facts), known, reporter)
+    silent = [one.primary.span for one in reporter.diagnostics if one.code in SILENT and one.primary.span]
+    _report_decided(passes, silent, reporter)
+    undecided = _report_overruled(passes, _quick(facts), silent, reporter)
+    return undecided + _report_lost_writes(passes, fields, _quick(facts), silent, reporter)
 
 
 def _quick(facts: Facts) -> Facts:
     return replace(facts, budget=Budget(BUDGET, BUDGET // 4))
 
 
-def silent_rules(reporter: Reporter) -> list[Span]:
-    """The rules that were reported already as never happening."""
-    return [one.primary.span for one in reporter.diagnostics if one.code in SILENT and one.primary.span]
+def _inside_any(span: Span, others: Sequence[Span]) -> bool:
+    return any(span.source == o.source and o.start <= span.start and span.end <= o.end for o in others)
 
 
 # Comparisons
 
 
-def _report_decided(passes: tuple[Pass, ...], known: Sequence[Span], reporter: Reporter) -> None:
+def _report_decided(passes: tuple[Pass, ...], silent: Sequence[Span], reporter: Reporter) -> None:
+    """Report comparisons of integers whose ranges alone decide them."""
     outcomes: dict[Span, set[bool | None]] = {}
     for _, moment, lets in substeps(passes):
-        parts = [*lets.values(), *(part for rule in moment.rules for part in _parts(rule))]
-        for node in (node for part in parts for node in part.walk()):
+        for node in (node for part in (*lets.values(), *_parts(moment.rules)) for node in part.walk()):
             if node.op in ("eq", "lt", "le") and node.span is not None:
-                outcomes.setdefault(node.span, set()).add(decided(node))
+                kinds, bounds = [arg.kind for arg in node.args], OPS[node.op].bounds
+                low, high = False, True
+                if (
+                    bounds is not None
+                    and all(kind.name == "int" for kind in kinds)
+                    and any(arg.op != "const" for arg in node.args)
+                ):
+                    low, high = bounds(node, *((kind.lo, kind.hi) for kind in kinds))
+                outcomes.setdefault(node.span, set()).add(bool(low) if low == high else None)
     for span, found in outcomes.items():
-        if found in ({True}, {False}) and not _inside_any(span, known):
+        if found in ({True}, {False}) and not _inside_any(span, silent):
             reporter.report(
                 "PD513", "this comparison decides nothing", span, "its result is the same in every world",
                 helps=["look at the bounds of both sides", "remove it, if it is meant so"],
             )  # fmt: skip
 
 
-def _parts(rule: Rule) -> Iterator[Expr]:
-    """The expressions of a rule."""
-    if rule.mask is not None:
-        yield rule.mask
-    if isinstance(rule, Assign):
-        yield rule.value
-        return
-    if isinstance(rule, Transform):
-        yield rule.target
-    yield from (effect.value for effect in rule.effects)
-
-
-def decided(node: Expr) -> bool | None:
-    """The outcome of a comparison of integers by their ranges alone; None if it depends on the world."""
-    kinds, bounds = [arg.kind for arg in node.args], OPS[node.op].bounds
-    if (
-        bounds is None
-        or any(kind.name != "int" for kind in kinds)
-        or all(arg.op == "const" for arg in node.args)
-    ):
-        return None
-    low, high = bounds(node, *((kind.lo, kind.hi) for kind in kinds))
-    return bool(low) if low == high else None
-
-
-def _inside_any(span: Span, others: Sequence[Span]) -> bool:
-    return any(span.source == o.source and o.start <= span.start and span.end <= o.end for o in others)
+def _parts(rules: Iterable[Rule]) -> Iterator[Expr]:
+    """The expressions of some rules."""
+    for rule in rules:
+        if rule.mask is not None:
+            yield rule.mask
+        if isinstance(rule, Transform):
+            yield rule.target
+        for write in writes_of(rule):
+            yield write.value
 
 
 def report_repeated(children: Sequence[Syntax], reporter: Reporter) -> None:
@@ -137,65 +136,64 @@ def report_repeated(children: Sequence[Syntax], reporter: Reporter) -> None:
 
 
 def _report_overruled(
-    passes: tuple[Pass, ...], facts: Facts, known: Sequence[Span], reporter: Reporter
+    passes: tuple[Pass, ...], facts: Facts, silent: Sequence[Span], reporter: Reporter
 ) -> list[Span]:
-    found: dict[Span, Rule] = {}
-    matter: dict[Span, None] = {}
-    undecided: dict[Span, None] = {}
+    matters: dict[Span, bool | None] = {}
+    winners: dict[Span, Rule] = {}
     for _, moment, lets in substeps(passes):
         for place, rule in enumerate(moment.rules):
-            if rule.span in matter:
-                continue
-            try:
-                winner = _overruling(rule, place, moment, facts, lets)
-            except Exhausted:
-                undecided[rule.span] = None
-                continue
-            if winner is None:
-                matter[rule.span] = None
-            else:
-                found.setdefault(rule.span, winner)
-    for span, winner in found.items():
-        if span in matter or span in undecided or winner.span == span or _inside_any(span, known):
+            known = matters.get(rule.span, False)
+            if not known:
+                rivals = _rivals(rule, place, moment)
+                matters[rule.span] = some((known, _matters(rule, rivals, moment, facts, lets)))
+                if rivals:
+                    winners.setdefault(rule.span, rivals[0])
+    undecided = []
+    for span, effect in matters.items():
+        if effect or _inside_any(span, silent):
             continue
+        if effect is None:
+            undecided.append(span)
+            continue
+        winner = winners[span]
         words = "writes over it, always" if isinstance(winner, Assign) else "always comes before it"
         reporter.report(
             "PD514", "this rule is always overruled", span, "it has no effect",
             secondary=[Label(winner.span, words)],
             helps=["make their conditions exclude each other", "or remove one of them"],
         )  # fmt: skip
-    return [span for span in undecided if span not in matter and not _inside_any(span, known)]
+    return undecided
 
 
-def _overruling(rule: Rule, place: int, moment: Moment, facts: Facts, lets: Lets) -> Rule | None:
-    """One of the rules of a substep that never leave anything to this one; None if it matters. Raises Exhausted."""
+def _matters(rule: Rule, rivals: Sequence[Rule], moment: Moment, facts: Facts, lets: Lets) -> bool | None:
+    """Whether a rule that may happen is not always overruled by its rivals; None if that takes too much work."""
+    facts.budget.left -= len(moment.rules) // GLANCES
     if rule.mask is None:
+        return True
+    if facts.budget.is_exhausted:
         return None
-    facts.budget.spend(len(moment.rules) // GLANCES)
-    rivals = [other for other in _rivals(rule, place, moment) if other.mask is not None]
     if not rivals or decide(facts, [(rule.mask, HERE)], lets) is False:
-        return None
-    conditions = [(rule.mask, HERE), *((negation(other.mask), HERE) for other in rivals if other.mask)]
-    return None if can_hold(facts, conditions, lets) else rivals[0]
+        return True
+    others = [(negation(other.mask), HERE) for other in rivals if other.mask]
+    return decide(facts, [(rule.mask, HERE), *others], lets)
 
 
-def _rivals(rule: Rule, place: int, moment: Moment) -> Iterator[Rule]:
+def _rivals(rule: Rule, place: int, moment: Moment) -> list[Rule]:
     """The rules of a substep that keep this one from having an effect where they happen."""
-    if isinstance(rule, Assign):
-        for other in moment.rules[place + 1 :]:
-            if not isinstance(other, Assign) or other.op != ":=" or other.span == rule.span:
-                continue
-            if (other.field, other.offset) == (rule.field, rule.offset):
-                yield other
-        return
-    if not isinstance(rule, Transform):
-        return
+    rivals: list[Rule] = []
     for number, other in enumerate(moment.rules):
-        if not isinstance(other, Transform) or number == place or other.span == rule.span:
+        earlier = number < place
+        if number == place or other.span == rule.span:
             continue
-        same = other.target == rule.target and other.effects == rule.effects
-        if moment.policy == "drop_both" or (number < place and (same or moment.policy == "first_wins")):
-            yield other
+        if isinstance(rule, Assign) and isinstance(other, Assign):
+            same = (other.field, other.offset) == (rule.field, rule.offset)
+            if same and not earlier and other.op == ":=" and other.mask is not None:
+                rivals.append(other)
+        elif isinstance(rule, Transform) and isinstance(other, Transform):
+            same = other.target == rule.target and other.effects == rule.effects
+            if moment.policy == "drop_both" or (earlier and (same or moment.policy == "first_wins")):
+                rivals.append(other)
+    return rivals
 
 
 # Chances that nothing draws
@@ -219,12 +217,10 @@ def report_undrawn(
     for name, number, span in given:
         if name not in chances or chances[name].values[number] == 0:
             continue
-        try:
-            drawn = _drawn(chances[name], number, ruleset, quick)
-        except Exhausted:
+        drawn = some(_drawn(chances[name], number, ruleset, quick))
+        if drawn is None:
             undecided.append(span)
-            continue
-        if not drawn:
+        elif not drawn:
             element = facts.names.get(number, "?")
             reporter.report(
                 "PD507", f"`{name}` of `{element}` is never used", span, f"no rule asks `{element}` for it",
@@ -233,140 +229,106 @@ def report_undrawn(
     return undecided
 
 
-def _drawn(prop: Property, number: int, ruleset: Ruleset, facts: Facts) -> bool:
-    """Whether some rule that reads the property may happen where this element stands. Raises Exhausted."""
+def _drawn(prop: Property, number: int, ruleset: Ruleset, facts: Facts) -> Iterator[bool | None]:
+    """For each rule that reads the property: may it happen where this element stands?"""
     for pass_ in ruleset.passes:
         everywhere = {let.name: let.value for moment in pass_.moments for let in moment.lets}
         for _, moment, lets in substeps([pass_]):
             for rule in moment.rules:
-                reads = _Reads(prop.name, lets, everywhere)
-                for part in _parts(rule):
-                    reads.find(part, HERE)
-                if reads.places and (reads.many or rule.mask is None):
-                    return True
-                for at in reads.places:
-                    here = (member(ELEMENT_HERE, (number,)), at)
-                    if can_hold(facts, [(rule.mask, HERE), here], lets):  # type: ignore[list-item]
-                        return True
-    return False
+                places = _reads(prop.name, _parts([rule]), lets, everywhere)
+                if places and (None in places or rule.mask is None):
+                    yield True
+                for at in places:
+                    if at is not None and rule.mask is not None:
+                        here = (member(ELEMENT_HERE, (number,)), at)
+                        yield decide(facts, [(rule.mask, HERE), here], lets)
 
 
-@dataclass
-class _Reads:
-    """Where expressions read a property. `many`: also of cells whose places or substeps are not told apart."""
-
-    name: str
-    lets: Lets
-    everywhere: Lets
-    places: dict[Offset, None] = field(default_factory=dict)
-    many: bool = False
-    _opened: set[tuple[str, Offset, bool]] = field(default_factory=set)
-
-    def find(self, expr: Expr, at: Offset, unclear: bool = False) -> None:
-        """Add the places of one expression that is asked at `at`."""
+def _reads(name: str, parts: Iterable[Expr], lets: Lets, everywhere: Lets) -> dict[Offset | None, None]:
+    """Where expressions read a property. None stands for cells whose places or substeps are not told apart."""
+    places: dict[Offset | None, None] = {}
+    opened = set()
+    waiting: list[tuple[Expr, Offset | None]] = [(part, HERE) for part in parts]
+    while waiting:
+        expr, at = waiting.pop()
         args = expr.args
-        if expr.op == "property" and expr.value == self.name:
-            self.places[at] = None
-            self.many |= unclear
-        elif expr.op == "let":
-            name = str(expr.value)
-            unclear |= name not in self.lets  # fixed before: what stood there then may be elsewhere now
-            if (name, at, unclear) in self._opened:
-                return
-            self._opened.add((name, at, unclear))
-            args = (self.everywhere[name],)
-        elif expr.op == "look":
-            at = (at[0] + expr.value[0], at[1] + expr.value[1])
-        unclear |= expr.op in ("count", "sum")
-        for arg in args:
-            self.find(arg, at, unclear)
+        match expr.op:
+            case "property" if expr.value == name:
+                places[at] = None
+            case "let":
+                if expr.value not in lets:
+                    at = None  # fixed before: what stood there then may be elsewhere now
+                args = (everywhere[str(expr.value)],) if (expr.value, at) not in opened else ()
+                opened.add((expr.value, at))
+            case "look":
+                at = at and (at[0] + expr.value[0], at[1] + expr.value[1])
+            case "count" | "sum":
+                at = None
+        waiting += [(arg, at) for arg in args]
+    return places
 
 
 # Writes that are lost: `of:` limits a field to other elements
 
 
-def report_lost_writes(
-    passes: tuple[Pass, ...], fields: dict[str, Field], facts: Facts, known: list[Span], reporter: Reporter
+def _report_lost_writes(
+    passes: tuple[Pass, ...], fields: dict[str, Field], facts: Facts, silent: list[Span], reporter: Reporter
 ) -> list[Span]:
-    """Warn of assignments and effects that are lost wherever their rule happens, in all its copies.
-
-    Args:
-        known: rules that have been reported already.
-
-    Returns:
-        The writes that may be lost, which takes too much work to decide.
-    """
+    """Warn of assignments and effects that are lost wherever their rule happens, in all its copies."""
     limited = {name: field for name, field in fields.items() if field.of is not None}
-    quick = _quick(facts)
-    lost: dict[tuple[Span, str], bool | None] = {}
+    arrives: dict[tuple[Span, str], bool | None] = {}
     for _, moment, lets in substeps(passes) if limited else ():
         for rule in moment.rules:
             for write in writes_of(rule):
                 key = write.span, write.field
-                if write.field in limited and lost.get(key, True) is not False and rule.span not in known:
-                    ids = limited[write.field].of or frozenset()
-                    try:
-                        here = not _arrives(write, rule, ids, moment, quick, lets)
-                    except Exhausted:
-                        here = None
-                    lost[key] = None if here and lost.get(key, True) is None else here
-    for (span, name), always in lost.items():
-        if always:
+                known = arrives.get(key, False)
+                if write.field in limited and not known and rule.span not in silent:
+                    ids = tuple(sorted(limited[write.field].of or ()))
+                    arrives[key] = some((known, _arrives(write, rule, ids, moment, facts, lets)))
+    for (span, name), answer in arrives.items():
+        if answer is False:
             reporter.report(
                 "PD516", f"this write to `{name}` is always lost", span, f"no cell that it reaches has a `{name}`",
                 secondary=[Label(limited[name].span, "`of:` says which elements have it")],
                 helps=["widen `of:`, or write to a cell that holds one of its elements"],
             )  # fmt: skip
-    return [span for (span, _), always in lost.items() if always is None]
+    return [span for (span, _), answer in arrives.items() if answer is None]
 
 
 def _arrives(
-    write: Assign, rule: Rule, ids: frozenset[int], moment: Moment, facts: Facts, lets: Lets
-) -> bool:
-    """Whether the cell may hold one of these elements when the write lands. Effects come after all that moves.
+    write: Assign, rule: Rule, ids: tuple[int, ...], moment: Moment, facts: Facts, lets: Lets
+) -> bool | None:
+    """Whether the cell may hold one of these elements when the write lands; None if that is too hard.
 
-    Raises Exhausted if that takes too much work to decide.
+    Assignments come before all that moves, effects after it.
     """
     if rule.mask is None:
         return True
-
-    def may(mask: Expr, what: Expr) -> bool:
-        return can_hold(facts, [(mask, HERE), (member(what, tuple(sorted(ids))), HERE)], lets)
-
-    if isinstance(rule, Assign):
-        return may(rule.mask, look(ELEMENT_HERE, write.offset))
-    if isinstance(rule, Transform) and write.offset == HERE:
-        return may(rule.mask, rule.target)
-    if isinstance(rule, Swap) and write.offset in (HERE, rule.offset):
-        other = rule.offset if write.offset == HERE else HERE
-        return may(rule.mask, look(ELEMENT_HERE, other))
-    if isinstance(rule, Move) and write.offset == rule.offset:
-        return may(rule.mask, ELEMENT_HERE)
-    if any(may(mask, what) for mask, what in _brought(moment)):
-        return True
-    if isinstance(rule, Move) and rule.leaving is None and write.offset == HERE:
-        return may(rule.mask, _left(rule))
+    certain = _brings(rule).get(write.offset)
     if isinstance(rule, Move) and write.offset == HERE:
-        return False  # what leaves is gone, and nothing brings one
-    return may(rule.mask, look(ELEMENT_HERE, write.offset))
+        certain = None  # another move may fill the place that is left
+    stays = rule.mask, look(ELEMENT_HERE, write.offset)
+    if isinstance(rule, Assign):
+        landing = [stays]
+    elif certain is not None:
+        landing = [(rule.mask, certain)]
+    else:
+        landing = [(one.mask, what) for one in moment.rules if one.mask for what in _brings(one).values()]
+        landing += [stays] if write.offset not in _brings(rule) else []
+    return some(decide(facts, [(mask, HERE), (member(what, ids), HERE)], lets) for mask, what in landing)
 
 
-def _brought(moment: Moment) -> Iterator[tuple[Expr, Expr]]:
-    """What the rules of a substep may bring into some cell, with the condition under which they do."""
-    for rule in moment.rules:
-        if isinstance(rule, Transform):
-            yield rule.mask, rule.target
-        elif isinstance(rule, Swap):
-            yield rule.mask, ELEMENT_HERE
-            yield rule.mask, look(ELEMENT_HERE, rule.offset)
-        elif isinstance(rule, Move):
-            yield rule.mask, ELEMENT_HERE
-            yield rule.mask, _left(rule)
-
-
-def _left(rule: Move) -> Expr:
-    """The element that a move leaves behind."""
-    return look(ELEMENT_HERE, rule.offset) if rule.leaving is None else rule.leaving
+def _brings(rule: Rule) -> dict[Offset, Expr]:
+    """The elements that a rule brings, by the offset of the cell that gets them."""
+    match rule:
+        case Transform():
+            return {HERE: rule.target}
+        case Swap():
+            return {HERE: look(ELEMENT_HERE, rule.offset), rule.offset: ELEMENT_HERE}
+        case Move():
+            left = look(ELEMENT_HERE, rule.offset) if rule.leaving is None else rule.leaving
+            return {HERE: left, rule.offset: ELEMENT_HERE}
+    return {}
 
 
 # What could not be decided
@@ -391,3 +353,136 @@ def report_undecided(spans: Iterable[Span], reporter: Reporter) -> None:
         notes=["nothing wrong was found; warnings about them, such as PD503 and PD514, may be missing"],
         helps=["`powderdsl test` lists the rules that never happen; a test of your own shows what one does"],
     )  # fmt: skip
+
+
+# Definitions that nothing uses
+
+
+def report_unused(composition: Composition, typer: Typer, produced: frozenset[int]) -> None:
+    """Report definitions that no rule uses (warnings), and what the loaded packs lack (notes)."""
+    reporter = typer.reporter
+    values = [str(value) for prop in typer.symbols.properties.values() for value in prop.values]
+    for qualified, param in composition.params.items():
+        if qualified not in typer.used and qualified not in values:
+            _unused("parameter", qualified, param.span, reporter)
+    for name, named_set in composition.sets.items():
+        if name not in typer.used:
+            _unused("set", name, named_set.span, reporter)
+        elif not typer.set_of(typer.symbols.constants[name], named_set.span).ids:
+            reporter.report(
+                "PD505", f"the set `{name}` is empty", named_set.decl.members.span, "no element of the loaded packs is in it",
+                helps=["load a pack with such elements, or widen the set"],
+            )  # fmt: skip
+    for name, kernel in composition.kernels.items():
+        if name not in typer.used:
+            _unused("kernel", name, kernel.span, reporter)
+    _report_unwritten(composition, reporter)
+    for element in composition.elements.values():
+        if element.id not in produced:
+            label = "it only comes from the start world, or by painting"
+            reporter.report("PD504", f"no rule produces `{element.name}`", element.span, label)
+
+
+def _unused(what: str, name: str, span: Span, reporter: Reporter) -> None:
+    message = f"the {what} `{name}` is never used"
+    reporter.report("PD507", message, span, "no rule reads it", helps=["remove it"])
+
+
+def _report_unwritten(composition: Composition, reporter: Reporter) -> None:
+    """Report fields and values under `let` whose names stand in no rule, not even in one that is inactive.
+
+    Tasks and programs may read a field that a ruleset lists as a channel. Streams and tags are left out: packs declare
+    them for others.
+    """
+    names = composition.names
+    words = {names.of(pack.name.text, word) for pack in composition.packs for word in pack_words(pack)}
+    for ruleset in composition.lineage:
+        words |= {word for line in ruleset.invariants for word in words_of(line)}
+        words |= {scalar.word.partition(".")[0] for scalar in ruleset.matrix}
+    for name, field in composition.fields.items():
+        if name not in words and field.decl.name.text not in words:
+            _unused("field", name, field.span, reporter)
+    for block in (block for pack in composition.packs for one in pack.passes for block in one.block.walk()):
+        inner = [line for one in block.walk() if one is not block for line in one.lines]
+        later = {word for line in (*block.lines[len(block.lets) :], *inner) for word in words_of(line)}
+        for scalar, value in reversed(block.lets):
+            if scalar.text not in later:
+                _unused("value", scalar.text, scalar.span, reporter)
+            later |= set(words_of(value))
+
+
+def pack_words(pack: PackDecl) -> Iterator[str]:
+    """Every name in a pack's rules, sets, invariants, tests and color ramps."""
+    yield from (one.ramp.field.word.rpartition(".")[2] for one in pack.entries if one.ramp)
+    for lines in (
+        pack.lines,
+        pack.invariants,
+        [one.members for one in pack.sets],
+        [line for test in pack.tests for line in test.always],
+        [decl.of for decl in pack.fields if decl.of is not None],
+    ):
+        for line in lines:
+            yield from words_of(line)
+
+
+# What rules produce and override
+
+
+def overridden_ids(passes: tuple[Pass, ...], names: Iterable[str], facts: Facts) -> dict[str, frozenset[int]]:
+    """For each of these properties the ids whose cells may hold their own value: the ids that some rule assigns it to.
+
+    A value of its own may fulfill the condition of another such rule, so this continues until nothing is added.
+    """
+    found: dict[str, frozenset[int]] = {name: frozenset() for name in names}
+    while True:
+        more = {name: found[name] | _overridden_ids(passes, name, facts) for name in found}
+        if more == found:
+            return found
+        found = more
+        stored = {name: replace(facts.properties[name], stored=ids) for name, ids in found.items()}
+        facts = replace(facts, properties={**facts.properties, **stored})
+
+
+def _overridden_ids(passes: tuple[Pass, ...], name: str, facts: Facts) -> frozenset[int]:
+    """The ids that some rule assigns a property to, if cells hold values of their own as `facts` say."""
+    found: set[int] = set()
+    for _, moment, lets in substeps(passes):
+        for assign in (write for rule in moment.rules for write in writes_of(rule) if write.field == name):
+            if assign.mask is None or assign.offset != HERE:
+                return frozenset(facts.ids)
+            for number in facts.ids:
+                here = (member(ELEMENT_HERE, (number,)), HERE)
+                if number not in found and satisfiable(facts, [here, (assign.mask, HERE)], lets):
+                    found.add(number)
+    return frozenset(found)
+
+
+def without_dead_overrides(passes: tuple[Pass, ...], dead: frozenset[str]) -> tuple[Pass, ...]:
+    """The passes without assignments to properties that no cell can come to override: there is no place for them."""
+    if not dead:
+        return passes
+    return tuple(
+        replace(
+            pass_,
+            moments=tuple(
+                replace(
+                    moment,
+                    rules=tuple(r for r in moment.rules if not (isinstance(r, Assign) and r.field in dead)),
+                )
+                for moment in pass_.moments
+            ),
+        )
+        for pass_ in passes
+    )
+
+
+def produced_ids(passes: tuple[Pass, ...], facts: Facts) -> frozenset[int]:
+    """The ids that some rule may bring about."""
+    found: set[int] = set()
+    for _, moment, _ in substeps(passes):
+        for rule in moment.rules:
+            made = rule.target if isinstance(rule, Transform) else None
+            target = rule.leaving if isinstance(rule, Move) else made
+            if target is not None:
+                found |= {target.value} if target.op == "const" else set(facts.ids)
+    return frozenset(found)
