@@ -131,7 +131,7 @@ class Home:
     at_import: tuple[str, ...]
 
 
-_TEXT = ("syntax", "worlds.scene")
+_TEXT = ("syntax",)
 _TORCH = (
     "targets.tensor_kind",
     "targets.random",

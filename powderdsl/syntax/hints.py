@@ -23,8 +23,12 @@ TERMINAL_WORDS = {
     "STAR": "`*`",
     "SLASH": "`/`",
     "QMARK": "`?`",
-    "__ANON_0": "`->`",
-    "__ANON_1": "`..`",
+    "_ARROW": "`->`",
+    "_DOTS": "`..`",
+    "_COLON": "`:`",
+    "_ASSIGN": "`:=`",
+    "_PERCENT_SIGN": "`%`",
+    "_END": "`end`",
     "$END": "the end of the line",
 }
 """What each terminal is called in messages; keywords, which are missing here, are called by themselves."""
@@ -32,7 +36,7 @@ TERMINAL_WORDS = {
 _VALUE_STARTS = {"NAME", "INTEGER", "LPAR"}
 _LITERALS = {"DECIMAL", "PERCENT", "YES", "NO", "TRUE", "FALSE"}
 _VALUES = _VALUE_STARTS | _LITERALS | {"CHANCE", "ANY", "ALL", "MINUS", "NOT"}
-_OPERATORS = {"PLUS", "MINUS", "STAR", "SLASH", "MOD", "COMPARE", "IS", "IN", "NOT", "__ANON_1"}
+_OPERATORS = {"PLUS", "MINUS", "STAR", "SLASH", "MOD", "COMPARE", "IS", "IN", "NOT", "_DOTS"}
 
 _CHARACTERS: tuple[tuple[str, str], ...] = (
     (r"\b(if|where|chance)\b.*‸=>", "write `>=`"),
@@ -144,7 +148,7 @@ _PHRASES: tuple[tuple[str, str, str], ...] = (
     (r"^\s*‸if$", "", "a rule says first what happens: `this -> that if …`"),
     (r"‸where$", "", "only assignments say `where`; this rule says `if`"),
     (r" is\s*‸in$", "", "say `is` or `in`, not both"),
-    (r"‸if$", "__ANON_0", "say what happens before the `if`: `SET -> ELEMENT if …`"),
+    (r"‸if$", "_ARROW", "say what happens before the `if`: `SET -> ELEMENT if …`"),
     (r"\b(box|ring|disc|diamond|cross|plus)\s*‸(\d+)$", "", r"write `\1(\2)`"),
     (r"/‸/$", "", "integer division, rounded down, is `div`: `a div b`"),
     (r"->.*‸->$", "", "one line is one rule: put the next one on a line of its own"),

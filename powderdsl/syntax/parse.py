@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -14,74 +16,107 @@ from lark.utils import TextSlice
 from powderdsl.diagnostics import Reporter, Source, Span
 from powderdsl.diagnostics.printable import shown_character
 from powderdsl.syntax.ast import Syntax
-from powderdsl.syntax.hints import character_help, expected_words, token_help, was_cut
-from powderdsl.syntax.yaml_tree import Scalar
+from powderdsl.syntax.hints import CUT, character_help, expected_words, token_help, was_cut
+from powderdsl.syntax.yaml_tree import Node, Scalar
 from powderdsl.system.user_cache import cache_folder
 
 MAX_LENGTH = 2000
 MAX_DEPTH = 48
-STARTS = ("rule", "expression", "header", "invariant")
 
 
-@lru_cache(maxsize=1)
-def parser() -> Lark:
-    """The one parser of the line language. Its tables are kept in the user's cache: making them takes 0.1 s."""
+@dataclass(frozen=True)
+class Language:
+    """A part of the grammar: what a line of it is called, its start symbols, and the codes of its errors.
+
+    The codes are for syntax, for size, and for escapes in quotes.
+    """
+
+    noun: str
+    starts: tuple[str, ...]
+    syntax: str
+    size: str
+    escapes: str
+
+
+RULES = Language("rule", ("rule", "expression", "header", "invariant"), "PD201", "PD202", "PD203")
+STATEMENTS = Language(
+    "statement",
+    ("statement", "setting", "shape", "operand", "repeat", "choice"),
+    "PD605",
+    "PD605",
+    "PD605",
+)
+LANGUAGES = {start: language for language in (RULES, STATEMENTS) for start in language.starts}
+
+
+@cache
+def parser(language: Language = RULES) -> Lark:
+    """The parser of a language. Its tables are kept in the user's cache: making them takes 0.2 s."""
     grammar = Path(__file__).with_name("grammar.lark").read_text(encoding="utf-8")
     try:
-        kept: str | bool = str(cache_folder("syntax") / f"grammar-{lark_version}.lark")
+        kept: str | bool = str(cache_folder("syntax") / f"{language.starts[0]}-{lark_version}.lark")
     except (OSError, RuntimeError):  # no home folder, or one that cannot be written
         kept = False
     return Lark(
         grammar,
         parser="lalr",
         lexer="basic",
-        start=list(STARTS),
+        start=list(language.starts),
         propagate_positions=True,
         maybe_placeholders=False,
         cache=kept,
     )
 
 
-def reserved_words() -> frozenset[str]:
-    """Words of the grammar that cannot be names."""
-    return words_of(parser())
+@cache
+def reserved_words(language: Language = RULES) -> frozenset[str]:
+    """The keywords of a language, which cannot be names."""
+    patterns = [terminal.pattern for terminal in parser(language).terminals]
+    return frozenset(
+        pattern.value for pattern in patterns if pattern.type == "str" and pattern.value.isalpha()
+    )
 
 
-def words_of(grammar: Lark) -> frozenset[str]:
-    """The keywords of a grammar."""
-    patterns = [terminal.pattern for terminal in grammar.terminals]
-    return frozenset(one.value for one in patterns if one.type == "str" and one.value.isalpha())
+def line_of(node: Node | None, start: str, reporter: Reporter) -> Span | None:
+    """The place of a line in a file; None for other nodes, or after reporting escapes, where carets would be wrong."""
+    if not isinstance(node, Scalar):
+        return None
+    if node.style == "quoted" and node.content.text.split() != node.text.split():
+        label = "a backslash, or doubled quotes"
+        helps = ["write the line without quotes, or without the escapes"]
+        language = LANGUAGES[start]
+        message = f"escapes in a quoted {language.noun}"
+        reporter.error(language.escapes, message, node.span, label, helps=helps)
+        return None
+    return node.content
 
 
 def parse_scalar(scalar: Scalar, start: str, reporter: Reporter) -> Syntax | None:
-    """Parse a YAML scalar as one of STARTS; None after reporting a syntax error."""
-    span = scalar.content
-    if scalar.style == "quoted" and " ".join(span.text.split()) != " ".join(scalar.text.split()):
-        label = "a backslash, or doubled quotes"
-        helps = ["write the line without quotes, or without the escapes"]
-        reporter.error("PD203", "escapes in a quoted rule", scalar.span, label, helps=helps)
-        return None
-    return parse_text(span.source, span.start, span.end, start, reporter)
+    """Parse a YAML scalar from a start symbol; None after reporting a syntax error."""
+    span = line_of(scalar, start, reporter)
+    return None if span is None else parse_text(span, start, reporter)
 
 
-def parse_text(source: Source, begin: int, end: int, start: str, reporter: Reporter) -> Syntax | None:
-    """Parse characters `begin` to `end` of a source. Reports at most one syntax error."""
-    first, helps = Span(source, begin, begin + 1), ["give parts of it names with `let:`"]
-    if end - begin > MAX_LENGTH:
-        message, label = f"a line of {end - begin:,} characters", f"longer than {MAX_LENGTH:,}"
-        reporter.error("PD202", message, first, label, helps=helps)
+def parse_text(line: Span, start: str, reporter: Reporter, usage: Sequence[str] = ()) -> Syntax | None:
+    """Parse a line from a start symbol. Reports at most one syntax error, with `usage` as its help if that is given."""
+    language = LANGUAGES[start]
+    length, first = line.end - line.start, Span(line.source, line.start, line.start + 1)
+    helps = usage or ["give parts of it names with `let:`"]
+    if length > MAX_LENGTH:
+        message, label = f"a line of {length:,} characters", f"longer than {MAX_LENGTH:,}"
+        reporter.error(language.size, message, first, label, helps=helps)
         return None
     try:
-        tree = parser().parse(TextSlice(source.text, begin, end), start=start)
+        tree = parser(language).parse(TextSlice(line.source.text, line.start, line.end), start=start)
     except UnexpectedInput as error:
-        _report_syntax_error(error, source, begin, end, reporter)
+        _report_syntax_error(error, line, language, reporter, usage)
         return None
     if depth(tree) > MAX_DEPTH:
         message = f"an expression nested more than {MAX_DEPTH} deep"
         notes = ["a long chain of `and`, `or` or `+` nests as well"]
-        reporter.error("PD202", message, first, notes=notes, helps=helps)
+        reporter.error(language.size, message, first, notes=notes, helps=helps)
         return None
-    return _convert(tree, source, Span(source, begin, max(end, begin + 1)))
+    return _convert(tree, line.source, Span(line.source, line.start, max(line.end, line.start + 1)))
 
 
 def depth(tree: Tree) -> int:
@@ -107,25 +142,27 @@ def _convert(tree: Tree | Token, source: Source, fallback: Span) -> Syntax:
 
 
 def _report_syntax_error(
-    error: UnexpectedInput, source: Source, begin: int, end: int, reporter: Reporter
+    error: UnexpectedInput, line: Span, language: Language, reporter: Reporter, usage: Sequence[str]
 ) -> None:
-    text = source.text
+    source, text = line.source, line.source.text
     if isinstance(error, UnexpectedCharacters):
         start: int = error.pos_in_stream  # type: ignore[assignment]  # declared as None, set by this subclass
         message = f"unexpected character {shown_character(text[start])}"
-        fix = character_help(text, start, begin)
-        span, label = Span(source, start, start + 1), "not part of a rule"
-        reporter.error("PD201", message, span, label, helps=[fix] if fix else [])
+        fix = character_help(text, start, line.start)
+        span, label = Span(source, start, start + 1), f"not part of a {language.noun}"
+        reporter.error(language.syntax, message, span, label, helps=[fix] if fix else usage)
         return
     assert isinstance(error, UnexpectedToken)
     token = error.token
     at_end = token.type == "$END"
-    place = len(text[:end].rstrip()) if at_end or token.start_pos is None else token.start_pos
-    start = min(max(place, begin), max(len(text) - 1, 0))
+    place = len(text[: line.end].rstrip()) if at_end or token.start_pos is None else token.start_pos
+    start = min(max(place, line.start), max(len(text) - 1, 0))
     stop = start + (1 if at_end else len(token))
     accepted = set(error.accepts or error.expected or ())
     expected = expected_words(accepted)
-    fix = token_help("" if at_end else str(token), accepted, text[begin:start], was_cut(text, begin, end))
+    cut = was_cut(text, line.start, line.end)
+    fix = token_help("" if at_end else str(token), accepted, text[line.start : start], cut)
+    helps = [CUT] if cut and usage else usage or ([fix] if fix else [])
     message = "the line ends too early" if at_end else f"unexpected `{token}`"
     span, label = Span(source, start, max(stop, start + 1)), f"expected {expected}" if expected else ""
-    reporter.error("PD201", message, span, label, helps=[fix] if fix else [])
+    reporter.error(language.syntax, message, span, label, helps=helps)

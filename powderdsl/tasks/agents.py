@@ -8,20 +8,20 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from powderdsl.diagnostics import Span, suggest
+from powderdsl.diagnostics import Reporter, Span, suggest
 from powderdsl.model.schema import Entries, Reader, first_line
 from powderdsl.model.state import slot_name
 from powderdsl.model.types import Expr, Ruleset
 from powderdsl.syntax import yaml_tree
 from powderdsl.syntax.ast import Syntax
-from powderdsl.syntax.parse import parse_scalar
+from powderdsl.syntax.parse import line_of, parse_scalar
 from powderdsl.tasks.drawings import choice_ids, element_ids
 from powderdsl.tasks.goals import GoalChecker, parts_of
 from powderdsl.tasks.task import BLOW, NO_CHANGE, Agent, Expert, ExpertMove, Measure
 from powderdsl.worlds.raster import Shape, Size
-from powderdsl.worlds.scene.amounts import integers
+from powderdsl.worlds.scene.amounts import constants
 from powderdsl.worlds.scene.read import two_integers
-from powderdsl.worlds.scene.statements import Word, read_choice, read_shape, text_span
+from powderdsl.worlds.scene.statements import amounts_of, read_line, read_shape
 
 ACTS = {"blow": BLOW, "nothing": NO_CHANGE}
 """Words of `may:` that are not elements."""
@@ -57,8 +57,8 @@ def _choices(reader: Reader, words: Sequence[yaml_tree.Scalar], rules: Ruleset) 
     """Element ids, ascending, then BLOW and NO_CHANGE."""
     elements: set[int] = set()
     for word in words:
-        span = text_span(word, reader.reporter) if word.text not in ACTS else None
-        choice = read_choice(span, reader.reporter) if span else None
+        span = line_of(word, "choice", reader.reporter) if word.text not in ACTS else None
+        choice = read_line(span, "choice", reader.reporter) if span else None
         if choice is not None:
             elements |= set(choice_ids(choice, rules, reader.reporter, {}))
     acts = {ACTS[word.text] for word in words if word.text in ACTS}
@@ -174,7 +174,7 @@ class _Move:
         if word.text in ACTS:
             ids: tuple[int, ...] = (ACTS[word.text],)
         else:
-            ids = element_ids(Word(word.text, word.span), self.rules, self.reporter)[:1]
+            ids = element_ids(word, self.rules, self.reporter)[:1]
         if ids and ids[0] not in self.agent.choices:
             message = f"the agent may not choose `{word.text}`"
             helps = [f"add `{word.text}` to `may:`"]
@@ -222,11 +222,12 @@ class _Move:
         return None, self.checker.measured("count", syntax.children[0])
 
     def within(self, word: yaml_tree.Scalar | None) -> Shape | None:
-        span = text_span(word, self.reporter)
+        span = line_of(word, "shape", self.reporter)
         statement = read_shape(span, self.reporter) if span is not None else None
         if statement is None:
             return None
-        numbers = integers(statement.numbers)
+        amounts = amounts_of(statement, {}, Reporter())
+        numbers = None if amounts is None else constants(amounts)
         if numbers is None:
             message = "the shape of a move is the same in all worlds"
             self.reporter.error("PD803", message, statement.span, "no draws or names here")

@@ -9,8 +9,10 @@ from pathlib import Path
 from powderdsl.arrays import NDArray, np
 from powderdsl.diagnostics import CompileError, Reporter, Span, suggest
 from powderdsl.model.schema import Reader, first_line
-from powderdsl.model.types import Element, Ruleset
+from powderdsl.model.types import Element, Expr, Ruleset
 from powderdsl.syntax import yaml_tree
+from powderdsl.syntax.ast import Syntax
+from powderdsl.syntax.parse import line_of
 from powderdsl.syntax.sources import path_beside
 from powderdsl.tasks.task import (
     MAX_NUMBER,
@@ -27,21 +29,18 @@ from powderdsl.worlds.ascii import load_ascii, parse_ascii
 from powderdsl.worlds.image import read_image
 from powderdsl.worlds.raster import Setting, Shape, Size, mask
 from powderdsl.worlds.scene import draw_scene, find_scene, shipped_scenes
-from powderdsl.worlds.scene.amounts import Amount, Interval, filled_in, integers, interval, number
-from powderdsl.worlds.scene.read import covers_nothing, not_a_statement
-from powderdsl.worlds.scene.statements import (
-    NUMBERS,
-    RANGES,
-    ElementChoice,
-    Statement,
-    Word,
+from powderdsl.worlds.scene.amounts import (
+    Written,
+    constants,
+    number,
     read_amount,
-    read_statement,
-    text_span,
+    report_unknown,
 )
+from powderdsl.worlds.scene.read import covers_nothing, not_a_statement
+from powderdsl.worlds.scene.statements import RANGES, Statement, amounts_of, read_line, read_statement
 
-BROKEN = Amount("broken")
-"""A number whose mistake has been reported: what depends on it is not a second one."""
+Lets = Sequence[tuple[Written, Syntax | None]]
+"""Names of numbers as written, in order; None for a number whose mistake has been reported."""
 
 MAX_STATEMENTS = 2_000
 """Statements of one list."""
@@ -51,8 +50,8 @@ MAX_STATEMENTS = 2_000
 class Repeat:
     """Statements that are done `count` times, with names of their own."""
 
-    count: Amount
-    lets: tuple[tuple[Word, Amount], ...]
+    count: Syntax
+    lets: Lets
     statements: tuple[Statement, ...]
     span: Span = field(compare=False, repr=False)
 
@@ -81,7 +80,7 @@ def read_items(node: yaml_tree.Node | None, reader: Reader, *, nested: bool = Fa
                 _not_a_statement(item, reporter, nested)
         elif isinstance(item, yaml_tree.Sequence):
             reader.shape(item, "a statement")
-        elif span := text_span(item, reporter):
+        elif span := line_of(item, "statement", reporter):
             found.append(read_statement(span, reporter))
     return tuple(item for item in found if item is not None)
 
@@ -96,8 +95,8 @@ def _repeat(item: yaml_tree.Mapping, reader: Reader) -> Repeat | None:
         _not_a_statement(item, reader.reporter, nested=False)
         return None
     key, body = item.entries[0]
-    count = read_amount(key.content, reader.reporter, repeat=True)
-    lets: list[tuple[Word, Amount]] = []
+    count = read_line(key.content, "repeat", reader.reporter)
+    lets: list[tuple[Written, Syntax | None]] = []
     for one in body.items if isinstance(body, yaml_tree.Sequence) else ():
         if isinstance(one, yaml_tree.Mapping) and _is_let(one):
             lets += read_lets(one.entries[0][1], reader)
@@ -105,19 +104,18 @@ def _repeat(item: yaml_tree.Mapping, reader: Reader) -> Repeat | None:
         reader.reporter.error("PD109", "a repetition of nothing", key.span, "no statements stand below it")
         return None
     statements = tuple(one for one in read_items(body, reader, nested=True) if isinstance(one, Statement))
-    return Repeat(count, tuple(lets), statements, key.span) if count is not None else None
+    return Repeat(count.children[0], lets, statements, key.span) if count is not None else None
 
 
-def read_lets(node: yaml_tree.Node | None, reader: Reader) -> list[tuple[Word, Amount]]:
-    """The names of a `let:` and their numbers, in order; BROKEN after a report."""
-    found = []
+def read_lets(node: yaml_tree.Node | None, reader: Reader) -> list[tuple[Written, Syntax | None]]:
+    """The names of a `let:` and their numbers, in order; None after a report."""
+    lets: list[tuple[Written, Syntax | None]] = []
     for key, value in reader.named(node, "a number"):
         if not isinstance(value, yaml_tree.Scalar):
             reader.shape(value, "a number")
-        span = text_span(value, reader.reporter)
-        amount = read_amount(span, reader.reporter) if span is not None else None
-        found.append((Word(key.text, key.span), amount or BROKEN))
-    return found
+        span = line_of(value, "operand", reader.reporter)
+        lets.append((key, read_line(span, "operand", reader.reporter) if span is not None else None))
+    return lets
 
 
 def _not_a_statement(item: yaml_tree.Mapping, reporter: Reporter, nested: bool) -> None:
@@ -142,7 +140,7 @@ class DrawingPlan:
     name: str
     fill: int
     knobs: Mapping[str, int]
-    lets: Sequence[tuple[Word, Amount]]
+    lets: Lets
     regions: Mapping[str, Sequence[Statement]]
     stamps: Mapping[str, Stamp]
     parts: Mapping[str, Sequence[Item]]
@@ -160,12 +158,14 @@ class Drawer:
     ruleset: Ruleset
     size: Size
     reporter: Reporter
-    names: dict[str, Interval] = field(default_factory=dict)
     used_parts: set[str] = field(default_factory=set)
-    broken: set[str] = field(default_factory=set)
-    """Names whose definition has been reported: using them is not a second mistake."""
     count: int = 0
     cells: int = 0
+
+    def __post_init__(self) -> None:
+        names: dict[str, Expr | None] = dict.fromkeys(self.plan.broken)
+        self.names = names | {name: number(value) for name, value in self.plan.knobs.items()}
+        """The amounts of names; None for a name whose definition has been reported."""
 
     def generator(self) -> Generator:
         plan = self.plan
@@ -179,23 +179,19 @@ class Drawer:
             stamps=tuple(plan.stamps.values()),
         )
 
-    def lets(
-        self, written: Sequence[tuple[Word, Amount]], names: dict[str, Interval]
-    ) -> tuple[tuple[str, Amount], ...]:
-        """Named numbers in order; `names` gets their bounds."""
-        found = []
-        for word, amount in written:
-            filled = self.filled(amount, names) if amount is not BROKEN else None
-            if filled is None:
-                self.broken.add(word.text)
-            else:
-                found.append((word.text, filled))
-            names[word.text] = (0, 0) if filled is None else interval(filled, names)
-        return tuple(found)
+    def lets(self, written: Lets, names: dict[str, Expr | None]) -> tuple[tuple[str, Expr], ...]:
+        """Named numbers in order, which `names` gets."""
+        lets = []
+        for word, syntax in written:
+            amount = None if syntax is None else read_amount(syntax, names, self.reporter)
+            names[word.text] = amount and Expr("let", amount.kind, value=word.text)
+            if amount is not None:
+                lets.append((word.text, amount))
+        return tuple(lets)
 
     def region(self, name: str, shapes: Sequence[Statement]) -> Region:
         drawings = tuple(filter(None, (self.drawing(one, self.names) for one in shapes)))
-        return Region(name, drawings, any(integers(one.amounts) is None for one in drawings))
+        return Region(name, drawings, any(constants(one.amounts) is None for one in drawings))
 
     def groups(self, items: Sequence[Item], inside: tuple[str, ...] = ()) -> tuple[Group, ...]:
         """The groups of a list of statements: each repetition is one, and each statement between them."""
@@ -203,8 +199,8 @@ class Drawer:
         for item in items:
             if isinstance(item, Repeat):
                 found += self.repeated(item)
-            elif item.kind == "part":
-                found += self.part(item.name or Word("", item.span), inside)
+            elif item.kind == "part" and item.name is not None:
+                found += self.part(item.name, inside)
             else:
                 self.count += 1
                 self.cells += 1
@@ -216,7 +212,7 @@ class Drawer:
                 break
         return tuple(found)
 
-    def part(self, name: Word, inside: tuple[str, ...]) -> tuple[Group, ...]:
+    def part(self, name: Syntax, inside: tuple[str, ...]) -> tuple[Group, ...]:
         if name.text not in self.plan.parts:
             report_unknown("part", name, self.plan.parts, self.reporter)
             return ()
@@ -231,10 +227,10 @@ class Drawer:
         place = self.count
         names = dict(self.names)
         for word, _ in repeat.lets:
-            if word.text in self.names or word.text in self.plan.knobs:
+            if word.text in self.names:
                 message = f"`{word.text}` already means something"
                 self.reporter.error("PD308", message, word.span, "second meaning")
-        count = self.filled(repeat.count, self.names)
+        count = read_amount(repeat.count, self.names, self.reporter)
         lets = self.lets(repeat.lets, names)
         drawings = []
         for statement in repeat.statements:
@@ -247,7 +243,7 @@ class Drawer:
         known = tuple(drawing for drawing in drawings if drawing is not None)
         if count is None or len(known) < len(drawings):
             return ()
-        low, most = interval(count, self.names)
+        low, most = int(count.kind.lo), int(count.kind.hi)
         if low < 0 or most > MAX_REPEATS:
             label = f"they must lie in 0..{MAX_REPEATS}"
             self.reporter.error("PD606", f"{low}..{most} repetitions", repeat.count.span, label)
@@ -255,85 +251,41 @@ class Drawer:
         self.cells += most * len(known)
         return (Group(place, count, most, lets, known),) if most and known else ()
 
-    def drawing(self, statement: Statement, names: Mapping[str, Interval]) -> Drawing | None:
+    def drawing(self, statement: Statement, names: Mapping[str, Expr | None]) -> Drawing | None:
         ids, over = (
-            choice_ids(one, self.ruleset, self.reporter, self.plan.knobs) if one else ()
-            for one in (statement.choice, statement.over)
+            choice_ids(choice, self.ruleset, self.reporter, self.plan.knobs) if choice else ()
+            for choice in (statement.choice, statement.over)
         )
         where, stamp = statement.where, statement.name
         for what, word, known in (("region", where, self.plan.regions), ("stamp", stamp, self.plan.stamps)):
             if word is not None and word.text not in known:
                 report_unknown(what, word, known, self.reporter)
-        amounts = [None if one is None else self.filled(one, names) for one in statement.numbers]
-        if any(new is None and old is not None for new, old in zip(amounts, statement.numbers, strict=True)):
+        amounts = amounts_of(statement, names, self.reporter, MAX_NUMBER)
+        if amounts is None:
             return None
-        found = Drawing(
+        drawing = Drawing(
             self.count,
             statement.kind,
-            tuple(amounts),
+            amounts,
             ids,
             where.text if where else None,
             frozenset(over) if statement.over else None,
             stamp.text if stamp else None,
             statement.span,
         )
-        return found if self.numbers_fit(found, names) and (ids or statement.choice is None) else None
+        return drawing if self.covers_something(drawing) and (ids or statement.choice is None) else None
 
-    def filled(self, amount: Amount, names: Mapping[str, Interval]) -> Amount | None:
-        """The amount with knobs filled in, or None after reporting names that nothing defines."""
-        if any(part.value in self.broken or part.value in self.plan.broken for part in amount.walk()):
-            return None
-        known = {**dict.fromkeys(names), **dict.fromkeys(self.plan.knobs)}
-        unknown = [part for part in amount.walk() if part.op == "name" and part.value not in known]
-        for part in unknown:
-            assert part.span is not None
-            report_unknown("number", Word(str(part.value), part.span), known, self.reporter)
-        if unknown:
-            return None
-        try:
-            found = filled_in(amount, self.plan.knobs)
-            interval(found, names)
-        except ZeroDivisionError:
-            self.reporter.error("PD606", "a division by zero", amount.span, "the divisor can be 0")
-            return None
-        for part in found.walk():
-            if part.op == "draw":
-                (low, _), (_, high) = (interval(arg, names) for arg in part.args)
-                if low > high:
-                    label = "the first must not be above the second"
-                    self.reporter.error("PD606", f"a range {low}..{high} without numbers", part.span, label)
-                    return None
-        return found
-
-    def numbers_fit(self, drawing: Drawing, names: Mapping[str, Interval]) -> bool:
-        """Whether all numbers can be what their statement needs; reports the others."""
-        fits = True
-        for amount, (what, lowest) in zip(drawing.amounts, NUMBERS[drawing.kind], strict=True):
-            if amount is None:
-                continue
-            low, high = interval(amount, names)
-            most = 100 if drawing.kind == "scatter" else MAX_NUMBER
-            # A range that begins before the world is cut off, as everything is that lies outside.
-            outside = drawing.kind in RANGES and lowest == 0
-            least = -MAX_NUMBER if outside else max(lowest, -MAX_NUMBER)
-            if low < least or high > most:
-                can_be = f"it can be {low}..{high}" if low < high else f"it is {low}"
-                self.reporter.error("PD606", f"{what} must lie in {least}..{most}", amount.span, can_be)
-                fits = False
-        return fits and self.covers_something(drawing, names)
-
-    def covers_something(self, drawing: Drawing, names: Mapping[str, Interval]) -> bool:
-        """Whether the shape can cover a cell; reports one that never does."""
+    def covers_something(self, drawing: Drawing) -> bool:
+        """Return True if the shape can cover a cell; report a shape that never does."""
         amounts = drawing.amounts
         never = ""
         for i in range(RANGES.get(drawing.kind, 0)):
             start, stop = amounts[2 * i], amounts[2 * i + 1]
             assert start is not None
-            low = interval(start, names)[0]
-            high = self.size[i] if stop is None else interval(stop, names)[1]
+            low, high = start.kind.lo, self.size[i] if stop is None else stop.kind.hi
             if low >= high or start == stop or low >= self.size[i] or high <= 0:
                 never = "rows" if i == 0 else "columns"
-        values = integers(amounts) if drawing.kind not in ("scatter", "stamp") else None
+        values = constants(amounts) if drawing.kind not in ("scatter", "stamp") else None
         if values is not None and not mask(Shape(drawing.kind, values), self.size).any():
             never = never or "cells"
         if never:
@@ -341,33 +293,28 @@ class Drawer:
         return not never
 
 
-def report_unknown(what: str, word: Word, known: Mapping[str, object], reporter: Reporter) -> None:
-    """Report a name that the task does not define, PD802."""
-    helps = suggest(word.text, known, f"{what}s") or (f"the task defines no {what}s",)
-    reporter.error("PD802", f"unknown {what} `{word.text}`", word.span, "not defined", helps=helps)
-
-
 def choice_ids(
-    choice: ElementChoice, ruleset: Ruleset, reporter: Reporter, knobs: Mapping[str, int]
+    choice: Syntax, ruleset: Ruleset, reporter: Reporter, knobs: Mapping[str, int]
 ) -> tuple[int, ...]:
     """The elements of a choice by id, in the order written, tags in the order of ids. Empty after a report."""
-    ids = tuple(dict.fromkeys(i for word in choice.names for i in element_ids(word, ruleset, reporter)))
-    if choice.how == "any":
+    words = [child for child in choice.children if child.kind == "identifier"]
+    ids = tuple(dict.fromkeys(i for word in words for i in element_ids(word, ruleset, reporter)))
+    if choice.kind == "any_element":
         ids = tuple(element.id for element in ruleset.elements if element.id not in ids)
-    if choice.how == "first":
-        assert choice.count is not None
-        count = filled_in(choice.count, knobs)
-        if not count.is_number or not 1 <= count.integer <= len(ids):
+    if choice.kind == "first":
+        written = choice.children[0]
+        count = read_amount(written, {name: number(value) for name, value in knobs.items()}, Reporter())
+        if count is None or count.op != "const" or not 1 <= count.value <= len(ids):
             label = f"a number from 1 to {len(ids)}, or knobs"
-            reporter.error("PD606", "how many of them must be fixed", choice.count.span, label)
+            reporter.error("PD606", "how many of them must be fixed", written.span, label)
             return ()
-        ids = ids[: count.integer]
-    if not ids and (choice.how == "any" or not choice.names):
+        ids = ids[: count.value]
+    if not ids and not words:
         reporter.error("PD604", "a choice among no elements", choice.span, "nothing is left")
     return ids
 
 
-def element_ids(word: Word, ruleset: Ruleset, reporter: Reporter) -> tuple[int, ...]:
+def element_ids(word: Written, ruleset: Ruleset, reporter: Reporter) -> tuple[int, ...]:
     """The element, or all elements with the tag, of a name; empty after reporting PD604."""
     element = ruleset.element(word.text)
     if element is not None:

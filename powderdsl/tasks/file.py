@@ -16,10 +16,10 @@ from powderdsl.model.schema import Entries, Key, Reader, first_line
 from powderdsl.model.state import fits, size_problem
 from powderdsl.model.types import Expr, Ruleset
 from powderdsl.syntax import yaml_tree
-from powderdsl.syntax.parse import reserved_words as rule_words
+from powderdsl.syntax.ast import Syntax
+from powderdsl.syntax.parse import STATEMENTS, line_of, reserved_words
 from powderdsl.tasks.agents import read_agent, read_expert
 from powderdsl.tasks.drawings import (
-    BROKEN,
     Drawer,
     DrawingPlan,
     element_ids,
@@ -27,21 +27,13 @@ from powderdsl.tasks.drawings import (
     read_items,
     read_lets,
     read_stamp,
-    report_unknown,
 )
 from powderdsl.tasks.goals import ACTION_WORDS, FUNCTIONS, GoalChecker
 from powderdsl.tasks.task import MAX_SIDE, Goal, Knob, Split, Stamp, Task
 from powderdsl.worlds.raster import Size
-from powderdsl.worlds.scene.amounts import Amount, filled_in, integers
+from powderdsl.worlds.scene.amounts import Written, constants, number, read_amount, report_unknown
 from powderdsl.worlds.scene.read import can_be_called, two_integers
-from powderdsl.worlds.scene.statements import (
-    Statement,
-    Word,
-    read_amount,
-    read_shape,
-    reserved_words,
-    text_span,
-)
+from powderdsl.worlds.scene.statements import Statement, read_line, read_shape
 
 MAX_ACTIONS, MAX_STEPS, MAX_PLANS = 1_000_000, 100_000, 10_000
 """The most actions of an episode, steps after one, and plans of a search."""
@@ -291,12 +283,13 @@ class _TaskReader:
 
     def fill(self) -> int:
         name = self.values.get("fill")
-        ids = element_ids(Word(name.text, name.span), self.ruleset, self.reporter) if name else ()
+        ids = element_ids(name, self.ruleset, self.reporter) if name else ()
         return ids[0] if ids else 0
 
-    def take(self, word: yaml_tree.Scalar | Word) -> None:
+    def take(self, word: Written) -> None:
         """Report a new name that already means something, or that statements and expressions need."""
-        if word.text in reserved_words() | rule_words() | {*ACTION_WORDS, *FUNCTIONS, *RULE_FUNCTIONS}:
+        keywords = reserved_words() | reserved_words(STATEMENTS)
+        if word.text in keywords | {*ACTION_WORDS, *FUNCTIONS, *RULE_FUNCTIONS}:
             self.reporter.error("PD311", f"`{word.text}` is a reserved word", word.span, "taken")
         elif word.text in self.taken:
             message = f"`{word.text}` already means something"
@@ -330,20 +323,29 @@ class _TaskReader:
         return tuple(found.values())
 
     def knob(self, key: yaml_tree.Scalar, entries: Entries, above: Mapping[str, Knob]) -> Knob | None:
-        bounds, default = (self.amount(entries, name) for name in ("range", "default"))
+        bounds, default = (self.line(entries, name, "operand") for name in ("range", "default"))
         if bounds is None or default is None:
             return None
-        low, high = integers(bounds.args) or (None, None) if bounds.op == "draw" else (None, None)
+        ends = bounds.children if bounds.kind == "range" else ()
+        amounts = [read_amount(part, {}, Reporter()) for part in ends]
+        low, high = constants(amounts) or (None, None) if ends else (None, None)
         if low is None or high is None:
             self.reporter.error("PD803", "a knob's range has two integers", bounds.span, "such as `0..64`")
             return None
-        value = filled_in(default, {name: knob.value for name, knob in above.items()})
-        if not value.is_number:
+        if read_amount(bounds, {}, self.reporter) is None:
+            return None
+        names = {name: number(knob.value) for name, knob in above.items()}
+        unread = Reporter()
+        amount = read_amount(default, names, unread)
+        if any(diagnostic.code == "PD606" for diagnostic in unread.diagnostics):
+            read_amount(default, names, self.reporter)
+            return None
+        if amount is None or amount.op != "const":
             label = "an integer, or knobs that stand above this one"
-            helps = suggest(default.span.text if default.span else "", above, "knobs above it")
+            helps = suggest(default.span.text, above, "knobs above it")
             self.reporter.error("PD803", f"the default of `{key.text}`", default.span, label, helps=helps)
             return None
-        usual = value.integer
+        usual = int(amount.value)
         chosen = int(self.given.get(key.text, usual))
         for one, span in ((usual, default.span), (chosen, None if key.text in self.given else default.span)):
             if not low <= one <= high:
@@ -351,9 +353,9 @@ class _TaskReader:
                 self.reporter.error("PD803", message, span, f"{one} lies outside", notes=[f"it is {one}"])
         return Knob(key.text, usual, low, high, chosen, self.reader.text(entries, "about"), key.span)
 
-    def amount(self, entries: Entries, key: str) -> Amount | None:
-        span = text_span(self.reader.scalar(entries, key), self.reporter)
-        return read_amount(span, self.reporter) if span is not None else None
+    def line(self, entries: Entries, key: str, start: str) -> Syntax | None:
+        span = line_of(self.reader.scalar(entries, key), start, self.reporter)
+        return read_line(span, start, self.reporter) if span is not None else None
 
     def regions(self) -> dict[str, tuple[Statement, ...]]:
         found = {}
@@ -361,7 +363,7 @@ class _TaskReader:
             self.take(key)
             shapes = []
             for item in node.items if isinstance(node, yaml_tree.Sequence) else (node,):
-                span = text_span(item, self.reporter)
+                span = line_of(item, "shape", self.reporter)
                 if not isinstance(item, yaml_tree.Scalar):
                     self.reader.shape(item, "a shape, such as `box rows 1:5 columns 2:8`")
                 elif span is not None:
@@ -421,18 +423,19 @@ class _TaskReader:
         """The plan with what a split or stand changes."""
         nodes = {key: node for key, (_, node) in entries.items()}
         knobs = dict(plan.knobs)
-        for word, amount in read_lets(nodes.get("knobs"), self.reader):
+        values = {name: number(value) for name, value in plan.knobs.items()}
+        for word, syntax in read_lets(nodes.get("knobs"), self.reader):
             self.known(word, plan.knobs, "knob")
-            filled = filled_in(amount, plan.knobs)
-            if filled.is_number:
-                knobs[word.text] = filled.integer
-            elif amount is not BROKEN:
+            amount = None if syntax is None else read_amount(syntax, values, self.reporter)
+            if amount is not None and amount.op == "const":
+                knobs[word.text] = int(amount.value)
+            elif amount is not None:
                 self.reporter.error("PD803", "a knob is one number", amount.span, "not an integer")
-        lets = {word.text: (word, amount) for word, amount in plan.lets}
-        for word, amount in read_lets(nodes.get("let"), self.reader):
+        lets = {word.text: (word, syntax) for word, syntax in plan.lets}
+        for word, syntax in read_lets(nodes.get("let"), self.reader):
             self.known(word, lets, "number")
             if word.text in lets:
-                lets[word.text] = lets[word.text][0], amount
+                lets[word.text] = lets[word.text][0], syntax
         parts = dict(plan.parts)
         for key, node in self.reader.named(nodes.get("parts"), "a part"):
             self.known(key, plan.parts, "part")
@@ -440,9 +443,9 @@ class _TaskReader:
         items = read_items(nodes["generate"], self.reader) if "generate" in nodes else plan.items
         return replace(plan, name=name, knobs=knobs, lets=list(lets.values()), parts=parts, items=items)
 
-    def known(self, word: Word | yaml_tree.Scalar, known: Mapping[str, object], what: str) -> None:
+    def known(self, word: Written, known: Mapping[str, object], what: str) -> None:
         if word.text not in known:
-            report_unknown(what, Word(word.text, word.span), known, self.reporter)
+            report_unknown(what, word, known, self.reporter)
 
     def goal(self, checker: GoalChecker) -> Goal:
         expressions: dict[str, Expr | None] = {}

@@ -12,7 +12,6 @@ from powderdsl.diagnostics import Span
 from powderdsl.model.fingerprint import UNMEANING
 from powderdsl.model.types import Expr, Ruleset
 from powderdsl.worlds.raster import Shape, Size
-from powderdsl.worlds.scene.amounts import Amount
 
 BLOW = -1
 """Among the choices of an agent: blow, instead of placing an element."""
@@ -54,7 +53,7 @@ class Drawing:
 
     number: int
     kind: str
-    amounts: tuple[Amount | None, ...]
+    amounts: tuple[Expr | None, ...]
     ids: tuple[int, ...]
     where: str | None = None
     over: frozenset[int] | None = None
@@ -67,10 +66,10 @@ class Group:
     """Drawings that are made `count` times in a row (a number of repetitions that may be drawn), with own names."""
 
     number: int
-    count: Amount
+    count: Expr
     most: int
     """The largest `count`."""
-    lets: tuple[tuple[str, Amount], ...]
+    lets: tuple[tuple[str, Expr], ...]
     drawings: tuple[Drawing, ...]
 
 
@@ -106,7 +105,7 @@ class Generator:
 
     name: str
     fill: int
-    lets: tuple[tuple[str, Amount], ...]
+    lets: tuple[tuple[str, Expr], ...]
     groups: tuple[Group, ...]
     regions: tuple[Region, ...]
     targets: tuple[Target, ...]

@@ -200,7 +200,7 @@ def _of_line(node: Tree, starts: tuple[str, ...]) -> Iterator[tuple[str, str]]:
         return
     span = node.content
     for start in starts:
-        syntax = parse_text(span.source, span.start, span.end, start, Reporter())
+        syntax = parse_text(span, start, Reporter())
         if syntax is not None:
             yield from _of_syntax(syntax)
             return

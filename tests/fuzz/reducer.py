@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import islice
 
-from powderdsl.diagnostics import Reporter, Source
+from powderdsl.diagnostics import Reporter, Source, Span
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.parse import parse_text
 from powderdsl.syntax.yaml_tree import parse_yaml
@@ -125,7 +125,11 @@ def _smaller_lines(text: str) -> Iterator[str]:
     """A rule or expression with a clause less, or an expression in it replaced by one of its parts or a plain one."""
     source = Source("line", text)
     syntax = next(
-        (s for start in ("rule", "expression") if (s := parse_text(source, 0, len(text), start, Reporter()))),
+        (
+            s
+            for start in ("rule", "expression")
+            if (s := parse_text(Span(source, 0, len(text)), start, Reporter()))
+        ),
         None,
     )
     if syntax is None:

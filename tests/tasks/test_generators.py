@@ -282,7 +282,7 @@ def test_obstacles_have_the_paper_s_numbers():
         place = (0, 63)
         assert bounds == [[place] * 4 + [(1, 9)], [place, place, (5, 19)], [place, place, (5, 19)]]
         for group in (*drawn, squares):
-            assert (group.count.args[0].value, group.count.op) == (0, "draw")
+            assert (group.count.args[0].value, group.count.op) == (0, "uniform")
             assert (2 in group.drawings[0].ids) == (name != "sand-pushing")
             assert len(group.drawings[0].ids) == 14 - (name == "sand-pushing")
 

@@ -176,7 +176,7 @@ MALFORMED = [
     ("  test:\n", "  test:\n    knobs: {liens: 3}\n", "PD802", "liens"),
     ("  test:\n", "  test:\n    let: {rows_: 3}\n", "PD802", "rows_"),
     ("  test:\n", "  test:\n    knobs: {lines: 1..3}\n", "PD803", "1..3"),
-    ("  test:\n", "  test:\n    knobs: {lines: 1 / 0}\n", "PD803", "1 / 0"),
+    ("  test:\n", "  test:\n    knobs: {lines: 1 / 0}\n", "PD606", "1 / 0"),
     ("  test:\n", "  test:\n    stands: []\n", "PD107", "[]"),
     ("  test:\n", "  test:\n    stands: [{let: {row: 4}}]\n", "PD109", "{"),
     ("  test:\n", "  te st:\n", "PD111", "te st"),

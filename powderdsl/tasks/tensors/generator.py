@@ -8,18 +8,20 @@ Painting happens on bits: an id is a few planes, a word is 64 rows of a column.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import operator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, reduce
 from math import prod
 from operator import or_
 from typing import Any
 
+from powderdsl.model.types import Expr
 from powderdsl.system.random import MASK, base_keys, mix, name_number
 from powderdsl.targets.array_kind import Array, ArrayKind
 from powderdsl.tasks.task import Drawing, Generator, Group, Region, Task
 from powderdsl.worlds.raster import Shape, Size, covered_rows, mask
-from powderdsl.worlds.scene.amounts import CALCULATE, Amount, integers
+from powderdsl.worlds.scene.amounts import constants
 
 
 def shape_words(kind: ArrayKind, shape: str, numbers: Sequence[Array | None], size: Size) -> Array:
@@ -156,6 +158,16 @@ class Hashes:
         return drawn.reshape(-1, most, wanted)[:, :repeats]
 
 
+_CALCULATE: dict[str, Callable[..., Any]] = {
+    "add": operator.add,
+    "sub": operator.sub,
+    "mul": operator.mul,
+    "quotient": operator.floordiv,
+    "neg": operator.neg,
+}
+"""Operations on integers, or on arrays of them."""
+
+
 class _Draws:
     """Values of the amounts of one statement, [B, R] for R repetitions; each draw takes the next counter."""
 
@@ -173,19 +185,20 @@ class _Draws:
         self.used += 1
         return low + ((drawn * (high - low + 1)) >> 32)
 
-    def value(self, amount: Amount) -> Array | int:
-        if amount.op == "number":
-            return amount.integer
-        if amount.op == "name":
-            return self.names[str(amount.value)]
-        parts = [self.value(arg) for arg in amount.args]
-        if amount.op == "draw":
-            return self.uniform(parts[0], parts[1])
-        if amount.op == "neg":
-            return -parts[0]
-        return CALCULATE[amount.op](parts[0], parts[1])
+    def value(self, amount: Expr) -> Array | int:
+        match amount.op, [self.value(arg) for arg in amount.args]:
+            case "const", _:
+                return int(amount.value)
+            case "let", _:
+                return self.names[amount.value]
+            case "uniform", [low, high]:
+                return self.uniform(low, high)
+            case "mod", [value]:
+                return value % amount.value
+            case op, values:
+                return _CALCULATE[op](*values)
 
-    def array(self, amount: Amount | None) -> Array | None:
+    def array(self, amount: Expr | None) -> Array | None:
         """int64 that broadcasts to [B, R]."""
         if amount is None:
             return None
@@ -193,8 +206,8 @@ class _Draws:
         return self.kind.put(value, "int64") if isinstance(value, int) else value
 
 
-def _draws_in(*amounts: Amount | None) -> int:
-    return sum(part.op == "draw" for one in amounts if one is not None for part in one.walk())
+def _draws_in(*amounts: Expr | None) -> int:
+    return sum(part.op == "uniform" for one in amounts if one is not None for part in one.walk())
 
 
 def _groups(generator: Generator) -> list[Group]:
@@ -285,7 +298,7 @@ class WorldMaker:
         return self.kind.copied(self.kind.xp.broadcast_to(plane, shape))
 
     def _lets(
-        self, lets: tuple[tuple[str, Amount], ...], hashes: Hashes, repeats: int, names: Mapping[str, Array]
+        self, lets: tuple[tuple[str, Expr], ...], hashes: Hashes, repeats: int, names: Mapping[str, Array]
     ) -> dict[str, Array]:
         """`names` and more of them: int64 that broadcasts to [B, R]."""
         found = dict(names)
@@ -314,7 +327,7 @@ class WorldMaker:
     def fixed_words(self, drawing: Drawing) -> Array:
         """The words [W, K] of a shape of plain numbers."""
         if drawing not in self.fixed:
-            shape = Shape(drawing.kind, integers(drawing.amounts) or ())
+            shape = Shape(drawing.kind, constants(drawing.amounts) or ())
             self.fixed[drawing] = pack(self.kind, self.kind.from_numpy(mask(shape, self.size)))
         return self.fixed[drawing]
 
@@ -372,7 +385,7 @@ class _Painter:
         self.bits = some if len(some) > 1 else some * repeats
         self.numbers: list[Array | None] = []
         words = once
-        if drawing.kind not in _LIMITED and integers(drawing.amounts) is not None:
+        if drawing.kind not in _LIMITED and constants(drawing.amounts) is not None:
             words = maker.fixed_words(drawing) & once
         else:
             shape = tuple(once.shape[:2])

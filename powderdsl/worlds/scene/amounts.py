@@ -1,101 +1,116 @@
-"""Integers in statements: written out, named, drawn (`a..b`), and arithmetic on them."""
+"""Integers in statements: written out, named, drawn (`a..b`), and arithmetic on them, as in rules."""
 
 from __future__ import annotations
 
-import operator
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import Protocol
 
-from powderdsl.diagnostics import Span
+from powderdsl.diagnostics import Reporter, Span, suggest
+from powderdsl.model.operations import OPS
+from powderdsl.model.types import Expr, integer
+from powderdsl.syntax.ast import Syntax
 
-Interval = tuple[int, int]
-"""Lowest and highest value."""
-
-
-@dataclass(frozen=True)
-class Amount:
-    """A number of a statement.
-
-    `op`: ``number`` (value: int), ``name`` (value: str), ``draw`` (two arguments: uniform, both ends included),
-    ``add sub mul div mod neg``; ``div`` and ``mod`` round down.
-    """
-
-    op: str
-    args: tuple[Amount, ...] = ()
-    value: int | str | None = None
-    span: Span | None = field(default=None, compare=False, repr=False)
-
-    def walk(self) -> Iterator[Amount]:
-        """This amount and everything in it."""
-        yield self
-        for arg in self.args:
-            yield from arg.walk()
-
-    @property
-    def is_number(self) -> bool:
-        return self.op == "number"
-
-    @property
-    def integer(self) -> int:
-        """The value of a number; of others 0."""
-        return self.value if isinstance(self.value, int) else 0
-
-
-def integers(amounts: Iterable[Amount | None]) -> tuple[int | None, ...] | None:
-    """The values of numbers that are written out, None for open ends; None if one is drawn or named."""
-    found = list(amounts)
-    if not all(one is None or one.is_number for one in found):
-        return None
-    return tuple(None if one is None else one.integer for one in found)
-
-
-def number(value: int, span: Span | None = None) -> Amount:
-    return Amount("number", (), value, span)
-
-
-CALCULATE: dict[str, Callable[[Any, Any], Any]] = {
-    "add": operator.add,
-    "sub": operator.sub,
-    "mul": operator.mul,
-    "div": operator.floordiv,
-    "mod": operator.mod,
+OPERATIONS = {
+    "add": "add",
+    "subtract": "sub",
+    "multiply": "mul",
+    "divide": "quotient",
+    "quotient": "quotient",
+    "mod": "mod",
+    "negate": "neg",
+    "range": "uniform",
 }
-"""Operations on integers, or on tensors of them. Integers divided by 0 raise ZeroDivisionError."""
+"""The operation of each kind of syntax. All are on integers, so that `/` rounds down as `div` does. ``uniform`` draws an
+integer between two others, both included."""
+
+MAX_DIGITS = 9
 
 
-def filled_in(amount: Amount, values: Mapping[str, int]) -> Amount:
-    """The amount with named numbers filled in and arithmetic on numbers done, except for divisions by 0."""
-    if amount.op == "name" and amount.value in values:
-        return number(values[str(amount.value)], amount.span)
-    args = tuple(filled_in(arg, values) for arg in amount.args)
-    if args and all(arg.is_number for arg in args):
-        first, *rest = (arg.integer for arg in args)
-        if amount.op == "neg":
-            return number(-first, amount.span)
-        divided = amount.op in ("div", "mod")
-        if amount.op != "draw" and not (divided and rest[0] == 0):
-            return number(CALCULATE[amount.op](first, rest[0]), amount.span)
-        if not divided and first == rest[0]:
-            return number(first, amount.span)
-    return Amount(amount.op, args, amount.value, amount.span)
+class Written(Protocol):
+    """A word of a file, and where it is."""
+
+    @property
+    def text(self) -> str: ...
+
+    @property
+    def span(self) -> Span: ...
 
 
-def interval(amount: Amount, names: Mapping[str, Interval]) -> Interval:
-    """The lowest and highest value that the amount can have. Raises KeyError for an unknown name, ZeroDivisionError if a divisor may be 0."""
-    if amount.op == "number":
-        return amount.integer, amount.integer
-    if amount.op == "name":
-        return names[str(amount.value)]
-    first, *rest = (interval(arg, names) for arg in amount.args)
-    if amount.op == "neg":
-        return -first[1], -first[0]
-    second = rest[0]
-    if amount.op == "draw":
-        return min(first[0], second[0]), max(first[1], second[1])
-    if amount.op in ("div", "mod") and second[0] <= 0 <= second[1]:
-        raise ZeroDivisionError
-    if amount.op == "mod":
-        return (0, second[1] - 1) if second[0] > 0 else (second[0] + 1, 0)
-    corners = [CALCULATE[amount.op](a, b) for a in first for b in second]
-    return min(corners), max(corners)
+def number(value: int, span: Span | None = None) -> Expr:
+    """A constant."""
+    return Expr("const", integer(value, value), value=value, span=span)
+
+
+def constants(amounts: Iterable[Expr | None]) -> tuple[int | None, ...] | None:
+    """The values of constants, None for open ends; None if an amount is not a constant."""
+    values = list(amounts)
+    if not all(amount is None or amount.op == "const" for amount in values):
+        return None
+    return tuple(None if amount is None else amount.value for amount in values)
+
+
+def read_amount(
+    syntax: Syntax, names: Mapping[str, Expr | None], reporter: Reporter, what: str = "a number"
+) -> Expr | None:
+    """The integer expression of syntax, its range as its kind, constants folded; None after a report (PD606, PD802).
+
+    Args:
+        names: the amounts of names; None for a name whose definition has been reported.
+        what: the number in words, for messages.
+    """
+    span, op = syntax.span, OPERATIONS.get(syntax.kind)
+    if syntax.kind == "integer" and len(syntax.text) <= MAX_DIGITS:
+        return number(int(syntax.text), span)
+    if syntax.kind == "name" and syntax.text in names:
+        named = names[syntax.text]
+        return None if named is None else replace(named, span=span)
+    if syntax.kind == "name":
+        report_unknown("number", syntax, names, reporter)
+        return None
+    if op is None:
+        label = "too large" if syntax.kind == "integer" else "not an integer"
+        reporter.error("PD606", f"{what} must be an integer", span, label)
+        return None
+    operands = [read_amount(child, names, reporter, what) for child in syntax.children]
+    args = tuple(operand for operand in operands if operand is not None)
+    if len(args) < len(operands):
+        return None
+    ranges = [(int(arg.kind.lo), int(arg.kind.hi)) for arg in args]
+    values = [arg.value for arg in args if arg.op == "const"]
+    if op == "uniform":
+        (low, first_high), (second_low, high) = ranges
+        if low > high:
+            label = "the first must not be above the second"
+            reporter.error("PD606", f"a range {low}..{high} without numbers", span, label)
+            return None
+        if len(values) == 2 and low == high:
+            return number(low, span)
+        return Expr(op, integer(min(low, second_low), max(first_high, high)), args, span=span)
+    if op in ("quotient", "mod") and ranges[1][0] <= 0 <= ranges[1][1]:
+        reporter.error("PD606", "a division by zero", span, "the divisor can be 0")
+        return None
+    if op == "mod":
+        modulus = args[1].value
+        if args[1].op != "const" or modulus < 0:
+            reporter.error("PD606", "`mod` takes a constant above 0", args[1].span, "not a constant above 0")
+            return None
+        amount = Expr("mod", integer(0, modulus - 1), args[:1], modulus, span)
+        values.pop()
+    elif op == "quotient":
+        corners = [a // b for a in ranges[0] for b in ranges[1]]
+        amount = Expr(op, integer(min(corners), max(corners)), args, span=span)
+    else:
+        bounds = OPS[op].bounds
+        assert bounds is not None
+        amount = Expr(op, integer(*bounds(None, *ranges)), args, span=span)
+    evaluate = OPS[op].evaluate
+    if len(values) == len(amount.args) and evaluate is not None:
+        return number(evaluate(amount, *values), span)
+    return amount
+
+
+def report_unknown(what: str, word: Written, known: Mapping[str, object], reporter: Reporter) -> None:
+    """Report a name that the task does not define, PD802."""
+    helps = suggest(word.text, known, f"{what}s") or (f"the task defines no {what}s",)
+    reporter.error("PD802", f"unknown {what} `{word.text}`", word.span, "not defined", helps=helps)

@@ -16,17 +16,20 @@ from powderdsl.model.schema import Key, Reader, first_line
 from powderdsl.model.state import Slot, slot_name, slots
 from powderdsl.model.types import Ruleset
 from powderdsl.syntax import yaml_tree
+from powderdsl.syntax.ast import Syntax
+from powderdsl.syntax.parse import line_of
 from powderdsl.syntax.sources import read_source
 from powderdsl.system.writing import failure
 from powderdsl.worlds.raster import MAX_CELLS, Paint, Setting, Shape, Size, mask, paint
-from powderdsl.worlds.scene.amounts import integers
+from powderdsl.worlds.scene.amounts import constants
 from powderdsl.worlds.scene.statements import (
     SETTING,
     STATEMENTS,
     Statement,
-    read_setting,
+    amounts_of,
+    read_line,
     read_statement,
-    text_span,
+    shape_of,
 )
 
 SCENE_KEYS = {
@@ -153,7 +156,7 @@ def _read_statements(node: yaml_tree.Node, reader: Reader) -> tuple[Paint | Sett
     spans: list[Span] = []
     if isinstance(node, yaml_tree.Sequence):
         for item in node.items:
-            span = text_span(item, reader.reporter)
+            span = line_of(item, "statement", reader.reporter)
             if span is not None:
                 spans.append(span)
             elif isinstance(item, yaml_tree.Mapping):
@@ -177,8 +180,9 @@ def _lines(block: Span) -> list[Span]:
     """The lines of a block that are neither empty nor a comment."""
     spans, start = [], block.start
     for line in block.text.splitlines(keepends=True):
-        if line.split("#")[0].strip():
-            spans.append(Span(block.source, start, start + len(line)))
+        statement = line.split("#")[0].rstrip()
+        if statement:
+            spans.append(Span(block.source, start, start + len(statement)))
         start += len(line)
     return spans
 
@@ -186,30 +190,31 @@ def _lines(block: Span) -> list[Span]:
 def parse_statement(span: Span, reporter: Reporter) -> Paint | Setting | None:
     """The statement of a scene at `span`, or None after reporting bad syntax (PD605) or numbers (PD606)."""
     if ":=" in span.text:
-        setting = read_setting(span, reporter)
-        if setting is None:
+        tree = read_line(span, "setting", reporter)
+        if tree is None:
             return None
-        shape = _fixed(setting.shape, SETTING, reporter) if setting.shape else Shape("fill")
-        name, value = setting.name, setting.value
-        if shape is None:
-            return None
-        return Setting(name.text, value.text, shape, setting.span, name.span, value.span)
-    found = read_statement(span, reporter)
-    if found is None:
+        name, value, *shapes = tree.children
+        drawn = shape_of(shapes[0], reporter) if shapes else None
+        shape = _fixed(drawn, SETTING, reporter) if drawn else None if shapes else Shape("fill")
+        word = "".join(value.span.text.split())
+        return Setting(name.text, word, shape, tree.span, name.span, value.span) if shape else None
+    statement = read_statement(span, reporter)
+    if statement is None:
         return None
-    usage = STATEMENTS.get(found.kind, "statements of scenes: " + ", ".join(STATEMENTS))
-    shape = _fixed(found, usage, reporter)
-    element = found.choice.names[0] if found.choice and found.choice.names else None
-    return Paint(element.text, shape, found.span, element.span) if shape and element else None
+    usage = STATEMENTS.get(statement.kind, "statements of scenes: " + ", ".join(STATEMENTS))
+    shape = _fixed(statement, usage, reporter)
+    element = statement.choice.children[0] if statement.choice and statement.choice.children else None
+    return Paint(element.text, shape, statement.span, element.span) if shape and element else None
 
 
 def _fixed(statement: Statement, usage: str, reporter: Reporter) -> Shape | None:
     """The shape of a statement, or None after reporting what only generators of tasks may say."""
-    faults: list[tuple[Span | None, str]] = []
-    if statement.choice is not None and statement.choice.how != "one":
+    faults: list[tuple[Span, str]] = []
+    if statement.choice is not None and statement.choice.kind != "element":
         faults.append((statement.choice.span, "one element, by its name"))
-    drawn = [one for one in statement.numbers if one is not None and not one.is_number]
-    faults += [(one.span, "a number, written out") for one in drawn]
+    for written in statement.numbers:
+        if written is not None and _varies(written):
+            faults.append((written.span, "a number, written out"))
     if statement.where is not None:
         faults.append((statement.where.span, "a scene has no regions"))
     if statement.over is not None:
@@ -218,7 +223,15 @@ def _fixed(statement: Statement, usage: str, reporter: Reporter) -> Shape | None
         faults = [(statement.span, f"`{statement.kind}` is a statement of tasks")]
     for span, label in faults:
         reporter.error("PD605", "a scene is the same every time", span, label, helps=(usage,))
-    return None if faults else Shape(statement.kind, integers(statement.numbers) or ())
+    if faults:
+        return None
+    amounts = amounts_of(statement, {}, reporter)
+    return None if amounts is None else Shape(statement.kind, constants(amounts) or ())
+
+
+def _varies(written: Syntax) -> bool:
+    """Return True if a number is named or drawn."""
+    return written.kind in ("name", "range") or any(map(_varies, written.children))
 
 
 @dataclass(frozen=True)

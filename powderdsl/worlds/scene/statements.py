@@ -1,29 +1,16 @@
-"""Drawing statements: the text of one line -> a `Statement`. `worlds.raster` says which cells its shape covers."""
+"""Drawing statements: the syntax of one line -> a `Statement`. `worlds.raster` says which cells its shape covers."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from functools import lru_cache
-from pathlib import Path
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
-from lark import Lark, Token, Tree
-from lark.exceptions import UnexpectedCharacters, UnexpectedInput, UnexpectedToken
-from lark.tree import Meta
-from lark.utils import TextSlice
-
-from powderdsl.diagnostics import Reporter, Source, Span, suggest
-from powderdsl.diagnostics.printable import shown_character
-from powderdsl.syntax import yaml_tree
-from powderdsl.syntax.hints import CUT, TERMINAL_WORDS, was_cut
-from powderdsl.syntax.parse import depth, words_of
+from powderdsl.diagnostics import Reporter, Span, suggest
+from powderdsl.model.types import Expr
+from powderdsl.syntax.ast import Syntax
+from powderdsl.syntax.parse import parse_text
 from powderdsl.worlds.raster import MAX_COORDINATE
-from powderdsl.worlds.scene.amounts import Amount, number
-
-MAX_STATEMENT = 500
-MAX_DEPTH = 25
+from powderdsl.worlds.scene.amounts import read_amount
 
 STATEMENTS = {
     "line": "line ELEMENT from (ROW, COLUMN) to (ROW, COLUMN) width NUMBER",
@@ -74,269 +61,147 @@ RANGES = {"box": 2, "arch": 2, "container": 2}
 
 
 @dataclass(frozen=True)
-class Word:
-    """A name as written, and where."""
-
-    text: str
-    span: Span = field(compare=False, repr=False)
-
-
-@dataclass(frozen=True)
-class ElementChoice:
-    """Elements one of which is used: ``one`` or ``some`` of `names`, ``any`` but them, or the ``first`` few of them."""
-
-    how: str
-    names: tuple[Word, ...]
-    span: Span = field(compare=False, repr=False)
-    count: Amount | None = None
-
-
-@dataclass(frozen=True)
 class Statement:
-    """A statement as written. `numbers` are those of NUMBERS; a region's shape has no `choice`."""
+    """A statement as written. `numbers` are those of NUMBERS; a region's shape has no `choice`.
+
+    `choice` and `over` are choices among elements: the one ``element``, one of ``some``, ``any_element`` but those
+    named, or one of the ``first`` few of those named.
+    """
 
     kind: str
-    numbers: tuple[Amount | None, ...]
+    numbers: tuple[Syntax | None, ...]
     span: Span = field(compare=False, repr=False)
-    choice: ElementChoice | None = None
-    name: Word | None = None
-    where: Word | None = None
-    over: ElementChoice | None = None
+    choice: Syntax | None = None
+    name: Syntax | None = None
+    where: Syntax | None = None
+    over: Syntax | None = None
 
 
-@dataclass(frozen=True)
-class WrittenSetting:
-    """A field and its value as written; without a `shape` all cells are meant."""
+def amounts_of(
+    statement: Statement,
+    names: Mapping[str, Expr | None],
+    reporter: Reporter,
+    most: int = MAX_COORDINATE,
+) -> tuple[Expr | None, ...] | None:
+    """The amounts of a statement's numbers, None for open ends. None after a report (PD606, PD802).
 
-    name: Word
-    value: Word
-    shape: Statement | None
-    span: Span = field(compare=False, repr=False)
-
-
-_WORDS = {
-    **TERMINAL_WORDS,
-    "NUMBER": "a number",
-    "COLON": "`:`",
-    "PERCENT": "`%`",
-    "__ANON_0": "`..`",
-    "ASSIGN": "`:=`",
-    "$END": "the end of the statement",
-}
-"""Names of terminals in messages; keywords stand for themselves."""
-
-
-@lru_cache(maxsize=1)
-def _parser() -> Lark:
-    return Lark(
-        Path(__file__).with_name("scene.lark").read_text(encoding="utf-8"),
-        parser="lalr",
-        lexer="basic",
-        start=["statement", "setting", "shape", "amount", "repeat", "choice"],
-        propagate_positions=True,
-        maybe_placeholders=False,
-    )
+    Args:
+        most: numbers lie within ±most.
+    """
+    amounts: list[Expr | None] = []
+    fits = True
+    for written, (what, lowest) in zip(statement.numbers, NUMBERS[statement.kind], strict=True):
+        amount = None if written is None else read_amount(written, names, reporter, what)
+        amounts.append(amount)
+        if written is None or amount is None:
+            fits &= written is None
+            continue
+        low, high = int(amount.kind.lo), int(amount.kind.hi)
+        # A computed range may begin before the world: it is cut off there, as everything is that lies outside.
+        is_cut = statement.kind in RANGES and lowest == 0 and written.kind not in ("integer", "negate")
+        least = -most if is_cut else max(lowest, -most)
+        greatest = 100 if statement.kind == "scatter" else most
+        if low < least or high > greatest:
+            can_be = f"it can be {low}..{high}" if low < high else f"it is {low}"
+            message = f"{what} must lie in {least}..{greatest}"
+            reporter.error("PD606", message, written.span, can_be)
+            fits = False
+    return tuple(amounts) if fits else None
 
 
-@lru_cache(maxsize=1)
-def reserved_words() -> frozenset[str]:
-    """Words of statements, which cannot name knobs, draws or regions."""
-    return words_of(_parser())
+CHOICES = ("element", "some", "any_element", "first")
 
 
-def text_span(node: yaml_tree.Node | None, reporter: Reporter) -> Span | None:
-    """The place of a line of text; None if the node is not one, or after reporting escapes, where carets would be wrong."""
-    if not isinstance(node, yaml_tree.Scalar):
+def read_statement(line: Span, reporter: Reporter) -> Statement | None:
+    """The statement of a line, or None after reporting PD605 or PD606."""
+    tree = read_line(line, "statement", reporter)
+    if tree is None:
         return None
-    if node.style == "quoted" and node.content.text.split() != node.text.split():
-        reporter.error("PD605", "escapes in a quoted statement", node.span, "escaped or doubled quotes")
+    painted, *clauses = tree.children
+    first, *parts = painted.children
+    numbers = _numbers(painted, parts, reporter)
+    if numbers is None:
         return None
-    return node.content
+    choice, name = (first, None) if first.kind in CHOICES else (None, first)
+    wheres = {clause.kind: clause.children[0] for clause in clauses}
+    region, over = wheres.get("region"), wheres.get("over")
+    return Statement(painted.kind, numbers, tree.span, choice, name, region, over)
 
 
-def read_statement(span: Span, reporter: Reporter) -> Statement | None:
-    """The statement at `span`, or None after reporting PD605 or PD606."""
-    return _read("statement", span, reporter)
+def read_shape(line: Span, reporter: Reporter) -> Statement | None:
+    """The shape of a region: a statement without an element. None after reporting PD605 or PD606."""
+    tree = read_line(line, "shape", reporter)
+    return None if tree is None else shape_of(tree, reporter)
 
 
-def read_shape(span: Span, reporter: Reporter) -> Statement | None:
-    """The shape of a region at `span`: a statement without an element. None after reporting PD605 or PD606."""
-    return _read("shape", span, reporter)
+def shape_of(tree: Syntax, reporter: Reporter) -> Statement | None:
+    """The shape of syntax; None after reporting PD606."""
+    numbers = _numbers(tree, tree.children, reporter)
+    return None if numbers is None else Statement(tree.kind, numbers, tree.span)
 
 
-def read_setting(span: Span, reporter: Reporter) -> WrittenSetting | None:
-    """The `FIELD := VALUE in SHAPE` at `span`, or None after reporting PD605 or PD606."""
-    return _read("setting", span, reporter)
+def read_line(line: Span, start: str, reporter: Reporter) -> Syntax | None:
+    """The syntax of a line of the language of statements, names as one word. None after reporting PD605."""
+    tree = parse_text(line, start, reporter, _usage(line))
+    return None if tree is None else _joined(tree)
 
 
-def read_amount(span: Span, reporter: Reporter, *, repeat: bool = False) -> Amount | None:
-    """A number as written, or the one after ``repeat``. None after reporting PD605 or PD606."""
-    return _read("repeat" if repeat else "amount", span, reporter)
+def _joined(tree: Syntax) -> Syntax:
+    """The tree with `pack.element` as the text of its identifiers."""
+    text = tree.text.replace(" ", ".") if tree.kind == "identifier" else tree.text
+    return replace(tree, text=text, children=tuple(map(_joined, tree.children)))
 
 
-def read_choice(span: Span, reporter: Reporter) -> ElementChoice | None:
-    """A choice among elements as written. None after reporting PD605."""
-    return _read("choice", span, reporter)
+def _numbers(tree: Syntax, parts: Sequence[Syntax], reporter: Reporter) -> tuple[Syntax | None, ...] | None:
+    """The numbers of a statement in the order of NUMBERS: ranges that are not written are open at both ends."""
+    numbers: list[Syntax | None] = []
+    zero, one = (Syntax("integer", (), digit, tree.span) for digit in "01")
+    ranges = {part.kind: part.children[0] for part in parts if part.kind in ("rows", "columns")}
+    for axis in ("rows", "columns")[: RANGES.get(tree.kind, 0)]:
+        extent = ranges.get(axis, Syntax("whole", (), "", tree.span))
+        match extent.kind, extent.children:
+            case "single", (start,):
+                numbers += [start, Syntax("add", (start, one), "", start.span)]
+            case "between", (start, stop):
+                if start.kind == stop.kind == "integer" and int(stop.text) <= int(start.text):
+                    label = "the end must be above the start: a:b leaves b out"
+                    reporter.error("PD606", f"a range without {axis}", extent.span, label)
+                    return None
+                numbers += [start, stop]
+            case "onward", (start,):
+                numbers += [start, None]
+            case "up_to", (stop,):
+                numbers += [zero, stop]
+            case _:
+                numbers += [zero, None]
+    for part in parts:
+        if part.kind == "percentage":
+            if not part.span.text.endswith("%"):
+                end = Span(part.span.source, part.span.end, part.span.end + 1)
+                usage = (GENERATOR_STATEMENTS[tree.kind],)
+                reporter.error("PD605", "a chance without its sign", end, "expected `%`", helps=usage)
+                return None
+            numbers += map(_without_signs, part.children)
+        elif part.kind == "point":
+            numbers += part.children
+        elif part.kind not in ranges:
+            numbers.append(part)
+    return tuple(numbers)
 
 
-def _read(start: str, span: Span, reporter: Reporter) -> Any:
-    """The value of the text at `span`, by the start symbol of the grammar; None after a report."""
-    if len(span.text) > MAX_STATEMENT:
-        first = Span(span.source, span.start, span.start + 1)
-        label = f"longer than {MAX_STATEMENT} characters"
-        reporter.error("PD605", "a statement that is too long", first, label)
-        return None
-    try:
-        tree: Any = _parser().parse(TextSlice(span.source.text, span.start, span.end), start=start)
-    except UnexpectedInput as error:
-        _report_syntax(error, span, reporter)
-        return None
-    if depth(tree) > MAX_DEPTH:
-        reporter.error("PD605", "numbers nested too deep", span, f"more than {MAX_DEPTH} deep")
-        return None
-    reading = _Reading(span.source, reporter)
-    found = getattr(reading, start)(tree)
-    return None if reading.failed else found
+def _without_signs(tree: Syntax) -> Syntax:
+    """The number before a percent sign: `5..30%` is a range from 5 to 30."""
+    if tree.kind == "percent":
+        span = Span(tree.span.source, tree.span.start, tree.span.end - 1)
+        return Syntax("integer" if span.text.isdigit() else "decimal", (), span.text, span)
+    return replace(tree, children=tuple(map(_without_signs, tree.children)))
 
 
-class _Reading:
-    """Turns one parse tree into what was written, a method for each start symbol. `failed`: after a report."""
-
-    def __init__(self, source: Source, reporter: Reporter):
-        self.source = source
-        self.reporter = reporter
-        self.failed = False
-
-    def span(self, place: Token | Meta) -> Span:
-        return Span(self.source, place.start_pos or 0, place.end_pos or 0)
-
-    def statement(self, tree: Any) -> Statement:
-        painted, *rest = tree.children
-        kind, parts = str(painted.data), list(painted.children)
-        named = kind in ("stamp", "part")
-        first = parts.pop(0)
-        clauses = {str(one.data): one.children[0] for one in rest}
-        return Statement(
-            kind,
-            self.numbers(kind, parts),
-            self.span(tree.meta),
-            None if named else self.choice(first),
-            self.word(first) if named else None,
-            self.word(clauses["where"]) if "where" in clauses else None,
-            self.choice(clauses["over"]) if "over" in clauses else None,
-        )
-
-    def shape(self, tree: Tree) -> Statement:
-        kind = str(tree.data)
-        return Statement(kind, self.numbers(kind, tree.children), self.span(tree.meta))
-
-    def setting(self, tree: Tree) -> WrittenSetting:
-        name, _, worth, *shapes = tree.children
-        span = self.span(worth.meta)
-        value = Word("".join(span.text.split()), span)
-        shape = self.shape(shapes[0]) if shapes else None
-        return WrittenSetting(self.word(name), value, shape, self.span(tree.meta))
-
-    def word(self, token: Any) -> Word:
-        return Word(str(token), self.span(token))
-
-    def choice(self, tree: Tree) -> ElementChoice:
-        how, parts = str(tree.data), list(tree.children)
-        count = self.amount(parts.pop(0), "how many", 0) if how == "first" else None
-        tokens = parts if how == "one" else parts[0].children if parts else []
-        return ElementChoice(how, tuple(map(self.word, tokens)), self.span(tree.meta), count)
-
-    def numbers(self, kind: str, parts: Sequence[Any]) -> tuple[Amount | None, ...]:
-        """The numbers of a statement in the order of NUMBERS; ranges that are not written are open at both ends."""
-        found: list[Amount | None] = []
-        ranges = {str(one.data): one.children[0] for one in parts if one.data in ("rows", "columns")}
-        for axis in ("rows", "columns")[: RANGES.get(kind, 0)]:
-            found += self.range(ranges[axis], axis) if axis in ranges else (number(0), None)
-        for part in parts:
-            if part.data not in ranges:
-                for one in part.children if part.data == "point" else (part,):
-                    found.append(self.amount(one, *NUMBERS[kind][len(found)]))
-        return tuple(found)
-
-    def range(self, tree: Tree, axis: str) -> tuple[Amount, Amount | None]:
-        parts: list[Any] = tree.children
-        if tree.data == "single":
-            start = self.amount(parts[0], "a row or column", 0)
-            if start.is_number:
-                return start, number(start.integer + 1, start.span)
-            return start, Amount("add", (start, number(1)), None, start.span)
-        colon = next(i for i, part in enumerate(parts) if getattr(part, "type", "") == "COLON")
-        start = self.amount(parts[0], "the start of a range", 0) if colon == 1 else number(0)
-        if colon + 1 == len(parts) or getattr(parts[-1], "type", "") == "END":
-            return start, None
-        stop = self.amount(parts[-1], "the end of a range", 0)
-        if stop.is_number and start.is_number and stop.integer <= start.integer and not self.failed:
-            label = "the end must be above the start: a:b leaves b out"
-            self.refuse(self.span(tree.meta), f"a range without {axis}", label)
-        return start, stop
-
-    def amount(self, tree: Tree, what: str = "a number", lowest: int = -MAX_COORDINATE) -> Amount:
-        """An amount. If it is a number as written, it must be at least `lowest`."""
-        found = self.any_amount(tree, what)
-        if found.is_number and not lowest <= found.integer <= MAX_COORDINATE:
-            assert found.span is not None
-            self.refuse(found.span, f"{what} must lie in {lowest}..{MAX_COORDINATE}", "out of range")
-        return found
-
-    def repeat(self, tree: Any) -> Amount:
-        return self.amount(tree.children[0])
-
-    def any_amount(self, tree: Tree, what: str) -> Amount:
-        span, op = self.span(tree.meta), str(tree.data)
-        parts: list[Any] = tree.children
-        if op == "name":
-            return Amount("name", (), str(parts[0]), span)
-        if op == "number":
-            return self.written(parts[0], span, what)
-        args = tuple(self.any_amount(part, what) for part in parts)
-        if op == "neg" and args[0].is_number:
-            return number(-args[0].integer, span)
-        if op == "draw" and all(arg.is_number for arg in args) and args[0].integer > args[1].integer:
-            self.refuse(span, "a range without numbers", "the first must not be above the second")
-        return Amount(op, args, None, span)
-
-    def written(self, token: str, span: Span, what: str) -> Amount:
-        """An integer as written; an amount of no known kind after a report."""
-        if re.fullmatch(r"[0-9]{1,9}", token):
-            return number(int(token), span)
-        label = "not an integer" if not token.isdecimal() or not token.isascii() else "too large"
-        self.refuse(span, f"{what} must be an integer", label)
-        return Amount("broken", (), None, span)
-
-    def refuse(self, span: Span, message: str, label: str) -> None:
-        self.failed = True
-        self.reporter.error("PD606", message, span, label)
-
-
-def _report_syntax(error: UnexpectedInput, statement: Span, reporter: Reporter) -> None:
-    source, label = statement.source, ""
-    if isinstance(error, UnexpectedCharacters):
-        start: int = error.pos_in_stream  # type: ignore[assignment]  # declared as None, set by this subclass
-        end, message = start + 1, f"unexpected character {shown_character(source.text[start])}"
-    else:
-        assert isinstance(error, UnexpectedToken)
-        token, accepted = error.token, set(error.accepts or error.expected or ())
-        label = "expected " + ", ".join(sorted({_WORDS.get(name, f"`{name.lower()}`") for name in accepted}))
-        start, end, message = token.start_pos or 0, token.end_pos or 0, f"unexpected `{token}`"
-        if token.type == "$END":
-            # Point behind the last character, which is where the missing word belongs.
-            start = statement.start + len(statement.text.split("#")[0].rstrip())
-            end, message = start + 1, "the statement ends too early"
-    reporter.error("PD605", message, Span(source, start, end), label, helps=_usage(statement))
-
-
-def _usage(statement: Span) -> tuple[str, ...]:
+def _usage(line: Span) -> tuple[str, ...]:
     """How the statement is written, if its first word says which it is; otherwise the word that was meant."""
-    if was_cut(statement.source.text, statement.start, statement.end):
-        return (CUT,)
-    if ":=" in statement.text:
+    if ":=" in line.text:
         return (SETTING,)
-    word = next(iter(statement.text.split(maxsplit=1)), "")
+    word = next(iter(line.text.split(maxsplit=1)), "")
     if word in GENERATOR_STATEMENTS:
         return (GENERATOR_STATEMENTS[word],)
     return suggest(word, GENERATOR_STATEMENTS, "statements")
