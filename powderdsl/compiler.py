@@ -423,7 +423,7 @@ def lower(ruleset: Ruleset, memo: Memo | None = None) -> Program:
     """The checked model as optimized IR. With a memo, only passes that have changed go through the stages."""
     from powderdsl.ir.lower import lower_ruleset
     from powderdsl.ir.stages import run_passes
-    from powderdsl.ir.structure import structure
+    from powderdsl.ir.text import structure
 
     program = lower_ruleset(ruleset)
     if memo is None:
@@ -441,7 +441,7 @@ def lower(ruleset: Ruleset, memo: Memo | None = None) -> Program:
 def parts(program: Program, memo: Memo | None = None) -> tuple[Segment, ...]:
     """Optimized IR in segments, on bit planes where they can carry it."""
     from powderdsl.ir.segments import Carried, carry, segments
-    from powderdsl.ir.structure import structure
+    from powderdsl.ir.text import structure
 
     def carried(whole: Program, pass_: PassGraph) -> Carried:
         if memo is None:

@@ -1,26 +1,31 @@
 """IR on numbers -> IR on bit planes: every integer becomes a few flags, every rule gates, shifts and swaps.
 
 The result is ordinary IR without integers: flags and floats remain. A slot of integers becomes one slot of flags
-for each bit plane, ``element:0`` the lowest.
+for each bit plane, ``element:0`` the lowest. `Gates` fold as they are built, by the same equations as the stages.
 """
 
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from collections import defaultdict
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial, reduce
+from itertools import permutations
+from typing import Any, NamedTuple
 
-from powderdsl.ir.build import Builder
-from powderdsl.ir.gates import Bits, Gates, width
 from powderdsl.ir.ops import (
     FLAG,
+    OPS,
     REAL,
+    Builder,
     Node,
     Offset,
     PassGraph,
     Program,
     SlotType,
     Type,
+    integer,
     kernel_rows,
     nodes_of,
     plane_name,
@@ -40,379 +45,561 @@ class NotBits(Exception):
         self.place = place
 
 
+def is_const(node: Node, value: object) -> bool:
+    """Whether a node is this flag everywhere."""
+    return node.op == "const" and node.attr is value
+
+
+def _opposite(a: Node, b: Node) -> bool:
+    return (a.op == "not" and a.args[0] is b) or (b.op == "not" and b.args[0] is a)
+
+
+def simpler(build: Builder, op: str, args: tuple[Node, ...], attr: Hashable = None) -> Node | None:
+    """Constants evaluated, except floats, and the algebra of flags: what an operation is without itself, if anything."""
+    row = OPS[op]
+    if row.evaluate is not None and all(arg.op == "const" and arg.type != REAL for arg in args):
+        return build.const(row.value(attr, *(arg.attr for arg in args)), row.type_of(attr, args))
+    match op, args:
+        case "not", (a,):  # not not a = a
+            return a.args[0] if a.op == "not" else None
+        case "and" | "or", (a, b):
+            absorbing = op == "or"
+            for x, y in ((a, b), (b, a)):
+                if is_const(x, absorbing):  # a and no = no, a or yes = yes
+                    return x
+                if is_const(x, not absorbing) or x is y:  # a and yes = a, a and a = a
+                    return y
+                if x.op == "not" and x.args[0] is y:  # a and not a = no
+                    return build.flag(absorbing)
+        case "xor", (a, b):
+            if a is b or _opposite(a, b):
+                return build.flag(a is not b)
+            for x, y in ((a, b), (b, a)):
+                if x.op == "const":  # a xor yes = not a
+                    return build.not_(y) if x.attr else y
+        case "select", (condition, yes, no):
+            if condition.op == "const":
+                return yes if condition.attr else no
+            if yes is no:
+                return yes
+            if yes.type == FLAG:
+                if is_const(yes, True) or yes is condition:  # select(c, yes, b) = c or b
+                    return build.or_(condition, no)
+                if is_const(yes, False):
+                    return build.and_(build.not_(condition), no)
+                if is_const(no, False) or no is condition:
+                    return build.and_(condition, yes)
+                if is_const(no, True):
+                    return build.or_(build.not_(condition), yes)
+                if _opposite(yes, no):
+                    return build.derive("xor", build.not_(condition), yes)
+            if condition.op == "not":  # select(not c, a, b) = select(c, b, a)
+                return Builder.derive(build, op, condition.args[0], no, yes)
+    return None
+
+
+@dataclass(frozen=True)
+class Bits:
+    """The bit planes of an integer, lowest first, and whether the highest is a sign (two's complement)."""
+
+    planes: tuple[Node, ...]
+    signed: bool = False
+
+
+class Gates(Builder):
+    """Boolean circuits on bit planes: gates that fold as they are built, adders, comparators, truth tables."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.no = self.flag(False)
+        self.yes = self.flag(True)
+
+    def derive(self, op: str, *args: Node, attr: Hashable = None) -> Node:
+        known = simpler(self, op, args, attr) if args and args[-1].type == FLAG else None
+        if known is not None:
+            return known
+        if op == "xor" and any(arg.op == "not" for arg in args):  # not a xor b = not (a xor b)
+            bare = [arg.args[0] if arg.op == "not" else arg for arg in args]
+            value = self.derive("xor", *bare)
+            return value if all(arg.op == "not" for arg in args) else self.not_(value)
+        return super().derive(op, *args, attr=attr)
+
+    def shift(self, a: Node, offset: Offset, wraps: bool = True) -> Node:
+        if a.type == REAL and a.op in (
+            "const",
+            "param",
+        ):  # planes may have shown that it is the same everywhere
+            return self.shift_uniform(a, offset, wraps)
+        if a is self.no or (a is self.yes and wraps):
+            return a
+        if a.type == FLAG and a.op == "shift" and a.attr[2] and wraps:
+            dy, dx, _ = a.attr
+            return self.shift(a.args[0], (dy + offset[0], dx + offset[1]))
+        if a.op == "not" and wraps and offset != (0, 0):  # both may be read, and one of them is then stored
+            return self.not_(self.shift(a.args[0], offset))
+        return super().shift(a, offset, wraps)
+
+    # Integers. `type` is the range of the result.
+
+    def constant(self, value: int) -> Bits:
+        type = integer(value, value)
+        return Bits(tuple([self.flag(bool(value >> i & 1)) for i in range(type.bits)]), type.signed)
+
+    def sign(self, a: Bits) -> Node:
+        """The plane that all those beyond the highest one equal."""
+        return a.planes[-1] if a.signed else self.no
+
+    def bit(self, a: Bits, index: int) -> Node:
+        return a.planes[index] if index < len(a.planes) else self.sign(a)
+
+    def fit(self, a: Bits, type: Type) -> Bits:
+        """The same number in the planes of a range that holds it."""
+        return Bits(tuple([self.bit(a, i) for i in range(type.bits)]), type.signed)
+
+    def full_adder(self, a: Node, b: Node, c: Node) -> tuple[Node, Node]:
+        """Sum and carry of three bits."""
+        half = self.derive("xor", a, b)
+        return self.derive("xor", half, c), self.or_(self.and_(a, b), self.and_(half, c))
+
+    def add(self, a: Bits, b: Bits, type: Type, carry: Node | None = None) -> Bits:
+        """a + b (+ carry)."""
+        carry = carry or self.no
+        planes = []
+        for i in range(type.bits):
+            total, carry = self.full_adder(self.bit(a, i), self.bit(b, i), carry)
+            planes.append(total)
+        return Bits(tuple(planes), type.signed)
+
+    def sub(self, a: Bits, b: Bits, type: Type) -> Bits:
+        """a - b, which is a + (-b - 1) + 1."""
+        planes = b.planes if b.signed else (*b.planes, self.no)
+        return self.add(a, Bits(tuple(map(self.not_, planes)), True), type, self.yes)
+
+    def neg(self, a: Bits, type: Type) -> Bits:
+        """-a, where `type` is the range of a."""
+        return self.sub(self.constant(0), a, integer(-type.hi, -type.lo))
+
+    def pairs(self, a: Bits, b: Bits) -> list[tuple[Node, Node]]:
+        """The bits of two numbers side by side, lowest first."""
+        count = max(len(a.planes), len(b.planes)) + (a.signed != b.signed)
+        return [(self.bit(a, i), self.bit(b, i)) for i in range(count)]
+
+    def eq(self, a: Bits, b: Bits) -> Node:
+        same = [self.not_(self.derive("xor", x, y)) for x, y in self.pairs(a, b)]
+        return reduce(self.and_, same)
+
+    def lt(self, a: Bits, b: Bits) -> Node:
+        """a < b: from the lowest bit, the highest difference decides."""
+        *pairs, (x, y) = self.pairs(a, b)
+        highest = (y, x) if a.signed or b.signed else (x, y)  # the sign counts the other way
+        result = self.no
+        for x, y in (*pairs, highest):
+            result = self.select(self.derive("xor", x, y), y, result)
+        return result
+
+    def choose(self, condition: Node, yes: Bits, no: Bits, type: Type) -> Bits:
+        """One number where a condition holds, the other elsewhere."""
+        pairs = zip(self.fit(yes, type).planes, self.fit(no, type).planes, strict=True)
+        return Bits(tuple([self.select(condition, a, b) for a, b in pairs]), type.signed)
+
+    def divide(self, a: Bits, b: Bits, most: int) -> tuple[Bits, Bits]:
+        """a / b rounded down, and the remainder, where 0 < b ≤ most; where b is 0 they mean nothing.
+
+        Long division from the highest bit: twice the remainder so far plus the bit, less b if it fits.
+        """
+        bits = list(reversed(a.planes))
+        rest, quotient = self.constant(0), []
+        if a.signed:  # the sign bit counts as minus one: minus one time b, and b - 1 left
+            quotient.append(bits[0])
+            less = self.sub(b, self.constant(1), integer(-1, most - 1))
+            rest = self.choose(bits.pop(0), less, rest, integer(0, most - 1))
+        for bit in bits:
+            doubled = Bits((bit, *rest.planes))
+            smaller = self.lt(doubled, b)
+            reduced = self.sub(doubled, b, integer(-most, 2 * most - 1))
+            rest = self.choose(smaller, doubled, reduced, integer(0, most - 1))
+            quotient.append(self.not_(smaller))
+        return Bits(tuple(reversed(quotient)), a.signed), rest
+
+    def total(self, terms: Iterable[tuple[Node, int]], count: int) -> tuple[Node, ...]:
+        """The sum of flags of some weights, as `count` planes: a carry-save tree."""
+        columns: defaultdict[int, list[Node]] = defaultdict(list)
+        for flag, weight in terms:
+            for i in range(weight.bit_length()):
+                if weight >> i & 1 and flag is not self.no:
+                    columns[i].append(flag)
+        planes = []
+        for i in range(count):
+            column = columns[i]
+            while len(column) > 1:
+                third = column.pop(0) if len(column) > 2 else self.no
+                total, carry = self.full_adder(column.pop(0), column.pop(0), third)
+                column.append(total)
+                columns[i + 1].append(carry)
+            planes.append(column[0] if column else self.no)
+        return tuple(planes)
+
+    def truth_table(self, inputs: Sequence[Node], values: Sequence[bool | None]) -> Node:
+        """Any function of a few planes; values by number, None where the number never occurs."""
+        used = [i for i, plane in enumerate(inputs) if plane.op != "const"]
+        fixed = sum(1 << i for i, plane in enumerate(inputs) if plane is self.yes)
+        numbers = [fixed]
+        for i in used:
+            numbers += [number | 1 << i for number in numbers]
+        table = tuple([values[number] if number < len(values) else None for number in numbers])
+
+        def made(split: Split | bool) -> Node:
+            if isinstance(split, bool):
+                return self.flag(split)
+            plane = inputs[used[split.input]]
+            if split.high is None:
+                return self.derive("xor", plane, made(split.low))
+            return self.select(plane, made(split.high), made(split.low))
+
+        return made(_best_split(table, len(used)))
+
+
+class Split(NamedTuple):
+    """A truth table split on an input: its value where that holds, and elsewhere; `high` is None if they are opposite."""
+
+    cost: int
+    """Gates; a half that is constant saves one."""
+    input: int
+    high: Split | bool | None
+    low: Split | bool
+
+
+def _split(table: Sequence[bool | None], order: Sequence[int]) -> Split | bool:
+    """Split a truth table on its inputs, the highest first; halves that agree where both matter are joined."""
+    cares = {value for value in table if value is not None}
+    if len(cares) < 2:
+        return True in cares
+    half = len(table) // 2
+    low, high = table[:half], table[half:]
+    for opposite in (False, True):
+        other = [None if b is None else b is not opposite for b in high]
+        if all(a is None or b is None or a is b for a, b in zip(low, other, strict=True)):
+            joined = _split([b if a is None else a for a, b in zip(low, other, strict=True)], order[1:])
+            return Split(_cost(joined) + 1, order[0], None, joined) if opposite else joined
+    yes, no = _split(high, order[1:]), _split(low, order[1:])
+    costs = _cost(yes), _cost(no)
+    return Split(sum(costs) + (2 if all(costs) else 1), order[0], yes, no)
+
+
+def _cost(split: Split | bool) -> int:
+    return 0 if isinstance(split, bool) else split.cost
+
+
+@lru_cache(maxsize=4096)
+def _best_split(table: tuple[bool | None, ...], inputs: int) -> Split | bool:
+    """The split that takes the fewest gates, of all orders of inputs; highest first where there are too many to try."""
+    orders: Iterable[tuple[int, ...]] = [tuple(reversed(range(inputs)))]
+    if inputs <= 5:
+        orders = permutations(range(inputs))
+    splits = []
+    for order in orders:
+        numbers = [0]
+        for i in reversed(order):
+            numbers += [number | 1 << i for number in numbers]
+        splits.append(_split([table[number] for number in numbers], order))
+    return min(splits, key=_cost)
+
+
 def plane_slots(slot: SlotType) -> tuple[SlotType, ...]:
     """The slots of an integer's bit planes, lowest bit first; flags and floats stay one slot."""
     if slot.type.name != "int":
         return (slot,)
-    count, _ = width(slot.type.lo, slot.type.hi)
     return tuple(
         SlotType(plane_name(slot.name, i), FLAG, int(slot.default) >> i & 1, slot.resets)
-        for i in range(count)
+        for i in range(slot.type.bits)
     )
 
 
 def lower_bits(program: Program) -> Program:
     """The program on bit planes. Raises NotBits for the first pass that they cannot carry."""
     slots = tuple(plane for slot in program.slots for plane in plane_slots(slot))
-    passes = tuple(lower_pass(program, pass_) for pass_ in program.passes)
-    return replace(program, slots=slots, passes=passes)
+    return replace(program, slots=slots, passes=tuple([lower_pass(program, p) for p in program.passes]))
 
 
 def lower_pass(program: Program, pass_: PassGraph) -> PassGraph:
     """One pass of a program on bit planes. Raises NotBits."""
-    return _PassBits({slot.name: slot for slot in program.slots}).lower(pass_)
+    slots = {slot.name: slot.type for slot in program.slots}
+    gates = _Lowering(slots)
+    values = gates.values
+    for node in nodes_of(pass_):
+        gates.place = node.places[0] if node.places else ""
+        try:
+            values[node] = gates.lower(node, [values[arg] for arg in node.args])
+            if gates.graph.size > MAX_GATES:
+                raise NotBits(f"more than {MAX_GATES:,} gates")
+        except NotBits as error:
+            error.place = error.place or gates.place
+            raise
 
-
-@dataclass
-class _PassBits:
-    slots: dict[str, SlotType]
-    build: Builder = field(default_factory=Builder)
-
-    def lower(self, pass_: PassGraph) -> PassGraph:
-        self.gates = Gates(self.build)
-        self.values: dict[int, Node | Bits] = {}
-        for node in nodes_of(pass_):
-            self.build.place = node.places[0] if node.places else ""
-            try:
-                self.values[id(node)] = self._lower(node)
-                if self.build.graph.size > MAX_GATES:
-                    raise NotBits(f"more than {MAX_GATES:,} gates")
-            except NotBits as error:
-                error.place = error.place or self.build.place
-                raise
-        substeps = []
-        for one in pass_.substeps:
-            writes = tuple(w for name, node in one.writes for w in self._write(name, node))
-            guards = tuple(self._flag(guard) for guard in one.guards)
-            substeps.append(replace(one, writes=writes, guards=guards))
-        outputs = tuple(w for name, node in pass_.outputs for w in self._write(name, node))
-        kept = tuple((name, node) for name, node in outputs if not (node.op == "input" and node.attr == name))
-        return replace(pass_, substeps=tuple(substeps), outputs=kept)
-
-    def _write(self, name: str, node: Node) -> list[tuple[str, Node]]:
+    def write(name: str, node: Node) -> list[tuple[str, Node]]:
         """The writes of bit planes that a write of a slot becomes. The range of a scratch slot is that of the node."""
-        value = self.values[id(node)]
+        value = values[node]
         if isinstance(value, Node):
             return [(name, value)]
-        if name in self.slots:
-            type = self.slots[name].type
-            value = self.gates.fit(value, type.lo, type.hi)
-        return [(plane_name(name, i), plane) for i, plane in enumerate(value.planes)]
+        planes = gates.fit(value, slots[name]).planes if name in slots else value.planes
+        return [(plane_name(name, i), plane) for i, plane in enumerate(planes)]
 
-    def _flag(self, node: Node) -> Node:
-        value = self.values[id(node)]
-        assert isinstance(value, Node)
-        return value
+    lowered = pass_.map(write, values.__getitem__)
+    outputs = tuple([(name, node) for name, node in lowered.outputs if not node.is_input(name)])
+    return replace(lowered, outputs=outputs)
 
-    def _bits(self, node: Node) -> Bits:
-        value = self.values[id(node)]
-        assert isinstance(value, Bits)
-        return value
 
-    def _lower(self, node: Node) -> Node | Bits:
-        gates, build = self.gates, self.build
-        args = node.args
-        match node.op:
-            case "input":
-                return self._input(node)
-            case "const" if node.type.name == "int":
-                return gates.constant(int(node.attr))
-            case "param" | "coordinate" if node.type.name == "int":
-                count, signed = width(node.type.lo, node.type.hi)
-                return Bits(
-                    tuple(build.make(node.op, FLAG, attr=(*node.attr, i)) for i in range(count)), signed
-                )
-            case "below":
-                return self._below(node)
-            case "shift":
-                return self._shift(node)
-            case "count":
-                return self._count(node)
-            case "not":
-                return gates.not_(self._flag(args[0]))
-            case "and" | "or" | "xor":
-                gate = {"and": gates.and_, "or": gates.or_, "xor": gates.xor}[node.op]
-                return gate(*(self._flag(arg) for arg in args))
-            case "in_set":
-                return self._function(args[0], lambda value: value in node.attr)
-            case "table":
-                return self._numbers(args[0], node.type, node.attr.__getitem__, len(node.attr))
-            case "eq" | "lt" | "le" if args[0].type.name == "int":
-                return self._compare(node)
-            case "select" if node.type.name == "int":
-                yes, no = self._bits(args[1]), self._bits(args[2])
-                return gates.select(self._flag(args[0]), yes, no, node.type.lo, node.type.hi)
-            case "select" if node.type == FLAG:
-                return gates.mux(*(self._flag(arg) for arg in args))
-            case "swap" | "arrive":
-                return self._movement(node)
-            case "to_real":
-                return self._to_real(args[0])
-        if node.type.name == "int":
-            return self._arithmetic(node)
-        return build.make(node.op, node.type, *(self._flag(arg) for arg in args), attr=node.attr)
+class _Lowering(Gates):
+    """Gates for the nodes of a pass. `slots` are the types of what it finds."""
 
-    def _input(self, node: Node) -> Node | Bits:
-        if node.type.name != "int":
-            return self.build.input(str(node.attr), node.type)
-        slot = self.slots[str(node.attr)]
-        count, signed = width(slot.type.lo, slot.type.hi)
-        stored = Bits(tuple(self.build.input(plane_name(slot.name, i), FLAG) for i in range(count)), signed)
-        return self.gates.fit(stored, node.type.lo, node.type.hi)
+    def __init__(self, slots: dict[str, Type]):
+        super().__init__()
+        self.slots = slots
+        self.values: dict[Node, Any] = {}
+        """The flag, float or integer (`Bits`) that each node has become."""
 
-    def _shift(self, node: Node) -> Node | Bits:
-        dy, dx, wraps = node.attr
-        value = self.values[id(node.args[0])]
-        if isinstance(value, Bits):
-            value = self.gates.fit(value, node.type.lo, node.type.hi)
-            return Bits(tuple(self.gates.shift(p, (dy, dx), wraps) for p in value.planes), value.signed)
-        if value.type == FLAG:
-            return self.gates.shift(value, (dy, dx), wraps)
-        return self._shift_floats(value, (dy, dx), wraps)
-
-    def _shift_floats(self, value: Node, offset: Offset, wraps: bool = True) -> Node:
-        """Floats at a neighbor. Planes may have shown that they are the same everywhere, which has no neighbors."""
-        if value.op in ("const", "param"):
-            return self.build.shift_uniform(value, offset, wraps)
-        return self.build.shift(value, offset, wraps)
-
-    def _movement(self, node: Node) -> Node | Bits:
-        """Swaps stay swaps, one for each bit plane: targets exchange planes in place."""
-        movers = self._flag(node.args[1])
-        content, rest = self.values[id(node.args[0])], self.values[id(node.args[2])]
-        offset = node.attr
-        if isinstance(content, Node):
-            assert isinstance(rest, Node)
-            if content.type == REAL:  # cell by cell anyway: choices between what neighbors hold
-                dy, dx = offset
-                targets = self.gates.shift(movers, (-dy, -dx), True)
-                moved = self.build.select(targets, self._shift_floats(content, (-dy, -dx)), rest)
-                if node.op == "swap":
-                    moved = self.build.select(movers, self._shift_floats(content, (dy, dx)), moved)
-                return moved
-            return self.build.derive(node.op, content, movers, rest, attr=offset)
-        assert isinstance(rest, Bits)
-        content = self.gates.fit(content, node.type.lo, node.type.hi)
-        rest = self.gates.fit(rest, node.type.lo, node.type.hi)
-        planes = tuple(
-            a if a is b and a.op == "const" else self.build.derive(node.op, a, movers, b, attr=offset)
-            for a, b in zip(content.planes, rest.planes, strict=True)
+    def lower(self, node: Node, args: Sequence[Any]) -> Node | Bits:
+        whole = node.type.name == "int" or any(arg.type.name == "int" for arg in node.args)
+        if whole and node.op not in _INTEGERS:
+            raise NotBits(f"{node.op} of integers")
+        row = (_INTEGERS if whole else _OTHERS).get(node.op)
+        if row is not None:
+            value: Node | Bits = row(self, node, *args)
+            return value
+        return (
+            self.derive(node.op, *args, attr=node.attr)
+            if args
+            else self.make(node.op, node.type, attr=node.attr)
         )
-        return Bits(planes, content.signed)
 
-    def _below(self, node: Node) -> Node:
-        """A draw below a limit. A constant limit is an attribute; another is given plane by plane, highest first."""
-        limit = node.args[0]
-        stream, bits = node.attr
-        if limit.op == "select":
-            condition, yes, no = limit.args
-            parts = [self._below(replace(node, args=(arg,))) for arg in (yes, no)]  # outside any graph
-            return self.gates.mux(self._flag(condition), *parts)
-        if limit.op == "const":
-            count = int(limit.attr)
-            if count <= 0:
-                return self.gates.no
-            if count >= 1 << bits:
-                return self.gates.yes
-            return self.build.make("chance", FLAG, attr=(stream, bits, count))
-        planes = self.gates.fit(self._bits(limit), 0, 1 << bits).planes
-        return self.build.make("below_planes", FLAG, *reversed(planes), attr=(stream, bits))
-
-    def _function(self, argument: Node, function: Callable[..., int], below: int | None = None) -> Node:
+    def flag_of(
+        self, a: Bits, type: Type, test: Callable[[int], bool | int], below: int | None = None
+    ) -> Node:
         """A flag that depends on a small integer only; what it is from `below` on does not matter."""
-        planes, type = self._bits(argument).planes, argument.type
-        count = len(planes)
+        count = len(a.planes)
         if count > MAX_TABLE_BITS:
             raise NotBits(f"a table over {count} planes")
         table: list[bool | None] = [None] * (1 << count)
-        for number in range(type.lo, type.hi + 1 if below is None else min(type.hi + 1, below)):
-            table[number & ((1 << count) - 1)] = bool(function(number))
-        return self.gates.truth_table(planes, table)
+        for number in range(type.lo, min(type.hi + 1, below or type.hi + 1)):
+            table[number & ((1 << count) - 1)] = bool(test(number))
+        return self.truth_table(a.planes, table)
 
-    def _numbers(
-        self, argument: Node, type: Type, function: Callable[[int], int], below: int | None = None
+    def number_of(
+        self, a: Bits, node: Node, function: Callable[[int], int], below: int | None = None
     ) -> Bits:
-        """An integer of a type that depends on a small integer only, bit by bit."""
-        count, signed = width(type.lo, type.hi)
-        planes = (self._function(argument, lambda v, i=i: function(v) >> i & 1, below) for i in range(count))
-        return Bits(tuple(planes), signed)
-
-    def _compare(self, node: Node) -> Node:
-        near = self._any_neighbor(node)
-        if near is not None:
-            return near
-        left, right = node.args
-        a, b = self._bits(left), self._bits(right)
-        holds = getattr(operator, node.op)
-        if right.op == "const" and len(a.planes) <= 5:
-            return self._function(left, lambda v: holds(v, right.attr))
-        if left.op == "const" and len(b.planes) <= 5:
-            return self._function(right, lambda v: holds(left.attr, v))
-        if node.op == "eq":
-            return self.gates.eq(a, b)
-        return self.gates.lt(a, b) if node.op == "lt" else self.gates.not_(self.gates.lt(b, a))
-
-    def _any_neighbor(self, node: Node) -> Node | None:
-        """0 < count(x), 1 <= count(x), count(x) == 0: neighbors are joined, not counted."""
-        left, right = node.args
-        counted = right if right.op == "count" else left
-        if counted.op != "count" or any(weight < 0 for _, _, weight in counted.attr[0]):
-            return None
-        bound = left if counted is right else right
-        if bound.op != "const":
-            return None
-        side = "both" if node.op == "eq" else "right" if counted is right else "left"
-        asked = (node.op, side, bound.attr)
-        some = asked in (("lt", "right", 0), ("le", "right", 1))
-        if not some and asked not in (("eq", "both", 0), ("lt", "left", 1), ("le", "left", 0)):
-            return None
-        weights, wraps = counted.attr
-        flag = self._flag(counted.args[0])
-        rows = kernel_rows(weights)
-        joined = self.gates.any([
-            self.gates.shift(self.gates.any([self.gates.shift(flag, (0, dx), wraps) for dx, _ in pattern]), (dy, 0), wraps)
-            for dy, pattern in rows.items()
-        ])  # fmt: skip
-        return joined if some else self.gates.not_(joined)
-
-    def _count(self, node: Node) -> Bits:
-        """A kernel as adders: each pattern of a row once, then the rows; negative weights are added inverted."""
-        gates = self.gates
-        weights, wraps = node.attr
-        flag = self._flag(node.args[0])
-        sums: dict[tuple[tuple[int, int], ...], tuple[tuple[Node, ...], tuple[Node, ...]]] = {}
-        columns: tuple[list[list[Node]], list[list[Node]]] = ([], [])
-        for dy, pattern in kernel_rows(weights).items():
-            if pattern not in sums:
-                parts = []
-                for sign in (1, -1):
-                    own: list[list[Node]] = []
-                    size = 0
-                    for dx, weight in pattern:
-                        if weight * sign > 0:
-                            size += weight * sign
-                            _put(own, gates.shift(flag, (0, dx), wraps), weight * sign)
-                    parts.append(gates.total(own, size.bit_length()))
-                sums[pattern] = (parts[0], parts[1])
-            for target, planes in zip(columns, sums[pattern], strict=True):
-                for i, plane in enumerate(planes):
-                    _put(target, gates.shift(plane, (dy, 0), wraps), 1 << i)
-        lo, hi = node.type.lo, node.type.hi
-        plus = Bits(gates.total(columns[0], max(hi.bit_length(), 1)))
-        if lo >= 0:
-            return gates.fit(plus, lo, hi)
-        minus = Bits(gates.total(columns[1], max((-lo).bit_length(), 1)))
-        return gates.sub(plus, minus, lo, hi)
-
-    def _arithmetic(self, node: Node) -> Bits:
-        gates = self.gates
-        lo, hi = node.type.lo, node.type.hi
-        args = [self._bits(arg) for arg in node.args]
-        match node.op:
-            case "add":
-                return gates.add(args[0], args[1], lo, hi)
-            case "sub":
-                return gates.sub(args[0], args[1], lo, hi)
-            case "neg":
-                return gates.sub(gates.constant(0), args[0], lo, hi)
-            case "abs":
-                negative = args[0].planes[-1] if args[0].signed else gates.no
-                inner = node.args[0].type
-                minus = gates.sub(gates.constant(0), args[0], -inner.hi, -inner.lo)
-                return gates.select(negative, minus, args[0], lo, hi)
-            case "min":
-                return gates.select(gates.lt(args[0], args[1]), args[0], args[1], lo, hi)
-            case "max":
-                return gates.select(gates.lt(args[0], args[1]), args[1], args[0], lo, hi)
-            case "mul":
-                return self._multiply(args[0], args[1], lo, hi)
-            case "quotient":
-                return self._quotient(node, args[0], args[1])
-            case "mod":
-                return self._mod(node, args[0])
-        raise NotBits(f"{node.op} of integers")
-
-    def _multiply(self, a: Bits, b: Bits, lo: int, hi: int) -> Bits:
-        """Shifted additions; a negative factor counts its sign bit as minus."""
-        gates = self.gates
-        result = gates.constant(0)
-        count, _ = width(min(lo, 0), hi)
-        bound = 1 << count
-        for i, bit in enumerate(b.planes):
-            term = Bits((*[gates.no] * i, *(gates.and_(bit, p) for p in a.planes)), a.signed)
-            if b.signed and i == len(b.planes) - 1:
-                result = gates.sub(result, term, -bound, bound - 1)
-            else:
-                result = gates.add(result, term, -bound, bound - 1)
-        return gates.fit(result, lo, hi)
-
-    def _quotient(self, node: Node, value: Bits, divisor: Bits) -> Bits:
-        gates = self.gates
-        lo, hi = node.type.lo, node.type.hi
-        inner, by = node.args[0].type, node.args[1].type
-        if by.lo == by.hi and by.lo > 0 and by.lo & (by.lo - 1) == 0:  # rounded down, as a shift is
-            sign = (
-                value.planes[-1] if value.signed else gates.no
-            )  # what is left of a number that has fewer bits
-            shifted = value.planes[by.lo.bit_length() - 1 :] or (sign,)
-            return gates.fit(Bits(shifted, value.signed), lo, hi)
-        if by.lo == by.hi and by.lo and len(value.planes) <= MAX_TABLE_BITS // 2:
-            return self._numbers(node.args[0], node.type, lambda v: v // by.lo)
-        most = max(abs(by.lo), abs(by.hi))
-        if divisor.signed:  # a div -b = -a div b
-            negative = divisor.planes[-1]
-            reach = max(abs(inner.lo), abs(inner.hi))
-            minus = gates.sub(gates.constant(0), value, -inner.hi, -inner.lo)
-            value = gates.select(negative, minus, value, -reach, reach)
-            opposite = gates.sub(gates.constant(0), divisor, -by.hi, -by.lo)
-            divisor = gates.select(negative, opposite, divisor, 0, most)
-        quotient, _ = gates.divide(value, divisor, most)
-        none = gates.eq(divisor, gates.constant(0))
-        return gates.select(none, gates.constant(0), quotient, lo, hi)
-
-    def _mod(self, node: Node, value: Bits) -> Bits:
-        modulus = node.attr
-        if modulus & (modulus - 1) == 0:  # its lowest bits; of a modulus of 1 none
-            bits = tuple(self.gates.bit(value, i) for i in range(modulus.bit_length() - 1))
-            return Bits(bits or (self.gates.no,))
-        if len(value.planes) > MAX_TABLE_BITS // 2:
-            _, rest = self.gates.divide(value, self.gates.constant(modulus), modulus)
-            return self.gates.fit(rest, 0, modulus - 1)
-        return self._numbers(node.args[0], node.type, lambda v: v % modulus)
-
-    def _to_real(self, argument: Node) -> Node:
-        """A number from its planes: exact, since integers stay below 2^24."""
-        build = self.build
-        value = self.values[id(argument)]
-        if isinstance(value, Node):
-            if value.type == REAL:
-                return value
-            return build.select(value, build.real(1.0), build.real(0.0))
-        if max(abs(argument.type.lo), abs(argument.type.hi)) >= 1 << 24:
-            raise NotBits("an integer too large for float32")
-        weights: dict[int, tuple[Node, float]] = {}  # equal planes count together
-        always = 0.0
-        for i, plane in enumerate(value.planes):
-            weight = -float(1 << i) if value.signed and i == len(value.planes) - 1 else float(1 << i)
-            if plane.op == "const":
-                always += weight if plane.attr else 0.0
-            else:
-                weights[id(plane)] = (plane, weights.get(id(plane), (plane, 0.0))[1] + weight)
-        if not weights:
-            return build.real(always)
-        (first, weight), *rest = weights.values()
-        total = build.select(first, build.real(always + weight), build.real(always))
-        for plane, weight in rest:
-            total = build.derive("add", total, build.select(plane, build.real(weight), build.real(0.0)))
-        return total
+        """The integer of a node that depends on a small integer only, bit by bit."""
+        of = node.args[0].type
+        planes = [
+            self.flag_of(a, of, partial(lambda i, number: function(number) >> i & 1, i), below)
+            for i in range(node.type.bits)
+        ]
+        return Bits(tuple(planes), node.type.signed)
 
 
-def _put(columns: list[list[Node]], plane: Node, weight: int) -> None:
-    """Add a plane of some weight to columns of bits."""
-    if plane.op == "const" and not plane.attr:
-        return
-    for i in range(weight.bit_length()):
-        if weight >> i & 1:
-            while len(columns) <= i:
-                columns.append([])
-            columns[i].append(plane)
+def _input(gates: _Lowering, node: Node) -> Bits:
+    type = gates.slots[str(node.attr)]
+    planes = [gates.input(plane_name(node.attr, i), FLAG) for i in range(type.bits)]
+    return gates.fit(Bits(tuple(planes), type.signed), node.type)
+
+
+def _by_bit(gates: _Lowering, node: Node) -> Bits:
+    planes = [gates.make(node.op, FLAG, attr=(*node.attr, i)) for i in range(node.type.bits)]
+    return Bits(tuple(planes), node.type.signed)
+
+
+def _shift(gates: _Lowering, node: Node, value: Bits) -> Bits:
+    dy, dx, wraps = node.attr
+    value = gates.fit(value, node.type)
+    return Bits(tuple([gates.shift(plane, (dy, dx), wraps) for plane in value.planes]), value.signed)
+
+
+def _move(gates: _Lowering, node: Node, content: Bits, movers: Node, rest: Bits) -> Bits:
+    """Swaps stay swaps, one for each bit plane: targets exchange planes in place."""
+    pairs = zip(gates.fit(content, node.type).planes, gates.fit(rest, node.type).planes, strict=True)
+    planes = [
+        a if a is b and a.op == "const" else gates.derive(node.op, a, movers, b, attr=node.attr)
+        for a, b in pairs
+    ]
+    return Bits(tuple(planes), node.type.signed)
+
+
+def _move_floats(gates: _Lowering, node: Node, content: Node, movers: Node, rest: Node) -> Node:
+    """Floats are moved cell by cell anyway: choices between what neighbors hold."""
+    if content.type == FLAG:
+        return gates.derive(node.op, content, movers, rest, attr=node.attr)
+    dy, dx = node.attr
+    back = (-dy, -dx)
+    moved = gates.select(gates.shift(movers, back), gates.shift(content, back), rest)
+    return gates.select(movers, gates.shift(content, (dy, dx)), moved) if node.op == "swap" else moved
+
+
+def _below(gates: _Lowering, node: Node, limit: Bits) -> Node:
+    """A draw below a limit. A constant limit is an attribute; another is given plane by plane, highest first."""
+    stream, bits = node.attr
+    (source,) = node.args
+    if source.op == "select":
+        condition, *parts = source.args
+        draws = [_below(gates, replace(node, args=(part,)), gates.values[part]) for part in parts]
+        return gates.select(gates.values[condition], *draws)
+    if source.op == "const":
+        count = int(source.attr)
+        if count <= 0 or count >= 1 << bits:
+            return gates.flag(count > 0)
+        return gates.derive("chance", attr=(stream, bits, count))
+    planes = gates.fit(limit, integer(0, 1 << bits)).planes
+    return gates.derive("below_planes", *reversed(planes), attr=(stream, bits))
+
+
+def _compare(gates: _Lowering, node: Node, a: Bits, b: Bits) -> Node:
+    left, right = node.args
+    holds = getattr(operator, node.op)
+    for side, bits, other in ((left, a, right), (right, b, left)):
+        if other.op != "const":
+            continue
+
+        def test(number: int, side: Node = side, limit: int = other.attr) -> bool:
+            result: bool = holds(number, limit) if side is left else holds(limit, number)
+            return result
+
+        if side.op == "count" and side.type.lo >= 0:  # none or some: neighbors are joined, not counted
+            some = {test(number) for number in range(1, side.type.hi + 1)}
+            if len(some) == 1 and test(0) not in some:
+                joined = _any_neighbor(gates, side)
+                return joined if True in some else gates.not_(joined)
+        if len(bits.planes) <= 5:
+            return gates.flag_of(bits, side.type, test)
+    if node.op == "eq":
+        return gates.eq(a, b)
+    return gates.lt(a, b) if node.op == "lt" else gates.not_(gates.lt(b, a))
+
+
+def _any_neighbor(gates: _Lowering, count: Node) -> Node:
+    weights, wraps = count.attr
+    flag = gates.values[count.args[0]]
+    rows = [
+        gates.shift(gates.any([gates.shift(flag, (0, dx), wraps) for dx, _ in pattern]), (dy, 0), wraps)
+        for dy, pattern in kernel_rows(weights).items()
+    ]
+    return gates.any(rows)
+
+
+def _count(gates: _Lowering, node: Node, flag: Node) -> Bits:
+    """A kernel as adders: each pattern of a row once, then the rows; negative weights are added inverted."""
+    weights, wraps = node.attr
+    sums: dict[object, list[tuple[Node, ...]]] = {}
+    terms: tuple[list[tuple[Node, int]], ...] = ([], [])
+    for dy, pattern in kernel_rows(weights).items():
+        if pattern not in sums:
+            sums[pattern] = []
+            for sign in (1, -1):
+                own = [(dx, weight * sign) for dx, weight in pattern if weight * sign > 0]
+                size = sum(weight for _, weight in own)
+                row = [(gates.shift(flag, (0, dx), wraps), weight) for dx, weight in own]
+                sums[pattern].append(gates.total(row, size.bit_length()))
+        for side, planes in zip(terms, sums[pattern], strict=True):
+            side += [(gates.shift(plane, (dy, 0), wraps), 1 << i) for i, plane in enumerate(planes)]
+    lo, hi = node.type.lo, node.type.hi
+    plus = Bits(gates.total(terms[0], max(hi.bit_length(), 1)))
+    if lo >= 0:
+        return gates.fit(plus, node.type)
+    return gates.sub(plus, Bits(gates.total(terms[1], max((-lo).bit_length(), 1))), node.type)
+
+
+def _multiply(gates: _Lowering, node: Node, a: Bits, b: Bits) -> Bits:
+    """Shifted additions; a negative factor counts its sign bit as minus."""
+    bound = 1 << integer(min(node.type.lo, 0), node.type.hi).bits
+    result = gates.constant(0)
+    for i, bit in enumerate(b.planes):
+        term = Bits((*[gates.no] * i, *[gates.and_(bit, plane) for plane in a.planes]), a.signed)
+        combine = gates.sub if b.signed and i == len(b.planes) - 1 else gates.add
+        result = combine(result, term, integer(-bound, bound - 1))
+    return gates.fit(result, node.type)
+
+
+def _quotient(gates: _Lowering, node: Node, value: Bits, divisor: Bits) -> Bits:
+    of, by = (arg.type for arg in node.args)
+    if by.lo == by.hi and by.lo > 0 and by.lo & (by.lo - 1) == 0:  # rounded down, as a shift is
+        shifted = value.planes[by.lo.bit_length() - 1 :] or (gates.sign(value),)
+        return gates.fit(Bits(shifted, value.signed), node.type)
+    if by.lo == by.hi and by.lo and len(value.planes) <= MAX_TABLE_BITS // 2:
+        return gates.number_of(value, node, lambda number: number // by.lo)
+    most = max(abs(by.lo), abs(by.hi))
+    if divisor.signed:  # a div -b = -a div b
+        negative = divisor.planes[-1]
+        reach = max(abs(of.lo), abs(of.hi))
+        value = gates.choose(negative, gates.neg(value, of), value, integer(-reach, reach))
+        divisor = gates.choose(negative, gates.neg(divisor, by), divisor, integer(0, most))
+    quotient, _ = gates.divide(value, divisor, most)
+    none = gates.eq(divisor, gates.constant(0))
+    return gates.choose(none, gates.constant(0), quotient, node.type)
+
+
+def _mod(gates: _Lowering, node: Node, value: Bits) -> Bits:
+    modulus = node.attr
+    if modulus & (modulus - 1) == 0:  # its lowest bits; of a modulus of 1 none
+        bits = [gates.bit(value, i) for i in range(modulus.bit_length() - 1)]
+        return Bits(tuple(bits) or (gates.no,))
+    if len(value.planes) > MAX_TABLE_BITS // 2:
+        _, rest = gates.divide(value, gates.constant(modulus), modulus)
+        return gates.fit(rest, node.type)
+    return gates.number_of(value, node, lambda number: number % modulus)
+
+
+def _to_real(gates: _Lowering, node: Node, value: Bits) -> Node:
+    """A number from its planes: exact, since integers stay below 2^24."""
+    of = node.args[0].type
+    if max(abs(of.lo), abs(of.hi)) >= 1 << 24:
+        raise NotBits("an integer too large for float32")
+    weights: dict[Node, float] = {}  # equal planes count together
+    always = 0.0
+    for i, plane in enumerate(value.planes):
+        weight = -float(1 << i) if value.signed and i == len(value.planes) - 1 else float(1 << i)
+        if plane.op == "const":
+            always += weight if plane.attr else 0.0
+        else:
+            weights[plane] = weights.get(plane, 0.0) + weight
+    if not weights:
+        return gates.real(always)
+    (first, weight), *others = weights.items()
+    total = gates.select(first, gates.real(always + weight), gates.real(always))
+    for plane, weight in others:
+        total = gates.derive("add", total, gates.select(plane, gates.real(weight), gates.real(0.0)))
+    return total
+
+
+_INTEGERS: dict[str, Callable[..., Node | Bits]] = {
+    "input": _input,
+    "const": lambda gates, node: gates.constant(node.attr),
+    "param": _by_bit,
+    "coordinate": _by_bit,
+    "below": _below,
+    "shift": _shift,
+    "count": _count,
+    "in_set": lambda gates, node, a: gates.flag_of(a, node.args[0].type, node.attr.__contains__),
+    "table": lambda gates, node, a: gates.number_of(a, node, node.attr.__getitem__, len(node.attr)),
+    "eq": _compare,
+    "lt": _compare,
+    "le": _compare,
+    "add": lambda gates, node, a, b: gates.add(a, b, node.type),
+    "sub": lambda gates, node, a, b: gates.sub(a, b, node.type),
+    "mul": _multiply,
+    "quotient": _quotient,
+    "mod": _mod,
+    "neg": lambda gates, node, a: gates.neg(a, node.args[0].type),
+    "abs": lambda gates, node, a: gates.choose(gates.sign(a), gates.neg(a, node.args[0].type), a, node.type),
+    "min": lambda gates, node, a, b: gates.choose(gates.lt(a, b), a, b, node.type),
+    "max": lambda gates, node, a, b: gates.choose(gates.lt(a, b), b, a, node.type),
+    "to_real": _to_real,
+    "select": lambda gates, node, condition, yes, no: gates.choose(condition, yes, no, node.type),
+    "swap": _move,
+    "arrive": _move,
+}
+"""Operations that give integers or take some, by their gates."""
+
+_OTHERS: dict[str, Callable[..., Node]] = {
+    "shift": lambda gates, node, value: gates.shift(value, node.attr[:2], node.attr[2]),
+    "to_real": lambda gates, node, value: gates.select(value, gates.real(1.0), gates.real(0.0)),
+    "swap": _move_floats,
+    "arrive": _move_floats,
+}
+"""Operations on flags and floats that do not stay as they are."""

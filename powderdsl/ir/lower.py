@@ -10,10 +10,10 @@ from math import ceil, floor, pi
 from typing import Any
 
 from powderdsl.analysis.changes import facts_of
-from powderdsl.ir.build import Builder
 from powderdsl.ir.ops import (
     FLAG,
     REAL,
+    Builder,
     Graph,
     Node,
     PassGraph,
@@ -82,7 +82,7 @@ class Inputs:
             )
         if prop.kind.name == "flag":
             return build.in_set(element, frozenset(i for i, value in enumerate(values) if value))
-        return build.table(element, tuple(int(value) for value in values))  # type: ignore[arg-type]  # only numbers are left
+        return build.derive("table", element, attr=tuple(int(value) for value in values))  # type: ignore[arg-type]  # only numbers are left
 
     def by_element(self, element: Node, values: list[Node]) -> Node:
         """The value that belongs to the element: one select a distinct value."""
@@ -177,7 +177,7 @@ def _member(expr: Expr, at: Inputs) -> Node:
 
 
 def _logic(expr: Expr, at: Inputs) -> Node:
-    return at.build.make(expr.op, FLAG, *(node(arg, at) for arg in expr.args))
+    return at.build.derive(expr.op, *(node(arg, at) for arg in expr.args))
 
 
 def _to_real(expr: Expr, at: Inputs) -> Node:
@@ -192,7 +192,7 @@ def _to_real(expr: Expr, at: Inputs) -> Node:
 def _draw_real(expr: Expr, at: Inputs) -> Node:
     """A draw as float32. Sums with integers are rounded after each addition."""
     if expr.op == "draw":
-        return at.build.make("draw", REAL, attr=_stream(expr, at))
+        return at.build.derive("draw", attr=_stream(expr, at))
     parts = [_draw_real(a, at) if a.kind.name == "draw" else at.build.to_real(node(a, at)) for a in expr.args]
     if expr.op == "look":
         return at.build.shift(parts[0], expr.value)
@@ -272,15 +272,13 @@ def _lt(expr: Expr, at: Inputs) -> Node:
     other = left if flipped else right
 
     def below(limit: Node) -> Node:
-        found = build.make(
-            "below", FLAG, build.shift(limit, (-offset[0], -offset[1])), attr=_stream(draw, at)
-        )
-        return build.shift(found, offset)
+        there = build.shift(limit, (-offset[0], -offset[1]))
+        return build.shift(build.derive("below", there, attr=_stream(draw, at)), offset)
 
     threshold = Threshold(_stream(draw, at)[1], strict=not flipped)
     if other.kind.name == "int":
         limit = node(other, at)
-        result = build.compare("lt", extra or build.integer(0), limit)
+        result = build.derive("lt", extra or build.integer(0), limit)
         return build.not_(result) if flipped else result
     base = 0
     if isinstance(other.value, (int, Fraction)) and other.op == "const":
@@ -292,16 +290,16 @@ def _lt(expr: Expr, at: Inputs) -> Node:
         result = part if base == 0 else build.flag(base > 0)
     else:
         bound = build.integer(base)
-        less = build.compare("lt", extra, bound)
-        result = build.or_(less, build.and_(build.compare("eq", extra, bound), part))
+        less = build.derive("lt", extra, bound)
+        result = build.or_(less, build.and_(build.derive("eq", extra, bound), part))
     return build.not_(result) if flipped else result
 
 
 def _compare(expr: Expr, at: Inputs) -> Node:
     a, b = (node(arg, at) for arg in expr.args)
     if a.type == FLAG:
-        return at.build.not_(at.build.make("xor", FLAG, a, b))
-    return at.build.compare(expr.op, a, b)
+        return at.build.not_(at.build.derive("xor", a, b))
+    return at.build.derive(expr.op, a, b)
 
 
 # Neighborhoods and vectors
@@ -309,8 +307,7 @@ def _compare(expr: Expr, at: Inputs) -> Node:
 
 def _count(expr: Expr, at: Inputs) -> Node:
     kernel = expr.value
-    type = integer(int(expr.kind.lo), int(expr.kind.hi))
-    return at.build.make("count", type, node(expr.args[0], at), attr=(kernel.weights, kernel.wrap))
+    return at.build.derive("count", node(expr.args[0], at), attr=(kernel.weights, kernel.wrap))
 
 
 def _sum(expr: Expr, at: Inputs) -> Node | Pair:
@@ -338,7 +335,7 @@ def _neighborhood(value: Node, kernel: Kernel, build: Builder) -> Node:
 def _length(vector: Pair, build: Builder) -> Node:
     y, x = vector
     squares = build.derive("add", build.derive("mul", y, y), build.derive("mul", x, x))
-    return build.make("sqrt", REAL, squares)
+    return build.derive("sqrt", squares)
 
 
 def _octant(expr: Expr, at: Inputs) -> Node:
@@ -348,18 +345,18 @@ def _octant(expr: Expr, at: Inputs) -> Node:
     reach = build.derive("add", _length((y, x), build), build.real(_float32(0.001)))
     near = build.derive("mul", build.real(_float32(NEAR)), reach)
     far = build.derive("mul", build.real(_float32(FAR)), reach)
-    up = build.compare("lt", y, build.real(0.0))
+    up = build.derive("lt", y, build.real(0.0))
     result: Node = build.integer(4)
     borders = (near, far, build.derive("neg", far), build.derive("neg", near))
     for octant in (3, 2, 1, 0):
         mirrored = build.select(up, build.integer((8 - octant) % 8), build.integer(octant))
-        result = build.select(build.compare("lt", borders[octant], x), mirrored, result)
+        result = build.select(build.derive("lt", borders[octant], x), mirrored, result)
     return result
 
 
 def _turned(eighths: int) -> Callable[[Expr, Inputs], Node]:
-    return lambda expr, at: at.build.mod(
-        at.build.derive("add", node(expr.args[0], at), at.build.integer(eighths)), 8
+    return lambda expr, at: at.build.derive(
+        "mod", at.build.derive("add", node(expr.args[0], at), at.build.integer(eighths)), attr=8
     )
 
 
@@ -389,7 +386,7 @@ def _wave(expr: Expr, at: Inputs) -> Node:
         return total
 
     def between(low: float, high: float) -> Node:
-        return build.and_(build.compare("lt", real(low), turn), build.compare("lt", turn, real(high)))
+        return build.and_(build.derive("lt", real(low), turn), build.derive("lt", turn, real(high)))
 
     q = rounded(mul(x, real(2 / pi)))
     coarse, middle, fine = (mul(q, real(part)) for part in HALF_PI)
@@ -400,9 +397,9 @@ def _wave(expr: Expr, at: Inputs) -> Node:
     z = mul(rest, rest)
     rising = add(rest, add(small, mul(rest, mul(z, series(SINE)))))
     level = sub(real(1.0), add(mul(real(0.5), z), sub(mul(rest, small), mul(mul(z, z), series(COSINE)))))
-    odd = build.or_(between(0.5, 1.5), build.compare("lt", real(2.5), turn))
+    odd = build.or_(between(0.5, 1.5), build.derive("lt", real(2.5), turn))
     is_cosine = expr.op == "cos"
-    down = between(0.5, 2.5) if is_cosine else build.compare("lt", real(1.5), turn)
+    down = between(0.5, 2.5) if is_cosine else build.derive("lt", real(1.5), turn)
     value = build.select(odd, rising, level) if is_cosine else build.select(odd, level, rising)
     return build.select(down, build.derive("neg", value), value)
 
@@ -430,15 +427,15 @@ _LOWER: dict[str, Callable[[Expr, Inputs], Node | Pair]] = {
     "coordinate": lambda e, at: at.build.make(
         "coordinate", integer(int(e.kind.lo), int(e.kind.hi)), attr=e.value
     ),
-    "inside": lambda e, at: at.build.make("inside", FLAG, attr=e.value),
+    "inside": lambda e, at: at.build.derive("inside", attr=e.value),
     "look": _look,
     "member": _member,
     **dict.fromkeys(("not", "and", "or"), _logic),
     **dict.fromkeys(("eq", "le"), _compare),
     "lt": _lt,
     **dict.fromkeys(("add", "sub", "mul", "min", "max", "div", "neg", "abs"), _arithmetic),
-    "quotient": lambda e, at: at.build.quotient(node(e.args[0], at), node(e.args[1], at)),
-    "mod": lambda e, at: at.build.mod(node(e.args[0], at), e.value),
+    "quotient": lambda e, at: at.build.derive("quotient", node(e.args[0], at), node(e.args[1], at)),
+    "mod": lambda e, at: at.build.derive("mod", node(e.args[0], at), attr=e.value),
     "to_real": _to_real,
     "count": _count,
     "sum": _sum,
@@ -601,7 +598,7 @@ class _PassLowering:
                 continue
             if before.type == REAL:
                 kind = self.slots[component_of(name)[0]].kind
-                last = build.make("settle", REAL, last, attr=(float(kind.lo), float(kind.hi)))
+                last = build.derive("settle", last, attr=(float(kind.lo), float(kind.hi)))
             outputs.append((name, last))
         return PassGraph(pass_.name, pass_.pack, substeps, tuple(outputs))
 

@@ -1,4 +1,4 @@
-"""The IR: one immutable, interned node; one table of operations; programs made of substeps.
+"""The IR: one table of operations, immutable interned nodes, and programs made of substeps.
 
 A node has a value in each cell of each world: a flag, an integer with a declared range, or a float32. There is no
 control flow inside a substep. Equal nodes of one graph are the same object, so common sub-expressions are free.
@@ -7,13 +7,15 @@ control flow inside a substep. Equal nodes of one graph are the same object, so 
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Container, Hashable, Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Container, Hashable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import reduce
 from typing import Any
 
-from powderdsl.ir.single import divided, larger, single, smaller, square_root
+from powderdsl.ir.single import larger, single, smaller, square_root
 
 Offset = tuple[int, int]
+Range = tuple[int, int]
 
 SNAP = 2.0**-20
 """Floats of a smaller magnitude are stored as zero."""
@@ -29,6 +31,18 @@ class Type:
 
     def __str__(self) -> str:
         return f"{self.lo}..{self.hi}" if self.name == "int" else self.name
+
+    @property
+    def bits(self) -> int:
+        """The number of bit planes of an integer."""
+        if self.signed:
+            return max((-self.lo - 1).bit_length(), max(self.hi, 0).bit_length()) + 1
+        return max(self.hi.bit_length(), 1)
+
+    @property
+    def signed(self) -> bool:
+        """Whether the highest bit plane is a sign."""
+        return self.lo < 0
 
 
 FLAG, REAL = Type("flag", 0, 1), Type("real")
@@ -51,9 +65,12 @@ class Threshold:
 
 @dataclass(frozen=True)
 class Op:
-    """A row of the table: argument types (`?` any, `=` all alike, `*` any number of them), result, what `attr` is.
+    """A row of the table: the kinds of the arguments and of the result, and what follows from them.
 
-    `evaluate` gives the result for `attr` and the values of the arguments, with which stages fold constants. None where the result depends on more than these, or is a choice between planes.
+    Kinds are names of types, `?` for any, `=` for arguments that are alike, `*` for any number of them. `bounds` gives the
+    range of an integer result for the types of the arguments, `evaluate` the result for their values, with which stages
+    fold constants; both take `attr` first if there is one. Without `evaluate` the result depends on more than these.
+    `gates` is the cost of the operation on bit planes.
     """
 
     name: str
@@ -61,22 +78,48 @@ class Op:
     result: str
     attr: str = ""
     about: str = ""
+    bounds: Callable[..., Range] | None = None
     evaluate: Callable[..., Any] | None = None
+    commutative: bool = False
+    gates: int = 0
+
+    def type_of(self, attr: Any, args: Sequence[Node]) -> Type:
+        """The type of the result."""
+        kind = args[-1].type.name if self.result == "=" else self.result
+        if kind != "int":
+            return FLAG if kind == "flag" else REAL
+        assert self.bounds is not None
+        return integer(*self.bounds(*([attr] if self.attr else []), *(arg.type for arg in args)))
+
+    def value(self, attr: Any, *args: Any) -> Any:
+        """The result for the values of the arguments, floats rounded to float32. Raises LookupError without `evaluate`."""
+        if self.evaluate is None:
+            raise LookupError(self.name)
+        result = self.evaluate(*([attr] if self.attr else []), *args)
+        return single(result) if isinstance(result, float) else result
 
 
-def _settle(attr: tuple[float, float], a: float) -> float:
-    kept = smaller(larger(a, single(attr[0])), single(attr[1]))
-    return kept if abs(kept) >= SNAP else 0.0  # NaN is not ≥ SNAP
+def _settle(limits: tuple[float, float], a: float) -> float:
+    result = smaller(larger(a, single(limits[0])), single(limits[1]))
+    return result if abs(result) >= SNAP else 0.0  # NaN is not ≥ SNAP
 
 
-def _plain(evaluate: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of the arguments alone; floats are rounded to float32."""
+def _quotient(a: int, b: int) -> int:
+    return a // b if b else 0
 
-    def result(attr: None, *args: Any) -> Any:
-        found = evaluate(*args)
-        return single(found) if isinstance(found, float) else found
 
-    return result
+def _corners(evaluate: Callable[[int, int], int], a: Type, others: Iterable[int]) -> Range:
+    values = [evaluate(x, y) for y in others for x in (a.lo, a.hi)]
+    return min(values), max(values)
+
+
+def _reachable(values: tuple[int, ...], index: Type) -> Range:
+    values = values[max(index.lo, 0) : index.hi + 1] or values
+    return min(values), max(values)
+
+
+def _union(a: Type, b: Type) -> Range:
+    return min(a.lo, b.lo), max(a.hi, b.hi)
 
 
 # fmt: off
@@ -93,44 +136,50 @@ _TABLE = (
     Op("chance", (), "flag", "(stream, bits, limit)", "whether the stream's draw k is less than a constant"),
     Op("below_planes", ("*flag",), "flag", "(stream, bits)", "`below`, the limit's bit planes given highest first"),
     # neighbors
-    Op("shift", ("?",), "=", "(rows, columns, wraps)", "the value at a neighbor; zero outside unless it wraps"),
-    Op("count", ("flag",), "int", "((rows, columns, weight)…, wraps)", "weighted number of neighbors that hold"),
+    Op("shift", ("=",), "=", "(rows, columns, wraps)", "the value at a neighbor; zero outside unless it wraps",
+       lambda at, a: (a.lo, a.hi) if at[2] else (min(a.lo, 0), max(a.hi, 0))),
+    Op("count", ("flag",), "int", "((rows, columns, weight)…, wraps)", "weighted number of neighbors that hold",
+       lambda attr, a: (sum(min(w, 0) for *_, w in attr[0]), sum(max(w, 0) for *_, w in attr[0]))),
     # flags
-    Op("not", ("flag",), "flag"),
-    Op("and", ("flag", "flag"), "flag"),
-    Op("or", ("flag", "flag"), "flag"),
-    Op("xor", ("flag", "flag"), "flag"),
+    Op("not", ("flag",), "flag", evaluate=lambda a: 1 - a, gates=1),
+    Op("and", ("flag", "flag"), "flag", evaluate=operator.and_, commutative=True, gates=1),
+    Op("or", ("flag", "flag"), "flag", evaluate=operator.or_, commutative=True, gates=1),
+    Op("xor", ("flag", "flag"), "flag", evaluate=operator.xor, commutative=True, gates=1),
     # integers and floats
-    Op("in_set", ("int",), "flag", "frozen set", "whether the value is one of these"),
-    Op("table", ("int",), "int", "values by index, from 0"),
-    Op("eq", ("=", "="), "flag", evaluate=_plain(operator.eq)),
-    Op("lt", ("=", "="), "flag", evaluate=_plain(operator.lt)),
-    Op("le", ("=", "="), "flag", evaluate=_plain(operator.le)),
-    Op("add", ("=", "="), "=", evaluate=_plain(operator.add)),
-    Op("sub", ("=", "="), "=", evaluate=_plain(operator.sub)),
-    Op("mul", ("=", "="), "=", evaluate=_plain(operator.mul)),
-    Op("div", ("real", "real"), "real", about="x / 0 is 0", evaluate=_plain(divided)),
-    Op("quotient", ("int", "int"), "int", about="rounded down; x div 0 is 0", evaluate=_plain(lambda a, b: a // b if b else 0)),
-    Op("neg", ("?",), "=", evaluate=_plain(operator.neg)),
-    Op("abs", ("?",), "=", evaluate=_plain(abs)),
-    Op("min", ("=", "="), "=", evaluate=_plain(smaller)),
-    Op("max", ("=", "="), "=", evaluate=_plain(larger)),
-    Op("mod", ("int",), "int", "modulus", evaluate=lambda modulus, a: a % modulus),
-    Op("sqrt", ("real",), "real", evaluate=_plain(square_root)),
+    Op("in_set", ("int",), "flag", "frozen set", "whether the value is one of these", evaluate=lambda members, a: a in members),
+    Op("table", ("int",), "int", "values by index, from 0", "",
+       _reachable, operator.getitem),
+    Op("eq", ("=", "="), "flag", evaluate=operator.eq, commutative=True),
+    Op("lt", ("=", "="), "flag", evaluate=operator.lt),
+    Op("le", ("=", "="), "flag", evaluate=operator.le),
+    Op("add", ("=", "="), "=", "", "", lambda a, b: (a.lo + b.lo, a.hi + b.hi), operator.add, commutative=True),
+    Op("sub", ("=", "="), "=", "", "", lambda a, b: (a.lo - b.hi, a.hi - b.lo), operator.sub),
+    Op("mul", ("=", "="), "=", "", "", lambda a, b: _corners(operator.mul, a, (b.lo, b.hi)), operator.mul, commutative=True),
+    Op("div", ("real", "real"), "real", "", "x / 0 is 0", evaluate=lambda a, b: a / b if b else 0.0),
+    Op("quotient", ("int", "int"), "int", "", "rounded down; x div 0 is 0",
+       lambda a, b: _corners(_quotient, a, [d for d in (b.lo, -1, 0, 1, b.hi) if b.lo <= d <= b.hi]), _quotient),
+    Op("mod", ("int",), "int", "modulus", "", lambda modulus, a: (0, modulus - 1), lambda modulus, a: a % modulus),
+    Op("neg", ("=",), "=", "", "", lambda a: (-a.hi, -a.lo), operator.neg),
+    Op("abs", ("=",), "=", "", "", lambda a: (max(a.lo, -a.hi, 0), max(-a.lo, a.hi)), abs),
+    Op("min", ("=", "="), "=", "", "", lambda a, b: (min(a.lo, b.lo), min(a.hi, b.hi)), smaller, commutative=True),
+    Op("max", ("=", "="), "=", "", "", lambda a, b: (max(a.lo, b.lo), max(a.hi, b.hi)), larger, commutative=True),
+    Op("sqrt", ("real",), "real", evaluate=square_root),
     Op("to_real", ("?",), "real"),
-    Op("settle", ("real",), "real", "(low, high)", "NaN → 0, clamped to the bounds, smaller than SNAP → 0", _settle),
+    Op("settle", ("real",), "real", "(low, high)", "NaN → 0, clamped to the bounds, smaller than SNAP → 0", evaluate=_settle),
     # choices and movements
-    Op("select", ("flag", "=", "="), "=", about="second argument where the first holds, else the third"),
-    Op("swap", ("=", "flag", "="), "=", "offset", "(content, movers, rest): movers and their targets exchanged"),
-    Op("arrive", ("=", "flag", "="), "=", "offset", "(content, movers, rest): targets get the movers' content"),
+    Op("select", ("flag", "=", "="), "=", "", "second argument where the first holds, else the third",
+       lambda condition, yes, no: _union(yes, no), gates=3),
+    Op("swap", ("=", "flag", "="), "=", "offset", "(content, movers, rest): movers and their targets exchanged",
+       lambda offset, content, movers, rest: _union(content, rest)),
+    Op("arrive", ("=", "flag", "="), "=", "offset", "(content, movers, rest): targets get the movers' content",
+       lambda offset, content, movers, rest: _union(content, rest)),
 )
 # fmt: on
 
 OPS: dict[str, Op] = {op.name: op for op in _TABLE}
 """Every operation of the IR."""
 
-COMMUTATIVE = frozenset({"and", "or", "xor", "eq", "add", "mul", "min", "max"})
-LEAVES = frozenset({"input", "const", "param", "coordinate", "inside", "draw"})
+COMMUTATIVE = frozenset(op.name for op in _TABLE if op.commutative)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -145,6 +194,10 @@ class Node:
     places: tuple[str, ...] = field(default=(), repr=False)
     """Where it was written: ``rules/acme.yaml:12``. Takes no part in interning."""
 
+    def is_input(self, slot: str) -> bool:
+        """Whether it is what the pass finds in a slot."""
+        return self.op == "input" and self.attr == slot
+
 
 class Graph:
     """Makes and interns nodes. Arguments of commutative operations are sorted, except floats: their order is kept."""
@@ -154,9 +207,9 @@ class Graph:
 
     def copy(self) -> Graph:
         """A graph with the same nodes, to which others can be added."""
-        made = Graph()
-        made._nodes = dict(self._nodes)
-        return made
+        graph = Graph()
+        graph._nodes = dict(self._nodes)
+        return graph
 
     @property
     def size(self) -> int:
@@ -175,11 +228,86 @@ class Graph:
             args = (args[1], args[0])
         # A const's type keeps 1 and 1.0 and True apart; -0.0 never arises as a constant.
         key = (op, type.name, tuple(arg.index for arg in args), attr)
-        found = self._nodes.get(key)
-        if found is None:
-            found = Node(op, type, args, attr, len(self._nodes), places)
-            self._nodes[key] = found
-        return found
+        node = self._nodes.get(key)
+        if node is None:
+            node = self._nodes[key] = Node(op, type, args, attr, len(self._nodes), places)
+        return node
+
+
+class Builder:
+    """Makes well-typed nodes in one graph. `place` is where the rule being lowered was written."""
+
+    def __init__(self, graph: Graph | None = None):
+        self.graph = graph or Graph()
+        self.place = ""
+
+    def make(self, op: str, type: Type, *args: Node, attr: Hashable = None) -> Node:
+        return self.graph.node(op, type, args, attr, (self.place,) if self.place else ())
+
+    def derive(self, op: str, *args: Node, attr: Hashable = None) -> Node:
+        """An operation whose type follows from its arguments."""
+        return self.make(op, OPS[op].type_of(attr, args), *args, attr=attr)
+
+    def input(self, slot: str, type: Type) -> Node:
+        return self.make("input", type, attr=slot)
+
+    def flag(self, value: bool) -> Node:
+        return self.make("const", FLAG, attr=bool(value))
+
+    def integer(self, value: int) -> Node:
+        return self.make("const", integer(value, value), attr=int(value))
+
+    def real(self, value: float) -> Node:
+        return self.make("const", REAL, attr=float(value))
+
+    def const(self, value: int | float, type: Type) -> Node:
+        if type == FLAG:
+            return self.flag(bool(value))
+        return self.real(value) if type == REAL else self.integer(int(value))
+
+    def not_(self, a: Node) -> Node:
+        return self.derive("not", a)
+
+    def and_(self, a: Node, b: Node) -> Node:
+        return self.derive("and", a, b)
+
+    def or_(self, a: Node, b: Node) -> Node:
+        return self.derive("or", a, b)
+
+    def any(self, flags: Sequence[Node]) -> Node:
+        """Whether some of these hold."""
+        return reduce(self.or_, flags) if flags else self.flag(False)
+
+    def select(self, condition: Node, yes: Node, no: Node) -> Node:
+        return self.derive("select", condition, yes, no)
+
+    def in_set(self, value: Node, members: frozenset[int]) -> Node:
+        return self.derive("in_set", value, attr=members)
+
+    def to_real(self, a: Node) -> Node:
+        return a if a.type == REAL else self.derive("to_real", a)
+
+    def clamp(self, a: Node, lo: int, hi: int) -> Node:
+        """Integers clamped to bounds, where their range asks for it."""
+        if a.type.lo < lo:
+            a = self.derive("max", a, self.integer(lo))
+        if a.type.hi > hi:
+            a = self.derive("min", a, self.integer(hi))
+        return a
+
+    def shift(self, a: Node, offset: Offset, wraps: bool = True) -> Node:
+        return a if offset == (0, 0) else self.derive("shift", a, attr=(*offset, wraps))
+
+    def shift_uniform(self, a: Node, offset: Offset, wraps: bool) -> Node:
+        """A constant or parameter at a neighbor: the same, and zero outside unless it wraps."""
+        if wraps or offset == (0, 0) or (a.op == "const" and not a.attr):
+            return a
+        return self.select(self.derive("inside", attr=offset), a, self.const(0, a.type))
+
+    def rebuild(self, node: Node, args: tuple[Node, ...]) -> Node:
+        """The same operation on other arguments."""
+        type = OPS[node.op].type_of(node.attr, args) if args else node.type
+        return self.make(node.op, type, *args, attr=node.attr)
 
 
 @dataclass(frozen=True)
@@ -201,6 +329,20 @@ class PassGraph:
     substeps: tuple[SubstepGraph, ...]
     outputs: tuple[tuple[str, Node], ...]
     """The last node of every slot that the pass changes."""
+
+    def map(
+        self, write: Callable[[str, Node], Iterable[tuple[str, Node]]], guard: Callable[[Node], Node]
+    ) -> PassGraph:
+        """The pass with other writes for each write of a slot, and another node for each guard."""
+
+        def written(pairs: Iterable[tuple[str, Node]]) -> tuple[tuple[str, Node], ...]:
+            return tuple([new for slot, node in pairs for new in write(slot, node)])
+
+        substeps = [
+            replace(step, writes=written(step.writes), guards=tuple(map(guard, step.guards)))
+            for step in self.substeps
+        ]
+        return replace(self, substeps=tuple(substeps), outputs=written(self.outputs))
 
 
 @dataclass(frozen=True)
@@ -278,8 +420,8 @@ def nodes_of(pass_: PassGraph, *, substeps: bool = True) -> list[Node]:
     """All nodes that a pass needs, as `ordered`: for its outputs and, unless told otherwise, for its substeps."""
     roots = [node for _, node in pass_.outputs]
     if substeps:
-        writes = [node for one in pass_.substeps for _, node in one.writes]
-        roots = [*writes, *roots, *(guard for one in pass_.substeps for guard in one.guards)]
+        writes = [node for step in pass_.substeps for _, node in step.writes]
+        roots = [*writes, *roots, *[guard for step in pass_.substeps for guard in step.guards]]
     return ordered(roots)
 
 
@@ -293,3 +435,58 @@ def walk(node: Node) -> Iterator[Node]:
             seen.add(id(top))
             yield top
             stack.extend(top.args)
+
+
+class InvalidIR(AssertionError):
+    """The compiler made something illegal: a bug of ours, never of a rule file."""
+
+
+def demand(holds: bool, message: str) -> None:
+    """Raise InvalidIR unless something holds."""
+    if not holds:
+        raise InvalidIR(message)
+
+
+def verify(program: Program, after: str) -> None:
+    """Raise InvalidIR unless every pass of the program is legal: checked after lowering and after every stage."""
+    slots = {slot.name: slot.type for slot in program.slots}
+    params = {name for name, _ in program.params}
+    streams = {(name, bits) for name, _, bits in program.streams}
+    for pass_ in program.passes:
+        seen: dict[object, Node] = {}
+        try:
+            for node in nodes_of(pass_):
+                _verify_node(node)
+                key = (node.op, node.type.name, node.args, node.attr)
+                demand(seen.setdefault(key, node) is node, f"{node.op} was not interned")
+                if node.op == "input":
+                    demand(node.attr in slots, f"unknown slot {node.attr}")
+                elif node.op == "param":
+                    demand(node.attr[0] in params, f"unknown parameter {node.attr}")
+                elif node.op in ("below", "draw"):
+                    demand(node.attr in streams, f"unknown stream {node.attr}")
+            for name, node in pass_.outputs:
+                demand(name in slots, f"unknown slot {name}")
+                own, type = slots[name], node.type
+                demand(type.name == own.name, f"{name} gets a {type}")
+                inside = type.name != "int" or own.lo <= type.lo <= type.hi <= own.hi
+                demand(inside, f"{name} of {own} gets {type}")
+            guards = [guard for step in pass_.substeps for guard in step.guards]
+            demand(all(guard.type == FLAG for guard in guards), "a guard is not a flag")
+        except InvalidIR as error:
+            raise InvalidIR(f"after {after}, pass {pass_.name}: {error}") from None
+
+
+def _verify_node(node: Node) -> None:
+    demand(node.op in OPS, f"unknown operation {node.op}")
+    op = OPS[node.op]
+    kinds = [arg.type.name for arg in node.args]
+    wanted = [kind.removeprefix("*") for kind in op.args] * (len(kinds) if op.args[:1] == ("*flag",) else 1)
+    demand(len(kinds) == len(wanted), f"{node.op} has {len(kinds)} arguments")
+    demand(bool(op.attr) == (node.attr is not None), f"{node.op} has the attribute {node.attr!r}")
+    alike = sorted({kind for kind, want in zip(kinds, wanted, strict=True) if want == "="})
+    demand(len(alike) <= 1, f"{node.op} mixes {alike}")
+    for kind, want in zip(kinds, wanted, strict=True):
+        demand(want in ("=", "?", kind), f"{node.op} takes {want}, found {kind}")
+    same = not node.args or node.type == op.type_of(node.attr, node.args)
+    demand(same and node.type.lo <= node.type.hi, f"{node.op} of {kinds} gives {node.type}")

@@ -16,36 +16,21 @@ def single(value: float) -> float:
     return array("f", (value,))[0]
 
 
-def _bits(value: float) -> int:
-    """The 32 bits of a float32."""
-    return int.from_bytes(struct.pack("<f", value), "little")
-
-
 def all_ones(value: float) -> bool:
     """Whether all bits of the fraction of its float32 are ones."""
-    return _bits(value) & 0x7FFFFF == 0x7FFFFF
+    return int.from_bytes(struct.pack("<f", value), "little") & 0x7FFFFF == 0x7FFFFF
 
 
-def following(value: float) -> float:
-    """The next larger float32 after one that is 0 or more and finite."""
-    found: float = struct.unpack("<f", struct.pack("<I", _bits(abs(value)) + 1))[0]
-    return found
-
-
-def preceding(value: float) -> float:
-    """The next smaller float32 before one above 0."""
-    found: float = struct.unpack("<f", struct.pack("<I", _bits(value) - 1))[0]
-    return found
+def stepped(value: float, by: int) -> float:
+    """The float32 so many steps up or down from one that is 0 or more and finite."""
+    (bits,) = struct.unpack("<I", struct.pack("<f", abs(value)))
+    result: float = struct.unpack("<f", struct.pack("<I", bits + by))[0]
+    return result
 
 
 def square_root(value: float) -> float:
     """The square root; NaN below 0."""
     return single(math.sqrt(value)) if value >= 0 else math.nan
-
-
-def divided(a: float, b: float) -> float:
-    """a / b; 0 where b is 0."""
-    return single(a / b) if b != 0 else 0.0
 
 
 def smaller(a: float, b: float) -> float:

@@ -1,8 +1,10 @@
-"""A stable printed form of the IR, for `--emit ir`, golden tests and bug reports."""
+"""Passes as text: a stable printed form for `--emit ir`, golden tests and bug reports, and digests to recognize them by."""
 
 from __future__ import annotations
 
-from powderdsl.ir.ops import Node, PassGraph, Program, ordered
+from hashlib import sha256
+
+from powderdsl.ir.ops import Node, PassGraph, Program, nodes_of, ordered
 
 
 def print_program(program: Program, only: str | None = None) -> str:
@@ -15,19 +17,25 @@ def print_program(program: Program, only: str | None = None) -> str:
         lines.append(f"  param {name}: {kind}")
     for name, ident, bits in program.streams:
         lines.append(f"  stream {name}: {bits} bits, hash {ident:#010x}")
-    lines += [print_pass(pass_) for pass_ in program.passes if only is None or pass_.name == only]
+    for pass_ in program.passes:
+        if only is None or pass_.name == only:
+            lines += _pass_lines(pass_)
     return "\n".join(lines) + "\n"
 
 
-def print_pass(pass_: PassGraph) -> str:
+def _pass_lines(pass_: PassGraph) -> list[str]:
     """One pass. Numbers are given in order of use, so that they do not depend on what was built and dropped."""
     names: dict[int, str] = {}
     lines = [f"pass {pass_.name}"]
 
     def show(root: Node) -> str:
         for node in ordered([root], names):
+            parts = [names[id(arg)] for arg in node.args]
+            if node.attr is not None:
+                parts.append(attr_text(node.attr))
             names[id(node)] = f"%{len(names)}"
-            lines.append(f"    {names[id(node)]} = {_node_text(node, names)}")
+            text = f"{node.op} {', '.join(parts)} : {node.type}".replace("  ", " ")
+            lines.append(f"    {names[id(node)]} = {text}")
         return names[id(root)]
 
     for number, step in enumerate(pass_.substeps):
@@ -37,24 +45,38 @@ def print_pass(pass_: PassGraph) -> str:
             reference = show(node)
             lines.append(f"    write {slot} = {reference}")
     for slot, node in pass_.outputs:
-        lines.append(f"  leave {slot} = {show(node)}")
-    return "\n".join(lines)
-
-
-def _node_text(node: Node, names: dict[int, str]) -> str:
-    parts = [names[id(arg)] for arg in node.args]
-    if node.attr is not None:
-        parts.append(attr_text(node.attr))
-    return f"{node.op} {', '.join(parts)} : {node.type}".replace("  ", " ")
+        reference = show(node)
+        lines.append(f"  leave {slot} = {reference}")
+    return lines
 
 
 def attr_text(attr: object) -> str:
     if isinstance(attr, frozenset):
         return "{" + ", ".join(map(str, sorted(attr))) + "}"
     if isinstance(attr, tuple):
-        return "(" + ", ".join(attr_text(part) for part in attr) + ")"
-    if isinstance(attr, float):
-        return f"{attr!r}"
-    if attr is None:
-        return "value"
-    return str(attr)
+        return "(" + ", ".join(map(attr_text, attr)) + ")"
+    return "value" if attr is None else str(attr)
+
+
+def structure(pass_: PassGraph, *, places: bool = True) -> bytes:
+    """A digest that is equal for two passes only if every stage makes the same of both.
+
+    Args:
+        places: whether they are also written in the same places, which messages and listings name.
+    """
+    numbers: dict[Node, int] = {}
+    rows: list[object] = []
+    for node in nodes_of(pass_):
+        numbers[node] = len(rows)
+        args = [numbers[arg] for arg in node.args]
+        rows.append((node.op, node.type, args, node.attr, node.index, node.places if places else ()))
+
+    def named(pairs: tuple[tuple[str, Node], ...]) -> object:
+        return [(name, numbers[node]) for name, node in pairs]
+
+    substeps = [
+        (step.label, step.place if places else "", named(step.writes), [numbers[n] for n in step.guards])
+        for step in pass_.substeps
+    ]
+    whole = pass_.name, pass_.pack, substeps, named(pass_.outputs), rows
+    return sha256(repr(whole).encode()).digest()

@@ -214,10 +214,7 @@ def _calm(values: list[Node]) -> tuple[list[float | bool], list[Node]] | None:
             if result and not node.attr[2]:
                 raise LookupError
         else:
-            evaluate = OPS[node.op].evaluate
-            if evaluate is None:
-                raise LookupError
-            result = evaluate(node.attr, *map(visit, node.args))
+            result = OPS[node.op].value(node.attr, *map(visit, node.args))
         memo[id(node)] = result
         return result
 

@@ -14,7 +14,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from powderdsl.ir.gates import width as width_of
 from powderdsl.ir.lower import ir_type, slot_names
 from powderdsl.ir.ops import component_of
 from powderdsl.model.state import Slot, property_dtype, property_values, slots
@@ -192,7 +191,7 @@ class Observer:
         for slot in self.slots.values():
             if not slot.is_real:
                 type = ir_type(slot.kind, self.ruleset.slots)
-                count = 1 if type.name == "flag" else width_of(type.lo, type.hi)[0]
+                count = 1 if type.name == "flag" else type.bits
                 found += [(slot.name, bit) for bit in range(count)]
         return tuple(found)
 

@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from powderdsl.ir.gates import width
 from powderdsl.ir.ops import Program, Threshold, Type, plane_name
 
 
@@ -32,12 +31,12 @@ class Piece:
         """The slots of its bit planes, lowest first; the slot itself for flags and floats."""
         if self.type.name != "int":
             return (self.slot,)
-        return tuple(plane_name(self.slot, i) for i in range(width(self.type.lo, self.type.hi)[0]))
+        return tuple(plane_name(self.slot, i) for i in range(self.type.bits))
 
     @property
     def signed(self) -> bool:
         """Whether the highest plane is a sign bit."""
-        return self.type.name == "int" and width(self.type.lo, self.type.hi)[1]
+        return self.type.name == "int" and self.type.signed
 
     @property
     def is_real(self) -> bool:

@@ -9,7 +9,7 @@ import pytest
 
 from powderdsl.compiler import lower
 from powderdsl.ir import bits
-from powderdsl.ir.cost import PassCost, costs
+from powderdsl.ir.segments import PassCost, costs
 from powderdsl.testing.generators.cases import load_text
 from tests.cli.commands import powderdsl
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from powderdsl.compiler import load
-from powderdsl.ir.verify import InvalidIR
+from powderdsl.ir.ops import InvalidIR
 from powderdsl.schedule.join import Read, field_reads
 from powderdsl.schedule.stages import CPU, plan
 from powderdsl.schedule.types import Compute, Schedule, Sweeps, flat

@@ -10,7 +10,6 @@ import pytest
 from powderdsl.compiler import load, lower
 from powderdsl.diagnostics import CompileError
 from powderdsl.ir.bits import plane_slots
-from powderdsl.ir.gates import width
 from powderdsl.ir.ops import PassGraph, Program, plane_name
 from powderdsl.ir.segments import segments
 from powderdsl.model.state import slots as state_slots
@@ -57,7 +56,7 @@ def random_world(rules: Ruleset, program: Program, seed: int) -> World:
             value = random.integers(slot.type.lo, slot.type.hi + 1, shape) * some
             value = np.clip(value, slot.type.lo, slot.type.hi)
             value = np.full(shape, int(slot.default)) if slot.resets else value
-            for i in range(width(slot.type.lo, slot.type.hi)[0]):
+            for i in range(slot.type.bits):
                 slots[plane_name(slot.name, i)] = value >> i & 1 != 0
     draws = {name: random.integers(0, 1 << bits, shape) for name, _, bits in program.streams}
     params = {}

@@ -7,8 +7,7 @@ import pytest
 import powderdsl
 from powderdsl.compiler import lower
 from powderdsl.ir import bits
-from powderdsl.ir.build import Builder
-from powderdsl.ir.ops import FLAG, PassGraph, Program, SlotType, integer
+from powderdsl.ir.ops import FLAG, Builder, PassGraph, Program, SlotType, integer
 from powderdsl.ir.segments import Carried, carry, segments
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.programs import BackendProgram
@@ -115,7 +114,7 @@ def test_what_planes_refuse_and_rules_cannot_say() -> None:
     number = build.input("number", integer(0, 1 << 25))
     slots = (SlotType("number", number.type, 0, False), SlotType("found", FLAG, 0, False))
     rare = build.in_set(number, frozenset({3, 1 << 20}))
-    rounded = build.compare("lt", build.to_real(number), build.real(2.5))
+    rounded = build.derive("lt", build.to_real(number), build.real(2.5))
     for node, why in ((rare, "a table over 26 planes"), (rounded, "an integer too large for float32")):
         pass_ = PassGraph("made", "made", (), (("found", node),))
         found = carry(Program("made", slots, (), (), (pass_,)), pass_)

@@ -14,7 +14,7 @@ from powderdsl import compiler
 from powderdsl.compiler import load_with_diagnostics, lower, parts, shipped
 from powderdsl.diagnostics import CompileError
 from powderdsl.ir.ops import PassGraph
-from powderdsl.ir.structure import structure
+from powderdsl.ir.text import structure
 from powderdsl.simulation.standalone import standalone_module
 from powderdsl.system.memo import Memo
 from powderdsl.targets.wasm import source

@@ -23,7 +23,7 @@ from powderdsl.system.reports import table
 from powderdsl.tasks.shipped import is_task
 
 if TYPE_CHECKING:
-    from powderdsl.ir.cost import PassCost
+    from powderdsl.ir.segments import PassCost
     from powderdsl.tasks.task import Task
 
 
@@ -133,7 +133,7 @@ def _check(name: str, quick: bool, cost: bool, ledger: bool) -> Checked:
         diagnostics = (*diagnostics, *refuted(ruleset, book))
     expenses = None
     if cost:
-        from powderdsl.ir.cost import costs
+        from powderdsl.ir.segments import costs
 
         expenses = costs(lower(ruleset))
     return Checked(name, diagnostics, ruleset, expenses, (book or make_ledger(ruleset)) if ledger else None)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 
 from powderdsl.ir.ops import REAL, Node, ordered
-from powderdsl.ir.single import all_ones, divided, single
+from powderdsl.ir.single import all_ones, single
 from powderdsl.schedule.join import keeps
 from powderdsl.schedule.rows import ANY_PASS, RowLoop, Rows, region_of, rows_of
 from powderdsl.schedule.types import Out, Sweeps, alternatives, is_zero
@@ -412,4 +412,4 @@ def quotient(value: str, divisor: float) -> str:
     """A division by a constant; a product, unless the divisor's fraction is all ones (Markstein 1990, theorem 8)."""
     if all_ones(divisor) or not 2.0**-60 < abs(divisor) < 2.0**60:
         return f"{value} / splatf({literal(divisor)})"
-    return f"divide_by({value}, {literal(divisor)}, {literal(divided(1.0, single(divisor)))})"
+    return f"divide_by({value}, {literal(divisor)}, {literal(single(1.0 / single(divisor)))})"

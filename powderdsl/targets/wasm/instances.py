@@ -9,7 +9,7 @@ from threading import RLock
 from typing import Any
 
 from powderdsl.ir.ops import Program
-from powderdsl.ir.structure import structure
+from powderdsl.ir.text import structure
 from powderdsl.system.memo import Memo
 from powderdsl.targets.array_kind import Array, ArrayKind
 from powderdsl.targets.codec import parameters, pieces

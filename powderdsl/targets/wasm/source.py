@@ -7,7 +7,7 @@ from functools import reduce
 from operator import or_
 
 from powderdsl.ir.ops import PassGraph, Program
-from powderdsl.ir.structure import structure
+from powderdsl.ir.text import structure
 from powderdsl.schedule.presence import asked_ids
 from powderdsl.schedule.stages import CPU, plan
 from powderdsl.schedule.types import Schedule

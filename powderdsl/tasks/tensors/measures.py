@@ -11,9 +11,8 @@ import torch
 from torch import Tensor
 
 from powderdsl.ir.bits import NotBits, lower_bits
-from powderdsl.ir.build import Builder
 from powderdsl.ir.lower import Inputs, ir_type, lower_expression, slot_names
-from powderdsl.ir.ops import FLAG, Node, PassGraph, Program, SlotType, Type, component_of
+from powderdsl.ir.ops import FLAG, Builder, Node, PassGraph, Program, SlotType, Type, component_of
 from powderdsl.ir.stages import run_passes
 from powderdsl.model.state import slots
 from powderdsl.model.types import Expr, Ruleset

@@ -233,11 +233,8 @@ def _reads(node: Node, at: Offset) -> list[tuple[Node, Offset]]:
 
 def _is_free(node: Node) -> bool:
     """Whether a node that is not a float is a variable of its own: it depends on some, or on a parameter."""
-    if node.op in ("param", "inside", "draw", "sqrt"):
-        return node.op != "inside"
-    if node.op == "below":
-        return node.args[0].op != "const"
-    return any(arg.type == REAL for arg in node.args)
+    chance = node.op == "below" and node.args[0].op != "const"
+    return chance or node.op == "param" or any(arg.type == REAL for arg in node.args)
 
 
 class _Cases:
@@ -401,9 +398,7 @@ class _Cases:
         parts = [self.value(part, place) for part, place in _reads(node, at)]
         if node.op == "shift":  # nothing beyond the edge, unless it wraps
             return parts[0] * own[0] if own else parts[0]
-        evaluate = _EVALUATE.get(node.op, OPS[node.op].evaluate)
-        if evaluate is None:
-            raise Undecided
+        evaluate = _EVALUATE.get(node.op, OPS[node.op].value)
         found: Array = evaluate(node.attr, *parts)
         return found.astype(np.int32)
 
@@ -441,10 +436,6 @@ def _answer(value: int, op: str, attr: Any) -> object:
 
 
 _EVALUATE: dict[str, Callable[..., Any]] = {
-    "not": lambda attr, a: 1 - a,
-    "and": lambda attr, a, b: a & b,
-    "or": lambda attr, a, b: a | b,
-    "xor": lambda attr, a, b: a ^ b,
     "in_set": lambda attr, a: np.isin(a, sorted(attr)),
     "table": lambda attr, a: np.asarray(attr, np.int32)[np.clip(a, 0, len(attr) - 1)],
     "min": lambda attr, a, b: np.minimum(a, b),
@@ -456,5 +447,4 @@ _EVALUATE: dict[str, Callable[..., Any]] = {
     ),
     "arrive": lambda attr, target, back, rest: np.where(target != 0, back, rest),
 }
-"""Exact evaluation of the operations that read cells, look up values, or work on flags, and of those that `OPS` has for
-numbers only."""
+"""The operations that read cells, and those that `OPS` evaluates for numbers only."""
