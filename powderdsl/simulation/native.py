@@ -33,7 +33,6 @@ from powderdsl.model.types import Ruleset
 from powderdsl.targets.array_kind import Array
 from powderdsl.targets.cache import turn
 from powderdsl.targets.cpp.build import building, cache_key, current
-from powderdsl.targets.cpp.code import compile_program, recall, remember
 from powderdsl.targets.cpp.compilers import (
     INSTALL,
     MISSING,
@@ -42,7 +41,7 @@ from powderdsl.targets.cpp.compilers import (
     find_compiler,
     flags_for,
 )
-from powderdsl.targets.cpp.program import NativeProgram
+from powderdsl.targets.cpp.program import NativeProgram, compile_program, recall, remember
 from powderdsl.targets.cpp.source import known_width
 from powderdsl.targets.job import Job, Runnable, shape_of, unavailable
 from powderdsl.targets.mixed import mixed_program

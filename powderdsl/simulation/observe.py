@@ -19,7 +19,7 @@ from powderdsl.ir.ops import component_of
 from powderdsl.model.state import Slot, property_dtype, property_values, slots
 from powderdsl.model.types import MatrixChannel, Ruleset
 from powderdsl.simulation.draw import CellTint, Ramp, palette, ramps, tint_cells, tints
-from powderdsl.targets.cpp.program import PackedState, address
+from powderdsl.targets.cpp.program import PackedState
 from powderdsl.targets.job import shape_of
 from powderdsl.targets.words import pack, word_count
 
@@ -68,7 +68,7 @@ class Observer:
         out, colors = self.buffer(out, (*shape_of(state), 3), torch.uint8), self._palette
         if isinstance(state, PackedState):
             library, (slot, bits, _) = state.program.library, state.program.planes_of("element")
-            library.pd_rgb(state.handle, slot, bits, address(colors), address(out), out.stride(0))
+            library.pd_rgb(state.handle, slot, bits, colors.data_ptr(), out.data_ptr(), out.stride(0))
         else:
             ids = state["element"].flatten().int()
             out.copy_(colors[:, :3].index_select(0, ids).view(out.shape))  # faster than an index
@@ -87,7 +87,7 @@ class Observer:
         if isinstance(state, PackedState):
             wanted = torch.tensor([_native_channel(one, state) for one in channels], dtype=torch.int32)
             state.program.library.pd_channels(
-                state.handle, len(channels), address(wanted), address(tables), address(out), out.stride(0)
+                state.handle, len(channels), wanted.data_ptr(), tables.data_ptr(), out.data_ptr(), out.stride(0)
             )
             return out
         at = 0
@@ -128,7 +128,7 @@ class Observer:
             program = state.program
             slots = [program.planes_of(name)[0] + bit for name, bit in self._bits]
             numbers = torch.tensor(slots, dtype=torch.int32)
-            program.library.pd_planes(state.handle, len(slots), address(numbers), address(out), out.stride(0))
+            program.library.pd_planes(state.handle, len(slots), numbers.data_ptr(), out.data_ptr(), out.stride(0))
             return out
         for place, (name, bit) in enumerate(self._bits):
             out[:, place] = pack((state[name] >> bit) & 1 != 0)
@@ -268,7 +268,7 @@ def _write_ramp(state: State, ramp: Ramp, out: Tensor) -> None:
         field = (program.layout.reals[ramp.field], 0, False) if real else program.planes_of(ramp.field)
         program.library.pd_ramp(
             state.handle, slot, bits, ramp.id, int(real), field[0], field[1], int(field[2]), len(ramp.starts),
-            address(ramp.starts), address(ramp.colors), address(out), out.stride(0),
+            ramp.starts.data_ptr(), ramp.colors.data_ptr(), out.data_ptr(), out.stride(0),
         )  # fmt: skip
         return
     reached = torch.bucketize(state[ramp.field].to(ramp.starts.dtype), ramp.starts, right=True)
@@ -282,7 +282,7 @@ def _write_tint(state: State, tint: CellTint, out: Tensor) -> None:
         program = state.program
         row, column = (program.layout.reals[piece.slot] for piece in program.pieces[tint.field])
         numbers = torch.tensor([*tint.color, tint.full, tint.most])
-        program.library.pd_tint(state.handle, row, column, address(numbers), address(out), out.stride(0))
+        program.library.pd_tint(state.handle, row, column, numbers.data_ptr(), out.data_ptr(), out.stride(0))
     else:
         tint_cells(out, state[tint.field], tint)
 
@@ -316,7 +316,7 @@ def _write_codes(state: State, slot: Slot, name: str, out: Tensor) -> None:
     floor = _floor(slot)
     if isinstance(state, PackedState) and slot.dtype == "float32" and not state.has(slot.name):
         program = state.program
-        program.library.pd_codes(state.handle, program.layout.reals[name], floor, address(out), out.stride(0))
+        program.library.pd_codes(state.handle, program.layout.reals[name], floor, out.data_ptr(), out.stride(0))
     else:
         value = (_component(state, name) if slot.planes == 2 else state[name]).to(torch.float32)
         one = torch.tensor(floor, device=out.device).view(torch.int32)

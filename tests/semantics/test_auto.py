@@ -317,7 +317,7 @@ def test_auto_changes_over_to_the_same_worlds_and_remembers(
 
 def libraries(folder: Path) -> list[Path]:
     """The libraries in a cache, which are not the starts of programs."""
-    return [entry.path for entry in cache.entries(folder) if not entry.name.endswith(".json")]
+    return [entry.path for entry in cache.entries(folder) if not entry.name.endswith(".layout")]
 
 
 def compiled_natively(rules: Ruleset) -> None:
@@ -330,10 +330,10 @@ def test_a_damaged_cache_is_mended(rules: Ruleset, tmp_path: Path) -> None:
     with building(Building("-O0", tmp_path)):
         compiled_natively(rules)
         (library,) = libraries(tmp_path)
-        starts = sorted(tmp_path.glob("*.json"))  # of the width, and of the width compiled last
+        starts = sorted(tmp_path.glob("*.layout"))  # of the width, and of the width compiled last
         assert len(starts) == 2
         whole = starts[0].read_bytes()
-        for damage in (whole[:40], b"[]", b'{"library": 3}', whole.replace(b'"layout"', b'"lay"'), b"\xff"):
+        for damage in (whole[:40], b"", whole.replace(b"layout", b"lay-by"), b"\xff"):
             for start in starts:
                 start.write_bytes(damage)
             assert powderdsl.compile(rules).running == "wasm"

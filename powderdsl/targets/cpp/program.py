@@ -3,22 +3,79 @@
 from __future__ import annotations
 
 import ctypes
+import pickle
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from powderdsl.targets.codec import parameters
-from powderdsl.targets.cpp.build import load_library
-from powderdsl.targets.cpp.code import NativeCode
+from powderdsl.ir.ops import Program
+from powderdsl.system.reading import read_bytes
+from powderdsl.targets import cache
+from powderdsl.targets.codec import Piece, parameters, pieces
+from powderdsl.targets.cpp.build import current, load_library, open_library
+from powderdsl.targets.cpp.source import native_source
 from powderdsl.targets.job import Job
+from powderdsl.targets.layout import Layout
 
 Like = Mapping[str, tuple[torch.dtype, tuple[int, ...]]]
 """The dtype and shape of each tensor of a state."""
 
 BATCH_SIZES = 16
 """How many batch sizes a program keeps the inputs of parameters for."""
+
+
+@dataclass(frozen=True)
+class NativeCode:
+    """A program as compiled C++: enough to run it again without lowering anything.
+
+    `width` is that of grids (`source.known_width`); `pieces` are those of each state tensor, `passes` the names of passes.
+    """
+
+    library: Path
+    width: int
+    layout: Layout
+    pieces: Mapping[str, tuple[Piece, ...]]
+    passes: tuple[str, ...]
+
+
+def compile_program(program: Program, planes: Program, width: int) -> NativeCode:
+    """Write a program as C++ and compile it.
+
+    Args:
+        program: the numeric program, whose slots are the state's.
+        planes: the same program from `ir.bits.lower_bits`.
+        width: of grids, see `source.known_width`.
+
+    Raises:
+        NoCompiler: there is no C++ compiler, or it failed.
+    """
+    source, layout, units = native_source(planes, width)
+    library, _ = open_library(source, program.name, units)
+    return NativeCode(library, width, layout, pieces(program), tuple(p.name for p in planes.passes))
+
+
+def recall(key: str) -> NativeCode | None:
+    """The code stored under a key, if its library still exists. Raises NoCompiler if there is no cache folder."""
+    folder = current().place()
+    path = cache.find(folder, key)
+    if path is None:
+        return None
+    # Whoever can write into the folder has his libraries run as well: a pickle is no less safe than they are.
+    code: NativeCode = pickle.loads(read_bytes(path, cache.LIMIT))
+    library = cache.find(folder, cache.key_and_name(code.library)[0])
+    return None if library is None else replace(code, library=library)
+
+
+def remember(key: str, code: NativeCode) -> None:
+    """Store the rest of a compiled program under a key. A cache that cannot be written only costs time."""
+    _, name = cache.key_and_name(code.library)
+    with suppress(OSError):
+        cache.add(current().place(), key, pickle.dumps(code), f"{name}.layout")
 
 
 class Inputs(NamedTuple):
@@ -79,17 +136,12 @@ class PackedState(Mapping[str, Tensor]):
 
     def write(self, name: str, out: Tensor) -> Tensor:
         """One slot, written into a tensor of its storage dtype whose worlds are contiguous; returns it."""
-        program = self.program
-        for piece in program.pieces[name]:
-            place = address(piece.of(out))
-            if piece.is_real:
-                number = program.layout.reals[piece.slot]
-                program.library.pd_store_real(self.handle, number, place, out.stride(0))
+        library, size, stride = self.program.library, out.element_size(), out.stride(0)
+        for part, number, bits, signed in self.program.parts(name, out):
+            if bits:
+                library.pd_store(self.handle, number, bits, signed, size, part.data_ptr(), stride)
             else:
-                slot, bits, signed = program.planes_of(name)
-                program.library.pd_store(
-                    self.handle, slot, bits, signed, out.element_size(), place, out.stride(0)
-                )
+                library.pd_store_real(self.handle, number, part.data_ptr(), stride)
         return out
 
     def fill(self, boxes: Tensor, values: Mapping[str, Tensor], *, reuse: bool) -> PackedState:
@@ -101,19 +153,16 @@ class PackedState(Mapping[str, Tensor]):
             values: by slot: int64 [B], float32 [B] for reals, float32 [B, 2] for vectors.
             reuse: write to this state itself, and return it.
         """
-        program = self.program
-        changed = self if reuse else self.__copy__()
+        changed, library = self if reuse else self.__copy__(), self.program.library
         boxes = boxes.contiguous()
         for name, value in values.items():
             changed._tensors.pop(name, None)
-            for piece in program.pieces[name]:
-                numbers = piece.of(value).contiguous()
-                if piece.is_real:
-                    slot = program.layout.reals[piece.slot]
-                    program.library.pd_fill_real(changed.handle, slot, address(boxes), address(numbers))
+            for part, number, bits, _ in self.program.parts(name, value):
+                numbers = part.contiguous()
+                if bits:
+                    library.pd_fill(changed.handle, number, bits, boxes.data_ptr(), numbers.data_ptr())
                 else:
-                    slot, bits, _ = program.planes_of(name)
-                    program.library.pd_fill(changed.handle, slot, bits, address(boxes), address(numbers))
+                    library.pd_fill_real(changed.handle, number, boxes.data_ptr(), numbers.data_ptr())
         return changed
 
     def put(self, places: Tensor, state: Mapping[str, Tensor], *, reuse: bool) -> PackedState:
@@ -121,24 +170,18 @@ class PackedState(Mapping[str, Tensor]):
 
         `reuse`: write to this state itself, and return it.
         """
-        program = self.program
-        changed = self if reuse else self.__copy__()
+        changed, library = self if reuse else self.__copy__(), self.program.library
         changed._tensors.clear()
-        places, count = places.contiguous(), len(places)
+        places = places.contiguous()
+        count, at = len(places), places.data_ptr()
         for name, value in state.items():
-            for piece in program.pieces[name]:
-                plane = piece.of(value).contiguous()
-                if piece.is_real:
-                    number = program.layout.reals[piece.slot]
-                    program.library.pd_put_real(
-                        changed.handle, number, count, address(places), address(plane)
-                    )
+            for part, number, bits, _ in self.program.parts(name, value):
+                plane = part.contiguous()
+                if bits:
+                    size = plane.element_size()
+                    library.pd_put(changed.handle, number, bits, size, count, at, plane.data_ptr())
                 else:
-                    slot, bits, _ = program.planes_of(name)
-                    item = plane.element_size()
-                    program.library.pd_put(
-                        changed.handle, slot, bits, item, count, address(places), address(plane)
-                    )
+                    library.pd_put_real(changed.handle, number, count, at, plane.data_ptr())
         return changed
 
     def __iter__(self) -> Iterator[str]:
@@ -205,20 +248,19 @@ class NativeProgram:
         for name, value in state.items():
             value = value.contiguous()
             like[name] = (value.dtype, tuple(value.shape))
-            for piece in self.pieces[name]:
-                place = address(piece.of(value))
-                if piece.is_real:
-                    self.library.pd_load_real(handle, self.layout.reals[piece.slot], place, value.stride(0))
+            for part, number, bits, _ in self.parts(name, value):
+                if bits:
+                    self.library.pd_load(handle, number, bits, value.element_size(), part.data_ptr())
                 else:
-                    slot, bits, _ = self.planes_of(name)
-                    self.library.pd_load(handle, slot, bits, value.element_size(), place)
+                    self.library.pd_load_real(handle, number, part.data_ptr(), value.stride(0))
         return handle, like
+
+    def parts(self, name: str, value: Tensor) -> Iterator[tuple[Tensor, int, int, bool]]:
+        """What slots hold of a state tensor: each part with its field's number and 0, or as `planes_of` says."""
+        for piece in self.pieces[name]:
+            number = (self.layout.reals[piece.slot], 0, False) if piece.is_real else self._planes[name]
+            yield piece.of(value), *number
 
     def planes_of(self, name: str) -> tuple[int, int, bool]:
         """The first plane of a state tensor, the number of planes, and whether the last one is a sign."""
         return self._planes[name]
-
-
-def address(tensor: Tensor) -> ctypes.c_void_p:
-    """The address of a tensor's data, for C."""
-    return ctypes.c_void_p(tensor.data_ptr())
