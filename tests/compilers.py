@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from powderdsl.targets.cpp.compilers import NoCompiler, find_compiler
+from powderdsl.targets.cpp.build import NoCompiler, find_compiler
 
 
 def skip_without_compiler(backend: str = "native") -> None:

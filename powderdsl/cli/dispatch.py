@@ -46,7 +46,7 @@ _usual = warnings.formatwarning
 
 def plain_warning(message: Warning | str, category: type[Warning], *rest: Any, **options: Any) -> str:
     """The text of a warning: our own in a sentence, others with the line that they come from."""
-    from powderdsl.targets.cpp.compilers import NoCompilerWarning
+    from powderdsl.targets.cpp.build import NoCompilerWarning
 
     if issubclass(category, NoCompilerWarning):
         return f"note: {message}\n"

@@ -408,7 +408,7 @@ def this_machine(device: str) -> dict[str, Any]:
     import torch
 
     from powderdsl.simulation.programs import find_device
-    from powderdsl.targets.cpp.compilers import NoCompiler, find_compiler
+    from powderdsl.targets.cpp.build import NoCompiler, find_compiler
 
     kind = find_device(device)
     try:

@@ -32,12 +32,14 @@ from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
 from powderdsl.targets.array_kind import Array
 from powderdsl.targets.cache import turn
-from powderdsl.targets.cpp.build import building, cache_key, current
-from powderdsl.targets.cpp.compilers import (
+from powderdsl.targets.cpp.build import (
     INSTALL,
     MISSING,
     NoCompiler,
     NoCompilerWarning,
+    building,
+    cache_key,
+    current,
     find_compiler,
     flags_for,
 )

@@ -87,7 +87,12 @@ class Observer:
         if isinstance(state, PackedState):
             wanted = torch.tensor([_native_channel(one, state) for one in channels], dtype=torch.int32)
             state.program.library.pd_channels(
-                state.handle, len(channels), wanted.data_ptr(), tables.data_ptr(), out.data_ptr(), out.stride(0)
+                state.handle,
+                len(channels),
+                wanted.data_ptr(),
+                tables.data_ptr(),
+                out.data_ptr(),
+                out.stride(0),
             )
             return out
         at = 0
@@ -128,7 +133,9 @@ class Observer:
             program = state.program
             slots = [program.planes_of(name)[0] + bit for name, bit in self._bits]
             numbers = torch.tensor(slots, dtype=torch.int32)
-            program.library.pd_planes(state.handle, len(slots), numbers.data_ptr(), out.data_ptr(), out.stride(0))
+            program.library.pd_planes(
+                state.handle, len(slots), numbers.data_ptr(), out.data_ptr(), out.stride(0)
+            )
             return out
         for place, (name, bit) in enumerate(self._bits):
             out[:, place] = pack((state[name] >> bit) & 1 != 0)
@@ -316,7 +323,9 @@ def _write_codes(state: State, slot: Slot, name: str, out: Tensor) -> None:
     floor = _floor(slot)
     if isinstance(state, PackedState) and slot.dtype == "float32" and not state.has(slot.name):
         program = state.program
-        program.library.pd_codes(state.handle, program.layout.reals[name], floor, out.data_ptr(), out.stride(0))
+        program.library.pd_codes(
+            state.handle, program.layout.reals[name], floor, out.data_ptr(), out.stride(0)
+        )
     else:
         value = (_component(state, name) if slot.planes == 2 else state[name]).to(torch.float32)
         one = torch.tensor(floor, device=out.device).view(torch.int32)

@@ -139,7 +139,7 @@ def command(
 def _there(asked: tuple[str, ...] | None) -> tuple[str, ...]:
     """The backends asked for, by default all that are there. Raises CompileError (PD701) if one is not."""
     from powderdsl.system.writing import failure
-    from powderdsl.targets.cpp.compilers import INSTALL, NoCompiler, find_compiler
+    from powderdsl.targets.cpp.build import INSTALL, NoCompiler, find_compiler
 
     wanted = asked or COMPARED
     compiled = [name for name in wanted if name in COMPILED]

@@ -13,7 +13,7 @@ from powderdsl.compiler import lower
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.programs import BackendProgram
 from powderdsl.simulation.simulator import Simulator
-from powderdsl.targets.cpp.compilers import find_compiler
+from powderdsl.targets.cpp.build import find_compiler
 from powderdsl.targets.cuda.program import Arguments, Compile, CudaProgram, Launch, worlds_of
 from powderdsl.targets.cuda.source import KernelSource
 from powderdsl.targets.torch.mixed import packed_program

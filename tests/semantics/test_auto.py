@@ -29,8 +29,7 @@ from powderdsl.simulation.native import AutoProgram, start_key
 from powderdsl.simulation.programs import BackendProgram
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.targets import cache
-from powderdsl.targets.cpp.build import Building, building
-from powderdsl.targets.cpp.compilers import NoCompiler, NoCompilerWarning
+from powderdsl.targets.cpp.build import Building, NoCompiler, NoCompilerWarning, building
 from powderdsl.targets.job import Clock, Job
 from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices

@@ -9,8 +9,15 @@ import pytest
 
 from powderdsl.compiler import load
 from powderdsl.simulation.simulator import compile as compile_ruleset
-from powderdsl.targets.cpp.build import Building, building
-from powderdsl.targets.cpp.compilers import ARCHITECTURE, NoCompiler, find_compiler, flags_for, processor
+from powderdsl.targets.cpp.build import (
+    ARCHITECTURE,
+    Building,
+    NoCompiler,
+    building,
+    find_compiler,
+    flags_for,
+    processor,
+)
 from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from powderdsl.testing.generators.rulemaker import random_ruleset_text

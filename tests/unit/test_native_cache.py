@@ -18,8 +18,16 @@ from filelock import FileLock
 
 from powderdsl.system.writing import MARK, scratch_folder
 from powderdsl.targets import cache
-from powderdsl.targets.cpp.build import Building, build, building, run_compilers
-from powderdsl.targets.cpp.compilers import Compiler, NoCompiler, find_compiler, flags_for
+from powderdsl.targets.cpp.build import (
+    Building,
+    Compiler,
+    NoCompiler,
+    build,
+    building,
+    find_compiler,
+    flags_for,
+    run_compilers,
+)
 from powderdsl.targets.cuda import build as cuda_build
 from powderdsl.targets.cuda.source import KernelSource
 from powderdsl.targets.layout import Layout
@@ -191,7 +199,7 @@ def test_without_a_compiler_all_that_were_tried_are_named(
 ) -> None:
     monkeypatch.delenv("CXX", raising=False)
     monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setattr("powderdsl.targets.cpp.compilers.find_spec", lambda name: None)
+    monkeypatch.setattr("powderdsl.targets.cpp.build.find_spec", lambda name: None)
     with pytest.raises(NoCompiler, match=r"tried g\+\+, c\+\+, clang\+\+, the package ziglang"):
         find_compiler()
     fake(tmp_path, "clang++", "clang version 9")

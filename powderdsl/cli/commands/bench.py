@@ -23,7 +23,7 @@ from powderdsl.experiments.bench import (
     this_machine,
 )
 from powderdsl.model.state import fitting
-from powderdsl.targets.cpp.compilers import NoCompiler, find_compiler
+from powderdsl.targets.cpp.build import NoCompiler, find_compiler
 
 MAX_SECONDS = 3600
 

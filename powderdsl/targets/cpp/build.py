@@ -6,6 +6,9 @@ import atexit
 import ctypes
 import hashlib
 import os
+import platform
+import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -15,6 +18,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryFile
 
@@ -22,7 +26,134 @@ from powderdsl.system.interrupts import held_back
 from powderdsl.system.user_cache import cache_folder
 from powderdsl.system.writing import scratch_folder
 from powderdsl.targets import cache
-from powderdsl.targets.cpp.compilers import Compiler, NoCompiler, find_compiler, flags_for, processor
+
+INSTALL = "install g++ or clang++, or `pip install powderdsl[native]`"
+"""What to do where there is no compiler."""
+
+MISSING = "no C++ compiler"
+"""How the messages of `NoCompiler` begin where none was found."""
+
+
+class NoCompilerWarning(UserWarning):
+    """The backend `auto` has work that is worth compiling, and no compiler."""
+
+
+class NoCompiler(Exception):
+    """No C++ compiler that works was found, or it failed; the message says what was tried."""
+
+
+@dataclass(frozen=True)
+class Compiler:
+    """A command that compiles C++, and its identity. `family` is ``gcc``, ``clang`` or ``zig``."""
+
+    command: tuple[str, ...]
+    family: str
+    version: str
+    """The first line of what `--version` says."""
+
+
+def find_compiler() -> Compiler:
+    """The compiler of `$CXX`; without that the first of g++, c++, clang++ and the `ziglang` package that works.
+
+    Raises:
+        NoCompiler: none works. If `$CXX` is set, no other compiler is tried.
+    """
+    return _find(os.environ.get("CXX", ""), os.environ.get("PATH", ""))
+
+
+@lru_cache(maxsize=8)
+def _find(cxx: str, path: str) -> Compiler:
+    """As above, for these values of the environment. Only successes are cached."""
+    try:
+        candidates: list[tuple[str, ...]] = (
+            [tuple(shlex.split(cxx))] if cxx.strip() else [("g++",), ("c++",), ("clang++",)]
+        )
+    except ValueError as error:
+        raise NoCompiler(f"{MISSING}: $CXX is `{cxx}`: {error}") from None
+    package = None if cxx.strip() else find_spec("ziglang")
+    if package is not None and package.origin:
+        # The program itself: `python -m ziglang` would start Python once more.
+        candidates.append((str(Path(package.origin).with_name("zig")), "c++"))
+    for command in candidates:
+        if version := _version(command):
+            zig = "c++" in command[1:] and any("zig" in Path(word).name for word in command)
+            family = "zig" if zig else "clang" if "clang" in version else "gcc"
+            return Compiler(command, family, version)
+    if cxx.strip():
+        raise NoCompiler(f"{MISSING}: $CXX is `{cxx}`, which cannot be run")
+    tried = [" ".join(command) for command in candidates]
+    tried += [] if len(candidates) > 3 else ["the package ziglang"]
+    raise NoCompiler(f"{MISSING}: tried " + ", ".join(tried))
+
+
+def _version(command: tuple[str, ...]) -> str:
+    """The first line of `--version`; empty if the command does not run."""
+    if shutil.which(command[0]) is None:
+        return ""
+    try:
+        result = subprocess.run(
+            [*command, "--version"],
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=30,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return (result.stdout.strip().splitlines() or ["unknown"])[0]
+
+
+ARCHITECTURE = "POWDERDSL_ARCH"
+"""The environment variable that names another processor to compile for, such as ``x86-64-v3``."""
+
+
+def flags_for(compiler: Compiler, level: str, machine: str = "", features: str = "") -> tuple[str, ...]:
+    """The flags for a library of generated code.
+
+    Args:
+        level: ``-O0`` to ``-O3``.
+        machine, features: of the processor, as `platform.machine` and `processor` say; this one's if empty.
+
+    Raises:
+        NoCompiler: `$POWDERDSL_ARCH` is not a name.
+
+    Floats keep their meaning at every level: no contraction (a·b + c is rounded twice on every machine) and no fast
+    mathematics, so that all backends agree bit for bit.
+    """
+    machine, features = machine or platform.machine(), features or processor()
+    on_x86 = machine in ("x86_64", "AMD64", "i686")
+    name = os.environ.get(ARCHITECTURE, "native")
+    if not re.fullmatch(r"[A-Za-z0-9_.+-]+", name):
+        raise NoCompiler(f"no C++ compiler: ${ARCHITECTURE} is `{name}`, which names no processor")
+    if compiler.family == "zig":
+        name = name.replace("-", "_")
+    flags = ["-std=c++17", level, f"-march={name}" if on_x86 else f"-mcpu={name}"]
+    flags += ["-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-fno-strict-aliasing"]
+    if on_x86 and ("avx512f" in features if name == "native" else name.endswith("v4")):
+        flags.append("-mprefer-vector-width=512")
+    if compiler.family == "gcc":
+        # On such long functions these two take most of the time and gain nothing.
+        flags += ["-fno-gcse", "-fno-tree-pre"]
+    else:
+        flags.append("-fno-slp-vectorize")  # the code is vectorized already: a tenth faster without
+    if compiler.family == "zig":
+        flags.append("-fno-sanitize=undefined")  # which zig adds at -O0
+    return (*flags, "-shared", "-fPIC", "-pthread", "-fvisibility=hidden", "-w")
+
+
+@lru_cache(maxsize=1)
+def processor() -> str:
+    """What code for this processor depends on: the machine and its instruction sets."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        return next((line for line in lines if line.startswith(("flags", "Features"))), platform.machine())
+    except OSError:
+        return f"{platform.machine()} {platform.processor()}"
+
+
+# Libraries
 
 TIMEOUT = 600
 
@@ -100,28 +231,18 @@ def _compile(
     with scratch_folder(folder) as scratch:
         text, library = scratch / "program.cpp", scratch / "library"
         text.write_text(source, encoding="utf-8")
-        command = [*compiler.command, *flags]
-        if units == 1 or os.cpu_count() == 1:
-            _call([[*command, "-o", str(library), str(text)]], scratch)
-        else:
+        command, objects = [*compiler.command, *flags], []
+        if units > 1 and os.cpu_count() != 1:
             objects = [str(scratch / f"{unit}.o") for unit in range(units)]
-            _call(
-                [
-                    [*command, "-c", f"-DUNIT={unit}", "-o", name, str(text)]
-                    for unit, name in enumerate(objects)
-                ],
-                scratch,
-            )
-            _call([[*command, "-o", str(library), *objects]], scratch)
+        parts = [
+            [*command, "-c", f"-DUNIT={unit}", "-o", name, str(text)] for unit, name in enumerate(objects)
+        ]
+        for commands in filter(None, (parts, [[*command, "-o", str(library), *(objects or [str(text)])]])):
+            status, messages = run_compilers(scratch, *commands)
+            if status:
+                raise NoCompiler("\n".join([f"{command[0]} failed:", *messages.splitlines()[:8]]))
         code = library.read_bytes()
     return cache.add(folder, key, code, ruleset)
-
-
-def _call(commands: list[list[str]], scratch: Path) -> None:
-    """Run compilers side by side. Raises NoCompiler if one fails."""
-    status, said = run_compilers(scratch, *commands)
-    if status:
-        raise NoCompiler("\n".join([f"{commands[0][0]} failed:", *said.splitlines()[:8]]))
 
 
 def run_compilers(scratch: Path, *commands: list[str]) -> tuple[int, str]:
@@ -180,49 +301,51 @@ def _end_all() -> None:
     _end([*_running])
 
 
-def open_library(source: str, ruleset: str = "", units: int = 1) -> tuple[Path, ctypes.CDLL]:
-    """The library of a source, built if necessary: see `build`. Raises NoCompiler."""
-    path = build(source, ruleset, units)
-    try:
-        return path, load_library(path)
-    except OSError:  # another process has just removed it, or it cannot be loaded at all
+def loadable(source: str, ruleset: str = "", units: int = 1) -> Path:
+    """The path of a library that has been loaded, see `build`. Raises NoCompiler."""
+    problem: OSError | None = None
+    for _ in range(2):
         path = build(source, ruleset, units)
-    try:
-        return path, load_library(path)
-    except OSError as error:
-        raise NoCompiler(f"compiled code cannot be loaded: {error}") from None
+        try:
+            load_library(path)
+            return path
+        except OSError as error:  # another process has just removed it, or it cannot be loaded at all
+            problem = error
+    raise NoCompiler(f"compiled code cannot be loaded: {problem}")
+
+
+_TYPES = {"p": ctypes.c_void_p, "i": ctypes.c_int, "l": ctypes.c_int64, "f": ctypes.c_float, "-": None}
+
+SIGNATURES = {
+    "pd_new": "p iii",
+    "pd_free": "- p",
+    "pd_copy": "p p",
+    "pd_run": "p pilippplppp",
+    "pd_count": "- pipipiipp",
+    "pd_load": "- piiip",
+    "pd_store": "- piiiipl",
+    "pd_put": "- piiiipp",
+    "pd_fill": "- piipp",
+    "pd_load_real": "- pipl",
+    "pd_store_real": "- pipl",
+    "pd_put_real": "- piipp",
+    "pd_fill_real": "- pipp",
+    "pd_rgb": "- piippl",
+    "pd_tint": "- piippl",
+    "pd_ramp": "- piiiiiiiipppl",
+    "pd_channels": "- pipppl",
+    "pd_planes": "- pippl",
+    "pd_codes": "- pifpl",
+}
+"""The result and the arguments of each function of a library, by letters of `_TYPES`."""
 
 
 @lru_cache(maxsize=64)
 def load_library(path: Path) -> ctypes.CDLL:
     """The library, loaded once per process, with its functions declared."""
     library = ctypes.CDLL(str(path))
-    pointer, integer, long = ctypes.c_void_p, ctypes.c_int, ctypes.c_int64
-    signatures = {
-        "pd_new": (pointer, [integer, integer, integer]),
-        "pd_free": (None, [pointer]),
-        "pd_copy": (pointer, [pointer]),
-        "pd_load": (None, [pointer, integer, integer, integer, pointer]),
-        "pd_store": (None, [pointer, integer, integer, integer, integer, pointer, long]),
-        "pd_load_real": (None, [pointer, integer, pointer, long]),
-        "pd_put": (None, [pointer, integer, integer, integer, integer, pointer, pointer]),
-        "pd_put_real": (None, [pointer, integer, integer, pointer, pointer]),
-        "pd_fill": (None, [pointer, integer, integer, pointer, pointer]),
-        "pd_fill_real": (None, [pointer, integer, pointer, pointer]),
-        "pd_store_real": (None, [pointer, integer, pointer, long]),
-        "pd_rgb": (None, [pointer, integer, integer, pointer, pointer, long]),
-        "pd_tint": (None, [pointer, integer, integer, pointer, pointer, long]),
-        "pd_ramp": (None, [pointer, *[integer] * 8, pointer, pointer, pointer, long]),
-        "pd_channels": (None, [pointer, integer, pointer, pointer, pointer, long]),
-        "pd_planes": (None, [pointer, integer, pointer, pointer, long]),
-        "pd_count": (
-            None,
-            [pointer, integer, pointer, integer, pointer, integer, integer, pointer, pointer],
-        ),
-        "pd_codes": (None, [pointer, integer, ctypes.c_float, pointer, long]),
-        "pd_run": (pointer, [pointer, integer, long, integer, *[pointer] * 3, long, *[pointer] * 3]),
-    }
-    for name, (result, arguments) in signatures.items():
+    for name, signature in SIGNATURES.items():
         function = getattr(library, name)
-        function.restype, function.argtypes = result, arguments
+        result, arguments = signature.split()
+        function.restype, function.argtypes = _TYPES[result], [_TYPES[letter] for letter in arguments]
     return library

@@ -17,7 +17,7 @@ from powderdsl.ir.ops import Program
 from powderdsl.system.reading import read_bytes
 from powderdsl.targets import cache
 from powderdsl.targets.codec import Piece, parameters, pieces
-from powderdsl.targets.cpp.build import current, load_library, open_library
+from powderdsl.targets.cpp.build import current, load_library, loadable
 from powderdsl.targets.cpp.source import native_source
 from powderdsl.targets.job import Job
 from powderdsl.targets.layout import Layout
@@ -55,7 +55,7 @@ def compile_program(program: Program, planes: Program, width: int) -> NativeCode
         NoCompiler: there is no C++ compiler, or it failed.
     """
     source, layout, units = native_source(planes, width)
-    library, _ = open_library(source, program.name, units)
+    library = loadable(source, program.name, units)
     return NativeCode(library, width, layout, pieces(program), tuple(p.name for p in planes.passes))
 
 
