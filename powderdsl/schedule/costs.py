@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 from powderdsl.ir.ops import FLAG, Graph, Node, Offset, ordered
 from powderdsl.schedule.floats import of_floats
-from powderdsl.schedule.rewrite import map_values
-from powderdsl.schedule.types import Compute, Schedule, combined, map_computes, with_args
+from powderdsl.schedule.types import (
+    Compute,
+    Facts,
+    Schedule,
+    Statement,
+    combined,
+    constant,
+    is_movement,
+    map_each,
+    map_values,
+    on_all_paths,
+)
 
 FAR = 100
 """The cost of a value that cannot be recomputed."""
@@ -27,6 +37,8 @@ class Costs:
 
     gates: int
     floats: int
+    by_rows: bool = False
+    """Whether whole planes are processed, row by row, and it is known which of them are empty."""
 
 
 def sources_of(node: Node) -> list[tuple[Node, Offset]]:
@@ -65,6 +77,25 @@ def movable(node: Node, have: Have, most: int) -> bool:
 def is_constant(node: Node) -> bool:
     """Whether a value is the same in all cells of a world."""
     return node.op in ("const", "param") or (node.op == "coordinate" and node.attr[0] == "step")
+
+
+def gate_cost(node: Node, have: Have, limit: int = 1000) -> int:
+    """The number of gates that recompute a flag in another row; `limit` if that is impossible."""
+    if have(node) or is_constant(node):
+        return 0
+    if node.op in UNIFORM:
+        return limit
+    if is_movement(node) or of_floats(node) or node.op in DRAWS:
+        return limit
+    if node.op == "shift":
+        _, dx, wraps = node.attr
+        return gate_cost(node.args[0], have, limit) if wraps and not dx else limit
+    total = 2 if node.op == "select" else 1
+    for arg in node.args:
+        total += gate_cost(arg, have, limit)
+        if total >= limit:
+            return limit
+    return total
 
 
 def float_cost(node: Node, have: Have) -> int:
@@ -115,7 +146,7 @@ def thresholds(schedule: Schedule) -> Schedule:
         (stream, bits), (name, view, _) = node.attr, node.args[0].attr
         if [arg.attr for arg in node.args] != [(name, view, i) for i in range(bits, -1, -1)]:
             return None
-        return schedule.graph.node("below_param", FLAG, (), (stream, bits, name, view), node.places)
+        return schedule.graph.node("below_param", FLAG, (), (stream, bits, name, view))
 
     return map_values(schedule, rule)
 
@@ -125,55 +156,49 @@ def conditions(schedule: Schedule) -> Schedule:
 
     `busy & chance(s)` → `busy & chance(s, busy)`; `busy ? chance(s) : a` → `busy ? chance(s, busy) : a`.
     """
-    return map_computes(schedule, lambda statement: [_with_conditions(statement, schedule.graph)])
+    graph = schedule.graph
 
+    def change(statement: Compute) -> list[Statement]:
+        roots = [out.value for out in statement.outs]
+        random: set[Node] = set()
+        for node in ordered(roots):
+            if takes_bits(node) or not random.isdisjoint(node.args):
+                random.add(node)
 
-def _with_conditions(statement: Compute, graph: Graph) -> Compute:
-    roots = [out.value for out in statement.outs]
-    nodes = ordered(roots)
-    random: dict[int, bool] = {}
-    for node in nodes:
-        random[id(node)] = takes_bits(node) or any(random[id(arg)] for arg in node.args)
-    if not any(random.values()):
-        return statement
-    fixed = set(map(id, roots))
-    where: dict[int, dict[int, Node]] = {}
-    for node in reversed(nodes):
-        own = {} if id(node) in fixed else where.get(id(node), {})
-        for arg in node.args:
-            if random[id(arg)]:
-                flags = dict(own) if node.op in _POINTWISE else {}
-                for other in node.args:
-                    if node.op == "and" and not random[id(other)] and len(flags) < MAX_CONDITIONS:
-                        flags[id(other)] = other
-                if node.op == "select" and not random[id(node.args[0])] and len(flags) < MAX_CONDITIONS:
-                    chosen = _chosen(node, arg, graph)
-                    flags[id(chosen)] = chosen
-                known = where.get(id(arg), flags)
-                where[id(arg)] = {key: flag for key, flag in known.items() if key in flags}
-    done: dict[int, Node] = {}
-    for node in nodes:
-        args = [done[id(arg)] for arg in node.args]
-        flags = {} if id(node) in fixed else where.get(id(node), {})  # a variable's value is read everywhere
-        asked = list(flags.values())
-        if node.op in DRAWS and takes_bits(node) and asked:
-            args.append(combined("and", asked, graph))
-        done[id(node)] = with_args(node, tuple(args), graph)
-    return replace(statement, outs=tuple(replace(out, value=done[id(out.value)]) for out in statement.outs))
+        def below(node: Node, facts: Facts) -> Iterator[tuple[Node, Facts]]:
+            """What a node reads that depends on draws, and the flags that hold where it does."""
+            for arg in node.args:
+                if arg in random:
+                    flags = facts if node.op in _POINTWISE else {}
+                    others = [other for other in node.args if other not in random] if node.op == "and" else []
+                    if node.op == "select" and node.args[0] not in random:
+                        others = [_chosen(node, arg, graph)]
+                    yield arg, flags | dict.fromkeys(others[: MAX_CONDITIONS - len(flags)])
+
+        where = on_all_paths(roots, below)  # a variable's value is read everywhere
+        done: dict[Node, Node] = {}
+        for node in ordered(roots):
+            args = [done[arg] for arg in node.args]
+            if node.op in DRAWS and node in random and where[node]:
+                args.append(combined("and", where[node], graph))
+            done[node] = graph.node(node.op, node.type, tuple(args), node.attr)
+        return [statement.with_values(lambda node: done.get(node, node))]
+
+    return map_each(schedule, Compute, change)
 
 
 def _chosen(node: Node, arg: Node, graph: Graph) -> Node:
     """Where a choice reads one of its two values: its condition or the opposite; everywhere, if both are that value."""
     condition, yes, no = node.args
     if yes is no:
-        return graph.node("const", FLAG, (), True)
+        return constant(graph, FLAG, True)
     return condition if arg is yes else graph.node("not", FLAG, (condition,))
 
 
 def asked_for(draw: Node, where: Node, graph: Graph) -> Node:
     """The same draw under another condition."""
     count = draw.attr[1] + 1 if draw.op == "below_planes" else 0
-    return graph.node(draw.op, FLAG, (*draw.args[:count], where), draw.attr, draw.places)
+    return graph.node(draw.op, FLAG, (*draw.args[:count], where), draw.attr)
 
 
 def is_coin(node: Node) -> bool:

@@ -2,22 +2,29 @@
 
 A loop over words reads flags of its own word; at neighbors it reads stored flags, or recomputes cheap ones.
 A loop over cells reads floats and stored flags.
+
+Some targets process whole planes `by_rows` and know which planes are empty. Testing a mask is free there. Movements are
+operations on whole planes, in place where a substep only moves them. Long chains of choices are applied to a field one
+after another.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Literal
 
 from powderdsl.ir.ops import FLAG, REAL, Node, Offset, ordered, walk
 from powderdsl.schedule.costs import (
-    ARITHMETIC,
     DRAWS,
-    LOGIC,
     UNIFORM,
     Costs,
+    Have,
     asked_for,
+    gate_cost,
+    is_coin,
     is_constant,
     movable,
     sources_of,
@@ -26,20 +33,32 @@ from powderdsl.schedule.costs import (
 from powderdsl.schedule.floats import is_comparison, of_floats
 from powderdsl.schedule.types import (
     ANSWER,
+    Block,
+    Carried,
     Compute,
     Forget,
     Guard,
+    Move,
     Namer,
     Out,
     Schedule,
     Statement,
     Var,
+    asked_masks,
     combined,
     conjuncts,
-    flat,
+    connected,
+    constant,
+    is_movement,
     load,
     loaded,
 )
+
+ONLY_READER = 4
+"""How many gates more are recomputed for a single reader: about what a loop that stores a plane costs."""
+
+FEWEST = 3
+"""The shortest chain of choices that is worth a field of its own."""
 
 
 def cut(costs: Costs) -> Callable[[Schedule], Schedule]:
@@ -49,56 +68,57 @@ def cut(costs: Costs) -> Callable[[Schedule], Schedule]:
     """
 
     def stage(schedule: Schedule) -> Schedule:
-        cutter = Cutter(schedule, costs)
+        cutter = _Cutter(schedule, costs)
         body = cutter.block(schedule.body, top=True)
         leaves = tuple((slot, cutter.renamed(node)) for slot, node in schedule.leaves)
-        return replace(schedule, body=tuple(body), leaves=leaves)
+        return replace(schedule, body=body, leaves=leaves)
 
     return stage
 
 
-# Loops
-
-
-Pairs = Callable[[list[Node]], list[tuple[Var, Node]]]
-"""Assigns variables to nodes that are to be stored."""
-
-
-class Cutter:
-    """Loops for targets where testing a mask costs a barrier and flags are computed word by word."""
-
+class _Cutter:
     def __init__(self, schedule: Schedule, costs: Costs):
         self.namer, self.graph, self.costs = Namer(schedule), schedule.graph, costs
-        self.known: dict[int, Var] = {}
-        """The variables of the values stored so far, by the value's id."""
         self.statements: list[Statement] = []
-        nodes = ordered(node for one in flat(schedule.body) for node in one.values())
-        self.comparisons = [node for node in nodes if is_comparison(node)]
-        offsets: dict[int, set[Offset]] = {}
-        for node in nodes:
-            for source, offset in sources_of(node):
-                offsets.setdefault(id(source), set()).add(offset)
-        self.askers = {key: len(found) for key, found in offsets.items()}
-        """At how many neighbors each node is read."""
-        shifted = [node.args[0] for node in nodes if node.op == "shift" and node.type == REAL]
-        self.wanted = {
-            id(part)
-            for node in shifted
-            for part in stored_parts(node, lambda node: node.op == "load", costs.floats)
-            if part.op != "load"
-        }
-        """Floats that are read at neighbors later."""
-        led = [node for node in nodes if node.op == "led"]
-        self.led = {id(node.args[1]): node for node in led}
+        self.known: dict[Node, Var] = {}
+        """The variables of the values stored so far."""
+        self.found = {var.name for _, var in schedule.finds}
+        self.there = set(self.found)
+        """The variables defined so far."""
         self.same: dict[str, Node] = {}
         """For each variable that is only another name: the load of the variable that it names."""
-
-        self.there = {var.name for _, var in schedule.finds}
-        """The variables defined so far."""
+        nodes = ordered(schedule.values())
+        self.comparisons = [node for node in nodes if is_comparison(node)]
+        self.led = {node.args[1]: node for node in nodes if node.op == "led"}
+        offsets: dict[Node, set[Offset]] = {}
+        for node in nodes:
+            for source, offset in sources_of(node):
+                offsets.setdefault(source, set()).add(offset)
+        self.askers = {source: len(where) for source, where in offsets.items()}
+        """At how many neighbors each node is read."""
+        shifted = [node.args[0] for node in nodes if node.op == "shift" and node.type == REAL]
+        parts = [part for node in shifted for part in stored_parts(node, self.have, costs.floats)]
+        self.wanted = {part for part in parts if part.op != "load"}
+        """Floats that are read at neighbors later."""
+        counts: Counter[Node] = Counter()
+        for _, masks in asked_masks(schedule.body):
+            counts.update({part for out in masks for part in _conjunctions(out.value)})
+        self.shared = {part for part, count in counts.items() if count > 1}
+        """Conjuncts that several masks have in common: if such a plane is empty, so are all these masks."""
+        self.split_masks: dict[Node, Node] = {}
+        """Masks whose first parts are stored: the stored parts and the rest."""
 
     def emit(self, statement: Statement) -> None:
         self.statements.append(statement)
         self.there |= {var.name for var in statement.defined()}
+
+    @contextmanager
+    def inner(self) -> Iterator[list[Statement]]:
+        """Collects the statements of a nested block; what they store is not known after it."""
+        outer = self.statements, self.known, self.there
+        self.statements, self.known, self.there = [], dict(self.known), set(self.there)
+        yield self.statements
+        self.statements, self.known, self.there = outer
 
     def alias(self, names: dict[str, Node]) -> None:
         """Note variables that are only other names of values."""
@@ -106,12 +126,12 @@ class Cutter:
         self.there |= names.keys()
 
     def have(self, node: Node) -> bool:
-        return node.op == "load" or id(node) in self.known
+        return node.op == "load" or node in self.known
 
     def variable(self, node: Node) -> Node:
         """The load of a stored node."""
-        found = node if node.op == "load" else load(self.graph, self.known[id(node)])
-        return self.same.get(found.attr, found)
+        stored = node if node.op == "load" else load(self.graph, self.known[node])
+        return self.same.get(stored.attr, stored)
 
     def renamed(self, node: Node) -> Node:
         return self.variable(node) if node.op == "load" else node
@@ -121,126 +141,104 @@ class Cutter:
 
     # Statements
 
-    def block(
-        self, body: Sequence[Statement], kept: frozenset[str] = frozenset(), *, top: bool = False
-    ) -> list[Statement]:
+    def block(self, body: Block, kept: Collection[str] = (), *, top: bool = False) -> Block:
         """A block as loops. `kept`: names that the guard around the block keeps."""
-        outer, self.statements = self.statements, []
-        scope = dict(self.known), set(self.there)
-        for i, statement in enumerate(body):
-            match statement:
-                case Compute(outs, place):
-                    guard = body[i + 1] if i + 1 < len(body) else None
-                    if top and (isinstance(guard, Guard) or all(out.var.type == FLAG for out in outs)):
-                        self.hoist_comparisons([out.value for out in outs], place)
-                    if isinstance(guard, Guard):
-                        self.guarded(statement, guard)
-                    else:
-                        self.compute(outs, place, kept, statement.when)
-                case Guard() if not (i and isinstance(body[i - 1], Compute)):
-                    self.ask([], statement)
-                case Guard():
-                    pass  # emitted with the masks before it
-                case Forget():
+        with self.inner() as statements:
+            for before, statement, after in zip((None, *body), body, (*body[1:], None), strict=False):
+                if isinstance(statement, Guard):
+                    masks = before if isinstance(before, Compute) else Compute((), statement.place)
+                    self.guarded(masks, statement)
+                elif isinstance(statement, Compute):
+                    is_mask = isinstance(after, Guard)
+                    if top and (is_mask or all(out.var.type == FLAG for out in statement.outs)):
+                        self.hoist_comparisons(statement)
+                    if not is_mask:
+                        self.compute(statement, kept)
+                else:
                     self.emit(statement)
-                case _:
-                    raise AssertionError("movements and buffers come after loops")
-        found, self.statements = self.statements, outer
-        if not top:
-            self.known, self.there = scope
-        return found
+        return tuple(statements)
 
-    def compute(
-        self,
-        outs: Iterable[Out],
-        place: str,
-        kept: frozenset[str] = frozenset(),
-        when: Node | None = None,
-    ) -> None:
-        """Store values under the names of their variables. `when`: see `Compute`."""
-        named = {id(out.value): out.var for out in reversed(list(outs)) if not self.have(out.value)}
-        self.ensure([out.value for out in outs], place, named, when)
-        for out in outs:
-            if named.get(id(out.value)) is out.var:
-                continue
-            if out.var.name in kept:
-                self.emit(Compute((Out(out.var, self.variable(out.value)),), place, "words"))
-            else:  # stored under another name
-                self.alias({out.var.name: self.variable(out.value)})
+    def compute(self, loop: Compute, kept: Collection[str] = ()) -> None:
+        """Store values under the names of their variables."""
+        named = {out.value: out.var for out in reversed(loop.outs) if not self.have(out.value)}
+        self.ensure([out.value for out in loop.outs], loop.place, named, loop.when)
+        for out in loop.outs:
+            if named.get(out.value) is not out.var:
+                value = self.variable(out.value)
+                if out.var.name in kept:
+                    self.emit(Compute((Out(out.var, value),), loop.place, "words"))
+                else:
+                    self.alias({out.var.name: value})
 
-    def hoist_comparisons(self, masks: list[Node], place: str) -> None:
+    def hoist_comparisons(self, masks: Compute) -> None:
         """Compute the comparisons of masks before the guard, with all others that the same loop can compute."""
-        asked = [
-            self.led.get(id(node), node)
-            for mask in masks
-            for node in walk(mask)
-            if is_comparison(node) and not self.have(node) and not self.have(self.led.get(id(node), node))
-        ]
-        if not asked:
-            return
-        asked = list(dict.fromkeys(asked))
-        self.ensure([need for node in asked for need in self.needs(node)], place)
-        others = [self.led.get(id(node), node) for node in self.comparisons]
-        ready = [
-            node
-            for node in others
-            if not self.have(node) and not self.needs(node) and self.there.issuperset(loaded([node]))
-        ]
-        self.ensure([*asked, *ready], place)
+        nodes = (node for out in masks.outs for node in walk(out.value) if is_comparison(node))
+        asked = [self.led.get(node, node) for node in nodes if not self.have(node)]
+        asked = [node for node in dict.fromkeys(asked) if not self.have(node)]
+        if asked:
+            self.ensure(self.needs_of(asked), masks.place)
+            ready = [
+                node
+                for node in (self.led.get(node, node) for node in self.comparisons)
+                if not self.have(node) and not self.needs(node) and self.there.issuperset(loaded([node]))
+            ]
+            self.ensure([*asked, *ready], masks.place)
+
+    # Masks and guards
 
     def guarded(self, masks: Compute, guard: Guard) -> None:
         """Masks and the guard that tests them: the cheap parts first, the rest only if those hold somewhere."""
-        graph, place = self.graph, masks.place
+        if self.costs.by_rows:
+            parts = [part for out in masks.outs for part in self.shared_parts(out.value)]
+            self.ensure(parts, masks.place)
+        # A mask may be known by another name, or be such a part itself.
         self.alias({out.var.name: self.variable(out.value) for out in masks.outs if self.have(out.value)})
         masks = replace(masks, outs=tuple(out for out in masks.outs if out.var.name not in self.same))
+        if self.costs.by_rows:
+            self.candidates(masks, guard)
+            self.then(guard)
+            return
+        graph, place = self.graph, masks.place
         split = {out.var.name: self.split(out.value) for out in masks.outs}
-        needs = [need for out in masks.outs for need in self.needs(out.value)]
+        needs = self.needs_of(out.value for out in masks.outs)
         asked = {node.attr for node in guard.when if node.op == "load"}
         mine = [out for out in masks.outs if out.var.name in asked]
         if len(mine) < len(masks.outs):
-            self.compute([out for out in masks.outs if out.var.name not in asked], place)
+            others = tuple(out for out in masks.outs if out.var.name not in asked)
+            self.compute(replace(masks, outs=others))
         lazy = [Out(out.var, self.lazily(*split[out.var.name])) for out in mine]
-        cheap = {name: parts for name, (parts, _) in split.items()}
-        if not needs or not all(cheap[out.var.name] for out in mine):
-            self.ensure([need for out in lazy for need in self.needs(out.value)], place)
+        if not needs or not all(split[out.var.name][0] for out in mine):
             self.ask(lazy, guard)
             return
         # The other parts, and what they need, are computed only if the cheap parts hold somewhere.
         first = [
-            combined("and", cheap[node.attr], graph) if node.attr in cheap else node for node in guard.when
+            combined("and", split[node.attr][0], graph) if node.attr in split else node for node in guard.when
         ]
-        outer, self.statements = self.statements, []
-        scope = dict(self.known), set(self.there)
-        self.ensure([need for out in lazy for need in self.needs(out.value)], place)
-        self.ask(lazy, guard)
-        inner, self.statements = self.statements, outer
-        self.known, self.there = scope
-        nothing = graph.node("const", FLAG, (), False)
-        masked = {
-            out.var.name for out in mine
-        }  # a mask may be what a slot held before: nothing, where masks are skipped
-        kept = tuple((var, nothing if value.attr in masked else value) for var, value in self.kept(guard))
-        kept = (*((out.var, nothing) for out in mine), *kept)
+        with self.inner() as inner:
+            self.ask(lazy, guard)
+        nothing = constant(graph, FLAG)
+        names = {out.var.name for out in mine}
+        # A mask may be what a slot held before: nothing, where masks are skipped.
+        kept = tuple((var, nothing if value.attr in names else value) for var, value in self.kept(guard))
         question = self.answer(first)
         self.emit(Compute((question,), place, "words"))
-        when = (load(graph, question.var),)
-        self.emit(Guard(when, tuple(inner), kept, guard.place))
+        keeps = (*((out.var, nothing) for out in mine), *kept)
+        self.emit(Guard((load(graph, question.var),), tuple(inner), keeps, guard.place))
 
     def ask(self, masks: list[Out], guard: Guard) -> None:
         """Store masks, test whether they hold anywhere, and emit the guard."""
         values = {out.var.name: out.value for out in masks}
         asked = [values.get(node.attr, node) if node.op == "load" else node for node in guard.when]
-        self.ensure([need for node in asked for need in self.needs(node)], guard.place)
-        words = tuple(Out(out.var, self.word(out.value)) for out in masks)
+        self.ensure(self.needs_of(asked), guard.place)
+        words = tuple(Out(out.var, self.value(out.value)) for out in masks)
         question = self.answer(asked)
         self.emit(Compute((*words, question), guard.place, "words"))
-        body = tuple(self.block(guard.body, frozenset(var.name for var, _ in guard.keeps)))
-        when = (load(self.graph, question.var),)
-        self.emit(Guard(when, body, self.kept(guard), guard.place))
+        body = self.block(guard.body, {var.name for var, _ in guard.keeps})
+        self.emit(Guard((load(self.graph, question.var),), body, self.kept(guard), guard.place))
 
-    def answer(self, flags: Sequence[Node]) -> Out:
+    def answer(self, flags: Iterable[Node]) -> Out:
         """A new variable: whether one of some flags holds in any cell."""
-        some = combined("or", [self.word(flag) for flag in flags], self.graph)
+        some = combined("or", [self.value(flag) for flag in flags], self.graph)
         return Out(self.namer.var(ANSWER), self.graph.node("any", ANSWER, (some,)))
 
     def split(self, mask: Node) -> tuple[list[Node], list[Node]]:
@@ -248,14 +246,12 @@ class Cutter:
         cheap: list[Node] = []
         rest: list[Node] = []
         for part in conjuncts(mask):
-            draws = any(self.is_costly(node) for node in walk(part)) and not self.have(part)
-            more = (of_floats(part) and not self.have(part)) or self.needs(part)
-            (rest if draws or more else cheap).append(part)
+            # Coins are tossed once a step for all masks where planes are processed by rows.
+            draws = (node for node in walk(part) if node.op in DRAWS)
+            costly = any(not (self.costs.by_rows and is_coin(node)) for node in draws)
+            more = not self.have(part) and (costly or of_floats(part) or self.needs(part))
+            (rest if more else cheap).append(part)
         return cheap, rest
-
-    def is_costly(self, node: Node) -> bool:
-        """Whether a draw is made only where a mask's other parts hold."""
-        return node.op in DRAWS
 
     def lazily(self, cheap: list[Node], rest: list[Node]) -> Node:
         """The conjunction; the rest is computed only in words where the cheap parts hold somewhere."""
@@ -272,210 +268,372 @@ class Cutter:
             value = combined("and", [value, part], self.graph)
         return self.graph.node("when", FLAG, (first, value))
 
+    # Masks and movements by rows
+
+    def candidates(self, masks: Compute, guard: Guard) -> None:
+        """Masks, in two steps where they have costly parts: these, and what they need, only if the others hold anywhere."""
+        graph, place = self.graph, masks.place
+        firsts: dict[Node, Out] = {}
+        for out in masks.outs:
+            if (first := firsts.setdefault(out.value, out)) is not out:
+                self.alias({out.var.name: load(graph, first.var)})
+        outs = [*firsts.values()]
+        split = {out.value: self.split(out.value) for out in outs}
+        costly = [out for out in outs if split[out.value][1]]
+        if not costly or not all(cheap for cheap, _ in split.values()):
+            named = {out.value: out.var for out in outs}
+            self.ensure([out.value for out in outs], place, named, masks.when)
+            return
+        whole = [Out(out.var, self.lazily(*split[out.value])) for out in outs]
+        if not any(self.needs(out.value) for out in whole):
+            self.emit(self.words(whole, masks))
+            self.known |= {out.value: out.var for out in outs}
+            return
+        candidates = {}
+        for out in outs:
+            cheap, rest = split[out.value]
+            candidates[out.value] = Out(
+                self.namer.var(FLAG) if rest else out.var, combined("and", cheap, graph)
+            )
+        self.emit(self.words(candidates.values(), masks))
+        asked = [load(graph, out.var) for out in candidates.values()]
+        mine = {out.var.name for out in outs}
+        asked += [self.renamed(node) for node in guard.when if node.attr not in mine]
+        with self.inner() as inner:
+            needed = {frozenset(conjuncts(need)): need for need in self.needs_of(out.value for out in outs)}
+            for value, candidate in candidates.items():
+                need = needed.get(frozenset(split[value][0]))
+                if need is not None:  # the same parts, read at a neighbor
+                    self.known[need] = candidate.var
+            for out in costly:
+                stored = load(graph, candidates[out.value].var)
+                self.split_masks[out.value] = self.under(stored, split[out.value][1])
+            # A mask that the next ones need is stored before them, under its own name.
+            self.ensure([out.value for out in costly], place, {out.value: out.var for out in costly})
+        kept = tuple((out.var, constant(graph, FLAG)) for out in costly)
+        self.emit(Guard(tuple(dict.fromkeys(asked)), tuple(inner), kept, guard.place))
+        self.known |= {out.value: out.var for out in outs}
+
+    def words(self, outs: Iterable[Out], masks: Compute) -> Compute:
+        """The loop of some masks."""
+        words = tuple(replace(out, value=self.value(out.value)) for out in outs)
+        return Compute(words, masks.place, "words", when=masks.when)
+
+    def shared_parts(self, mask: Node) -> list[Node]:
+        """The largest parts that a mask shares with other masks, if one loop can compute them."""
+        if self.have(mask) or mask.op == "not":
+            return []
+        simple = mask in self.shared and mask.op not in UNIFORM and not self.needs(mask)
+        if simple and not any(
+            node.op in DRAWS or is_movement(node) or is_comparison(node) for node in walk(mask)
+        ):
+            return [mask]
+        return [part for arg in mask.args for part in self.shared_parts(arg)] if mask.op == "and" else []
+
+    def then(self, guard: Guard) -> None:
+        """The body of a guard: planes that only move do so in place; the rest stays in a guard."""
+        when = tuple(self.renamed(node) for node in guard.when)
+        outs = [out for one in guard.body if isinstance(one, Compute) for out in one.outs]
+        olds = {var.name: old for var, old in self.kept(guard)}
+        carried = self.carried(outs, olds)
+        others = tuple(out for out in outs if out.value not in carried)
+        first = any(node in carried for out in others for node in walk(out.value))
+        if first:
+            self.move(carried, olds, guard.place)
+        inner: list[Statement] = [one for one in guard.body if isinstance(one, Forget)]
+        inner += [Compute(others, guard.place)] if others else []
+        if inner:
+            body = self.block(tuple(inner), {out.var.name for out in others})
+            keeps = tuple((out.var, olds[out.var.name]) for out in others)
+            self.emit(Guard(when, body, keeps, guard.place))
+        if not first:
+            self.move(carried, olds, guard.place)
+
+    def carried(self, outs: Iterable[Out], olds: dict[str, Node]) -> dict[Node, Var]:
+        """Writes that move their slot's old value, all with the same movers and offset."""
+        carried: dict[Node, Var] = {}
+        for out in outs:
+            node = out.value
+            if not is_movement(node) or node.args[0] is not olds[out.var.name]:
+                continue
+            content, movers, rest = node.args
+            left = Carried(out.var, content, rest).leftover(movers)
+            simple = left == "same" if node.op == "swap" else left is not None
+            near = node.op == "swap" or abs(node.attr[0]) <= 1
+            other = next(iter(carried), node)
+            same = (node.op, node.attr, movers) == (other.op, other.attr, other.args[1])
+            if simple and near and same and self.have(movers):
+                carried[node] = out.var
+        return carried
+
+    def move(self, carried: dict[Node, Var], olds: dict[str, Node], place: str) -> None:
+        planes = []
+        for node, var in carried.items():
+            old, movers, rest = leaves, _, _ = olds[var.name], self.variable(node.args[1]), node.args[2]
+            if rest is not node.args[0]:
+                gone = self.graph.node("not", FLAG, (movers,)) if rest.op == "and" else movers
+                leaves = self.graph.node(rest.op, FLAG, (old, gone))
+            planes.append(Carried(var, old, leaves))
+        for node in [*carried][:1]:
+            self.emit(Move(node.op, node.attr, self.variable(node.args[1]), tuple(planes), place))
+        self.known |= carried
+
     # What must be stored
+
+    def chain(self, node: Node) -> list[Node]:
+        """The choices of a float that get a loop of their own."""
+        return chain_of(node, self.have) if self.costs.by_rows else []
+
+    def needs_of(self, nodes: Iterable[Node]) -> list[Node]:
+        return [need for node in nodes for need in self.needs(node)]
 
     def needs(self, node: Node) -> list[Node]:
         """What must be stored before a node can be computed."""
         if self.have(node):
             return []
+        if self.costs.by_rows and is_movement(node):
+            return [arg for arg in node.args if not self.have(arg)]
+        if chain := self.chain(node):
+            parts = [part for choice in chain for part in self.cell_needs(choice.args[1])]
+            needs = [*(choice.args[0] for choice in chain), *parts, chain[-1].args[2]]
+            return [need for need in needs if not self.have(need) and need not in chain]
         return self.cell_needs(node) if of_floats(node) else self.word_needs(node)
 
-    def again(self, node: Node) -> bool:
-        """Whether a flag's value at a neighbor is stored or cheap to recompute."""
-        most = max(1, self.costs.gates // max(1, self.askers.get(id(node), 1)))
-        return self.have(node) or movable(node, self.have, most)
+    def is_again(self, source: Node, reader: Node) -> bool:
+        """Whether a flag that a node reads at a neighbor is recomputed there, or stored already."""
+        if self.have(source):
+            return True
+        askers, gates = self.askers.get(source, 1), self.costs.gates
+        if not self.costs.by_rows:
+            return movable(source, self.have, max(1, gates // askers))
+        _, dx, wraps = reader.attr
+        # What is read at one neighbor only would fill a plane for it alone.
+        alone = askers == 1
+        cheap = gate_cost(source, self.have) <= gates + (ONLY_READER if alone else 0)
+        return wraps and (is_constant(source) or (cheap and abs(dx) <= (1 if alone else 0)))
 
     def word_needs(self, node: Node) -> list[Node]:
-        found: dict[int, Node] = {}
-        seen: set[int] = set()
+        """The flags at neighbors, the floats and the movements that a loop over words reads."""
+        needs: dict[Node, None] = {}
+        seen: set[Node] = set()
         stack = [node]
         while stack:
             top = stack.pop()
-            if id(top) in seen or self.have(top) or top.op in UNIFORM:
+            if top in seen or self.have(top) or top.op in UNIFORM:
                 continue
-            seen.add(id(top))
-            if of_floats(top):
-                found[id(top)] = top
+            seen.add(top)
+            if of_floats(top) or (self.costs.by_rows and is_movement(top)):
+                needs[top] = None
                 continue
-            sources = {id(source): source for source, _ in sources_of(top)}
-            for source in sources.values():
-                if not self.again(source):
-                    found[id(source)] = source
-                else:
+            sources = dict.fromkeys(source for source, _ in sources_of(top))
+            for source in sources:
+                if self.is_again(source, top):
                     stack.append(source)
-            stack.extend(arg for arg in top.args if id(arg) not in sources)
-        return list(found.values())
+                else:
+                    needs[source] = None
+            stack.extend(arg for arg in top.args if arg not in sources)
+        return [*needs]
 
     def cell_needs(self, node: Node) -> list[Node]:
         """The flags, then the floats, that a loop over cells reads."""
-        found: dict[int, Node] = {}
-        seen: set[int] = set()
+        needs: dict[Node, None] = {}
+        seen: set[Node] = set()
         stack = [node]
         while stack:
             top = stack.pop()
-            if id(top) in seen or (top is not node and self.have(top)):
+            if top in seen or (top is not node and self.have(top)):
                 continue
-            seen.add(id(top))
-            if self.stands_apart(top, node):
-                found[id(top)] = top
+            seen.add(top)
+            if top is not node and not _is_kept(node, self.found) and self.chain(top):
+                needs[top] = None  # long chains are applied before the loop that reads them
             elif top.op == "led":
                 stack.extend(top.args)
             elif top.op == "select" and of_floats(top.args[0]) and not self.have(top.args[0]):
-                found[id(top.args[0])] = top.args[0]  # choices read stored flags
+                needs[top.args[0]] = None  # choices read stored flags
                 stack.extend(top.args[1:])
             elif top.type != REAL and top is not node and not is_comparison(top):
-                if top.op != "param":
-                    found[id(top)] = top
+                needs |= {} if top.op == "param" else {top: None}
             elif top.op == "shift":
                 source = top.args[0]
-                if self.have(source):
-                    continue
-                parts = stored_parts(source, self.have, self.costs.floats) if top.attr[2] else [source]
-                found |= {id(part): part for part in parts}
-                if not parts:
-                    stack.append(source)
+                if not self.have(source):
+                    parts = stored_parts(source, self.have, self.costs.floats) if top.attr[2] else [source]
+                    needs |= dict.fromkeys(parts)
+                    stack.extend([] if parts else [source])
             else:
                 stack.extend(top.args)
-        return sorted(found.values(), key=lambda need: need.type == REAL)
-
-    def stands_apart(self, part: Node, node: Node) -> bool:
-        """Whether a part of a node has a loop of its own before the node's loop."""
-        return False
+        return sorted(needs, key=lambda need: need.type == REAL)
 
     def ensure(
         self,
         nodes: Iterable[Node],
         place: str,
-        named: dict[int, Var] | None = None,
+        named: dict[Node, Var] | None = None,
         when: Node | None = None,
     ) -> None:
         """Store nodes, after everything that they need. `when`: see `Compute`."""
         named = named or {}
-        wanted = [
-            node
-            for node in dict.fromkeys(nodes)
-            if not self.have(node) and not (node.op in UNIFORM and node.type == REAL)
-        ]
-        if not wanted:
-            return
-        before = [
-            need
-            for need in dict.fromkeys(n for node in wanted for n in self.needs(node))
-            if not self.have(need)
-        ]
-        if before:
+        wanted = [node for node in dict.fromkeys(nodes) if node.op not in UNIFORM or node.type != REAL]
+        while wanted := [node for node in wanted if not self.have(node)]:
+            before = [need for need in self.needs_of(wanted) if not self.have(need)]
+            if not before:
+                break
             self.ensure(before, place, named)
-            self.ensure(wanted, place, named, when)
-            return
         floats = [node for node in wanted if of_floats(node)]
         # Floats that are read at neighbors later are stored here, where they are computed anyway.
-        floats += [i for node in floats for i in walk(node) if id(i) in self.wanted and not self.have(i)]
+        floats += [
+            part for node in floats for part in walk(node) if part in self.wanted and not self.have(part)
+        ]
+        floats = [*dict.fromkeys(floats)]
         flags = [node for node in wanted if node not in floats]
 
-        def pairs(nodes: list[Node]) -> list[tuple[Var, Node]]:
-            return [(named.get(id(node)) or self.namer.var(node.type), node) for node in nodes]
+        def pairs(nodes: Iterable[Node]) -> list[tuple[Var, Node]]:
+            return [(named.get(node) or self.namer.var(node.type), node) for node in nodes]
 
-        self.store(list(dict.fromkeys(floats)), flags, pairs, place, when)
+        chains: dict[tuple[Node, ...], list[tuple[Var, Node]]] = {}
+        for var, node in pairs(node for node in floats if self.chain(node)):
+            chains.setdefault(tuple(choice.args[0] for choice in self.chain(node)), []).append((var, node))
+        for group in chains.values():  # chains with the same masks share a loop
+            self.loop(group, place, "choices")
+        floats = [node for node in floats if not self.have(node)]
+        for nodes in connected(floats, _operations) if self.costs.by_rows else [floats]:
+            self.loop(pairs(nodes), place, "cells")
+        moves = [node for node in flags if self.costs.by_rows and is_movement(node)]
+        self.loop(pairs(node for node in flags if node not in moves), place, "words", when)
+        together: dict[tuple[str, Offset, Node], list[Carried]] = {}
+        for var, node in pairs(moves):
+            content, movers, rest = map(self.variable, node.args)
+            together.setdefault((node.op, node.attr, movers), []).append(Carried(var, content, rest))
+            self.known[node] = var
+        for (op, offset, movers), planes in together.items():
+            self.emit(Move(op, offset, movers, tuple(planes), place))
 
-    def store(
-        self, floats: list[Node], flags: list[Node], pairs: Pairs, place: str, when: Node | None
-    ) -> None:
-        """Loops for nodes whose inputs are all stored."""
-        if floats:
-            self.cells(pairs(floats), place)
-        if flags:
-            self.words(pairs(flags), place, when)
-
-    def words(self, pairs: Sequence[tuple[Var, Node]], place: str, when: Node | None = None) -> None:
-        outs = tuple(Out(var, self.word(node)) for var, node in pairs)
-        self.emit(Compute(outs, place, "words", when=when))
-        self.known |= {id(node): var for var, node in pairs if not self.have(node)}
-
-    def cells(
+    def loop(
         self,
-        pairs: Sequence[tuple[Var, Node]],
+        pairs: list[tuple[Var, Node]],
         place: str,
-        over: Literal["cells", "choices"] = "cells",
+        over: Literal["words", "cells", "choices"],
+        when: Node | None = None,
     ) -> None:
-        """A loop over cells: floats first, then comparisons, each after the one under which it is computed."""
-        pairs = sorted(pairs, key=lambda pair: (pair[1].type != REAL, pair[1].op == "led"))
-        cells = _Cells(self)
-        outs = tuple(Out(var, cells.value(node)) for var, node in pairs)
-        self.emit(Compute(outs, place, over))
-        self.known |= {id(node): var for var, node in pairs}
+        """A loop: floats first, then comparisons, each after the one under which it is computed."""
+        if pairs:
+            pairs = sorted(pairs, key=lambda pair: (pair[1].type != REAL, pair[1].op == "led"))
+            outs = tuple(Out(var, self.value(self.split_masks.get(node, node))) for var, node in pairs)
+            self.emit(Compute(outs, place, over, when=when))
+            for var, node in pairs:
+                self.known.setdefault(node, var)
 
-    # Values of a loop
-
-    def word(self, root: Node) -> Node:
-        """A flag in a loop over words; only variables are read at neighbors."""
-        memo: dict[tuple[int, int, int], Node] = {}
+    def value(self, root: Node) -> Node:
+        """A value in a loop: only variables are read at neighbors, the rest is recomputed."""
         graph = self.graph
-
-        def value(node: Node, dy: int = 0, dx: int = 0) -> Node:
-            key = (id(node), dy, dx)
-            if key not in memo:
-                memo[key] = compute(node, dy, dx)
-            return memo[key]
-
-        def compute(node: Node, dy: int, dx: int) -> Node:
+        done: dict[tuple[Node, int, int], Node] = {}
+        stack = [(root, 0, 0)]
+        while stack:
+            node, dy, dx = place = stack[-1]
+            below = self.below(node, dy, dx)
+            missing = [part for part in below if part not in done]
+            if missing:
+                stack.append(missing[0])
+                continue
+            stack.pop()
+            if place in done:
+                continue
+            args = tuple(done[part] for part in below)
             if self.have(node):
-                found = self.variable(node)
-                return graph.node("shift", FLAG, (found,), (dy, dx, True)) if (dy, dx) != (0, 0) else found
-            if is_constant(node):
-                return node
-            if node.op == "shift":
-                sy, sx, wraps = node.attr
-                if not wraps and self.have(node.args[0]):
-                    assert dy == dx == 0
-                    return graph.node("shift", FLAG, (self.variable(node.args[0]),), node.attr)
-                moved = value(node.args[0], dy + sy, dx + sx)
-                if wraps:
-                    return moved
-                assert dy == dx == 0
-                inside = graph.node("inside", FLAG, (), (sy, sx))
-                return graph.node("and", FLAG, (moved, inside))
-            if node.op in LOGIC:
-                return graph.node(node.op, FLAG, tuple(value(arg, dy, dx) for arg in node.args))
-            assert dy == dx == 0
-            if node.op in ("swap", "arrive"):
-                content, movers, rest = node.args
-                sy, sx = node.attr
-                arriving = (value(movers, -sy, -sx), value(content, -sy, -sx), value(rest))
-                found = graph.node("select", FLAG, arriving)
-                if node.op == "swap":
-                    found = graph.node("select", FLAG, (value(movers), value(content, sy, sx), found))
-                return found
-            return graph.node(node.op, FLAG, tuple(value(arg) for arg in node.args), node.attr, node.places)
+                new = self.variable(node)
+                if (dy, dx) != (0, 0):
+                    new = graph.node("shift", node.type, (new,), (dy, dx, True))
+            elif node.op == "shift":
+                if not args:
+                    new = graph.node("shift", node.type, (self.variable(node.args[0]),), node.attr)
+                elif node.attr[2]:
+                    new = args[0]
+                else:
+                    inside = graph.node("inside", FLAG, (), node.attr[:2])
+                    new = graph.node("and", FLAG, (args[0], inside))
+            elif is_movement(node):
+                new = graph.node("select", FLAG, args if node.op == "arrive" else (*args[1:], args[0]))
+            else:
+                new = graph.node(node.op, node.type, args, node.attr) if args else node
+            done[place] = new
+        return done[root, 0, 0]
 
-        return value(root)
-
-
-class _Cells:
-    """Values of one loop over cells; floats at neighbors are read from variables or recomputed."""
-
-    def __init__(self, cutter: Cutter):
-        self.cutter, self.graph = cutter, cutter.graph
-        self.memo: dict[tuple[int, int, int], Node] = {}
-
-    def value(self, node: Node, dy: int = 0, dx: int = 0) -> Node:
-        key = (id(node), dy, dx)
-        if key not in self.memo:
-            self.memo[key] = self.compute(node, dy, dx)
-        return self.memo[key]
-
-    def compute(self, node: Node, dy: int, dx: int) -> Node:
-        graph = self.graph
-        if self.cutter.have(node):
-            found = self.cutter.variable(node)
-            return graph.node("shift", node.type, (found,), (dy, dx, True)) if (dy, dx) != (0, 0) else found
-        if node.op in ("const", "param"):
-            return node
+    def below(self, node: Node, dy: int, dx: int) -> list[tuple[Node, int, int]]:
+        """The nodes from which a node at a neighbor is computed, with the neighbors at which they are read."""
+        if self.have(node):
+            return []
         if node.op == "shift":
             sy, sx, wraps = node.attr
-            if wraps:
-                return self.value(node.args[0], dy + sy, dx + sx)
-            assert dy == dx == 0
-            return graph.node("shift", REAL, (self.cutter.variable(node.args[0]),), node.attr)
-        assert dy == dx == 0 or node.op in ARITHMETIC
-        args = tuple(self.value(arg, dy, dx) for arg in node.args)
-        return graph.node(node.op, node.type, args, node.attr, node.places)
+            stored = not wraps and self.have(node.args[0])
+            return [] if stored else [(node.args[0], dy + sy, dx + sx)]
+        if is_movement(node):
+            (sy, sx), (content, movers, rest) = node.attr, node.args
+            if node.op == "arrive":
+                return [(movers, -sy, -sx), (content, -sy, -sx), (rest, 0, 0)]
+            arrived = self.graph.node("arrive", FLAG, node.args, node.attr)
+            return [(arrived, 0, 0), (movers, 0, 0), (content, sy, sx)]
+        return [(arg, dy, dx) for arg in node.args]
+
+
+def chain_of(node: Node, have: Have) -> list[Node]:
+    """A chain of at least FEWEST choices, outermost first, whose values read stored variables only; else nothing."""
+    chain: list[Node] = []
+    while node.op == "select" and node.type == REAL and not have(node):
+        if node.args[0].op == "param":
+            return []
+        chain.append(node)
+        node = node.args[2]
+    if len(chain) < FEWEST or node.op in UNIFORM:  # a value that is the same in all cells has no field
+        return []
+    # A choice may build on the one below it, which the row still holds, not on those before.
+    for choice in chain:
+        seen, others = {choice.args[2]}, set[Node]()
+        stack = [choice.args[1]]
+        while stack:
+            part = stack.pop()
+            if part in seen or have(part):
+                continue
+            seen.add(part)
+            if part.op in ("select", "draw"):
+                return []
+            if part.op == "shift" and not have(choice.args[2]) and _reads(part, choice.args[2], others):
+                return []
+            stack.extend(part.args)
+    return chain
+
+
+def _reads(node: Node, read: Node, others: set[Node]) -> bool:
+    """Whether a value reads another one. `others`: nodes that do not; those found are added."""
+    stack = [node]
+    while stack:
+        top = stack.pop()
+        if top is read:
+            return True
+        if top not in others:
+            others.add(top)
+            stack.extend(top.args)
+    return False
+
+
+def _is_kept(node: Node, found: set[str]) -> bool:
+    """Whether a float is a clamped slot with some cells replaced by choices."""
+    if node.op != "settle":
+        return False
+    node = node.args[0]
+    while node.op == "select" and node.args[0].op != "param":
+        node = node.args[2]
+    return node.op == "load" and node.attr in found
+
+
+def _operations(node: Node) -> set[object]:
+    """What floats have in common that are computed in the same loop: an operation, or the masks of all choices."""
+    parts = [part for part in walk(node) if part.args]
+    masks = frozenset(part.args[0] for part in parts if part.op == "select")
+    return {*filter(of_floats, parts), ("masks", masks)}
+
+
+def _conjunctions(node: Node) -> Iterator[Node]:
+    """A mask and its nested conjuncts."""
+    yield node
+    if node.op == "and":
+        for arg in node.args:
+            yield from _conjunctions(arg)

@@ -6,18 +6,19 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from powderdsl.ir.ops import FLAG, REAL, Graph, Node, ordered
-from powderdsl.schedule.rewrite import Rule, map_values, with_values
 from powderdsl.schedule.types import (
     Compute,
-    Guard,
+    Facts,
     Namer,
     Out,
     Schedule,
-    Statement,
     conjuncts,
     flat,
     load,
+    map_values,
+    on_all_paths,
     rewritten,
+    without_unread,
 )
 
 COMPARISONS = ("eq", "lt", "le")
@@ -31,44 +32,28 @@ def late(schedule: Schedule) -> Schedule:
     What only moves, more than once, needs not be clamped again.
     `if any m: v2 = select(m, a, v1); … v3 = select(n, b, v2)` → `v3 = select(n, b, select(m, a, v1))`.
     """
-    graph = schedule.graph
     known: dict[str, Node] = {}
 
     def rule(node: Node) -> Node | None:
         return known.get(node.attr) if node.op == "load" else None
 
-    def block(body: tuple[Statement, ...]) -> tuple[Statement, ...]:
-        result: list[Statement] = []
-        for given in body:
-            statement = with_values(given, graph, rule) if known else given
-            match statement:
-                case Compute(outs):
-                    known.update({out.var.name: out.value for out in outs if out.var.type == REAL})
-                    outs = tuple(out for out in outs if out.var.type != REAL)
-                    if outs:
-                        result.append(replace(statement, outs=outs))
-                case Guard(_, inner, keeps):
-                    inner = block(inner)
-                    keeps = tuple(keep for keep in keeps if keep[0].type != REAL)
-                    if inner:
-                        result.append(replace(statement, body=inner, keeps=keeps))
-        return tuple(result)
-
-    body = block(schedule.body)
-    namer = Namer(schedule)
-    outs: dict[int, Out] = {}
+    for statement in flat(schedule.body):
+        new = rewritten(statement.values(), schedule.graph, rule)
+        if isinstance(statement, Compute):
+            known |= {out.var.name: new(out.value) for out in statement.outs if out.var.type == REAL}
+    schedule = map_values(schedule, rule)
+    namer, slots = Namer(schedule), dict(schedule.finds)
+    outs: dict[Node, Out] = {}
     leaves = []
-    found = dict(schedule.finds)
-    for slot, node in schedule.leaves:
-        value = rewritten([node], graph, rule)[id(node)]
-        if value.op == "settle" and slot in found and _only_moves(value.args[0], found[slot].name):
+    for slot, value in schedule.leaves:
+        if value.op == "settle" and slot in slots and _only_moves(value.args[0], slots[slot].name):
             value = value.args[0]
         if value.type == REAL and value.op != "load":
-            out = outs.setdefault(id(value), Out(namer.var(REAL), value))
-            value = load(graph, out.var)
+            out = outs.setdefault(value, Out(namer.var(REAL), value))
+            value = load(schedule.graph, out.var)
         leaves.append((slot, value))
     end = (Compute(tuple(outs.values())),) if outs else ()
-    return replace(schedule, body=(*body, *end), leaves=tuple(leaves))
+    return without_unread(replace(schedule, body=(*schedule.body, *end), leaves=tuple(leaves)))
 
 
 def _only_moves(value: Node, slot: str) -> bool:
@@ -76,13 +61,13 @@ def _only_moves(value: Node, slot: str) -> bool:
 
     After one movement, `narrow` limits the loop to rows in which something moves.
     """
-    stack, seen = [value], set[int]()
+    stack, seen = [value], set[Node]()
     again = False
     while stack:
         node = stack.pop()
-        if id(node) in seen:
+        if node in seen:
             continue
-        seen.add(id(node))
+        seen.add(node)
         match node.op:
             case "select":
                 stack += node.args[1:]
@@ -103,11 +88,10 @@ def chosen(schedule: Schedule) -> Schedule:
 
     `(m ? 22 : 2)[0,1]` → `m[0,1] ? 22 : 2`, where edges wrap.
     """
-    graph = schedule.graph
 
     def rule(node: Node) -> Node | None:
         at_neighbor = node.op == "shift" and node.type == REAL and node.attr[2]
-        return _at_neighbor(node.args[0], node.attr, graph) if at_neighbor else None
+        return _at_neighbor(node.args[0], node.attr, schedule.graph) if at_neighbor else None
 
     return map_values(schedule, rule)
 
@@ -135,51 +119,47 @@ def led(schedule: Schedule) -> Schedule:
     Draws as floats are costly, so their comparisons follow the condition of a choice, too: `c ? (draw < x ? 1 : 2) : 3`
     → `c ? (led(c, draw < x) ? 1 : 2) : 3`.
     """
-    roots = [node for statement in flat(schedule.body) for node in statement.values()]
-    comparisons = [node for node in ordered(roots) if is_comparison(node)]
-    conjoined = _conjoined(roots, comparisons)
-    leaders = _conditions(roots, [node for node in comparisons if _is_drawn(node)])
-    leading = {id(part) for leader in leaders.values() for part in ordered([leader])}
+    roots = schedule.values()
+    comparisons = {node: number for number, node in enumerate(filter(is_comparison, ordered(roots)))}
+    choices, conjunctions = on_all_paths(roots, _choices), on_all_paths(roots, _conjunctions)
+    leaders: dict[Node, Node] = {}
+    for node in filter(_is_drawn, comparisons):
+        free = (flag for flag in choices[node] if flag.op != "param" and not _is_drawn(flag))
+        if leader := next(free, None):
+            leaders[node] = leader
+    leading = set(ordered(leaders.values()))
     for node in comparisons:
-        for number in _bits(conjoined[id(node)]):
-            leader = comparisons[number]
-            free = id(leader) not in leaders and id(node) not in leaders and id(node) not in leading
-            if free and leader.args != node.args:
-                leaders[id(node)] = leader
-                leading.add(id(leader))
-                break
-    return map_values(schedule, _rule(leaders, schedule.graph)) if leaders else schedule
+        for leader in sorted(conjunctions[node], key=comparisons.__getitem__):
+            fixed = leader in leaders or node in leaders or node in leading
+            if not fixed and leader.args != node.args:
+                leaders[node] = leader
+                leading.add(leader)
+
+    def rule(node: Node) -> Node | None:
+        leader = leaders.get(node)
+        return schedule.graph.node("led", FLAG, (leader, node)) if leader is not None else None
+
+    return map_values(schedule, rule) if leaders else schedule
 
 
 def _is_drawn(node: Node) -> bool:
     return any(part.op == "draw" for part in ordered([node]))
 
 
-def _conditions(roots: list[Node], comparisons: list[Node]) -> dict[int, Node]:
-    """By id of a comparison: the condition of a choice that all paths to it take, if one does not depend on draws."""
-    found: dict[int, dict[int, Node]] = {id(root): {} for root in roots}
-    for node in reversed(ordered(roots)):  # users first
-        above = found[id(node)]
-        for number, arg in enumerate(node.args):
-            paths = {} if node.op in AT_NEIGHBORS else above
-            if node.op == "select" and number == 1:
-                paths = {**above, id(node.args[0]): node.args[0]}
-            known = found.get(id(arg), paths)
-            found[id(arg)] = {key: one for key, one in known.items() if key in paths}
-    leaders: dict[int, Node] = {}
-    for node in comparisons:
-        free = [one for one in found[id(node)].values() if one.op != "param" and not _is_drawn(one)]
-        if free:
-            leaders[id(node)] = free[0]
-    return leaders
+def _choices(node: Node, facts: Facts) -> Iterator[tuple[Node, Facts]]:
+    """The conditions of choices on the way to what a node reads. What holds in a cell need not hold at its neighbors."""
+    here = {} if node.op in AT_NEIGHBORS else facts
+    for number, arg in enumerate(node.args):
+        yield arg, here | {node.args[0]: None} if node.op == "select" and number == 1 else here
 
 
-def _rule(leaders: dict[int, Node], graph: Graph) -> Rule:
-    def rule(node: Node) -> Node | None:
-        leader = leaders.get(id(node))
-        return graph.node("led", FLAG, (leader, node)) if leader is not None else None
-
-    return rule
+def _conjunctions(node: Node, facts: Facts) -> Iterator[tuple[Node, Facts]]:
+    """The comparisons with which a conjunction joins what it reads. A path leads to each conjunct at once."""
+    here = {} if node.op in AT_NEIGHBORS else facts
+    parts = conjuncts(node) if node.op == "and" else node.args
+    joined = dict.fromkeys(filter(is_comparison, parts)) if node.op == "and" else {}
+    for part in parts:
+        yield part, here | {other: None for other in joined if other is not part}
 
 
 def is_comparison(node: Node) -> bool:
@@ -190,30 +170,3 @@ def is_comparison(node: Node) -> bool:
 def of_floats(node: Node) -> bool:
     """Whether a node needs a loop over cells: floats, and flags that compare them."""
     return node.type == REAL or node.op == "led" or is_comparison(node)
-
-
-def _conjoined(roots: list[Node], comparisons: list[Node]) -> dict[int, int]:
-    """For each node, by id, the comparisons that every path from a root to it goes through a conjunction with, as bits.
-
-    From a conjunction, paths lead to its conjuncts at once. The path to a conjunct is not one with itself. What holds in
-    a cell need not hold at the neighbors that it reads.
-    """
-    bit = {id(node): 1 << number for number, node in enumerate(comparisons)}
-    found: dict[int, int] = {id(root): 0 for root in roots}
-    for node in reversed(ordered(roots)):  # users first
-        if id(node) not in found:
-            continue  # a conjunction inside others
-        below = conjuncts(node) if node.op == "and" else node.args
-        others = sum(bit.get(id(part), 0) for part in below) if node.op == "and" else 0
-        for part in below:
-            paths = 0 if node.op in AT_NEIGHBORS else found[id(node)] | (others & ~bit.get(id(part), 0))
-            found[id(part)] = found.get(id(part), paths) & paths
-    return found
-
-
-def _bits(number: int) -> Iterator[int]:
-    """The places of the bits of a number that are set, lowest first."""
-    while number:
-        lowest = number & -number
-        yield lowest.bit_length() - 1
-        number ^= lowest

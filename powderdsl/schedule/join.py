@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections import Counter
+from collections.abc import Container, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from powderdsl.ir.ops import FLAG, OPS, REAL, Graph, Node, ordered
 from powderdsl.ir.single import single
 from powderdsl.schedule.types import (
     ANSWER,
+    Block,
     Compute,
+    Facts,
     Guard,
     Namer,
     Out,
@@ -18,14 +21,17 @@ from powderdsl.schedule.types import (
     Statement,
     Sweeps,
     combined,
-    flat,
+    connected,
+    constant,
+    field_reads,
     in_order,
     is_zero,
     load,
     loaded,
+    made_in,
     map_blocks,
-    map_computes,
-    over_variables,
+    map_each,
+    on_all_paths,
     planes_at_neighbors,
     rewritten,
 )
@@ -38,13 +44,8 @@ def narrow(schedule: Schedule) -> Schedule:
     """
     schedule = _where_read(schedule)
     found = {slot: var.name for slot, var in schedule.finds}
-    olds = {str(node.attr): found[slot] for slot, node in schedule.leaves if slot in found}
-
-    def change(loop: Compute) -> list[Statement]:
-        cells = loop.over in ("cells", "choices")
-        return [_narrowed(loop, schedule.graph, olds) if cells else loop]
-
-    return map_computes(schedule, change)
+    olds = {str(node.attr): (found[slot],) for slot, node in schedule.leaves if slot in found}
+    return map_each(schedule, Compute, lambda loop: [_narrowed(loop, schedule.graph, olds)])
 
 
 def _where_read(schedule: Schedule) -> Schedule:
@@ -52,16 +53,27 @@ def _where_read(schedule: Schedule) -> Schedule:
 
     `b = f(a)`, `c = m[0,1] ? x + b[0,1] : x` → `b = m ? f(a) : 0`.
     """
-    graph = schedule.graph
-    statements = list(flat(schedule.body))
-    shifted = planes_at_neighbors(schedule)
-    asking: dict[str, set[str]] = {}  # by field: the flags that hold wherever it is read
-    roots = [node for one in statements for node in one.values()] + [node for _, node in schedule.leaves]
-    for name, where, masks in _field_reads(roots):
-        flags = {shifted[mask][0] for mask in masks if mask in shifted and shifted[mask][1] == where}
-        if where == HERE:
-            flags |= masks
-        asking[name] = asking[name] & flags if name in asking else flags
+    graph, shifted = schedule.graph, planes_at_neighbors(schedule)
+
+    def field_of(node: Node) -> Node | None:
+        """The field that a node reads, here or at a neighbor."""
+        field = node.args[0] if node.op == "shift" else node
+        return field if field.op == "load" and field.type == REAL else None
+
+    def below(node: Node, masks: Facts) -> Iterator[tuple[Node, Facts]]:
+        for number, arg in enumerate(() if field_of(node) else node.args):
+            chosen = node.op == "select" and number == 1 and node.args[0].op == "load"
+            yield arg, masks | {node.args[0]: None} if chosen else masks
+
+    asking: dict[str, set[str]] = {}
+    """By field: the flags that hold wherever it is read."""
+    roots = [*schedule.values(), *(node for _, node in schedule.leaves)]
+    for node, masks in on_all_paths(roots, below).items():
+        if field := field_of(node):
+            names, where = {str(mask.attr) for mask in masks}, node.attr if node.op == "shift" else HERE
+            flags = {shifted[name][0] for name in names if name in shifted and shifted[name][1] == where}
+            flags |= names if where == HERE else set()
+            asking[field.attr] = asking.get(field.attr, flags) & flags
     there = {var.name for _, var in schedule.finds}
 
     def change(loop: Compute) -> list[Statement]:
@@ -69,34 +81,16 @@ def _where_read(schedule: Schedule) -> Schedule:
         for out in loop.outs:
             flags = in_order(asking.get(out.var.name, set()) & there)
             if loop.over == "cells" and out.var.type == REAL and out.var.means is None and flags:
-                mask = graph.node("load", FLAG, (), flags[0])
-                zero = graph.node("const", REAL, (), 0.0)
-                out = replace(out, value=graph.node("select", REAL, (mask, out.value, zero)))
+                args = graph.node("load", FLAG, (), flags[0]), out.value, constant(graph, REAL)
+                out = replace(out, value=graph.node("select", REAL, args))
             outs.append(out)
-        there.update(out.var.name for out in outs)
+        there.update(var.name for var in loop.defined())
         return [replace(loop, outs=tuple(outs))]
 
-    return map_computes(schedule, change)
+    return map_each(schedule, Compute, change)
 
 
 HERE = (0, 0, True)
-
-
-def _field_reads(roots: Sequence[Node]) -> Iterator[tuple[str, tuple[int, int, bool], set[str]]]:
-    """Where values read fields: the field, the neighbor, and the flags under which all that need it choose it."""
-    under: dict[int, set[str]] = {id(root): set() for root in roots}
-    for node in reversed(ordered(roots)):  # users first
-        masks = under.get(id(node))
-        if masks is None:  # read at neighbors only
-            continue
-        field = node.args[0] if node.op == "shift" else node
-        if field.op == "load" and field.type == REAL:
-            yield str(field.attr), node.attr if node.op == "shift" else HERE, masks
-            continue
-        for number, arg in enumerate(node.args):
-            chosen = node.op == "select" and number == 1 and node.args[0].op == "load"
-            found = masks | {str(node.args[0].attr)} if chosen else masks
-            under[id(arg)] = under[id(arg)] & found if id(arg) in under else found
 
 
 def ask_regions(schedule: Schedule) -> Schedule:
@@ -106,69 +100,47 @@ def ask_regions(schedule: Schedule) -> Schedule:
     """
     namer, graph = Namer(schedule), schedule.graph
 
+    def anywhere(node: Node) -> Node | None:
+        """A field is tested in the cell itself only: a region holds somewhere if it does anywhere."""
+        return graph.node("live", FLAG, node.args, (0, 0)) if node.op == "live" else None
+
     def change(loop: Compute) -> list[Statement]:
         if loop.region is None:
             return [loop]
-        question = Out(namer.var(ANSWER), graph.node("any", ANSWER, (_anywhere(loop.region, graph),)))
-        keeps = tuple((out.var, out.otherwise) for out in loop.outs if out.otherwise is not None)
-        asking = Compute((question,), loop.place, "words")
-        return [asking, Guard((load(graph, question.var),), (loop,), keeps, loop.place)]
+        region = rewritten([loop.region], graph, anywhere)(loop.region)
+        question = Out(namer.var(ANSWER), graph.node("any", ANSWER, (region,)))
+        guard = Guard((load(graph, question.var),), (loop,), tuple(loop.unchanged()), loop.place)
+        return [Compute((question,), loop.place, "words"), guard]
 
-    return map_computes(schedule, change)
+    return map_each(schedule, Compute, change)
 
 
-def _narrowed(loop: Compute, graph: Graph, slots: Mapping[str, str]) -> Compute:
+def _narrowed(loop: Compute, graph: Graph, slots: Mapping[str, tuple[str]]) -> Compute:
     """A loop with its region, if it has one. `slots`: the variable that a slot's new value replaces, by the new one's name.
 
     Only a slot's own old value has been clamped to the bounds of that slot.
     """
-    values = [out.value for out in loop.outs]
-    kept = [
-        unchanged(out.value, {slots[out.var.name]}) if out.var.name in slots else None for out in loop.outs
-    ]
-    if all(kept) and loop.over == "cells":
-        olds = [old for old, _ in kept if old is not None]  # type: ignore[misc]
-        masks = [mask for _, chosen in kept for mask in chosen]  # type: ignore[misc]
-        region = _any_of(masks, graph)
-        return _with_region(loop, region, olds)
-    calm = _calm(values)
-    if calm is None:
+    if not loop.of_cells:
         return loop
-    numbers, masks = calm
-    if any(mask.op == "param" for mask in masks):
-        return loop
-    flags = [*masks, *(_live(field, dy, dx, graph) for field, dy, dx in _reads(values))]
-    rest = [
-        graph.node("const", out.var.type, (), bool(number) if out.var.type == FLAG else 0.0)
-        for out, number in zip(loop.outs, numbers, strict=True)
-    ]
-    return _with_region(loop, _any_of(flags, graph), rest)
+    kept = [unchanged(out.value, slots.get(out.var.name, ())) for out in loop.outs]
+    rest = [old for old, _ in filter(None, kept)]
+    flags = [mask for _, masks in filter(None, kept) for mask in masks]
+    if loop.over != "cells" or len(rest) < len(loop.outs):
+        values = [out.value for out in loop.outs]
+        calm = _calm(values)
+        if calm is None:
+            return loop
+        numbers, flags = calm
+        flags += [graph.node("live", FLAG, (field,), (dy, reach)) for field, dy, reach in _reads(values)]
+        rest = [
+            constant(graph, out.var.type, bool(number) and out.var.type == FLAG)
+            for out, number in zip(loop.outs, numbers, strict=True)
+        ]
+    outs = tuple(replace(out, otherwise=other) for out, other in zip(loop.outs, rest, strict=True))
+    return replace(loop, outs=outs, region=combined("or", dict.fromkeys(flags), graph))
 
 
-def _with_region(loop: Compute, region: Node, rest: Iterable[Node]) -> Compute:
-    outs = (replace(out, otherwise=other) for out, other in zip(loop.outs, rest, strict=True))
-    return replace(loop, outs=tuple(outs), region=region)
-
-
-def _any_of(flags: Iterable[Node], graph: Graph) -> Node:
-    found = dict.fromkeys(flags)
-    return combined("or", found, graph) if found else graph.node("const", FLAG, (), False)
-
-
-def _live(field: Node, dy: int, reach: int, graph: Graph) -> Node:
-    return graph.node("live", FLAG, (field,), (dy, reach))
-
-
-def _anywhere(region: Node, graph: Graph) -> Node:
-    """A flag that holds somewhere if a region does; fields are tested in the cell itself only."""
-
-    def rule(node: Node) -> Node | None:
-        return _live(node.args[0], 0, 0, graph) if node.op == "live" else None
-
-    return rewritten([region], graph, rule)[id(region)]
-
-
-def unchanged(value: Node, found: set[str]) -> tuple[Node, list[Node]] | None:
+def unchanged(value: Node, names: Container[str]) -> tuple[Node, list[Node]] | None:
     """For a clamped slot under choices: its old value, and the masks without which it keeps it (it was clamped)."""
     masks = []
     if value.op not in ("settle", "select"):
@@ -177,94 +149,76 @@ def unchanged(value: Node, found: set[str]) -> tuple[Node, list[Node]] | None:
     while node.op == "select":
         masks.append(node.args[0])
         node = node.args[2]
-    known = node.op == "load" and node.attr in found and all(mask.op != "param" for mask in masks)
+    known = node.op == "load" and node.attr in names and all(mask.op != "param" for mask in masks)
     return (node, masks) if known else None
 
 
 def _calm(values: list[Node]) -> tuple[list[float | bool], list[Node]] | None:
     """The values where all floats are zero and no mask holds, and the masks. None if a float is not zero there, or if
     values depend on draws or parameters."""
-    memo: dict[int, Any] = {}
-    masks: dict[int, Node] = {}
+    memo: dict[Node, Any] = {}
+    masks: Facts = {}
 
     def visit(node: Node) -> Any:
-        if id(node) in memo:
-            return memo[id(node)]
-        if node.op == "load":
-            result: Any = 0.0
-        elif node.op == "led" and node.args[0].op == "load":
-            try:
-                result = visit(node.args[1])
-            except LookupError:
-                result = True
-            if result:  # the result depends on the flag
-                masks[id(node.args[0])] = node.args[0]
-                result = False
-        elif node.op == "const":
-            result = single(node.attr)
-        elif node.op == "select":
-            masks[id(node.args[0])] = node.args[0]
-            result = visit(node.args[2])
-        elif node.op in ("param", "draw"):
-            raise LookupError
-        elif node.op == "led":
-            result = visit(node.args[0]) and visit(node.args[1])
-        elif node.op == "shift":
-            result = visit(node.args[0])
-            if result and not node.attr[2]:
-                raise LookupError
-        else:
-            result = OPS[node.op].value(node.attr, *map(visit, node.args))
-        memo[id(node)] = result
-        return result
+        if node not in memo:
+            memo[node] = evaluated(node)
+        return memo[node]
+
+    def evaluated(node: Node) -> Any:
+        match node.op:
+            case "load":
+                return 0.0
+            case "const":
+                return single(node.attr)
+            case "led" if node.args[0].op == "load":
+                try:
+                    result = visit(node.args[1])
+                except LookupError:
+                    result = True
+                if result:  # the result depends on the flag
+                    masks[node.args[0]] = None
+                return False
+            case "led":
+                return visit(node.args[0]) and visit(node.args[1])
+            case "select" if node.args[0].op != "param":
+                masks[node.args[0]] = None
+                return visit(node.args[2])
+            case "shift" if node.attr[2] or not visit(node.args[0]):
+                return visit(node.args[0])
+        return OPS[node.op].value(node.attr, *map(visit, node.args))
 
     try:
-        found = [visit(value) for value in values]
+        numbers = [visit(value) for value in values]
     except LookupError:
         return None
-    if any(isinstance(number, float) and number != 0 for number in found):
+    if any(isinstance(number, float) and number != 0 for number in numbers):
         return None
-    return found, list(masks.values())
+    return numbers, list(masks)
 
 
 def _reads(values: list[Node]) -> list[tuple[Node, int, int]]:
     """Fields that values read where no mask holds: field, rows down, and the largest distance in columns."""
-    reach: dict[tuple[int, int], int] = {}
-    fields: dict[int, Node] = {}
-    below = [(value, 0, 0) for value in values]
-    seen: set[tuple[int, int, int]] = set()
-    while below:
-        node, dy, dx = below.pop()
-        if (id(node), dy, dx) in seen:
+    reach: dict[tuple[Node, int], int] = {}
+    stack = [(value, 0, 0) for value in values]
+    seen: set[tuple[Node, int, int]] = set()
+    while stack:
+        node, dy, dx = top = stack.pop()
+        if top in seen:
             continue
-        seen.add((id(node), dy, dx))
+        seen.add(top)
         if node.op == "load" and node.type == REAL:
-            fields[id(node)] = node
-            reach[id(node), dy] = max(reach.get((id(node), dy), 0), abs(dx))
+            reach[node, dy] = max(reach.get((node, dy), 0), abs(dx))
         elif node.op == "shift":
-            below.append((node.args[0], dy + node.attr[0], dx + node.attr[1]))
-        elif node.op == "select":
-            below.append((node.args[2], dy, dx))
+            stack.append((node.args[0], dy + node.attr[0], dx + node.attr[1]))
         else:
-            below += [(arg, dy, dx) for arg in node.args]
-    order = [node for node in ordered(values) if id(node) in fields]
-    found = [(node, dy, dx) for node in order for (key, dy), dx in reach.items() if key == id(node)]
-    return sorted(found, key=lambda one: (order.index(one[0]), one[1]))
+            stack += [(arg, dy, dx) for arg in node.args[2 if node.op == "select" else 0 :]]
+    order = ordered(values)
+    reads = ((field, dy, dx) for (field, dy), dx in reach.items())
+    return sorted(reads, key=lambda read: (order.index(read[0]), read[1]))
 
 
 FEW = 8
 """The most operations that are applied to the result of choices while it is in registers."""
-
-
-@dataclass(frozen=True)
-class Read:
-    """A field that is read at an offset in rows and columns, or asked whether it is zero there (`live`)."""
-
-    name: str
-    dy: int
-    dx: int
-    wraps: bool
-    live: bool
 
 
 def join(schedule: Schedule) -> Schedule:
@@ -273,33 +227,25 @@ def join(schedule: Schedule) -> Schedule:
     `loop cells: a = …`, `loop cells: b = a[0,1|0] + …` → one loop over the rows of a world, in which `b` follows `a`
     one row behind. Where a loop only continues the choices before it, it becomes one with them.
     """
-    everything = [node for _, node in schedule.leaves]
-    everything += [node for statement in flat(schedule.body) for node in statement.values()]
-    reads: dict[str, int] = {}
-    for name in loaded(everything):
-        reads[name] = reads.get(name, 0) + 1
+    reads = Counter(loaded([*(node for _, node in schedule.leaves), *schedule.values()]))
 
-    def change(block: tuple[Statement, ...]) -> tuple[Statement, ...]:
+    def change(block: Block) -> Block:
         result: list[Statement] = []
         run: list[Compute] = []
         for statement in (*block, None):
-            if isinstance(statement, Compute) and statement.over in ("cells", "choices"):
-                if run and (_asks_masks_of(statement, run) or keeps(statement) or keeps(run[-1])):
-                    result += [_joined(part, reads) for part in _components(run)]
-                    run = []
-                if run and (one := _continued(run[-1], statement, reads, schedule.graph)):
-                    run[-1] = one
-                else:
-                    run.append(statement)
-                continue
-            if run:
-                result += [_joined(part, reads) for part in _components(run)]
+            loop = statement if isinstance(statement, Compute) and statement.of_cells else None
+            if run and (loop is None or _asks_masks_of(loop, run) or keeps(loop) or keeps(run[-1])):
+                result += [_joined(loops, reads) for loops in _components(run)]
                 run = []
-            if statement is not None:
-                result.append(statement)
+            if loop is None:
+                result += [] if statement is None else [statement]
+            elif run and (continued := _continued(run[-1], loop, reads, schedule.graph)):
+                run[-1] = continued
+            else:
+                run.append(loop)
         return tuple(result)
 
-    return replace(schedule, body=map_blocks(schedule.body, change))
+    return map_blocks(schedule, change)
 
 
 def keeps(loop: Compute) -> bool:
@@ -313,7 +259,7 @@ def _asks_masks_of(loop: Compute, run: Sequence[Compute]) -> bool:
     return loop.over == "choices" and not flags.isdisjoint(loaded(loop.values()))
 
 
-def _continued(first: Compute, second: Compute, reads: dict[str, int], graph: Graph) -> Compute | None:
+def _continued(first: Compute, second: Compute, reads: Counter[str], graph: Graph) -> Compute | None:
     """Choices and a few operations on their results as one loop, if nothing else reads these results.
 
     `loop choices: a = m ? x : y`, `loop cells: b = 0.9 * a` → `loop choices: b = 0.9 * (m ? x : y)`.
@@ -321,28 +267,19 @@ def _continued(first: Compute, second: Compute, reads: dict[str, int], graph: Gr
     made = {out.var.name: out.value for out in first.outs}
     if first.over != "choices" or first.region is None or second.region is None:
         return None
-    asked = list(loaded([second.region]))
-    if any(
-        out.var.type != REAL or out.otherwise is None or not is_zero(out.otherwise) for out in second.outs
-    ):
+    if any(out.var.type != REAL or not out.otherwise or not is_zero(out.otherwise) for out in second.outs):
         return None
     nodes = ordered(out.value for out in second.outs)
-    names = [str(node.attr) for node in nodes if node.op == "load"]
     simple = all(node.type == REAL and node.op in CONTINUING for node in nodes)
-    bases = {_base(value) for value in made.values()}
-    operations = [node for node in nodes if node.args]
-    if not simple or len(operations) > FEW or not bases | made.keys() >= {*names, *asked}:
+    known = {_base(value) for value in made.values()} | made.keys()
+    inside = Counter(loaded(second.values()))
+    names = {*loaded(out.value for out in second.outs), *loaded([second.region])}
+    if not simple or sum(bool(node.args) for node in nodes) > FEW or not known >= names:
         return None
-    inside = list(loaded(second.values()))
-    if any(reads.get(name, 0) != inside.count(name) for name in made):
+    if any(reads[name] != inside[name] for name in made):
         return None
-
-    def known(node: Node) -> Node | None:
-        return made.get(str(node.attr)) if node.op == "load" else None
-
-    outs = tuple(
-        Out(out.var, over_variables(out.value, graph, known), None, out.otherwise) for out in second.outs
-    )
+    new = rewritten(nodes, graph, lambda node: made.get(node.attr) if node.op == "load" else None)
+    outs = tuple(Out(out.var, new(out.value), None, out.otherwise) for out in second.outs)
     return replace(first, outs=outs)
 
 
@@ -359,43 +296,23 @@ CONTINUING = ("load", "const", "param", "add", "sub", "mul", "neg", "abs")
 
 def _components(run: Sequence[Compute]) -> list[list[Compute]]:
     """The loops of a run, apart where none reads what another one of them computes."""
-    found: list[tuple[set[str], list[Compute]]] = []
-    for loop in run:
-        names = {out.var.name for out in loop.outs} | set(loaded(loop.values()))
-        joined = [part for part in found if any(out.var.name in names for one in part[1] for out in one.outs)]
-        found = [part for part in found if part not in joined]
-        found.append((names, [*(one for _, loops in joined for one in loops), loop]))
-    order = {id(loop): number for number, loop in enumerate(run)}
-    parts = [sorted(loops, key=lambda loop: order[id(loop)]) for _, loops in found]
-    return sorted(parts, key=lambda loops: order[id(loops[0])])
+    made = made_in(run)
+    return connected(run, lambda loop: made.intersection((*made_in([loop]), *loaded(loop.values()))))
 
 
-def _joined(run: Sequence[Compute], reads: dict[str, int]) -> Sweeps:
+def _joined(run: Sequence[Compute], reads: Counter[str]) -> Sweeps:
+    """The loops with their parts and lags, and the fields that only loops of the same part read."""
     parts, lags = _places(run)
-    written = {
-        out.var.name: part
+    inside = [Counter[str]() for _ in run]
+    for loop, part in zip(run, parts, strict=True):
+        inside[part].update(loaded(loop.values()))
+    passing = (
+        out.var.name
         for loop, part in zip(run, parts, strict=True)
         for out in loop.outs
-        if out.var.type == REAL
-    }
-    inside = dict.fromkeys(written, 0)
-    for loop, part in zip(run, parts, strict=True):
-        for name in loaded(loop.values()):
-            if written.get(name) == part:
-                inside[name] += 1
-    passing = (name for name in written if reads.get(name, 0) == inside[name])
+        if out.var.type == REAL and reads[out.var.name] == inside[part][out.var.name]
+    )
     return Sweeps(tuple(run), tuple(parts), tuple(lags), tuple(passing))
-
-
-def field_reads(loop: Compute) -> Iterator[Read]:
-    """The fields that a loop or its region reads."""
-    for node in ordered(loop.values()):
-        if node.op == "load" and node.type == REAL:
-            yield Read(str(node.attr), 0, 0, True, False)
-        elif node.op in ("shift", "live") and node.args[0].op == "load" and node.args[0].type == REAL:
-            dy, dx, *wraps = node.attr
-            live = node.op == "live"
-            yield Read(str(node.args[0].attr), dy, 0 if live else dx, bool(wraps and wraps[0]), live)
 
 
 def _places(run: Sequence[Compute]) -> tuple[list[int], list[int]]:

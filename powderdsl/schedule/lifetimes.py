@@ -6,11 +6,11 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from powderdsl.ir.ops import FLAG, REAL, Graph, Node, Offset, ordered
-from powderdsl.schedule.join import field_reads, keeps
-from powderdsl.schedule.rewrite import with_values, without_unread
+from powderdsl.ir.ops import FLAG, REAL, Graph, Node, Offset
+from powderdsl.schedule.join import keeps
 from powderdsl.schedule.types import (
     ANSWER,
+    Block,
     Carried,
     Compute,
     Guard,
@@ -24,14 +24,22 @@ from powderdsl.schedule.types import (
     Sync,
     Var,
     combined,
+    constant,
+    field_reads,
     flat,
     in_order,
     is_zero,
+    live_before,
     load,
     loaded,
-    map_computes,
+    map_blocks,
+    map_each,
     planes_at_neighbors,
+    read_by,
     read_elsewhere,
+    reads_of,
+    rewritten,
+    without_unread,
 )
 
 
@@ -40,48 +48,33 @@ def release(schedule: Schedule) -> Schedule:
 
     `swap by m: b = a`, where `a` is not read again → `b = a into a`; the same where a loop over words changes some words.
     """
-    live = set(loaded(node for _, node in schedule.leaves))
-    body = _block(schedule.body, live, Namer(schedule), schedule.graph)
-    return replace(schedule, body=body)
+    namer, graph = Namer(schedule), schedule.graph
 
+    def block(body: Block, live: set[str]) -> Block:
+        """The statements with releases. `live`: the variables that are read after them."""
+        lives = [live]
+        for statement in reversed(body):
+            lives.append(live_before(statement, lives[-1]))
+        result: list[Statement] = []
+        for statement, after in zip(body, lives[-2::-1], strict=True):
+            used = read_by((statement,)) | {var.name for var in statement.defined() if var.type != ANSWER}
+            if isinstance(statement, Guard):
+                # Outer variables are released after the guard, whether its body runs or not.
+                statement = replace(statement, body=block(statement.body, after | used))
+            elif isinstance(statement, Move):
+                statement = _in_place(statement, after)
+            elif isinstance(statement, Compute) and statement.region is not None:
+                statement = _updated(statement, after)
+            elif isinstance(statement, Sweeps) and keeps(statement.loops[0]):
+                statement = replace(statement, loops=(_updated(statement.loops[0], after),))
+            elif isinstance(statement, Sweeps):
+                statement = _overtaken(_put_off(statement, after, namer, graph), after)
+            result.append(statement)
+            if gone := used - after - set(statement.ended()):
+                result.append(Release(tuple(in_order(gone))))
+        return tuple(result)
 
-def _block(
-    body: Sequence[Statement], live_end: set[str], namer: Namer, graph: Graph
-) -> tuple[Statement, ...]:
-    lives: list[set[str]] = []
-    live = set(live_end)
-    for statement in reversed(body):
-        lives.append(live)
-        live = live_before(statement, live)
-    result: list[Statement] = []
-    for given, after in zip(body, reversed(lives), strict=True):
-        statement = given
-        written = {var.name for var in statement.defined() if var.type != ANSWER}
-        gone = (reads(statement) | written) - after
-        if isinstance(statement, Guard):
-            outside = reads(statement) - made_in(statement.body)
-            kept = {var.name for var, _ in statement.keeps}
-            # Outer variables are released after the guard, whether its body runs or not.
-            inner = _block(statement.body, after | kept | outside, namer, graph)
-            statement = replace(statement, body=inner)
-            gone = (outside | kept) - after
-        elif isinstance(statement, Move):
-            statement = _in_place(statement, after)
-            gone -= {plane.into for plane in statement.planes if plane.into is not None}
-        elif isinstance(statement, Sweeps) and keeps(statement.loops[0]):
-            loop = _overwriting(statement.loops[0], after)
-            statement = replace(statement, loops=(loop,))
-            gone -= {out.into for out in loop.outs if out.into is not None}
-        elif isinstance(statement, Sweeps):
-            statement = _overtaken(_put_off(statement, after, namer, graph), after)
-            gone -= {out.into for loop in statement.loops for out in loop.outs if out.into is not None}
-        elif isinstance(statement, Compute) and statement.region is not None:
-            statement = _updated(statement, after | read_elsewhere(statement.values()))
-            gone -= {out.into for out in statement.outs if out.into is not None}
-        result.append(statement)
-        if gone:
-            result.append(Release(tuple(in_order(gone))))
-    return tuple(result)
+    return replace(schedule, body=block(schedule.body, set(loaded(node for _, node in schedule.leaves))))
 
 
 def _in_place(move: Move, after: set[str]) -> Move:
@@ -89,19 +82,24 @@ def _in_place(move: Move, after: set[str]) -> Move:
     reads = Counter(loaded([move.movers]))
     for plane in move.planes:
         reads.update(set(loaded([plane.old, plane.leaves])))
-
-    def overwritten(plane: Carried) -> str | None:
+    planes = []
+    for plane in move.planes:
         stays = plane.leaves if plane.leaves.op in ("load", "const") else plane.old
-        free = stays.op == "load" and stays.attr not in after and reads[str(stays.attr)] == 1
-        return str(stays.attr) if free else None
+        free = stays.op == "load" and stays.attr not in after and reads[stays.attr] == 1
+        planes.append(replace(plane, into=stays.attr if free else None))
+    return replace(move, planes=tuple(planes))
 
-    return replace(move, planes=tuple(replace(plane, into=overwritten(plane)) for plane in move.planes))
 
-
-def _overwriting(loop: Compute, after: set[str]) -> Compute:
-    """A loop that changes some rows of fields, in place where nothing reads the old one elsewhere."""
-    far = {read.name for read in field_reads(loop) if (read.dy or read.dx) and not read.live}
-    return _updated(loop, after | far)
+def _updated(loop: Compute, after: set[str]) -> Compute:
+    """A loop that changes some words or rows in place, where nothing reads the old ones later or elsewhere."""
+    needed = after | {read.name for read in reads_of(loop.values()) if read.far and not read.live}
+    olds = Counter(old.attr for _, old in loop.unchanged() if old.op == "load")
+    ended = {name for name, count in olds.items() if count == 1} - needed
+    outs = (
+        replace(out, into=out.otherwise.attr) if out.otherwise and out.otherwise.attr in ended else out
+        for out in loop.outs
+    )
+    return replace(loop, outs=tuple(outs))
 
 
 def _put_off(sweeps: Sweeps, after: set[str], namer: Namer, graph: Graph) -> Sweeps:
@@ -111,115 +109,56 @@ def _put_off(sweeps: Sweeps, after: set[str], namer: Namer, graph: Graph) -> Swe
     """
     loop = sweeps.loops[0]
     lasting = [out for out in loop.outs if out.var.name not in sweeps.passing]
-    first, readers = _last_reads(sweeps, after)
-    free = [name for name in first if first[name] < NEVER and readers[name] == 0]
-    if (
-        loop.over != "choices"
-        or loop.region is None
-        or any(sweeps.parts)
-        or not lasting
-        or len(free) < len(lasting)
-    ):
+    free = [lag for lag, reader in _last_reads(sweeps, after).values() if reader == 0]
+    choices = loop.over == "choices" and loop.region is not None and not any(sweeps.parts)
+    if not choices or not lasting or len(free) < len(lasting):
         return sweeps
     waiting = {out.var.name: namer.var(REAL) for out in lasting}
-
-    def rule(node: Node) -> Node | None:
-        return load(graph, waiting[str(node.attr)]) if node.op == "load" and node.attr in waiting else None
-
-    loops = [with_values(one, graph, rule) for one in sweeps.loops]
+    olds = {name: load(graph, var) for name, var in waiting.items()}
+    loops = []
+    for one in sweeps.loops:
+        new = rewritten(one.values(), graph, lambda node: olds.get(node.attr) if node.op == "load" else None)
+        loops.append(one.with_values(new))
     outs = tuple(replace(out, var=waiting.get(out.var.name, out.var)) for out in loop.outs)
-    zero = graph.node("const", REAL, (), 0.0)
-    olds = [load(graph, waiting[out.var.name]) for out in lasting]
-    region = combined("or", [graph.node("live", FLAG, (old,), (0, 0)) for old in olds], graph)
-    stored = tuple(Out(out.var, old, None, zero) for out, old in zip(lasting, olds, strict=True))
+    zero = constant(graph, REAL)
+    region = combined("or", [graph.node("live", FLAG, (old,), (0, 0)) for old in olds.values()], graph)
+    stored = tuple(Out(out.var, olds[out.var.name], None, zero) for out in lasting)
     return Sweeps(
-        (replace(loop, outs=outs), *(one for one in loops[1:] if isinstance(one, Compute)), Compute(stored, loop.place, "cells", region)),
+        (replace(loops[0], outs=outs), *loops[1:], Compute(stored, loop.place, "cells", region)),
         (*sweeps.parts, 0),
-        (*sweeps.lags, max(first[name] for name in free)),
+        (*sweeps.lags, max(free)),
         (*sweeps.passing, *(var.name for var in waiting.values())),
-    )  # fmt: skip
+    )
 
 
-def _last_reads(sweeps: Sweeps, after: set[str]) -> tuple[dict[str, int], dict[str, int]]:
-    """By field that loops read: the least lag with which a row of it may be written over, and the last loop that reads it."""
-    made = {out.var.name for loop in sweeps.loops for out in loop.outs}
-    first: dict[str, int] = {}
-    readers: dict[str, int] = {}
+def _last_reads(sweeps: Sweeps, after: set[str]) -> dict[str, tuple[int, int]]:
+    """By field that may be written over: the least lag with which that can be done to a row, and its last reader."""
+    reads: dict[str, tuple[int, int]] = {}
+    kept = after | {var.name for var in sweeps.defined()}
     for number, (loop, part, lag) in enumerate(zip(sweeps.loops, sweeps.parts, sweeps.lags, strict=True)):
         for read in field_reads(loop):
-            far = part > 0 or (read.live and read.dy != 0)
-            least = NEVER if far or read.name in after or read.name in made else lag - read.dy + 1
-            first[read.name] = max(first.get(read.name, 0), least)
-            readers[read.name] = number
-    return first, readers
+            if part > 0 or (read.live and read.dy):
+                kept.add(read.name)
+            reads[read.name] = max(reads.get(read.name, (0, 0))[0], lag - read.dy + 1), number
+    return {name: last for name, last in reads.items() if name not in kept}
 
 
 def _overtaken(sweeps: Sweeps, after: set[str]) -> Sweeps:
     """Loops with fields that overwrite a field which earlier loops of the part have read in all rows so far."""
-    first, readers = _last_reads(sweeps, after)
+    reads = _last_reads(sweeps, after)
     loops = []
     for number, (loop, part, lag) in enumerate(zip(sweeps.loops, sweeps.parts, sweeps.lags, strict=True)):
-        free = [name for name in first if first[name] <= lag and readers[name] < number and part == 0]
+        free = [
+            name for name, (least, reader) in reads.items() if least <= lag and reader < number and part == 0
+        ]
         outs = []
         for out in loop.outs:
             lasts = out.var.type == REAL and out.var.name not in sweeps.passing
             into = free.pop(0) if lasts and free else None
-            if into is not None:
-                first[into] = NEVER
+            reads.pop(into or "", None)
             outs.append(replace(out, into=into))
         loops.append(replace(loop, outs=tuple(outs)))
     return replace(sweeps, loops=tuple(loops))
-
-
-NEVER = 1 << 30
-
-
-def _updated(loop: Compute, after: set[str]) -> Compute:
-    olds = Counter(str(out.otherwise.attr) for out in loop.outs if out.otherwise is not None)
-    outs = []
-    for out in loop.outs:
-        old = str(out.otherwise.attr) if out.otherwise is not None else ""
-        ends = old and old not in after and olds[old] == 1
-        outs.append(replace(out, into=old) if ends else out)
-    return replace(loop, outs=tuple(outs))
-
-
-def live_before(statement: Statement, after: set[str]) -> set[str]:
-    """The variables that are live before a statement, given those that are live after it."""
-    live = after - {var.name for var in statement.defined()}
-    return live | (reads(statement) - made_in([statement]))
-
-
-def reads(statement: Statement) -> set[str]:
-    """The variables that a statement reads, including nested statements."""
-    names: set[str] = set()
-    for inner in flat([statement]):
-        passing = inner.passing if isinstance(inner, Sweeps) else ()
-        names |= set(loaded(inner.values())) - set(passing)
-    return names
-
-
-def made_in(body: Sequence[Statement]) -> set[str]:
-    """The variables that statements define, including nested ones."""
-    return {var.name for statement in flat(body) for var in statement.defined()}
-
-
-@dataclass(frozen=True)
-class _Swap:
-    """The movers of a swap, where they go, and the field whose values they exchange.
-
-    `fresh` lists the flags under which the value is zero afterwards, the last one first to be asked.
-    """
-
-    movers: Node
-    offset: Offset
-    field: Node
-    fresh: tuple[tuple[Node, Node], ...]
-
-    @property
-    def kind(self) -> object:
-        """What fields have in common that one loop exchanges."""
-        return self.movers, self.offset, tuple(mask for mask, _ in self.fresh)
 
 
 def swaps(schedule: Schedule) -> Schedule:
@@ -229,79 +168,74 @@ def swaps(schedule: Schedule) -> Schedule:
     slot stay within its bounds wherever they are. What becomes zero afterwards does so in a loop over rows where it does.
     """
     offsets = {
-        str(one.movers.attr): one.offset
-        for one in flat(schedule.body)
-        if isinstance(one, Move) and one.op == "swap"
+        str(statement.movers.attr): statement.offset
+        for statement in flat(schedule.body)
+        if isinstance(statement, Move) and statement.op == "swap"
     }
     if not offsets:
         return schedule
     shifted = planes_at_neighbors(schedule)
-    slots = {str(node.attr): slot for slot, node in schedule.leaves if node.op == "load"}
+    slots = {node.attr: slot for slot, node in schedule.leaves if node.op == "load"}
     settled = {var.name: slot for slot, var in schedule.finds if var.type == REAL}
     """Fields that hold values of a slot, with the slot."""
 
     namer, graph = Namer(schedule), schedule.graph
 
     def change(loop: Compute) -> list[Statement]:
-        floats = loop.over in ("cells", "choices")
-        found = [_swap(out, offsets, shifted) for out in loop.outs] if floats else []
+        found = [_swap(out.value, offsets, shifted) for out in loop.outs if loop.of_cells]
         first = found[0] if found else None
         if first is None:
             return [loop]
+        movers, offset, _, fresh = first
         planes, outs = [], []
         for out, swap in zip(loop.outs, found, strict=True):
-            if swap is None or swap.kind != first.kind:
+            if swap is None or (swap[0], swap[1], swap[3]) != (movers, offset, fresh):
                 return [loop]
-            slot = settled.get(str(swap.field.attr))
+            old = swap[2]
+            slot = settled.get(old.attr)
             if out.value.op == "settle" and (slot is None or slots.get(out.var.name) != slot):
                 return [loop]
-            moved = namer.var(REAL) if swap.fresh else out.var
+            moved = namer.var(REAL) if fresh else out.var
             if slot is not None:
                 settled[moved.name] = settled[out.var.name] = slot
-            planes.append(Carried(moved, swap.field, swap.field))
+            planes.append(Carried(moved, old, old))
             value = load(graph, moved)
-            for mask, number in swap.fresh:
-                value = graph.node("select", REAL, (mask, number, value))
+            for mask in fresh:
+                value = graph.node("select", REAL, (mask, constant(graph, REAL), value))
             outs.append(Out(out.var, value, None, load(graph, moved)))
-        statements: list[Statement] = [Move("swap", first.offset, first.movers, tuple(planes), loop.place)]
-        if first.fresh:
-            region = combined("or", [mask for mask, _ in first.fresh], graph)
-            statements.append(Compute(tuple(outs), loop.place, "cells", region))
-        return statements
+        move = Move("swap", offset, movers, tuple(planes), loop.place)
+        region = combined("or", fresh, graph)
+        return [move, Compute(tuple(outs), loop.place, "cells", region)] if fresh else [move]
 
-    return without_unread(map_computes(schedule, change))
+    return without_unread(map_each(schedule, Compute, change))
 
 
 def _swap(
-    out: Out, offsets: Mapping[str, Offset], shifted: Mapping[str, tuple[str, tuple[int, int, bool]]]
-) -> _Swap | None:
-    """The swap whose result a value is. Movers come before or after their targets: no cell is both."""
-    value = out.value.args[0] if out.value.op == "settle" else out.value
-    fresh: list[tuple[Node, Node]] = []
+    value: Node, offsets: Mapping[str, Offset], shifted: Mapping[str, tuple[str, tuple[int, int, bool]]]
+) -> tuple[Node, Offset, Node, tuple[Node, ...]] | None:
+    """The swap whose result a value is: its movers, where they go, the field whose values they exchange, and the flags
+    under which the value is zero afterwards, the last one first to be asked.
+
+    Movers come before or after their targets: no cell is both.
+    """
+    value = value.args[0] if value.op == "settle" else value
+    fresh: tuple[Node, ...] = ()
     while value.op == "select" and value.args[0].op == "load" and is_zero(value.args[1]):
-        fresh.insert(0, (value.args[0], value.args[1]))
-        value = value.args[2]
+        fresh, value = (value.args[0], *fresh), value.args[2]
     if value.op != "select" or value.args[2].op != "select":
         return None
     field = value.args[2].args[2]
-    chosen = [(one.args[0], one.args[1]) for one in (value, value.args[2])]
+    chosen = [choice.args[:2] for choice in (value, value.args[2])]
     if field.op != "load" or field.type != REAL or any(mask.op != "load" for mask, _ in chosen):
         return None
     for (movers, there), (targets, back) in (chosen, chosen[::-1]):
-        dy, dx = offset = offsets.get(str(movers.attr), (0, 0))
-        opposite = (-dy, -dx, True)
-        if (
-            offset != (0, 0)
-            and shifted.get(str(targets.attr)) == (movers.attr, opposite)
-            and _reads(there, field, (dy, dx, True))
-            and _reads(back, field, opposite)
-        ):
-            return _Swap(movers, offset, field, tuple(fresh))
+        dy, dx = offset = offsets.get(movers.attr, (0, 0))
+        ways = (dy, dx, True), (-dy, -dx, True)
+        reads = [(node.op, node.args[:1], node.attr) for node in (there, back)]
+        exchanged = reads == [("shift", (field,), way) for way in ways]
+        if offset != (0, 0) and exchanged and shifted.get(targets.attr) == (movers.attr, ways[1]):
+            return movers, offset, field, fresh
     return None
-
-
-def _reads(value: Node, field: Node, where: tuple[int, int, bool]) -> bool:
-    return value.op == "shift" and value.args[0] is field and value.attr == where
 
 
 FOREVER = 1 << 30
@@ -326,106 +260,114 @@ def buffers(schedule: Schedule, homes: Mapping[str, int], pool: Pool, *, in_plac
         pool: shared by all passes; it grows.
         in_place: whether a loop may overwrite planes that it reads at neighbors, by storing only after all reads.
     """
-    found = {var.name: homes[slot] for slot, var in schedule.finds}
-    types = {var.name: var.type.name for _, var in schedule.finds}
-    changed = {slot for slot, _ in schedule.leaves}
-    plan = _Plan(schedule, pool, in_place)
-    plan.buffer = {name: (types[name], number) for name, number in found.items()}
-    plan.open = {(node.type.name, homes[slot]) for slot, node in schedule.leaves}
-    plan.wanted = {}
+    numbers = _Plan(schedule, homes, pool, in_place).assigned()
+    graph, namer = schedule.graph, Namer(schedule)
+
+    def moves(var: Var, old: Node) -> bool:
+        """Whether the value that a variable has where nothing happens lies in another buffer."""
+        return old.op == "load" and numbers[old.attr] != numbers[var.name]
+
+    def change(body: Block) -> Block:
+        """The statements with the copies that the assignment requires."""
+        result: list[Statement] = []
+        for statement in body:
+            if isinstance(statement, Guard):
+                pairs = [keep for keep in statement.keeps if keep[1].op != "load" or moves(*keep)]
+                statement = replace(statement, otherwise=tuple(copies(pairs, graph)))
+            elif isinstance(statement, Compute):
+                across = {numbers[read.name] for read in reads_of(statement.values()) if read.far}
+                held = any(numbers.get(var.name) in across for var in statement.defined())
+                moved = any(moves(*pair) for pair in statement.unchanged())
+                statement = replace(statement, held=held, region=None if moved else statement.region)
+            result.append(statement)
+        return tuple(result)
+
+    schedule = map_blocks(schedule, change)
+    leaves, pairs = [], []
     for slot, node in schedule.leaves:
-        if node.op == "load":
-            plan.wanted.setdefault(node.attr, homes[slot])
-    plan.run(kept=[var.name for slot, var in schedule.finds if slot not in changed])
-    return _explicit(schedule, plan, homes)
+        home = (node.type.name, homes[slot])
+        if node.op != "load" or numbers[node.attr] != home:
+            var = namer.var(node.type)
+            numbers[var.name] = home
+            pairs.append((var, node))
+            node = load(graph, var)
+        leaves.append((slot, node))
+    body = (*schedule.body, *copies(pairs, graph))
+    return replace(schedule, body=body, leaves=tuple(leaves), buffers=tuple(sorted(numbers.items())))
 
 
-@dataclass
 class _Plan:
-    schedule: Schedule
-    pool: Pool
-    in_place: bool
-    buffer: dict[str, Buffer] = field(default_factory=dict)
-    open: set[Buffer] = field(default_factory=set)
-    """Buffers of the slots that the pass changes; until its end they may hold other values."""
-    wanted: dict[str, int] = field(default_factory=dict)
-    """The slot's buffer in which a variable must end up."""
-    last: dict[str, int] = field(default_factory=dict)
-    defined: dict[str, int] = field(default_factory=dict)
-    follows: dict[str, str] = field(default_factory=dict)
-    """The variable whose value each variable has if its statement is skipped."""
-    ends: dict[str, int] = field(default_factory=dict)
-    """The position at which that value must be in place."""
+    """Assigns buffers in the order of the statements; a guard comes after its body."""
 
-    def run(self, kept: Sequence[str]) -> None:
-        """Assign all buffers; those of the variables `kept` hold slots that the pass does not change."""
-        order = list(_in_order(self.schedule.body))
-        for position, statement in enumerate(order):
-            self.number(statement, position)
-        self.last |= dict.fromkeys(kept, FOREVER)
-        end = len(order)
-        for _, node in self.schedule.leaves:
+    def __init__(self, schedule: Schedule, homes: Mapping[str, int], pool: Pool, in_place: bool):
+        self.pool, self.in_place = pool, in_place
+        self.buffer: dict[str, Buffer] = {
+            var.name: (var.type.name, homes[slot]) for slot, var in schedule.finds
+        }
+        self.open = {(node.type.name, homes[slot]) for slot, node in schedule.leaves}
+        """Buffers of the slots that the pass changes; until its end they may hold other values."""
+        self.wanted: dict[str, int] = {}
+        """The slot's buffer in which a variable must end up."""
+        self.last: dict[str, int] = {}
+        """The position at which each variable is last read."""
+        self.follows: dict[str, str] = {}
+        """The variable whose value each variable has if its statement is skipped."""
+        self.ends: dict[str, int] = {}
+        """The position at which that value must be in place."""
+        self.order = list(_in_order(schedule.body))
+        defined: dict[str, int] = {}
+        for position, statement in enumerate(self.order):
+            if isinstance(statement, Compute):
+                self.read(position, *loaded(statement.values()))
+                defined |= {var.name: position for var in statement.defined()}
+            self.read(position, *(var.name for var in statement.defined()))
+            for var, old in statement.unchanged():
+                self.ends[var.name] = position
+                if old.op == "load":
+                    self.follows[var.name] = old.attr
+        changed = {slot for slot, _ in schedule.leaves}
+        self.read(FOREVER, *(var.name for slot, var in schedule.finds if slot not in changed))
+        for slot, node in schedule.leaves:
             if node.op == "load":
-                self.last[node.attr] = max(self.last.get(node.attr, -1), end)
-        for name, old in self.follows.items():
-            if name in self.defined:
-                self.last[old] = max(self.last.get(old, -1), self.defined[name])
+                self.wanted.setdefault(node.attr, homes[slot])
+                self.read(len(self.order), node.attr)
+        for name, before in self.follows.items():
+            self.read(defined[name], before)
+
+    def read(self, position: int, *names: str) -> None:
+        self.last |= {name: max(self.last.get(name, -1), position) for name in names}
+
+    def assigned(self) -> dict[str, Buffer]:
+        """The buffer of each variable."""
         busy = {number: name for name, number in self.buffer.items()}
-        for position, statement in enumerate(order):
+        for position, statement in enumerate(self.order):
             busy = {key: name for key, name in busy.items() if self.last.get(name, -1) >= position}
             if not isinstance(statement, Compute):
                 continue
-            reads = neighbors(statement)
-            for out in statement.outs:
-                if out.var.type == ANSWER:
-                    continue
-                found = self.taken_over(out.var, statement, reads, position, busy)
-                if found is None:
-                    found = self.free(out.var, busy)
-                    if old := self.follows.get(
-                        out.var.name, ""
-                    ):  # it is copied there, so it must still exist
-                        self.last[old] = max(self.last.get(old, -1), self.ends[out.var.name])
-                kind, number = found
-                self.pool.size[kind] = max(self.pool.size[kind], number + 1)
-                self.buffer[out.var.name] = found
-                busy[found] = out.var.name
+            for var in (var for var in statement.defined() if var.type != ANSWER):
+                number = self.taken_over(var, statement, position, busy)
+                if number is None:
+                    number = self.free(var, busy)
+                    if old := self.follows.get(var.name):  # it is copied there, so it must still exist
+                        self.read(self.ends[var.name], old)
+                kind, count = number
+                self.pool.size[kind] = max(self.pool.size[kind], count + 1)
+                self.buffer[var.name] = number
+                busy[number] = var.name
+        return self.buffer
 
-    def number(self, statement: Statement, position: int) -> None:
-        """Note where variables are defined and last read, and what they replace."""
-        if isinstance(statement, Compute):
-            for name in neighbors(statement):
-                self.last[name] = position
-            for out in statement.outs:
-                self.defined[out.var.name] = position
-                self.last.setdefault(out.var.name, position)
-                if out.otherwise is not None and out.otherwise.op == "load":
-                    self.follow(out.var.name, out.otherwise.attr, position)
-        elif isinstance(statement, Guard):
-            for var, value in statement.keeps:
-                self.ends[var.name] = position
-                if value.op == "load":
-                    self.follow(var.name, value.attr, position)
-                    self.last[var.name] = max(self.last.get(var.name, -1), position)
-
-    def follow(self, name: str, old: str, position: int) -> None:
-        self.follows[name], self.ends[name] = old, position
-
-    def taken_over(
-        self, var: Var, loop: Compute, reads: Mapping[str, bool], position: int, busy: Mapping[Buffer, str]
-    ) -> Buffer | None:
+    def taken_over(self, var: Var, loop: Compute, position: int, busy: Mapping[Buffer, str]) -> Buffer | None:
         """The buffer to reuse: that of the variable it replaces, or its slot's, if nothing reads it after this loop."""
-        home = busy.get((var.type.name, self.wanted.get(var.name, -1)), "")
-        for old in (self.follows.get(var.name, ""), home):
-            if not old or self.last.get(old, -1) > position:
+        near = {read.name for read in reads_of(loop.values())}
+        far = read_elsewhere(loop.values())
+        home = busy.get((var.type.name, self.wanted.get(var.name, -1)))
+        for old in filter(None, (self.follows.get(var.name), home)):
+            if self.last.get(old, -1) > position or busy.get(self.buffer[old]) != old:
                 continue
-            if busy.get(self.buffer[old]) != old:
-                continue
-            if reads.get(old) and not (self.in_place and loop.over == "words"):
-                continue
-            if old in reads and loop.over == "cells" and var.type == FLAG:
-                continue  # one thread would write a word that others read
-            return self.buffer[old]
+            shared = old in far and not (self.in_place and loop.over == "words")
+            # A thread that computes cells would write a word that others read.
+            if not shared and not (old in near and loop.over == "cells" and var.type == FLAG):
+                return self.buffer[old]
         return None
 
     def free(self, var: Var, busy: Mapping[Buffer, str]) -> Buffer:
@@ -434,76 +376,15 @@ class _Plan:
         home = self.wanted.get(var.name)
         if home is not None and (kind, home) not in busy:
             return kind, home
-        return kind, next(
-            n
-            for n in range(FOREVER)
-            if (kind, n) not in busy and (n >= self.pool.slots[kind] or (kind, n) in self.open)
-        )
+        slots = {number for number in range(self.pool.slots[kind]) if (kind, number) not in self.open}
+        return kind, next(n for n in range(FOREVER) if (kind, n) not in busy and n not in slots)
 
 
 def _in_order(body: Sequence[Statement]) -> Iterator[Statement]:
-    """All statements in order; a guard comes after its body."""
     for statement in body:
-        if isinstance(statement, Guard):
-            yield from _in_order(statement.body)
+        for block in statement.blocks():
+            yield from _in_order(block)
         yield statement
-
-
-def neighbors(statement: Statement) -> dict[str, bool]:
-    """The variables that a statement reads, and whether it reads them at neighbors too."""
-    found: dict[str, bool] = {}
-    for node in ordered(statement.values()):
-        if node.op == "load":
-            found.setdefault(node.attr, False)
-        elif node.op in ("shift", "live") and node.args[0].op == "load" and any(node.attr[:2]):
-            found[node.args[0].attr] = True
-    return found
-
-
-def _explicit(schedule: Schedule, plan: _Plan, homes: Mapping[str, int]) -> Schedule:
-    """The schedule with the copies that the assignment requires."""
-    graph, namer = schedule.graph, Namer(schedule)
-    numbers = dict(plan.buffer)
-
-    def block(body: Sequence[Statement]) -> tuple[Statement, ...]:
-        result: list[Statement] = []
-        for statement in body:
-            if isinstance(statement, Guard):
-                pairs = [
-                    (var, value)
-                    for var, value in statement.keeps
-                    if value.op != "load" or numbers[value.attr] != numbers[var.name]
-                ]
-                result.append(
-                    replace(statement, body=block(statement.body), otherwise=tuple(copies(pairs, graph)))
-                )
-            elif isinstance(statement, Compute):
-                across = {numbers[name] for name, far in neighbors(statement).items() if far}
-                held = any(numbers.get(out.var.name) in across for out in statement.outs)
-                moved = any(
-                    out.otherwise is not None
-                    and out.otherwise.op == "load"
-                    and numbers[out.otherwise.attr] != numbers[out.var.name]
-                    for out in statement.outs
-                )
-                result.append(replace(statement, held=held, region=None if moved else statement.region))
-            else:
-                result.append(statement)
-        return tuple(result)
-
-    body = block(schedule.body)
-    leaves, pairs = [], []
-    for slot, node in schedule.leaves:
-        home = (node.type.name, homes[slot])
-        if node.op == "load" and numbers[node.attr] == home:
-            leaves.append((slot, node))
-            continue
-        var = namer.var(node.type)
-        numbers[var.name] = home
-        pairs.append((var, node))
-        leaves.append((slot, load(graph, var)))
-    end = tuple(copies(pairs, graph))
-    return replace(schedule, body=(*body, *end), leaves=tuple(leaves), buffers=tuple(sorted(numbers.items())))
 
 
 def copies(pairs: Sequence[tuple[Var, Node]], graph: Graph) -> Iterator[Compute]:
@@ -513,19 +394,13 @@ def copies(pairs: Sequence[tuple[Var, Node]], graph: Graph) -> Iterator[Compute]
         yield Compute(flags, "", "words")
     floats = [(var, value) for var, value in pairs if var.type == REAL]
     if floats:
-        zero = graph.node("const", REAL, (), 0.0)
-        region: Node = graph.node("const", FLAG, (), False)
-        outs = []
-        for var, value in floats:
-            if value.op == "load":
-                live = graph.node("live", FLAG, (value,), (0, 0))
-                region = live if region.op == "const" else graph.node("or", FLAG, (region, live))
-            outs.append(Out(var, value, None, zero))
-        yield Compute(tuple(outs), "", "cells", region)
+        lives = (graph.node("live", FLAG, (old,), (0, 0)) for _, old in floats if old.op == "load")
+        outs = tuple(Out(var, value, None, constant(graph, REAL)) for var, value in floats)
+        yield Compute(outs, "", "cells", combined("or", lives, graph))
 
 
-Access = tuple[bool, bool, bool]
-"""Whether an access is in a loop over words, of the thread's own word only, and a write."""
+Access = tuple[bool, bool]
+"""Whether an access is in a loop over words, of the thread's own word only; whether it is a write."""
 
 
 @dataclass
@@ -534,80 +409,49 @@ class Pending:
 
     done: dict[Buffer, set[Access]] = field(default_factory=dict)
 
-    def clashes(self, buffer: Buffer, access: Access) -> bool:
-        """Whether an access needs a barrier before it. A thread has the same words in all loops over words."""
-        words, own, written = access
-        return any(
-            (written or before_written) and not (words and before_words and own and before_own)
-            for before_words, before_own, before_written in self.done.get(buffer, ())
+    def add(self, accesses: Sequence[tuple[Buffer, Access]]) -> bool:
+        """Note the accesses of a loop. True if it needs a barrier before it: a thread has the same words in all loops."""
+        wait = any(
+            (written or before_written) and not (own and before_own)
+            for buffer, (own, written) in accesses
+            for before_own, before_written in self.done.get(buffer, ())
         )
-
-    def add(self, buffer: Buffer, access: Access) -> None:
-        self.done.setdefault(buffer, set()).add(access)
-
-    def join(self, other: Pending) -> None:
-        for buffer, accesses in other.done.items():
-            self.done.setdefault(buffer, set()).update(accesses)
-
-    def copy(self) -> Pending:
-        return Pending({buffer: set(accesses) for buffer, accesses in self.done.items()})
+        if wait:
+            self.done.clear()
+        for buffer, access in accesses:
+            self.done.setdefault(buffer, set()).add(access)
+        return wait
 
 
 def barriers(schedule: Schedule, pending: Pending) -> Schedule:
     """The schedule with barriers. `pending` is handed from pass to pass; computing an answer is a barrier too."""
-    placing = _Placing(dict(schedule.buffers), pending)
-    return replace(schedule, body=placing.block(schedule.body))
+    numbers = dict(schedule.buffers)
 
-
-@dataclass
-class _Placing:
-    buffers: dict[str, Buffer]
-    pending: Pending
-
-    def block(self, body: Sequence[Statement]) -> tuple[Statement, ...]:
+    def block(body: Block) -> Block:
         result: list[Statement] = []
         for statement in body:
             if isinstance(statement, Guard):
-                before = self.pending.copy()
-                inner = self.block(statement.body)
-                after = self.pending.copy()
-                self.pending.done = before.done
-                otherwise = self.block(statement.otherwise)
-                self.pending.join(after)
-                result.append(replace(statement, body=inner, otherwise=otherwise))
-                continue
-            if isinstance(statement, Compute):
-                if self.access(self.accesses(statement)):
+                before = {buffer: set(accesses) for buffer, accesses in pending.done.items()}
+                inner = block(statement.body)
+                after, pending.done = pending.done, before
+                statement = replace(statement, body=inner, otherwise=block(statement.otherwise))
+                pending.done |= {
+                    buffer: accesses | pending.done.get(buffer, set()) for buffer, accesses in after.items()
+                }
+            elif isinstance(statement, Compute):
+                words = statement.over == "words"
+                accesses = reads_of(statement.values())
+                reads = [(numbers[read.name], (words and not read.far, False)) for read in accesses]
+                stored = [var for var in statement.defined() if var.type != ANSWER]
+                writes = [(numbers[var.name], (words, True)) for var in stored]
+                if pending.add(reads if statement.held else [*reads, *writes]):
                     result.append(Sync())
-                if statement.held:
-                    result.append(statement)
-                    # It has a barrier of its own between reading and storing.
-                    self.pending.done.clear()
-                    self.access(self.writes(statement))
-                else:
-                    result.append(statement)
-                if any(out.var.type == ANSWER for out in statement.outs):
-                    self.pending.done.clear()
-                continue
+                if statement.held:  # it has a barrier of its own between reading and storing
+                    pending.done.clear()
+                    pending.add(writes)
+                if len(stored) < len(statement.outs):
+                    pending.done.clear()
             result.append(statement)
         return tuple(result)
 
-    def accesses(self, loop: Compute) -> list[tuple[Buffer, Access]]:
-        words = loop.over == "words"
-        reads = [(self.buffers[name], (words, not far, False)) for name, far in neighbors(loop).items()]
-        return reads if loop.held else [*reads, *self.writes(loop)]
-
-    def writes(self, loop: Compute) -> list[tuple[Buffer, Access]]:
-        words = loop.over == "words"
-        return [
-            (self.buffers[out.var.name], (words, True, True)) for out in loop.outs if out.var.type != ANSWER
-        ]
-
-    def access(self, accesses: list[tuple[Buffer, Access]]) -> bool:
-        """Note the accesses of a loop. True if it needs a barrier before it."""
-        wait = any(self.pending.clashes(*one) for one in accesses)
-        if wait:
-            self.pending.done.clear()
-        for one in accesses:
-            self.pending.add(*one)
-        return wait
+    return replace(schedule, body=block(schedule.body))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import reduce
 from operator import or_
 
@@ -52,24 +52,18 @@ def presence(schedule: Schedule) -> Schedule:
         return replace(schedule, body=(*schedule.body, Forget())) if leaves else schedule
     body: list[Statement] = []
     times = _times(schedule, bits)
-    for i, statement in enumerate(schedule.body):
-        after = schedule.body[i + 1] if i + 1 < len(schedule.body) else None
-        match statement:
-            case Compute(outs) if isinstance(after, Guard):
-                asked = {node.attr for node in after.when if node.op == "load"}
-                if asked == {out.var.name for out in outs}:
-                    when = _asked([out.value for out in outs], bits, times, schedule.graph)
-                    statement = replace(statement, when=when)
-                body.append(statement)
-            case Guard(_, inner, keeps):
-                changed = [(var, old) for var, old in keeps if var.name in bits]
-                if changed and not _only_swaps(statement, {var.name: old for var, old in changed}):
-                    statement = replace(statement, body=(Forget(), *inner))
-                body.append(statement)
-            case Compute(outs) if any(out.var.name in bits for out in outs):
-                body += [statement, Forget()]
-            case _:
-                body.append(statement)
+    for statement, after in zip(schedule.body, (*schedule.body[1:], None), strict=True):
+        if isinstance(statement, Guard):
+            olds = {var.name: old for var, old in statement.keeps if var.name in bits}
+            if olds and not _only_swaps(statement, olds):
+                statement = replace(statement, body=(Forget(), *statement.body))
+        writes = isinstance(statement, Compute) and any(out.var.name in bits for out in statement.outs)
+        if isinstance(statement, Compute) and isinstance(after, Guard):
+            writes = False
+            if {out.var.name for out in statement.outs} == {mask.attr for mask in after.when}:
+                masks = [out.value for out in statement.outs]
+                statement = replace(statement, when=_asked(masks, bits, times, schedule.graph))
+        body += [statement, Forget()] if writes else [statement]
     if any(node.op != "load" for node in leaves):
         body.append(Forget())
     return replace(schedule, body=tuple(body), when=_pass_asks(schedule, bits))
@@ -78,18 +72,15 @@ def presence(schedule: Schedule) -> Schedule:
 def _element_bits(schedule: Schedule) -> dict[str, int]:
     """For each variable that holds a bit of the element: which bit. Empty if there are more than MAX_PLANES."""
     bits: dict[str, int] = {}
-    for slot, var in schedule.finds:
+    ends = [(slot, str(node.attr)) for slot, node in schedule.leaves if node.op == "load"]
+    for slot, name in (*((slot, var.name) for slot, var in schedule.finds), *ends):
         if slot.startswith(_ELEMENT):
-            bits[var.name] = int(slot.removeprefix(_ELEMENT))
-    for slot, node in schedule.leaves:
-        if slot.startswith(_ELEMENT) and node.op == "load":
-            bits[node.attr] = int(slot.removeprefix(_ELEMENT))
+            bits[name] = int(slot.removeprefix(_ELEMENT))
     pairs = [
-        (var.name, str(value.attr))
+        (var.name, str(old.attr))
         for statement in flat(schedule.body)
-        if isinstance(statement, Guard)
-        for var, value in statement.keeps
-        if value.op == "load"
+        for var, old in statement.unchanged()
+        if old.op == "load"
     ]
     for new, old in (*pairs, *reversed(pairs)):  # forward from the inputs, backward from the outputs
         for known, other in ((old, new), (new, old)):
@@ -107,22 +98,17 @@ def _times(schedule: Schedule, bits: dict[str, int]) -> dict[str, Time]:
     current: dict[int, str] = {}
     begins: dict[str, int] = {}
     ends: dict[str, int] = {}
-    assigned = [var.name for _, var in schedule.finds]
-    for statement in flat(schedule.body):
-        if isinstance(statement, Compute):
-            assigned += [out.var.name for out in statement.outs]
-    for name in assigned:
-        if name not in bits:
-            continue
-        bit = bits[name]
-        if bit in changed:
-            change, changed = change + 1, set()
-        changed.add(bit)
-        begins[name] = change
-        if bit in current:
-            ends[current[bit]] = change
-        current[bit] = name
-    return {name: (begins[name], ends.get(name, change + 1)) for name in begins}
+    computed = (out.var for one in flat(schedule.body) if isinstance(one, Compute) for out in one.outs)
+    for var in (*(var for _, var in schedule.finds), *computed):
+        if (bit := bits.get(var.name)) is not None:
+            if bit in changed:
+                change, changed = change + 1, set()
+            changed.add(bit)
+            begins[var.name] = change
+            if bit in current:
+                ends[current[bit]] = change
+            current[bit] = var.name
+    return {name: (begin, ends.get(name, change + 1)) for name, begin in begins.items()}
 
 
 def _only_swaps(guard: Guard, olds: dict[str, Node]) -> bool:
@@ -141,33 +127,28 @@ def _pass_asks(schedule: Schedule, bits: dict[str, int]) -> Node | None:
     Until something changes, slots hold their values from the beginning of the pass, so every mask is judged as if it
     were the first.
     """
-    masks: dict[str, Node] = {}
-    chains: dict[str, Guard] = {}
+    values: dict[str, Node] = {}
+    guards: dict[str, tuple[Guard, Node]] = {}
     for statement in schedule.body:
         if isinstance(statement, Compute):
-            masks |= {out.var.name: out.value for out in statement.outs}
+            values |= {out.var.name: out.value for out in statement.outs}
         elif isinstance(statement, Guard):
-            chains |= {var.name: statement for var, _ in statement.keeps}
-    found = {var.name: slot for slot, var in schedule.finds}
-    asked: list[Node] = []
+            guards |= {var.name: (statement, old) for var, old in statement.keeps}
+    slots = {var.name: slot for slot, var in schedule.finds}
+    masks: list[Node] = []
     for slot, node in schedule.leaves:
-        if node.op != "load":
-            return None
-        name = str(node.attr)
-        if node.type == REAL:
-            kept = unchanged(masks[name], set(found)) if name in masks else None
-            if kept is None or found[str(kept[0].attr)] != slot:
+        if node.type == REAL and node.op == "load":
+            kept = unchanged(values[node.attr], slots) if node.attr in values else None
+            if kept is None:
                 return None
-            asked += [masks.get(str(mask.attr), mask) for mask in kept[1]]
-            continue
-        while name in chains:
-            guard = chains[name]
-            asked += [masks.get(str(mask.attr), mask) for mask in guard.when]
-            old = next(value for var, value in guard.keeps if var.name == name)
-            name = str(old.attr)
-        if found.get(name) != slot:
+            node, choices = kept
+            masks += choices
+        while node.op == "load" and node.attr in guards:
+            guard, node = guards[node.attr]
+            masks += guard.when
+        if node.op != "load" or slots.get(node.attr) != slot:
             return None
-    return _asked(asked, bits, {}, schedule.graph)
+    return _asked([values.get(str(mask.attr), mask) for mask in masks], bits, {}, schedule.graph)
 
 
 def when_present(masks: list[Node], schedule: Schedule) -> Node | None:
@@ -178,7 +159,7 @@ def when_present(masks: list[Node], schedule: Schedule) -> Node | None:
 
 def _asked(masks: list[Node], bits: dict[str, int], times: dict[str, Time], graph: Graph) -> Node | None:
     """An answer that is true whenever one of some masks holds anywhere; None if none is known."""
-    needs = _Needs(1 + max(bits.values()), bits, times)
+    needs = _Needs(bits, times)
     ways = dict.fromkeys(needs.of(mask) for mask in masks)
     if not ways or frozenset() in ways:
         return None
@@ -190,117 +171,85 @@ def _asked(masks: list[Node], bits: dict[str, int], times: dict[str, Time], grap
 
 def asked_ids(schedule: Schedule) -> int:
     """All ids whose presence a schedule tests."""
-    roots = [] if schedule.when is None else [schedule.when]
-    roots += [node for statement in flat(schedule.body) for node in statement.values()]
-    return reduce(or_, (node.attr for node in ordered(roots) if node.op == "present"), 0)
+    nodes = ordered([*schedule.values(), *([schedule.when] if schedule.when else [])])
+    return reduce(or_, (node.attr for node in nodes if node.op == "present"), 0)
 
 
-@dataclass
-class _Needs:
-    """For each flag: the ids for which it holds, if it depends on the cell's element alone; the ids that a cell
-    can have where it holds; and sets of ids of each of which one must be present somewhere.
+@dataclass(frozen=True)
+class _Ids:
+    """The ids that a cell can have where a flag holds, at some time; `exact`, if it holds in all cells with these ids.
 
-    A cell has an id at a time: bits from before and after a change say nothing together.
+    Of each of `sets` one id must be present somewhere for the flag to hold anywhere.
     """
 
-    planes: int
-    bits: dict[str, int]
-    times: dict[str, Time]
-    time: dict[int, Time] = field(default_factory=dict)
-    exact: dict[int, int | None] = field(default_factory=dict)
-    cell: dict[int, int] = field(default_factory=dict)
-    sets: dict[int, Sets] = field(default_factory=dict)
+    cell: int
+    exact: bool
+    time: Time
+    sets: Sets
 
-    def __post_init__(self) -> None:
-        self.everything = (1 << (1 << self.planes)) - 1
-        self.columns = [
-            sum(1 << code for code in range(1 << self.planes) if code >> bit & 1)
-            for bit in range(self.planes)
-        ]
+
+class _Needs:
+    """What flags say about ids. A cell has an id at a time: bits from before and after a change say nothing together."""
+
+    def __init__(self, bits: dict[str, int], times: dict[str, Time]):
+        self.bits, self.times = bits, times
+        self.known: dict[Node, _Ids] = {}
+        codes = 1 << 1 + max(bits.values())
+        self.everything = (1 << codes) - 1
+        self.columns = {
+            bit: sum(1 << code for code in range(codes) if code >> bit & 1) for bit in bits.values()
+        }
 
     def of(self, mask: Node) -> Sets:
         """Sets of ids of each of which one must be present for the mask to hold anywhere."""
         for node in ordered([mask]):
-            key = id(node)
-            if key in self.exact:
-                continue
-            begin, end = self.time[key] = self._time(node)
-            exact = self.exact[key] = self._exact(node) if begin < end else None
-            if begin >= end:
-                self.cell[key], self.time[key] = self.everything, ALWAYS
-            else:
-                self.cell[key] = self._cell(node) if exact is None else exact
-            self.sets[key] = frozenset() if exact is not None else self._sets(node)
-        return self._all(mask)
+            if node not in self.known:
+                self.known[node] = self._ids(node, [self.known[arg] for arg in node.args])
+        return self.known[mask].sets
 
-    def _time(self, node: Node) -> Time:
-        """When the cell's ids are those that `exact` and `cell` know; empty if they never are together."""
-        if node.op == "load":
-            return self.times.get(str(node.attr), ALWAYS)
-        if node.op not in ("and", "or", "xor", "not", "select"):
-            return ALWAYS
-        times = [self.time[id(arg)] for arg in node.args if self.cell[id(arg)] != self.everything]
-        return max([begin for begin, _ in times], default=0), min(
-            [end for _, end in times], default=ALWAYS[1]
-        )
-
-    def _all(self, node: Node) -> Sets:
-        cell = self.cell[id(node)]
-        return _least(self.sets[id(node)] | ({cell} if cell != self.everything else set()))
-
-    def _exact(self, node: Node) -> int | None:
-        if node.op == "load" and node.attr in self.bits:
-            return self.columns[self.bits[node.attr]]
-        if node.op == "const" and node.type == FLAG:
-            return self.everything if node.attr else 0
-        if node.op not in ("and", "or", "xor", "not", "select"):
-            return None
-        match node.op, [self.exact[id(arg)] for arg in node.args]:
-            case "and", [int(a), int(b)]:
-                return a & b
-            case "or", [int(a), int(b)]:
-                return a | b
-            case "xor", [int(a), int(b)]:
-                return a ^ b
-            case "not", [int(a)]:
-                return self.everything ^ a
-            case "select", [int(asked), int(yes), int(no)]:
-                return asked & yes | ~asked & no
-        return None
-
-    def _cell(self, node: Node) -> int:
-        cells = [self.cell[id(arg)] for arg in node.args]
+    def _ids(self, node: Node, args: list[_Ids]) -> _Ids:
+        cells, sets = [arg.cell for arg in args], [arg.sets for arg in args]
+        together = node.op in ("and", "or", "xor", "not", "select")
+        exact = together and all(arg.exact for arg in args)
+        times = [arg.time for arg in args if together and arg.cell != self.everything]
+        cell, needs = self.everything, Sets()
         match node.op:
+            case "load" if node.attr in self.bits:
+                cell, exact = self.columns[self.bits[node.attr]], True
+                times = [self.times.get(node.attr, ALWAYS)]
+            case "const" if node.type == FLAG:
+                cell, exact = self.everything if node.attr else 0, True
+            case "not" if exact:
+                cell = self.everything ^ cells[0]
             case "and":
-                return cells[0] & cells[1]
+                cell, needs = cells[0] & cells[1], _least(sets[0] | sets[1])
             case "or" | "xor":
-                return cells[0] | cells[1]
+                both = cells[0] & cells[1] if exact and node.op == "xor" else 0
+                cell, needs = (cells[0] | cells[1]) ^ both, _either(*sets)
             case "select":
-                return cells[0] & cells[1] | cells[2]
-        return self.everything
-
-    def _sets(self, node: Node) -> Sets:
-        match node.op:
-            case "and":
-                return _least(self._all(node.args[0]) | self._all(node.args[1]))
-            case "or" | "xor":
-                return _either(self._all(node.args[0]), self._all(node.args[1]))
+                chosen = cells[0] if exact else 0
+                cell = cells[0] & cells[1] | cells[2] & ~chosen
+                needs = _either(_least(sets[0] | sets[1]), sets[2])
             case "shift":
-                return self._all(node.args[0])
-            case "select":
-                chosen = _least(self._all(node.args[0]) | self._all(node.args[1]))
-                return _either(chosen, self._all(node.args[2]))
-        return frozenset()
+                needs = sets[0]
+        begin, end = (
+            max([begin for begin, _ in times], default=0),
+            min([end for _, end in times], default=ALWAYS[1]),
+        )
+        if begin >= end:  # they never are together
+            cell, exact, begin, end = self.everything, False, *ALWAYS
+        needs = Sets() if exact else needs
+        return _Ids(cell, exact, (begin, end), _least(needs | {cell} - {self.everything}))
 
 
 def _either(a: Sets, b: Sets) -> Sets:
-    return _least(frozenset(one | other for one in a for other in b))
+    return _least(one | other for one in a for other in b)
 
 
 def _least(sets: Iterable[int]) -> Sets:
     """The smallest sets, at most MAX_SETS. A set that contains another adds nothing."""
-    kept: list[int] = []
+    least: list[int] = []
     for ids in sorted(sets, key=lambda ids: (ids.bit_count(), ids)):
-        if not any(one & ids == one for one in kept):
-            kept.append(ids)
-    return frozenset(kept[:MAX_SETS])
+        if not any(smaller & ids == smaller for smaller in least):
+            least.append(ids)
+    return frozenset(least[:MAX_SETS])

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from powderdsl.ir.ops import REAL, Node, ordered
-from powderdsl.schedule.join import field_reads, keeps
-from powderdsl.schedule.types import Compute, Out, Schedule, Sweeps, alternatives, flat
+from powderdsl.schedule.join import keeps
+from powderdsl.schedule.types import Compute, Out, Schedule, Sweeps, alternatives, field_reads, flat
 
 ANY_PASS = 1 << 30
 """A field is read as far as any pass reads its slot."""
@@ -127,7 +127,7 @@ def _saved(sweeps: Sweeps) -> dict[str, int]:
 
 def region_of(loop: Compute) -> tuple[list[Node], list[str]]:
     """Where a loop has work: fields that are live in some row (`live`), and planes."""
-    parts = [] if loop.region is None else alternatives(loop.region)
+    parts = alternatives(loop.region)
     return [part for part in parts if part.op == "live"], [str(p.attr) for p in parts if p.op == "load"]
 
 

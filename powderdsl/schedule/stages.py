@@ -8,14 +8,12 @@ from dataclasses import dataclass
 from powderdsl.ir.ops import PassGraph
 from powderdsl.schedule.costs import Costs, conditions, thresholds
 from powderdsl.schedule.cut import cut
-from powderdsl.schedule.cut_rows import cut_rows
 from powderdsl.schedule.floats import chosen, late, led
 from powderdsl.schedule.join import ask_regions, join, narrow
 from powderdsl.schedule.lifetimes import release, swaps
 from powderdsl.schedule.lower import lower
 from powderdsl.schedule.presence import presence
-from powderdsl.schedule.rewrite import without_unread
-from powderdsl.schedule.types import Schedule
+from powderdsl.schedule.types import Schedule, without_unread
 from powderdsl.schedule.verify import verify
 from powderdsl.schedule.words import early, empty, updates
 
@@ -66,7 +64,7 @@ CPU = (
     ),
     Stage(
         "cut",
-        cut_rows(Costs(gates=6, floats=2)),
+        cut(Costs(gates=6, floats=2, by_rows=True)),
         "where loops over rows begin and end, and which movements happen in place",
     ),
     Stage("unread", without_unread, "variables that nothing reads after `cut` are removed"),

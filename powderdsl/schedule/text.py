@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 
-from powderdsl.ir.ops import Node, ordered
+from powderdsl.ir.ops import FLAG, Node, ordered
 from powderdsl.ir.text import attr_text
 from powderdsl.schedule.types import (
     Compute,
@@ -20,7 +20,6 @@ from powderdsl.schedule.types import (
     Schedule,
     Statement,
     Sweeps,
-    Sync,
 )
 
 _INFIX = {
@@ -66,12 +65,12 @@ def _block(body: Sequence[Statement], indent: str, names: _Names) -> Iterator[st
 def _statement(statement: Statement, indent: str, names: _Names) -> Iterator[str]:
     values = _Values(statement.values(), names)
     match statement:
-        case Compute(outs, _, over, region):
+        case Compute(outs, _, over, region, when):
             if over:
                 where = f" over {values.text(region)}" if region is not None else ""
-                where += f" when {values.text(statement.when)}" if statement.when is not None else ""
+                where += f" when {values.text(when)}" if when is not None else ""
                 yield from (f"{indent}{line}" for line in values.taken())
-                yield f"{indent}loop {over}{where}{' held' if statement.held else ''}"
+                yield f"{indent}loop {over}{where}"
                 indent += "  "
             for out in outs:
                 value = values.text(out.value)
@@ -79,14 +78,11 @@ def _statement(statement: Statement, indent: str, names: _Names) -> Iterator[str
                 into = f" into {names.of(out.into)}" if out.into else ""
                 rest = f" else {values.text(out.otherwise)}" if out.otherwise is not None else ""
                 yield f"{indent}{names.of(out.var.name)} = {value}{rest}{into}"
-        case Sync():
-            yield f"{indent}sync"
-        case Forget():
-            yield f"{indent}forget elements"
         case Sweeps(loops, parts, lags):
             for loop, part, lag in zip(loops, parts, lags, strict=True):
                 if len(loops) > 1:
-                    yield f"{indent}{f'row by row, part {part}' if parts[-1] else 'row by row'}{f', {lag} behind' if lag else ''}"
+                    behind = f", {lag} behind" if lag else ""
+                    yield f"{indent}row by row{f', part {part}' if parts[-1] else ''}{behind}"
                 yield from _statement(loop, indent + ("  " if len(loops) > 1 else ""), names)
         case Move(op, (dy, dx), movers, planes):
             yield f"{indent}{op} by {values.text(movers)} [{dy:+d},{dx:+d}]"
@@ -95,15 +91,17 @@ def _statement(statement: Statement, indent: str, names: _Names) -> Iterator[str
                 into = f" into {names.of(plane.into)}" if plane.into else ""
                 yield f"{indent}  {names.of(plane.new.name)} = {values.text(plane.old)}{leaves}{into}"
         case Guard(when, inner, keeps):
-            asked = " | ".join(values.text(node) for node in when)
+            asked = " | ".join(map(values.text, when))
             yield from (f"{indent}{line}" for line in values.taken())
             yield f"{indent}if any {asked}"
             yield from _block(inner, indent + "  ", names)
-            kept = ", ".join(f"{names.of(var.name)} = {values.text(value)}" for var, value in keeps)
-            if kept:
-                yield f"{indent}else {kept}"
-        case Release(gone):
-            yield f"{indent}release {', '.join(names.of(name) for name in gone)}"
+            if keeps:
+                olds = (f"{names.of(var.name)} = {values.text(value)}" for var, value in keeps)
+                yield f"{indent}else {', '.join(olds)}"
+        case Release(released):
+            yield f"{indent}release {', '.join(map(names.of, released))}"
+        case Forget():
+            yield f"{indent}forget elements"
 
 
 class _Values:
@@ -112,9 +110,9 @@ class _Values:
     def __init__(self, roots: Iterable[Node], names: _Names):
         roots = list(roots)
         self.names = names
-        self.uses = Counter(id(node) for node in roots)
-        self.uses.update(id(arg) for node in ordered(roots) for arg in node.args)
-        self.known: dict[int, str] = {}
+        self.uses = Counter(roots)
+        self.uses.update(arg for node in ordered(roots) for arg in node.args)
+        self.known: dict[Node, str] = {}
         self.lines: list[str] = []
         self.count = 0
 
@@ -125,24 +123,22 @@ class _Values:
 
     def text(self, root: Node) -> str:
         for node in ordered([root]):
-            if id(node) not in self.known:
+            if node not in self.known:
                 text = self._node(node)
-                if self.uses[id(node)] > 1 and node.args and node is not root:
+                if self.uses[node] > 1 and node.args and node is not root:
                     self.count += 1
                     self.lines.append(f"  t{self.count} = {text}")
                     text = f"t{self.count}"
-                self.known[id(node)] = text
-        return self.known[id(root)]
+                self.known[node] = text
+        return self.known[root]
 
     def _node(self, node: Node) -> str:
-        args = [self.known[id(arg)] for arg in node.args]
-        if node.op == "load":
-            return self.names.of(node.attr)
-        if node.op in _INFIX and len(args) == 2:
-            return f"({args[0]} {_INFIX[node.op]} {args[1]})"
+        args = [self.known[arg] for arg in node.args]
         match node.op:
+            case "load":
+                return self.names.of(node.attr)
             case "const":
-                return str(int(node.attr)) if node.type.name == "flag" else repr(node.attr)
+                return str(int(node.attr)) if node.type == FLAG else repr(node.attr)
             case "not":
                 return f"~{args[0]}"
             case "select":
@@ -150,8 +146,9 @@ class _Values:
             case "shift":
                 dy, dx, wraps = node.attr
                 return f"{args[0]}[{dy},{dx}{'' if wraps else '|0'}]"
-        if node.op == "present":
-            return f"present({node.attr:#x})"
-        if node.attr is not None:
-            args.append(attr_text(node.attr))
+            case "present":
+                return f"present({node.attr:#x})"
+        if node.op in _INFIX and len(args) == 2:
+            return f"({args[0]} {_INFIX[node.op]} {args[1]})"
+        args += [] if node.attr is None else [attr_text(node.attr)]
         return f"{node.op}({', '.join(args)})"

@@ -9,15 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import chain
-from typing import Literal, Self
+from itertools import pairwise
+from typing import Any, Literal, Self, TypeVar
 
-from powderdsl.ir.ops import FLAG, REAL, Graph, Node, Type, ordered
+from powderdsl.ir.ops import FLAG, REAL, Graph, Node, Type, ordered, walk
 
 ANSWER = Type("answer")
 """One truth value for all cells, such as whether a flag is set anywhere."""
 
 _PREFIX = {"flag": "p", "real": "f", "answer": "q"}
+
+Rule = Callable[[Node], Node | None]
+"""Gives a node to put in another one's place, or None."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,25 +45,40 @@ class Out:
     otherwise: Node | None = None
 
 
+Block = tuple["Statement", ...]
+
+
 @dataclass(frozen=True)
 class Statement:
-    """A statement says once what values it reads and what variables it makes; all walks over schedules follow from that."""
+    """A statement says once what it reads, makes and contains; all walks over schedules follow from that."""
 
-    def values(self) -> Iterator[Node]:
+    def values(self) -> Iterable[Node]:
         """The values that it reads, without those of nested statements."""
-        return iter(())
+        return ()
+
+    def blocks(self) -> tuple[Block, ...]:
+        """The statements that it contains."""
+        return ()
 
     def with_values(self, new: Callable[[Node], Node]) -> Self:
         """The statement with each of these values replaced by another."""
         return self
 
-    def defined(self) -> Iterator[Var]:
-        """The variables that it defines for statements after it."""
-        return iter(())
+    def with_blocks(self, new: Callable[[Block], Block]) -> Self:
+        """The statement with each of these blocks replaced by another."""
+        return self
 
-    def unchanged(self) -> Iterator[tuple[Var, Node]]:
+    def defined(self) -> Iterable[Var]:
+        """The variables that it defines for statements after it."""
+        return ()
+
+    def unchanged(self) -> Iterable[tuple[Var, Node]]:
         """Variables with the value that they have where the statement does nothing."""
-        return iter(())
+        return ()
+
+    def ended(self) -> Iterable[str]:
+        """The variables whose memory it frees, or takes for those that it defines."""
+        return ()
 
 
 @dataclass(frozen=True)
@@ -80,10 +98,15 @@ class Compute(Statement):
     held: bool = False
     """Whether all values are computed before any is stored, since it overwrites what it reads at neighbors (`buffers`)."""
 
+    @property
+    def of_cells(self) -> bool:
+        """Whether it is a loop over cells, not over words."""
+        return self.over in ("cells", "choices")
+
     def values(self) -> Iterator[Node]:
         yield from (out.value for out in self.outs)
-        yield from (out.otherwise for out in self.outs if out.otherwise is not None)
-        yield from (node for node in (self.region, self.when) if node is not None)
+        rest = (*(out.otherwise for out in self.outs), self.region, self.when)
+        yield from (node for node in rest if node is not None)
 
     def with_values(self, new: Callable[[Node], Node]) -> Self:
         outs = tuple(
@@ -99,6 +122,9 @@ class Compute(Statement):
 
     def unchanged(self) -> Iterator[tuple[Var, Node]]:
         return ((out.var, out.otherwise) for out in self.outs if out.otherwise is not None)
+
+    def ended(self) -> Iterator[str]:
+        return (out.into for out in self.outs if out.into is not None)
 
 
 Leftover = Literal["same", "nothing", "everything"]
@@ -154,6 +180,9 @@ class Move(Statement):
     def unchanged(self) -> Iterator[tuple[Var, Node]]:
         return ((plane.new, plane.old) for plane in self.planes)
 
+    def ended(self) -> Iterator[str]:
+        return (plane.into for plane in self.planes if plane.into is not None)
+
     def leftovers(self) -> dict[Leftover, list[Carried]] | None:
         """The planes by the flags that movers leave behind; None if these are any others in some plane."""
         groups: dict[Leftover, list[Carried]] = {}
@@ -173,25 +202,31 @@ class Guard(Statement):
     """
 
     when: tuple[Node, ...]
-    body: tuple[Statement, ...]
+    body: Block
     keeps: tuple[tuple[Var, Node], ...]
     place: str = ""
-    otherwise: tuple[Statement, ...] = ()
+    otherwise: Block = ()
     """Statements that give `keeps` their values if the body is skipped and they share no buffers (set by `buffers`)."""
 
     def values(self) -> Iterator[Node]:
         yield from self.when
         yield from (value for _, value in self.keeps)
 
+    def blocks(self) -> tuple[Block, ...]:
+        return self.body, self.otherwise
+
     def with_values(self, new: Callable[[Node], Node]) -> Self:
         keeps = tuple((var, new(value)) for var, value in self.keeps)
         return replace(self, when=tuple(map(new, self.when)), keeps=keeps)
 
+    def with_blocks(self, new: Callable[[Block], Block]) -> Self:
+        return replace(self, body=new(self.body), otherwise=new(self.otherwise))
+
     def defined(self) -> Iterator[Var]:
         return (var for var, _ in self.keeps)
 
-    def unchanged(self) -> Iterator[tuple[Var, Node]]:
-        return iter(self.keeps)
+    def unchanged(self) -> Iterable[tuple[Var, Node]]:
+        return self.keeps
 
 
 @dataclass(frozen=True)
@@ -199,6 +234,9 @@ class Release(Statement):
     """Frees the buffers of variables that nothing reads later."""
 
     names: tuple[str, ...]
+
+    def ended(self) -> Iterable[str]:
+        return self.names
 
 
 @dataclass(frozen=True)
@@ -215,19 +253,16 @@ class Sweeps(Statement):
     lags: tuple[int, ...]
     passing: tuple[str, ...]
 
-    def values(self) -> Iterator[Node]:
-        for loop in self.loops:
-            yield from loop.values()
-
-    def with_values(self, new: Callable[[Node], Node]) -> Self:
-        return replace(self, loops=tuple(loop.with_values(new) for loop in self.loops))
+    def blocks(self) -> tuple[Block, ...]:
+        return (self.loops,)
 
     def defined(self) -> Iterator[Var]:
-        for loop in self.loops:
-            yield from (var for var in loop.defined() if var.name not in self.passing)
+        return (var for loop in self.loops for var in loop.defined())
 
-    def unchanged(self) -> Iterator[tuple[Var, Node]]:
-        return chain.from_iterable(loop.unchanged() for loop in self.loops)
+    def ended(self) -> Iterator[str]:
+        yield from self.passing
+        for loop in self.loops:
+            yield from loop.ended()
 
 
 @dataclass(frozen=True)
@@ -246,7 +281,7 @@ class Schedule:
 
     name: str
     finds: tuple[tuple[str, Var], ...]
-    body: tuple[Statement, ...]
+    body: Block
     leaves: tuple[tuple[str, Node], ...]
     graph: Graph = field(compare=False, repr=False)
     """Interns values: equal ones are one object in all stages."""
@@ -254,6 +289,10 @@ class Schedule:
     """An answer: if it is false, the pass changes nothing."""
     buffers: tuple[tuple[str, tuple[str, int]], ...] = ()
     """The kind and number of each variable's buffer, for targets that number buffers."""
+
+    def values(self) -> list[Node]:
+        """The values of all statements, without those that the pass leaves in slots."""
+        return [node for statement in flat(self.body) for node in statement.values()]
 
 
 # Values
@@ -264,6 +303,11 @@ def load(graph: Graph, var: Var) -> Node:
     return graph.node("load", var.type, (), var.name)
 
 
+def constant(graph: Graph, type: Type, value: float | bool = False) -> Node:
+    """The same value in all cells."""
+    return graph.node("const", type, (), value if type != REAL else float(value))
+
+
 def is_zero(value: Node) -> bool:
     """Whether a value is the constant 0."""
     return value.op == "const" and not value.attr
@@ -272,56 +316,25 @@ def is_zero(value: Node) -> bool:
 def loaded(nodes: Iterable[Node]) -> Iterator[str]:
     """The names of the variables that values read, with repetitions."""
     for node in nodes:
-        seen: set[int] = set()
-        stack = [node]
-        while stack:  # as `walk`
-            top = stack.pop()
-            if id(top) not in seen:
-                seen.add(id(top))
-                if top.op == "load":
-                    yield str(top.attr)
-                stack.extend(top.args)
+        yield from (str(part.attr) for part in walk(node) if part.op == "load")
 
 
-def with_args(node: Node, args: tuple[Node, ...], graph: Graph) -> Node:
-    """The same operation on other arguments."""
-    return node if args == node.args else graph.node(node.op, node.type, args, node.attr, node.places)
-
-
-def rewritten(roots: Iterable[Node], graph: Graph, rule: Callable[[Node], Node | None]) -> dict[int, Node]:
-    """Values rebuilt bottom-up, by the id of the old node. `rule` maps nodes that have their new arguments already."""
-    done: dict[int, Node] = {}
+def rewritten(roots: Iterable[Node], graph: Graph, rule: Rule) -> Callable[[Node], Node]:
+    """Values rebuilt bottom-up, as a function of the old ones. `rule` maps nodes that have their new arguments already."""
+    done: dict[Node, Node] = {}
     for node in ordered(roots):
-        new = with_args(node, tuple([done[id(arg)] for arg in node.args]), graph)
-        done[id(node)] = rule(new) or new
-    return done
+        args = tuple([done[arg] for arg in node.args])
+        new = node if args == node.args else graph.node(node.op, node.type, args, node.attr)
+        done[node] = rule(new) or new
+    return done.__getitem__
 
 
-def over_variables(root: Node, graph: Graph, known: Callable[[Node], Node | None]) -> Node:
-    """A value rebuilt in `graph`. Where `known` gives a node, that node replaces the old one and all below it."""
-    done: dict[int, Node] = {}
-    stack = [(root, False)]
-    while stack:
-        node, ready = stack.pop()
-        if id(node) in done:
-            continue
-        if ready:
-            args = tuple(done[id(arg)] for arg in node.args)
-            done[id(node)] = graph.node(node.op, node.type, args, node.attr, node.places)
-        elif (found := known(node)) is not None:
-            done[id(node)] = found
-        else:
-            stack.append((node, True))
-            stack.extend((arg, False) for arg in reversed(node.args))
-    return done[id(root)]
-
-
-def combined(op: Literal["and", "or"], nodes: Iterable[Node], graph: Graph) -> Node:
-    """The conjunction or disjunction of one or more flags or answers."""
-    first, *rest = nodes
-    for node in rest:
-        first = graph.node(op, first.type, (first, node))
-    return first
+def combined(op: str, nodes: Iterable[Node], graph: Graph, type: Type = FLAG) -> Node:
+    """The conjunction or disjunction of flags or answers; of none, the constant of that type."""
+    result: Node | None = None
+    for node in nodes:
+        result = node if result is None else graph.node(op, result.type, (result, node))
+    return result or constant(graph, type, op == "and")
 
 
 def is_movement(node: Node) -> bool:
@@ -331,49 +344,51 @@ def is_movement(node: Node) -> bool:
 
 def conjuncts(node: Node) -> list[Node]:
     """The flags that must all hold for a flag to hold, each once, in order."""
-    seen: dict[int, Node] = {}
+    seen: dict[Node, None] = {}
     stack = [node]
     while stack:
         top = stack.pop()
-        if id(top) not in seen:
-            seen[id(top)] = top
+        if top not in seen:
+            seen[top] = None
             stack.extend(reversed(top.args) if top.op == "and" else ())
-    return [part for part in seen.values() if part.op != "and"]
+    return [part for part in seen if part.op != "and"]
 
 
-def alternatives(region: Node) -> list[Node]:
+def alternatives(region: Node | None) -> list[Node]:
     """The flags of which one must hold for a region to hold."""
-    if region.op == "or":
-        return [part for arg in region.args for part in alternatives(arg)]
-    return [] if region.op == "const" else [region]
+    if region is None or region.op == "const":
+        return []
+    return [part for arg in region.args for part in alternatives(arg)] if region.op == "or" else [region]
 
 
-def read_elsewhere(values: Iterable[Node]) -> set[str]:
-    """The planes that values read at neighbors."""
-    return {str(name) for node in ordered(values) if node.op == "shift" for name in loaded(node.args)}
+Facts = dict[Node, None]
+"""Flags, in the order in which they are found."""
+
+
+def on_all_paths(
+    roots: Iterable[Node], below: Callable[[Node, Facts], Iterable[tuple[Node, Facts]]]
+) -> dict[Node, Facts]:
+    """For each node, the facts that all paths from the roots to it have in common.
+
+    `below` gives the nodes that a node reads, each with the facts of a path there, from those at the node itself.
+    """
+    facts: dict[Node, Facts] = {root: {} for root in roots}
+    for node in reversed(ordered([*facts])):  # users first
+        if node in facts:  # else no path leads here
+            for part, path in below(node, facts[node]):
+                facts[part] = {fact: None for fact in facts.get(part, path) if fact in path}
+    return facts
 
 
 # Statements
 
 
 def flat(body: Iterable[Statement]) -> Iterator[Statement]:
-    """All statements, including nested ones; a guard comes before its body."""
+    """All statements, including nested ones, which come after those that contain them."""
     for statement in body:
         yield statement
-        if isinstance(statement, Guard):
-            yield from flat(statement.body)
-            yield from flat(statement.otherwise)
-
-
-def planes_at_neighbors(schedule: Schedule) -> dict[str, tuple[str, tuple[int, int, bool]]]:
-    """The variables that are another one, read at a neighbor: by name, the other one and where it is read."""
-    return {
-        out.var.name: (str(out.value.args[0].attr), out.value.attr)
-        for one in flat(schedule.body)
-        if isinstance(one, Compute)
-        for out in one.outs
-        if out.value.op == "shift" and out.value.args[0].op == "load"
-    }
+        for block in statement.blocks():
+            yield from flat(block)
 
 
 def in_order(names: Iterable[str]) -> list[str]:
@@ -384,32 +399,149 @@ def in_order(names: Iterable[str]) -> list[str]:
 def variables(schedule: Schedule) -> dict[str, Var]:
     """All variables by name."""
     found = {var.name: var for _, var in schedule.finds}
-    for statement in flat(schedule.body):
-        loops = statement.loops if isinstance(statement, Sweeps) else (statement,)  # with what only passes
-        found |= {var.name: var for one in loops for var in one.defined()}
-    return found
+    return found | {var.name: var for statement in flat(schedule.body) for var in statement.defined()}
 
 
-def map_blocks(
-    body: Sequence[Statement], change: Callable[[tuple[Statement, ...]], tuple[Statement, ...]]
-) -> tuple[Statement, ...]:
-    """A body in which every block of statements is changed, inner blocks first."""
-    inner = tuple(
-        replace(one, body=map_blocks(one.body, change), otherwise=map_blocks(one.otherwise, change))
-        if isinstance(one, Guard)
-        else one
-        for one in body
-    )
-    return change(inner)
+def asked_masks(body: Block) -> Iterator[tuple[int, list[Out]]]:
+    """Guards with masks in the statement before them: the position of that statement, and these masks."""
+    for i, (masks, guard) in enumerate(pairwise(body)):
+        if isinstance(masks, Compute) and isinstance(guard, Guard):
+            asked = {node.attr for node in guard.when if node.op == "load"}
+            yield i, [out for out in masks.outs if out.var.name in asked]
 
 
-def map_computes(schedule: Schedule, change: Callable[[Compute], Iterable[Statement]]) -> Schedule:
-    """The schedule with every `Compute`, nested or not, replaced by other statements."""
+def map_blocks(schedule: Schedule, change: Callable[[Block], Block]) -> Schedule:
+    """The schedule with every block of statements changed, inner blocks first."""
 
-    def block(body: tuple[Statement, ...]) -> tuple[Statement, ...]:
-        return tuple(new for one in body for new in (change(one) if isinstance(one, Compute) else (one,)))
+    def block(body: Block) -> Block:
+        return change(tuple(statement.with_blocks(block) for statement in body))
 
-    return replace(schedule, body=map_blocks(schedule.body, block))
+    return replace(schedule, body=block(schedule.body))
+
+
+Kind = TypeVar("Kind", bound=Statement)
+
+
+def map_each(schedule: Schedule, kind: type[Kind], change: Callable[[Kind], Iterable[Statement]]) -> Schedule:
+    """The schedule with every statement of a kind, nested or not, replaced by other statements."""
+
+    def block(body: Block) -> Block:
+        return tuple(new for old in body for new in (change(old) if isinstance(old, kind) else (old,)))
+
+    return map_blocks(schedule, block)
+
+
+def map_values(schedule: Schedule, rule: Rule) -> Schedule:
+    """The schedule with every value rewritten by a rule, see `rewritten`."""
+    leaves = [node for _, node in schedule.leaves]
+    new = rewritten([*schedule.values(), *leaves], schedule.graph, rule)
+    changed = map_blocks(schedule, lambda body: tuple(statement.with_values(new) for statement in body))
+    return replace(changed, leaves=tuple((slot, new(node)) for slot, node in schedule.leaves))
+
+
+# What is read where, and until when
+
+
+@dataclass(frozen=True)
+class Read:
+    """A variable that is read at an offset in rows and columns, or asked whether it is zero near there (`live`)."""
+
+    name: str
+    type: Type
+    dy: int = 0
+    dx: int = 0
+    wraps: bool = True
+    live: bool = False
+    far: bool = False
+    """Whether other cells are read or asked."""
+
+
+def reads_of(values: Iterable[Node]) -> Iterator[Read]:
+    """Where values read variables. What is read at neighbors is also read in the cell itself."""
+    for node in ordered(values):
+        if node.op == "load":
+            yield Read(str(node.attr), node.type)
+        elif node.args and node.args[0].op == "load" and node.op in ("shift", "live"):
+            plane, (dy, dx, *wraps) = node.args[0], node.attr
+            far, live = bool(dy or dx), node.op == "live"
+            yield Read(str(plane.attr), plane.type, dy, 0 if live else dx, True in wraps, live, far)
+
+
+def field_reads(loop: Compute) -> Iterator[Read]:
+    """The fields that a loop or its region reads."""
+    return (read for read in reads_of(loop.values()) if read.type == REAL)
+
+
+def read_elsewhere(values: Iterable[Node]) -> set[str]:
+    """The variables that values read at neighbors."""
+    return {read.name for read in reads_of(values) if read.far}
+
+
+def planes_at_neighbors(schedule: Schedule) -> dict[str, tuple[str, tuple[int, int, bool]]]:
+    """Map each variable that is another one, read at a neighbor, to that one and where it is read."""
+    return {
+        out.var.name: (str(out.value.args[0].attr), out.value.attr)
+        for statement in flat(schedule.body)
+        if isinstance(statement, Compute)
+        for out in statement.outs
+        if out.value.op == "shift" and out.value.args[0].op == "load"
+    }
+
+
+def made_in(body: Iterable[Statement]) -> set[str]:
+    """The variables that statements define, including nested ones."""
+    return {var.name for statement in flat(body) for var in statement.defined()}
+
+
+def read_by(body: Block) -> set[str]:
+    """The variables that statements read, without those that they define."""
+    return set(loaded(node for statement in flat(body) for node in statement.values())) - made_in(body)
+
+
+def live_before(statement: Statement, after: set[str]) -> set[str]:
+    """The variables that are read from before a statement on, given those that are read after it."""
+    return (after - {var.name for var in statement.defined()}) | read_by((statement,))
+
+
+def without_unread(schedule: Schedule) -> Schedule:
+    """The schedule without unread variables; guards keep only what is read after them."""
+
+    def block(body: Block, live: set[str]) -> tuple[Block, set[str]]:
+        """The statements that are needed if some variables are read after them, and what is read before them."""
+        result: list[Statement] = []
+        for statement in reversed(body):
+            needed = True
+            if isinstance(statement, Compute):
+                statement = replace(statement, outs=tuple(o for o in statement.outs if o.var.name in live))
+                needed = bool(statement.outs)
+            elif isinstance(statement, Guard):
+                keeps = tuple(keep for keep in statement.keeps if keep[0].name in live)
+                inner, _ = block(statement.body, live | {var.name for var, _ in keeps})
+                statement = replace(statement, body=inner, keeps=keeps)
+                needed = bool(keeps) or any(isinstance(part, Forget) for part in inner)
+            if needed:
+                result.append(statement)
+                live = live_before(statement, live)
+        return tuple(reversed(result)), live
+
+    body, live = block(schedule.body, set(loaded(node for _, node in schedule.leaves)))
+    finds = tuple((slot, var) for slot, var in schedule.finds if var.name in live)
+    return replace(schedule, body=body, finds=finds)
+
+
+Item = TypeVar("Item")
+
+
+def connected(items: Sequence[Item], keys: Callable[[Item], set[Any]]) -> list[list[Item]]:
+    """Items in groups, all in order: those that share keys, or are connected through others that do, are together."""
+    groups: list[tuple[set[Any], list[int]]] = []
+    for number, item in enumerate(items):
+        own = keys(item)
+        same = [group for group in groups if not own.isdisjoint(group[0])]
+        numbers = sorted([number, *(old for _, members in same for old in members)])
+        groups = [group for group in groups if own.isdisjoint(group[0])]
+        groups.append((own.union(*(others for others, _ in same)), numbers))
+    return [[items[number] for number in members] for members in sorted(members for _, members in groups)]
 
 
 class Namer:
@@ -422,11 +554,3 @@ class Namer:
     def var(self, type: Type, means: Node | None = None) -> Var:
         self.count += 1
         return Var(f"{_PREFIX[type.name]}{self.count}", type, means)
-
-
-__all__ = [
-    "ANSWER", "FLAG", "REAL",
-    "Carried", "Compute", "Forget", "Guard", "Move", "Namer", "Out", "Release", "Schedule", "Statement", "Sweeps", "Sync", "Var",
-    "combined", "conjuncts", "flat", "in_order", "is_movement", "is_zero", "load", "loaded", "map_blocks", "map_computes", "ordered",
-    "over_variables", "planes_at_neighbors", "read_elsewhere", "rewritten", "variables", "with_args",
-]  # fmt: skip

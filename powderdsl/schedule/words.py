@@ -7,9 +7,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from powderdsl.ir.ops import FLAG, Graph, Node, ordered
-from powderdsl.schedule.costs import DRAWS, LOGIC
+from powderdsl.schedule.costs import DRAWS, LOGIC, UNIFORM
 from powderdsl.schedule.floats import is_comparison
-from powderdsl.schedule.lifetimes import made_in, reads
 from powderdsl.schedule.presence import when_present
 from powderdsl.schedule.types import (
     ANSWER,
@@ -21,18 +20,21 @@ from powderdsl.schedule.types import (
     Schedule,
     Statement,
     Var,
+    asked_masks,
     combined,
     conjuncts,
-    flat,
+    constant,
     in_order,
     is_movement,
+    is_zero,
     load,
     loaded,
+    made_in,
     map_blocks,
-    map_computes,
+    map_each,
+    read_by,
     read_elsewhere,
     rewritten,
-    with_args,
 )
 
 WORTH = 3
@@ -54,50 +56,44 @@ def early(schedule: Schedule) -> Schedule:
     `m = a & b & c; if any m: a' = …; n = a' & ~b & c` → `s = b & c, t = ~b & c; m = a & s; …; n = a' & t`.
     """
     graph, namer = schedule.graph, Namer(schedule)
-    known = {var.name: -1 for _, var in schedule.finds}
-    for i, statement in enumerate(schedule.body):
-        known |= {var.name: i for var in statement.defined()}
-    users: dict[int, int] = {}  # the first statement that computes a value
-    for i, statement in enumerate(schedule.body):
-        for node in ordered(statement.values()):
-            users.setdefault(id(node), i)
+    known = {var.name: i for i, statement in enumerate(schedule.body) for var in statement.defined()}
+    users: dict[Node, int] = {}
+    """The first statement that computes each value."""
+    for i, statement in reversed([*enumerate(schedule.body)]):
+        users |= dict.fromkeys(ordered(statement.values()), i)
     groups: dict[int, list[_Mask]] = {}
-    for i, (masks, guard) in enumerate(zip(schedule.body, schedule.body[1:], strict=False)):
-        if isinstance(masks, Compute) and isinstance(guard, Guard):
-            asked = {node.attr for node in guard.when if node.op == "load"}
-            for out in masks.outs:
-                if out.var.name in asked:
-                    for since, parts in _known_parts(out.value, known).items():
-                        groups.setdefault(since, []).append(_Mask(i, out.value, parts))
+    """Masks with the conjuncts that depend on the same statement last."""
+    for i, masks in asked_masks(schedule.body):
+        for out in masks:
+            parts: dict[int, list[Node]] = {}
+            for part in conjuncts(out.value):
+                if not any(node.op in DRAWS or is_movement(node) for node in ordered([part])):
+                    since = max((known.get(name, -1) for name in loaded([part])), default=-1)
+                    parts.setdefault(since, []).append(part)
+            for since, nodes in parts.items():
+                groups.setdefault(since, []).append(_Mask(i, out.value, tuple(nodes)))
     before: dict[int, list[Out]] = {}
-    planes: dict[int, dict[int, Node]] = {}  # by mask: the loads of planes, by the parts that they replace
-    for group in groups.values():
-        found: dict[frozenset[int], Out] = {}
-        masks_of_group = _shared(group)
-        for mask in masks_of_group:
-            key = frozenset(map(id, mask.parts))
-            if key not in found:
-                found[key] = Out(namer.var(FLAG), combined("and", mask.parts, graph))
-            plane = load(graph, found[key].var)
-            planes.setdefault(id(mask.value), {}).update({id(part): plane for part in mask.parts})
-        if found:
-            first = min(users[id(mask.value)] for mask in masks_of_group)
-            before.setdefault(first, []).extend(found.values())
+    planes: dict[Node, dict[Node, Node]] = {}
+    """By mask: the loads of planes, by the parts that they replace."""
+    for group in filter(None, map(_shared, groups.values())):
+        outs: dict[frozenset[Node], Out] = {}
+        for mask in group:
+            if (key := frozenset(mask.parts)) not in outs:
+                outs[key] = Out(namer.var(FLAG), combined("and", mask.parts, graph))
+            plane = load(graph, outs[key].var)
+            planes.setdefault(mask.value, {}).update(dict.fromkeys(mask.parts, plane))
+        before.setdefault(min(users[mask.value] for mask in group), []).extend(outs.values())
     if not planes:
         return schedule
-    done: dict[int, Node] = {}
-    for node in ordered(node for statement in flat(schedule.body) for node in statement.values()):
-        done[id(node)] = with_args(node, tuple(done[id(arg)] for arg in node.args), graph)
-        if id(node) in planes:
-            known_parts = planes[id(node)]
-            rest = [done[id(part)] for part in conjuncts(node) if id(part) not in known_parts]
-            done[id(node)] = combined("and", dict.fromkeys([*known_parts.values(), *rest]), graph)
-
-    def renewed(statement: Compute) -> list[Statement]:
-        return [replace(statement, outs=tuple(replace(o, value=done[id(o.value)]) for o in statement.outs))]
-
+    new: dict[Node, Node] = {}
+    for node in ordered(schedule.values()):
+        new[node] = graph.node(node.op, node.type, tuple(new[arg] for arg in node.args), node.attr)
+        if node in planes:
+            rest = [new[part] for part in conjuncts(node) if part not in planes[node]]
+            new[node] = combined("and", dict.fromkeys([*planes[node].values(), *rest]), graph)
+    changed = map_blocks(schedule, lambda body: tuple(one.with_values(new.__getitem__) for one in body))
     body: list[Statement] = []
-    for i, statement in enumerate(map_computes(schedule, renewed).body):
+    for i, statement in enumerate(changed.body):
         if i in before:
             when = when_present([out.value for out in before[i]], schedule)
             body.append(Compute(tuple(before[i]), when=when))
@@ -105,36 +101,27 @@ def early(schedule: Schedule) -> Schedule:
     return replace(schedule, body=tuple(body))
 
 
-def _known_parts(mask: Node, known: dict[str, int]) -> dict[int, tuple[Node, ...]]:
-    """The conjuncts of a mask without draws and movements, by the last statement that they depend on."""
-    found: dict[int, list[Node]] = {}
-    for part in conjuncts(mask):
-        if not any(node.op in DRAWS or is_movement(node) for node in ordered([part])):
-            found.setdefault(max((known[name] for name in loaded([part])), default=-1), []).append(part)
-    return {since: tuple(parts) for since, parts in found.items()}
-
-
-def _gates(parts: Sequence[Node]) -> list[Node]:
+def _gates(parts: Iterable[Node]) -> Iterable[Node]:
     """The operations on flags in the cell itself, and comparisons. What is read at neighbors is stored anyway."""
-    found: dict[int, Node] = {}
+    gates: dict[Node, None] = {}
     stack = [*parts]
     while stack:
         node = stack.pop()
-        if (node.op in LOGIC or is_comparison(node)) and id(node) not in found:
-            found[id(node)] = node
+        if (node.op in LOGIC or is_comparison(node)) and node not in gates:
+            gates[node] = None
             stack.extend(() if is_comparison(node) else node.args)
-    return list(found.values())
+    return gates
 
 
 def _shared(group: Sequence[_Mask]) -> list[_Mask]:
     """The masks of a group with the parts that share gates with other masks, if these are worth a plane."""
-    count = Counter(id(gate) for mask in group for gate in _gates(mask.parts))
-    found = []
+    count = Counter(gate for mask in group for gate in _gates(mask.parts))
+    shared = []
     for mask in group:
-        parts = tuple(part for part in mask.parts if any(count[id(gate)] > 1 for gate in _gates([part])))
-        if sum(count[id(gate)] > 1 for gate in _gates(parts)) >= WORTH:
-            found.append(replace(mask, parts=parts))
-    return found if len({mask.place for mask in found}) >= WORTH else []
+        parts = tuple(part for part in mask.parts if any(count[gate] > 1 for gate in _gates([part])))
+        if sum(count[gate] > 1 for gate in _gates(parts)) >= WORTH:
+            shared.append(replace(mask, parts=parts))
+    return shared if len({mask.place for mask in shared}) >= WORTH else []
 
 
 MAX_CONDITIONS = 4
@@ -146,17 +133,15 @@ def empty(schedule: Schedule) -> Schedule:
 
     `m = a & (b | c[0,1])` → when `any a`; `n = a | b` needs no loop, since it tests its planes itself.
     """
-    graph = schedule.graph
 
     def change(loop: Compute) -> list[Statement]:
         if loop.over != "words" or loop.region is not None:
             return [loop]
-        whole = [out for out in loop.outs if is_whole(out.value)]
-        rest = tuple(out for out in loop.outs if not is_whole(out.value))
-        alone = [replace(loop, outs=(out,), when=None) for out in whole]
-        return [*alone, _asked(replace(loop, outs=rest), graph)] if rest else [*alone]
+        alone = [replace(loop, outs=(out,), when=None) for out in loop.outs if is_whole(out.value)]
+        rest = replace(loop, outs=tuple(out for out in loop.outs if not is_whole(out.value)))
+        return [*alone, _with_condition(rest, schedule.graph)] if rest.outs else [*alone]
 
-    return map_computes(schedule, change)
+    return map_each(schedule, Compute, change)
 
 
 def is_whole(value: Node) -> bool:
@@ -183,60 +168,45 @@ def difference(value: Node) -> tuple[Node, Node]:
     return (first, second.args[0]) if second.op == "not" else (second, first.args[0])
 
 
-def _asked(loop: Compute, graph: Graph) -> Compute:
-    memo: dict[int, frozenset[str] | None] = {}
-    loads = {str(node.attr): node for node in ordered(out.value for out in loop.outs) if node.op == "load"}
+def _with_condition(loop: Compute, graph: Graph) -> Compute:
+    """The loop with a condition: of some sets of planes, one plane must be non-empty for a value to hold anywhere."""
+    nodes = ordered(out.value for out in loop.outs)
+    holders: dict[Node, frozenset[str] | None] = {}
+    """For each flag: planes such that it holds nowhere if all of them are empty; None if none are known."""
+    for node in nodes:
+        sets = [holders[arg] for arg in node.args[node.op == "select" :]]
+        known = [names for names in sets if names is not None]
+        holders[node] = None
+        match node.op:
+            case "load":
+                holders[node] = frozenset({str(node.attr)})
+            case "const" if not node.attr:
+                holders[node] = frozenset()
+            case "and" | "when":
+                holders[node] = min(known, key=lambda names: (len(names), sorted(names)), default=None)
+            case "shift" | "or" | "xor" | "select" if len(known) == len(sets):
+                holders[node] = frozenset[str]().union(*known)
     ways: list[list[frozenset[str]]] = []
-    for out in loop.outs:
-        conditions = _conditions(out.value, memo)
-        if not conditions:
+    for value in (out.value for out in loop.outs):
+        parts = [value.args[0], *conjuncts(value.args[1])] if value.op == "when" else conjuncts(value)
+        needs = dict.fromkeys(names for part in parts if (names := holders[part]) is not None)
+        if not needs:
             return loop
+        conditions = sorted(needs, key=len)[:MAX_CONDITIONS]
         if not any(set(way) <= set(conditions) for way in ways):
             ways = [*(way for way in ways if not set(conditions) < set(way)), conditions]
-    found = [combined("and", [_any(names, loads, graph) for names in way], graph) for way in ways]
-    asked = combined("or", found, graph)
-    return replace(loop, when=asked if loop.when is None else combined("and", [loop.when, asked], graph))
+    loads = {node.attr: node for node in nodes if node.op == "load"}
+
+    def some(names: frozenset[str]) -> Node:
+        flags = [graph.node("any", ANSWER, (loads[name],)) for name in in_order(names)]
+        return combined("or", flags, graph, ANSWER)
+
+    answers = [combined("and", [*map(some, way)], graph) for way in ways]
+    before = [] if loop.when is None else [loop.when]
+    return replace(loop, when=combined("and", [*before, combined("or", answers, graph)], graph))
 
 
-def _conditions(value: Node, memo: dict[int, frozenset[str] | None]) -> list[frozenset[str]]:
-    """Sets of planes; of each set one plane must be non-empty for the value to hold anywhere."""
-    parts = [value.args[0], *conjuncts(value.args[1])] if value.op == "when" else conjuncts(value)
-    found = dict.fromkeys(names for part in parts if (names := holders(part, memo)) is not None)
-    return sorted(found, key=len)[:MAX_CONDITIONS]
-
-
-def _any(names: Iterable[str], loads: dict[str, Node], graph: Graph) -> Node:
-    found = [graph.node("any", ANSWER, (loads[name],)) for name in in_order(names)]
-    return combined("or", found, graph) if found else graph.node("const", ANSWER, (), False)
-
-
-def holders(node: Node, memo: dict[int, frozenset[str] | None]) -> frozenset[str] | None:
-    """Planes such that the flag holds nowhere if all of them are empty; None if none are known."""
-    for inner in ordered([node]):
-        if id(inner) not in memo and inner.type == FLAG:
-            memo[id(inner)] = _holders(inner, memo)
-    return memo[id(node)]
-
-
-def _holders(node: Node, memo: dict[int, frozenset[str] | None]) -> frozenset[str] | None:
-    match node.op:
-        case "load":
-            return frozenset({str(node.attr)})
-        case "const":
-            return None if node.attr else frozenset()
-        case "shift":
-            return memo[id(node.args[0])]
-        case "and" | "when":
-            found = [names for arg in node.args if (names := memo[id(arg)]) is not None]
-            return min(found, key=lambda names: (len(names), sorted(names)), default=None)
-        case "or" | "xor" | "select":
-            parts = [memo[id(arg)] for arg in node.args[node.op == "select" :]]
-            known = [part for part in parts if part is not None]
-            return frozenset[str]().union(*known) if len(known) == len(parts) else None
-    return None
-
-
-IN_A_WORD = ("and", "or", "xor", "not", "select", "load", "const", "param", "coordinate", "inside")
+IN_A_WORD = (*LOGIC, *UNIFORM, "load")
 """Operations that read the word itself."""
 
 
@@ -246,14 +216,7 @@ def updates(schedule: Schedule) -> Schedule:
     Outside the guard, `release` finds out that most old planes end there, so that the words are changed in place.
     `if any m: b = a & ~m, else b = a` → `loop words over m: b = a & ~m, else a`.
     """
-    graph = schedule.graph
-
-    def change(block: tuple[Statement, ...]) -> tuple[Statement, ...]:
-        return tuple(
-            new for one in block for new in (_taken_out(one, graph) if isinstance(one, Guard) else [one])
-        )
-
-    return replace(schedule, body=map_blocks(schedule.body, change))
+    return map_each(schedule, Guard, lambda guard: _taken_out(guard, schedule.graph))
 
 
 def _taken_out(guard: Guard, graph: Graph, *, near: bool = True) -> list[Statement]:
@@ -263,40 +226,30 @@ def _taken_out(guard: Guard, graph: Graph, *, near: bool = True) -> list[Stateme
     masks = {str(node.attr) for node in guard.when}
     inside, olds = made_in(guard.body), {var.name: value for var, value in guard.keeps}
     body: list[Statement] = []
-    found: tuple[list[Out], list[Out]] = [], []  # those that read neighbors come first, before these change
+    taken: dict[bool, list[Out]] = {True: [], False: []}
+    """Values by whether they read neighbors; those come first, before these change."""
     for statement in guard.body:
         if not isinstance(statement, Compute) or statement.over != "words" or statement.when is not None:
             body.append(statement)
             continue
         rest = []
         for out in statement.outs:
-            old = olds.get(out.var.name)
-            elsewhere = read_elsewhere([out.value])
-            if (
-                old is None
-                or (elsewhere and not near)
-                or inside & set(loaded([out.value]))
-                or not _is_update(out.value, masks, old, graph)
-            ):
+            old, far = olds.get(out.var.name), bool(read_elsewhere([out.value]))
+            stays = old is None or (far and not near) or not inside.isdisjoint(loaded([out.value]))
+            if old is None or stays or not _is_update(out.value, masks, old, graph):
                 rest.append(out)
             else:
-                found[not elsewhere].append(replace(out, otherwise=old))
-        if rest:
-            body += _partly(replace(statement, outs=tuple(rest)), guard.when, graph)
-    elsewhere = read_elsewhere(out.value for out in found[0])
-    if any(out.otherwise is not None and out.otherwise.attr in elsewhere for out in found[0]):
+                taken[far].append(replace(out, otherwise=old))
+        body += _partly(replace(statement, outs=tuple(rest)), guard.when, graph) if rest else []
+    elsewhere = read_elsewhere(out.value for out in taken[True])
+    if any(olds[out.var.name].attr in elsewhere for out in taken[True]):
         return _taken_out(guard, graph, near=False)  # in place, such a loop would read what it has changed
-    if not found[0] and not found[1]:
-        return [replace(guard, body=tuple(body))]
     region = combined("or", guard.when, graph)
-    loops = [Compute(tuple(outs), guard.place, "words", region) for outs in found if outs]
-    names = {out.var.name for outs in found for out in outs}
+    loops = [Compute(tuple(outs), guard.place, "words", region) for outs in taken.values() if outs]
+    names = made_in(loops)
     keeps = tuple((var, value) for var, value in guard.keeps if var.name not in names)
-    if not body:
-        return [*loops]
-    left = replace(guard, body=tuple(body), keeps=keeps)
-    first = any(names & reads(statement) for statement in body)
-    return [*loops, left] if first else [left, *loops]
+    left = [replace(guard, body=tuple(body), keeps=keeps)] if body else []
+    return [*left, *loops] if names.isdisjoint(read_by(tuple(body))) else [*loops, *left]
 
 
 def _partly(loop: Compute, when: Sequence[Node], graph: Graph) -> list[Compute]:
@@ -305,13 +258,13 @@ def _partly(loop: Compute, when: Sequence[Node], graph: Graph) -> list[Compute]:
     `if any m: loop words: b = m ? a[0,1] : a` → `if any m: loop words over m: b = m ? a[0,1] : a, else a`.
     """
     masks = {str(node.attr) for node in when}
-    outs: tuple[list[Out], list[Out]] = [], []
+    outs: dict[bool, list[Out]] = {False: [], True: []}
     for out in loop.outs:
-        stays = without(out.value, masks, graph) if out.value.op != "load" else None
-        partly = stays is not None and _is_update(out.value, masks, stays, graph)
-        outs[partly].append(replace(out, otherwise=stays) if partly else out)
+        old = without(out.value, masks, graph)
+        partly = out.value.op != "load" and _is_update(out.value, masks, old, graph)
+        outs[partly].append(replace(out, otherwise=old) if partly else out)
     region = combined("or", when, graph)
-    parts = [replace(loop, outs=tuple(outs[0])), replace(loop, outs=tuple(outs[1]), region=region)]
+    parts = [replace(loop, outs=tuple(outs[False])), replace(loop, outs=tuple(outs[True]), region=region)]
     return [part for part in parts if part.outs]
 
 
@@ -328,42 +281,32 @@ def _is_update(value: Node, masks: set[str], old: Node, graph: Graph) -> bool:
 
 def is_cleared(out: Out, graph: Graph) -> bool:
     """Whether an updated plane can only lose flags."""
-    assert out.otherwise is not None
-    value = without(out.value, {str(out.otherwise.attr)}, graph)
-    return value.op == "const" and not value.attr
+    return out.otherwise is not None and is_zero(without(out.value, {str(out.otherwise.attr)}, graph))
 
 
 def without(value: Node, planes: set[str], graph: Graph) -> Node:
     """A flag where some planes are zero."""
 
     def rule(node: Node) -> Node | None:
-        if node.op == "load" and node.attr in planes:
-            return graph.node("const", FLAG, (), False)
-        return _folded(node, node.args, graph)
+        known = [bool(arg.attr) if arg.op == "const" else None for arg in node.args]
+        match node.op:
+            case "load" if node.attr in planes:
+                return constant(graph, FLAG)
+            case "and" | "or":
+                if (ends := node.op == "or") in known:
+                    return constant(graph, FLAG, ends)
+                return combined(node.op, [arg for arg in node.args if arg.op != "const"], graph)
+            case "xor" if False in known:
+                return node.args[1 - known.index(False)]
+            case "not" if known[0] is not None:
+                return constant(graph, FLAG, not known[0])
+            case "select" if known[0] is not None:
+                return node.args[1] if known[0] else node.args[2]
+            case "select" if known[1:] == [False, False]:
+                return constant(graph, FLAG)
+        return None
 
-    return rewritten([value], graph, rule)[id(value)]
-
-
-def _folded(node: Node, args: Sequence[Node], graph: Graph) -> Node | None:
-    """A simpler node, if some arguments are constants."""
-    known = [bool(arg.attr) if arg.op == "const" else None for arg in args]
-    match node.op:
-        case "and" | "or":
-            ends = node.op == "or"
-            if ends in known:
-                return graph.node("const", FLAG, (), ends)
-            rest = [arg for arg, value in zip(args, known, strict=True) if value is None]
-            if len(rest) < 2:
-                return rest[0] if rest else graph.node("const", FLAG, (), not ends)
-        case "xor" if False in known:
-            return args[1 - known.index(False)]
-        case "not" if known[0] is not None:
-            return graph.node("const", FLAG, (), not known[0])
-        case "select" if known[0] is not None:
-            return args[1] if known[0] else args[2]
-        case "select" if known[1] is False and known[2] is False:
-            return graph.node("const", FLAG, (), False)
-    return None
+    return rewritten([value], graph, rule)(value)
 
 
 def moved(move: Move, graph: Graph) -> Compute:
@@ -388,9 +331,3 @@ def targets(move: Move, graph: Graph) -> Compute:
 
 def _at_neighbor(plane: Node, dy: int, dx: int, graph: Graph) -> Node:
     return graph.node("shift", FLAG, (plane,), (dy, dx, True))
-
-
-def asked(loop: Compute) -> list[Node]:
-    """The masks of an update."""
-    assert loop.region is not None
-    return [node for node in ordered([loop.region]) if node.op == "load"]

@@ -25,6 +25,7 @@ from powderdsl.schedule.types import (
     Statement,
     Sweeps,
     Var,
+    flat,
 )
 
 SNAP = np.float32(2.0**-20)
@@ -103,15 +104,11 @@ class _State:
                             assert np.array_equal(self.held[name], kept[name]), name
                     # What the body released or overwrote is gone in either case.
                     gone = set(before) - set(self.held)
-                    for inside in _all(inner):
-                        if isinstance(inside, Release):
-                            gone |= set(inside.names)
-                        if isinstance(inside, Compute):
-                            gone |= {out.into for out in inside.outs if out.into}
+                    gone |= {name for inside in flat(inner) for name in inside.ended()}
                     if self.buffers:  # skipped or not, what shares a buffer with what the body makes is gone
                         made = {
                             self.buffers[v.name]
-                            for one in _all(inner)
+                            for one in flat(inner)
                             for v in one.defined()
                             if v.name in self.buffers
                         }
@@ -159,14 +156,6 @@ class _State:
             others = [n for n in self.held if n != var.name and self.buffers.get(n) == self.buffers[var.name]]
             for name in others:
                 del self.held[name]
-
-
-def _all(body: Sequence[Statement]) -> list[Statement]:
-    found = list(body)
-    for statement in body:
-        if isinstance(statement, Guard):
-            found += _all(statement.body)
-    return found
 
 
 def _shift(x: Array, dy: int, dx: int, wraps: bool) -> Array:

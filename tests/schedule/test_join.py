@@ -8,9 +8,8 @@ import pytest
 
 from powderdsl.compiler import load
 from powderdsl.ir.ops import InvalidIR
-from powderdsl.schedule.join import Read, field_reads
 from powderdsl.schedule.stages import CPU, plan
-from powderdsl.schedule.types import Compute, Schedule, Sweeps, flat
+from powderdsl.schedule.types import Compute, Read, Schedule, Sweeps, field_reads, flat
 from powderdsl.schedule.verify import verify
 from tests.schedule.test_stages import packed_passes
 

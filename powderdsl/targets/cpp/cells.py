@@ -98,7 +98,7 @@ def _nothing(rows: Rows) -> list[str]:
     made = {out.var.name for out in rows.outs}
     tests = []
     for region in (plan.loop.region for plan in rows.loops):
-        for part in alternatives(region) if region is not None else ():
+        for part in alternatives(region):
             name, test = (part.args[0].attr, "still") if part.op == "live" else (part.attr, "zero")
             tests += [f"{name}->{test}"] if name not in made else []
     return list(dict.fromkeys(tests))

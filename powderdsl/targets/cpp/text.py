@@ -19,9 +19,10 @@ from powderdsl.schedule.types import (
     Statement,
     Sweeps,
     Var,
+    alternatives,
     variables,
 )
-from powderdsl.schedule.words import asked, difference, is_cleared
+from powderdsl.schedule.words import difference, is_cleared
 from powderdsl.targets.cpp.cells import sweeps_text
 from powderdsl.targets.layout import NativeLayout, fixed_key, is_run, number, param_key
 from powderdsl.targets.printing import Printer, WordText, drawn_where, limited_draw
@@ -180,7 +181,7 @@ class _Printer(Printer):
             if out.into:
                 values.places[old] = name
             yield f"{name} = {old if out.into else f'keep({old})'};"
-        masks = [str(node.attr) for node in asked(loop)]
+        masks = [str(node.attr) for node in alternatives(loop.region)]
         yield f"if ({' || '.join(f'!{mask}->zero' for mask in masks)}) {{"
         before, stores, after = [], [], []
         for out in loop.outs:

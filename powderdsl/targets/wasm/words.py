@@ -9,8 +9,7 @@ from operator import or_
 
 from powderdsl.ir.ops import Node, ordered
 from powderdsl.schedule.costs import is_coin
-from powderdsl.schedule.types import Compute, loaded
-from powderdsl.schedule.words import asked
+from powderdsl.schedule.types import Compute, alternatives, loaded
 from powderdsl.targets import printing
 from powderdsl.targets.layout import Layout, fixed_key, is_run, param_key
 from powderdsl.targets.printing import drawn_where, limited_draw
@@ -40,7 +39,7 @@ class WordLoop:
         self.updates = loop.region is not None
         olds = {out.into for out in loop.outs if self.updates and out.into is not None}
         made = [plane_name(node, self.memory.layout) for node in self.nodes]
-        self.mask_names = [str(node.attr) for node in asked(loop)] if self.updates else []
+        self.mask_names = [str(node.attr) for node in alternatives(loop.region)] if self.updates else []
         self.reads: list[str | tuple[str, int]] = [name for name in loaded(roots) if name not in olds]
         self.reads = list(dict.fromkeys([*self.reads, *filter(None, made), *self.mask_names]))
         shifts = (node for node in self.nodes if node.op == "shift" and node.attr[0])
