@@ -26,7 +26,6 @@ from powderdsl.ir.stages import PIPELINE
 from powderdsl.model.builtins import (
     DIRECTION_SETS,
     DIRECTIONS,
-    FUNCTIONS,
     KERNEL_SHAPES,
     KERNELS,
     KIND_WORDS,
@@ -40,6 +39,7 @@ from powderdsl.model.composition.pass_order import MAX_PASSES
 from powderdsl.model.elaborate import MAX_MOMENTS, MAX_RULES
 from powderdsl.model.examples import MAX_SIDE
 from powderdsl.model.expressions.typer import MAX_ROUNDS, MAX_SET_DEPTH
+from powderdsl.model.operations import FUNCTIONS
 from powderdsl.model.schema import KEYS, MAX_NAME, OPEN
 from powderdsl.model.text import show_offset
 from powderdsl.model.types import Kernel
@@ -129,7 +129,7 @@ def kernel_shapes() -> str:
 
 
 def functions() -> str:
-    return table(("function", "value"), [(f"`{f.signature}`", f.about) for f in FUNCTIONS.values()])
+    return table(("function", "value"), [(f"`{f.usage}`", f.about) for f in FUNCTIONS.values()])
 
 
 def kinds() -> str:

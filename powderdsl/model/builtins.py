@@ -1,4 +1,4 @@
-"""The table of words that every rule file knows: directions, kernels, functions, kinds. Docs are made from it."""
+"""The table of words that every rule file knows: directions, kernels, kinds; functions are rows of `operations`. Docs are made from it."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
+from powderdsl.model.operations import FUNCTIONS
 from powderdsl.model.types import Kernel, Offset
 
 DIRECTIONS: dict[str, Offset] = {
@@ -77,43 +78,6 @@ def shaped_kernel(shape: str, radius: int, name: str = "", wrap: bool = False) -
 KERNELS: dict[str, Kernel] = {name: shaped_kernel(name, 1, name) for name in ("box", "ring", "cross", "plus")}
 """Neighborhoods for `count` and `sum`. Cells outside the grid count as nothing."""
 
-
-@dataclass(frozen=True)
-class Function:
-    """A function of the line language: how it is called, one line for the documentation, how many arguments it takes."""
-
-    signature: str
-    about: str
-    arity: tuple[int, int]
-
-
-FUNCTIONS: dict[str, Function] = {
-    "count": Function(
-        "count(SET in KERNEL)", "how many cells of the neighborhood hold; `box` if none is named", (1, 16)
-    ),
-    "sum": Function("sum(VALUE in KERNEL)", "the weighted sum of a value over the neighborhood", (1, 1)),
-    "at": Function("at(ROWS, COLUMNS)", "the neighbor ROWS down and COLUMNS right", (2, 2)),
-    "inside": Function(
-        "inside(PLACE)", "whether that neighbor lies inside the grid, without wrapping", (1, 1)
-    ),
-    "octant": Function("octant(VEC2)", "the direction a vector points to", (1, 1)),
-    "length": Function("length(VEC2)", "the length of a vector", (1, 1)),
-    "vector": Function("vector(ROWS, COLUMNS)", "a vec2 from two numbers", (2, 2)),
-    "min": Function("min(A, B)", "the smaller of two numbers", (2, 8)),
-    "max": Function("max(A, B)", "the larger of two numbers", (2, 8)),
-    "abs": Function("abs(A)", "a number without its sign", (1, 1)),
-    "clamp": Function("clamp(A, LOW, HIGH)", "a number kept between two bounds", (3, 3)),
-    "opposite": Function("opposite(PLACE)", "the neighbor, or the direction, the other way", (1, 1)),
-    "clockwise": Function(
-        "clockwise(PLACE)", "the neighbor, or the direction, a quarter turn to the right", (1, 1)
-    ),
-    "counterclockwise": Function(
-        "counterclockwise(PLACE)", "the neighbor, or the direction, a quarter turn to the left", (1, 1)
-    ),
-    "pick": Function("pick(DRAW, A, B, …)", "one of the values, each as likely as the others", (3, 17)),
-    "sin": Function("sin(A)", "the sine of an angle in radians", (1, 1)),
-    "cos": Function("cos(A)", "the cosine of an angle in radians", (1, 1)),
-}
 
 COORDINATES = ("row", "column", "step")
 """Where and when: integers that are used with `mod`, as in `(row + step) mod 2`."""

@@ -28,6 +28,7 @@ from powderdsl.model.expressions.operators import (
 from powderdsl.model.expressions.symbols import default_of, read_kind
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.types import (
+    ELEMENT,
     REAL,
     VEC2,
     Assign,
@@ -213,7 +214,7 @@ class Elaborator:
         if value.op == "draw":
             return value  # a stream's draws are fixed for the whole step
         if value.kind.name in ("draw", "chance"):
-            value = self.typer.real(value, syntax.span)
+            value = self.typer.of_kind(value, REAL, syntax.span)
         count = self._lets.get(name, 0)
         self._lets[name] = count + 1
         unique = name if count == 0 else f"{name}#{count + 1}"
@@ -285,7 +286,7 @@ class Elaborator:
     def _transform(self, syntax: Syntax, scope: Scope) -> list[Rule]:
         who, target = syntax.children[:2]
         mask = self._mask([self.typer.condition(who, scope)], syntax, scope)
-        value = self.typer.element(self.typer.evaluate(target, scope), target.span)
+        value = self.typer.of_kind(self.typer.evaluate(target, scope), ELEMENT, target.span)
         return [Transform(mask, value, self._effects(syntax, scope), syntax.span)]
 
     def _swap(self, syntax: Syntax, scope: Scope) -> list[Rule]:
@@ -306,7 +307,7 @@ class Elaborator:
                 message, label = "what is left behind is what was there", "another place than the target"
                 raise self.typer.fail("PD405", message, leaving.span, label, fix)
             return [Move(mask, offset, None, self._effects(syntax, scope), syntax.span)]
-        left = self.typer.element(behind, leaving.span)
+        left = self.typer.of_kind(behind, ELEMENT, leaving.span)
         if left.op != "const":
             raise self.typer.fail("PD405", "what is left behind must be one element", leaving.span, "name it")
         return [Move(mask, offset, left, self._effects(syntax, scope), syntax.span)]
@@ -400,7 +401,7 @@ class Elaborator:
             message, fix = f"`{name}` is not a vector", "`push` works on vec2 fields"
             raise self.typer.fail("PD401", message, target.span, f"this is a {kind}", fix)
         mask = self._mask([self.typer.condition(source, scope)], syntax, scope)
-        strength = self.typer.real(self.typer.evaluate(amount, scope), amount.span)
+        strength = self.typer.of_kind(self.typer.evaluate(amount, scope), REAL, amount.span)
         part = {0: Expr("const", REAL, value=0.0), 1: strength, -1: Expr("neg", REAL, (strength,))}
         rules: list[Rule] = []
         for side in DIRECTION_SETS["sides"]:

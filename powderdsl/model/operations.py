@@ -1,113 +1,206 @@
-"""Every operation of the model in one table: what its `value` is, and what it gives for known arguments or between bounds."""
+"""Every operation of the language in one table, a row each.
+
+The words of functions, their arguments' kinds, the folding of constants, ranges of integers, the search of
+`logic.satisfy`, the printed model, the lowering, random rules and the table in `docs/language.md` follow from it. The
+oracle, `model.reference`, has a table of its own.
+"""
 
 from __future__ import annotations
 
+import math
+import operator
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
-from powderdsl.model.types import Expr
+from powderdsl.model.types import DIRECTION, FLAG, REAL, VEC2, Kind
 
 Bounds = tuple[Any, Any]
+
+INTEGER = Kind("int", -math.inf, math.inf)
+NUMBER, PLACE = Kind("number"), Kind("place")
+"""Kinds of arguments: any integer; integers, which stay integers, or else floats; a neighbor, which becomes the `value`."""
 
 
 @dataclass(frozen=True)
 class Operation:
-    """A row of `OPS`.
+    """A row of `OPERATIONS`.
 
-    evaluate: the exact value for the values of the arguments. The search of `logic.satisfy` gives up on an operation
-        without it, unless it has a case of its own there.
-    bounds: between which numbers the value lies, for the bounds of the arguments; flags are 0, 1, False or True.
-        Without it an integer has those of its kind, and a value whose arguments are known is known.
+    about: one sentence; of a function, as `docs/language.md` has it. `value` is what an `Expr` of it has besides its
+        arguments.
+    usage: how rules call it; nothing for an operation that is written in another way.
+    takes: the kinds of the arguments. Without them a function has a check of its own in `expressions.functions`.
+    gives: the kind of the result. Without one it is an integer with the range of `between`, or a float.
+    most: how many arguments it may have, if that is more than `usage` has.
+    meaning: an expression of the language, in the names of the arguments, that stands for a call.
+    sign, binds: how it is written between its arguments, or before one, and how tightly it binds.
+    lowers: the operation of the IR that it is, if that has another name.
+    evaluate: the exact value for the values of the arguments, and `value` if there is one.
+    monotone: between bounds of the arguments, the extremes of the value lie where those of the arguments do.
+    bounds: the bounds of the value for those of the arguments, where it is not monotone.
     """
 
+    name: str
     about: str = ""
+    usage: str = ""
+    takes: tuple[Kind, ...] = ()
+    gives: Kind | None = None
+    most: int = 0
+    meaning: str = ""
+    sign: str = ""
+    binds: int = 0
+    lowers: str = ""
     evaluate: Callable[..., Any] | None = None
+    monotone: bool = False
     bounds: Callable[..., Bounds] | None = None
 
+    @property
+    def parameters(self) -> list[str]:
+        """The names of a function's arguments."""
+        return self.usage.partition("(")[2].rstrip(")").removesuffix(", …").split(", ")
 
-def _chosen_bounds(node: Expr, condition: Bounds, yes: Bounds, no: Bounds) -> Bounds:
-    if condition[0] == condition[1]:
-        return yes if condition[0] else no
-    return min(yes[0], no[0]), max(yes[1], no[1])
+    def between(self, *bounds: Bounds) -> Bounds | None:
+        """The bounds of the value for those of the arguments, if they follow; flags are 0, 1, False or True."""
+        if self.bounds is not None:
+            return self.bounds(*bounds)
+        if not self.monotone or self.evaluate is None:
+            return None
+        values = [self.evaluate(*corner) for corner in product(*bounds)]
+        return min(values), max(values)
 
 
-def _product_bounds(node: Expr, a: Bounds, b: Bounds) -> Bounds:
-    products = [x * y for x in a for y in b]
-    return min(products), max(products)
-
-
-def _abs_bounds(node: Expr, a: Bounds) -> Bounds:
+def _abs_bounds(a: Bounds) -> Bounds:
     return (0 if a[0] <= 0 <= a[1] else min(abs(a[0]), abs(a[1]))), max(abs(a[0]), abs(a[1]))
 
 
-def _turned(about: str, eighths: int) -> Operation:
-    """An operation that turns a direction clockwise."""
-
-    def bounds(node: Expr, a: Bounds) -> Bounds:
-        return ((a[0] + eighths) % 8,) * 2 if a[0] == a[1] else (0, 7)
-
-    return Operation(about, evaluate=lambda node, a: (a + eighths) % 8, bounds=bounds)
+def _quotient_bounds(a: Bounds, b: Bounds) -> Bounds:
+    """For divisors of one sign, the extremes lie at the ends of both ranges."""
+    divisors = [d for d in (b[0], min(b[1], -1), max(b[0], 1), b[1]) if d and b[0] <= d <= b[1]]
+    corners = [x // d for x in a for d in divisors] + [0] * (b[0] <= 0 <= b[1])
+    return min(corners), max(corners)
 
 
-OPS: dict[str, Operation] = {
-    "const": Operation("value: the constant"),
-    "param": Operation("value: the parameter's qualified name"),
-    "element": Operation("the element of this cell"),
-    "property": Operation(
-        "value: the property's name, as this cell's element has it (or as the cell overrides it)"
+_TABLE = (
+    # Where values come from
+    Operation("const", "value: the constant"),
+    Operation("param", "value: the parameter's qualified name"),
+    Operation("element", "the element of this cell"),
+    Operation(
+        "property", "value: the property's name, as this cell's element has it (or as the cell overrides it)"
     ),
-    "field": Operation("value: the field's name, or a pass's scratch field"),
-    "let": Operation("value: the name of a value fixed earlier in the pass"),
-    "draw": Operation("value: the stream's name; a number strictly between 0 and 1"),
-    "coordinate": Operation("value: (row, column or step, modulus)"),
-    "inside": Operation("value: offset; whether that neighbor lies inside the grid"),
-    "look": Operation("value: offset; the argument as it is at that neighbor (the grid wraps around)"),
-    "member": Operation(
+    Operation("field", "value: the field's name, or a pass's scratch field"),
+    Operation("let", "value: the name of a value fixed earlier in the pass"),
+    Operation("draw", "value: the stream's name; a number strictly between 0 and 1"),
+    Operation("coordinate", "value: (row, column or step, modulus)"),
+    # Neighborhoods
+    Operation(
+        "count",
+        "how many cells of the neighborhood hold; `box` if none is named",
+        "count(SET in KERNEL)",
+        most=16,
+    ),
+    Operation("sum", "the weighted sum of a value over the neighborhood", "sum(VALUE in KERNEL)"),
+    Operation("at", "the neighbor ROWS down and COLUMNS right", "at(ROWS, COLUMNS)"),
+    Operation(
+        "inside",
+        "whether that neighbor lies inside the grid, without wrapping",
+        "inside(PLACE)",
+        (PLACE,),
+        FLAG,
+    ),
+    Operation(
+        "look",
+        "value: offset; the argument as it is at that neighbor (the grid wraps around)",
+        lowers="shift",
+    ),
+    # Vectors
+    Operation("octant", "the direction a vector points to", "octant(VEC2)", (VEC2,), DIRECTION),
+    Operation("length", "the length of a vector", "length(VEC2)", (VEC2,), REAL),
+    Operation("vector", "a vec2 from two numbers", "vector(ROWS, COLUMNS)", (REAL, REAL), VEC2),
+    Operation("row_part", "the first component of a vec2"),
+    Operation("column_part", "the second component of a vec2"),
+    # Numbers
+    Operation(
+        "min", "the smaller of two numbers", "min(A, B)", (NUMBER,), most=8, evaluate=min, monotone=True
+    ),
+    Operation(
+        "max", "the larger of two numbers", "max(A, B)", (NUMBER,), most=8, evaluate=max, monotone=True
+    ),
+    Operation("abs", "a number without its sign", "abs(A)", (NUMBER,), evaluate=abs, bounds=_abs_bounds),
+    Operation(
+        "clamp", "a number kept between two bounds", "clamp(A, LOW, HIGH)", meaning="min(max(A, LOW), HIGH)"
+    ),
+    Operation("add", sign="+", binds=5, evaluate=operator.add, monotone=True),
+    Operation("sub", sign="-", binds=5, evaluate=operator.sub, monotone=True),
+    Operation("mul", sign="*", binds=6, evaluate=operator.mul, monotone=True),
+    Operation("div", "real division; x / 0 is 0", sign="/", binds=6, evaluate=lambda a, b: a / b if b else 0),
+    Operation(
+        "quotient",
+        "integer division, rounded down; x div 0 is 0",
+        sign="div",
+        binds=6,
+        evaluate=lambda a, b: a // b if b else 0,
+        bounds=_quotient_bounds,
+    ),
+    Operation("mod", "value: the modulus, an integer above 0", sign="mod", binds=6, evaluate=operator.mod),
+    Operation("neg", sign="-", binds=7, evaluate=operator.neg, monotone=True),
+    Operation("to_real", "an int, flag or chance as float32; a draw rounded to float32"),
+    # Directions and choices
+    Operation(
+        "opposite",
+        "the neighbor, or the direction, the other way",
+        "opposite(PLACE)",
+        evaluate=lambda a: (a + 4) % 8,
+    ),
+    Operation(
+        "clockwise",
+        "the neighbor, or the direction, a quarter turn to the right",
+        "clockwise(PLACE)",
+        evaluate=lambda a: (a + 2) % 8,
+    ),
+    Operation(
+        "counterclockwise",
+        "the neighbor, or the direction, a quarter turn to the left",
+        "counterclockwise(PLACE)",
+    ),
+    Operation("pick", "one of the values, each as likely as the others", "pick(DRAW, A, B, …)", most=17),
+    Operation(
+        "choose",
+        "condition, value if it holds, value otherwise",
+        lowers="select",
+        evaluate=lambda condition, yes, no: yes if condition else no,
+        monotone=True,
+    ),
+    # Waves
+    Operation("sin", "the sine of an angle in radians", "sin(A)", (REAL,), REAL),
+    Operation("cos", "the cosine of an angle in radians", "cos(A)", (REAL,), REAL),
+    # Conditions
+    Operation(
+        "member",
         "value: frozen set of ids; whether the argument is one of them",
-        evaluate=lambda node, a: a in node.value,
+        lowers="in_set",
+        evaluate=lambda a, ids: a in ids,
     ),
-    "not": Operation(evaluate=lambda node, a: not a, bounds=lambda node, a: (1 - a[1], 1 - a[0])),
-    "and": Operation(bounds=lambda node, a, b: (a[0] and b[0], a[1] and b[1])),
-    "or": Operation(bounds=lambda node, a, b: (a[0] or b[0], a[1] or b[1])),
-    "eq": Operation(
-        evaluate=lambda node, a, b: a == b,
-        bounds=lambda node, a, b: (a[0] == a[1] == b[0] == b[1], a[0] <= b[1] and b[0] <= a[1]),
+    Operation(
+        "eq",
+        sign="==",
+        binds=4,
+        evaluate=operator.eq,
+        bounds=lambda a, b: (a[0] == a[1] == b[0] == b[1], a[0] <= b[1] and b[0] <= a[1]),
     ),
-    "lt": Operation(evaluate=lambda node, a, b: a < b, bounds=lambda node, a, b: (a[1] < b[0], a[0] < b[1])),
-    "le": Operation(
-        evaluate=lambda node, a, b: a <= b, bounds=lambda node, a, b: (a[1] <= b[0], a[0] <= b[1])
-    ),
-    "add": Operation(evaluate=lambda node, a, b: a + b, bounds=lambda node, a, b: (a[0] + b[0], a[1] + b[1])),
-    "sub": Operation(evaluate=lambda node, a, b: a - b, bounds=lambda node, a, b: (a[0] - b[1], a[1] - b[0])),
-    "mul": Operation(evaluate=lambda node, a, b: a * b, bounds=_product_bounds),
-    "div": Operation("real division; x / 0 is 0"),
-    "quotient": Operation(
-        "integer division, rounded down; x div 0 is 0", evaluate=lambda node, a, b: a // b if b else 0
-    ),
-    "neg": Operation(evaluate=lambda node, a: -a, bounds=lambda node, a: (-a[1], -a[0])),
-    "abs": Operation(evaluate=lambda node, a: abs(a), bounds=_abs_bounds),
-    "min": Operation(
-        evaluate=lambda node, a, b: min(a, b), bounds=lambda node, a, b: (min(a[0], b[0]), min(a[1], b[1]))
-    ),
-    "max": Operation(
-        evaluate=lambda node, a, b: max(a, b), bounds=lambda node, a, b: (max(a[0], b[0]), max(a[1], b[1]))
-    ),
-    "mod": Operation("value: the modulus, an integer above 0", evaluate=lambda node, a: a % node.value),
-    "to_real": Operation("an int, flag or chance as float32; a draw rounded to float32"),
-    "count": Operation("value: kernel; weighted number of neighborhood cells where the argument holds"),
-    "sum": Operation(
-        "value: kernel; weighted sum of the argument, within a row from the left, then the rows from the top"
-    ),
-    "choose": Operation("condition, value if it holds, value otherwise", bounds=_chosen_bounds),
-    "octant": Operation("the direction a vec2 points to"),
-    "opposite": _turned("the direction the other way", 4),
-    "clockwise": _turned("the direction a quarter turn to the right", 2),
-    "length": Operation("√(y² + x²) in float32"),
-    "sin": Operation("the sine of a float32, see `model.reference`"),
-    "cos": Operation("the cosine of a float32"),
-    "row_part": Operation("the first component of a vec2"),
-    "column_part": Operation("the second component of a vec2"),
-    "vector": Operation("a vec2 from its two components"),
-}
-"""Every operation of the model."""
+    Operation("lt", sign="<", binds=4, evaluate=operator.lt, monotone=True),
+    Operation("le", sign="<=", binds=4, evaluate=operator.le, monotone=True),
+    Operation("not", sign="not ", binds=3, evaluate=operator.not_, monotone=True),
+    Operation("and", sign="and", binds=2, evaluate=lambda a, b: a and b, monotone=True),
+    Operation("or", sign="or", binds=1, evaluate=lambda a, b: a or b, monotone=True),
+)
+
+OPERATIONS: dict[str, Operation] = {row.name: row for row in _TABLE}
+"""Every operation of the language. `at`, `pick` and what has a `meaning` or only turns neighbors is none of the model."""
+
+FUNCTIONS: dict[str, Operation] = {row.name: row for row in _TABLE if row.usage}
+"""The operations that rules call by name."""
+
+COMPARISONS: dict[str, str] = {row.sign: row.name for row in _TABLE if row.binds == OPERATIONS["eq"].binds}
+"""The operations that compare, by their signs."""

@@ -10,6 +10,7 @@ from powderdsl.diagnostics import Span
 from powderdsl.model.builtins import DIRECTIONS, OCTANTS
 from powderdsl.model.declarations import Block, PackDecl, PassDecl
 from powderdsl.model.expressions.operators import TRUE
+from powderdsl.model.operations import COMPARISONS, OPERATIONS
 from powderdsl.model.types import (
     Assign,
     Element,
@@ -29,21 +30,8 @@ from powderdsl.model.types import (
 )
 from powderdsl.syntax.ast import Syntax
 
-_INFIX: dict[str, tuple[str, int, int]] = {
-    # operation: (sign, how tightly it binds, how tightly its right side must bind without parentheses)
-    "or": ("or", 1, 1),
-    "and": ("and", 2, 2),
-    "eq": ("==", 4, 5),
-    "lt": ("<", 4, 5),
-    "le": ("<=", 4, 5),
-    "add": ("+", 5, 6),
-    "sub": ("-", 5, 6),
-    "mul": ("*", 6, 7),
-    "div": ("/", 6, 7),
-    "quotient": ("div", 6, 7),
-}
-_COMPARISONS = ("eq", "lt", "le")
 _ATOM = 9
+"""How tightly a word binds, or what ends in a parenthesis."""
 _PLACES = {offset: name for name, offset in DIRECTIONS.items()}
 
 
@@ -303,10 +291,14 @@ class _Printer:
     def _expr(self, expr: Expr) -> tuple[str, int]:
         """The text of an expression, and how tightly it binds."""
         rules, args = self.ruleset, expr.args
-        if expr.op in _INFIX:
-            sign, level, right = _INFIX[expr.op]
-            left = level + 1 if expr.op in _COMPARISONS else level
-            return f"{self.expr(args[0], left)} {sign} {self.expr(args[1], right)}", level
+        row = OPERATIONS[expr.op]
+        if row.sign:
+            sign, level = row.sign, row.binds
+            if len(args) == 1 and expr.value is None:
+                return f"{sign}{self.expr(args[0], level)}", level
+            # Comparisons do not nest, and a chain of `and` or `or` needs no parentheses on either side.
+            left = self.expr(args[0], level + (expr.op in COMPARISONS.values()))
+            return f"{left} {sign} {expr.value or self.expr(args[1], level + (level > 2))}", level
         match expr.op:
             case "const":
                 return show_value(rules, expr.kind, expr.value), _ATOM
@@ -322,12 +314,6 @@ class _Printer:
                 return f"{show_offset(expr.value)}.{self.expr(args[0], _ATOM)}", _ATOM
             case "member":
                 return f"{self.expr(args[0], 5)} in {show_set(rules, expr.value)}", 4
-            case "not":
-                return f"not {self.expr(args[0], 3)}", 3
-            case "neg":
-                return f"-{self.expr(args[0], 7)}", 7
-            case "mod":
-                return f"{self.expr(args[0], 6)} mod {expr.value}", 6
             case "count" | "sum":
                 kernel = self.kernel(expr.value)
                 return f"{expr.op}({self.expr(args[0], 5)} in {kernel})", _ATOM

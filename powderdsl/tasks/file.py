@@ -8,10 +8,10 @@ from typing import Any
 
 from powderdsl.compiler import load_with_diagnostics, names_in_file, read
 from powderdsl.diagnostics import CompileError, Reporter, Source, suggest
-from powderdsl.model.builtins import FUNCTIONS as RULE_FUNCTIONS
 from powderdsl.model.check import resolve_names
 from powderdsl.model.composition.palette import Palette
 from powderdsl.model.expressions.typer import Typer
+from powderdsl.model.operations import FUNCTIONS as RULE_FUNCTIONS
 from powderdsl.model.schema import Entries, Key, Reader, first_line
 from powderdsl.model.state import fits, size_problem
 from powderdsl.model.types import Expr, Ruleset

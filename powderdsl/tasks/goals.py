@@ -12,6 +12,7 @@ from powderdsl.diagnostics import Span, suggest
 from powderdsl.model.expressions.coercer import read_number
 from powderdsl.model.expressions.operators import Number, Operand, Poisoned, Scope, SetOf, Unresolved
 from powderdsl.model.expressions.typer import Typer
+from powderdsl.model.operations import COMPARISONS
 from powderdsl.model.types import FLAG, REAL, Expr
 from powderdsl.syntax.ast import Syntax
 from powderdsl.tasks.task import Measure
@@ -35,15 +36,7 @@ FUNCTIONS = {**MEASURES, **MEMORIES, **ARITHMETIC}
 ACTION_WORDS = ("taken", "left", "painted", "placed", "blown")
 """Numbers that describe the last action, and the counts of actions taken and left."""
 
-_BINARY = {
-    "add": "add",
-    "subtract": "sub",
-    "multiply": "mul",
-    "divide": "div",
-    "quotient": "quotient",
-    "mod": "mod",
-}
-_COMPARE = {"<": "lt", "<=": "le", "==": "eq"}
+_BINARY = ("add", "sub", "mul", "div", "quotient", "mod")
 REGION_LET = "in "
 """How the names of regions begin among the values that cell conditions read."""
 
@@ -105,14 +98,14 @@ class GoalChecker:
             return self.name(syntax)
         if kind == "call":
             return self.call(syntax)
-        if kind == "negate":
+        if kind == "neg":
             return Expr("neg", REAL, (self.scalar(parts[0]),))
         if kind in _BINARY:
             first, second = self.scalar(parts[0]), self.scalar(parts[1])
-            if kind in ("divide", "mod") and second.op == "const" and not second.value:
+            if kind in ("div", "mod") and second.op == "const" and not second.value:
                 fix = "divide by another number"
                 raise self.typer.fail("PD402", "division by zero", parts[1].span, "this is 0", fix)
-            return Expr(_BINARY[kind], REAL, (first, second))
+            return Expr(kind, REAL, (first, second))
         if kind == "choose":
             yes, condition, no = parts
             return Expr("choose", REAL, (self.truth(condition), self.scalar(yes), self.scalar(no)))
@@ -141,7 +134,7 @@ class GoalChecker:
         for sign, (left, right) in zip(syntax.text.split(), pairwise(values), strict=True):
             if sign in (">", ">="):
                 left, right, sign = right, left, sign.replace(">", "<")
-            one = Expr(_COMPARE.get(sign, "eq"), FLAG, (left, right))
+            one = Expr(COMPARISONS.get(sign, "eq"), FLAG, (left, right))
             found.append(Expr("not", FLAG, (one,)) if sign == "!=" else one)
         return reduce(lambda a, b: Expr("and", FLAG, (a, b)), found)
 

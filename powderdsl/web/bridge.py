@@ -19,7 +19,8 @@ from powderdsl.arrays import np
 from powderdsl.compiler import load_with_diagnostics, read, shipped
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter
 from powderdsl.diagnostics.render import diagnostic_data, render_text
-from powderdsl.model.builtins import FUNCTIONS, RESERVED
+from powderdsl.model.builtins import RESERVED
+from powderdsl.model.operations import FUNCTIONS
 from powderdsl.model.parameter_values import set_params
 from powderdsl.model.schema import KEYS
 from powderdsl.model.state import qualified_slots, slot_name

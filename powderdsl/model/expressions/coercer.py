@@ -38,6 +38,13 @@ _KINDS = {
     "real": "a float",
     "vec2": "a vector",
 }
+_HELPS = {
+    "chance": ("such as `5%`, or a parameter",),
+    "vec2": ("such as `vector(1, 0)`: rows down, columns right",),
+    "direction": ("such as `left`, or `octant(…)`",),
+}
+"""What to write where a value of a kind is needed."""
+
 _OPERANDS: dict[type, str] = {
     Place: "a place",
     PlaceChoice: "a choice of places",
@@ -92,10 +99,8 @@ class Coercer:
         match operand:
             case Expr() if operand.kind == FLAG:
                 return operand
-            case SetOf():
-                return member(ELEMENT_HERE, operand.ids, span)
-            case Items():
-                return self.flag(self.set_of(operand, span), span)
+            case SetOf() | Items():
+                return member(ELEMENT_HERE, self.set_of(operand, span).ids, span)
             case Absent():
                 return FALSE
         kind = operand.kind.name if isinstance(operand, Expr) else type(operand).__name__
@@ -124,23 +129,6 @@ class Coercer:
             raise Unresolved(operand.name)
         raise self.wrong(operand, "a neighbor", span, "such as `below`, `above.left`, or `at(2, -1)`")
 
-    def element(self, operand: Operand, span: Span) -> Expr:
-        match operand:
-            case Expr() if operand.kind == ELEMENT:
-                return operand
-            case Place():
-                return look(ELEMENT_HERE, operand.offset, span)
-            case PlaceChoice():
-                places = (self.element(operand.yes, span), self.element(operand.no, span))
-                return Expr("choose", ELEMENT, (operand.condition, *places), span=span)
-            case SetOf() if operand.name is not None:
-                return Expr("const", ELEMENT, value=operand.ids[0], span=span)
-            case SetOf():
-                raise self.wrong(operand, "one element", span, "name the element itself")
-            case Absent():
-                raise Unresolved(operand.name)
-        raise self.wrong(operand, "an element", span)
-
     def value(self, operand: Operand, span: Span) -> Expr | Number:
         """A runtime value or a number, as arithmetic and comparisons need."""
         match operand:
@@ -149,101 +137,89 @@ class Coercer:
             case SetOf(_, None):
                 return self.flag(operand, span)
             case SetOf() | Place() | PlaceChoice() | Absent():
-                return self.element(operand, span)
+                return self.of_kind(operand, ELEMENT, span)
         raise self.wrong(operand, "a value", span)
 
-    def real(self, operand: Operand, span: Span) -> Expr:
-        """A float; draws that integers were added to are rounded after each operation."""
-        value = self.value(operand, span)
+    def of_kind(self, operand: Operand, kind: Kind, span: Span) -> Expr:
+        """A value of a kind, as arguments and fields need it. Constants out of its range are reported."""
+        match kind.name, operand:
+            case "flag", Number() if operand.value in (0, 1):
+                return Expr("const", FLAG, value=int(operand.value), span=span)
+            case "flag", _:
+                return self.flag(operand, span)
+            case _, Absent():
+                raise Unresolved(operand.name)
+            case "element" | "direction", PlaceChoice():
+                ways = (self.of_kind(operand.yes, kind, span), self.of_kind(operand.no, kind, span))
+                return Expr("choose", kind, (operand.condition, *ways), span=span)
+            case "element", Place():
+                return look(ELEMENT_HERE, operand.offset, span)
+            case "element", SetOf():
+                if operand.name is None:
+                    raise self.wrong(operand, "one element", span, "name the element itself")
+                return Expr("const", ELEMENT, value=operand.ids[0], span=span)
+            case "direction", Place():
+                if operand.offset not in OCTANTS:
+                    raise self.fail("PD401", "not a direction", span, "directions are the eight neighbors")
+                return Expr("const", DIRECTION, value=OCTANTS.index(operand.offset), span=span)
+        value = operand if kind.name in ("element", "direction") else self.value(operand, span)
         if isinstance(value, Number):
-            return Expr("const", REAL, value=float(value.value), span=span)
-        if value.kind.name == "real":
-            return value
-        if value.kind.name == "draw" and value.op in ("add", "sub"):
-            return Expr(value.op, REAL, tuple(self.real(arg, span) for arg in value.args), span=span)
-        if value.kind.name == "draw" and value.op == "look":
-            return look(self.real(value.args[0], span), value.value, span)
-        if value.kind.name in ("int", "chance", "draw", "flag"):
-            return Expr("to_real", REAL, (value,), span=span)
-        raise self.wrong(value, "a number", span)
+            return self._constant(value.value, kind, span)
+        if isinstance(value, Expr):
+            if value.kind.name == kind.name:
+                return value
+            converted = self._converted(value, kind, span)
+            if converted is not None:
+                return converted
+        helps = (
+            _integer_helps(value, span)
+            if kind.name == "int" and isinstance(value, Expr)
+            else _HELPS.get(kind.name, ())
+        )
+        raise self.wrong(value, "a number" if kind.name == "real" else _KINDS[kind.name], span, *helps)
 
-    def integer(self, operand: Operand, span: Span) -> Expr:
-        value = self.value(operand, span)
-        if isinstance(value, Number):
-            if value.value.denominator != 1:
-                label = f"{float(value.value):g} is not whole"
+    def _converted(self, value: Expr, kind: Kind, span: Span) -> Expr | None:
+        """A number as a float or a chance. Draws that integers were added to are rounded after each operation."""
+        source = value.kind.name
+        if kind.name == "chance":
+            return (
+                value if source == "real" else self._converted(value, REAL, span) if source == "int" else None
+            )
+        if kind.name != "real" or source not in ("int", "chance", "draw", "flag"):
+            return None
+        if source == "draw" and value.op in ("add", "sub"):
+            return Expr(value.op, REAL, tuple(self.of_kind(arg, REAL, span) for arg in value.args), span=span)
+        if source == "draw" and value.op == "look":
+            return look(self.of_kind(value.args[0], REAL, span), value.value, span)
+        return Expr("to_real", REAL, (value,), span=span)
+
+    def _constant(self, number: Fraction, kind: Kind, span: Span) -> Expr:
+        """A number written in a rule, as a constant of a kind."""
+        match kind.name:
+            case "vec2" if number == 0:
+                zero = Expr("const", REAL, value=0.0, span=span)
+                return Expr("vector", VEC2, (zero, zero), span=span)
+            case "chance" if 0 <= number <= 1:
+                return Expr("const", CHANCE, value=number, span=span)
+            case "chance":
+                fix = "write a chance from `0%` to `100%`"
+                if 1 < number <= 100 and "%" not in span.text:
+                    fix = f"did you mean `{float(number):g}%`?"
+                message = f"a chance of {float(number * 100):g}%"
+                raise self.fail("PD403", message, span, "chances lie in 0%..100%", fix)
+            case "int" if number.denominator != 1:
+                label = f"{float(number):g} is not whole"
                 fix = "write an integer; a field may also be declared as `real(LOW..HIGH)`"
                 raise self.fail("PD401", "expected an integer", span, label, fix)
-            return constant(value, span)
-        if value.kind.name == "int":
-            return value
-        raise self.wrong(value, "an integer", span, *_integer_helps(value, span))
-
-    def chance(self, operand: Operand, span: Span) -> Expr:
-        """A probability: a constant within 0..1, or a property, parameter or field that is one."""
-        value = self.value(operand, span)
-        if isinstance(value, Number):
-            if not 0 <= value.value <= 1:
-                fix = "write a chance from `0%` to `100%`"
-                if 1 < value.value <= 100 and "%" not in span.text:
-                    fix = f"did you mean `{float(value.value):g}%`?"
-                message = f"a chance of {float(value.value * 100):g}%"
-                raise self.fail("PD403", message, span, "chances lie in 0%..100%", fix)
-            return Expr("const", CHANCE, value=value.value, span=span)
-        if value.kind.name in ("chance", "real"):
-            return value
-        if value.kind.name == "int":
-            return self.real(value, span)
-        raise self.wrong(value, "a chance", span, "such as `5%`, or a parameter")
-
-    def of_kind(self, operand: Operand, kind: Kind, span: Span) -> Expr:
-        """A value to store in something of `kind`. Constants out of range are reported."""
-        match kind.name:
-            case "flag" if isinstance(operand, Number) and operand.value in (0, 1):
-                return Expr("const", FLAG, value=int(operand.value), span=span)
-            case "flag":
-                return self.flag(operand, span)
-            case "element":
-                return self.element(operand, span)
-            case "direction":
-                return self.direction(operand, span)
-            case "chance":
-                return self.chance(operand, span)
-            case "vec2":
-                return self.vector(operand, span)
-            case "real":
-                value = self.real(operand, span)
-            case _:
-                value = self.integer(operand, span)
-        number = value.value if value.op == "const" else kind.lo
-        if isinstance(number, (int, float)) and not kind.lo <= number <= kind.hi:
-            label = f"the range is {kind.lo:g}..{kind.hi:g}"
-            fix = "write a number in this range, or widen it where it is declared"
-            raise self.fail("PD402", f"{number:g} lies outside {kind}", span, label, fix)
-        return value
-
-    def vector(self, operand: Operand, span: Span) -> Expr:
-        if isinstance(operand, Number) and operand.value == 0:
-            zero = Expr("const", REAL, value=0.0, span=span)
-            return Expr("vector", VEC2, (zero, zero), span=span)
-        value = self.value(operand, span)
-        if isinstance(value, Expr) and value.kind.name == "vec2":
-            return value
-        raise self.wrong(value, "a vector", span, "such as `vector(1, 0)`: rows down, columns right")
-
-    def direction(self, operand: Operand, span: Span) -> Expr:
-        if isinstance(operand, Place):
-            if operand.offset in OCTANTS:
-                return Expr("const", DIRECTION, value=OCTANTS.index(operand.offset), span=span)
-            raise self.fail("PD401", "not a direction", span, "directions are the eight neighbors")
-        if isinstance(operand, PlaceChoice):
-            ways = (self.direction(operand.yes, span), self.direction(operand.no, span))
-            return Expr("choose", DIRECTION, (operand.condition, *ways), span=span)
-        if isinstance(operand, Expr) and operand.kind == DIRECTION:
-            return operand
-        if isinstance(operand, Absent):
-            raise Unresolved(operand.name)
-        raise self.wrong(operand, "a direction", span, "such as `left`, or `octant(…)`")
+            case "int" | "real":
+                if kind != REAL and not kind.lo <= number <= kind.hi:
+                    label = f"the range is {kind.lo:g}..{kind.hi:g}"
+                    fix = "write a number in this range, or widen it where it is declared"
+                    raise self.fail("PD402", f"{float(number):g} lies outside {kind}", span, label, fix)
+                if kind.name == "int":
+                    return constant(Number(number), span)
+                return Expr("const", REAL, value=float(number), span=span)
+        raise self.wrong(Number(number), _KINDS[kind.name], span, *_HELPS.get(kind.name, ()))
 
     def offset(self, offset: Offset, span: Span) -> Offset:
         """An offset that rules can reach."""
@@ -306,7 +282,7 @@ def read_bounds(syntax: Syntax, coercer: Coercer) -> tuple[int, int]:
         raise coercer.fail("PD401", "expected a range", syntax.span, "such as `0..7`")
     bounds = []
     for end in syntax.children:
-        sign, literal = (-1, end.children[0]) if end.kind == "negate" else (1, end)
+        sign, literal = (-1, end.children[0]) if end.kind == "neg" else (1, end)
         if literal.kind != "integer":
             raise coercer.fail("PD405", "a range has integers at its ends", end.span, "not an integer")
         bounds.append(sign * int(read_number(literal, coercer)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import operator
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from math import ceil, floor
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from powderdsl.diagnostics import Span
 from powderdsl.model.builtins import COORDINATES
-from powderdsl.model.operations import OPS
+from powderdsl.model.operations import COMPARISONS, INTEGER, OPERATIONS
 from powderdsl.model.types import (
     CHANCE,
     DIRECTION,
@@ -213,26 +213,27 @@ def is_integer(value: Value) -> bool:
     return value.value.denominator == 1 if isinstance(value, Number) else value.kind.name == "int"
 
 
-def on_integers(typer: Typer, op: str, values: tuple[Value, ...], span: Span) -> Expr:
-    """An operation on integers; its range follows from theirs."""
-    args = tuple(typer.integer(value, span) for value in values)
-    return Expr(op, _range(op, *(arg.kind for arg in args)), args, span=span)
+def whole_constant(operand: Operand) -> int | None:
+    """The integer that an operand is, if it is a constant one."""
+    return int(operand.value) if isinstance(operand, Number) and is_integer(operand) else None
 
 
-def _range(op: str, *kinds: Kind) -> Kind:
-    bounds = OPS[op].bounds
-    assert bounds is not None
-    return integer(*bounds(None, *((kind.lo, kind.hi) for kind in kinds)))
-
-
-def on_floats(typer: Typer, op: str, values: tuple[Value, ...], span: Span) -> Expr:
-    return Expr(op, REAL, tuple(typer.real(value, span) for value in values), span=span)
+def arithmetic(typer: Typer, op: str, values: Sequence[Placed], span: Span) -> Value:
+    """An operation on numbers: constants are folded, integers stay integers, all else becomes floats."""
+    row = OPERATIONS[op]
+    numbers = [value.value for value, _ in values if isinstance(value, Number)]
+    if row.evaluate is not None and len(numbers) == len(values):
+        return Number(Fraction(row.evaluate(*numbers)))
+    if all(is_integer(value) for value, _ in values):
+        args = tuple(typer.of_kind(value, INTEGER, place) for value, place in values)
+        bounds = row.between(*((arg.kind.lo, arg.kind.hi) for arg in args))
+        if bounds is not None:
+            return Expr(op, integer(*bounds), args, span=span)
+    return Expr(op, REAL, tuple(typer.of_kind(value, REAL, place) for value, place in values), span=span)
 
 
 # Comparisons
 
-_COMPARISONS = {"==": "eq", "<": "lt", "<=": "le"}
-_FLIP = {">": "<", ">=": "<="}
 _COMPARABLE = {
     FLAG: ("a condition", "a condition holds or not: write it, or `not` and it"),
     ELEMENT: ("an element", "ask for an element, or one of a set, with `is`"),
@@ -245,12 +246,13 @@ def compare(typer: Typer, sign: str, left: Placed, right: Placed, span: Span) ->
     """A comparison as `eq`, `lt` or `le`, maybe negated."""
     if sign == "!=":
         return negation(compare(typer, "==", left, right, span), span)
-    if sign in _FLIP:
-        return compare(typer, _FLIP[sign], right, left, span)
+    if sign in (">", ">="):
+        return compare(typer, sign.replace(">", "<"), right, left, span)
     (a, _), (b, _) = left, right
-    op = _COMPARISONS[sign]
-    if isinstance(a, Number) and isinstance(b, Number):
-        return TRUE if getattr(operator, op)(a.value, b.value) else FALSE
+    op = COMPARISONS[sign]
+    evaluate = OPERATIONS[op].evaluate
+    if evaluate is not None and isinstance(a, Number) and isinstance(b, Number):
+        return TRUE if evaluate(a.value, b.value) else FALSE
     kinds = {kind_name(value) for value in (a, b)} - {""}
     if "draw" in kinds:
         return _compare_draw(typer, op, left, right, span)
@@ -258,7 +260,7 @@ def compare(typer: Typer, sign: str, left: Placed, right: Placed, span: Span) ->
         return _compare_discrete(typer, op, left, right, span)
     if kinds == {"int"}:
         return _compare_integers(typer, op, a, b, span)
-    return Expr(op, FLAG, (typer.real(a, span), typer.real(b, span)), span=span)
+    return Expr(op, FLAG, tuple(typer.of_kind(value, REAL, span) for value in (a, b)), span=span)
 
 
 def _compare_discrete(typer: Typer, op: str, left: Placed, right: Placed, span: Span) -> Expr:
@@ -283,7 +285,7 @@ def _compare_integers(typer: Typer, op: str, left: Value, right: Value, span: Sp
         left = Number(Fraction(floor(left.value) + (op == "le")))
     elif isinstance(right, Number) and not is_integer(right):
         right = Number(Fraction(ceil(right.value) - (op == "le")))
-    return Expr(op, FLAG, (typer.integer(left, span), typer.integer(right, span)), span=span)
+    return Expr(op, FLAG, tuple(typer.of_kind(value, INTEGER, span) for value in (left, right)), span=span)
 
 
 def _compare_draw(typer: Typer, op: str, left: Placed, right: Placed, span: Span) -> Expr:
@@ -307,7 +309,7 @@ def _compare_draw(typer: Typer, op: str, left: Placed, right: Placed, span: Span
         _check_resolution(typer, draw, other.value, place)
         other = Expr("const", kind, value=other.value, span=span)
     if other.kind.name == "real":
-        draw = typer.real(draw, span)
+        draw = typer.of_kind(draw, REAL, span)
     elif other.kind.name not in ("chance", "number", "int"):
         fix = "such as `5%`, a parameter or a property"
         raise typer.wrong(other, "a chance to compare the draw with", place, fix)
@@ -348,12 +350,12 @@ def holds(typer: Typer, left: Operand, right: Operand, syntax: Syntax) -> Expr:
         case SetOf(), SetOf() if left.name is not None:
             return TRUE if left.ids[0] in right.ids else FALSE
         case (PlaceChoice(), Place() | PlaceChoice()) | (Place(), PlaceChoice()):
-            one, other = typer.direction(left, first), typer.direction(right, second)
+            one, other = typer.of_kind(left, DIRECTION, first), typer.of_kind(right, DIRECTION, second)
             return compare(typer, "==", (one, span), (other, span), span)
         case Expr(), Place() | PlaceChoice():
-            return compare(typer, "==", (left, span), (typer.direction(right, second), span), span)
+            return compare(typer, "==", (left, span), (typer.of_kind(right, DIRECTION, second), span), span)
         case _, Expr() if right.kind == DIRECTION:
-            return compare(typer, "==", (typer.direction(left, first), span), (right, span), span)
+            return compare(typer, "==", (typer.of_kind(left, DIRECTION, first), span), (right, span), span)
         case _, Bounds():
             value = (typer.value(left, first), span)
             low, high = ((Number(Fraction(bound)), span) for bound in (right.lo, right.hi))
@@ -370,7 +372,7 @@ def holds(typer: Typer, left: Operand, right: Operand, syntax: Syntax) -> Expr:
     ids = typer.set_of(right, second).ids
     if isinstance(left, SetOf) and left.name is None:
         raise typer.wrong(left, "a place or an element before `is`", first, "such as `below is …`")
-    return member(typer.element(left, first), ids, span)
+    return member(typer.of_kind(left, ELEMENT, first), ids, span)
 
 
 def _stands_alone(item: Operand) -> bool:
@@ -391,45 +393,40 @@ def _not_a_set(typer: Typer, syntax: Syntax) -> Poisoned:
     message, fix = "`in` asks for a range or a set", "compare numbers with `==`"
     if syntax.kind in ("is_", "is_not"):
         message = "`is` asks for an element or a direction"
-    elif second.kind == "subtract":
+    elif second.kind == "sub":
         fix = "a range is written `LOW..HIGH`"
     return typer.fail("PD401", message, second.span, "this is a number", fix)
 
 
 # Arithmetic
 
-_BINARY = {"add": "add", "subtract": "sub", "multiply": "mul", "divide": "div"}
-"""Kinds of syntax, and the operations that they are."""
-
 
 def binary(typer: Typer, left: Value, right: Value, syntax: Syntax) -> Value:
     """`+ - * /` on numbers and vectors."""
-    op, span = _BINARY[syntax.kind], syntax.span
-    if isinstance(left, Number) and isinstance(right, Number):
-        _check_divisor(typer, op, right, syntax)
-        value = getattr(operator, "truediv" if op == "div" else op)(left.value, right.value)
-        if abs(value) > 10**6 or value.denominator > 10**18:
-            raise typer.fail("PD402", "a constant out of reach", span, "numbers go up to 1,000,000")
-        return Number(value)
-    for value, child in zip((left, right), syntax.children, strict=True):
-        if kind_name(value) in ("flag", "element", "direction"):
+    op, span = syntax.kind, syntax.span
+    kinds = [kind_name(value) for value in (left, right)]
+    for value, kind, child in zip((left, right), kinds, syntax.children, strict=True):
+        if kind in ("flag", "element", "direction"):
             raise typer.wrong(value, "a number", child.span)
     _check_divisor(typer, op, right, syntax)
-    kinds = [kind_name(value) for value in (left, right)]
     if "vec2" in kinds:
         return _on_vectors(typer, op, left, right, span)
-    if op != "div" and is_integer(left) and is_integer(right):
-        return typer.bounded(on_integers(typer, op, (left, right), span), span)
     # An integer added to a draw, or subtracted from it, shifts its range.
     shifts = op == "add" or (op == "sub" and kinds[0] == "draw")
     if shifts and sorted(kinds) in (["", "draw"], ["draw", "int"]):
-        a, b = (
-            value if isinstance(value, Expr) and value.kind.name == "draw" else typer.integer(value, span)
+        args = tuple(
+            value if isinstance(value, Expr) else typer.of_kind(value, INTEGER, span)
             for value in (left, right)
         )
-        bounds = _range(op, a.kind, b.kind)
-        return Expr(op, Kind("draw", bounds.lo, bounds.hi), (a, b), span=span)
-    return on_floats(typer, op, (left, right), span)
+        bounds = OPERATIONS[op].between(*((arg.kind.lo, arg.kind.hi) for arg in args))
+        assert bounds is not None
+        return Expr(op, Kind("draw", *bounds), args, span=span)
+    result = arithmetic(typer, op, [(left, span), (right, span)], span)
+    if isinstance(result, Number):
+        if abs(result.value) > 10**6 or result.value.denominator > 10**18:
+            raise typer.fail("PD402", "a constant out of reach", span, "numbers go up to 1,000,000")
+        return result
+    return typer.bounded(result, span)
 
 
 def _check_divisor(typer: Typer, op: str, divisor: Value, syntax: Syntax) -> None:
@@ -446,22 +443,19 @@ def _on_vectors(typer: Typer, op: str, left: Value, right: Value, span: Span) ->
     if (op == "mul" and first and second) or (op == "div" and second):
         message = "a vector is multiplied or divided by a number"
         raise typer.fail("PD401", message, span, "the other way round, or two vectors")
-    a = left if first else typer.real(left, span)
-    b = right if second else typer.real(right, span)
-    return Expr(op, VEC2, (a, b), span=span)  # type: ignore[arg-type]  # vectors, or made real
+    args = (
+        value if kind_name(value) == "vec2" else typer.of_kind(value, REAL, span) for value in (left, right)
+    )
+    return Expr(op, VEC2, tuple(args), span=span)  # type: ignore[arg-type]  # vectors, or made real
 
 
 def negate(typer: Typer, value: Value, span: Span) -> Value:
-    if isinstance(value, Number):
-        return Number(-value.value)
-    match value.kind.name:
-        case "int":
-            return on_integers(typer, "neg", (value,), span)
-        case "element" | "flag":
-            raise typer.wrong(value, "a number", span, "an item of a list has a blank after its `-`")
-        case "vec2":
-            return Expr("neg", VEC2, (value,), span=span)
-    return on_floats(typer, "neg", (value,), span)
+    kind = kind_name(value)
+    if kind in ("element", "flag"):
+        raise typer.wrong(value, "a number", span, "an item of a list has a blank after its `-`")
+    if isinstance(value, Expr) and kind == "vec2":
+        return Expr("neg", VEC2, (value,), span=span)
+    return arithmetic(typer, "neg", [(value, span)], span)
 
 
 def quotient(typer: Typer, syntax: Syntax, scope: Scope) -> Value:
@@ -470,61 +464,42 @@ def quotient(typer: Typer, syntax: Syntax, scope: Scope) -> Value:
     for value, span in values:
         if kind_name(value) == "real":
             raise typer.wrong(value, "an integer", span, "`div` divides integers; for floats say `/`")
-    a, b = (typer.integer(*value) for value in values)
-    _check_divisor(typer, "quotient", b, syntax)
-    if a.op == b.op == "const":
-        return Number(Fraction(int(a.value) // int(b.value)))
-    return Expr("quotient", _quotient_range(a.kind, b.kind), (a, b), span=syntax.span)
-
-
-def _quotient_range(a: Kind, b: Kind) -> Kind:
-    """The range of a div b: for divisors of one sign, the extremes lie at the ends of both ranges."""
-    divisors = [d for d in (b.lo, min(b.hi, -1), max(b.lo, 1), b.hi) if d and b.lo <= d <= b.hi]
-    corners = [x // d for x in (a.lo, a.hi) for d in divisors]
-    if b.lo <= 0 <= b.hi:
-        corners.append(0)
-    return integer(min(corners), max(corners))
+        typer.of_kind(value, INTEGER, span)
+    _check_divisor(typer, "quotient", values[1][0], syntax)
+    return arithmetic(typer, "quotient", values, syntax.span)
 
 
 def modulo(typer: Typer, syntax: Syntax, scope: Scope) -> Value:
     """`x mod n` for an integer constant n; coordinates (and their sums) may only appear here."""
     left, right = syntax.children
-    modulus = _small_constant(typer, right, scope, MAX_MODULUS)
-    if modulus is None:
+    modulus = whole_constant(typer.evaluate(right, scope))
+    if modulus is None or not 1 <= modulus <= MAX_MODULUS:
         label = f"expected 1 to {MAX_MODULUS}"
         raise typer.fail("PD405", "`mod` takes an integer constant", right.span, label)
     value = _coordinate_sum(typer, left, modulus, scope)
     if isinstance(value, Number):
         if not is_integer(value):
             raise typer.fail("PD401", "`mod` takes integers", left.span)
-        return Number(Fraction(int(value.value) % modulus))
+        return Number(value.value % modulus)
     return Expr("mod", integer(0, modulus - 1), (value,), modulus, syntax.span)
-
-
-def _small_constant(typer: Typer, syntax: Syntax, scope: Scope, most: int) -> int | None:
-    """An integer constant from 1 to `most`, if it is one."""
-    value = typer.value_of(syntax, scope)
-    if isinstance(value, Number) and is_integer(value) and 1 <= value.value <= most:
-        return int(value.value)
-    return None
 
 
 def _coordinate_sum(typer: Typer, syntax: Syntax, modulus: int, scope: Scope) -> Value:
     """Sums of coordinates, each reduced by the modulus, so that every part has a small declared range."""
     if syntax.kind == "name" and syntax.text in COORDINATES:
         return Expr("coordinate", integer(0, modulus - 1), (), (syntax.text, modulus), syntax.span)
-    if syntax.kind in ("add", "subtract"):
+    if syntax.kind in ("add", "sub"):
         left, right = (_coordinate_sum(typer, child, modulus, scope) for child in syntax.children)
         return binary(typer, left, right, syntax)
     if syntax.kind == "quotient" and _names_coordinate(syntax.children[0]):
         return _coordinate_quotient(typer, syntax, modulus, scope)
     value = typer.value_of(syntax, scope)
-    return value if isinstance(value, Number) else typer.integer(value, syntax.span)
+    return value if isinstance(value, Number) else typer.of_kind(value, INTEGER, syntax.span)
 
 
 def _names_coordinate(syntax: Syntax) -> bool:
     """Whether a sum has a coordinate among its terms."""
-    if syntax.kind in ("add", "subtract"):
+    if syntax.kind in ("add", "sub"):
         return any(_names_coordinate(child) for child in syntax.children)
     return syntax.kind == "name" and syntax.text in COORDINATES
 
@@ -533,11 +508,11 @@ def _coordinate_quotient(typer: Typer, syntax: Syntax, modulus: int, scope: Scop
     """`row div n` under `mod m`: what `row mod (n · m)` says, divided by n."""
     left, right = syntax.children
     most = MAX_MODULUS // modulus
-    number = _small_constant(typer, right, scope, most)
-    if number is None:
+    number = whole_constant(typer.evaluate(right, scope))
+    if number is None or not 1 <= number <= most:
         label = f"expected 1 to {most}: times {modulus} it is at most {MAX_MODULUS}"
         raise typer.fail("PD405", "a coordinate is divided by an integer constant", right.span, label)
-    inner = typer.integer(_coordinate_sum(typer, left, modulus * number, scope), left.span)
+    inner = typer.of_kind(_coordinate_sum(typer, left, modulus * number, scope), INTEGER, left.span)
     known = Expr("mod", integer(0, modulus * number - 1), (inner,), modulus * number, left.span)
     by = constant(Number(Fraction(number)), right.span)
     return Expr("quotient", integer(0, modulus - 1), (known, by), span=syntax.span)
@@ -551,29 +526,16 @@ def choose(
         return PlaceChoice(condition, yes[0], no[0])
     a, b = typer.value(*yes), typer.value(*no)
     kinds = {kind_name(value) or "number" for value in (a, b)}
+    numbers = [value.value for value in (a, b) if isinstance(value, Number)]
     if is_integer(a) and is_integer(b):
-        first, second = typer.integer(a, yes[1]), typer.integer(b, no[1])
-        kind = integer(min(first.kind.lo, second.kind.lo), max(first.kind.hi, second.kind.hi))
-    elif kinds <= {"chance", "number"} and all(
-        0 <= value.value <= 1 for value in (a, b) if isinstance(value, Number)
-    ):
-        kind, first, second = CHANCE, typer.chance(a, yes[1]), typer.chance(b, no[1])
+        kind = INTEGER
+    elif kinds <= {"chance", "number"} and all(0 <= number <= 1 for number in numbers):
+        kind = CHANCE
     elif kinds <= {"int", "number", "real", "chance", "draw"}:
-        kind, first, second = REAL, typer.real(a, yes[1]), typer.real(b, no[1])
+        kind = REAL
     else:  # a place is an element or a direction, whichever the other value is
         kind = next(o for o in (yes[0], no[0], a, b) if isinstance(o, Expr)).kind
-        first, second = typer.of_kind(yes[0], kind, yes[1]), typer.of_kind(no[0], kind, no[1])
+    first, second = typer.of_kind(yes[0], kind, yes[1]), typer.of_kind(no[0], kind, no[1])
+    if kind == INTEGER:
+        kind = integer(min(first.kind.lo, second.kind.lo), max(first.kind.hi, second.kind.hi))
     return Expr("choose", kind, (condition, first, second), span=span)
-
-
-def extreme(typer: Typer, op: str, values: list[Value], span: Span) -> Value:
-    """`min` or `max` of several numbers."""
-    result = values[0]
-    for value in values[1:]:
-        if isinstance(result, Number) and isinstance(value, Number):
-            result = Number((min if op == "min" else max)(result.value, value.value))
-        elif is_integer(result) and is_integer(value):
-            result = on_integers(typer, op, (result, value), span)
-        else:
-            result = on_floats(typer, op, (result, value), span)
-    return constant(result, span) if isinstance(result, Number) and is_integer(result) else result

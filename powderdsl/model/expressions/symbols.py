@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 
 from powderdsl.diagnostics import Label, Reporter, Span, suggest
-from powderdsl.model.builtins import DIRECTION_SETS, DIRECTIONS, FUNCTIONS, KERNELS, KIND_WORDS, grid_kernel
+from powderdsl.model.builtins import DIRECTION_SETS, DIRECTIONS, KERNELS, KIND_WORDS, grid_kernel
 from powderdsl.model.composition.compose import Composition
 from powderdsl.model.expressions.coercer import Coercer, read_bounds
 from powderdsl.model.expressions.operators import Items, Operand, Place, SetOf
+from powderdsl.model.operations import FUNCTIONS
 from powderdsl.model.state import SNAP
 from powderdsl.model.types import (
     CHANCE,

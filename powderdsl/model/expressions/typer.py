@@ -9,7 +9,7 @@ from itertools import pairwise, product
 from math import prod
 
 from powderdsl.diagnostics import Reporter, Span
-from powderdsl.model.builtins import COORDINATES, FUNCTIONS, KERNEL_SHAPES, KERNELS
+from powderdsl.model.builtins import COORDINATES, KERNEL_SHAPES, KERNELS
 from powderdsl.model.expressions.coercer import Coercer, read_bounds, read_number
 from powderdsl.model.expressions.functions import call
 from powderdsl.model.expressions.operators import (
@@ -45,7 +45,8 @@ from powderdsl.model.expressions.operators import (
 )
 from powderdsl.model.expressions.symbols import Symbols, UnknownNames, number_value
 from powderdsl.model.logic.needless import report_repeated
-from powderdsl.model.types import CHANCE, DRAW, FLAG, REAL, Expr, Kernel, Kind
+from powderdsl.model.operations import FUNCTIONS
+from powderdsl.model.types import CHANCE, DIRECTION, DRAW, FLAG, REAL, Expr, Kernel, Kind
 from powderdsl.model.types import Value as Constant
 from powderdsl.syntax.ast import Syntax
 
@@ -80,16 +81,20 @@ class Typer(Coercer):
 
     def evaluate(self, syntax: Syntax, scope: Scope) -> Operand:
         """The operand that syntax stands for. Raises Poisoned after reporting, Unresolved if it depends on an absent name."""
-        self._work += 1
-        if self._work > MAX_WORK + 1:
+        self.spend(1, syntax.span)
+        return HANDLERS[syntax.kind](self, syntax, scope)
+
+    def spend(self, parts: int, span: Span) -> None:
+        """Count parts of expressions. Raises Poisoned once a rule, or all of them, have too many."""
+        if self._work > MAX_WORK:
             raise Poisoned  # that has been reported, and is true of all that follows
+        self._work += parts
         if self._work - self._rule_start > MAX_RULE_WORK or self._work > MAX_WORK:
             self._rule_start = self._work  # once for a rule is enough
             what = "a rule that expands" if self._work <= MAX_WORK else "rules that expand"
-            span, label = self._rule_span or syntax.span, "written out, it has thousands of parts"
             fix = "loop over fewer things, or name parts under `let:`"
-            raise self.fail("PD508", f"{what} to too much", span, label, fix)
-        return HANDLERS[syntax.kind](self, syntax, scope)
+            label = "written out, it has thousands of parts"
+            raise self.fail("PD508", f"{what} to too much", self._rule_span or span, label, fix)
 
     def start_rule(self, span: Span) -> None:
         """Start counting the work of the rule or value at `span`."""
@@ -211,7 +216,7 @@ class Typer(Coercer):
             label, fix = "its radius is missing", f"write `{word}(3)`"
             raise self.fail("PD406", f"`{word}` needs a radius", span, label, fix)
         if word in FUNCTIONS:
-            fix = f"write `{FUNCTIONS[word].signature}`"
+            fix = f"write `{FUNCTIONS[word].usage}`"
             raise self.fail("PD406", f"`{word}` is a function", span, "its values are missing", fix)
         return self.lookup(word, span, scope)
 
@@ -339,7 +344,7 @@ class Typer(Coercer):
         self._no_sets(operands, syntax)
         headings = any(kind_name(operand) == "direction" for operand in operands)
         values: list[tuple[Value, Span]] = [
-            (self.direction(operand, child.span), child.span)
+            (self.of_kind(operand, DIRECTION, child.span), child.span)
             if headings and isinstance(operand, (Place, PlaceChoice))
             else (self.value(operand, child.span), child.span)
             for operand, child in zip(operands, syntax.children, strict=True)
@@ -425,7 +430,7 @@ class Typer(Coercer):
     def chance_draw(self, stream: str, syntax: Syntax, scope: Scope) -> Expr:
         """`with chance P`: a draw of the rule's own stream below P."""
         span = syntax.span
-        threshold = self.chance(self.evaluate(syntax, scope), span)
+        threshold = self.of_kind(self.evaluate(syntax, scope), CHANCE, span)
         draw = Expr("draw", DRAW, value=stream, span=span)
         if threshold.kind == CHANCE:
             return compare(self, "<", (draw, span), (threshold, span), span)
@@ -453,8 +458,8 @@ HANDLERS: dict[str, Callable[[Typer, Syntax, Scope], Operand]] = {
     "choose": Typer.choose,
     **dict.fromkeys(("any_of", "all_of"), Typer.quantifier),
     "call": call,
-    **dict.fromkeys(("add", "subtract", "multiply", "divide"), Typer.binary),
-    "negate": lambda typer, at, scope: negate(typer, typer.value_of(at.children[0], scope), at.span),
+    **dict.fromkeys(("add", "sub", "mul", "div"), Typer.binary),
+    "neg": lambda typer, at, scope: negate(typer, typer.value_of(at.children[0], scope), at.span),
     "quotient": quotient,
     "mod": modulo,
 }

@@ -36,7 +36,7 @@ from powderdsl.model.logic.satisfy import (
     some,
     substeps,
 )
-from powderdsl.model.operations import OPS
+from powderdsl.model.operations import OPERATIONS
 from powderdsl.model.types import FLAG, Assign, Expr, Move, Offset, Pass, Rule, Swap, Transform
 
 if TYPE_CHECKING:
@@ -448,6 +448,4 @@ def _follows(expr: Expr, follow: Lets) -> Expr:
     return TRUE
 
 
-_COORDINATES = frozenset(
-    ("const", "coordinate", "and", "or", *(name for name, row in OPS.items() if row.evaluate))
-)
+_COORDINATES = frozenset(("const", "coordinate", *(row.name for row in OPERATIONS.values() if row.evaluate)))

@@ -27,7 +27,7 @@ from powderdsl.model.logic.satisfy import (
     substeps,
     writes_of,
 )
-from powderdsl.model.operations import OPS
+from powderdsl.model.operations import OPERATIONS
 from powderdsl.model.text import place_of
 from powderdsl.model.types import (
     Assign,
@@ -93,15 +93,13 @@ def _report_decided(passes: tuple[Pass, ...], silent: Sequence[Span], reporter: 
     for _, moment, lets in substeps(passes):
         for node in (node for part in (*lets.values(), *_parts(moment.rules)) for node in part.walk()):
             if node.op in ("eq", "lt", "le") and node.span is not None:
-                kinds, bounds = [arg.kind for arg in node.args], OPS[node.op].bounds
-                low, high = False, True
-                if (
-                    bounds is not None
-                    and all(kind.name == "int" for kind in kinds)
-                    and any(arg.op != "const" for arg in node.args)
+                bounds = None
+                if all(arg.kind.name == "int" for arg in node.args) and any(
+                    arg.op != "const" for arg in node.args
                 ):
-                    low, high = bounds(node, *((kind.lo, kind.hi) for kind in kinds))
-                outcomes.setdefault(node.span, set()).add(bool(low) if low == high else None)
+                    bounds = OPERATIONS[node.op].between(*((arg.kind.lo, arg.kind.hi) for arg in node.args))
+                outcome = bool(bounds[0]) if bounds and bounds[0] == bounds[1] else None
+                outcomes.setdefault(node.span, set()).add(outcome)
     for span, found in outcomes.items():
         if found in ({True}, {False}) and not _inside_any(span, silent):
             reporter.report(

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any, NamedTuple, TypeVar
 
-from powderdsl.model.operations import OPS, Bounds
-from powderdsl.model.types import Assign, Expr, Moment, Offset, Pass, Property, Rule
+from powderdsl.model.operations import OPERATIONS, Bounds
+from powderdsl.model.types import FLAG, Assign, Expr, Moment, Offset, Pass, Property, Rule
 
 HERE: Offset = (0, 0)
 
@@ -396,7 +396,7 @@ class _Search:
                 return self._value(args[1 if self._value(args[0], chosen) else 2], chosen)
             case "coordinate":
                 return (chosen[keys[0]] + about) % node.value[1]
-        return _EVALUATE[op](node, *[self._value(arg, chosen) for arg in args])
+        return _evaluated(node, [self._value(arg, chosen) for arg in args])
 
     def _bounds(self, term: _Term) -> Bounds:
         """The bounds of the value while some variables are open; those of a flag are 0 and 1."""
@@ -427,14 +427,14 @@ class _Search:
             case "coordinate":
                 return (self._value(term, chosen),) * 2 if keys[0] in chosen else (0, node.value[1] - 1)
         bounds = [self._bounds(arg) for arg in args]
-        if op == "member":
-            low, high = bounds[0]
-            return (0, 1) if low != high else (low in node.value,) * 2
-        combined = OPS[op].bounds
-        if combined is not None:
-            return combined(node, *bounds)
-        if all(low == high for low, high in bounds):
-            return (_EVALUATE[op](node, *(low for low, _ in bounds)),) * 2
+        if _ANY not in bounds:
+            combined = OPERATIONS[op].between(*bounds)
+            if combined is not None:
+                return combined
+            if all(low == high for low, high in bounds):
+                return (_evaluated(node, [low for low, _ in bounds]),) * 2
+        if node.kind == FLAG:
+            return 0, 1
         return (node.kind.lo, node.kind.hi) if node.kind.name == "int" else _ANY
 
     def _span(self, key: int) -> Bounds:
@@ -446,7 +446,13 @@ class _Search:
 
 
 _ANY: Bounds = (-math.inf, math.inf)
-_EVALUATE = {name: row.evaluate for name, row in OPS.items() if row.evaluate}
+
+
+def _evaluated(node: Expr, args: list[Any]) -> Any:
+    """The value of an operation for those of its arguments."""
+    evaluate = OPERATIONS[node.op].evaluate
+    assert evaluate is not None
+    return evaluate(*args) if node.value is None else evaluate(*args, node.value)
 
 
 def _plus(at: Offset, offset: Offset) -> Offset:
@@ -465,7 +471,7 @@ def _is_opaque(node: Expr) -> bool:
         return True
     if op in ("eq", "lt", "le") and any(a.kind.name in _FLOATS and a.op != "const" for a in node.args):
         return True
-    if op not in _EVALUATE and op not in ("and", "or", "choose"):
+    if OPERATIONS[op].evaluate is None:
         raise _Unknown
     return False
 
