@@ -45,11 +45,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "system": ("arrays", "diagnostics"),
     "syntax": ("diagnostics", "system"),
     "model": ("diagnostics", "system", "syntax"),
-    "model.float_operations": ("arrays",),
-    "model.reference": (
-        *_FRONT,
-        "model.float_operations",
-    ),  # never ir: an oracle that shares the lowering cannot see a bug in it
+    "model.reference": _FRONT,  # never ir: an oracle that shares the lowering cannot see a bug in it
     "analysis": _FRONT,  # decides from the model alone: no world is run
     "ir": ("diagnostics",),
     "ir.stages": ("diagnostics", "ir"),  # never the model: by now all that is needed is in the IR

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
 from math import ceil, floor, pi
-from typing import Any
 
 from powderdsl.analysis.changes import facts_of
 from powderdsl.ir.ops import (
@@ -29,6 +28,7 @@ from powderdsl.ir.ops import (
 )
 from powderdsl.ir.single import single
 from powderdsl.model.logic.satisfy import Budget, Facts, satisfiable
+from powderdsl.model.operations import OPERATIONS
 from powderdsl.model.state import Slot, scratch_slots, slots
 from powderdsl.model.types import (
     Assign,
@@ -37,11 +37,13 @@ from powderdsl.model.types import (
     Kind,
     Moment,
     Move,
+    Offset,
     Pass,
     Property,
     Ruleset,
     Swap,
     Transform,
+    Value,
 )
 
 Pair = tuple[Node, Node]
@@ -69,20 +71,36 @@ class Inputs:
     build: Builder
     state: dict[str, Node]
     lets: dict[str, Node | Pair]
+    threshold: Threshold | None = None
+    """Chances are the number of draws below them if this is given, else floats."""
+
+    def constant(self, value: Value | str, kind: Kind) -> Node:
+        """A constant of a kind; a text names a parameter."""
+        build, threshold = self.build, self.threshold
+        if isinstance(value, str):
+            param = next(p for p in self.ruleset.params if p.name == value)
+            if kind.name == "chance" and threshold is not None:
+                return build.make("param", integer(0, 1 << threshold.bits), attr=(value, threshold))
+            types = {"flag": FLAG, "int": integer(int(param.kind.lo), int(param.kind.hi))}
+            return build.make("param", types.get(param.kind.name, REAL), attr=(value, None))
+        assert not isinstance(value, tuple)
+        match kind.name:
+            case "flag":
+                return build.flag(bool(value))
+            case "chance" if threshold is not None:
+                return build.integer(draws_below(value, threshold))
+            case "chance" | "real":
+                return build.real(_float32(value))
+        return build.integer(int(value))
 
     def property_of(self, prop: Property, element: Node) -> Node:
-        """A property of given elements; values that are parameters are chosen one at a time."""
-        build = self.build
+        """A property of given elements; chances, and values that are parameters, are chosen one at a time."""
         values = prop.values
-        if any(isinstance(value, str) for value in values):
-            type = FLAG if prop.kind.name == "flag" else integer(0, 0)
-            return self.by_element(
-                element,
-                [param_node(self, v) if isinstance(v, str) else build.const(v, type) for v in values],  # type: ignore[arg-type]  # only numbers are left
-            )
+        if prop.kind.name == "chance" or any(isinstance(value, str) for value in values):
+            return self.by_element(element, [self.constant(value, prop.kind) for value in values])
         if prop.kind.name == "flag":
-            return build.in_set(element, frozenset(i for i, value in enumerate(values) if value))
-        return build.derive("table", element, attr=tuple(int(value) for value in values))  # type: ignore[arg-type]  # only numbers are left
+            return self.build.in_set(element, frozenset(i for i, value in enumerate(values) if value))
+        return self.build.derive("table", element, attr=tuple(int(value) for value in values))  # type: ignore[arg-type]  # only numbers are left
 
     def by_element(self, element: Node, values: list[Node]) -> Node:
         """The value that belongs to the element: one select a distinct value."""
@@ -96,8 +114,15 @@ class Inputs:
 
 
 def lower_expression(expr: Expr, at: Inputs) -> Node | Pair:
-    """The node of a checked expression; a pair for vectors."""
-    return _LOWER[expr.op](expr, at)
+    """The node of a checked expression; a pair for vectors.
+
+    What has no code in `_LOWER` is an operation of the IR, as its row says, of numbers or of both parts of vectors.
+    """
+    if expr.op in _LOWER:
+        return _LOWER[expr.op](expr, at)
+    name = OPERATIONS[expr.op].lowers or expr.op
+    args = [lower_expression(arg, at) for arg in expr.args]
+    return _each(partial(at.build.derive, name, attr=expr.value), *args)
 
 
 def node(expr: Expr, at: Inputs) -> Node:
@@ -113,23 +138,13 @@ def pair(expr: Expr, at: Inputs) -> Pair:
     return lowered
 
 
-def param_node(at: Inputs, name: str, threshold: Threshold | None = None) -> Node:
-    """A parameter's value, or as a chance the number of draws that lie below it."""
-    param = next(p for p in at.ruleset.params if p.name == name)
-    if threshold is not None:
-        return at.build.make("param", integer(0, 1 << threshold.bits), attr=(name, threshold))
-    type = {"flag": FLAG, "int": integer(int(param.kind.lo), int(param.kind.hi))}.get(param.kind.name, REAL)
-    return at.build.make("param", type, attr=(name, None))
-
-
-def _const(expr: Expr, at: Inputs) -> Node:
-    build = at.build
-    match expr.kind.name:
-        case "flag":
-            return build.flag(bool(expr.value))
-        case "real" | "chance" | "number":
-            return build.real(_float32(expr.value))
-    return build.integer(int(expr.value))
+def _each(function: Callable[..., Node], *values: Node | Pair) -> Node | Pair:
+    """Apply to numbers, or to both parts of vectors; numbers beside vectors serve both parts."""
+    if all(isinstance(value, Node) for value in values):
+        return function(*values)
+    rows = [value if isinstance(value, Node) else value[0] for value in values]
+    columns = [value if isinstance(value, Node) else value[1] for value in values]
+    return function(*rows), function(*columns)
 
 
 def _float32(value: object) -> float:
@@ -140,118 +155,29 @@ def _float32(value: object) -> float:
 def _property(expr: Expr, at: Inputs) -> Node:
     prop = at.ruleset.property(str(expr.value))
     assert prop is not None
-    if prop.stored:
-        return at.state[prop.name]
-    if prop.kind.name == "chance":
-        return _chance(expr, at)
-    return at.property_of(prop, at.state["element"])
+    return at.state[prop.name] if prop.stored else at.property_of(prop, at.state["element"])
 
 
-def _slot(name: str, at: Inputs) -> Node | Pair:
+def _slot(expr: Expr, at: Inputs) -> Node | Pair:
+    name = str(expr.value)
     if name in at.state:
         return at.state[name]
     row, column = component_names(name)
     return at.state[row], at.state[column]
 
 
-def _each(function: Callable[..., Node], *values: Node | Pair) -> Node | Pair:
-    """Apply to numbers, or to both parts of vectors; numbers beside vectors serve both parts."""
-    if all(isinstance(value, Node) for value in values):
-        return function(*values)
-    rows = [value if isinstance(value, Node) else value[0] for value in values]
-    columns = [value if isinstance(value, Node) else value[1] for value in values]
-    return function(*rows), function(*columns)
-
-
 def _look(expr: Expr, at: Inputs) -> Node | Pair:
-    offset = expr.value
-    return _each(lambda a: at.build.shift(a, offset), lower_expression(expr.args[0], at))
+    return _each(lambda a: at.build.shift(a, expr.value), lower_expression(expr.args[0], at))
 
 
-def _arithmetic(expr: Expr, at: Inputs) -> Node | Pair:
-    return _each(partial(at.build.derive, expr.op), *(lower_expression(arg, at) for arg in expr.args))
-
-
-def _member(expr: Expr, at: Inputs) -> Node:
-    return at.build.in_set(node(expr.args[0], at), expr.value)
-
-
-def _logic(expr: Expr, at: Inputs) -> Node:
-    return at.build.derive(expr.op, *(node(arg, at) for arg in expr.args))
-
-
-def _to_real(expr: Expr, at: Inputs) -> Node:
-    argument = expr.args[0]
-    if argument.kind.name == "draw":
-        return _draw_real(argument, at)
-    if argument.kind.name == "chance":
-        return _chance(argument, at)
-    return at.build.to_real(node(argument, at))
-
-
-def _draw_real(expr: Expr, at: Inputs) -> Node:
-    """A draw as float32. Sums with integers are rounded after each addition."""
-    if expr.op == "draw":
-        return at.build.derive("draw", attr=_stream(expr, at))
-    parts = [_draw_real(a, at) if a.kind.name == "draw" else at.build.to_real(node(a, at)) for a in expr.args]
-    if expr.op == "look":
-        return at.build.shift(parts[0], expr.value)
-    return at.build.derive(expr.op, parts[0], parts[1])
-
-
-def _chance(expr: Expr, at: Inputs, threshold: Threshold | None = None) -> Node:
-    """A chance as float32, or as the number of draws below it."""
-    build = at.build
-
-    def number(value: Any) -> Node:
-        if isinstance(value, str):
-            return param_node(at, value, threshold)
-        return (
-            build.real(_float32(value)) if threshold is None else build.integer(draws_below(value, threshold))
-        )
-
-    match expr.op:
-        case "const" | "param":
-            return number(expr.value)
-        case "look":
-            return build.shift(_chance(expr.args[0], at, threshold), expr.value)
-        case "choose":
-            condition, yes, no = expr.args
-            return build.select(node(condition, at), _chance(yes, at, threshold), _chance(no, at, threshold))
-        case "let":
-            value = at.lets[str(expr.value)]
-            assert isinstance(value, Node)
-            return value
-    prop = at.ruleset.property(str(expr.value))
-    assert prop is not None
-    return at.by_element(at.state["element"], [number(value) for value in prop.values])
+def _eq(expr: Expr, at: Inputs) -> Node:
+    a, b = (node(arg, at) for arg in expr.args)
+    if a.type == FLAG:
+        return at.build.not_(at.build.derive("xor", a, b))
+    return at.build.derive("eq", a, b)
 
 
 # Draws
-
-
-def _stream(expr: Expr, at: Inputs) -> tuple[str, int]:
-    stream = next(s for s in at.ruleset.streams if s.name == expr.value)
-    return stream.name, stream.bits
-
-
-def _split_draw(expr: Expr, at: Inputs) -> tuple[Expr, tuple[int, int], Node | None]:
-    """A draw expression as (draw, where it is read, integer added to it)."""
-    if expr.op == "draw":
-        return expr, (0, 0), None
-    if expr.op == "look":
-        draw, (dy, dx), extra = _split_draw(expr.args[0], at)
-        oy, ox = expr.value
-        return draw, (dy + oy, dx + ox), at.build.shift(extra, (oy, ox)) if extra else None
-    left, right = expr.args
-    if left.kind.name == "draw":
-        draw, offset, extra = _split_draw(left, at)
-        other = node(right, at)
-        other = at.build.derive("neg", other) if expr.op == "sub" else other
-    else:
-        draw, offset, extra = _split_draw(right, at)
-        other = node(left, at)
-    return draw, offset, at.build.derive("add", extra, other) if extra else other
 
 
 def draws_below(chance: Fraction | float, threshold: Threshold) -> int:
@@ -261,31 +187,47 @@ def draws_below(chance: Fraction | float, threshold: Threshold) -> int:
     return min(max(count, 0), 1 << threshold.bits)
 
 
+def _stream(name: str, at: Inputs) -> tuple[str, int]:
+    return name, next(stream.bits for stream in at.ruleset.streams if stream.name == name)
+
+
+def _split_draw(expr: Expr, at: Inputs) -> tuple[tuple[str, int], Offset, Node | None]:
+    """A draw as its stream, the offset at which it is read, and the integer that is added to it."""
+    build = at.build
+    if expr.op == "draw":
+        return _stream(expr.value, at), (0, 0), None
+    if expr.op == "look":
+        stream, (dy, dx), extra = _split_draw(expr.args[0], at)
+        oy, ox = expr.value
+        return stream, (dy + oy, dx + ox), build.shift(extra, (oy, ox)) if extra else None
+    draw, number = sorted(expr.args, key=lambda arg: arg.kind.name != "draw")
+    stream, offset, extra = _split_draw(draw, at)
+    other = node(number, at)
+    other = build.derive("neg", other) if expr.op == "sub" else other
+    return stream, offset, build.derive("add", extra, other) if extra else other
+
+
 def _lt(expr: Expr, at: Inputs) -> Node:
     left, right = expr.args
-    if "draw" not in (left.kind.name, right.kind.name):
-        return _compare(expr, at)
-    # draw + extra < other, or other < draw + extra, which is the opposite of draw + extra <= other
     build = at.build
+    if "draw" not in (left.kind.name, right.kind.name):
+        return build.derive("lt", node(left, at), node(right, at))
+    # draw + extra < other, or other < draw + extra, which is the opposite of draw + extra <= other
     flipped = right.kind.name == "draw"
-    draw, offset, extra = _split_draw(right if flipped else left, at)
-    other = left if flipped else right
-
-    def below(limit: Node) -> Node:
-        there = build.shift(limit, (-offset[0], -offset[1]))
-        return build.shift(build.derive("below", there, attr=_stream(draw, at)), offset)
-
-    threshold = Threshold(_stream(draw, at)[1], strict=not flipped)
+    draw, other = (right, left) if flipped else (left, right)
+    stream, offset, extra = _split_draw(draw, at)
+    threshold = Threshold(stream[1], strict=not flipped)
     if other.kind.name == "int":
         limit = node(other, at)
         result = build.derive("lt", extra or build.integer(0), limit)
         return build.not_(result) if flipped else result
-    base = 0
-    if isinstance(other.value, (int, Fraction)) and other.op == "const":
-        base = floor(other.value)
-        part = below(build.integer(draws_below(Fraction(other.value) - base, threshold)))
+    base = floor(other.value) if other.op == "const" else 0
+    if other.op == "const":
+        limit = build.integer(draws_below(other.value - base, threshold))
     else:
-        part = below(_chance(other, at, threshold))
+        limit = node(other, replace(at, threshold=threshold))
+    there = build.shift(limit, (-offset[0], -offset[1]))
+    part = build.shift(build.derive("below", there, attr=stream), offset)
     if extra is None:
         result = part if base == 0 else build.flag(base > 0)
     else:
@@ -295,19 +237,7 @@ def _lt(expr: Expr, at: Inputs) -> Node:
     return build.not_(result) if flipped else result
 
 
-def _compare(expr: Expr, at: Inputs) -> Node:
-    a, b = (node(arg, at) for arg in expr.args)
-    if a.type == FLAG:
-        return at.build.not_(at.build.derive("xor", a, b))
-    return at.build.derive(expr.op, a, b)
-
-
 # Neighborhoods and vectors
-
-
-def _count(expr: Expr, at: Inputs) -> Node:
-    kernel = expr.value
-    return at.build.derive("count", node(expr.args[0], at), attr=(kernel.weights, kernel.wrap))
 
 
 def _sum(expr: Expr, at: Inputs) -> Node | Pair:
@@ -404,42 +334,24 @@ def _wave(expr: Expr, at: Inputs) -> Node:
     return build.select(down, build.derive("neg", value), value)
 
 
-def _vector(expr: Expr, at: Inputs) -> Pair:
-    return node(expr.args[0], at), node(expr.args[1], at)
-
-
-def _choose(expr: Expr, at: Inputs) -> Node | Pair:
-    if expr.kind.name == "chance":
-        return _chance(expr, at)
-    condition = node(expr.args[0], at)
-    values = [lower_expression(arg, at) for arg in expr.args[1:]]
-    return _each(lambda a, b: at.build.select(condition, a, b), *values)
-
-
 _LOWER: dict[str, Callable[[Expr, Inputs], Node | Pair]] = {
-    "const": _const,
-    "param": lambda e, at: param_node(at, str(e.value)),
+    **dict.fromkeys(("const", "param"), lambda e, at: at.constant(e.value, e.kind)),
     "element": lambda e, at: at.state["element"],
     "property": _property,
-    "field": lambda e, at: _slot(str(e.value), at),
+    "field": _slot,
     "let": lambda e, at: at.lets[str(e.value)],
-    "draw": _draw_real,
+    "draw": lambda e, at: at.build.derive("draw", attr=_stream(e.value, at)),
     "coordinate": lambda e, at: at.build.make(
         "coordinate", integer(int(e.kind.lo), int(e.kind.hi)), attr=e.value
     ),
-    "inside": lambda e, at: at.build.derive("inside", attr=e.value),
     "look": _look,
-    "member": _member,
-    **dict.fromkeys(("not", "and", "or"), _logic),
-    **dict.fromkeys(("eq", "le"), _compare),
+    "eq": _eq,
     "lt": _lt,
-    **dict.fromkeys(("add", "sub", "mul", "min", "max", "div", "neg", "abs"), _arithmetic),
-    "quotient": lambda e, at: at.build.derive("quotient", node(e.args[0], at), node(e.args[1], at)),
-    "mod": lambda e, at: at.build.derive("mod", node(e.args[0], at), attr=e.value),
-    "to_real": _to_real,
-    "count": _count,
+    "to_real": lambda e, at: at.build.to_real(node(e.args[0], replace(at, threshold=None))),
+    "count": lambda e, at: at.build.derive(
+        "count", node(e.args[0], at), attr=(e.value.weights, e.value.wrap)
+    ),
     "sum": _sum,
-    "choose": _choose,
     "octant": _octant,
     "opposite": _turned(4),
     "clockwise": _turned(2),
@@ -448,9 +360,9 @@ _LOWER: dict[str, Callable[[Expr, Inputs], Node | Pair]] = {
     "length": lambda e, at: _length(pair(e.args[0], at), at.build),
     "row_part": lambda e, at: pair(e.args[0], at)[0],
     "column_part": lambda e, at: pair(e.args[0], at)[1],
-    "vector": _vector,
+    "vector": lambda e, at: (node(e.args[0], at), node(e.args[1], at)),
 }
-"""One lowering for every operation of the model."""
+"""Operations of the model that are more than one of the IR."""
 
 
 Mover = Transform | Swap | Move

@@ -109,11 +109,7 @@ _TABLE = (
         (PLACE,),
         FLAG,
     ),
-    Operation(
-        "look",
-        "value: offset; the argument as it is at that neighbor (the grid wraps around)",
-        lowers="shift",
-    ),
+    Operation("look", "value: offset; the argument as it is at that neighbor (the grid wraps around)"),
     # Vectors
     Operation("octant", "the direction a vector points to", "octant(VEC2)", (VEC2,), DIRECTION),
     Operation("length", "the length of a vector", "length(VEC2)", (VEC2,), REAL),

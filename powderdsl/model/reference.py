@@ -6,13 +6,13 @@ are int64 here, floats float32 with one rounding an operation, draws float64.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any, NamedTuple, Protocol
 
 from powderdsl.arrays import np
-from powderdsl.model import float_operations as floats
 from powderdsl.model.state import SNAP, Slot, scratch_slots, slots
 from powderdsl.model.types import (
     Assign,
@@ -181,8 +181,11 @@ class Context:
 
 def evaluate(expr: Expr, at: Context) -> Array:
     """The value of an expression in every cell."""
+    args = [evaluate(arg, at) for arg in expr.args]
+    if any(arg.ndim == 4 for arg in args):  # numbers beside vectors get an axis to match
+        args = [arg if arg.ndim == 4 else arg[:, None] for arg in args]
     with np.errstate(all="ignore"):
-        return np.asarray(_OPS[expr.op](expr, at, *(evaluate(arg, at) for arg in expr.args)))
+        return np.asarray(_OPS[expr.op](expr, at, *args))
 
 
 def _constant(expr: Expr, at: Context) -> Array:
@@ -241,10 +244,6 @@ def _member(expr: Expr, at: Context, ids: Array) -> Array:
     return np.isin(ids, sorted(expr.value))
 
 
-def _choose(expr: Expr, at: Context, condition: Array, yes: Array, no: Array) -> Array:
-    return np.where(condition[:, None] if yes.ndim == 4 else condition, yes, no)
-
-
 _OPS: dict[str, Any] = {
     "const": _constant,
     "param": _parameter,
@@ -265,8 +264,8 @@ _OPS: dict[str, Any] = {
     "le": lambda e, at, a, b: a <= b,
     "add": lambda e, at, a, b: a + b,
     "sub": lambda e, at, a, b: a - b,
-    "mul": lambda e, at, a, b: floats.multiply(a, b),
-    "div": lambda e, at, a, b: floats.divide(a, b),
+    "mul": lambda e, at, a, b: a * b,
+    "div": lambda e, at, a, b: np.where(b == 0, np.float32(0), a / b),
     "quotient": lambda e, at, a, b: np.where(b == 0, 0, a // np.where(b == 0, 1, b)),
     "neg": lambda e, at, a: -a,
     "abs": lambda e, at, a: np.abs(a),
@@ -276,17 +275,74 @@ _OPS: dict[str, Any] = {
     "to_real": lambda e, at, a: a.astype(np.float32),
     "count": lambda e, at, a: neighborhood(a.astype(np.int64), e.value),
     "sum": lambda e, at, a: neighborhood(a, e.value),
-    "choose": _choose,
-    "octant": lambda e, at, v: floats.octant(v),
+    "choose": lambda e, at, condition, yes, no: np.where(condition, yes, no),
+    "octant": lambda e, at, v: octant(v),
     "opposite": lambda e, at, a: (a + 4) % 8,
     "clockwise": lambda e, at, a: (a + 2) % 8,
-    "sin": lambda e, at, a: floats.wave(a, cosine=False),
-    "cos": lambda e, at, a: floats.wave(a, cosine=True),
-    "length": lambda e, at, v: floats.length(v),
+    "sin": lambda e, at, a: wave(a, cosine=False),
+    "cos": lambda e, at, a: wave(a, cosine=True),
+    "length": lambda e, at, v: length(v),
     "row_part": lambda e, at, v: v[:, 0],
     "column_part": lambda e, at, v: v[:, 1],
     "vector": lambda e, at, y, x: np.stack([y, x], 1),
 }
+
+
+# Floats, step by step: each rounds once, to float32. Another order of these steps would give other bits.
+
+FAN = {
+    op: np.dtype("float32").type(value)
+    for op, value in (("near", 0.92387953251128674), ("far", 0.38268343236508977))
+}
+"""cos(π/8) and cos(3π/8): the borders of the octants."""
+
+
+HALF_PI = (1.5703125, 0.0004837512969970703125, 7.549789954891609e-08)
+"""π/2 in three parts, the first two of so few bits that small multiples of them are exact."""
+
+SERIES = ((-1 / 6, 1 / 120, -1 / 5040, 1 / 362880), (1 / 24, -1 / 720, 1 / 40320, -1 / 3628800))
+"""Coefficients of the sine from x³ on, and of the cosine from x⁴ on."""
+
+ROUNDER = 12582912.0
+"""1.5 · 2²³: a float32 of a smaller magnitude plus this number is rounded to an integer."""
+
+
+def length(v: Array) -> Array:
+    y, x = v[:, 0], v[:, 1]
+    return np.sqrt(y * y + x * x)
+
+
+def wave(x: Array, *, cosine: bool) -> Array:
+    """The sine or cosine of angles in radians, within 2⁻²² for those up to 1000.
+
+    x is the q-th multiple of π/2 plus a rest, and what rounding took off the rest. Both waves follow from its series.
+    """
+    sine, cosine_of = ([np.float32(number) for number in row] for row in SERIES)
+    rounder, whole = np.float32(ROUNDER), np.float32(1)
+    q = (x * np.float32(2 / math.pi) + rounder) - rounder
+    coarse, middle, fine = (q * np.float32(part) for part in HALF_PI)
+    near = (x - coarse) - middle  # exact
+    rest = near - fine
+    small = (near - rest) - fine
+    turn = q - np.float32(4) * ((q * np.float32(0.25) - np.float32(0.375) + rounder) - rounder)
+    z = rest * rest
+    rising = rest + (small + rest * (z * (sine[0] + z * (sine[1] + z * (sine[2] + z * sine[3])))))
+    higher = z * z * (cosine_of[0] + z * (cosine_of[1] + z * (cosine_of[2] + z * cosine_of[3])))
+    level = whole - (np.float32(0.5) * z + (rest * small - higher))
+    odd = ((turn > np.float32(0.5)) & (turn < np.float32(1.5))) | (turn > np.float32(2.5))
+    down = (turn > np.float32(0.5)) & (turn < np.float32(2.5)) if cosine else turn > np.float32(1.5)
+    value = np.where(~odd if cosine else odd, level, rising)
+    return np.where(down, -value, value)
+
+
+def octant(v: Array) -> Array:
+    """The octant of the angle acos(x / (|v| + 0.001)), by comparing x with the octants' borders."""
+    y, x = v[:, 0], v[:, 1]
+    reach = np.sqrt(y * y + x * x) + np.float32(0.001)
+    near, far = FAN["near"] * reach, FAN["far"] * reach
+    lower = np.where(x > -far, 2, np.where(x > -near, 3, 4))
+    half = np.where(x > near, 0, np.where(x > far, 1, lower))
+    return np.where(y < 0, (8 - half) % 8, half)
 
 
 # Substeps

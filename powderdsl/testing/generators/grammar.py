@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 from powderdsl.model.builtins import DIRECTION_SETS, MAX_MAGNITUDE
+from powderdsl.model.operations import FUNCTIONS, NUMBER
+from powderdsl.model.types import DIRECTION, REAL, VEC2, Kind
 from powderdsl.testing.generators.choices import Choices
 
 Reach = Callable[[list[float]], float]
@@ -69,6 +71,20 @@ def numbers(values: Iterable[int]) -> Productions:
     return tuple(named(str(value), abs(value)) for value in values)
 
 
+def functions(count: int, takes: Kind, gives: Kind | None = None) -> list[str]:
+    """The functions of so many arguments of a kind, by their rows in `operations`."""
+    return [
+        row.name
+        for row in FUNCTIONS.values()
+        if set(row.takes) == {takes} and row.gives == gives and len(row.parameters) == count
+    ]
+
+
+def calls(weight: int, argument: str, takes: Kind, gives: Kind | None = None) -> list[tuple[int, str]]:
+    """A production for each function of one argument."""
+    return [(weight, f"{name}({argument})") for name in functions(1, takes, gives)]
+
+
 def seen(kind: str) -> Productions:
     """A named value here or at a neighbor, whose pack may be absent."""
     return weighted(
@@ -79,8 +95,8 @@ def seen(kind: str) -> Productions:
 WORDS: dict[str, Productions] = {
     "plus or minus": either("+", "-"),
     "arithmetic": either("+", "-", "*"),
-    "min or max": either("min", "max"),
-    "wave": either("sin", "cos"),
+    "min or max": either(*functions(2, NUMBER)),
+    "wave": either(*functions(1, REAL, REAL)),
     "any or all": either("any", "all"),
     "and or or": either("and", "or"),
     "is": either("is", "is not", "in", "not in"),
@@ -196,7 +212,7 @@ EXPRESSIONS: dict[str, Productions] = {
         (2, "({varying integer} {plus or minus} {integer})", math.fsum),
         (1, "({integer} {plus or minus} {varying integer})", math.fsum),
         (2, "({varying integer} * {integer})", math.prod),
-        (1, "(-{varying integer})"), (1, "abs({varying integer})"), (1, "clamp({varying integer}, -2, 3)"),
+        (1, "(-{varying integer})"), *calls(1, "{varying integer}", NUMBER), (1, "clamp({varying integer}, -2, 3)"),
         (3, "{min or max}({varying integer}, {integer})"),
         (1, "({varying integer} mod {modulus})"), (1, "(({varying integer} {plus or minus} {clock}) mod {modulus})"),
         (1, "({varying integer} div {divisor})"), (1, "({varying integer} div {varying integer})"),
@@ -206,14 +222,14 @@ EXPRESSIONS: dict[str, Productions] = {
     # Floats and vectors
     "number": weighted((3, "{real}"), (1, "{integer}")),
     "varying number": weighted((2, "{varying real}"), (1, "{varying integer}")),
-    "real": weighted((2, "{decimal}"), (6, "{varying real}"), (1, "abs({decimal})"), (1, "{wave}({decimal})")),
+    "real": weighted((2, "{decimal}"), (6, "{varying real}"), *calls(1, "{decimal}", NUMBER), (1, "{wave}({decimal})")),
     "varying real": weighted(
         (4, "{seen real}"), (1, "{real param}"),
         (3, "({varying real} {arithmetic} {number})"), (1, "({number} {arithmetic} {varying real})"),
         (1, "({varying real} / {scale})"), (1, "({number} / {varying number})"),
-        (1, "(-{varying real})"), (1, "abs({varying real})"), (1, "{wave}({varying real})"),
+        (1, "(-{varying real})"), *calls(1, "{varying real}", NUMBER), (1, "{wave}({varying real})"),
         (2, "{min or max}({varying real}, {number})"),
-        (3, "{vec2}.{axis}"), (3, "length({vec2})"), (1, "sum({varying real}{kernel})"),
+        (3, "{vec2}.{axis}"), *calls(3, "{vec2}", VEC2, REAL), (1, "sum({varying real}{kernel})"),
         (1, "({varying real} if {condition} else {number})"),
         (1, "({seen stream} * 0.001)"), (1, "({seen stream} / 2.5)"), (1, "({seen stream} {plus or minus} {varying real})"),
     ),
@@ -235,7 +251,7 @@ EXPRESSIONS: dict[str, Productions] = {
     ),
     "side or loop": weighted((1, "{side}"), (1, "{loop side}")),
     "world direction": weighted(
-        (7, "{seen direction}"), (1, "octant({seen vec2})"), (3, "octant({vec2})"), (2, "{turn}({world direction})"),
+        (7, "{seen direction}"), *calls(1, "{seen vec2}", VEC2, DIRECTION), *calls(3, "{vec2}", VEC2, DIRECTION), (2, "{turn}({world direction})"),
         (2, "({seen direction} if {condition} else {direction})"),
     ),
 }  # fmt: skip
