@@ -49,11 +49,11 @@ passes:
 RUN = """\
 import sys
 import numpy as np
-from powderdsl.simulation.compiling import compile_any
+from powderdsl.simulation.simulator import compile as compile_rules
 
 states = []
 for backend in ("reference", "wasm"):
-    simulator = compile_any(sys.argv[1], backend)
+    simulator = compile_rules(sys.argv[1], backend)
     world = simulator.world(np.zeros((2, 7, 33), np.uint8), seed=1)
     for _ in range(6):
         world = simulator.step(world)

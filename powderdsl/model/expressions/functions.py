@@ -83,8 +83,8 @@ def _applied(typer: Typer, function: Operation, operands: list[tuple[Operand, Sp
 
 @lru_cache
 def _meaning(function: Operation) -> Syntax:
-    text = function.meaning
-    syntax = parse_text(Source(function.name, text), 0, len(text), "expression", Reporter())
+    line = Span(Source(function.name, function.meaning), 0, len(function.meaning))
+    syntax = parse_text(line, "expression", Reporter())
     assert syntax is not None
     return syntax
 

@@ -7,18 +7,13 @@ from dataclasses import replace
 from typing import Protocol
 
 from powderdsl.diagnostics import Reporter, Span, suggest
-from powderdsl.model.operations import OPS
+from powderdsl.model.operations import OPERATIONS
 from powderdsl.model.types import Expr, integer
 from powderdsl.syntax.ast import Syntax
 
-OPERATIONS = {
-    "add": "add",
-    "subtract": "sub",
-    "multiply": "mul",
-    "divide": "quotient",
-    "quotient": "quotient",
-    "mod": "mod",
-    "negate": "neg",
+AMOUNTS = {
+    **{op: op for op in ("add", "sub", "mul", "quotient", "mod", "neg")},
+    "div": "quotient",
     "range": "uniform",
 }
 """The operation of each kind of syntax. All are on integers, so that `/` rounds down as `div` does. ``uniform`` draws an
@@ -59,7 +54,7 @@ def read_amount(
         names: the amounts of names; None for a name whose definition has been reported.
         what: the number in words, for messages.
     """
-    span, op = syntax.span, OPERATIONS.get(syntax.kind)
+    span, op = syntax.span, AMOUNTS.get(syntax.kind)
     if syntax.kind == "integer" and len(syntax.text) <= MAX_DIGITS:
         return number(int(syntax.text), span)
     if syntax.kind == "name" and syntax.text in names:
@@ -96,17 +91,13 @@ def read_amount(
             reporter.error("PD606", "`mod` takes a constant above 0", args[1].span, "not a constant above 0")
             return None
         amount = Expr("mod", integer(0, modulus - 1), args[:1], modulus, span)
-        values.pop()
-    elif op == "quotient":
-        corners = [a // b for a in ranges[0] for b in ranges[1]]
-        amount = Expr(op, integer(min(corners), max(corners)), args, span=span)
     else:
-        bounds = OPS[op].bounds
+        bounds = OPERATIONS[op].between(*ranges)
         assert bounds is not None
-        amount = Expr(op, integer(*bounds(None, *ranges)), args, span=span)
-    evaluate = OPS[op].evaluate
-    if len(values) == len(amount.args) and evaluate is not None:
-        return number(evaluate(amount, *values), span)
+        amount = Expr(op, integer(*bounds), args, span=span)
+    evaluate = OPERATIONS[op].evaluate
+    if len(values) == len(args) and evaluate is not None:
+        return number(evaluate(*values), span)
     return amount
 
 

@@ -98,7 +98,7 @@ def amounts_of(
             continue
         low, high = int(amount.kind.lo), int(amount.kind.hi)
         # A computed range may begin before the world: it is cut off there, as everything is that lies outside.
-        is_cut = statement.kind in RANGES and lowest == 0 and written.kind not in ("integer", "negate")
+        is_cut = statement.kind in RANGES and lowest == 0 and written.kind not in ("integer", "neg")
         least = -most if is_cut else max(lowest, -most)
         greatest = 100 if statement.kind == "scatter" else most
         if low < least or high > greatest:
