@@ -28,7 +28,14 @@ FORMAT = 1
 MAX_CELLS = 1 << 22
 """The largest world: 2048×2048 cells, whose planes and fields fit into the memory of a module."""
 
-_BYTES = {"uint8": 1, "int8": 1, "int16": 2, "int32": 4, "float32": 4}
+_CELLS = {
+    "uint8": ("i32.load8_u", 1),
+    "int8": ("i32.load8_s", 1),
+    "int16": ("i32.load16_s", 2),
+    "int32": ("i32.load", 4),
+    "float32": ("f32.load", 4),
+}
+"""The instruction that loads a cell, and its bytes."""
 
 
 def standalone_module(ruleset: Ruleset, size: tuple[int, int], memo: Memo | None = None) -> bytes:
@@ -75,7 +82,7 @@ def _stored(slot: Slot, ruleset: Ruleset, parts: tuple[Piece, ...]) -> Stored:
     return Stored(
         slot.name,
         parts,
-        _BYTES[slot.dtype],
+        *_CELLS[slot.dtype],
         tuple(tuple(map(float, one)) for one in by_component),
         float(low),
         float(high),

@@ -8,7 +8,7 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
-from powderdsl.targets.wasm.instances import WasmState
+from powderdsl.targets.wasm.program import WasmState
 
 HOST = Path(__file__).with_name("host.mjs")
 
@@ -22,7 +22,8 @@ def write_job(folder: Path, sim: Any, world: Any, steps: int) -> None:
     calls = []
     for name, value in world.state.items():
         (folder / name).write_bytes(value.contiguous().numpy().tobytes())
-        calls += [{"slot": name, **one} for one in instance.transfers(name, value.itemsize, value.shape)]
+        pieces = instance.transfers(name, value.itemsize, value.shape, 0)
+        calls += [{"slot": name, "numbers": numbers} for numbers in pieces]
     clock = torch.stack([world.seed, world.index, world.step])
     inputs = instance.input_bytes(sim.parameters({}, batch), batch)
     (folder / "inputs").write_bytes(clock.numpy().tobytes() + inputs)

@@ -38,8 +38,7 @@ class StandaloneWorld:
     """A module in wasmtime, with its fields by name."""
 
     def __init__(self, ruleset: Ruleset, size: tuple[int, int]):
-        host = this_host()
-        self.running = host.instantiate(host.compile(standalone_module(ruleset, size)))
+        self.running = this_host()(standalone_module(ruleset, size)).instantiate()
         self.call, self.size = self.running.call, size
         self.slots = {slot.name: (number, slot) for number, slot in enumerate(slots(ruleset)[1:])}
 
@@ -70,8 +69,7 @@ class StandaloneWorld:
         self.call("parameter", number, pattern(value))
 
     def _read(self, at: int, shape: tuple[int, ...], dtype: np.dtype[Any]) -> np.ndarray:
-        memory = bytearray(int(np.prod(shape)) * dtype.itemsize)
-        self.running.read(at, memory)
+        memory = self.running.read(at, int(np.prod(shape)) * dtype.itemsize)
         return np.frombuffer(memory, dtype).reshape(shape)
 
 

@@ -17,11 +17,10 @@ def take_apart():
         setattr(_ffi, name, None)
 
 atexit.register(take_apart)  # what is registered first runs last
-from powderdsl.targets.wasm.wasmtime_host import WasmtimeHost
+from powderdsl.targets.wasm.wasmtime_host import WasmtimeModule
 
-host = WasmtimeHost()
-module = host.compile(bytes.fromhex("0061736d01000000" "0503010001" "070a01066d656d6f72790200"))  # exports a memory
-running = host.instantiate(module)
+module = WasmtimeModule(bytes.fromhex("0061736d01000000" "0503010001" "070a01066d656d6f72790200"))  # exports a memory
+running = module.instantiate()
 assert running.memory_size() == 1 << 16
 """
 

@@ -17,9 +17,8 @@ from powderdsl.compiler import lower
 from powderdsl.ir.segments import segments
 from powderdsl.system.memo import Memo
 from powderdsl.targets.tensor_kind import Tensors
-from powderdsl.targets.wasm import instances
-from powderdsl.targets.wasm.instances import Instance, WasmState
-from powderdsl.targets.wasm.program import WasmProgram
+from powderdsl.targets.wasm import program
+from powderdsl.targets.wasm.program import Instance, WasmProgram, WasmState
 from powderdsl.targets.wasm.source import WasmModule, wasm_module
 from tests.wasm.jobs import hashes, hashes_in_v8, write_job
 
@@ -75,11 +74,11 @@ def test_worlds_keep_their_state_when_others_follow(torch) -> None:  # type: ign
 
 def test_the_same_rules_are_compiled_once_for_a_width(monkeypatch: pytest.MonkeyPatch, torch) -> None:  # type: ignore[no-untyped-def]
     made: list[int] = []
-    original = instances.wasm_module
+    original = program.wasm_module
     monkeypatch.setattr(
-        instances, "wasm_module", lambda *given, **more: made.append(given[1]) or original(*given, **more)
+        program, "wasm_module", lambda *given, **more: made.append(given[1]) or original(*given, **more)
     )
-    monkeypatch.setattr(instances, "_MODULES", Memo(versions=1, things=64))
+    monkeypatch.setattr(program, "_MODULES", Memo(versions=1, things=64))
     for chance in ("20%", "20%", "30%"):
         ruleset = powderdsl.load("core+sand+water", params={"water.melt": chance})
         sim = powderdsl.compile(ruleset, backend="wasm")
@@ -104,7 +103,7 @@ def test_memory_is_used_again(torch) -> None:  # type: ignore[no-untyped-def]
 
 def test_a_full_memory_is_followed_by_another(monkeypatch: pytest.MonkeyPatch, torch) -> None:  # type: ignore[no-untyped-def]
     """Worlds that a user keeps stay readable, and later ones come into another instance."""
-    monkeypatch.setattr(instances, "ROOM", 1 << 17)
+    monkeypatch.setattr(program, "ROOM", 1 << 17)
     ruleset = powderdsl.load("core+water+sand")
     sims = [powderdsl.compile(ruleset, backend=name) for name in ("wasm", "torch")]
     ids = torch.randint(0, 4, (9, 40, 64), generator=torch.Generator().manual_seed(1))
@@ -141,8 +140,7 @@ def test_few_addresses_are_enough() -> None:
 
 
 def test_too_many_worlds_are_refused(torch) -> None:  # type: ignore[no-untyped-def]
-    program = WasmProgram(*_programs("life"), Tensors())
-    instance = program.loaded(64).instance(2, 64)
+    instance = WasmProgram(*_programs("life"), Tensors()).instance(2, 64, 64)
     for worlds, rows in ((1 << 31, 64), (1 << 25, 64), (2, 1 << 30)):
         with pytest.raises(MemoryError):
             instance.call("allocate", worlds, rows)
@@ -155,30 +153,6 @@ def test_too_many_worlds_are_refused(torch) -> None:  # type: ignore[no-untyped-
 def _programs(name: str) -> tuple[Any, Any]:
     (segment,) = segments(lower(powderdsl.load(name)))
     return segment.program, segment.planes
-
-
-@pytest.mark.parametrize("worlds", [1, 3])
-def test_boxes_are_filled(worlds: int, torch) -> None:  # type: ignore[no-untyped-def]
-    """As a host paints: one box of cells in one world, in a batch that shares its planes with a copy."""
-    sim = powderdsl.compile("powderworld", backend="wasm")
-    ids = torch.randint(0, 3, (worlds, 12, 70), generator=torch.Generator().manual_seed(1))
-    world = sim.step(sim.world(ids, seed=3))
-    before = world.ids.clone()
-    instance, batch = packed(world)
-    shapes = {name: (value.dtype, tuple(value.shape)) for name, value in world.state.items()}
-    layout = instance.loaded.layout
-    copy = WasmState(instance, instance.call("copy", batch), shapes)
-    last = worlds - 1
-    instance.call("fill", copy.batch, last, layout.planes["element:0"], 4, 2, 9, 60, 70, 9)
-    expected = before.clone()
-    expected[last, 2:9, 60:70] = 9
-    assert torch.equal(copy["element"], expected.to(copy["element"].dtype))
-    assert torch.equal(world.ids, before)
-    speed = torch.tensor([2.5]).view(torch.int32).item()
-    instance.call("fill_real", copy.batch, last, layout.reals["velocity.row"], 2, 9, 60, 70, int(speed))
-    wanted = world.state["velocity"].clone()
-    wanted[last, 0, 2:9, 60:70] = 2.5
-    assert torch.equal(copy["velocity"], wanted)
 
 
 @pytest.mark.parametrize(("batch", "rows", "width"), [(1, 32, 64), (3, 9, 70)])

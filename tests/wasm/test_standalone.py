@@ -183,8 +183,7 @@ def test_the_clock_continues_a_world() -> None:
     one.begin(state["element"], 3)
     one.call("step", 9)
     two.begin(one.ids(), 0)
-    clock = bytearray(24)
-    one.running.read(one.call("clock"), clock)
+    clock = one.running.read(one.call("clock"), 24)
     assert np.frombuffer(clock, np.int64).tolist() == [3, 0, 9]
     two.running.write(two.call("clock"), bytes(clock))
     for name in two.slots:

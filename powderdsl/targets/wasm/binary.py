@@ -11,6 +11,7 @@ import struct
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
+from functools import cache
 from io import BytesIO
 from itertools import groupby
 from typing import NamedTuple, TypeAlias
@@ -103,6 +104,8 @@ def _result(name: str) -> str:
         return "i64" if kind == "i64x2" else "i32"
     if "x" in kind:
         return "v128"
+    if name in ("memory.copy", "memory.fill"):
+        return ""
     if rest.split("_")[0] in ("eqz", "eq", "ne", "lt", "gt", "le", "ge") or kind == "memory":
         return "i32"
     return kind
@@ -116,7 +119,11 @@ for _first, _names in _NUMBERED:
         OPCODES[_name] = (
             bytes([_number]) if _number < 256 else bytes([_number >> 8]) + unsigned(_number & 255)
         )
+for _name, _memories in (("size", 1), ("grow", 1), ("copy", 2), ("fill", 1)):
+    OPCODES[f"memory.{_name}"] += bytes(_memories)  # their numbers
 RESULTS = {name: _result(name) for name in OPCODES}
+_NUMBERS = {name: kind if (kind := name.partition(".")[0]) in TYPES else "i32" for name in OPCODES}
+"""The types of numbers among the arguments."""
 
 
 class Member(NamedTuple):
@@ -190,11 +197,12 @@ class Place(Value):
 
 class _Variable(Place):
     __slots__ = ("index",)
-    scope: str
+    get: bytes
+    put: bytes
 
     def __init__(self, type: str, index: int):
-        get, put = (OPCODES[f"{self.scope}.{name}"] + unsigned(index) for name in ("get", "set"))
-        super().__init__(type, get, b"", put)
+        number = unsigned(index)
+        super().__init__(type, self.get + number, b"", self.put + number)
         self.index = index
 
 
@@ -202,14 +210,14 @@ class Local(_Variable):
     """A local variable or parameter."""
 
     __slots__ = ()
-    scope = "local"
+    get, put = OPCODES["local.get"], OPCODES["local.set"]
 
 
 class Global(_Variable):
     """A global variable of a module."""
 
     __slots__ = ()
-    scope = "global"
+    get, put = OPCODES["global.get"], OPCODES["global.set"]
 
 
 I32: TypeAlias = Local
@@ -226,9 +234,7 @@ Body: TypeAlias = "Callable[..., Value | int | None]"
 
 def op(name: str, *args: Value | int, tail: bytes = b"") -> Value:
     """An instruction on its arguments, where numbers are of its own type, or i32 beside vectors; `tail`: its immediates."""
-    kind = name.partition(".")[0]
-    code = _codes(args, kind if kind in TYPES else "i32")
-    return Value(RESULTS[name], code + OPCODES[name] + tail)
+    return Value(RESULTS[name], _codes(args, _NUMBERS[name]) + OPCODES[name] + tail)
 
 
 def _codes(values: Iterable[Value | int], type: str) -> bytes:
@@ -262,14 +268,18 @@ _ALIGN = {"v128": 4, "i64": 3, "f64": 3, "i32": 2, "f32": 2, "8": 0, "16": 1, "3
 
 def load(name: str, address: Value | int, offset: int = 0) -> Place:
     """An item in memory, which an instruction such as ``v128.load`` reads."""
+    before = _codes([address], "i32")
+    get, put = _accesses(name, offset)
+    return Place(RESULTS[name], before + get, before, put)
+
+
+@cache
+def _accesses(name: str, offset: int) -> tuple[bytes, bytes]:
+    """The code that loads an item at an address, and that stores it; the natural alignment is only a hint."""
     type, _, what = name.partition(".")
     size = "".join(c for c in what if c.isdigit())
-    immediates = unsigned(_ALIGN[size or type]) + unsigned(
-        offset
-    )  # the natural alignment, which is only a hint
-    at = _codes([address], "i32")
-    store = OPCODES.get(f"{type}.store{size}", b"")
-    return Place(RESULTS[name], at + OPCODES[name] + immediates, at, store + immediates)
+    immediates = unsigned(_ALIGN[size or type]) + unsigned(offset)
+    return OPCODES[name] + immediates, OPCODES.get(f"{type}.store{size}", b"") + immediates
 
 
 @dataclass(frozen=True)
@@ -332,14 +342,6 @@ class Function:
     def set(self, target: Place, value: Value | int) -> None:
         """Set a variable or an item in memory."""
         self.body += target.before + _codes([value], target.type) + target.after
-
-    def copy(self, target: Value, source: Value, size: Value) -> None:
-        """Copy bytes in memory."""
-        self.body += op("memory.copy", target, source, size, tail=b"\0\0").code
-
-    def fill(self, target: Value | int, byte: Value | int, size: Value | int) -> None:
-        """Set bytes in memory."""
-        self.body += op("memory.fill", target, byte, size, tail=b"\0").code
 
     def give(self, value: Value | int) -> None:
         """The result of the function is this; a number is an i32."""
@@ -417,6 +419,7 @@ class Module:
         self._globals: list[tuple[str, int]] = []
         self._exports: list[bytes] = [_text("memory") + b"\x02\x00"]
         self._data: list[bytes] = []
+        self._start: list[bytes] = []
         self._custom: list[bytes] = []
 
     def define(self, body: Body, name: str = "", *, export: bool = False) -> Callee:
@@ -441,6 +444,10 @@ class Module:
 
     def export(self, function: Callee, name: str) -> None:
         self._exports.append(_text(name) + b"\x00" + unsigned(function.index))
+
+    def start(self, function: Callee) -> None:
+        """Call this whenever the module is instantiated."""
+        self._start = [unsigned(function.index)]
 
     def variable(self, type: str, start: int = 0) -> Global:
         self._globals.append((type, start))
@@ -472,6 +479,7 @@ class Module:
             (5, _vector([b"\x01" + unsigned(self.pages) + unsigned(self.most)])),
             (6, _vector(variables)),
             (7, _vector(self._exports)),
+            *((8, number) for number in self._start),
             (10, _vector([unsigned(len(code)) + code for _, code in self._functions])),
             *([(11, _vector(self._data))] if self._data else []),
             *((0, section) for section in self._custom),

@@ -6,12 +6,14 @@ end before `bottom` and `right`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 
 from powderdsl.ir.ops import REAL, Program
 from powderdsl.system.random import START_0, START_1
+from powderdsl.targets.codec import Piece
+from powderdsl.targets.layout import Layout
 from powderdsl.targets.wasm.binary import (
     F32,
     I32,
@@ -53,13 +55,26 @@ LARGE_PLANE = 32 << 10
 WEIGHTS = bytes(1 << i for i in range(8)) * 2
 
 
+def numbers_of(piece: Piece, layout: Layout, size: int) -> tuple[int, int, int, int]:
+    """What `load` and `store` take for a piece of the state whose cells have some bytes: slot, planes, signed, size."""
+    if piece.is_real:
+        return len(layout.planes) + layout.reals[piece.slot], 0, 0, size
+    return layout.planes[piece.planes[0]], len(piece.planes), int(piece.signed), size
+
+
 class Batches:
     """Code that finds the parts of batches."""
 
     def __init__(self, library: Library):
         self.library, self.memory, self.layout = library, library.memory, library.memory.layout
+        self.calls: dict[str, Callee] = {}
 
-    def clock(self, batch: Value, what: int, world: Value) -> Value:
+    def define(self, *bodies: Body, export: bool = False) -> None:
+        """Add functions, to be called by name."""
+        for body in bodies:
+            self.calls[body.__name__.strip("_")] = self.library.module.define(body, export=export)
+
+    def clock_of(self, batch: Value, what: int, world: Value) -> Value:
         """Where seed, index or step of a world lies."""
         return batch + ((batch[WORLDS] * what + world) << 3) + HEADER
 
@@ -82,28 +97,18 @@ class Batches:
             yield group
 
     @contextmanager
-    def each_lane(self, f: Function, batch: Value) -> Iterator[tuple[Local, Local, Local, Local]]:
-        """Group, lane, world, and the world's row at which the lane begins, of all lanes that are used."""
+    def each_lane(
+        self, f: Function, batch: Value, address: Value, apart: Value, size: Value | int
+    ) -> Iterator[tuple[Local, Local, Local]]:
+        """Group, lane, and where its cells of some bytes lie in an array, of all lanes that are used."""
         strips, number = self.library.strips, f.let(0)
         with self.each_group(f, batch) as group:
             with f.each(0, LANES) as lane:
                 world = f.let(either(strips, number, (number << 1) + lane))
-                top = f.let(either(strips, lane * self.library.rows, 0))
+                top = either(strips, lane * self.library.rows, 0)  # the world's row at which the lane begins
                 with f.when(world < batch[WORLDS]):
-                    yield group, lane, world, top
+                    yield group, lane, f.let(address + world * apart + top * self.memory.width * size)
             f.set(number, number + 1)
-
-    @contextmanager
-    def each_box_row(
-        self, f: Function, batch: Value, world: Value, top: Value, bottom: Value
-    ) -> Iterator[tuple[Local, Local, Local]]:
-        """Group, lane and row of the lane, for the rows of a box in a world."""
-        rows, strips = self.library.rows, self.library.strips
-        with f.each(top, bottom, some=False) as y:
-            lane = f.let(either(strips, y // rows, world & 1))
-            number = either(strips, world, world >> 1)
-            group = f.let(self.first_group(batch) + number * self.memory.group)
-            yield group, lane, f.let(either(strips, y % rows, y))
 
     @contextmanager
     def each_run(self, f: Function) -> Iterator[tuple[Local, Local]]:
@@ -148,32 +153,17 @@ class Driver(Batches):
     def __init__(self, library: Library, program: Program, passes: Sequence[Callee], asked: int):
         super().__init__(library)
         self.program, self.passes, self.asked = program, passes, asked
-        self.calls: dict[str, Callee] = {}
 
     def add(self, *, export: bool) -> dict[str, Callee]:
         """Add the functions, and give them by name. `export`: hosts see them, and the passes by number."""
-        module = self.library.module
-        self.calls["setup"] = module.define(self._setup)
-        self._define([self.allocate, self.enter, self.begin, self.leave], export=export)
-        if export:
-            module.define(self.groups, export=True)
-            for number, pass_ in enumerate(self.passes):
-                module.export(pass_, str(number))
-        bodies: list[Body] = [
-            self.copy,
-            self.release,
-            self.scratch,
-            self.inputs,
-            self.run,
-            self.load,
-            self.store,
-        ]
-        self._define([*bodies, self.load_real, self.store_real, self.fill, self.fill_real], export=export)
+        self.define(self._setup, self._load_real, self._store_real)
+        self.define(
+            self.allocate, self.release, self.copy, self.scratch, self.load, self.store, export=export
+        )
+        self.define(self.enter, self.begin, self.leave, self.run, export=export)
+        for number, pass_ in enumerate(self.passes if export else ()):
+            self.library.module.export(pass_, str(number))
         return self.calls
-
-    def _define(self, bodies: Iterable[Body], *, export: bool) -> None:
-        for body in bodies:
-            self.calls[body.__name__] = self.library.module.define(body, export=export)
 
     # Batches
 
@@ -229,7 +219,7 @@ class Driver(Batches):
         library, present = self.library, self.memory.present
         new = f.let(self.calls["allocate"](old[WORLDS], library.world_rows))
         begin = const("i32", HEADER)
-        f.copy(new + begin, old + begin, self.first_group(old) - old - HEADER)
+        f.do(op("memory.copy", new + begin, old + begin, self.first_group(old) - old - HEADER))
         apart = f.let(new - old)
         with self.each_group(f, old) as group:
             for member, real in self.memory.slots:
@@ -248,21 +238,26 @@ class Driver(Batches):
             f.set(library.scratch_end, library.scratch + more - 64)
         return library.scratch
 
-    def inputs(self, f: Function, batch: I32) -> Value:
-        """Where i64 [3, worlds] lie: seed, index, step; then bits of parameters, bytes [bits, worlds]; then, from a
-        multiple of 16 bytes on, their values, f32 [values, worlds].
-        """
-        return batch + HEADER
-
     # Cells
 
-    def cell(self, address: Value, size: Value) -> Value:
-        wide = either(size.equals(2), load("i32.load16_u", address), word(address))
-        return either(size.equals(1), load("i32.load8_u", address), wide)
-
-    def load(self, f: Function, batch: I32, slot: I32, planes: I32, size: I32, address: I32) -> None:
-        """Read cells [worlds, rows, columns], integers of 1, 2 or 4 bytes, into planes from a slot on."""
+    def load(
+        self,
+        f: Function,
+        batch: I32,
+        slot: I32,
+        planes: I32,
+        signed: I32,
+        size: I32,
+        address: I32,
+        apart: I32,
+    ) -> None:
+        """Read cells [worlds, rows, columns] into planes from a slot on: integers of 1, 2 or 4 bytes, or f32 into a field if
+        there are no planes. `apart`: bytes from one world to the next.
+        """
         library, memory = self.library, self.memory
+        with f.when(planes.equals(0)):
+            f.do(self.calls["load_real"](batch, slot, address, apart))
+            f.leave()
         with self.each_group(f, batch) as group:
             f.set(group[memory.present], -1)
             with f.each(0, planes) as bit:
@@ -270,76 +265,78 @@ class Driver(Batches):
                 f.do(library.give(word(at)))
                 plane = f.let(library.take())
                 f.set(word(at), plane)
-                f.fill(plane + memory.base, 0, library.cells)
-        with self.each_lane(f, batch) as (group, lane, world, top):
-            start = world * library.world_rows + top
-            source = f.let(address + start * size * memory.width)
-            with self.each_run(f) as (at, count):
-                with f.each(0, planes) as bit:
-                    plane = f.let(word(group + ((slot + bit) << 2)))
-                    flags, x = f.let(const("i64", 0)), f.let(0)
-                    with self.each_sixteen(f, size, x, count):
-                        top_bits = op("i8x16.shl", load("v128.load", source + x), 7 - bit)
-                        f.set(flags, flags | (counted(op("i8x16.bitmask", top_bits)) << counted(x)))
-                    with f.each(x, count, some=False) as x:
-                        flag = (self.cell(source + x * size, size) >> bit) & 1
-                        f.set(flags, flags | (counted(flag) << counted(x)))
-                    f.set((plane + at + (lane << 3))[memory.half], flags)
-                    f.set(plane[SOME], plane[SOME] | op("i64.ne", flags, 0))
-                f.set(source, source + count * size)
+                f.do(op("memory.fill", plane + memory.base, 0, library.cells))
+        with (
+            self.each_lane(f, batch, address, apart, size) as (group, lane, source),
+            self.each_run(f) as (at, count),
+        ):
+            with f.each(0, planes) as bit:
+                plane = f.let(word(group + ((slot + bit) << 2)))
+                flags, x = f.let(const("i64", 0)), f.let(0)
+                with self.each_sixteen(f, size, x, count):
+                    top_bits = op("i8x16.shl", load("v128.load", source + x), 7 - bit)
+                    f.set(flags, flags | (counted(op("i8x16.bitmask", top_bits)) << counted(x)))
+                with f.each(x, count, some=False) as x:
+                    flag = (word(source + x * size) >> bit) & 1
+                    f.set(flags, flags | (counted(flag) << counted(x)))
+                f.set((plane + at + (lane << 3))[memory.half], flags)
+                f.set(plane[SOME], plane[SOME] | op("i64.ne", flags, 0))
+            f.set(source, source + count * size)
 
     def store(
-        self, f: Function, batch: I32, slot: I32, planes: I32, negative: I32, size: I32, address: I32
+        self,
+        f: Function,
+        batch: I32,
+        slot: I32,
+        planes: I32,
+        signed: I32,
+        size: I32,
+        address: I32,
+        apart: I32,
     ) -> None:
-        """Write cells; `negative`: the last plane is their sign."""
+        """Write cells, from first to last, each as 4 bytes of which `size` stay; `signed`: the last plane is the sign."""
+        memory = self.memory
+        with f.when(planes.equals(0)):
+            f.do(self.calls["store_real"](batch, slot, address, apart))
+            f.leave()
+        with (
+            self.each_lane(f, batch, address, apart, size) as (group, lane, target),
+            self.each_run(f) as (at, count),
+        ):
+            place, x = f.let(at + (lane << 3)), f.let(0)
+
+            def bits_from(bit: Value) -> Value:
+                plane = word(group + ((slot + bit) << 2))
+                return op("i32.wrap_i64", (plane + place)[memory.half] >> counted(x))
+
+            def weight(bit: Value) -> Value:
+                one = 1 << bit
+                return either(signed & bit.equals(planes - 1), 0 - one, one)
+
+            with self.each_sixteen(f, size, x, count):
+                cells = f.let(const("v128", 0))
+                with f.each(0, planes) as bit:
+                    bits = op("i8x16.swizzle", splat(bits_from(bit)), vector(bytes(8) + b"\1" * 8))
+                    chosen = op("i8x16.eq", bits & vector(WEIGHTS), vector(WEIGHTS))
+                    f.set(cells, op("i8x16.add", cells, chosen & op("i8x16.splat", weight(bit))))
+                f.set(load("v128.load", target), cells)
+                f.set(target, target + 16)
+            with f.each(x, count, some=False) as x:
+                value = f.let(0)
+                with f.each(0, planes) as bit:
+                    f.set(value, value + (bits_from(bit) & 1) * weight(bit))
+                f.set(word(target), value)
+                f.set(target, target + size)
+
+    def _load_real(self, f: Function, batch: I32, slot: I32, address: I32, apart: I32) -> None:
         library, memory = self.library, self.memory
-        with self.each_lane(f, batch) as (group, lane, world, top):
-            start = world * library.world_rows + top
-            target = f.let(address + start * size * memory.width)
-            with self.each_run(f) as (at, count):
-                place, x = f.let(at + (lane << 3)), f.let(0)
-
-                def bits_from(bit: Value) -> Value:
-                    plane = word(group + ((slot + bit) << 2))
-                    return op("i32.wrap_i64", (plane + place)[memory.half] >> counted(x))
-
-                def weight(bit: Value) -> Value:
-                    one = 1 << bit
-                    return either(negative & bit.equals(planes - 1), 0 - one, one)
-
-                with self.each_sixteen(f, size, x, count):
-                    cells = f.let(const("v128", 0))
-                    with f.each(0, planes) as bit:
-                        bits = op("i8x16.swizzle", splat(bits_from(bit)), vector(bytes(8) + b"\1" * 8))
-                        chosen = op("i8x16.eq", bits & vector(WEIGHTS), vector(WEIGHTS))
-                        f.set(cells, op("i8x16.add", cells, chosen & op("i8x16.splat", weight(bit))))
-                    f.set(load("v128.load", target), cells)
-                    f.set(target, target + 16)
-                with f.each(x, count, some=False) as x:
-                    value = f.let(0)
-                    with f.each(0, planes) as bit:
-                        f.set(value, value + (bits_from(bit) & 1) * weight(bit))
-                    with f.when(size.equals(1)):
-                        f.set(load("i32.load8_u", target), value)
-                        f.otherwise()
-                        with f.when(size.equals(2)):
-                            f.set(load("i32.load16_u", target), value)
-                            f.otherwise()
-                            f.set(word(target), value)
-                    f.set(target, target + size)
-
-    def load_real(self, f: Function, batch: I32, slot: I32, address: I32, apart: I32) -> None:
-        """Read cells, f32, into a field; `apart`: bytes from one world to the next."""
-        library, memory = self.library, self.memory
-        f.set(slot, slot + len(self.layout.planes))
         with self.each_group(f, batch) as group:
             at = f.let(group + (slot << 2))
             f.do(library.give_field(word(at)))
             field = f.let(library.take_field())
             f.set(word(at), field)
-            f.fill(field + HEADER, 0, library.live_size)
-        with self.each_lane(f, batch) as (group, lane, world, top):
-            source = f.let(address + world * apart + top * (4 * memory.width))
+            f.do(op("memory.fill", field + HEADER, 0, library.live_size))
+        with self.each_lane(f, batch, address, apart, 4) as (group, lane, source):
             field = f.let(word(group + (slot << 2)))
             with self.each_line(f, lane) as line:
                 start, alive = f.let(library.line_start(field, line)), f.let(0)
@@ -350,76 +347,15 @@ class Driver(Batches):
                 self.close_line(f, field, line, start, alive)
                 f.set(source, source + 4 * memory.width)
 
-    def store_real(self, f: Function, batch: I32, slot: I32, address: I32, apart: I32) -> None:
-        """Write the cells of a field."""
+    def _store_real(self, f: Function, batch: I32, slot: I32, address: I32, apart: I32) -> None:
         memory = self.memory
-        f.set(slot, slot + len(self.layout.planes))
-        with self.each_lane(f, batch) as (group, lane, world, top):
-            target = f.let(address + world * apart + top * (4 * memory.width))
+        with self.each_lane(f, batch, address, apart, 4) as (group, lane, target):
             field = f.let(word(group + (slot << 2)))
             with self.each_line(f, lane) as line:
                 start = f.let(self.library.line(field, line))
                 with f.each(0, 4 * memory.width, 4) as at:
                     f.set(word(target + at), word(start + at))
                 f.set(target, target + 4 * memory.width)
-
-    def fill(
-        self,
-        f: Function,
-        batch: I32,
-        world: I32,
-        slot: I32,
-        planes: I32,
-        top: I32,
-        bottom: I32,
-        left: I32,
-        right: I32,
-        value: I32,
-    ) -> None:
-        """A box of equal cells."""
-        library, memory = self.library, self.memory
-        with self.each_box_row(f, batch, world, top, bottom) as (group, lane, y):
-            f.set(group[memory.present], -1)
-            with f.each(0, planes) as bit:
-                at = f.let(group + ((slot + bit) << 2))
-                plane = f.let(library.own(word(at)))
-                f.set(word(at), plane)
-                flag = f.let(counted((value >> bit) & 1))
-                f.set(plane[SOME], plane[SOME] | op("i32.wrap_i64", flag))
-                with f.each(left, right, some=False) as x:
-                    place = f.let(plane + y * memory.row + ((x >> 6) << 4) + (lane << 3))
-                    by = f.let(counted(x & 63))
-                    others = place[memory.half] & (const("i64", -1) ^ (1 << by))
-                    f.set(place[memory.half], others | (flag << by))
-
-    def fill_real(
-        self,
-        f: Function,
-        batch: I32,
-        world: I32,
-        slot: I32,
-        top: I32,
-        bottom: I32,
-        left: I32,
-        right: I32,
-        value: F32,
-    ) -> None:
-        """A box of equal floats."""
-        library, memory = self.library, self.memory
-        f.set(slot, slot + len(self.layout.planes))
-        with self.each_box_row(f, batch, world, top, bottom) as (group, lane, y):
-            at = f.let(group + (slot << 2))
-            field = f.let(library.own_field(word(at)))
-            f.set(word(at), field)
-            line = f.let(lane * library.rows + y)
-            start, alive = f.let(library.line_start(field, line)), f.let(0)
-            with f.when((field + line)[LIVE].equals(0)):
-                f.fill(start, 0, 4 * memory.width)
-            with f.each(left, right, some=False) as x:
-                f.set(load("f32.load", start + (x << 2)), value)
-            with f.each(0, 4 * memory.width, 4) as x:
-                f.set(alive, alive | (word(start + x) << 1))
-            self.close_line(f, field, line, start, alive)
 
     # Steps
 
@@ -435,12 +371,8 @@ class Driver(Batches):
                         f.do(pass_())
                 f.do(self.calls["leave"]())
         with f.each(0, batch[WORLDS], some=False) as world:
-            at = f.let(self.clock(batch, 2, world))
+            at = f.let(self.clock_of(batch, 2, world))
             f.set(load("i64.load", at), load("i64.load", at) + counted(steps))
-
-    def groups(self, f: Function, batch: I32) -> Value:
-        """The number of groups, each of which is entered, begins each step and leaves, if a host calls the passes."""
-        return batch[GROUPS]
 
     def world_of(self, f: Function, batch: Value, number: Value, lane: int) -> Local:
         """The world of a lane; unused lanes are the last world once more."""
@@ -464,7 +396,7 @@ class Driver(Batches):
                 for i in range(len(layout.param_reals)):
                     f.set(word(0, memory.at("reals", i) + 4 * lane), word(values))
                     f.set(values, values + (worlds << 2))
-                seed, index = (f.let(load("i64.load", self.clock(batch, i, world))) for i in range(2))
+                seed, index = (f.let(load("i64.load", self.clock_of(batch, i, world))) for i in range(2))
                 parts = [op("i32.wrap_i64", part) for part in (seed, seed >> 32, index)]
                 for i, start in enumerate((START_0, START_1)):
                     key: Value = const("i32", start)
@@ -481,7 +413,7 @@ class Driver(Batches):
         library, memory = self.library, self.memory
         for lane in range(LANES):
             with f.scope():
-                start = load("i64.load", self.clock(batch, 2, self.world_of(f, batch, number, lane)))
+                start = load("i64.load", self.clock_of(batch, 2, self.world_of(f, batch, number, lane)))
                 step = f.let(start + counted(done))
                 self._twice(f, op("i32.wrap_i64", step), memory.at("clock") + 8 * lane)
                 for (modulus, bit), i in self.layout.step_planes.items():
@@ -508,9 +440,12 @@ class Driver(Batches):
             if slot.resets:
                 held, real = library.group[memory.slot(slot.name, slot.type)], slot.type == REAL
                 f.do(library.giver(real)(held))
-                same = library.calm if real else library.everything if slot.default else library.nothing
-                constant = real and slot.default
-                f.set(held, self._constant(float(slot.default)) if constant else library.keep(same))
+                if real and slot.default:
+                    make = library.module.define(self._constant_field)
+                    f.set(held, make(const("f32", slot.default)))
+                else:
+                    same = library.calm if real else library.everything if slot.default else library.nothing
+                    f.set(held, library.keep(same))
         names = [name for name in self.layout.planes if name.startswith("element:")]
         if ids := [code for code in range(1 << len(names)) if self.asked >> code & 1]:
             look = library.module.define(partial(self._look, names, ids), "look")
@@ -521,13 +456,8 @@ class Driver(Batches):
         """The group keeps the ids that are present."""
         f.set(self.library.group[self.memory.present], self.library.present)
 
-    def _constant(self, value: float) -> Value:
-        """A new field of equal values."""
-        library = self.library
-        make = library.lazily("constant_field", lambda: library.module.define(self._constant_field))
-        return make(const("f32", value))
-
     def _constant_field(self, f: Function, value: F32) -> Value:
+        """A new field of equal values."""
         library, width = self.library, self.memory.width
         field = f.let(library.take_field())
         f.set(field[SOME], 1)
@@ -572,9 +502,8 @@ class Driver(Batches):
         f.set(library.world_rows, height)
         f.set(library.strips, strips)
         f.set(library.rows, height >> strips)
-        rows = f.let(library.rows)
-        f.set(library.lines, rows << 1)
-        lines = f.let(library.lines)
+        f.set(library.lines, library.rows << 1)
+        rows, lines = library.rows, library.lines
         f.set(library.cells, rows * memory.row)
         f.set(library.plane_size, rows * memory.row + (memory.base + memory.extent.around * memory.row))
         f.set(library.live_size, (lines + 16) & ~15)

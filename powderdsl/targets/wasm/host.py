@@ -1,13 +1,13 @@
-"""Hosts: what runs modules of WebAssembly. One is wasmtime in this process; in a browser it is the browser itself."""
+"""Hosts: what compiles and runs modules of WebAssembly, which import nothing and export `memory`.
+
+One is wasmtime in this process (`wasmtime_host`); in Pyodide it is the browser, or Node.js.
+"""
 
 from __future__ import annotations
 
 import sys
-from functools import cache
+from collections.abc import Callable
 from typing import Any, Protocol
-
-Bytes = Any
-"""An object that has the buffer protocol."""
 
 TOO_LARGE = "the worlds do not fit into the memory of a WebAssembly module"
 
@@ -23,12 +23,12 @@ class RunningModule(Protocol):
         """
         ...
 
-    def write(self, at: int, data: Bytes) -> None:
+    def write(self, at: int, data: bytes) -> None:
         """Write bytes to an address of the module's memory."""
         ...
 
-    def read(self, at: int, out: Bytes) -> None:
-        """Fill a buffer from an address of the module's memory."""
+    def read(self, at: int, size: int) -> bytearray:
+        """Bytes from an address of the module's memory."""
         ...
 
     def memory_size(self) -> int:
@@ -36,25 +36,64 @@ class RunningModule(Protocol):
         ...
 
 
-class Host(Protocol):
-    """Runs modules that import nothing and export `memory`."""
+class CompiledModule(Protocol):
+    """A module, ready to be instantiated."""
 
-    def compile(self, code: bytes) -> Any:
-        """A module, ready to be instantiated."""
-        ...
-
-    def instantiate(self, module: Any) -> RunningModule:
-        """A new instance of a module of this host."""
-        ...
+    def instantiate(self) -> RunningModule: ...
 
 
-@cache
-def this_host() -> Host:
-    """The host of this process. Raises ImportError if there is none."""
+def this_host() -> Callable[[bytes], CompiledModule]:
+    """The compiler of this process. Raises ImportError if there is none."""
     if sys.platform == "emscripten":
-        from powderdsl.targets.wasm.browser_host import BrowserHost
+        return BrowserModule
+    from powderdsl.targets.wasm.wasmtime_host import WasmtimeModule
 
-        return BrowserHost()
-    from powderdsl.targets.wasm.wasmtime_host import WasmtimeHost
+    return WasmtimeModule
 
-    return WasmtimeHost()
+
+class BrowserModule:
+    """A module of JavaScript, compiled at once: on a page that is for a worker to do."""
+
+    def __init__(self, code: bytes):
+        import js
+        from pyodide.ffi import to_js
+
+        self._module = js.WebAssembly.Module.new(to_js(code))
+
+    def instantiate(self) -> BrowserInstance:
+        import js
+
+        return BrowserInstance(js.WebAssembly.Instance.new(self._module).exports)
+
+
+class BrowserInstance:
+    """Addresses of its memory stay valid when it grows, views of it do not, so each call makes its own."""
+
+    def __init__(self, exports: Any):
+        import js
+        from pyodide.ffi import JsException
+
+        self._exports, self._memory, self._trap = exports, exports.memory, JsException
+        self._view = js.Uint8Array.new
+        self._functions: dict[str, Any] = {}
+
+    def call(self, name: str, *args: int) -> int:
+        function = self._functions.get(name)
+        if function is None:
+            function = self._functions[name] = getattr(self._exports, name)
+        try:
+            result = function(*args)
+        except self._trap:
+            raise MemoryError(TOO_LARGE) from None
+        return 0 if result is None else int(result) & 0xFFFFFFFF
+
+    def write(self, at: int, data: bytes) -> None:
+        self._view(self._memory.buffer, at, len(data)).assign(data)
+
+    def read(self, at: int, size: int) -> bytearray:
+        octets = bytearray(size)
+        self._view(self._memory.buffer, at, size).assign_to(octets)
+        return octets
+
+    def memory_size(self) -> int:
+        return int(self._memory.buffer.byteLength)

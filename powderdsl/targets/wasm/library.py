@@ -255,9 +255,9 @@ class Library:
         with f.when(size >= self.module.most * PAGE):
             f.trap()
         end = f.let(place + size)
-        pages, before = f.let((end + (PAGE - 1)) >> 16), op("memory.size", tail=b"\0")
+        pages, before = f.let((end + (PAGE - 1)) >> 16), op("memory.size")
         with f.when(pages >= before + 1):
-            grown = op("memory.grow", pages - before, tail=b"\0")
+            grown = op("memory.grow", pages - before)
             with f.when(grown.equals(-1)):
                 f.trap()
         f.set(self.top, end)
@@ -306,7 +306,7 @@ class Library:
     def _copied(self, f: Function, old: Local, take: Callee, give: Callee, first: int, size: Value) -> Value:
         """A copy of a plane or field, whose owner gives that back."""
         new, start = f.let(take()), const("i32", first)
-        f.copy(new + start, old + start, size)
+        f.do(op("memory.copy", new + start, old + start, size))
         f.set(new[SOME], old[SOME])
         f.do(give(old))
         return new

@@ -1,15 +1,36 @@
-"""The backend `wasm`: a module in a host. Worlds stay packed between calls; arrays are made when they are read."""
+"""The backend `wasm`: modules in a host, and batches of worlds in their memory.
+
+Worlds stay packed between calls; arrays are made when they are read.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
+from math import prod
+from threading import RLock
+from typing import Any
 
 from powderdsl.ir.ops import Program
+from powderdsl.ir.text import structure
 from powderdsl.system.memo import Memo
 from powderdsl.targets.array_kind import Array, ArrayKind
+from powderdsl.targets.codec import parameters, pieces
 from powderdsl.targets.job import Job, shape_of
-from powderdsl.targets.wasm.host import this_host
-from powderdsl.targets.wasm.instances import Loaded, WasmState, digest_of
+from powderdsl.targets.layout import Layout
+from powderdsl.targets.wasm.driver import numbers_of
+from powderdsl.targets.wasm.host import CompiledModule, this_host
+from powderdsl.targets.wasm.library import GROUPS, HEADER
+from powderdsl.targets.wasm.source import wasm_module
+
+ROOM = 1 << 30
+"""Bytes of memory from which an instance takes no new batches. What it has can be stepped and read: there is as much again."""
+
+_MODULES = Memo(versions=1, things=64)
+"""The compiled modules of this process: tests, tasks and environments run the same rules on the same widths again."""
+
+Like = Mapping[str, tuple[Any, tuple[int, ...]]]
+"""The dtype and shape of each array of a state."""
 
 
 class WasmProgram:
@@ -23,37 +44,43 @@ class WasmProgram:
     """
 
     def __init__(self, program: Program, planes: Program, kind: ArrayKind, memo: Memo | None = None):
-        self._program, self._planes, self._kind = program, planes, kind
+        self.kind, self.pieces, self.planes = kind, pieces(program), planes
+        self._compile = this_host()
         self._memo = Memo() if memo is None else memo  # the schedules are the same for all widths
-        self._digest = digest_of(planes)
-        self._host = this_host()
-        self._modules: dict[int, Loaded] = {}
+        passes = tuple(structure(pass_, places=False) for pass_ in planes.passes)
+        self._digest = planes.slots, planes.params, planes.streams, passes
+        self._instances: dict[tuple[int, int, bool], Instance] = {}
 
-    def loaded(self, width: int) -> Loaded:
-        """The module for a width."""
-        if width not in self._modules:
-            self._modules[width] = Loaded(
-                self._host,
-                self._kind,
-                self._program,
-                self._planes,
-                width,
-                self._digest,
-                memo=self._memo,
-            )
-        return self._modules[width]
+    def module(self, width: int) -> tuple[CompiledModule, Layout]:
+        """The module for a width, and its numbers."""
+
+        def make() -> tuple[CompiledModule, Layout]:
+            made = wasm_module(self.planes, width, memo=self._memo)
+            return self._compile(made.code), made.layout
+
+        return _MODULES.of((self._digest, width), "", make)
+
+    def instance(self, worlds: int, rows: int, width: int) -> Instance:
+        """The instance for new batches of a shape: another one when the memory of the last is full.
+
+        Whether lanes are strips depends on the rows and on whether there is one world.
+        """
+        key = (rows, width, worlds == 1)
+        instance = self._instances.get(key)
+        if instance is None or instance.running.memory_size() > ROOM:
+            instance = self._instances[key] = Instance(self, width)
+        return instance
 
     def run(self, job: Job) -> Mapping[str, Array]:
         """The state `job.steps` later. Jobs with given draws or chosen passes are for other backends."""
         assert not job.draws
         assert job.passes is None
         state = job.state
-        worlds, rows, width = shape_of(state)
-        loaded = self.loaded(width)
-        if isinstance(state, WasmState) and state.instance.loaded is loaded and job.reuse:
+        shape = shape_of(state)
+        if isinstance(state, WasmState) and state.instance.program is self and job.reuse:
             instance = state.instance
         else:
-            instance = loaded.instance(worlds, rows)
+            instance = self.instance(*shape)
         if isinstance(state, WasmState) and state.instance is not instance:
             state = dict(state)
         with instance as call:
@@ -61,5 +88,147 @@ class WasmProgram:
                 batch, like = state.take() if job.reuse else call("copy", state.batch), state.like
             else:
                 batch, like = instance.pack(state)
-            instance.run(batch, job, worlds)
+            instance.run(batch, job, shape[0])
         return WasmState(instance, batch, like)
+
+
+class Instance:
+    """An instance of a module, for worlds of one number of rows. As a context, it lets one thread call functions.
+
+    Its memory goes when no batch in it is used any more.
+    """
+
+    def __init__(self, program: WasmProgram, width: int):
+        module, self.layout = program.module(width)
+        self.program, self.kind = program, program.kind
+        self.running = module.instantiate()
+        self.call = self.running.call
+        self.gone: list[int] = []
+        """Batches that nobody uses any more."""
+        self._lock = RLock()
+        self._inputs: tuple[Mapping[str, Array], int, bytes] | None = None
+        """The last parameters, the number of worlds, and what the module takes for them."""
+
+    def __enter__(self) -> Callable[..., int]:
+        self._lock.acquire()
+        while self.gone:
+            self.call("release", self.gone.pop())
+        return self.call
+
+    def __exit__(self, *_: object) -> None:
+        self._lock.release()
+
+    def transfers(
+        self, name: str, size: int, shape: tuple[int, ...], at: int
+    ) -> Iterator[tuple[int, int, int, int, int, int]]:
+        """What `load` and `store` take, after the batch, for each piece of an array of cells of `size` bytes."""
+        plane = shape[-2] * shape[-1] * size
+        for piece in self.program.pieces[name]:
+            numbers = numbers_of(piece, self.layout, size)
+            component = piece.component
+            yield (
+                (*numbers, at, plane) if component is None else (*numbers, at + component * plane, 2 * plane)
+            )
+
+    def pack(self, state: Mapping[str, Array]) -> tuple[int, Like]:
+        """A new batch with the state."""
+        worlds, rows, _ = state["element"].shape
+        batch = self.call("allocate", worlds, rows)
+        like: dict[str, tuple[Any, tuple[int, ...]]] = {}
+        for name, given in state.items():
+            value = self.kind.contiguous(given)
+            like[name] = (value.dtype, tuple(value.shape))
+            if bool(value.any()):  # a new batch holds zeros
+                data = bytes(self.kind.bytes_of(value))
+                at = self.call("scratch", len(data))
+                self.running.write(at, data)
+                for numbers in self.transfers(name, value.dtype.itemsize, like[name][1], at):
+                    self.call("load", batch, *numbers)
+        return batch, like
+
+    def read(self, batch: int, name: str, like: Like) -> Array:
+        """One slot as a new array of its storage dtype."""
+        dtype, shape = like[name]
+        size = prod(shape) * dtype.itemsize
+        with self as call:
+            at = call("scratch", size)
+            for numbers in self.transfers(name, dtype.itemsize, shape, at):
+                call("store", batch, *numbers)
+            return self.kind.from_bytes(self.running.read(at, size), dtype, shape)
+
+    def input_bytes(self, params: Mapping[str, Array], worlds: int) -> bytes:
+        """Parameters as the module takes them, after the clocks."""
+        layout = self.layout
+        bits, reals = parameters(self.kind.xp, params, layout.param_planes, layout.param_reals, worlds)
+        head = bytes(self.kind.bytes_of(bits))[: worlds * len(layout.param_planes)]
+        padding = bytes(-len(head) - 8 * worlds & 15)  # the values begin at a multiple of 16 bytes
+        return head + padding + bytes(self.kind.bytes_of(reals))[: 4 * worlds * len(layout.param_reals)]
+
+    def run(self, batch: int, job: Job, worlds: int) -> None:
+        """Run a batch, and measure the time of passes if the job asks for it."""
+        if self._inputs is None or self._inputs[0] is not job.params or self._inputs[1] != worlds:
+            self._inputs = (job.params, worlds, self.input_bytes(job.params, worlds))
+        clocks = [self.kind.contiguous(clock) for clock in (job.clock.seed, job.clock.world, job.clock.step)]
+        self.running.write(batch + HEADER, b"".join((*map(self.kind.bytes_of, clocks), self._inputs[2])))
+        if job.timing is None:
+            self.call("run", batch, job.steps)
+            return
+        groups = int.from_bytes(self.running.read(batch + GROUPS.offset, 4), "little")
+        for group in range(groups):
+            self.call("enter", batch, group)
+            for step in range(job.steps):
+                self.call("begin", batch, group, step)
+                for number, pass_ in enumerate(self.program.planes.passes):
+                    before = time.perf_counter()
+                    self.call(str(number))
+                    job.timing.add(pass_.name, time.perf_counter() - before)
+            self.call("leave")
+
+
+class WasmState(Mapping[str, Array]):
+    """A batch's state in the memory of an instance. Slots are unpacked into arrays one by one, on first access."""
+
+    _batch: int | None = None  # of the class: a signal may end `__init__` before its first line
+
+    def __init__(self, instance: Instance, batch: int, like: Like):
+        self.instance, self.like = instance, like
+        self._batch = batch
+        self._arrays: dict[str, Array] = {}
+
+    def __del__(self) -> None:
+        # The collector may come in the middle of a call, of this or another thread: the next call releases it.
+        if self._batch is not None:
+            self.instance.gone.append(self._batch)
+
+    @property
+    def batch(self) -> int:
+        """The batch's address. Raises RuntimeError after `take`."""
+        if self._batch is None:
+            raise RuntimeError(
+                "these worlds were stepped with `reuse`: only those that came of it can be used"
+            )
+        return self._batch
+
+    def take(self) -> int:
+        """The batch, for a new owner. This state must not be used afterwards."""
+        batch, self._batch = self.batch, None
+        self._arrays.clear()
+        return batch
+
+    def __copy__(self) -> WasmState:
+        with self.instance as call:
+            return WasmState(self.instance, call("copy", self.batch), self.like)
+
+    def __deepcopy__(self, memo: Any) -> WasmState:
+        return self.__copy__()
+
+    def __getitem__(self, name: str) -> Array:
+        if name not in self._arrays:
+            self._arrays[name] = self.instance.read(self.batch, name, self.like)
+        return self._arrays[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.like)
+
+    def __len__(self) -> int:
+        return len(self.like)

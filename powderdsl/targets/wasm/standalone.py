@@ -26,13 +26,13 @@ from functools import partial
 from powderdsl.ir.ops import SNAP, Threshold
 from powderdsl.targets.codec import Piece
 from powderdsl.targets.wasm.binary import F64, I32, Callee, Function, Local, Value, const, load, op
-from powderdsl.targets.wasm.driver import Batches
-from powderdsl.targets.wasm.library import HEADER, PAGE, Library, aligned, either, word
+from powderdsl.targets.wasm.driver import Batches, numbers_of
+from powderdsl.targets.wasm.library import HEADER, LIVE, PAGE, SOME, Library, aligned, counted, either, word
 
 
 @dataclass(frozen=True)
 class Stored:
-    """An array of the state: its parts, the bytes of a cell, and the values that cells may have.
+    """An array of the state: its parts, how a cell is loaded, its bytes, and the values that cells may have.
 
     `usual`: by component and id, the value of a fresh cell. `holders`: the ids of elements whose cells can have another
     one; None for all. `of_element`: it comes and goes with the element.
@@ -40,6 +40,7 @@ class Stored:
 
     name: str
     pieces: tuple[Piece, ...]
+    load: str
     size: int
     usual: tuple[tuple[float, ...], ...]
     low: float
@@ -83,22 +84,23 @@ class Standalone(Batches):
         self.count = face.rows * self.memory.width
         self.valid = self._data(bytes(i if i in face.ids else face.ids[0] for i in range(256)))
         self.usual = {
-            one.name: [self._values(one.pieces[0], values) for values in one.usual] for one in face.fields
+            slot.name: [self._values(slot.pieces[0], values) for values in slot.usual] for slot in face.fields
         }
         self.holders = {
-            one.name: self._data(bytes(i in one.holders for i in range(256)))
-            for one in face.fields
-            if one.holders is not None
+            slot.name: self._data(bytes(i in slot.holders for i in range(256)))
+            for slot in face.fields
+            if slot.holders is not None
         }
         self.buffers: dict[str, int] = {}
-        for one in (face.element, *face.fields):
-            self.buffers[one.name] = self._place(self.count * one.size * len(one.usual))
+        for slot in (face.element, *face.fields):
+            self.buffers[slot.name] = self._place(self.count * slot.size * len(slot.usual))
         self.cells_at = const("i32", self.buffers["element"])
         self.wide = self._place(4 * self.count)
         """Cells of 4 bytes, while fresh values are spread."""
 
     def _place(self, size: int) -> int:
-        place, self.end = self.end, aligned(self.end + size)
+        """Static memory, with room for what `store` writes beyond."""
+        place, self.end = self.end, aligned(self.end + size + 3)
         return place
 
     def _data(self, octets: bytes) -> int:
@@ -112,148 +114,113 @@ class Standalone(Batches):
 
     def add(self) -> None:
         """Add all functions, and grow the memory by what they need."""
-        module, fields = self.library.module, self.face.fields
-        self.ready = module.define(self._ready)
-        self.shown = module.define(self.show)
-        self.reads = [module.define(partial(self._read, one), "read") for one in fields]
-        self.takes = [module.define(partial(self._take_values, one), "take_values") for one in fields]
-        for body in (
-            self.cells,
-            self.begin,
-            self.step,
-            self.show,
-            self.field,
-            self.take,
-            self.paint,
-            self.set,
-        ):
-            module.define(body, export=True)
-        module.define(self.parameter, export=True)
-        module.define(self.clock_at, "clock", export=True)
+        module, define = self.library.module, self.library.module.define
+        self.define(self.begin, self.show, export=True)
+        self.define(self._fill)
+        self.knobs = [define(partial(self._knob, knob), "knob") for knob in self.face.knobs]
+        self.reads = [define(partial(self._read, slot), "read") for slot in self.face.fields]
+        self.takes = [define(partial(self._take_values, slot), "take_values") for slot in self.face.fields]
+        self.define(self.cells, self.step, self.field, self.take, self.paint, self.set, export=True)
+        self.define(self.parameter, self.clock, export=True)
+        module.start(define(self._start))
         module.custom("powderdsl", self.face.about)
         module.pages = self.end // PAGE + 1
         module.restart(self.library.top, self.end)
 
     # The world
 
-    def _ready(self, f: Function) -> None:
-        """Makes the world where there is none: of the first element, with seed 0."""
-        with f.when(self.batch):
-            f.leave()
+    def _start(self, f: Function) -> None:
+        """Makes a world of the first element, with seed 0."""
         f.set(self.batch, self.calls["allocate"](1, self.face.rows))
-        for number, knob in enumerate(self.face.knobs):
-            f.do(self._knob(number)(const("f64", knob.default)))
-        f.fill(self.cells_at, self.face.ids[0], self.count)
-        f.do(self._fresh()(0))
-
-    def _fresh(self) -> Callee:
-        """The ids in the buffer become a world of a seed, with fresh cells."""
-
-        def fresh(f: Function, seed: I32) -> None:
-            with f.each(0, self.count) as i:
-                cell = load("i32.load8_u", self.cells_at + i)
-                f.set(cell, load("i32.load8_u", cell, self.valid))
-            (piece,) = self.face.element.pieces
-            f.do(self._load(piece, self.cells_at, 1))
-            for one in self.face.fields:
-                for piece, table in zip(one.pieces, self.usual[one.name], strict=True):
-                    with f.each(0, self.count) as i:
-                        value = word(load("i32.load8_u", self.cells_at + i) << 2, table)
-                        f.set(word(i << 2, self.wide), value)
-                    f.do(self._load(piece, const("i32", self.wide), 4))
-            for number, start in enumerate((op("i64.extend_i32_u", seed), const("i64", 0), const("i64", 0))):
-                f.set(load("i64.load", self.batch, HEADER + 8 * number), start)
-
-        return self.library.lazily("fresh", lambda: self.library.module.define(fresh))
-
-    def _load(self, piece: Piece, address: Value, size: int) -> Value:
-        if piece.is_real:
-            return self.calls["load_real"](self.batch, self.layout.reals[piece.slot], address, 0)
-        first = self.layout.planes[piece.planes[0]]
-        return self.calls["load"](self.batch, first, len(piece.planes), size, address)
-
-    def _store(self, piece: Piece, address: int, size: int) -> Value:
-        if piece.is_real:
-            return self.calls["store_real"](self.batch, self.layout.reals[piece.slot], address, 0)
-        first = self.layout.planes[piece.planes[0]]
-        return self.calls["store"](self.batch, first, len(piece.planes), int(piece.signed), size, address)
-
-    def cells(self, f: Function) -> Value:
-        f.do(self.ready())
-        return self.cells_at
+        for set_knob, knob in zip(self.knobs, self.face.knobs, strict=True):
+            f.do(set_knob(const("f64", knob.default)))
+        f.do(op("memory.fill", self.cells_at, self.face.ids[0], self.count))
+        f.do(self.calls["begin"](0))
 
     def begin(self, f: Function, seed: I32) -> None:
-        f.do(self.ready())
-        f.do(self._fresh()(seed))
+        """The ids in the buffer become a world of a seed, with fresh cells."""
+        with f.each(0, self.count) as i:
+            cell = load("i32.load8_u", self.cells_at + i)
+            f.set(cell, load("i32.load8_u", cell, self.valid))
+        (piece,) = self.face.element.pieces
+        f.do(self._load(piece, self.cells_at, 1))
+        for slot in self.face.fields:
+            for piece, table in zip(slot.pieces, self.usual[slot.name], strict=True):
+                with f.each(0, self.count) as i:
+                    value = word(load("i32.load8_u", self.cells_at + i) << 2, table)
+                    f.set(word(i << 2, self.wide), value)
+                f.do(self._load(piece, self.wide, 4))
+        f.set(load("i64.load", self.batch, HEADER), op("i64.extend_i32_u", seed))
+        for number in (1, 2):
+            f.set(load("i64.load", self.batch, HEADER + 8 * number), 0)
+
+    def _load(self, piece: Piece, address: Value | int, size: int) -> Value:
+        return self.calls["load"](self.batch, *numbers_of(piece, self.layout, size), address, 0)
+
+    def _store(self, piece: Piece, address: Value | int, size: int) -> Value:
+        return self.calls["store"](self.batch, *numbers_of(piece, self.layout, size), address, 0)
+
+    def cells(self, f: Function) -> Value:
+        return self.cells_at
 
     def step(self, f: Function, count: I32) -> None:
-        f.do(self.ready())
         f.do(self.calls["run"](self.batch, count))
 
-    def clock_at(self, f: Function) -> Value:
-        f.do(self.ready())
+    def clock(self, f: Function) -> Value:
         return self.batch + HEADER
 
     def show(self, f: Function) -> Value:
-        f.do(self.ready())
         (piece,) = self.face.element.pieces
-        f.do(self._store(piece, self.buffers["element"], 1))
+        f.do(self._store(piece, self.cells_at, 1))
         return self.cells_at
 
     # Fields
 
-    def _at(self, one: Stored, component: int) -> int:
-        return self.buffers[one.name] + component * self.count * one.size
+    def _at(self, slot: Stored, component: int) -> int:
+        return self.buffers[slot.name] + component * self.count * slot.size
 
-    def _read(self, one: Stored, f: Function) -> None:
+    def _read(self, slot: Stored, f: Function) -> None:
         """Writes the values of a field into its buffer."""
-        for component, piece in enumerate(one.pieces):
-            f.do(self._store(piece, self._at(one, component), one.size))
+        for component, piece in enumerate(slot.pieces):
+            f.do(self._store(piece, self._at(slot, component), slot.size))
 
-    def _take_values(self, one: Stored, f: Function) -> None:
+    def _take_values(self, slot: Stored, f: Function) -> None:
         """The values in a field's buffer become the field's, cut to what cells can have; the ids have been shown."""
-        for component, piece in enumerate(one.pieces):
-            at, table = self._at(one, component), self.usual[one.name][component]
+        for component, piece in enumerate(slot.pieces):
+            at, table = self._at(slot, component), self.usual[slot.name][component]
             with f.scope(), f.each(0, self.count) as i:
-                place = f.let(i * one.size)
+                place = f.let(i * slot.size)
                 identity = f.let(load("i32.load8_u", self.cells_at + i))
+                cell = load(slot.load, place, at)
                 if piece.is_real:
-                    cell, value = load("f32.load", place, at), f.let(load("f32.load", place, at))
-                    low, high = const("f32", one.low), const("f32", one.high)
-                    f.set(value, op("f32.min", op("f32.max", value, low), high))
+                    value = f.let(_within(cell, slot.low, slot.high))
                     # Without a number, and for small ones, the comparison does not hold.
                     large = op("f32.ge", op("f32.abs", value), const("f32", SNAP))
                     f.set(cell, either(large, value, const("f32", 0)))
                 else:
-                    name = "i32.load8_s" if piece.signed and one.size == 1 else _LOADS[one.size]
-                    cell = load(name, place, at)
                     value = f.let(cell)
-                    if one.names_element:
+                    if slot.names_element:
                         f.set(value, load("i32.load8_u", value, self.valid))
                     else:
-                        self._bound(f, value, one)
+                        low, high = int(slot.low), int(slot.high)
+                        f.set(value, either(op("i32.lt_s", value, low), low, value))
+                        f.set(value, either(op("i32.gt_s", value, high), high, value))
                     f.set(cell, value)
-                if one.name in self.holders:
-                    holds = load("i32.load8_u", identity, self.holders[one.name])
+                if slot.name in self.holders:
+                    holds = load("i32.load8_u", identity, self.holders[slot.name])
                     with f.when(holds.equals(0)):
-                        f.set(load(_LOADS[one.size], place, at), word(identity << 2, table))
-            f.do(self._load(piece, const("i32", at), one.size))
-
-    def _bound(self, f: Function, value: Local, one: Stored) -> None:
-        low, high = int(one.low), int(one.high)
-        f.set(value, either(op("i32.lt_s", value, low), low, value))
-        f.set(value, either(op("i32.gt_s", value, high), high, value))
+                        f.set(cell, load("f32.load" if piece.is_real else "i32.load", identity << 2, table))
+            f.do(self._load(piece, const("i32", at), slot.size))
 
     def field(self, f: Function, number: I32) -> int:
-        f.do(self.ready())
-        for i, one in enumerate(self.face.fields):
+        for i, slot in enumerate(self.face.fields):
             with f.when(number.equals(i)):
                 f.do(self.reads[i]())
-                f.give(self.buffers[one.name])
+                f.give(self.buffers[slot.name])
         return 0
 
     def take(self, f: Function, number: I32) -> None:
-        f.do(self.shown())
+        f.do(self.calls["show"]())
         for i, take in enumerate(self.takes):
             with f.when(number.equals(i)):
                 f.do(take())
@@ -268,7 +235,6 @@ class Standalone(Batches):
             f.leave()
 
     def paint(self, f: Function, element: I32, top: I32, bottom: I32, left: I32, right: I32) -> None:
-        f.do(self.ready())
         self._cut(f, top, bottom, self.face.rows)
         self._cut(f, left, right, self.memory.width)
         with f.when(element >= 256):
@@ -276,18 +242,54 @@ class Standalone(Batches):
         with f.when(op("i32.ne", load("i32.load8_u", element, self.valid), element)):
             f.leave()
         parts: list[tuple[Piece, Value]] = [(self.face.element.pieces[0], element)]
-        for one in self.face.fields:
-            for piece, table in zip(one.pieces, self.usual[one.name], strict=True):
-                if one.of_element:
-                    kind = "f32.load" if piece.is_real else "i32.load"
-                    parts.append((piece, load(kind, element << 2, table)))
+        for slot in self.face.fields:
+            if slot.of_element:
+                values = [word(element << 2, table) for table in self.usual[slot.name]]
+                parts += zip(slot.pieces, values, strict=True)
         for piece, value in parts:
-            box = (top, bottom, left, right, value)
-            if piece.is_real:
-                f.do(self.calls["fill_real"](self.batch, 0, self.layout.reals[piece.slot], *box))
-            else:
-                first, count = self.layout.planes[piece.planes[0]], len(piece.planes)
-                f.do(self.calls["fill"](self.batch, 0, first, count, *box))
+            place, planes, *_ = numbers_of(piece, self.layout, 0)
+            f.do(self.calls["fill"](place, planes, top, bottom, left, right, value))
+
+    def _fill(
+        self,
+        f: Function,
+        slot: I32,
+        planes: I32,
+        top: I32,
+        bottom: I32,
+        left: I32,
+        right: I32,
+        value: I32,
+    ) -> None:
+        """A box of equal cells: in planes from a slot on; without planes, in a field, by the bits of its value."""
+        library, memory = self.library, self.memory
+        group = f.let(self.first_group(self.batch))
+        f.set(group[memory.present], -1)
+        with f.each(top, bottom) as y:
+            lane, row = f.let(y // library.rows), f.let(y % library.rows)
+            with f.each(slot, slot + planes, some=False) as number:
+                at = f.let(group + (number << 2))
+                plane = f.let(library.own(word(at)))
+                f.set(word(at), plane)
+                flag = f.let(counted((value >> (number - slot)) & 1))
+                f.set(plane[SOME], plane[SOME] | op("i32.wrap_i64", flag))
+                with f.each(left, right) as x:
+                    half = f.let(plane + row * memory.row + ((x >> 6) << 4) + (lane << 3))[memory.half]
+                    by = f.let(counted(x & 63))
+                    f.set(half, half & (const("i64", -1) ^ (1 << by)) | (flag << by))
+            with f.when(planes.equals(0)):
+                at = f.let(group + (slot << 2))
+                field = f.let(library.own_field(word(at)))
+                f.set(word(at), field)
+                line = f.let(lane * library.rows + row)
+                start, alive = f.let(library.line_start(field, line)), f.let(0)
+                with f.when((field + line)[LIVE].equals(0)):
+                    f.do(op("memory.fill", start, 0, 4 * memory.width))
+                with f.each(left, right) as x:
+                    f.set(word(start + (x << 2)), value)
+                with f.each(0, 4 * memory.width, 4) as x:
+                    f.set(alive, alive | (word(start + x) << 1))
+                self.close_line(f, field, line, start, alive)
 
     def set(
         self,
@@ -300,63 +302,55 @@ class Standalone(Batches):
         right: I32,
         given: F64,
     ) -> None:
-        f.do(self.shown())
+        f.do(self.calls["show"]())
         self._cut(f, top, bottom, self.face.rows)
         self._cut(f, left, right, self.memory.width)
-        for i, one in enumerate(self.face.fields):
+        for i, slot in enumerate(self.face.fields):
             with f.when(number.equals(i)), f.scope():
-                with f.when(component >= len(one.pieces)):
+                with f.when(component >= len(slot.pieces)):
                     f.leave()
                 f.do(self.reads[i]())
-                real = one.pieces[0].is_real
-                value = f.let(op("f32.demote_f64" if real else "i32.trunc_sat_f64_s", given))
-                if one.names_element:
-                    f.set(value, either(value >= 256, 255, value))
-                elif not real:
-                    self._bound(f, value, one)
-                base = f.let(component * (self.count * one.size))
+                convert = "f32.demote_f64" if slot.pieces[0].is_real else "i32.trunc_sat_f64_s"
+                value = f.let(op(convert, _within(given, slot.low, slot.high)))
+                base = f.let(component * (self.count * slot.size))
                 with f.each(top, bottom) as y, f.each(left, right) as x:
-                    place = base + (y * self.memory.width + x) * one.size
-                    kind = "f32.load" if real else _LOADS[one.size]
-                    f.set(load(kind, place, self.buffers[one.name]), value)
+                    place = base + (y * self.memory.width + x) * slot.size
+                    f.set(load(slot.load, place, self.buffers[slot.name]), value)
                 f.do(self.takes[i]())
 
     # Parameters
 
-    def _knob(self, number: int) -> Callee:
+    def _knob(self, knob: Knob, f: Function, value: F64) -> None:
         """Sets a parameter: its value, cut to its range, as bits and floats."""
-        knob, layout = self.face.knobs[number], self.layout
-
-        def set_knob(f: Function, value: F64) -> None:
-            with f.when(op("f64.ne", value, value)):
-                f.leave()
-            f.set(value, op("f64.min", op("f64.max", value, const("f64", knob.low)), const("f64", knob.high)))
-            if knob.whole:
-                f.set(value, op("f64.floor", op("f64.add", value, const("f64", 0.5))))
-            views: dict[Threshold | None, list[tuple[int, int]]] = {}
-            for (name, threshold, bit), place in layout.param_planes.items():
-                if name == knob.name:
-                    views.setdefault(threshold, []).append((bit, place))
-            for threshold, bits in views.items():
-                limit = value if threshold is None else _limit(value, threshold)
-                limit = f.let(op("i64.trunc_sat_f64_s", limit))
-                for bit, place in bits:
-                    f.set(load("i64.load8_u", self.bits(self.batch) + place), (limit >> bit) & 1)
-            if knob.name in layout.param_reals:
-                at = self.values(self.batch) + 4 * layout.param_reals[knob.name]
-                f.set(load("f32.load", at), op("f32.demote_f64", value))
-
-        return self.library.lazily(("knob", number), lambda: self.library.module.define(set_knob, "knob"))
+        layout = self.layout
+        with f.when(op("f64.ne", value, value)):
+            f.leave()
+        f.set(value, _within(value, knob.low, knob.high))
+        if knob.whole:
+            f.set(value, op("f64.floor", op("f64.add", value, const("f64", 0.5))))
+        views: dict[Threshold | None, list[tuple[int, int]]] = {}
+        for (name, threshold, bit), place in layout.param_planes.items():
+            if name == knob.name:
+                views.setdefault(threshold, []).append((bit, place))
+        for threshold, bits in views.items():
+            limit = value if threshold is None else _limit(value, threshold)
+            limit = f.let(op("i64.trunc_sat_f64_s", limit))
+            for bit, place in bits:
+                f.set(load("i64.load8_u", self.bits(self.batch) + place), (limit >> bit) & 1)
+        if knob.name in layout.param_reals:
+            at = self.values(self.batch) + 4 * layout.param_reals[knob.name]
+            f.set(load("f32.load", at), op("f32.demote_f64", value))
 
     def parameter(self, f: Function, number: I32, value: F64) -> None:
-        f.do(self.ready())
-        for i in range(len(self.face.knobs)):
+        for i, set_knob in enumerate(self.knobs):
             with f.when(number.equals(i)):
-                f.do(self._knob(i)(value))
+                f.do(set_knob(value))
 
 
-_LOADS = {1: "i32.load8_u", 2: "i32.load16_s", 4: "i32.load"}
-"""The instruction that loads an integer of some bytes; one of a byte may also have a sign."""
+def _within(value: Value, low: float, high: float) -> Value:
+    """A float, cut to a range."""
+    kind = value.type
+    return op(f"{kind}.min", op(f"{kind}.max", value, const(kind, low)), const(kind, high))
 
 
 def _limit(value: Value, threshold: Threshold) -> Value:
@@ -367,4 +361,4 @@ def _limit(value: Value, threshold: Threshold) -> Value:
         limit = op("f64.ceil", scaled)
     else:
         limit = op("f64.add", op("f64.floor", scaled), const("f64", 1))
-    return op("f64.min", op("f64.max", limit, const("f64", 0)), const("f64", count))
+    return _within(limit, 0, count)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import atexit
 import ctypes
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import cache
 from typing import Any, TypeVar
 from weakref import WeakSet
@@ -13,64 +12,28 @@ from weakref import WeakSet
 import wasmtime
 from wasmtime import _ffi
 
-from powderdsl.targets.wasm.host import TOO_LARGE, Bytes
+from powderdsl.targets.wasm.host import TOO_LARGE
 
 MOST_ARGUMENTS = 16
 GROWTH = 16 << 20
 """Bytes of addresses beyond a memory into which it grows without being moved, where addresses are few."""
-
 
 _OWNED: WeakSet[Any] = WeakSet()
 """What wasmtime frees with the objects of Python that own it."""
 T = TypeVar("T")
 
 
-def _owned(one: T) -> T:
-    _OWNED.add(one)
-    return one
+def _owned(owner: T) -> T:
+    _OWNED.add(owner)
+    return owner
 
 
 @atexit.register
 def _leave() -> None:
     """Leave everything to the operating system: wasmtime cannot free it when Python has taken its modules apart."""
-    for one in list(_OWNED):
+    for owner in list(_OWNED):
         with suppress(ValueError):  # it was freed before
-            one._consume()
-
-
-@dataclass
-class Compiled:
-    """A module with the engine that has compiled it."""
-
-    code: bytes
-    engine: wasmtime.Engine
-    module: wasmtime.Module
-
-
-class WasmtimeHost:
-    """Compiles modules and instantiates them, each in a store of its own.
-
-    wasmtime reserves 4 GiB of addresses for each memory, so that the processor checks accesses. Where addresses are
-    limited (`ulimit -v`), it checks them itself, in code that takes half as long again.
-    """
-
-    def __init__(self) -> None:
-        self._engine = _engine(reserve=True)
-
-    def compile(self, code: bytes) -> Compiled:
-        engine = self._engine
-        return Compiled(code, engine, _owned(wasmtime.Module(engine, code)))
-
-    def instantiate(self, module: Compiled) -> WasmtimeModule:
-        try:
-            return WasmtimeModule(module.engine, module.module)
-        except wasmtime.WasmtimeError:
-            self._engine = module.engine = _engine(reserve=False)
-            module.module = _owned(wasmtime.Module(module.engine, module.code))
-        try:
-            return WasmtimeModule(module.engine, module.module)
-        except wasmtime.WasmtimeError:
-            raise MemoryError(TOO_LARGE) from None
+            owner._consume()
 
 
 @cache
@@ -84,6 +47,36 @@ def _engine(*, reserve: bool) -> wasmtime.Engine:
 
 
 class WasmtimeModule:
+    """A compiled module, which is instantiated in stores of their own.
+
+    wasmtime reserves 4 GiB of addresses for each memory, so that the processor checks accesses. Where addresses are
+    limited (`ulimit -v`), it checks them itself, in code that takes half as long again.
+    """
+
+    engine = _engine(reserve=True)
+    """That of new modules."""
+
+    def __init__(self, code: bytes):
+        self._code = code
+        self._compile()
+
+    def _compile(self) -> None:
+        self._engine = self.engine
+        self._module = _owned(wasmtime.Module(self.engine, self._code))
+
+    def instantiate(self) -> WasmtimeInstance:
+        try:
+            return WasmtimeInstance(self._engine, self._module)
+        except wasmtime.WasmtimeError:
+            WasmtimeModule.engine = _engine(reserve=False)
+            self._compile()
+        try:
+            return WasmtimeInstance(self._engine, self._module)
+        except wasmtime.WasmtimeError:
+            raise MemoryError(TOO_LARGE) from None
+
+
+class WasmtimeInstance:
     """An instance in a store of its own."""
 
     def __init__(self, engine: wasmtime.Engine, module: wasmtime.Module):
@@ -93,7 +86,9 @@ class WasmtimeModule:
         )
         self._context = self._store._context()
         self._functions = {
-            name: ctypes.byref(one._func) for name, one in exports.items() if isinstance(one, wasmtime.Func)
+            name: ctypes.byref(item._func)
+            for name, item in exports.items()
+            if isinstance(item, wasmtime.Func)
         }
         self._memory = exports["memory"]
         self._memory_at = ctypes.byref(self._memory._memory)
@@ -110,37 +105,25 @@ class WasmtimeModule:
         error = _ffi.wasmtime_func_call_unchecked(
             self._context, self._functions[name], self._values, max(len(args), 1), self._trap_at
         )
-        if bool(error) or bool(self._trap):
-            self._forget(error)
-            raise MemoryError(TOO_LARGE)
-        return raw[0] & 0xFFFFFFFF
-
-    def _forget(self, error: Any) -> None:
-        """Free what a call has failed with."""
-        if error:
+        if not bool(error) and not bool(self._trap):
+            return raw[0] & 0xFFFFFFFF
+        if bool(error):
             _ffi.wasmtime_error_delete(error)
         if bool(self._trap):
             _ffi.wasm_trap_delete(self._trap)
             ctypes.memset(self._trap_at, 0, ctypes.sizeof(self._trap))
-
-    def write(self, at: int, data: Bytes) -> None:
-        if isinstance(data, bytes):
-            ctypes.memmove(self._address(at), data, len(data))
-            return
-        view = memoryview(data).cast("B")
-        self._bytes(at, view.nbytes)[:] = view
-
-    def read(self, at: int, out: Bytes) -> None:
-        view = memoryview(out).cast("B")
-        view[:] = self._bytes(at, view.nbytes)
+        raise MemoryError(TOO_LARGE)
 
     def _address(self, at: int) -> int:
         """An address of the module's memory in this process; memory may move when it grows."""
         start = _ffi.wasmtime_memory_data(self._context, self._memory_at)
         return ctypes.addressof(start.contents) + at
 
-    def _bytes(self, at: int, size: int) -> memoryview:
-        return memoryview((ctypes.c_ubyte * size).from_address(self._address(at))).cast("B")
+    def write(self, at: int, data: bytes) -> None:
+        ctypes.memmove(self._address(at), data, len(data))
+
+    def read(self, at: int, size: int) -> bytearray:
+        return bytearray((ctypes.c_ubyte * size).from_address(self._address(at)))
 
     def memory_size(self) -> int:
         return int(self._memory.data_len(self._store))
