@@ -69,6 +69,10 @@ class Values(Generic[Named]):
                 self.made(node)
         return self.known[id(root)]
 
+    def named(self, node: Node, value: Named) -> Named:
+        """A node's expression, or a name for it."""
+        return value
+
     def fresh(self, prefix: str) -> str:
         """A name that the block does not have yet."""
         self.count += 1
@@ -94,10 +98,6 @@ class WordValues(Values[Named]):
 
     def lazy(self, node: Node) -> Named:
         """The name of a `when`; its second argument is computed only where the first holds."""
-        raise NotImplementedError
-
-    def named(self, node: Node, value: Named) -> Named:
-        """A node's expression, or a name for it."""
         raise NotImplementedError
 
     def needed(self, node: Node) -> Sequence[Node]:
@@ -168,7 +168,8 @@ class CellValues(Values[Named]):
         if node.op == "select":
             self.choice(node)
         else:
-            self.known[id(node)] = self.led(node) if node.op == "led" else self.node(node)
+            value = self.led(node) if node.op == "led" else self.node(node)
+            self.known[id(node)] = self.named(node, value)
 
     def choice(self, node: Node) -> None:
         """Name a chain of choices, and others on the same masks: the components of a vector share their tests."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import reduce
 from importlib.resources import files
 from operator import or_
@@ -23,9 +23,10 @@ LIBRARY = ("vectors", "runtime", "planes", "movements", "fields")
 DRIVER = ("driver", "views")
 """Headers that come after them."""
 
-
 UNIT_SIZE = 40_000
 """Letters of generated passes from which compiling two units side by side is faster."""
+
+ELEMENT = "element:"
 
 
 class NativeSource(NamedTuple):
@@ -55,106 +56,103 @@ def native_source(program: Program, width: int = 0) -> NativeSource:
     layout = native_layout(program)
     schedules = [plan(pass_, CPU) for pass_ in program.passes]
     passes = [pass_text(schedule, i, layout) for i, schedule in enumerate(schedules)]
-    asked = reduce(or_, map(asked_ids, schedules), 0)
-    calls = "\n".join(f"  pass_{i}(c); TICK({i})" for i in range(len(program.passes)))
-    resets = [
-        (slot, layout.planes.get(slot.name), layout.reals.get(slot.name))
-        for slot in program.slots
-        if slot.resets
-    ]
-    reset_planes = [f"{{{plane}, {int(slot.default)}}}" for slot, plane, _ in resets if plane is not None]
-    reset_reals = [
-        f"{{{real}, {literal(float(slot.default))}}}" for slot, _, real in resets if real is not None
-    ]
-    step_table = [f"{{{a}, {b}}}" for a, b in layout.step_planes]
-    fixed = [f"{{{k}, {a}, {b}}}" for k, a, b in layout.fixed]
-    idents = [f"{ident}u" for _, ident, _ in program.streams]
-    head = "\n".join([
-        f"// {len(program.passes)} passes, generated; version {GENERATOR_VERSION}",
-        f"#define WIDTH {width}",
-        f"#define STREAMS {len(layout.streams)}",
-        f"#define STEP_PLANES {len(layout.step_planes)}",
-        f"#define PARAM_PLANES {len(layout.param_planes)}",
-        f"#define PARAM_REALS {len(layout.param_reals)}",
-        f"#define SLOTS {len(layout.planes)}",
-        f"#define COINS {len(layout.coins)}",
-        f"#define REALS {len(layout.reals)}",
-        *(f"#define {name.upper()} {size}" for name, size in vars(layout).items() if isinstance(size, int)),
-        f"#define SNAP {literal(SNAP)}",
-        f"#define PASSES {len(program.passes)}",
-    ])  # fmt: skip
-    tables = "\n".join([
-        "struct ResetPlane { int slot; bool value; };",
-        "struct ResetReal { int slot; float value; };",
-        "struct FixedPlane { int kind, a, b; };",
-        "struct StepPlane { u64 a; int b; };",
-        f"static const std::vector<ResetPlane> RESET_PLANES = {{{', '.join(reset_planes)}}};",
-        f"static const std::vector<ResetReal> RESET_REALS = {{{', '.join(reset_reals)}}};",
-        f"static const std::vector<FixedPlane> FIXED = {{{', '.join(fixed)}}};",
-        f"static const std::vector<StepPlane> STEP_TABLE = {{{', '.join(step_table)}}};",
-        f"static const std::vector<u32> STREAM_IDENT = {{{', '.join(idents)}}};",
-    ])  # fmt: skip
+    sizes = {
+        "WIDTH": width,
+        "STREAMS": len(layout.streams),
+        "STEP_PLANES": len(layout.step_planes),
+        "PARAM_PLANES": len(layout.param_planes),
+        "PARAM_REALS": len(layout.param_reals),
+        "SLOTS": len(layout.planes),
+        "COINS": len(layout.coins),
+        "REALS": len(layout.reals),
+        **{name.upper(): size for name, size in vars(layout).items() if isinstance(size, int)},
+        "SNAP": literal(SNAP),
+        "PASSES": len(passes),
+    }
     folder = files("powderdsl.targets.cpp")
     before, after = (
         "\n".join((folder / f"{part}.hpp").read_text(encoding="utf-8") for part in parts)
         for parts in (LIBRARY, DRIVER)
     )
     units = 2 if sum(map(len, passes)) >= UNIT_SIZE else 1
-    body = _in_units(passes, units, len(after))
-    known = "  if (c.present == ~0ull) look(c);\n" if asked else ""
-    step = f"{look(layout, asked)}\nstatic void run_passes(Context& c) {{\n  START;\n{known}{calls}\n}}"
-    last = f"{_only_in(0)}\n{tables}\n{step}\n{after}\n#endif\n"
-    return NativeSource("\n".join([head, before, body, last]), layout, units)
+    asked = reduce(or_, map(asked_ids, schedules), 0)
+    lines = [
+        f"// {len(passes)} passes, generated; version {GENERATOR_VERSION}",
+        *(f"#define {name} {size}" for name, size in sizes.items()),
+        before,
+        *_in_units(passes, units, len(after)),
+        _only_in(0),
+        *_tables(program, layout),
+        *_look(layout, asked),
+        "static void run_passes(Context& c) {\n  START;",
+        *(["  if (c.present == ~0ull) look(c);"] if asked else []),
+        *(f"  pass_{i}(c); TICK({i})" for i in range(len(passes))),
+        "}",
+        after,
+        "#endif\n",
+    ]
+    return NativeSource("\n".join(lines), layout, units)
+
+
+def _tables(program: Program, layout: NativeLayout) -> Iterator[str]:
+    """The types of tables, and tables of slots that a step resets, of planes and of streams."""
+    yield "struct ResetPlane { int slot; bool value; };"
+    yield "struct ResetReal { int slot; float value; };"
+    yield "struct FixedPlane { int kind, a, b; };"
+    yield "struct StepPlane { u64 a; int b; };"
+    planes, reals = [], []
+    for slot in program.slots:
+        if slot.resets and slot.name in layout.planes:
+            planes.append((layout.planes[slot.name], int(slot.default)))
+        elif slot.resets:
+            reals.append((layout.reals[slot.name], literal(float(slot.default))))
+    tables: dict[tuple[str, str], Iterable[tuple[object, ...]]] = {
+        ("ResetPlane", "RESET_PLANES"): planes,
+        ("ResetReal", "RESET_REALS"): reals,
+        ("FixedPlane", "FIXED"): layout.fixed,
+        ("StepPlane", "STEP_TABLE"): layout.step_planes,
+    }
+    for (type, name), rows in tables.items():
+        items = ", ".join(f"{{{', '.join(map(str, row))}}}" for row in rows)
+        yield f"static const std::vector<{type}> {name} = {{{items}}};"
+    idents = ", ".join(f"{ident}u" for _, ident, _ in program.streams)
+    yield f"static const std::vector<u32> STREAM_IDENT = {{{idents}}};"
 
 
 def _only_in(unit: int) -> str:
     return f"#if !defined(UNIT) || UNIT == {unit}"
 
 
-def _in_units(passes: Sequence[str], units: int, driver: int) -> str:
+def _in_units(passes: Sequence[str], units: int, driver: int) -> Iterator[str]:
     """The passes, each in a unit, so that all units are about as long; the first has a driver of so many letters, too."""
     sizes = [driver, *[0] * (units - 1)]
     chosen: dict[int, int] = {}
     for number in sorted(range(len(passes)), key=lambda number: -len(passes[number])):
         chosen[number] = sizes.index(min(sizes))
         sizes[chosen[number]] += len(passes[number])
-    declared = [f"void pass_{number}(Context& c);" for number in range(len(passes))]
-    return "\n".join(declared + [f"{_only_in(chosen[i])}\n{text}\n#endif" for i, text in enumerate(passes)])
+    yield from (f"void pass_{number}(Context& c);" for number in range(len(passes)))
+    for number, text in enumerate(passes):
+        yield f"{_only_in(chosen[number])}\n{text}\n#endif"
 
 
-ELEMENT = "element:"
-
-
-def look(layout: NativeLayout, asked: int) -> str:
+def _look(layout: NativeLayout, asked: int) -> Iterator[str]:
     """The function that finds which of the ids in `asked` are present, from products of their low and high bits."""
-    count = sum(name.startswith(ELEMENT) for name in layout.planes)
-    ids = [code for code in range(1 << count) if asked >> code & 1]
+    planes = [plane for name, plane in layout.planes.items() if name.startswith(ELEMENT)]
+    ids = [code for code in range(1 << len(planes)) if asked >> code & 1]
     if not ids:
-        return "static void look(Context&) {}"
-    low = count // 2
-    planes = [layout.planes[f"{ELEMENT}{bit}"] for bit in range(count)]
-
-    def products(name: str, bits: range) -> list[str]:
-        return [
-            f"const V {name}{code} = "
-            + (
-                " & ".join(f"{'' if code >> i & 1 else '~'}b{bit}" for i, bit in enumerate(bits))
-                or "~splat(0)"
-            )
-            + ";"
-            for code in range(1 << len(bits))
-        ]
-
-    return "\n".join([
-        "static void look(Context& c) {",
-        *(f"const V* e{bit} = c.slot[{plane}]->data;" for bit, plane in enumerate(planes)),
-        *(f"V id{code} = splat(0);" for code in ids),
-        "for (size_t i = 0; i < c.g.cells(); i++) {",
-        *(f"const V b{bit} = e{bit}[i];" for bit in range(count)),
-        *products("low", range(low)),
-        *products("high", range(low, count)),
-        *(f"id{code} |= low{code & (1 << low) - 1} & high{code >> low};" for code in ids),
-        "}",
-        "c.present = " + " | ".join(f"(any(id{code}) ? 1ull << {code} : 0)" for code in ids) + ";",
-        "}",
-    ])  # fmt: skip
+        yield "static void look(Context&) {}"
+        return
+    low = len(planes) // 2
+    yield "static void look(Context& c) {"
+    yield from (f"const V* e{bit} = c.slot[{plane}]->data;" for bit, plane in enumerate(planes))
+    yield from (f"V id{code} = splat(0);" for code in ids)
+    yield "for (size_t i = 0; i < c.g.cells(); i++) {"
+    yield from (f"const V b{bit} = e{bit}[i];" for bit in range(len(planes)))
+    for name, bits in (("low", range(low)), ("high", range(low, len(planes)))):
+        for code in range(1 << len(bits)):
+            factors = [f"{'' if code >> i & 1 else '~'}b{bit}" for i, bit in enumerate(bits)]
+            yield f"const V {name}{code} = {' & '.join(factors) or '~splat(0)'};"
+    yield from (f"id{code} |= low{code & (1 << low) - 1} & high{code >> low};" for code in ids)
+    yield "}"
+    yield "c.present = " + " | ".join(f"(any(id{code}) ? 1ull << {code} : 0)" for code in ids) + ";"
+    yield "}"

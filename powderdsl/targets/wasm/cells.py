@@ -45,6 +45,7 @@ class CellLoop:
         self.held = dict(zip(self.reads, f.params, strict=False))
         self.outs = f.params[len(self.reads) :]
         self.nodes = ordered(values)
+        self.columns = self.memory.at("columns") + 4 * self.memory.halo
         self.starts: dict[tuple[str, int, bool], Local] = {}
 
     def made(self) -> Callee:
@@ -69,11 +70,8 @@ class CellLoop:
 
     # Lines
 
-    def start(self, field: str, dy: int = 0, *, wraps: bool = True) -> Local:
-        """Where a line of a field begins; made before the loop over its cells."""
-        return self.starts[field, dy, wraps]
-
     def find_starts(self) -> None:
+        """Where the lines of fields begin that are read; found before the loop over their cells."""
         for node in self.nodes:
             if node.type != REAL or node.op not in ("load", "shift"):
                 continue
@@ -89,8 +87,7 @@ class CellLoop:
         return (field + (self.line if line is None else line))[LIVE]
 
     def set_live(self, place: int, value: Value) -> None:
-        f = self.f
-        value = f.let(value)
+        f, value = self.f, self.f.let(value)
         f.set((self.outs[place] + self.line)[LIVE], value)
         f.set(self.somewhere[place], self.somewhere[place] | value)
 
@@ -100,27 +97,25 @@ class CellLoop:
 
     def row_flags(self, planes: Sequence[str]) -> Value:
         """Whether planes hold a flag in this row of the lane."""
-        found = const("i64", 0)
-        if self.memory.words <= 4:
+        f, memory = self.f, self.memory
+        flags = const("i64", 0)
+        if memory.words <= 4:
             for name in planes:
-                for w in range(self.memory.words):
-                    found = found | load("i64.load", self.held[name] + self.row, self.memory.base + 16 * w)
-            return op("i64.ne", found, const("i64", 0))
-        f = self.f
-        total = f.let(found)
+                for w in range(memory.words):
+                    flags = flags | load("i64.load", self.held[name] + self.row, memory.base + 16 * w)
+            return op("i64.ne", flags, 0)
+        total = f.let(flags)
         for name in planes:
-            with f.each(0, self.memory.row, 16) as at:
+            with f.each(0, memory.row, 16) as at:
                 f.set(total, total | self.flags(self.held[name], self.row + at))
-        return op("i64.ne", total, const("i64", 0))
+        return op("i64.ne", total, 0)
 
     def copy(self, place: int, source: Local) -> None:
         """A line as it is in another field."""
-        f = self.f
         self.set_live(place, self.live(source))
-        with f.when(self.live(source)):
+        with self.f.when(self.live(source)):
             self.copy_cells(
-                self.library.line_start(self.outs[place], self.line),
-                self.library.line_start(source, self.line),
+                *(self.library.line_start(field, self.line) for field in (self.outs[place], source))
             )
 
     def copy_cells(self, to: Value, source: Value) -> None:
@@ -142,10 +137,11 @@ class CellLoop:
             return
         fields, planes = region_of(loop)
         busy = ZERO
-        for part in fields:
-            line = self.library.other_line(self.line, part.attr[0], wraps=True)
-            busy = busy | self.live(self.held[str(part.args[0].attr)], line)
-        busy = busy | self.row_flags(planes) if planes else busy
+        for live in fields:
+            line = self.library.other_line(self.line, live.attr[0], wraps=True)
+            busy = busy | self.live(self.held[str(live.args[0].attr)], line)
+        if planes:
+            busy = busy | self.row_flags(planes)
         with f.when(op("i32.eqz", busy)):
             for i, out in enumerate(loop.outs):
                 assert out.otherwise is not None
@@ -155,56 +151,46 @@ class CellLoop:
                     self.set_live(i, ZERO)
                 else:
                     if out.otherwise.attr:
-                        f.set(self.somewhere[i], const("i32", 1))
+                        f.set(self.somewhere[i], 1)
                     for w in range(self.memory.words):
-                        value = const("i64", self.valid(w) if out.otherwise.attr else 0)
-                        f.set(load("i64.load", self.outs[i] + self.row, self.memory.base + 16 * w), value)
+                        columns = (1 << min(WORD, self.memory.width - WORD * w)) - 1
+                        word = load("i64.load", self.outs[i] + self.row, self.memory.base + 16 * w)
+                        f.set(word, columns if out.otherwise.attr else 0)
             f.jump(self.skip)
-
-    def valid(self, w: int) -> int:
-        """The columns of a word that lie in the grid."""
-        return (1 << min(WORD, self.memory.width - WORD * w)) - 1
 
     def body(self) -> None:
         f, memory, library = self.f, self.memory, self.library
         self.skipped()
         self.find_starts()
-        width = memory.width
-        fields = [(i, out) for i, out in enumerate(self.loop.outs) if out.var.type == REAL]
-        flags = [(i, out) for i, out in enumerate(self.loop.outs) if out.var.type != REAL]
-        lines = {i: f.let(library.line_start(self.outs[i], self.line)) for i, _ in fields}
-        alive = {i: f.let(const("v128", 0)) for i, _ in fields}
+        fields = [i for i, out in enumerate(self.loop.outs) if out.var.type == REAL]
+        flags = [i for i, out in enumerate(self.loop.outs) if out.var.type != REAL]
+        lines = {i: f.let(library.line_start(self.outs[i], self.line)) for i in fields}
+        alive = {i: f.let(const("v128", 0)) for i in fields}
         with self.each_word() as (at, x, stop):
-            bits = {i: f.let(const("i64", 0)) for i, _ in flags}
+            bits = {i: f.let(const("i64", 0)) for i in flags}
             planes = [str(node.attr) for node in self.nodes if node.op == "load" and node.type != REAL]
             words = {name: f.let(self.flags(self.held[name], at)) for name in dict.fromkeys(planes)}
             with f.each(x, stop, CHUNK) as column, f.scope():
                 self.column, self.at = column, at
-                values = Chunks(self, words)
-                found = [values.of(out.value) for out in self.loop.outs]
-                found = [v if isinstance(v, Local) else f.let(v) for v in found]
-                for i, _ in fields:
-                    f.set(load("v128.load", lines[i] + (column << 2)), found[i])
-                    kept = found[i]
-                    if width % CHUNK:
-                        kept = kept & load("v128.load", column << 2, memory.at("columns") + 4 * memory.halo)
-                    f.set(alive[i], alive[i] | kept)
-                for i, _ in flags:
-                    four = op("i64.extend_i32_u", op("i32x4.bitmask", found[i]))
-                    f.set(bits[i], bits[i] | (four << counted(column)))
-            for i, _ in flags:
-                value: Value = bits[i]
+                chunks = Chunks(self, words)
+                values = [chunks.of(out.value) for out in self.loop.outs]
+                values = [value if isinstance(value, Local) else f.let(value) for value in values]
+                for i in fields:
+                    f.set(load("v128.load", lines[i] + (column << 2)), values[i])
+                    inside = values[i]
+                    if memory.width % CHUNK:
+                        inside = inside & load("v128.load", column << 2, self.columns)
+                    f.set(alive[i], alive[i] | inside)
+                for i in flags:
+                    f.set(bits[i], bits[i] | (counted(op("i32x4.bitmask", values[i])) << counted(column)))
+            for i in flags:
                 if not memory.whole:
-                    value = value & self.valid_word(at)
-                    f.set(bits[i], value)
+                    f.set(bits[i], bits[i] & (library.everything + at)[memory.half])
                 f.set(self.somewhere[i], self.somewhere[i] | op("i64.ne", bits[i], const("i64", 0)))
                 f.set((self.outs[i] + at)[memory.half], bits[i])
-        for i, _ in fields:
+        for i in fields:
             self.set_live(i, some(op("i32x4.shl", alive[i], const("i32", 1))))
             library.finish_line(f, lines[i])
-
-    def valid_word(self, at: Value) -> Value:
-        return (self.library.everything + at)[self.memory.half]
 
     @contextmanager
     def each_word(self) -> Iterator[tuple[Value, Value, Value]]:
@@ -251,9 +237,9 @@ class CellLoop:
         running = lines
         if continued:
             first = memory.at("chains") + 4 * memory.halo
-            running = [f.let(const("i32", first + 4 * memory.stride * i)) for i in range(len(chains))]
+            running = [f.let(first + 4 * memory.stride * i) for i in range(len(chains))]
         for chain, line in zip(chains, running, strict=True):
-            self.copy_cells(line, self.start(str(chain[0].args[2].attr)))
+            self.copy_cells(line, self.starts[str(chain[0].args[2].attr), 0, True])
         with self.each_word() as (at, x, _):
             for level, mask in enumerate(masks):
                 with f.scope():
@@ -276,8 +262,7 @@ class CellLoop:
             f.jump(done, op("i64.eqz", left))
             nibble = f.let(op("i64.ctz", left) & (WORD - CHUNK))
             self.column = f.let(x + op("i32.wrap_i64", nibble))
-            four = splat(op("i32.wrap_i64", left >> nibble))
-            chosen = f.let(op("i32x4.eq", four & vector(BITS), vector(BITS)))
+            chosen = f.let(spread(op("i32.wrap_i64", left >> nibble)))
             f.set(left, left & (const("i64", -1) ^ (const("i64", 15) << nibble)))
             values = Chunks(self, {})
             places = [line + (self.column << 2) for line in lines]
@@ -287,6 +272,11 @@ class CellLoop:
                 new = choose(chosen, values.of(choice.args[1]), values.known[id(choice.args[2])])
                 f.set(load("v128.load", place), new)
             f.jump(again)
+
+
+def spread(bits: Value) -> Value:
+    """Four bits as lanes."""
+    return op("i32x4.eq", splat(bits) & vector(BITS), vector(BITS))
 
 
 class Chunks(CellValues[Value]):
@@ -306,25 +296,20 @@ class Chunks(CellValues[Value]):
             return op("i32.wrap_i64", load("i64.load", self.loop.lane, self.memory.at("params", number)))
         return op("i32.wrap_i64", self.words[str(node.attr)] >> counted(self.loop.column))
 
-    def spread(self, bits: Value) -> Value:
-        """Four bits as lanes."""
-        return op("i32x4.eq", splat(bits) & vector(BITS), vector(BITS))
-
-    def node(self, node: Node) -> Value:
-        value = self.made_of(node)
+    def named(self, node: Node, value: Value) -> Value:
         once = isinstance(value, Local) or node.op == "const" or self.uses[id(node)] < 2
         return value if once else self.f.let(value)
 
-    def made_of(self, node: Node) -> Value:
+    def node(self, node: Node) -> Value:
         attr, args = node.attr, [self.known[id(arg)] for arg in node.args if id(arg) in self.known]
         memory, loop = self.memory, self.loop
         match node.op:
             case "const":
                 return floats(float(attr))
             case "load" | "param" if node.type != REAL:
-                return self.spread(self.nibble(node))
+                return spread(self.nibble(node))
             case "load":
-                return load("v128.load", loop.start(str(attr)) + (loop.column << 2))
+                return self.beside(loop.starts[str(attr), 0, True], 0)
             case "param":
                 number = memory.layout.param_reals[attr[0]]
                 return load("v128.load32_splat", loop.lane >> 1, memory.at("reals", number))
@@ -332,11 +317,9 @@ class Chunks(CellValues[Value]):
                 return self.draw(node)
             case "shift":
                 dy, dx, wraps = attr
-                start = loop.start(str(node.args[0].attr), dy, wraps=wraps or not dy)
+                start = loop.starts[str(node.args[0].attr), dy, wraps or not dy]
                 value = self.beside(start, dx)
-                if wraps or not dx:
-                    return value
-                return value & self.beside(const("i32", memory.at("columns") + 4 * memory.halo), dx)
+                return value if wraps or not dx else value & self.beside(const("i32", loop.columns), dx)
             case "div":
                 return op("v128.andnot", op("f32x4.div", *args), op("f32x4.eq", args[1], floats(0)))
             case "min" | "max":
@@ -360,8 +343,7 @@ class Chunks(CellValues[Value]):
         stream, bits = node.attr
         keys = self.memory.at("keys", self.memory.layout.streams[stream])
         loop, f = self.loop, self.f
-        row = op("i32.sub", loop.row, loop.lane)
-        y = f.let(row // self.memory.row)
+        y = f.let((loop.row - loop.lane) // self.memory.row)
         at = f.let(self.library.word_number(loop.at - loop.lane, y))
         found = f.let(const("v128", 0))
         for i in range(CHUNK):
@@ -390,7 +372,7 @@ class Chunks(CellValues[Value]):
         f = self.f
         bits = f.let(self.nibble(mask) & 15)
         with f.when(bits):
-            lanes = f.let(self.spread(bits))
+            lanes = f.let(spread(bits))
             new = [self.of(value) for value in values]
             new = [value if len(new) == 1 else f.let(value) for value in new]
             for variable, value in zip(variables, new, strict=True):
