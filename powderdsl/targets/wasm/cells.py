@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-from powderdsl.ir.ops import REAL, SNAP, Node, ordered
+from powderdsl.ir.ops import REAL, SNAP, Node
 from powderdsl.schedule.rows import chains_of, region_of
 from powderdsl.schedule.types import Compute, loaded
 from powderdsl.targets.layout import param_key
@@ -26,25 +26,20 @@ from powderdsl.targets.wasm.library import (
     some,
     splat,
 )
+from powderdsl.targets.wasm.words import Loop
 
 CHUNK = 4
 BITS = struct.pack("<4I", 1, 2, 4, 8)
 _ARITHMETIC = {"add", "sub", "mul", "neg", "abs", "sqrt", "eq", "lt", "le"}
 
 
-class CellLoop:
-    """A function with one loop over cells. Its parameters are planes and fields: those read, and those written."""
+class CellLoop(Loop):
+    """A loop over cells."""
 
     def __init__(self, library: Library, loop: Compute):
-        self.library, self.loop, self.memory = library, loop, library.memory
-        values = [out.value for out in loop.outs]
         olds = [old for _, old in loop.unchanged() if old.op == "load"]
         region = [] if loop.region is None else [loop.region]
-        self.reads = list(dict.fromkeys(loaded([*values, *region, *olds])))
-        self.f = f = Function(["i32"] * (len(self.reads) + len(loop.outs)))
-        self.held = dict(zip(self.reads, f.params, strict=False))
-        self.outs = f.params[len(self.reads) :]
-        self.nodes = ordered(values)
+        super().__init__(library, loop, loaded([*(out.value for out in loop.outs), *region, *olds]))
         self.columns = self.memory.at("columns") + 4 * self.memory.halo
         self.starts: dict[tuple[str, int, bool], Local] = {}
 
@@ -66,7 +61,7 @@ class CellLoop:
             f.set(place[SOME], found)
             if out.var.type != REAL:
                 f.set(place[HALOED], 0)
-        return library.module.add(f, f"cells_{self.loop.place.rpartition('/')[2]}")
+        return self.added("cells")
 
     # Lines
 

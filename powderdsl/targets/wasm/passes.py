@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from functools import reduce
 from operator import or_
 
-from powderdsl.ir.ops import REAL, Node
+from powderdsl.ir.ops import FLAG, REAL, Node
 from powderdsl.schedule.rows import is_copy
 from powderdsl.schedule.types import (
     Compute,
@@ -48,6 +49,7 @@ class Pass(Printer):
 
     def __init__(self, schedule: Schedule, library: Library):
         self.schedule, self.library, self.f = schedule, library, Function()
+        self.nothing = schedule.graph.node("const", FLAG, (), False)
         self.vars: dict[str, Local] = {}
         self.types: dict[str, bool] = {}
 
@@ -134,81 +136,67 @@ class Pass(Printer):
     def forget(self, _: Forget) -> None:
         self.f.set(self.library.present, const("i64", -1))
 
+    @contextmanager
+    def where(self, condition: Value, keeps: Iterable[tuple[Var, Node]]) -> Iterator[None]:
+        """Statements that run if a condition holds; if not, variables that they define get other values."""
+        values = list(keeps)
+        self.declare(var for var, _ in values)
+        with self.f.when(condition):
+            yield
+            if values:
+                self.f.otherwise()
+                for var, value in values:
+                    self.define(var, self.kept(value))
+
+    def guard(self, guard: Guard) -> None:
+        asked = [self.of(node)[SOME] for node in guard.when]
+        with self.where(reduce(or_, asked) if asked else ZERO, guard.keeps):
+            self.block(guard.body)
+
     def sweeps(self, sweeps: Sweeps) -> None:
         for loop in sweeps.loops:
-            self.copies(loop) if is_copy(loop) else self.cells(loop)
+            self.cells(loop)
             for out in loop.outs:
                 if out.into is not None:
                     self.f.do(self.library.give_field(self.vars[out.into]))
         self.give(sweeps.passing)
 
-    def copies(self, loop: Compute) -> None:
-        """Fields that are shared, not copied."""
-        self.declare(loop.defined())
-        for out in loop.outs:
-            self.define(out.var, self.kept(out.value))
-
     def cells(self, loop: Compute) -> None:
         """A loop over cells, if its region holds anywhere."""
-        f = self.f
-        self.declare(loop.defined())
-        if loop.region is None:
-            self.run(loop)
-            return
-        parts = alternatives(loop.region)
-        fields_and_planes = (self.of(part.args[0] if part.op == "live" else part) for part in parts)
-        with f.when(reduce(or_, (held[SOME] for held in fields_and_planes), ZERO)):
-            self.run(loop)
-            f.otherwise()
+        if is_copy(loop):  # fields are shared
             for out in loop.outs:
-                assert out.otherwise is not None
-                self.define(out.var, self.kept(out.otherwise))
+                self.define(out.var, self.kept(out.value))
+        elif loop.region is None:
+            self.run(CellLoop(self.library, loop))
+        else:
+            parts = alternatives(loop.region)
+            held = (self.of(part.args[0] if part.op == "live" else part) for part in parts)
+            with self.where(reduce(or_, (one[SOME] for one in held), ZERO), loop.unchanged()):
+                self.run(CellLoop(self.library, loop))
 
-    def run(self, loop: Compute) -> None:
-        """Call a loop over cells that gives new planes and fields."""
+    def words(self, loop: Compute) -> None:
+        """A loop over words that computes all of its planes anew, if they hold anything."""
+        made = WordLoop(self.library, loop)
+        if loop.when is None:
+            self.run(made)
+            return
+        with self.where(self.answer(loop.when), [(out.var, self.nothing) for out in loop.outs]):
+            self.run(made)
+
+    def run(self, made: CellLoop | WordLoop) -> None:
+        """Call a loop that writes new planes and fields."""
         library = self.library
-        for out in loop.outs:
+        for out in made.loop.outs:
             self.define(out.var, (library.take_field if out.var.type == REAL else library.take)())
-        self.call(CellLoop(library, loop))
+        self.call(made)
 
     def call(self, made: CellLoop | WordLoop) -> None:
         """Call a loop with what it reads and what it writes."""
+        for name in made.haloed:
+            self.f.do(self.library.edges(self.vars[name]))
         function = made.made()
         outs = (self.vars[out.var.name] for out in made.loop.outs)
         self.f.do(function(*map(self.read, made.reads), *outs))
-
-    def guard(self, guard: Guard) -> None:
-        f = self.f
-        asked = [self.of(node)[SOME] for node in guard.when]
-        self.declare(guard.defined())
-        with f.when(reduce(or_, asked) if asked else ZERO):
-            self.block(guard.body)
-            if guard.keeps:
-                f.otherwise()
-                for var, value in guard.keeps:
-                    self.define(var, self.kept(value))
-
-    def words(self, loop: Compute) -> None:
-        """Planes that are all computed anew."""
-        if loop.when is None:
-            self.all_words(loop)
-            return
-        self.declare(loop.defined())
-        with self.f.when(self.answer(loop.when)):
-            self.all_words(loop)
-            self.f.otherwise()
-            for out in loop.outs:
-                self.define(out.var, self.library.keep(self.library.nothing))
-
-    def all_words(self, loop: Compute) -> None:
-        for out in loop.outs:
-            self.define(out.var, self.library.take())
-        self.call_words(WordLoop(self.library, loop))
-
-    def call_words(self, made: WordLoop) -> None:
-        for name in made.haloed:
-            self.f.do(self.library.edges(self.vars[name]))
-        self.call(made)
 
     def read(self, name: str | tuple[str, int]) -> Value:
         if isinstance(name, str):
@@ -222,7 +210,6 @@ class Pass(Printer):
     def update(self, loop: Compute) -> None:
         """Planes that change only in words where a mask holds."""
         f, library = self.f, self.library
-        assert loop.region is not None
         for out in loop.outs:
             assert out.otherwise is not None
             self.define(out.var, self.of(out.otherwise) if out.into else self.kept(out.otherwise))
@@ -233,36 +220,28 @@ class Pass(Printer):
                 needed = plane[SOME] if is_cleared(out, self.schedule.graph) else ONE  # 0 stays 0
                 with f.when(needed):
                     f.set(plane, library.own(plane))
-            self.call_words(made)
+            self.call(made)
 
     def whole(self, out: Out) -> None:
         """An operation on whole planes that tests for empty ones first."""
         value = out.value
-        tests: list[tuple[Value, Value]]  # planes, and what the result is if one is empty
+        tests: list[tuple[Node, Node]]  # planes, and what the result is if one is empty
         match value.op:
             case "load" | "const":
                 self.define(out.var, self.kept(value))
                 return
             case "and":
-                stays, gone = map(self.of, difference(value))
+                stays, gone = difference(value)
                 tests = [(stays, stays), (gone, stays)]
             case "or":
-                first, second = map(self.of, value.args)
+                first, second = value.args
                 tests = [(second, first), (first, second)]
             case _:
-                tests = [(self.of(value.args[0]), self.library.nothing)]
-        self.declare([out.var])
-        self._tested(tests, out)
-
-    def _tested(self, tests: Sequence[tuple[Value, Value]], out: Out) -> None:
-        if not tests:
-            self.all_words(Compute((out,), "", "words"))
-            return
-        (plane, rest), *others = tests
-        with self.f.when(plane[SOME]):
-            self._tested(others, out)
-            self.f.otherwise()
-            self.define(out.var, self.library.keep(rest))
+                tests = [(value.args[0], self.nothing)]
+        with ExitStack() as inner:
+            for plane, rest in tests:
+                inner.enter_context(self.where(self.of(plane)[SOME], [(out.var, rest)]))
+            self.run(WordLoop(self.library, Compute((out,), "", "words")))
 
     def move(self, move: Move) -> None:
         """Planes that move, or fields that exchange values; those that nothing moves stay as they are."""
@@ -270,7 +249,7 @@ class Pass(Printer):
         movers, fields = self.of(move.movers), move.planes[0].new.type == REAL
         groups = None if fields else groups_in_place(move)
         if groups is None and not fields:
-            self.all_words(moved(move, graph))
+            self.run(WordLoop(library, moved(move, graph)))
             for plane in move.planes:
                 if plane.into is not None:
                     f.do(library.give(self.vars[plane.into]))
@@ -285,7 +264,5 @@ class Pass(Printer):
         if groups is not None:
             with f.when(movers[SOME]), f.scope():
                 entered = WordLoop(library, targets(move, graph)).made()
-                by_kind = {
-                    kind: [self.vars[plane.new.name] for plane in planes] for kind, planes in groups.items()
-                }
-                move_groups(library, f, move, movers, by_kind, entered)
+                planes = {kind: [self.vars[one.new.name] for one in group] for kind, group in groups.items()}
+                move_groups(library, f, move, movers, planes, entered)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import reduce
+from itertools import chain
 from operator import or_
 
 from powderdsl.ir.ops import Node, ordered
@@ -26,32 +27,43 @@ def plane_name(node: Node, layout: Layout) -> tuple[str, int] | None:
     return None
 
 
-class WordLoop:
-    """A function with one loop over words. Its parameters are planes: those that it reads, and those that it writes.
+class Loop:
+    """A function with one loop. Its parameters are planes and fields: those that it reads, and those that it writes.
 
     `reads` are names of variables, or tables and numbers of planes that are there anyway (`plane_name`).
     """
 
-    def __init__(self, library: Library, loop: Compute):
+    def __init__(self, library: Library, loop: Compute, reads: Iterable[str | tuple[str, int]]):
         self.library, self.loop, self.memory = library, loop, library.memory
-        roots = [out.value for out in loop.outs]
-        self.nodes = ordered(roots)
+        self.reads = list(dict.fromkeys(reads))
+        self.f = Function(["i32"] * (len(self.reads) + len(loop.outs)))
+        self.held = dict(zip(self.reads, self.f.params, strict=False))
+        self.outs = self.f.params[len(self.reads) :]
+        self.nodes = ordered(out.value for out in loop.outs)
+        self.haloed: list[str] = []
+        """The planes of which other rows are read."""
+
+    def added(self, kind: str) -> Callee:
+        """The function in the module, under the name of its place in the rules."""
+        return self.library.module.add(self.f, f"{kind}_{self.loop.place.rpartition('/')[2]}")
+
+
+class WordLoop(Loop):
+    """A loop over words."""
+
+    def __init__(self, library: Library, loop: Compute):
+        values = [out.value for out in loop.outs]
+        self.mask_names = [str(node.attr) for node in alternatives(loop.region)]
         self.updates = loop.region is not None
         olds = {out.into for out in loop.outs if self.updates and out.into is not None}
-        made = [plane_name(node, self.memory.layout) for node in self.nodes]
-        self.mask_names = [str(node.attr) for node in alternatives(loop.region)] if self.updates else []
-        self.reads: list[str | tuple[str, int]] = [name for name in loaded(roots) if name not in olds]
-        self.reads = list(dict.fromkeys([*self.reads, *filter(None, made), *self.mask_names]))
+        made = (plane_name(node, library.memory.layout) for node in ordered(values))
+        names = (name for name in loaded(values) if name not in olds)
+        super().__init__(library, loop, chain(names, filter(None, made), self.mask_names))
         shifts = (node for node in self.nodes if node.op == "shift" and node.attr[0])
         self.haloed = list(dict.fromkeys(str(node.args[0].attr) for node in shifts))
-        """The planes of which other rows are read."""
-        self.f = Function(["i32"] * (len(self.reads) + len(loop.outs)))
-        self.planes = dict(zip(self.reads, self.f.params, strict=False))
-        self.outs = self.f.params[len(self.reads) :]
         for out, place in zip(loop.outs, self.outs, strict=True):
             if out.into in olds:  # what is overwritten holds the old value
-                self.planes[str(out.into)] = place
-        self.masks = [self.planes[name] for name in self.mask_names]
+                self.held[str(out.into)] = place
 
     def made(self) -> Callee:
         """The function."""
@@ -78,22 +90,22 @@ class WordLoop:
         for place, any_flag in zip(self.outs, kept, strict=True):
             before = place[SOME] if self.updates else ZERO
             f.set(place[SOME], before | some(any_flag))
-        return library.module.add(f, f"words_{self.loop.place.rpartition('/')[2]}")
+        return self.added("words")
 
     def body(self, kept: Sequence[Local]) -> None:
         f, flags = self.f, self.memory.flags
         values = WordValues(self)
         with f.scope(), f.block() as skip:
             if self.updates:
-                wanted = reduce(or_, [(mask + self.at)[flags] for mask in self.masks])
+                wanted = reduce(or_, [(self.held[name] + self.at)[flags] for name in self.mask_names])
                 f.jump(skip, some(wanted).equals(0))
-            found = []
+            new = []
             for out in self.loop.outs:
                 value = values.clean(out.value)
-                found.append(f.let(value) if self.updates or len(self.outs) > 1 else value)
-            for i, (place, value) in enumerate(zip(self.outs, found, strict=True)):
-                value = value if isinstance(value, Local) else f.let(value)
-                f.set(kept[i], kept[i] | value)
+                again = not isinstance(value, Local) or self.updates or len(self.outs) > 1
+                new.append(f.let(value) if again else value)
+            for place, some_flag, value in zip(self.outs, kept, new, strict=True):
+                f.set(some_flag, some_flag | value)
                 f.set((place + self.at)[flags], value)
 
 
@@ -155,7 +167,7 @@ class WordValues(printing.WordValues[Value]):
     def plane(self, node: Node) -> Value:
         """A word of a plane that is there."""
         name = plane_name(node, self.memory.layout) or str(node.attr)
-        return (self.loop.planes[name] + self.loop.at)[self.memory.flags]
+        return (self.loop.held[name] + self.loop.at)[self.memory.flags]
 
     def lazy(self, node: Node) -> Value:
         """A conjunction whose second part is computed only where the first holds somewhere in the word."""
@@ -167,7 +179,7 @@ class WordValues(printing.WordValues[Value]):
     def shift(self, node: Node) -> Value:
         dy, dx, wraps = node.attr
         loop, memory, f = self.loop, self.memory, self.f
-        plane = loop.planes[str(node.args[0].attr)]
+        plane = loop.held[str(node.args[0].attr)]
         offset = memory.base + dy * memory.row
         if memory.words == 1:
             row = load("v128.load", plane + loop.at, offset)
