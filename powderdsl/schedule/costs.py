@@ -159,7 +159,7 @@ def conditions(schedule: Schedule) -> Schedule:
     graph = schedule.graph
 
     def change(statement: Compute) -> list[Statement]:
-        roots = [out.value for out in statement.outs]
+        roots = statement.results
         random: set[Node] = set()
         for node in ordered(roots):
             if takes_bits(node) or not random.isdisjoint(node.args):

@@ -110,7 +110,7 @@ class _Cutter:
 
     def emit(self, statement: Statement) -> None:
         self.statements.append(statement)
-        self.there |= {var.name for var in statement.defined()}
+        self.there |= statement.made()
 
     @contextmanager
     def inner(self) -> Iterator[list[Statement]]:
@@ -161,7 +161,7 @@ class _Cutter:
     def compute(self, loop: Compute, kept: Collection[str] = ()) -> None:
         """Store values under the names of their variables."""
         named = {out.value: out.var for out in reversed(loop.outs) if not self.have(out.value)}
-        self.ensure([out.value for out in loop.outs], loop.place, named, loop.when)
+        self.ensure(loop.results, loop.place, named, loop.when)
         for out in loop.outs:
             if named.get(out.value) is not out.var:
                 value = self.variable(out.value)
@@ -200,7 +200,7 @@ class _Cutter:
             return
         graph, place = self.graph, masks.place
         split = {out.var.name: self.split(out.value) for out in masks.outs}
-        needs = self.needs_of(out.value for out in masks.outs)
+        needs = self.needs_of(masks.results)
         asked = {node.attr for node in guard.when if node.op == "load"}
         mine = [out for out in masks.outs if out.var.name in asked]
         if len(mine) < len(masks.outs):
@@ -233,7 +233,7 @@ class _Cutter:
         words = tuple(Out(out.var, self.value(out.value)) for out in masks)
         question = self.answer(asked)
         self.emit(Compute((*words, question), guard.place, "words"))
-        body = self.block(guard.body, {var.name for var, _ in guard.keeps})
+        body = self.block(guard.body, guard.made())
         self.emit(Guard((load(self.graph, question.var),), body, self.kept(guard), guard.place))
 
     def answer(self, flags: Iterable[Node]) -> Out:

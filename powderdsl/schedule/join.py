@@ -67,8 +67,7 @@ def _where_read(schedule: Schedule) -> Schedule:
 
     asking: dict[str, set[str]] = {}
     """By field: the flags that hold wherever it is read."""
-    roots = [*schedule.values(), *(node for _, node in schedule.leaves)]
-    for node, masks in on_all_paths(roots, below).items():
+    for node, masks in on_all_paths(schedule.values(), below).items():
         if field := field_of(node):
             names, where = {str(mask.attr) for mask in masks}, node.attr if node.op == "shift" else HERE
             flags = {shifted[name][0] for name in names if name in shifted and shifted[name][1] == where}
@@ -84,7 +83,7 @@ def _where_read(schedule: Schedule) -> Schedule:
                 args = graph.node("load", FLAG, (), flags[0]), out.value, constant(graph, REAL)
                 out = replace(out, value=graph.node("select", REAL, args))
             outs.append(out)
-        there.update(var.name for var in loop.defined())
+        there.update(loop.made())
         return [replace(loop, outs=tuple(outs))]
 
     return map_each(schedule, Compute, change)
@@ -126,12 +125,13 @@ def _narrowed(loop: Compute, graph: Graph, slots: Mapping[str, tuple[str]]) -> C
     rest = [old for old, _ in filter(None, kept)]
     flags = [mask for _, masks in filter(None, kept) for mask in masks]
     if loop.over != "cells" or len(rest) < len(loop.outs):
-        values = [out.value for out in loop.outs]
-        calm = _calm(values)
+        calm = _calm(loop.results)
         if calm is None:
             return loop
         numbers, flags = calm
-        flags += [graph.node("live", FLAG, (field,), (dy, reach)) for field, dy, reach in _reads(values)]
+        flags += [
+            graph.node("live", FLAG, (field,), (dy, reach)) for field, dy, reach in _reads(loop.results)
+        ]
         rest = [
             constant(graph, out.var.type, bool(number) and out.var.type == FLAG)
             for out, number in zip(loop.outs, numbers, strict=True)
@@ -227,7 +227,7 @@ def join(schedule: Schedule) -> Schedule:
     `loop cells: a = …`, `loop cells: b = a[0,1|0] + …` → one loop over the rows of a world, in which `b` follows `a`
     one row behind. Where a loop only continues the choices before it, it becomes one with them.
     """
-    reads = Counter(loaded([*(node for _, node in schedule.leaves), *schedule.values()]))
+    reads = Counter(loaded(schedule.values()))
 
     def change(block: Block) -> Block:
         result: list[Statement] = []
@@ -269,11 +269,11 @@ def _continued(first: Compute, second: Compute, reads: Counter[str], graph: Grap
         return None
     if any(out.var.type != REAL or not out.otherwise or not is_zero(out.otherwise) for out in second.outs):
         return None
-    nodes = ordered(out.value for out in second.outs)
+    nodes = ordered(second.results)
     simple = all(node.type == REAL and node.op in CONTINUING for node in nodes)
     known = {_base(value) for value in made.values()} | made.keys()
     inside = Counter(loaded(second.values()))
-    names = {*loaded(out.value for out in second.outs), *loaded([second.region])}
+    names = {*loaded([*second.results, second.region])}
     if not simple or sum(bool(node.args) for node in nodes) > FEW or not known >= names:
         return None
     if any(reads[name] != inside[name] for name in made):

@@ -74,7 +74,7 @@ def release(schedule: Schedule) -> Schedule:
                 result.append(Release(tuple(in_order(gone))))
         return tuple(result)
 
-    return replace(schedule, body=block(schedule.body, set(loaded(node for _, node in schedule.leaves))))
+    return replace(schedule, body=block(schedule.body, set(loaded(schedule.results))))
 
 
 def _in_place(move: Move, after: set[str]) -> Move:
@@ -134,7 +134,7 @@ def _put_off(sweeps: Sweeps, after: set[str], namer: Namer, graph: Graph) -> Swe
 def _last_reads(sweeps: Sweeps, after: set[str]) -> dict[str, tuple[int, int]]:
     """By field that may be written over: the least lag with which that can be done to a row, and its last reader."""
     reads: dict[str, tuple[int, int]] = {}
-    kept = after | {var.name for var in sweeps.defined()}
+    kept = after | sweeps.made()
     for number, (loop, part, lag) in enumerate(zip(sweeps.loops, sweeps.parts, sweeps.lags, strict=True)):
         for read in field_reads(loop):
             if part > 0 or (read.live and read.dy):
@@ -320,7 +320,7 @@ class _Plan:
             if isinstance(statement, Compute):
                 self.read(position, *loaded(statement.values()))
                 defined |= {var.name: position for var in statement.defined()}
-            self.read(position, *(var.name for var in statement.defined()))
+            self.read(position, *statement.made())
             for var, old in statement.unchanged():
                 self.ends[var.name] = position
                 if old.op == "load":

@@ -54,15 +54,14 @@ def presence(schedule: Schedule) -> Schedule:
     times = _times(schedule, bits)
     for statement, after in zip(schedule.body, (*schedule.body[1:], None), strict=True):
         if isinstance(statement, Guard):
-            olds = {var.name: old for var, old in statement.keeps if var.name in bits}
+            olds = {name: old for name, old in statement.olds.items() if name in bits}
             if olds and not _only_swaps(statement, olds):
                 statement = replace(statement, body=(Forget(), *statement.body))
         writes = isinstance(statement, Compute) and any(out.var.name in bits for out in statement.outs)
         if isinstance(statement, Compute) and isinstance(after, Guard):
             writes = False
             if {out.var.name for out in statement.outs} == {mask.attr for mask in after.when}:
-                masks = [out.value for out in statement.outs]
-                statement = replace(statement, when=_asked(masks, bits, times, schedule.graph))
+                statement = replace(statement, when=_asked(statement.results, bits, times, schedule.graph))
         body += [statement, Forget()] if writes else [statement]
     if any(node.op != "load" for node in leaves):
         body.append(Forget())

@@ -138,7 +138,7 @@ def is_copy(loop: Compute) -> bool:
 
 def reaches_of(schedule: Schedule) -> dict[str, int]:
     """How many columns of each field are read beyond the edges; ANY_PASS for fields that slots may get."""
-    reaches = {str(node.attr): ANY_PASS for _, node in schedule.leaves if node.op == "load"}
+    reaches = {str(node.attr): ANY_PASS for node in schedule.results if node.op == "load"}
     copies: list[tuple[str, Node]] = []  # a field whose rows may be those of another one
     for statement in flat(schedule.body):
         for node in ordered(statement.values()):
@@ -160,7 +160,7 @@ def chains_of(loop: Compute) -> list[list[Node]]:
     """The chains of choices of a loop, all on the same masks, in the order in which choices are applied."""
     chains: list[list[Node]] = []
     below: set[int] = set()
-    for node in reversed(ordered(out.value for out in loop.outs)):
+    for node in reversed(ordered(loop.results)):
         if node.op != "select" or id(node) in below:
             continue
         chain: list[Node] = []

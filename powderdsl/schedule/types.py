@@ -68,13 +68,17 @@ class Statement:
         """The statement with each of these blocks replaced by another."""
         return self
 
-    def defined(self) -> Iterable[Var]:
-        """The variables that it defines for statements after it."""
-        return ()
-
     def unchanged(self) -> Iterable[tuple[Var, Node]]:
         """Variables with the value that they have where the statement does nothing."""
         return ()
+
+    def defined(self) -> Iterable[Var]:
+        """The variables that it defines for statements after it."""
+        return [var for var, _ in self.unchanged()]
+
+    def made(self) -> set[str]:
+        """The names of these variables."""
+        return {var.name for var in self.defined()}
 
     def ended(self) -> Iterable[str]:
         """The variables whose memory it frees, or takes for those that it defines."""
@@ -103,10 +107,14 @@ class Compute(Statement):
         """Whether it is a loop over cells, not over words."""
         return self.over in ("cells", "choices")
 
-    def values(self) -> Iterator[Node]:
-        yield from (out.value for out in self.outs)
+    @property
+    def results(self) -> list[Node]:
+        """The values of its variables."""
+        return [out.value for out in self.outs]
+
+    def values(self) -> Iterable[Node]:
         rest = (*(out.otherwise for out in self.outs), self.region, self.when)
-        yield from (node for node in rest if node is not None)
+        return (*self.results, *filter(None, rest))
 
     def with_values(self, new: Callable[[Node], Node]) -> Self:
         outs = tuple(
@@ -117,14 +125,14 @@ class Compute(Statement):
             self, outs=outs, region=self.region and new(self.region), when=self.when and new(self.when)
         )
 
-    def defined(self) -> Iterator[Var]:
-        return (out.var for out in self.outs)
+    def defined(self) -> Iterable[Var]:
+        return [out.var for out in self.outs]
 
-    def unchanged(self) -> Iterator[tuple[Var, Node]]:
-        return ((out.var, out.otherwise) for out in self.outs if out.otherwise is not None)
+    def unchanged(self) -> Iterable[tuple[Var, Node]]:
+        return [(out.var, out.otherwise) for out in self.outs if out.otherwise is not None]
 
-    def ended(self) -> Iterator[str]:
-        return (out.into for out in self.outs if out.into is not None)
+    def ended(self) -> Iterable[str]:
+        return [out.into for out in self.outs if out.into is not None]
 
 
 Leftover = Literal["same", "nothing", "everything"]
@@ -174,14 +182,11 @@ class Move(Statement):
         planes = (replace(plane, old=new(plane.old), leaves=new(plane.leaves)) for plane in self.planes)
         return replace(self, movers=new(self.movers), planes=tuple(planes))
 
-    def defined(self) -> Iterator[Var]:
-        return (plane.new for plane in self.planes)
+    def unchanged(self) -> Iterable[tuple[Var, Node]]:
+        return [(plane.new, plane.old) for plane in self.planes]
 
-    def unchanged(self) -> Iterator[tuple[Var, Node]]:
-        return ((plane.new, plane.old) for plane in self.planes)
-
-    def ended(self) -> Iterator[str]:
-        return (plane.into for plane in self.planes if plane.into is not None)
+    def ended(self) -> Iterable[str]:
+        return [plane.into for plane in self.planes if plane.into is not None]
 
     def leftovers(self) -> dict[Leftover, list[Carried]] | None:
         """The planes by the flags that movers leave behind; None if these are any others in some plane."""
@@ -208,9 +213,13 @@ class Guard(Statement):
     otherwise: Block = ()
     """Statements that give `keeps` their values if the body is skipped and they share no buffers (set by `buffers`)."""
 
-    def values(self) -> Iterator[Node]:
-        yield from self.when
-        yield from (value for _, value in self.keeps)
+    @property
+    def olds(self) -> dict[str, Node]:
+        """The values that variables have if the body is skipped, by name."""
+        return {var.name: value for var, value in self.keeps}
+
+    def values(self) -> Iterable[Node]:
+        return (*self.when, *self.olds.values())
 
     def blocks(self) -> tuple[Block, ...]:
         return self.body, self.otherwise
@@ -221,9 +230,6 @@ class Guard(Statement):
 
     def with_blocks(self, new: Callable[[Block], Block]) -> Self:
         return replace(self, body=new(self.body), otherwise=new(self.otherwise))
-
-    def defined(self) -> Iterator[Var]:
-        return (var for var, _ in self.keeps)
 
     def unchanged(self) -> Iterable[tuple[Var, Node]]:
         return self.keeps
@@ -256,13 +262,11 @@ class Sweeps(Statement):
     def blocks(self) -> tuple[Block, ...]:
         return (self.loops,)
 
-    def defined(self) -> Iterator[Var]:
-        return (var for loop in self.loops for var in loop.defined())
+    def defined(self) -> Iterable[Var]:
+        return [var for loop in self.loops for var in loop.defined()]
 
-    def ended(self) -> Iterator[str]:
-        yield from self.passing
-        for loop in self.loops:
-            yield from loop.ended()
+    def ended(self) -> Iterable[str]:
+        return (*self.passing, *(name for loop in self.loops for name in loop.ended()))
 
 
 @dataclass(frozen=True)
@@ -290,9 +294,15 @@ class Schedule:
     buffers: tuple[tuple[str, tuple[str, int]], ...] = ()
     """The kind and number of each variable's buffer, for targets that number buffers."""
 
+    @property
+    def results(self) -> list[Node]:
+        """The values that the pass leaves in slots."""
+        return [node for _, node in self.leaves]
+
     def values(self) -> list[Node]:
-        """The values of all statements, without those that the pass leaves in slots."""
-        return [node for statement in flat(self.body) for node in statement.values()]
+        """All values: those of statements, then the results."""
+        nodes = [node for statement in flat(self.body) for node in statement.values()]
+        return nodes + self.results
 
 
 # Values
@@ -398,8 +408,8 @@ def in_order(names: Iterable[str]) -> list[str]:
 
 def variables(schedule: Schedule) -> dict[str, Var]:
     """All variables by name."""
-    found = {var.name: var for _, var in schedule.finds}
-    return found | {var.name: var for statement in flat(schedule.body) for var in statement.defined()}
+    made = [var for statement in flat(schedule.body) for var in statement.defined()]
+    return {var.name: var for var in (*dict(schedule.finds).values(), *made)}
 
 
 def asked_masks(body: Block) -> Iterator[tuple[int, list[Out]]]:
@@ -433,8 +443,7 @@ def map_each(schedule: Schedule, kind: type[Kind], change: Callable[[Kind], Iter
 
 def map_values(schedule: Schedule, rule: Rule) -> Schedule:
     """The schedule with every value rewritten by a rule, see `rewritten`."""
-    leaves = [node for _, node in schedule.leaves]
-    new = rewritten([*schedule.values(), *leaves], schedule.graph, rule)
+    new = rewritten(schedule.values(), schedule.graph, rule)
     changed = map_blocks(schedule, lambda body: tuple(statement.with_values(new) for statement in body))
     return replace(changed, leaves=tuple((slot, new(node)) for slot, node in schedule.leaves))
 
@@ -500,7 +509,7 @@ def read_by(body: Block) -> set[str]:
 
 def live_before(statement: Statement, after: set[str]) -> set[str]:
     """The variables that are read from before a statement on, given those that are read after it."""
-    return (after - {var.name for var in statement.defined()}) | read_by((statement,))
+    return (after - statement.made()) | read_by((statement,))
 
 
 def without_unread(schedule: Schedule) -> Schedule:
@@ -516,15 +525,16 @@ def without_unread(schedule: Schedule) -> Schedule:
                 needed = bool(statement.outs)
             elif isinstance(statement, Guard):
                 keeps = tuple(keep for keep in statement.keeps if keep[0].name in live)
-                inner, _ = block(statement.body, live | {var.name for var, _ in keeps})
-                statement = replace(statement, body=inner, keeps=keeps)
+                statement = replace(statement, keeps=keeps)
+                inner, _ = block(statement.body, live | statement.made())
+                statement = replace(statement, body=inner)
                 needed = bool(keeps) or any(isinstance(part, Forget) for part in inner)
             if needed:
                 result.append(statement)
                 live = live_before(statement, live)
         return tuple(reversed(result)), live
 
-    body, live = block(schedule.body, set(loaded(node for _, node in schedule.leaves)))
+    body, live = block(schedule.body, set(loaded(schedule.results)))
     finds = tuple((slot, var) for slot, var in schedule.finds if var.name in live)
     return replace(schedule, body=body, finds=finds)
 

@@ -33,7 +33,7 @@ def verify(schedule: Schedule, after: str) -> None:
     try:
         checker = _Checker({var.name: var for _, var in schedule.finds})
         end = checker.block(schedule.body, set(checker.vars))
-        for _, node in schedule.leaves:
+        for node in schedule.results:
             checker.value(node, end)
     except InvalidIR as error:
         raise InvalidIR(f"after {after}, pass {schedule.name}: {error}") from None
@@ -50,7 +50,7 @@ class _Checker:
             for node in statement.values():
                 self.value(node, live)
             ends = [self.block(block, live) for block in statement.blocks()]
-            defined = {var.name for var in statement.defined()}
+            defined = statement.made()
             if isinstance(statement, Guard):
                 end, skipped = ends
                 demand(

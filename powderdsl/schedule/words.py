@@ -170,7 +170,7 @@ def difference(value: Node) -> tuple[Node, Node]:
 
 def _with_condition(loop: Compute, graph: Graph) -> Compute:
     """The loop with a condition: of some sets of planes, one plane must be non-empty for a value to hold anywhere."""
-    nodes = ordered(out.value for out in loop.outs)
+    nodes = ordered(loop.results)
     holders: dict[Node, frozenset[str] | None] = {}
     """For each flag: planes such that it holds nowhere if all of them are empty; None if none are known."""
     for node in nodes:
@@ -187,7 +187,7 @@ def _with_condition(loop: Compute, graph: Graph) -> Compute:
             case "shift" | "or" | "xor" | "select" if len(known) == len(sets):
                 holders[node] = frozenset[str]().union(*known)
     ways: list[list[frozenset[str]]] = []
-    for value in (out.value for out in loop.outs):
+    for value in loop.results:
         parts = [value.args[0], *conjuncts(value.args[1])] if value.op == "when" else conjuncts(value)
         needs = dict.fromkeys(names for part in parts if (names := holders[part]) is not None)
         if not needs:
@@ -224,7 +224,7 @@ def _taken_out(guard: Guard, graph: Graph, *, near: bool = True) -> list[Stateme
     if not all(node.op == "load" for node in guard.when) or guard.otherwise:
         return [guard]
     masks = {str(node.attr) for node in guard.when}
-    inside, olds = made_in(guard.body), {var.name: value for var, value in guard.keeps}
+    inside, olds = made_in(guard.body), guard.olds
     body: list[Statement] = []
     taken: dict[bool, list[Out]] = {True: [], False: []}
     """Values by whether they read neighbors; those come first, before these change."""
