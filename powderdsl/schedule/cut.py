@@ -21,7 +21,6 @@ from powderdsl.schedule.costs import (
     DRAWS,
     UNIFORM,
     Costs,
-    Have,
     asked_for,
     gate_cost,
     is_coin,
@@ -30,7 +29,7 @@ from powderdsl.schedule.costs import (
     sources_of,
     stored_parts,
 )
-from powderdsl.schedule.floats import is_comparison, of_floats
+from powderdsl.schedule.floats import is_comparison, of_floats, unchanged
 from powderdsl.schedule.types import (
     ANSWER,
     Block,
@@ -46,6 +45,7 @@ from powderdsl.schedule.types import (
     Var,
     asked_masks,
     combined,
+    conjunctions,
     conjuncts,
     connected,
     constant,
@@ -97,12 +97,11 @@ class _Cutter:
         self.askers = {source: len(where) for source, where in offsets.items()}
         """At how many neighbors each node is read."""
         shifted = [node.args[0] for node in nodes if node.op == "shift" and node.type == REAL]
-        parts = [part for node in shifted for part in stored_parts(node, self.have, costs.floats)]
-        self.wanted = {part for part in parts if part.op != "load"}
+        self.wanted = {part for node in shifted for part in stored_parts(node, self.have, costs.floats)}
         """Floats that are read at neighbors later."""
         counts: Counter[Node] = Counter()
         for _, masks in asked_masks(schedule.body):
-            counts.update({part for out in masks for part in _conjunctions(out.value)})
+            counts.update({part for out in masks for part in conjunctions(out.value)})
         self.shared = {part for part, count in counts.items() if count > 1}
         """Conjuncts that several masks have in common: if such a plane is empty, so are all these masks."""
         self.split_masks: dict[Node, Node] = {}
@@ -217,9 +216,8 @@ class _Cutter:
         with self.inner() as inner:
             self.ask(lazy, guard)
         nothing = constant(graph, FLAG)
-        names = {out.var.name for out in mine}
         # A mask may be what a slot held before: nothing, where masks are skipped.
-        kept = tuple((var, nothing if value.attr in names else value) for var, value in self.kept(guard))
+        kept = tuple((var, nothing if value.attr in asked else value) for var, value in self.kept(guard))
         question = self.answer(first)
         self.emit(Compute((question,), place, "words"))
         keeps = (*((out.var, nothing) for out in mine), *kept)
@@ -230,8 +228,7 @@ class _Cutter:
         values = {out.var.name: out.value for out in masks}
         asked = [values.get(node.attr, node) if node.op == "load" else node for node in guard.when]
         self.ensure(self.needs_of(asked), guard.place)
-        words = tuple(Out(out.var, self.value(out.value)) for out in masks)
-        question = self.answer(asked)
+        words, question = self.computed(masks), self.answer(asked)
         self.emit(Compute((*words, question), guard.place, "words"))
         body = self.block(guard.body, guard.made())
         self.emit(Guard((load(self.graph, question.var),), body, self.kept(guard), guard.place))
@@ -273,51 +270,44 @@ class _Cutter:
     def candidates(self, masks: Compute, guard: Guard) -> None:
         """Masks, in two steps where they have costly parts: these, and what they need, only if the others hold anywhere."""
         graph, place = self.graph, masks.place
-        firsts: dict[Node, Out] = {}
+        vars: dict[Node, Var] = {}
         for out in masks.outs:
-            if (first := firsts.setdefault(out.value, out)) is not out:
-                self.alias({out.var.name: load(graph, first.var)})
-        outs = [*firsts.values()]
-        split = {out.value: self.split(out.value) for out in outs}
-        costly = [out for out in outs if split[out.value][1]]
+            if (first := vars.setdefault(out.value, out.var)) is not out.var:
+                self.alias({out.var.name: load(graph, first)})
+        split = {value: self.split(value) for value in vars}
+        costly = {value: var for value, var in vars.items() if split[value][1]}
         if not costly or not all(cheap for cheap, _ in split.values()):
-            named = {out.value: out.var for out in outs}
-            self.ensure([out.value for out in outs], place, named, masks.when)
+            self.ensure(vars, place, vars, masks.when)
             return
-        whole = [Out(out.var, self.lazily(*split[out.value])) for out in outs]
-        if not any(self.needs(out.value) for out in whole):
-            self.emit(self.words(whole, masks))
-            self.known |= {out.value: out.var for out in outs}
+        whole = [Out(var, self.lazily(*split[value])) for value, var in vars.items()]
+        if not self.needs_of(out.value for out in whole):
+            self.emit(Compute(self.computed(whole), place, "words", when=masks.when))
+            self.known |= vars
             return
-        candidates = {}
-        for out in outs:
-            cheap, rest = split[out.value]
-            candidates[out.value] = Out(
-                self.namer.var(FLAG) if rest else out.var, combined("and", cheap, graph)
-            )
-        self.emit(self.words(candidates.values(), masks))
-        asked = [load(graph, out.var) for out in candidates.values()]
-        mine = {out.var.name for out in outs}
-        asked += [self.renamed(node) for node in guard.when if node.attr not in mine]
+        candidates = [
+            Out(self.namer.var(FLAG) if value in costly else var, combined("and", split[value][0], graph))
+            for value, var in vars.items()
+        ]
+        self.emit(Compute(self.computed(candidates), place, "words", when=masks.when))
+        asked = [load(graph, out.var) for out in candidates]
+        asked += [self.renamed(node) for node in guard.when if node.attr not in masks.made()]
         with self.inner() as inner:
-            needed = {frozenset(conjuncts(need)): need for need in self.needs_of(out.value for out in outs)}
-            for value, candidate in candidates.items():
-                need = needed.get(frozenset(split[value][0]))
-                if need is not None:  # the same parts, read at a neighbor
+            needs = {frozenset(conjuncts(need)): need for need in self.needs_of(vars)}
+            for value, candidate in zip(vars, candidates, strict=True):
+                cheap, rest = split[value]
+                if need := needs.get(frozenset(cheap)):  # the same parts, read at a neighbor
                     self.known[need] = candidate.var
-            for out in costly:
-                stored = load(graph, candidates[out.value].var)
-                self.split_masks[out.value] = self.under(stored, split[out.value][1])
+                if rest:
+                    self.split_masks[value] = self.under(load(graph, candidate.var), rest)
             # A mask that the next ones need is stored before them, under its own name.
-            self.ensure([out.value for out in costly], place, {out.value: out.var for out in costly})
-        kept = tuple((out.var, constant(graph, FLAG)) for out in costly)
-        self.emit(Guard(tuple(dict.fromkeys(asked)), tuple(inner), kept, guard.place))
-        self.known |= {out.value: out.var for out in outs}
+            self.ensure(costly, place, costly)
+        keeps = tuple((var, constant(graph, FLAG)) for var in costly.values())
+        self.emit(Guard(tuple(dict.fromkeys(asked)), tuple(inner), keeps, guard.place))
+        self.known |= vars
 
-    def words(self, outs: Iterable[Out], masks: Compute) -> Compute:
-        """The loop of some masks."""
-        words = tuple(replace(out, value=self.value(out.value)) for out in outs)
-        return Compute(words, masks.place, "words", when=masks.when)
+    def computed(self, outs: Iterable[Out]) -> tuple[Out, ...]:
+        """Variables with the values that a loop computes."""
+        return tuple(Out(out.var, self.value(self.split_masks.get(out.value, out.value))) for out in outs)
 
     def shared_parts(self, mask: Node) -> list[Node]:
         """The largest parts that a mask shares with other masks, if one loop can compute them."""
@@ -339,7 +329,7 @@ class _Cutter:
         others = tuple(out for out in outs if out.value not in carried)
         first = any(node in carried for out in others for node in walk(out.value))
         if first:
-            self.move(carried, olds, guard.place)
+            self.move(carried, guard.place)
         inner: list[Statement] = [one for one in guard.body if isinstance(one, Forget)]
         inner += [Compute(others, guard.place)] if others else []
         if inner:
@@ -347,42 +337,63 @@ class _Cutter:
             keeps = tuple((out.var, olds[out.var.name]) for out in others)
             self.emit(Guard(when, body, keeps, guard.place))
         if not first:
-            self.move(carried, olds, guard.place)
+            self.move(carried, guard.place)
 
     def carried(self, outs: Iterable[Out], olds: dict[str, Node]) -> dict[Node, Var]:
         """Writes that move their slot's old value, all with the same movers and offset."""
         carried: dict[Node, Var] = {}
         for out in outs:
             node = out.value
-            if not is_movement(node) or node.args[0] is not olds[out.var.name]:
-                continue
-            content, movers, rest = node.args
-            left = Carried(out.var, content, rest).leftover(movers)
-            simple = left == "same" if node.op == "swap" else left is not None
-            near = node.op == "swap" or abs(node.attr[0]) <= 1
-            other = next(iter(carried), node)
-            same = (node.op, node.attr, movers) == (other.op, other.attr, other.args[1])
-            if simple and near and same and self.have(movers):
-                carried[node] = out.var
+            if is_movement(node) and node.args[0] is olds[out.var.name] and self.have(node.args[1]):
+                old, movers, rest = node.args
+                left = Carried(out.var, old, rest).leftover(movers)
+                simple = left == "same" if node.op == "swap" else left and abs(node.attr[0]) <= 1
+                first = next(iter(carried), node)
+                if simple and (node.op, node.attr, movers) == (first.op, first.attr, first.args[1]):
+                    carried[node] = out.var
         return carried
 
-    def move(self, carried: dict[Node, Var], olds: dict[str, Node], place: str) -> None:
-        planes = []
+    def move(self, carried: dict[Node, Var], place: str) -> None:
+        """Planes that move in place."""
+        if not carried:
+            return
+        mask, planes = self.variable(next(iter(carried)).args[1]), []
         for node, var in carried.items():
-            old, movers, rest = leaves, _, _ = olds[var.name], self.variable(node.args[1]), node.args[2]
-            if rest is not node.args[0]:
-                gone = self.graph.node("not", FLAG, (movers,)) if rest.op == "and" else movers
+            old, _, rest = node.args
+            leaves = old
+            if rest is not old:
+                gone = self.graph.node("not", FLAG, (mask,)) if rest.op == "and" else mask
                 leaves = self.graph.node(rest.op, FLAG, (old, gone))
             planes.append(Carried(var, old, leaves))
-        for node in [*carried][:1]:
-            self.emit(Move(node.op, node.attr, self.variable(node.args[1]), tuple(planes), place))
+        self.emit(Move(node.op, node.attr, mask, tuple(planes), place))
         self.known |= carried
 
     # What must be stored
 
     def chain(self, node: Node) -> list[Node]:
-        """The choices of a float that get a loop of their own."""
-        return chain_of(node, self.have) if self.costs.by_rows else []
+        """At least FEWEST choices, outermost first, whose values read stored variables only; else nothing."""
+        chain: list[Node] = []
+        while node.op == "select" and node.type == REAL and not self.have(node) and self.costs.by_rows:
+            if node.args[0].op == "param":
+                return []
+            chain.append(node)
+            node = node.args[2]
+        if len(chain) < FEWEST or node.op in UNIFORM:  # a value that is the same in all cells has no field
+            return []
+        # A choice may build on the one below it, which the row still holds, not on those before.
+        for choice in chain:
+            _, value, base = choice.args
+            seen, stack = {base}, [value]
+            while stack:
+                part = stack.pop()
+                if part in seen or self.have(part):
+                    continue
+                seen.add(part)
+                around = part.op == "shift" and not self.have(base) and base in walk(part)
+                if around or part.op in ("select", "draw"):
+                    return []
+                stack.extend(part.args)
+        return chain
 
     def needs_of(self, nodes: Iterable[Node]) -> list[Node]:
         return [need for node in nodes for need in self.needs(node)]
@@ -436,6 +447,7 @@ class _Cutter:
 
     def cell_needs(self, node: Node) -> list[Node]:
         """The flags, then the floats, that a loop over cells reads."""
+        kept = node.op == "settle" and unchanged(node, self.found)
         needs: dict[Node, None] = {}
         seen: set[Node] = set()
         stack = [node]
@@ -444,7 +456,7 @@ class _Cutter:
             if top in seen or (top is not node and self.have(top)):
                 continue
             seen.add(top)
-            if top is not node and not _is_kept(node, self.found) and self.chain(top):
+            if top is not node and not kept and self.chain(top):
                 needs[top] = None  # long chains are applied before the loop that reads them
             elif top.op == "led":
                 stack.extend(top.args)
@@ -486,74 +498,70 @@ class _Cutter:
         floats = [*dict.fromkeys(floats)]
         flags = [node for node in wanted if node not in floats]
 
-        def pairs(nodes: Iterable[Node]) -> list[tuple[Var, Node]]:
-            return [(named.get(node) or self.namer.var(node.type), node) for node in nodes]
+        def outs(nodes: Iterable[Node]) -> list[Out]:
+            return [Out(named.get(node) or self.namer.var(node.type), node) for node in nodes]
 
-        chains: dict[tuple[Node, ...], list[tuple[Var, Node]]] = {}
-        for var, node in pairs(node for node in floats if self.chain(node)):
-            chains.setdefault(tuple(choice.args[0] for choice in self.chain(node)), []).append((var, node))
+        chains: dict[tuple[Node, ...], list[Out]] = {}
+        for out in outs(filter(self.chain, floats)):
+            masks = tuple(choice.args[0] for choice in self.chain(out.value))
+            chains.setdefault(masks, []).append(out)
         for group in chains.values():  # chains with the same masks share a loop
             self.loop(group, place, "choices")
         floats = [node for node in floats if not self.have(node)]
         for nodes in connected(floats, _operations) if self.costs.by_rows else [floats]:
-            self.loop(pairs(nodes), place, "cells")
+            self.loop(outs(nodes), place, "cells")
         moves = [node for node in flags if self.costs.by_rows and is_movement(node)]
-        self.loop(pairs(node for node in flags if node not in moves), place, "words", when)
+        self.loop(outs(node for node in flags if node not in moves), place, "words", when)
         together: dict[tuple[str, Offset, Node], list[Carried]] = {}
-        for var, node in pairs(moves):
-            content, movers, rest = map(self.variable, node.args)
-            together.setdefault((node.op, node.attr, movers), []).append(Carried(var, content, rest))
-            self.known[node] = var
+        for out in outs(moves):
+            content, movers, rest = map(self.variable, out.value.args)
+            key = (out.value.op, out.value.attr, movers)
+            together.setdefault(key, []).append(Carried(out.var, content, rest))
+            self.known[out.value] = out.var
         for (op, offset, movers), planes in together.items():
             self.emit(Move(op, offset, movers, tuple(planes), place))
 
     def loop(
         self,
-        pairs: list[tuple[Var, Node]],
+        outs: list[Out],
         place: str,
         over: Literal["words", "cells", "choices"],
         when: Node | None = None,
     ) -> None:
         """A loop: floats first, then comparisons, each after the one under which it is computed."""
-        if pairs:
-            pairs = sorted(pairs, key=lambda pair: (pair[1].type != REAL, pair[1].op == "led"))
-            outs = tuple(Out(var, self.value(self.split_masks.get(node, node))) for var, node in pairs)
-            self.emit(Compute(outs, place, over, when=when))
-            for var, node in pairs:
-                self.known.setdefault(node, var)
+        if outs:
+            outs = sorted(outs, key=lambda out: (out.var.type != REAL, out.value.op == "led"))
+            self.emit(Compute(self.computed(outs), place, over, when=when))
+            for out in outs:
+                self.known.setdefault(out.value, out.var)
 
     def value(self, root: Node) -> Node:
         """A value in a loop: only variables are read at neighbors, the rest is recomputed."""
         graph = self.graph
         done: dict[tuple[Node, int, int], Node] = {}
-        stack = [(root, 0, 0)]
+        stack = [((root, 0, 0), False)]
         while stack:
-            node, dy, dx = place = stack[-1]
-            below = self.below(node, dy, dx)
-            missing = [part for part in below if part not in done]
-            if missing:
-                stack.append(missing[0])
-                continue
-            stack.pop()
+            place, ready = stack.pop()
             if place in done:
                 continue
-            args = tuple(done[part] for part in below)
+            node, dy, dx = place
+            below = self.below(node, dy, dx)
+            if below and not ready:
+                stack += [(place, True), *((part, False) for part in reversed(below))]
+                continue
+            args = tuple([done[part] for part in below])
             if self.have(node):
                 new = self.variable(node)
-                if (dy, dx) != (0, 0):
-                    new = graph.node("shift", node.type, (new,), (dy, dx, True))
+                new = graph.node("shift", node.type, (new,), (dy, dx, True)) if dy or dx else new
+            elif node.op == "shift" and not below:
+                new = graph.node("shift", node.type, (self.variable(node.args[0]),), node.attr)
             elif node.op == "shift":
-                if not args:
-                    new = graph.node("shift", node.type, (self.variable(node.args[0]),), node.attr)
-                elif node.attr[2]:
-                    new = args[0]
-                else:
-                    inside = graph.node("inside", FLAG, (), node.attr[:2])
-                    new = graph.node("and", FLAG, (args[0], inside))
+                inside = () if node.attr[2] else (graph.node("inside", FLAG, (), node.attr[:2]),)
+                new = combined("and", (*args, *inside), graph)
             elif is_movement(node):
                 new = graph.node("select", FLAG, args if node.op == "arrive" else (*args[1:], args[0]))
             else:
-                new = graph.node(node.op, node.type, args, node.attr) if args else node
+                new = graph.node(node.op, node.type, args, node.attr)
             done[place] = new
         return done[root, 0, 0]
 
@@ -574,66 +582,8 @@ class _Cutter:
         return [(arg, dy, dx) for arg in node.args]
 
 
-def chain_of(node: Node, have: Have) -> list[Node]:
-    """A chain of at least FEWEST choices, outermost first, whose values read stored variables only; else nothing."""
-    chain: list[Node] = []
-    while node.op == "select" and node.type == REAL and not have(node):
-        if node.args[0].op == "param":
-            return []
-        chain.append(node)
-        node = node.args[2]
-    if len(chain) < FEWEST or node.op in UNIFORM:  # a value that is the same in all cells has no field
-        return []
-    # A choice may build on the one below it, which the row still holds, not on those before.
-    for choice in chain:
-        seen, others = {choice.args[2]}, set[Node]()
-        stack = [choice.args[1]]
-        while stack:
-            part = stack.pop()
-            if part in seen or have(part):
-                continue
-            seen.add(part)
-            if part.op in ("select", "draw"):
-                return []
-            if part.op == "shift" and not have(choice.args[2]) and _reads(part, choice.args[2], others):
-                return []
-            stack.extend(part.args)
-    return chain
-
-
-def _reads(node: Node, read: Node, others: set[Node]) -> bool:
-    """Whether a value reads another one. `others`: nodes that do not; those found are added."""
-    stack = [node]
-    while stack:
-        top = stack.pop()
-        if top is read:
-            return True
-        if top not in others:
-            others.add(top)
-            stack.extend(top.args)
-    return False
-
-
-def _is_kept(node: Node, found: set[str]) -> bool:
-    """Whether a float is a clamped slot with some cells replaced by choices."""
-    if node.op != "settle":
-        return False
-    node = node.args[0]
-    while node.op == "select" and node.args[0].op != "param":
-        node = node.args[2]
-    return node.op == "load" and node.attr in found
-
-
 def _operations(node: Node) -> set[object]:
     """What floats have in common that are computed in the same loop: an operation, or the masks of all choices."""
     parts = [part for part in walk(node) if part.args]
     masks = frozenset(part.args[0] for part in parts if part.op == "select")
     return {*filter(of_floats, parts), ("masks", masks)}
-
-
-def _conjunctions(node: Node) -> Iterator[Node]:
-    """A mask and its nested conjuncts."""
-    yield node
-    if node.op == "and":
-        for arg in node.args:
-            yield from _conjunctions(arg)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import replace
 
 from powderdsl.ir.ops import FLAG, REAL, Graph, Node, ordered
@@ -160,6 +160,19 @@ def _conjunctions(node: Node, facts: Facts) -> Iterator[tuple[Node, Facts]]:
     joined = dict.fromkeys(filter(is_comparison, parts)) if node.op == "and" else {}
     for part in parts:
         yield part, here | {other: None for other in joined if other is not part}
+
+
+def unchanged(value: Node, names: Container[str]) -> tuple[Node, list[Node]] | None:
+    """For a clamped slot under choices: its old value, and the masks without which it keeps it (it was clamped)."""
+    masks = []
+    if value.op not in ("settle", "select"):
+        return None
+    node = value.args[0] if value.op == "settle" else value
+    while node.op == "select":
+        masks.append(node.args[0])
+        node = node.args[2]
+    known = node.op == "load" and node.attr in names and all(mask.op != "param" for mask in masks)
+    return (node, masks) if known else None
 
 
 def is_comparison(node: Node) -> bool:

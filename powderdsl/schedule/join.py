@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 from powderdsl.ir.ops import FLAG, OPS, REAL, Graph, Node, ordered
 from powderdsl.ir.single import single
+from powderdsl.schedule.floats import unchanged
 from powderdsl.schedule.types import (
     ANSWER,
     Block,
@@ -138,19 +139,6 @@ def _narrowed(loop: Compute, graph: Graph, slots: Mapping[str, tuple[str]]) -> C
         ]
     outs = tuple(replace(out, otherwise=other) for out, other in zip(loop.outs, rest, strict=True))
     return replace(loop, outs=outs, region=combined("or", dict.fromkeys(flags), graph))
-
-
-def unchanged(value: Node, names: Container[str]) -> tuple[Node, list[Node]] | None:
-    """For a clamped slot under choices: its old value, and the masks without which it keeps it (it was clamped)."""
-    masks = []
-    if value.op not in ("settle", "select"):
-        return None
-    node = value.args[0] if value.op == "settle" else value
-    while node.op == "select":
-        masks.append(node.args[0])
-        node = node.args[2]
-    known = node.op == "load" and node.attr in names and all(mask.op != "param" for mask in masks)
-    return (node, masks) if known else None
 
 
 def _calm(values: list[Node]) -> tuple[list[float | bool], list[Node]] | None:

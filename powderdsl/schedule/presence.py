@@ -8,7 +8,7 @@ from functools import reduce
 from operator import or_
 
 from powderdsl.ir.ops import FLAG, REAL, Graph, Node, ordered
-from powderdsl.schedule.join import unchanged
+from powderdsl.schedule.floats import unchanged
 from powderdsl.schedule.types import (
     ANSWER,
     Compute,

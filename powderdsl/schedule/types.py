@@ -352,8 +352,8 @@ def is_movement(node: Node) -> bool:
     return node.op in ("swap", "arrive") and node.type == FLAG
 
 
-def conjuncts(node: Node) -> list[Node]:
-    """The flags that must all hold for a flag to hold, each once, in order."""
+def conjunctions(node: Node) -> Iterable[Node]:
+    """A flag and the flags that must all hold for it to hold, each once, in order."""
     seen: dict[Node, None] = {}
     stack = [node]
     while stack:
@@ -361,7 +361,12 @@ def conjuncts(node: Node) -> list[Node]:
         if top not in seen:
             seen[top] = None
             stack.extend(reversed(top.args) if top.op == "and" else ())
-    return [part for part in seen if part.op != "and"]
+    return seen
+
+
+def conjuncts(node: Node) -> list[Node]:
+    """These flags without those that are conjunctions themselves."""
+    return [part for part in conjunctions(node) if part.op != "and"]
 
 
 def alternatives(region: Node | None) -> list[Node]:
