@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from functools import partial
+from functools import partial, reduce
 from math import ceil, floor, pi
 
 from powderdsl.analysis.changes import facts_of
@@ -27,13 +27,12 @@ from powderdsl.ir.ops import (
     kernel_rows,
 )
 from powderdsl.ir.single import single
-from powderdsl.model.logic.satisfy import Budget, Facts, satisfiable
+from powderdsl.model.logic.satisfy import Budget, satisfiable
 from powderdsl.model.operations import OPERATIONS
-from powderdsl.model.state import Slot, scratch_slots, slots
+from powderdsl.model.state import scratch_slots, slots
 from powderdsl.model.types import (
     Assign,
     Expr,
-    Kernel,
     Kind,
     Moment,
     Move,
@@ -46,8 +45,8 @@ from powderdsl.model.types import (
     Value,
 )
 
-Pair = tuple[Node, Node]
-"""A vector: its row and column components."""
+Parts = tuple[Node, ...]
+"""A value: one node, or the row and column components of a vector."""
 
 NEAR, FAR = 0.92387953251128674, 0.38268343236508977
 """cos(π/8) and cos(3π/8), where octants end."""
@@ -70,9 +69,12 @@ class Inputs:
     ruleset: Ruleset
     build: Builder
     state: dict[str, Node]
-    lets: dict[str, Node | Pair]
+    lets: dict[str, Parts]
     threshold: Threshold | None = None
     """Chances are the number of draws below them if this is given, else floats."""
+
+    def with_threshold(self, threshold: Threshold | None) -> Inputs:
+        return Inputs(self.ruleset, self.build, self.state, self.lets, threshold)
 
     def constant(self, value: Value | str, kind: Kind) -> Node:
         """A constant of a kind; a text names a parameter."""
@@ -81,8 +83,7 @@ class Inputs:
             param = next(p for p in self.ruleset.params if p.name == value)
             if kind.name == "chance" and threshold is not None:
                 return build.make("param", integer(0, 1 << threshold.bits), attr=(value, threshold))
-            types = {"flag": FLAG, "int": integer(int(param.kind.lo), int(param.kind.hi))}
-            return build.make("param", types.get(param.kind.name, REAL), attr=(value, None))
+            return build.make("param", ir_type(param.kind), attr=(value, None))
         assert not isinstance(value, tuple)
         match kind.name:
             case "flag":
@@ -90,7 +91,7 @@ class Inputs:
             case "chance" if threshold is not None:
                 return build.integer(draws_below(value, threshold))
             case "chance" | "real":
-                return build.real(_float32(value))
+                return _real(build, value)
         return build.integer(int(value))
 
     def property_of(self, prop: Property, element: Node) -> Node:
@@ -113,13 +114,14 @@ class Inputs:
         return result
 
 
-def lower_expression(expr: Expr, at: Inputs) -> Node | Pair:
-    """The node of a checked expression; a pair for vectors.
+def lower_expression(expr: Expr, at: Inputs) -> Parts:
+    """The nodes of a checked expression.
 
     What has no code in `_LOWER` is an operation of the IR, as its row says, of numbers or of both parts of vectors.
     """
     if expr.op in _LOWER:
-        return _LOWER[expr.op](expr, at)
+        value = _LOWER[expr.op](expr, at)
+        return (value,) if isinstance(value, Node) else value
     name = OPERATIONS[expr.op].lowers or expr.op
     args = [lower_expression(arg, at) for arg in expr.args]
     return _each(partial(at.build.derive, name, attr=expr.value), *args)
@@ -127,29 +129,20 @@ def lower_expression(expr: Expr, at: Inputs) -> Node | Pair:
 
 def node(expr: Expr, at: Inputs) -> Node:
     """The node of an expression that is not a vector."""
-    lowered = lower_expression(expr, at)
-    assert isinstance(lowered, Node)
-    return lowered
+    (number,) = lower_expression(expr, at)
+    return number
 
 
-def pair(expr: Expr, at: Inputs) -> Pair:
-    lowered = lower_expression(expr, at)
-    assert not isinstance(lowered, Node)
-    return lowered
-
-
-def _each(function: Callable[..., Node], *values: Node | Pair) -> Node | Pair:
+def _each(function: Callable[..., Node], *values: Parts) -> Parts:
     """Apply to numbers, or to both parts of vectors; numbers beside vectors serve both parts."""
-    if all(isinstance(value, Node) for value in values):
-        return function(*values)
-    rows = [value if isinstance(value, Node) else value[0] for value in values]
-    columns = [value if isinstance(value, Node) else value[1] for value in values]
-    return function(*rows), function(*columns)
+    if all(len(value) == 1 for value in values):
+        return (function(*[number for (number,) in values]),)
+    return tuple([function(*[value[part % len(value)] for value in values]) for part in (0, 1)])
 
 
-def _float32(value: object) -> float:
+def _real(build: Builder, value: float | Fraction) -> Node:
     """A constant as the float32 it is rounded to, going through float64 as the reference does."""
-    return single(float(value))  # type: ignore[arg-type]  # a constant is a number
+    return build.real(single(float(value)))
 
 
 def _property(expr: Expr, at: Inputs) -> Node:
@@ -158,16 +151,8 @@ def _property(expr: Expr, at: Inputs) -> Node:
     return at.state[prop.name] if prop.stored else at.property_of(prop, at.state["element"])
 
 
-def _slot(expr: Expr, at: Inputs) -> Node | Pair:
-    name = str(expr.value)
-    if name in at.state:
-        return at.state[name]
-    row, column = component_names(name)
-    return at.state[row], at.state[column]
-
-
-def _look(expr: Expr, at: Inputs) -> Node | Pair:
-    return _each(lambda a: at.build.shift(a, expr.value), lower_expression(expr.args[0], at))
+def _look(expr: Expr, at: Inputs) -> Parts:
+    return _each(lambda part: at.build.shift(part, expr.value), lower_expression(expr.args[0], at))
 
 
 def _eq(expr: Expr, at: Inputs) -> Node:
@@ -188,6 +173,7 @@ def draws_below(chance: Fraction | float, threshold: Threshold) -> int:
 
 
 def _stream(name: str, at: Inputs) -> tuple[str, int]:
+    """A stream and the bits of its draws."""
     return name, next(stream.bits for stream in at.ruleset.streams if stream.name == name)
 
 
@@ -225,7 +211,7 @@ def _lt(expr: Expr, at: Inputs) -> Node:
     if other.op == "const":
         limit = build.integer(draws_below(other.value - base, threshold))
     else:
-        limit = node(other, replace(at, threshold=threshold))
+        limit = node(other, at.with_threshold(threshold))
     there = build.shift(limit, (-offset[0], -offset[1]))
     part = build.shift(build.derive("below", there, attr=stream), offset)
     if extra is None:
@@ -240,47 +226,45 @@ def _lt(expr: Expr, at: Inputs) -> Node:
 # Neighborhoods and vectors
 
 
-def _sum(expr: Expr, at: Inputs) -> Node | Pair:
-    kernel = expr.value
-    return _each(lambda a: _neighborhood(a, kernel, at.build), lower_expression(expr.args[0], at))
-
-
-def _neighborhood(value: Node, kernel: Kernel, build: Builder) -> Node:
+def _sum(expr: Expr, at: Inputs) -> Parts:
     """The weighted sum, each row from the left, then the rows from the top. Equal rows are summed once and shifted."""
-    total: Node | None = None
-    for dy, cells in kernel_rows(kernel.weights).items():
-        row: Node | None = None
-        for dx, weight in cells:
-            term = build.shift(value, (0, dx), kernel.wrap)
-            if weight != 1:
-                factor = build.real(float(weight)) if value.type == REAL else build.integer(weight)
-                term = build.derive("mul", term, factor)
-            row = term if row is None else build.derive("add", row, term)
-        assert row is not None
-        row = build.shift(row, (dy, 0), kernel.wrap)
-        total = row if total is None else build.derive("add", total, row)
-    return total if total is not None else build.const(0, value.type)
+    build, kernel = at.build, expr.value
+
+    def weighted(value: Node, dx: int, weight: int) -> Node:
+        term = build.shift(value, (0, dx), kernel.wrap)
+        return term if weight == 1 else build.derive("mul", term, build.const(weight, value.type))
+
+    def total(value: Node) -> Node:
+        if not kernel.weights:
+            return build.const(0, value.type)
+        rows = (
+            build.shift(reduce(add, (weighted(value, *cell) for cell in cells)), (dy, 0), kernel.wrap)
+            for dy, cells in kernel_rows(kernel.weights).items()
+        )
+        return reduce(add, rows)
+
+    add = partial(build.derive, "add")
+    return _each(total, lower_expression(expr.args[0], at))
 
 
-def _length(vector: Pair, build: Builder) -> Node:
-    y, x = vector
-    squares = build.derive("add", build.derive("mul", y, y), build.derive("mul", x, x))
-    return build.derive("sqrt", squares)
+def _length(expr: Expr, at: Inputs) -> Node:
+    derive = at.build.derive
+    y, x = lower_expression(expr.args[0], at)
+    return derive("sqrt", derive("add", derive("mul", y, y), derive("mul", x, x)))
 
 
 def _octant(expr: Expr, at: Inputs) -> Node:
     """The octant, by comparing x with the borders of the octants at this length."""
-    build = at.build
-    y, x = pair(expr.args[0], at)
-    reach = build.derive("add", _length((y, x), build), build.real(_float32(0.001)))
-    near = build.derive("mul", build.real(_float32(NEAR)), reach)
-    far = build.derive("mul", build.real(_float32(FAR)), reach)
-    up = build.derive("lt", y, build.real(0.0))
-    result: Node = build.integer(4)
-    borders = (near, far, build.derive("neg", far), build.derive("neg", near))
+    build, derive = at.build, at.build.derive
+    y, x = lower_expression(expr.args[0], at)
+    reach = derive("add", _length(expr, at), _real(build, 0.001))
+    near, far = (derive("mul", _real(build, border), reach) for border in (NEAR, FAR))
+    up = derive("lt", y, build.real(0.0))
+    result = build.integer(4)
+    borders = (near, far, derive("neg", far), derive("neg", near))
     for octant in (3, 2, 1, 0):
         mirrored = build.select(up, build.integer((8 - octant) % 8), build.integer(octant))
-        result = build.select(build.derive("lt", borders[octant], x), mirrored, result)
+        result = build.select(derive("lt", borders[octant], x), mirrored, result)
     return result
 
 
@@ -293,30 +277,18 @@ def _turned(eighths: int) -> Callable[[Expr, Inputs], Node]:
 def _wave(expr: Expr, at: Inputs) -> Node:
     """A sine or cosine: π/2 is taken off in three parts, then follows a series. See `model.reference` for each step."""
     build, x = at.build, node(expr.args[0], at)
-
-    def real(value: float) -> Node:
-        return build.real(_float32(value))
-
-    def add(a: Node, b: Node) -> Node:
-        return build.derive("add", a, b)
-
-    def sub(a: Node, b: Node) -> Node:
-        return build.derive("sub", a, b)
-
-    def mul(a: Node, b: Node) -> Node:
-        return build.derive("mul", a, b)
+    real = partial(_real, build)
+    add, sub, mul, lt = (partial(build.derive, op) for op in ("add", "sub", "mul", "lt"))
 
     def rounded(value: Node) -> Node:
         return sub(add(value, real(ROUNDER)), real(ROUNDER))
 
     def series(coefficients: tuple[float, ...]) -> Node:
-        *others, total = map(real, coefficients)
-        for coefficient in reversed(others):
-            total = add(coefficient, mul(z, total))
-        return total
+        *others, last = map(real, coefficients)
+        return reduce(lambda total, coefficient: add(coefficient, mul(z, total)), reversed(others), last)
 
     def between(low: float, high: float) -> Node:
-        return build.and_(build.derive("lt", real(low), turn), build.derive("lt", turn, real(high)))
+        return build.and_(lt(real(low), turn), lt(turn, real(high)))
 
     q = rounded(mul(x, real(2 / pi)))
     coarse, middle, fine = (mul(q, real(part)) for part in HALF_PI)
@@ -327,27 +299,25 @@ def _wave(expr: Expr, at: Inputs) -> Node:
     z = mul(rest, rest)
     rising = add(rest, add(small, mul(rest, mul(z, series(SINE)))))
     level = sub(real(1.0), add(mul(real(0.5), z), sub(mul(rest, small), mul(mul(z, z), series(COSINE)))))
-    odd = build.or_(between(0.5, 1.5), build.derive("lt", real(2.5), turn))
+    odd = build.or_(between(0.5, 1.5), lt(real(2.5), turn))
     is_cosine = expr.op == "cos"
-    down = between(0.5, 2.5) if is_cosine else build.derive("lt", real(1.5), turn)
+    down = between(0.5, 2.5) if is_cosine else lt(real(1.5), turn)
     value = build.select(odd, rising, level) if is_cosine else build.select(odd, level, rising)
     return build.select(down, build.derive("neg", value), value)
 
 
-_LOWER: dict[str, Callable[[Expr, Inputs], Node | Pair]] = {
+_LOWER: dict[str, Callable[[Expr, Inputs], Node | Parts]] = {
     **dict.fromkeys(("const", "param"), lambda e, at: at.constant(e.value, e.kind)),
     "element": lambda e, at: at.state["element"],
     "property": _property,
-    "field": _slot,
-    "let": lambda e, at: at.lets[str(e.value)],
+    "field": lambda e, at: tuple([at.state[name] for name in part_names(e.value, e.kind)]),
+    "let": lambda e, at: at.lets[e.value],
     "draw": lambda e, at: at.build.derive("draw", attr=_stream(e.value, at)),
-    "coordinate": lambda e, at: at.build.make(
-        "coordinate", integer(int(e.kind.lo), int(e.kind.hi)), attr=e.value
-    ),
+    "coordinate": lambda e, at: at.build.make("coordinate", ir_type(e.kind), attr=e.value),
     "look": _look,
     "eq": _eq,
     "lt": _lt,
-    "to_real": lambda e, at: at.build.to_real(node(e.args[0], replace(at, threshold=None))),
+    "to_real": lambda e, at: at.build.to_real(node(e.args[0], at.with_threshold(None))),
     "count": lambda e, at: at.build.derive(
         "count", node(e.args[0], at), attr=(e.value.weights, e.value.wrap)
     ),
@@ -355,11 +325,10 @@ _LOWER: dict[str, Callable[[Expr, Inputs], Node | Pair]] = {
     "octant": _octant,
     "opposite": _turned(4),
     "clockwise": _turned(2),
-    "sin": _wave,
-    "cos": _wave,
-    "length": lambda e, at: _length(pair(e.args[0], at), at.build),
-    "row_part": lambda e, at: pair(e.args[0], at)[0],
-    "column_part": lambda e, at: pair(e.args[0], at)[1],
+    **dict.fromkeys(("sin", "cos"), _wave),
+    "length": _length,
+    "row_part": lambda e, at: lower_expression(e.args[0], at)[0],
+    "column_part": lambda e, at: lower_expression(e.args[0], at)[1],
     "vector": lambda e, at: (node(e.args[0], at), node(e.args[1], at)),
 }
 """Operations of the model that are more than one of the IR."""
@@ -371,34 +340,24 @@ LIVE_BUDGET = 100_000
 """Nodes evaluated to find rules that no world lets happen, a tenth of a second. After that every rule stays."""
 
 
-def slot_names(slot: Slot) -> tuple[str, ...]:
+def part_names(name: str, kind: Kind) -> tuple[str, ...]:
     """The IR slots of a state array: one, or one for each component of a vector."""
-    return _parts_of(slot.name, slot.kind)
-
-
-def _parts_of(name: str, kind: Kind) -> tuple[str, ...]:
     return component_names(name) if kind.name == "vec2" else (name,)
 
 
-def ir_type(kind: Kind, ids: int) -> Type:
+def ir_type(kind: Kind, ids: int = 256) -> Type:
     """The IR type in which values of a kind are held; `ids` is the number of element ids."""
-    match kind.name:
-        case "flag":
-            return FLAG
-        case "real" | "vec2":
-            return REAL
-        case "element":
-            return integer(0, ids - 1)
-        case "direction":
-            return integer(0, 7)
-    return integer(int(kind.lo), int(kind.hi))
+    types = {"flag": FLAG, "element": integer(0, ids - 1), "direction": integer(0, 7)}
+    if kind.name in ("real", "vec2", "chance"):
+        return REAL
+    return types.get(kind.name) or integer(int(kind.lo), int(kind.hi))
 
 
 def lower_ruleset(ruleset: Ruleset) -> Program:
     """All passes of a ruleset, one graph each."""
     slot_types = []
     for slot in slots(ruleset):
-        names = slot_names(slot)
+        names = part_names(slot.name, slot.kind)
         for i, name in enumerate(names):
             default = slot.default[i] if isinstance(slot.default, tuple) else slot.default
             type, component = ir_type(slot.kind, ruleset.slots), i if len(names) > 1 else None
@@ -428,18 +387,17 @@ def lower_ruleset(ruleset: Ruleset) -> Program:
 def live_passes(ruleset: Ruleset) -> tuple[Pass, ...]:
     """The passes without rules whose conditions cannot hold: a loop writes many copies, of which few suit the elements."""
     facts = replace(facts_of(ruleset), budget=Budget(LIVE_BUDGET))
-    return tuple(
-        replace(one, moments=tuple(_live_substep(moment, facts) for moment in one.moments))
-        for one in ruleset.passes
-    )
 
+    def live(moment: Moment) -> Moment:
+        lets = {let.name: let.value for let in moment.lets}
+        rules = [
+            rule
+            for rule in moment.rules
+            if rule.mask is None or satisfiable(facts, [(rule.mask, (0, 0))], lets)
+        ]
+        return replace(moment, rules=tuple(rules))
 
-def _live_substep(moment: Moment, facts: Facts) -> Moment:
-    lets = {let.name: let.value for let in moment.lets}
-    rules = (
-        rule for rule in moment.rules if rule.mask is None or satisfiable(facts, [(rule.mask, (0, 0))], lets)
-    )
-    return replace(moment, rules=tuple(rules))
+    return tuple([replace(pass_, moments=tuple(map(live, pass_.moments))) for pass_ in ruleset.passes])
 
 
 def lower_pass(ruleset: Ruleset, pass_: Pass, graph: Graph) -> dict[str, Node]:
@@ -458,22 +416,23 @@ def lower_substep(ruleset: Ruleset, pass_: Pass, number: int, graph: Graph) -> d
     scratch = scratch_slots(pass_)
     lowering.slots |= scratch
     for slot in scratch.values():
-        for name in slot_names(slot):
+        for name in part_names(slot.name, slot.kind):
             lowering.state[name] = build.input(name, ir_type(slot.kind, ruleset.slots))
     for moment in pass_.moments[:number]:
         for let in moment.lets:
-            type = REAL if let.value.kind.name == "chance" else ir_type(let.value.kind, ruleset.slots)
-            parts = tuple(build.input(f"let {name}", type) for name in _parts_of(let.name, let.value.kind))
-            lowering.lets[let.name] = parts[0] if len(parts) == 1 else (parts[0], parts[1])
+            kind = let.value.kind
+            names = [f"let {name}" for name in part_names(let.name, kind)]
+            lowering.lets[let.name] = tuple(
+                [build.input(name, ir_type(kind, ruleset.slots)) for name in names]
+            )
     before = dict(lowering.state)
     moment = pass_.moments[number]
     lowering.substep(moment)
-    found = {name: node for name, node in lowering.state.items() if before[name] is not node}
+    changed = {name: node for name, node in lowering.state.items() if before[name] is not node}
     for let in moment.lets:
-        names = _parts_of(let.name, let.value.kind)
-        parts = _parts(lowering.lets[let.name])
-        found |= {f"let {name}": part for name, part in zip(names, parts, strict=True)}
-    return found
+        names = [f"let {name}" for name in part_names(let.name, let.value.kind)]
+        changed |= zip(names, lowering.lets[let.name], strict=True)
+    return changed
 
 
 class _PassLowering:
@@ -487,10 +446,10 @@ class _PassLowering:
         types = {
             name: ir_type(slot.kind, ruleset.slots)
             for slot in self.slots.values()
-            for name in slot_names(slot)
+            for name in part_names(slot.name, slot.kind)
         } | dict(ranges or {})
         self.state = {name: self.build.input(name, type) for name, type in types.items()}
-        self.lets: dict[str, Node | Pair] = {}
+        self.lets: dict[str, Parts] = {}
 
     def lower(self, pass_: Pass) -> PassGraph:
         build = self.build
@@ -500,7 +459,7 @@ class _PassLowering:
         for slot in scratch.values():
             # The number nearest to zero: the same in both components of a vector.
             default = slot.default[0] if isinstance(slot.default, tuple) else slot.default
-            for name in slot_names(slot):
+            for name in part_names(slot.name, slot.kind):
                 self.state[name] = build.const(default, ir_type(slot.kind, self.ruleset.slots))
         substeps = tuple(self.substep(moment) for moment in pass_.moments)
         outputs = []
@@ -540,7 +499,7 @@ class _PassLowering:
         changed = tuple((name, new) for name, new in self.state.items() if before[name] is not new)
         return SubstepGraph(moment.label, place, changed, tuple(masks.values()))
 
-    def _assign(self, write: Assign, value: Node | Pair, mask: Node) -> None:
+    def _assign(self, write: Assign, value: Parts, mask: Node) -> None:
         """`field op value` at an offset from each cell of the mask, read from the target's side."""
         build = self.build
         slot = self.slots[write.field]
@@ -548,7 +507,7 @@ class _PassLowering:
         mask = build.shift(mask, back)
         if slot.of is not None:  # cells of other elements keep reading the default
             mask = build.and_(mask, build.in_set(self.state["element"], slot.of))
-        for name, part in zip(slot_names(slot), _parts(value), strict=True):
+        for name, part in zip(part_names(slot.name, slot.kind), value, strict=True):
             old = self.state[name]
             new = build.shift(part, back)
             if write.op != ":=":
@@ -565,7 +524,9 @@ class _PassLowering:
         """
         build = self.build
         before = dict(self.state)
-        travelling = [name for slot in self.slots.values() if slot.travels for name in slot_names(slot)]
+        travelling = [
+            name for slot in self.slots.values() if slot.travels for name in part_names(slot.name, slot.kind)
+        ]
         for rule in movers:
             if isinstance(rule, Swap):
                 continue
@@ -603,7 +564,9 @@ class _PassLowering:
                 continue
             defaults = slot.default if isinstance(slot.default, tuple) else (slot.default,)
             type = ir_type(slot.kind, self.ruleset.slots)
-            for part, (name, default) in enumerate(zip(slot_names(slot), defaults, strict=True)):
+            for part, (name, default) in enumerate(
+                zip(part_names(slot.name, slot.kind), defaults, strict=True)
+            ):
                 values = [build.const(default, type)] * self.ruleset.slots
                 for identity, own in slot.own:
                     values[identity] = build.const(own[part] if isinstance(own, tuple) else own, type)
@@ -615,13 +578,11 @@ class _PassLowering:
         build = self.build
         wanted = {id(rule): masks[id(rule)] for rule in movers}
 
-        def claimed(rule: Mover, mask: Node) -> Node:
+        def reach(rule: Mover, cells: Node, way: int) -> Node:
+            """The cells and their targets, or under -1 these cells and those from where they are targets."""
             if isinstance(rule, Transform):
-                return mask
-            return build.or_(mask, build.shift(mask, (-rule.offset[0], -rule.offset[1])))
-
-        def touches(rule: Mover, cells: Node) -> Node:
-            return cells if isinstance(rule, Transform) else build.or_(cells, build.shift(cells, rule.offset))
+                return cells
+            return build.or_(cells, build.shift(cells, (way * rule.offset[0], way * rule.offset[1])))
 
         taken = build.flag(False)
         for rule in movers:
@@ -633,12 +594,10 @@ class _PassLowering:
             if policy == "drop_both":
                 for other in movers:
                     if other is not rule:
-                        mask = build.and_(mask, build.not_(touches(rule, claimed(other, wanted[id(other)]))))
+                        mask = build.and_(
+                            mask, build.not_(reach(rule, reach(other, wanted[id(other)], -1), 1))
+                        )
             else:
-                mask = build.and_(mask, build.not_(touches(rule, taken)))
-                taken = build.or_(taken, claimed(rule, mask))
+                mask = build.and_(mask, build.not_(reach(rule, taken, 1)))
+                taken = build.or_(taken, reach(rule, mask, -1))
             masks[id(rule)] = mask
-
-
-def _parts(value: Node | Pair) -> tuple[Node, ...]:
-    return (value,) if isinstance(value, Node) else value

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from powderdsl.ir.lower import ir_type, slot_names
+from powderdsl.ir.lower import ir_type, part_names
 from powderdsl.ir.ops import component_of
 from powderdsl.model.state import Slot, property_dtype, property_values, slots
 from powderdsl.model.types import MatrixChannel, Ruleset
@@ -189,7 +189,7 @@ class Observer:
     def _coded(self) -> tuple[tuple[str, Slot], ...]:
         """The channels of `compact`: names, and the slots that they are codes of, which a step does not restart."""
         lasting = [slot for slot in self.slots.values() if not slot.resets]
-        return tuple((name, slot) for slot in lasting for name in slot_names(slot))
+        return tuple((name, slot) for slot in lasting for name in part_names(slot.name, slot.kind))
 
     @cached_property
     def _bits(self) -> tuple[tuple[str, int], ...]:

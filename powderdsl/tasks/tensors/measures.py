@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from powderdsl.ir.bits import NotBits, lower_bits
-from powderdsl.ir.lower import Inputs, ir_type, lower_expression, slot_names
+from powderdsl.ir.lower import Inputs, ir_type, lower_expression, part_names
 from powderdsl.ir.ops import FLAG, Builder, Node, PassGraph, Program, SlotType, Type, component_of
 from powderdsl.ir.stages import run_passes
 from powderdsl.model.state import slots
@@ -186,7 +186,11 @@ def _cut(plane: Tensor, window: Window) -> Tensor:
 
 def _types(ruleset: Ruleset) -> dict[str, Type]:
     """The slots that cell expressions read, by name."""
-    return {name: ir_type(slot.kind, ruleset.slots) for slot in slots(ruleset) for name in slot_names(slot)}
+    return {
+        name: ir_type(slot.kind, ruleset.slots)
+        for slot in slots(ruleset)
+        for name in part_names(slot.name, slot.kind)
+    }
 
 
 def _lets(measures: Sequence[Measure]) -> list[str]:
@@ -200,12 +204,11 @@ def _lowered(ruleset: Ruleset, measures: Sequence[tuple[int, Measure]]) -> Progr
     build = Builder()
     types, regions = _types(ruleset), _lets([measure for _, measure in measures])
     state = {name: build.input(name, type) for name, type in types.items()}
-    lets: dict[str, Node | tuple[Node, Node]] = {name: build.input(name, FLAG) for name in regions}
+    lets: dict[str, tuple[Node, ...]] = {name: (build.input(name, FLAG),) for name in regions}
     outputs = []
     for number, measure in measures:
         assert measure.value is not None
-        node = lower_expression(measure.value, Inputs(ruleset, build, state, lets))
-        assert isinstance(node, Node)
+        (node,) = lower_expression(measure.value, Inputs(ruleset, build, state, lets))
         outputs.append((f"measure {number}", node))
     every = {**types, **dict.fromkeys(regions, FLAG), **{name: node.type for name, node in outputs}}
     rows = [SlotType(name, type, 0, False) for name, type in every.items()]

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from powderdsl.ir.lower import lower_pass, lower_substep, slot_names
+from powderdsl.ir.lower import lower_pass, lower_substep, part_names
 from powderdsl.ir.ops import COMMUTATIVE, OPS, REAL, Graph, Node, Offset
 from powderdsl.model.state import slots
 from powderdsl.model.types import Pass, Ruleset
@@ -52,7 +52,7 @@ def _cells(ruleset: Ruleset) -> Cells:
     for slot in slots(ruleset):
         if slot.is_real:
             continue
-        (name,) = slot_names(slot)
+        (name,) = part_names(slot.name, slot.kind)
         prop = ruleset.property(slot.name)
         if slot.kind.name == "element":
             domains[name] = ids
