@@ -103,3 +103,25 @@ MAX_MAGNITUDE = 1_000_000
 
 RESERVED = frozenset((*DIRECTIONS, *DIRECTION_SETS, *KERNELS, *FUNCTIONS, *COORDINATES))
 """Words that no definition may take. Shapes such as `diamond(3)` have their radius with them: elements may have their names."""
+
+ELSEWHERE = {
+    **dict.fromkeys(("up", "north", "top"), "write `above`"),
+    **dict.fromkeys(("down", "south", "bottom"), "write `below`"),
+    "west": "write `left`",
+    "east": "write `right`",
+    **dict.fromkeys(("self", "this"), "a rule speaks of its own cell already: leave it out, or write `here`"),
+    "true": "write `yes`",
+    "false": "write `no`",
+    **dict.fromkeys(("none", "nothing", "air"), "name the element that stands for nothing, such as `empty`"),
+    **dict.fromkeys(("neighbors", "neighbours"), "count them: `count(SET)`, `count(SET in ring)`"),
+    **dict.fromkeys(
+        ("random", "rand"), "say `with chance 5%` at the end of the rule, or compare a stream: `luck < 5%`"
+    ),
+    "probability": "say `with chance 5%` at the end of the rule",
+    **dict.fromkeys(("floor", "round", "int"), "`a div b` divides integers and rounds down"),
+    "ceil": "`a div b` divides integers and rounds down: `(a + b - 1) div b` rounds up",
+    "sqrt": "there are no roots; `length(VEC2)` is the length of a vector",
+    "pow": "powers are written out: `x * x`",
+    "distance": "`length(VEC2)` is the length of a vector",
+}
+"""Words of other languages, and what to write instead."""

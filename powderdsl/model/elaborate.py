@@ -22,7 +22,6 @@ from powderdsl.model.expressions.operators import (
     SetOf,
     Unresolved,
     conjunction,
-    constant,
     turned,
 )
 from powderdsl.model.expressions.symbols import default_of, read_kind
@@ -210,7 +209,7 @@ class Elaborator:
             return Absent(missing.name)
         finally:
             self._empty_lets |= self.typer.empty
-        value = constant(value) if isinstance(value, Number) else value
+        assert isinstance(value, Expr)
         if value.op == "draw":
             return value  # a stream's draws are fixed for the whole step
         if value.kind.name in ("draw", "chance"):

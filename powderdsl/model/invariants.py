@@ -8,7 +8,6 @@ from powderdsl.diagnostics import Reporter, Span, suggest
 from powderdsl.model.composition.claim_scopes import names_left_out, with_optional, words_of
 from powderdsl.model.composition.compose import Composition
 from powderdsl.model.declarations import RulesetDecl
-from powderdsl.model.expressions.coercer import read_bounds
 from powderdsl.model.expressions.operators import (
     ELEMENT_HERE,
     FALSE,
@@ -23,6 +22,7 @@ from powderdsl.model.expressions.operators import (
     kind_name,
     member,
 )
+from powderdsl.model.expressions.symbols import read_bounds
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.text import one_line
 from powderdsl.model.types import (

@@ -30,7 +30,7 @@ class Operation:
     about: one sentence; of a function, as `docs/language.md` has it. `value` is what an `Expr` of it has besides its
         arguments.
     usage: how rules call it; nothing for an operation that is written in another way.
-    takes: the kinds of the arguments. Without them a function has a check of its own in `expressions.functions`.
+    takes: the kinds of the arguments. Without them a function has a check of its own in `expressions.operators`.
     gives: the kind of the result. Without one it is an integer with the range of `between`, or a float.
     most: how many arguments it may have, if that is more than `usage` has.
     meaning: an expression of the language, in the names of the arguments, that stands for a call.

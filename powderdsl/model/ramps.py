@@ -8,8 +8,8 @@ from powderdsl.diagnostics import Label, Span
 from powderdsl.model.composition.contested import report_replaced
 from powderdsl.model.composition.names import report_unknown
 from powderdsl.model.declarations import RampDecl
-from powderdsl.model.expressions.coercer import read_bounds
 from powderdsl.model.expressions.operators import Poisoned
+from powderdsl.model.expressions.symbols import read_bounds
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.types import ColorRamp, Element, Field
 

@@ -9,8 +9,8 @@ from functools import reduce
 from itertools import pairwise
 
 from powderdsl.diagnostics import Span, suggest
-from powderdsl.model.expressions.coercer import read_number
 from powderdsl.model.expressions.operators import Number, Operand, Poisoned, Scope, SetOf, Unresolved
+from powderdsl.model.expressions.symbols import read_number
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.operations import COMPARISONS
 from powderdsl.model.types import FLAG, REAL, Expr

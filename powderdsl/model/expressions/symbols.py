@@ -5,11 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from fractions import Fraction
+from typing import TYPE_CHECKING
 
 from powderdsl.diagnostics import Label, Reporter, Span, suggest
-from powderdsl.model.builtins import DIRECTION_SETS, DIRECTIONS, KERNELS, KIND_WORDS, grid_kernel
+from powderdsl.model.builtins import (
+    DIRECTION_SETS,
+    DIRECTIONS,
+    ELSEWHERE,
+    KERNELS,
+    KIND_WORDS,
+    MAX_MAGNITUDE,
+    grid_kernel,
+)
 from powderdsl.model.composition.compose import Composition
-from powderdsl.model.expressions.coercer import Coercer, read_bounds
 from powderdsl.model.expressions.operators import Items, Operand, Place, SetOf
 from powderdsl.model.operations import FUNCTIONS
 from powderdsl.model.state import SNAP
@@ -29,6 +37,9 @@ from powderdsl.model.types import (
 )
 from powderdsl.syntax.ast import Syntax
 from powderdsl.system.random import name_number
+
+if TYPE_CHECKING:
+    from powderdsl.model.expressions.typer import Typer
 
 
 @dataclass
@@ -85,6 +96,45 @@ def base_symbols(composition: Composition) -> Symbols:
     return symbols
 
 
+# Literals: no float is involved, `2%` is 1/50
+
+
+def read_number(syntax: Syntax, typer: Typer) -> Fraction:
+    """The exact value of an integer, decimal or percentage literal."""
+    text = syntax.text
+    if syntax.kind == "integer" and len(text) > 1 and text[0] == "0":
+        fix = f"write `{text.lstrip('0') or '0'}`"
+        raise typer.fail("PD110", f"`{text}` starts with a zero", syntax.span, "not a plain number", fix)
+    limit = f"the limit is {MAX_MAGNITUDE:,}"
+    if "e" in text.lower() and abs(int(text.lower().split("e")[1])) > 12:
+        raise typer.fail("PD402", f"`{text}` is too large or too small", syntax.span, limit)
+    value = Fraction(text.removesuffix("%"))
+    if syntax.kind == "percent":
+        value /= 100
+    if abs(value) > MAX_MAGNITUDE:
+        raise typer.fail("PD402", f"`{text}` is too large", syntax.span, limit)
+    return value
+
+
+def read_bounds(syntax: Syntax, typer: Typer) -> tuple[int, int]:
+    """The bounds of `LOW..HIGH`, integer literals."""
+    if syntax.kind != "range":
+        raise typer.fail("PD401", "expected a range", syntax.span, "such as `0..7`")
+    bounds = []
+    for end in syntax.children:
+        sign, literal = (-1, end.children[0]) if end.kind == "neg" else (1, end)
+        if literal.kind != "integer":
+            raise typer.fail("PD405", "a range has integers at its ends", end.span, "not an integer")
+        bounds.append(sign * int(read_number(literal, typer)))
+    lo, hi = bounds
+    if lo > hi:
+        label, fix = f"{lo} is above {hi}", f"write `{hi}..{lo}`"
+        raise typer.fail("PD402", "a range that runs backwards", syntax.span, label, fix)
+    return lo, hi
+
+
+# Kinds and values
+
 _KINDS_ELSEWHERE = {
     **dict.fromkeys(("int", "integer", "number"), "0..9"),
     "uint8": "0..255",
@@ -96,19 +146,19 @@ _KINDS_ELSEWHERE = {
 """Kinds by the names that other languages give them, and how they are written here."""
 
 
-def read_kind(syntax: Syntax, coercer: Coercer) -> Kind:
+def read_kind(syntax: Syntax, typer: Typer) -> Kind:
     """A kind as written: ``0..7``, ``flag``, ``element``, ``chance``, ``real(0..1)``, ``vec2(-10..10)``."""
     word = syntax.text if syntax.kind in ("name", "call") else ""
     plain = {"flag": FLAG, "element": ELEMENT, "direction": DIRECTION, "chance": CHANCE}.get(word)
     if syntax.kind == "range":
-        return integer(*read_bounds(syntax, coercer))
+        return integer(*read_bounds(syntax, typer))
     if syntax.kind == "name" and plain is not None:
         return plain
     if syntax.kind == "call" and word in ("real", "vec2") and len(syntax.children) == 1:
-        return Kind(word, *read_bounds(syntax.children[0], coercer))
+        return Kind(word, *read_bounds(syntax.children[0], typer))
     if syntax.kind == "name" and word in ("real", "vec2"):
         fix = f"write `{word}(-100..100)`"
-        raise coercer.fail("PD401", f"`{word}` needs bounds", syntax.span, "no bounds", fix)
+        raise typer.fail("PD401", f"`{word}` needs bounds", syntax.span, "no bounds", fix)
     close = suggest(word, KIND_WORDS) if word else ()
     helps: tuple[str, ...] = (
         "kinds: LOW..HIGH, flag, element, direction, chance, real(LOW..HIGH), vec2(LOW..HIGH)",
@@ -117,14 +167,14 @@ def read_kind(syntax: Syntax, coercer: Coercer) -> Kind:
         helps = (f"write `{_KINDS_ELSEWHERE[word]}`",)
     elif close and close[0].startswith("did"):
         helps = close
-    raise coercer.fail("PD401", "not a kind", syntax.span, "expected a kind", *helps)
+    raise typer.fail("PD401", "not a kind", syntax.span, "expected a kind", *helps)
 
 
 _FLAGS = {"on": "yes", "true": "yes", "y": "yes", "off": "no", "false": "no", "n": "no", "none": "no"}
 """Words that people write for yes and no."""
 
 
-def not_a_value(prop: Property, syntax: Syntax, coercer: Coercer) -> None:
+def not_a_value(prop: Property, syntax: Syntax, typer: Typer) -> None:
     """Report a word as a property's value that names nothing."""
     word = syntax.text.lower()
     fix = "or a parameter of this pack"
@@ -138,7 +188,7 @@ def not_a_value(prop: Property, syntax: Syntax, coercer: Coercer) -> None:
         case _:
             form = f"a number in {prop.kind}"
             fix = f"write a number from {prop.kind.lo:g} to {prop.kind.hi:g}, {fix}"
-    coercer.fail("PD110", f"`{syntax.text}` is not {form}", syntax.span, f"the value of `{prop.name}`", fix)
+    typer.fail("PD110", f"`{syntax.text}` is not {form}", syntax.span, f"the value of `{prop.name}`", fix)
 
 
 def default_of(kind: Kind, first_id: int = 0) -> Value:
@@ -164,7 +214,7 @@ def clamped_number(value: float | Fraction, kind: Kind) -> float:
 
 
 def number_value(expr: Expr, kind: Kind) -> Value:
-    """The constant in an expression that `Coercer.of_kind` accepted."""
+    """The constant in an expression that `Typer.of_kind` accepted."""
     if kind.name == "vec2":
         parts = [arg.value for arg in expr.args]
         return (float(parts[0]), float(parts[1]))
@@ -173,28 +223,6 @@ def number_value(expr: Expr, kind: Kind) -> Value:
 
 
 # Unknown names
-
-ELSEWHERE = {
-    **dict.fromkeys(("up", "north", "top"), "write `above`"),
-    **dict.fromkeys(("down", "south", "bottom"), "write `below`"),
-    "west": "write `left`",
-    "east": "write `right`",
-    **dict.fromkeys(("self", "this"), "a rule speaks of its own cell already: leave it out, or write `here`"),
-    "true": "write `yes`",
-    "false": "write `no`",
-    **dict.fromkeys(("none", "nothing", "air"), "name the element that stands for nothing, such as `empty`"),
-    **dict.fromkeys(("neighbors", "neighbours"), "count them: `count(SET)`, `count(SET in ring)`"),
-    **dict.fromkeys(
-        ("random", "rand"), "say `with chance 5%` at the end of the rule, or compare a stream: `luck < 5%`"
-    ),
-    "probability": "say `with chance 5%` at the end of the rule",
-    **dict.fromkeys(("floor", "round", "int"), "`a div b` divides integers and rounds down"),
-    "ceil": "`a div b` divides integers and rounds down: `(a + b - 1) div b` rounds up",
-    "sqrt": "there are no roots; `length(VEC2)` is the length of a vector",
-    "pow": "powers are written out: `x * x`",
-    "distance": "`length(VEC2)` is the length of a vector",
-}
-"""Words of other languages, and what to write instead."""
 
 MAX_PLACES = 4
 """Places of a name that are shown besides the first."""
