@@ -396,7 +396,7 @@ def _not_a_set(typer: Typer, syntax: Syntax) -> Poisoned:
 # Arithmetic
 
 
-def binary(typer: Typer, left: Value, right: Value, syntax: Syntax) -> Value:
+def binary(typer: Typer, syntax: Syntax, left: Value, right: Value) -> Value:
     """`+ - * /` on numbers and vectors."""
     op, span = syntax.kind, syntax.span
     kinds = [kind_name(value) for value in (left, right)]
@@ -484,8 +484,9 @@ def _coordinate_sum(typer: Typer, syntax: Syntax, modulus: int, scope: Scope) ->
     if syntax.kind == "name" and syntax.text in COORDINATES:
         return Expr("coordinate", integer(0, modulus - 1), (), (syntax.text, modulus), syntax.span)
     if syntax.kind in ("add", "sub"):
-        left, right = (_coordinate_sum(typer, child, modulus, scope) for child in syntax.children)
-        return binary(typer, left, right, syntax)
+        return binary(
+            typer, syntax, *[_coordinate_sum(typer, part, modulus, scope) for part in syntax.children]
+        )
     if syntax.kind == "quotient" and _names_coordinate(syntax.children[0]):
         return _coordinate_quotient(typer, syntax, modulus, scope)
     value = typer.value_of(syntax, scope)
@@ -724,20 +725,13 @@ def _pick(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
 
 def _clamp(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
     operands: list[Placed] = [(typer.value_of(child, scope), child.span) for child in syntax.children]
-    least, most = _bounds_of(operands[1][0]), _bounds_of(operands[2][0])
-    if least is not None and most is not None and least[0] > most[1]:
+    room = arithmetic(typer, "sub", [operands[2], operands[1]], syntax.span)
+    if (room.value if isinstance(room, Number) else room.kind.hi) < 0:
         words = [child.span.text for child in syntax.children]
         message, label = "the bounds of `clamp` are the wrong way round", "below the other bound"
         fix = f"write `clamp({words[0]}, {words[2]}, {words[1]})`"
         raise typer.fail("PD406", message, syntax.children[2].span, label, fix)
     return _meant(typer, FUNCTIONS["clamp"], operands, syntax.span)
-
-
-def _bounds_of(value: Value) -> tuple[Fraction | float, Fraction | float] | None:
-    """The least and the greatest value of a number, if they are known."""
-    if isinstance(value, Number):
-        return value.value, value.value
-    return (value.kind.lo, value.kind.hi) if value.kind.name == "int" else None
 
 
 CALLS: dict[str, Call] = {

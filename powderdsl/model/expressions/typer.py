@@ -88,7 +88,7 @@ _KINDS = {
     "real": "a float",
     "vec2": "a vector",
 }
-_HELPS = {
+_HELPS: dict[str, tuple[str, ...]] = {
     "chance": ("such as `5%`, or a parameter",),
     "vec2": ("such as `vector(1, 0)`: rows down, columns right",),
     "direction": ("such as `left`, or `octant(…)`",),
@@ -265,33 +265,19 @@ class Typer:
         value = operand if kind.name in ("element", "direction") else self.value(operand, span)
         if isinstance(value, Number):
             return self._constant(value.value, kind, span)
+        helps = _HELPS.get(kind.name, ())
         if isinstance(value, Expr):
-            if value.kind.name == kind.name:
+            source = value.kind.name
+            if source == kind.name or (source == "real" and kind.name == "chance"):
                 return value
-            converted = self._converted(value, kind, span)
-            if converted is not None:
-                return converted
-        helps = (
-            _integer_helps(value, span)
-            if kind.name == "int" and isinstance(value, Expr)
-            else _HELPS.get(kind.name, ())
-        )
+            if kind.name == "real" and source == "draw" and value.op in ("add", "sub", "look"):
+                # Draws that integers were added to are rounded after each operation.
+                args = tuple(self.of_kind(arg, REAL, span) for arg in value.args)
+                return Expr(value.op, REAL, args, value.value, span)
+            if source in {"real": ("int", "chance", "draw", "flag"), "chance": ("int",)}.get(kind.name, ()):
+                return Expr("to_real", REAL, (value,), span=span)
+            helps = _integer_helps(value, span) if kind.name == "int" else helps
         raise self.wrong(value, "a number" if kind.name == "real" else _KINDS[kind.name], span, *helps)
-
-    def _converted(self, value: Expr, kind: Kind, span: Span) -> Expr | None:
-        """A number as a float or a chance. Draws that integers were added to are rounded after each operation."""
-        source = value.kind.name
-        if kind.name == "chance":
-            return (
-                value if source == "real" else self._converted(value, REAL, span) if source == "int" else None
-            )
-        if kind.name != "real" or source not in ("int", "chance", "draw", "flag"):
-            return None
-        if source == "draw" and value.op in ("add", "sub"):
-            return Expr(value.op, REAL, tuple(self.of_kind(arg, REAL, span) for arg in value.args), span=span)
-        if source == "draw" and value.op == "look":
-            return look(self.of_kind(value.args[0], REAL, span), value.value, span)
-        return Expr("to_real", REAL, (value,), span=span)
 
     def _constant(self, number: Fraction, kind: Kind, span: Span) -> Expr:
         """A number written in a rule, as a constant of a kind."""
@@ -353,7 +339,7 @@ class Typer:
         symbols = self.symbols
         self.used.add(name)
         if name in scope.locals:
-            return self.turn(self._sound(scope.locals[name]), scope)
+            return self.turn(scope.locals[name], scope)
         param = symbols.params.get(f"{scope.pack}.{name}")
         if param is not None:  # a name that hides no other that its pack knows
             self.used.add(param.name)
@@ -363,20 +349,13 @@ class Typer:
         if name in symbols.composition.sets and name not in symbols.constants:
             return self.resolve_set(name, span)
         if name in symbols.constants:
-            constant = self._sound(symbols.constants[name])
-            if constant == SetOf(()):
+            if symbols.constants[name] == SetOf(()):
                 self.empty.add(name)
-            return self.turn(constant, scope)
+            return self.turn(symbols.constants[name], scope)
         for op, table in (("property", symbols.properties), ("field", symbols.fields)):
             if name in table:
                 return Expr(op, table[name].kind, value=name, span=span)
         return Expr("draw", DRAW, value=name, span=span) if name in symbols.streams else None
-
-    @staticmethod
-    def _sound(operand: Operand) -> Operand:
-        if isinstance(operand, Broken):
-            raise Poisoned
-        return operand
 
     def hides(self, name: str, span: Span, scope: Scope) -> bool:
         """Whether a new local name would hide one that its pack knows. Names of other packs may be hidden."""
@@ -410,7 +389,9 @@ class Typer:
         return result
 
     def turn(self, operand: Operand, scope: Scope) -> Operand:
-        """The operand with its places and kernels turned by the scope's symmetry."""
+        """The operand with its places and kernels turned by the scope's symmetry. Raises Poisoned if it is broken."""
+        if isinstance(operand, Broken):
+            raise Poisoned
         if scope.orientation == IDENTITY:
             return operand
         match operand:
@@ -559,28 +540,23 @@ class Typer:
     def compare(self, syntax: Syntax, scope: Scope) -> Operand:
         operands = [self.evaluate(child, scope) for child in syntax.children]
         report_repeated(syntax.children, self.reporter)
-        self._no_sets(operands, syntax)
+        if any(isinstance(operand, Place) or kind_name(operand) == "element" for operand in operands):
+            for operand, child in zip(operands, syntax.children, strict=True):
+                # `below == fluid` would ask whether the two hold alike; what is meant is `below is fluid`.
+                if isinstance(operand, Items) or (isinstance(operand, SetOf) and operand.name is None):
+                    fix = "write `is` or `is not` instead of `==` or `!=`"
+                    raise self.wrong(operand, "one element to compare with", child.span, fix)
         headings = any(kind_name(operand) == "direction" for operand in operands)
-        values: list[tuple[Value, Span]] = [
-            (self.of_kind(operand, DIRECTION, child.span), child.span)
-            if headings and isinstance(operand, (Place, PlaceChoice))
-            else (self.value(operand, child.span), child.span)
-            for operand, child in zip(operands, syntax.children, strict=True)
-        ]
+        values: list[tuple[Value, Span]] = []
+        for operand, child in zip(operands, syntax.children, strict=True):
+            if headings and isinstance(operand, (Place, PlaceChoice)):
+                operand = self.of_kind(operand, DIRECTION, child.span)
+            values.append((self.value(operand, child.span), child.span))
         parts = [
             compare(self, sign, left, right, left[1].to(right[1]))
             for sign, (left, right) in zip(syntax.text.split(), pairwise(values), strict=True)
         ]
         return conjunction(parts, syntax.span)
-
-    def _no_sets(self, operands: list[Operand], syntax: Syntax) -> None:
-        """`below == fluid` would ask whether the two hold alike; what is meant is `below is fluid`."""
-        if not any(isinstance(operand, Place) or kind_name(operand) == "element" for operand in operands):
-            return
-        for operand, child in zip(operands, syntax.children, strict=True):
-            if isinstance(operand, Items) or (isinstance(operand, SetOf) and operand.name is None):
-                fix = "write `is` or `is not` instead of `==` or `!=`"
-                raise self.wrong(operand, "one element to compare with", child.span, fix)
 
     def is_(self, syntax: Syntax, scope: Scope) -> Operand:
         left, right = (self.evaluate(child, scope) for child in syntax.children)
@@ -641,18 +617,12 @@ class Typer:
         fix = "such as `0..4`, a tag, or `(left, right)`"
         raise self.wrong(operand, "a range, a set or a list", syntax.span, fix)
 
-    def binary(self, syntax: Syntax, scope: Scope) -> Operand:
-        left, right = (self.value_of(child, scope) for child in syntax.children)
-        return binary(self, left, right, syntax)
-
     def chance_draw(self, stream: str, syntax: Syntax, scope: Scope) -> Expr:
         """`with chance P`: a draw of the rule's own stream below P."""
         span = syntax.span
         threshold = self.of_kind(self.evaluate(syntax, scope), CHANCE, span)
         draw = Expr("draw", DRAW, value=stream, span=span)
-        if threshold.kind == CHANCE:
-            return compare(self, "<", (draw, span), (threshold, span), span)
-        return Expr("lt", FLAG, (Expr("to_real", threshold.kind, (draw,)), threshold), span=span)
+        return compare(self, "<", (draw, span), (threshold, span), span)
 
 
 def _integer_helps(value: Expr, span: Span) -> tuple[str, ...]:
@@ -696,7 +666,10 @@ HANDLERS: dict[str, Callable[[Typer, Syntax, Scope], Operand]] = {
     "choose": Typer.choose,
     **dict.fromkeys(("any_of", "all_of"), Typer.quantifier),
     "call": call,
-    **dict.fromkeys(("add", "sub", "mul", "div"), Typer.binary),
+    **dict.fromkeys(
+        ("add", "sub", "mul", "div"),
+        lambda typer, at, scope: binary(typer, at, *[typer.value_of(child, scope) for child in at.children]),
+    ),
     "neg": lambda typer, at, scope: negate(typer, typer.value_of(at.children[0], scope), at.span),
     "quotient": quotient,
     "mod": modulo,
