@@ -74,11 +74,7 @@ class Rows:
 
 def rows_of(sweeps: Sweeps, reaches: Mapping[str, int]) -> Rows:
     """The plan of loops that run together."""
-    rings, waiting = _rings(sweeps)
-    saved: dict[str, tuple[int, int]] = {}
-    for name, count in _saved(sweeps).items():
-        saved[name] = count, waiting
-        waiting += count
+    rings, saved, waiting = _waiting(sweeps)
     made = {out.var.name for loop in sweeps.loops for out in loop.outs}
     loops = []
     turned = 0
@@ -94,35 +90,32 @@ def rows_of(sweeps: Sweeps, reaches: Mapping[str, int]) -> Rows:
     return Rows(tuple(loops), rings, saved, waiting, turned, places, reaches)
 
 
-def _rings(sweeps: Sweeps) -> tuple[dict[str, Ring], int]:
-    """The rings of passing fields, numbered one after another, and the number of their rows."""
+def _waiting(sweeps: Sweeps) -> tuple[dict[str, Ring], dict[str, tuple[int, int]], int]:
+    """The rings of passing fields, the rows that are saved of others, and the number of rows that wait in all."""
     lags = {
         out.var.name: lag for loop, lag in zip(sweeps.loops, sweeps.lags, strict=True) for out in loop.outs
     }
     depths = dict.fromkeys(sweeps.passing, 1)
     bare: dict[str, int | None] = dict.fromkeys(sweeps.passing, 0)
+    below = {out.into: 0 for loop in sweeps.loops for out in loop.outs if out.into is not None}
     for loop, lag in zip(sweeps.loops, sweeps.lags, strict=True):
         for read in field_reads(loop):
             if (name := read.name) in depths:
                 depths[name] = max(depths[name], lag - lags[name] - read.dy + 1)
                 around, reach = read.wraps and read.dx, bare[name]
                 bare[name] = None if around or reach is None else max(reach, abs(read.dx))
-    rings: dict[str, Ring] = {}
+            elif name in below and read.wraps:
+                below[name] = max(below[name], read.dy)
+    rings, saved = {}, {}
     count = 0
     for name, depth in depths.items():
         rings[name] = Ring(count, 1 << (depth - 1).bit_length(), bare[name])
         count += rings[name].depth
-    return rings, count
-
-
-def _saved(sweeps: Sweeps) -> dict[str, int]:
-    """How many rows of each field that is written over are read below the last row, around the edge."""
-    counts = {out.into: 0 for loop in sweeps.loops for out in loop.outs if out.into is not None}
-    for loop in sweeps.loops:
-        for read in field_reads(loop):
-            if read.name in counts and read.wraps:
-                counts[read.name] = max(counts[read.name], read.dy)
-    return {name: count for name, count in counts.items() if count}
+    for old, rows in below.items():
+        if rows:
+            saved[old] = rows, count
+            count += rows
+    return rings, saved, count
 
 
 def region_of(loop: Compute) -> tuple[list[Node], list[str]]:

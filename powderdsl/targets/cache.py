@@ -14,8 +14,8 @@ import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 # Imported here, not later: a fork while another thread imports it would leave the child waiting forever.
 from filelock import FileLock, Timeout
@@ -35,8 +35,7 @@ PATIENCE = 120.0
 """Seconds to wait for another process that compiles the same source; after that both compile."""
 
 
-@dataclass(frozen=True)
-class Entry:
+class Entry(NamedTuple):
     """A file in the cache. `used` is the time of its last use, in seconds since the epoch."""
 
     path: Path
@@ -87,8 +86,8 @@ def entries(folder: Path) -> list[Entry]:
     """The files in the cache, most recently used first."""
     stored = []
     for path in sorted(folder.iterdir()):
-        if match := NAME.fullmatch(path.name):
-            with suppress(OSError):
+        with suppress(OSError):
+            if match := NAME.fullmatch(path.name):
                 status = path.stat()
                 stored.append(Entry(path, match[3], status.st_size, status.st_mtime))
     return sorted(stored, key=lambda entry: -entry.used)
@@ -97,9 +96,7 @@ def entries(folder: Path) -> list[Entry]:
 def clear(folder: Path) -> list[Entry]:
     """Remove all files of the cache, and return them. Builds in progress belong to other processes."""
     removed = entries(folder)
-    for entry in removed:
-        _discard(entry.path)
-    tidy(folder)
+    tidy(folder, limit=-1)
     return removed
 
 
@@ -124,11 +121,8 @@ def turn(folder: Path, key: str) -> Iterator[None]:
     The operating system releases the lock of a process that dies. Without file locks, nobody waits.
     """
     lock = FileLock(folder / f"{key}.lock")
-    try:
+    with suppress(OSError, NotImplementedError, Timeout):
         lock.acquire(timeout=PATIENCE)
-    except (OSError, NotImplementedError, Timeout):
-        yield
-        return
     try:
         yield
     finally:
@@ -137,8 +131,8 @@ def turn(folder: Path, key: str) -> Iterator[None]:
 
 def _discard(path: Path) -> None:
     """Remove a file or a folder, if that is possible."""
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path, ignore_errors=True)
-    else:
-        with suppress(OSError):
+    with suppress(OSError):
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
             path.unlink(missing_ok=True)

@@ -215,34 +215,32 @@ def build(source: str, ruleset: str = "", units: int = 1) -> Path:
     compiler, how = find_compiler(), current()
     flags, folder = flags_for(compiler, how.level), how.place()
     key = cache_key(source, compiler, flags)
-    found = cache.find(folder, key)
-    if found is not None:
+    if found := cache.find(folder, key):
         return found
     with cache.turn(folder, key):
+        if found := cache.find(folder, key):
+            return found
         try:
-            return cache.find(folder, key) or _compile(source, units, ruleset, compiler, flags, folder, key)
+            code = _compiled([*compiler.command, *flags], source, units, folder)
+            return cache.add(folder, key, code, ruleset)
         except OSError as error:
             raise NoCompiler(f"no room for compiled code: {error}") from None
 
 
-def _compile(
-    source: str, units: int, ruleset: str, compiler: Compiler, flags: tuple[str, ...], folder: Path, key: str
-) -> Path:
+def _compiled(command: list[str], source: str, units: int, folder: Path) -> bytes:
+    """The library of a source; its units are compiled side by side, if this machine can."""
     with scratch_folder(folder) as scratch:
         text, library = scratch / "program.cpp", scratch / "library"
         text.write_text(source, encoding="utf-8")
-        command, objects = [*compiler.command, *flags], []
+        inputs, rounds = [str(text)], []
         if units > 1 and os.cpu_count() != 1:
-            objects = [str(scratch / f"{unit}.o") for unit in range(units)]
-        parts = [
-            [*command, "-c", f"-DUNIT={unit}", "-o", name, str(text)] for unit, name in enumerate(objects)
-        ]
-        for commands in filter(None, (parts, [[*command, "-o", str(library), *(objects or [str(text)])]])):
+            inputs = [str(scratch / f"{unit}.o") for unit in range(units)]
+            rounds = [[[*command, "-c", f"-DUNIT={i}", "-o", o, str(text)] for i, o in enumerate(inputs)]]
+        for commands in (*rounds, [[*command, "-o", str(library), *inputs]]):
             status, messages = run_compilers(scratch, *commands)
             if status:
                 raise NoCompiler("\n".join([f"{command[0]} failed:", *messages.splitlines()[:8]]))
-        code = library.read_bytes()
-    return cache.add(folder, key, code, ruleset)
+        return library.read_bytes()
 
 
 def run_compilers(scratch: Path, *commands: list[str]) -> tuple[int, str]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Mapping, Sequence
-from ctypes import Structure, c_double, c_int
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,14 +30,6 @@ class Counted:
     region: str | None = None
     highest: bool = False
     divisor: float = 1.0
-
-
-class _Gate(Structure):
-    _fields_ = [("op", c_int), ("a", c_int), ("b", c_int)]
-
-
-class _Count(Structure):
-    _fields_ = [("gate", c_int), ("highest", c_int), ("divisor", c_double)]
 
 
 class CellCounts:
@@ -69,7 +61,8 @@ class CellCounts:
             gates.append((op, a, b))
             return len(gates) - 1
 
-        for node in ordered([one.flag for one in counted]):
+        for node in ordered([count.flag for count in counted]):
+            args = [places[arg] for arg in node.args]
             if node.op == "input" and node.attr in planes:
                 places[node] = gate(_PLANE, planes[node.attr])
             elif node.op == "input" and node.attr in masks:
@@ -78,29 +71,29 @@ class CellCounts:
                 nothing = gate(_NOTHING)
                 places[node] = gate(_OPS["not"], nothing) if node.attr else nothing
             elif node.op == "select":
-                condition, yes, no = (places[arg] for arg in node.args)
-                kept = gate(_OPS["and"], condition, yes), gate(_OPS["and"], gate(_OPS["not"], condition), no)
-                places[node] = gate(_OPS["or"], *kept)
+                yes, no = gate(_OPS["and"], *args[:2]), gate(_OPS["and"], gate(_OPS["not"], args[0]), args[2])
+                places[node] = gate(_OPS["or"], yes, no)
             else:
-                places[node] = gate(_OPS[node.op], *(places[arg] for arg in node.args))
+                places[node] = gate(_OPS[node.op], *args)
         ends = []
-        for one in counted:
-            end = places[one.flag]
-            if one.region is not None:
-                end = gate(_OPS["and"], end, gate(_MASK, names.index(one.region)))
-            ends.append((end, int(one.highest), one.divisor))
+        for count in counted:
+            end = places[count.flag]
+            if count.region is not None:
+                end = gate(_OPS["and"], end, gate(_MASK, names.index(count.region)))
+            ends.append(struct.pack("iid", end, count.highest, count.divisor))
         if len(gates) > MOST_GATES:
             raise ValueError(f"{len(gates)} gates")
-        self.count = len(counted)
-        self._gates: Any = (_Gate * len(gates))(*(_Gate(*one) for one in gates))
-        self._counts: Any = (_Count * len(ends))(*(_Count(*one) for one in ends))
         self._rows = rows
+        self._sizes = len(gates), len(ends)
+        # As the structs `Gate` and `Count` of views.hpp.
+        self._gates, self._counts = b"".join(struct.pack("iii", *gate) for gate in gates), b"".join(ends)
 
     def of(self, library: Any, handle: int, worlds: int) -> Tensor:
         """The numbers in each world of a batch in native memory: float64 [B, n]."""
-        found = torch.empty(worlds, self.count, dtype=torch.float64)
+        gates, counts = self._sizes
+        numbers = torch.empty(worlds, counts, dtype=torch.float64)
+        masks = self.masks.data_ptr()
         library.pd_count(
-            handle, len(self._gates), self._gates, self.count, self._counts, *self._rows,
-            self.masks.data_ptr(), found.data_ptr(),
-        )  # fmt: skip
-        return found
+            handle, gates, self._gates, counts, self._counts, *self._rows, masks, numbers.data_ptr()
+        )
+        return numbers

@@ -79,13 +79,11 @@ def remember(key: str, code: NativeCode) -> None:
 
 
 class Inputs(NamedTuple):
-    """The parameters of a batch as generated code reads them: flags uint8 [n, B], floats float32 [m, B], and where."""
+    """The parameters of a batch as generated code reads them: flags uint8 [n, B], floats float32 [m, B]."""
 
     params: Mapping[str, Tensor]
     planes: Tensor
     reals: Tensor
-    planes_at: int
-    reals_at: int
 
 
 class PackedState(Mapping[str, Tensor]):
@@ -224,7 +222,7 @@ class NativeProgram:
         seconds = None if job.timing is None else (ctypes.c_double * len(self._passes))()
         handle = self.library.pd_run(
             handle, copy, job.steps, self.threads,
-            seed.data_ptr(), index.data_ptr(), start.data_ptr(), since, inputs.planes_at, inputs.reals_at, seconds,
+            seed.data_ptr(), index.data_ptr(), start.data_ptr(), since, inputs.planes.data_ptr(), inputs.reals.data_ptr(), seconds,
         )  # fmt: skip
         if job.timing is not None and seconds is not None:
             for name, spent in zip(self._passes, seconds, strict=True):
@@ -234,12 +232,11 @@ class NativeProgram:
     def _made_inputs(self, params: Mapping[str, Tensor], batch: int) -> Inputs:
         """The inputs of some parameters, kept for the next call with the same mapping."""
         layout = self.layout
-        planes, reals = parameters(torch, params, layout.param_planes, layout.param_reals, batch)
-        found = Inputs(params, planes, reals, planes.data_ptr(), reals.data_ptr())
+        bits, floats = parameters(torch, params, layout.param_planes, layout.param_reals, batch)
         if len(self._inputs) >= BATCH_SIZES:
             self._inputs = {}  # not cleared: another thread may be reading it
-        self._inputs[batch] = found
-        return found
+        self._inputs[batch] = inputs = Inputs(params, bits, floats)
+        return inputs
 
     def _pack(self, state: Mapping[str, Tensor]) -> tuple[int, Like]:
         batch, height, width = state["element"].shape

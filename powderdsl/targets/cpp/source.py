@@ -27,6 +27,7 @@ UNIT_SIZE = 40_000
 """Letters of generated passes from which compiling two units side by side is faster."""
 
 ELEMENT = "element:"
+ONLY_IN = "#if !defined(UNIT) || UNIT == "
 
 
 class NativeSource(NamedTuple):
@@ -81,7 +82,7 @@ def native_source(program: Program, width: int = 0) -> NativeSource:
         *(f"#define {name} {size}" for name, size in sizes.items()),
         before,
         *_in_units(passes, units, len(after)),
-        _only_in(0),
+        f"{ONLY_IN}0",
         *_tables(program, layout),
         *_look(layout, asked),
         "static void run_passes(Context& c) {\n  START;",
@@ -113,14 +114,10 @@ def _tables(program: Program, layout: NativeLayout) -> Iterator[str]:
         ("StepPlane", "STEP_TABLE"): layout.step_planes,
     }
     for (type, name), rows in tables.items():
-        items = ", ".join(f"{{{', '.join(map(str, row))}}}" for row in rows)
+        items = ", ".join(["{" + ", ".join(map(str, row)) + "}" for row in rows])
         yield f"static const std::vector<{type}> {name} = {{{items}}};"
     idents = ", ".join(f"{ident}u" for _, ident, _ in program.streams)
     yield f"static const std::vector<u32> STREAM_IDENT = {{{idents}}};"
-
-
-def _only_in(unit: int) -> str:
-    return f"#if !defined(UNIT) || UNIT == {unit}"
 
 
 def _in_units(passes: Sequence[str], units: int, driver: int) -> Iterator[str]:
@@ -132,7 +129,7 @@ def _in_units(passes: Sequence[str], units: int, driver: int) -> Iterator[str]:
         sizes[chosen[number]] += len(passes[number])
     yield from (f"void pass_{number}(Context& c);" for number in range(len(passes)))
     for number, text in enumerate(passes):
-        yield f"{_only_in(chosen[number])}\n{text}\n#endif"
+        yield f"{ONLY_IN}{chosen[number]}\n{text}\n#endif"
 
 
 def _look(layout: NativeLayout, asked: int) -> Iterator[str]:
@@ -143,16 +140,17 @@ def _look(layout: NativeLayout, asked: int) -> Iterator[str]:
         yield "static void look(Context&) {}"
         return
     low = len(planes) // 2
+    before, stores, present = [], [], []
+    for code in ids:
+        before.append(f"V id{code} = splat(0);")
+        stores.append(f"id{code} |= low{code & (1 << low) - 1} & high{code >> low};")
+        present.append(f"(any(id{code}) ? 1ull << {code} : 0)")
     yield "static void look(Context& c) {"
     yield from (f"const V* e{bit} = c.slot[{plane}]->data;" for bit, plane in enumerate(planes))
-    yield from (f"V id{code} = splat(0);" for code in ids)
-    yield "for (size_t i = 0; i < c.g.cells(); i++) {"
+    yield from (*before, "for (size_t i = 0; i < c.g.cells(); i++) {")
     yield from (f"const V b{bit} = e{bit}[i];" for bit in range(len(planes)))
     for name, bits in (("low", range(low)), ("high", range(low, len(planes)))):
         for code in range(1 << len(bits)):
             factors = [f"{'' if code >> i & 1 else '~'}b{bit}" for i, bit in enumerate(bits)]
             yield f"const V {name}{code} = {' & '.join(factors) or '~splat(0)'};"
-    yield from (f"id{code} |= low{code & (1 << low) - 1} & high{code >> low};" for code in ids)
-    yield "}"
-    yield "c.present = " + " | ".join(f"(any(id{code}) ? 1ull << {code} : 0)" for code in ids) + ";"
-    yield "}"
+    yield from (*stores, "}", f"c.present = {' | '.join(present)};", "}")

@@ -37,26 +37,24 @@ LOOP = (
 def pass_text(schedule: Schedule, number: int, layout: NativeLayout) -> str:
     """The function of a pass."""
     printer = _Printer(layout, schedule)
-    changed = {slot for slot, _ in schedule.leaves}
-    lines = []
+    changed = dict(schedule.leaves)
+    lines = [f"// pass {number}\n__attribute__((noinline)) void pass_{number}(Context& c) {{"]
     if schedule.when is not None:
         lines.append(f"if (!{answer(schedule.when)}) return;")
     lines.append(
         "const int words = c.g.words, height = c.g.height, width = c.g.width, strips = c.g.strips ? -1 : 0, "
         "*rows = c.rows(); (void)words; (void)height; (void)width; (void)strips; (void)rows;"
     )
+    rest = variables(schedule)
     for slot, var in schedule.finds:
+        del rest[var.name]
         place = printer.slot(slot, var)
         if slot in changed:  # nothing else refers to it while the pass runs, so it may be overwritten
             lines.append(f"{kind(var)}* {var.name} = {place}; {place} = nullptr;")
         else:
             lines.append(f"{kind(var)}* {var.name} = keep({place});")
-    there = {var.name for _, var in schedule.finds}
-    lines += [f"{kind(var)}* {name};" for name, var in variables(schedule).items() if name not in there]
-    lines += printer.block(schedule.body)
-    lines += printer.leave(schedule)
-    body = "\n".join(lines)
-    return f"// pass {number}\n__attribute__((noinline)) void pass_{number}(Context& c) {{\n{body}\n}}"
+    lines += [f"{kind(var)}* {var.name};" for var in rest.values()]
+    return "\n".join([*lines, *printer.block(schedule.body), *printer.leave(schedule), "}"])
 
 
 def kind(var: Var) -> str:
@@ -117,15 +115,16 @@ class _Printer(Printer):
 
     def leave(self, schedule: Schedule) -> Iterator[str]:
         """The new values of slots; all are read before any is stored."""
-        places = []
+        places, names = [], {}
         for i, (slot, node) in enumerate(schedule.leaves):
             var = Var(_held(node), node.type)
             yield f"{kind(var)}* s{i} = keep({var.name});"
             places.append(self.slot(slot, var))
+            if node.op == "load":
+                names[var.name] = f"give(c, {var.name});"
         for i, place in enumerate(places):
             yield f"if ({place}) give(c, {place}); {place} = s{i};"
-        names = dict.fromkeys(str(node.attr) for _, node in schedule.leaves if node.op == "load")
-        yield " ".join(f"give(c, {name});" for name in names)
+        yield " ".join(names.values())
 
     def guard(self, guard: Guard) -> Iterator[str]:
         asked = " || ".join(f"!{node.attr}->zero" for node in guard.when) or "false"
@@ -200,23 +199,21 @@ class _Printer(Printer):
         yield "\n".join([*values.lines, *stores, "}", *after, "}"])
 
     def words(self, loop: Compute) -> Iterator[str]:
-        names = [out.var.name for out in loop.outs]
+        """Planes that are all computed anew."""
         values = _Words(self.layout)
-        stores = [
-            f"{{ const V o = {values.clean(out.value)}; d{out.var.name}[i] = o; a{out.var.name} |= o; }}"
-            for out in loop.outs
-        ]
-        if loop.when is not None:
-            without = " ".join(f"{name} = keep(c.nothing);" for name in names)
-            yield f"if (!{answer(loop.when)}) {{ {without} }} else {{"
-        else:
-            yield "{"
+        without, before, stores, after = [], [], [], []
+        for out in loop.outs:
+            name = out.var.name
+            without.append(f"{name} = keep(c.nothing);")
+            before.append(f"{name} = take(c); V* const d{name} = {name}->data; V a{name} = splat(0);")
+            stores.append(f"{{ const V o = {values.clean(out.value)}; d{name}[i] = o; a{name} |= o; }}")
+            after.append(f"{name}->zero = !any(a{name});")
+        skipped = "" if loop.when is None else f"if (!{answer(loop.when)}) {{ {' '.join(without)} }} else "
+        yield f"{skipped}{{"
         yield values.ready()
-        yield " ".join(
-            f"{name} = take(c); V* const d{name} = {name}->data; V a{name} = splat(0);" for name in names
-        )
+        yield " ".join(before)
         yield "\n".join([values.pointers(), LOOP, *values.lines, *stores, "}"])
-        yield " ".join(f"{name}->zero = !any(a{name});" for name in names) + " }"
+        yield " ".join(after) + " }"
 
 
 def _held(value: Node) -> str:
