@@ -8,7 +8,7 @@ from powderdsl.ir.ops import REAL, Node, ordered
 from powderdsl.ir.single import all_ones, single
 from powderdsl.schedule.join import keeps
 from powderdsl.schedule.rows import ANY_PASS, RowLoop, Rows, region_of, rows_of
-from powderdsl.schedule.types import Out, Sweeps, alternatives, is_zero
+from powderdsl.schedule.types import Sweeps, alternatives, is_zero
 from powderdsl.targets.layout import NativeLayout, literal, param_key
 from powderdsl.targets.printing import CellValues
 
@@ -55,9 +55,9 @@ def sweeps_text(sweeps: Sweeps, layout: NativeLayout, reaches: Mapping[str, int]
     text = "\n".join(["[&]() __attribute__((noinline)) {", *lines, "}();"])
     if any(loop.region is None for loop in sweeps.loops):
         return f"{{\n{text}\n}}"
-    lasting = [out for out in rows.outs if out.var.name not in rows.rings]
-    quiet = " ".join(f"{out.var.name} = keep({_quiet(out)});" for out in lasting)
-    quiet += " ".join(f" give(c, {out.into});" for out in lasting if out.into is not None)
+    lasting = [(out.var.name, out.otherwise, out.into) for out in rows.outs if out.var.name not in rows.rings]
+    quiet = " ".join(f"{name} = keep({held(value)});" for name, value, _ in lasting if value is not None)
+    quiet += " ".join(f" give(c, {old});" for _, _, old in lasting if old is not None)
     return f"if ({' && '.join(_nothing(rows)) or 'true'}) {{ {quiet} }} else {{\n{text}\n}}"
 
 
@@ -104,11 +104,13 @@ def _nothing(rows: Rows) -> list[str]:
     return list(dict.fromkeys(tests))
 
 
-def _quiet(out: Out) -> str:
-    """What holds the value outside the region."""
-    if out.var.type == REAL:
+def held(value: Node) -> str:
+    """The variable that holds a plane or field, or a constant one of the context."""
+    if value.op == "load":
+        return str(value.attr)
+    if value.type == REAL:
         return "c.calm"
-    return "c.everything" if out.otherwise is not None and out.otherwise.attr else "c.nothing"
+    return "c.everything" if value.attr else "c.nothing"
 
 
 class _Loop(CellValues[str]):
@@ -121,6 +123,7 @@ class _Loop(CellValues[str]):
         self.choices = [node for node in ordered(out.value for out in self.outs) if node.op == "select"]
         self.passing = [out.var.name for out in self.outs if out.var.name in rows.rings]
         self.lasting = [out for out in self.outs if out.var.type == REAL and out.var.name not in rows.rings]
+        self.fields = [out.var.name for out in self.outs if out.var.type == REAL]
         self.flags = [out.var.name for out in self.outs if out.var.type != REAL]
         self.pointers: dict[str, str] = {}
         """Names of pointers to rows, set up once a row, by their values."""
@@ -168,7 +171,7 @@ class _Loop(CellValues[str]):
         """Pointers to the rows that the loop writes."""
         for name in self.flags:
             yield f"Word* o{name} = &lane_word(v{name}, row * words, lane);"
-        for name in (out.var.name for out in self.outs if out.var.type == REAL):
+        for name in self.fields:
             if ring := self.rows.rings.get(name):
                 row = f"waiting_row(c, {ring.first} + (y & {ring.depth - 1})); {self.at(name, 0)} = o{name}"
             else:
@@ -177,7 +180,7 @@ class _Loop(CellValues[str]):
 
     def ends(self) -> Iterator[str]:
         """The columns beyond the edges of what the loop has written."""
-        for name in (out.var.name for out in self.outs if out.var.type == REAL):
+        for name in self.fields:
             if self.is_bare(name):
                 bare = self.rows.rings[name].bare
                 yield f"bare_row<{bare}>(c, o{name});" if bare else ""
@@ -187,17 +190,15 @@ class _Loop(CellValues[str]):
 
     def quiet(self) -> Iterator[str]:
         """What a row outside the region gets."""
-        for out in self.outs:
-            name = out.var.name
-            if name in self.rows.rings:
-                yield f"{self.at(name, 0)} = nothing;"
-            elif out.otherwise is not None and out.otherwise.op == "load":
-                continue
-            elif out.var.type == REAL:
-                yield f"v{name}.live[base + y] = 0;"
-            else:
-                rest = "c.valid(w)[lane]" if out.otherwise is not None and out.otherwise.attr else "0"
-                yield f"for (int w = 0; w < words; w++) lane_word(v{name}, row * words + w, lane) = {rest};"
+        for var, value in self.plan.loop.unchanged():
+            if var.name in self.rows.rings:
+                yield f"{self.at(var.name, 0)} = nothing;"
+            elif var.type == REAL and value.op == "const":
+                yield f"v{var.name}.live[base + y] = 0;"
+            elif value.op == "const":
+                word = f"lane_word(v{var.name}, row * words + w, lane)"
+                rest = "c.valid(w)[lane]" if value.attr else "0"
+                yield f"for (int w = 0; w < words; w++) {word} = {rest};"
 
     # Rows, chunk by chunk
 

@@ -23,7 +23,7 @@ from powderdsl.schedule.types import (
     variables,
 )
 from powderdsl.schedule.words import difference, is_cleared
-from powderdsl.targets.cpp.cells import sweeps_text
+from powderdsl.targets.cpp.cells import held, sweeps_text
 from powderdsl.targets.layout import NativeLayout, fixed_key, is_run, number, param_key
 from powderdsl.targets.printing import Printer, WordText, drawn_where, limited_draw
 
@@ -92,7 +92,7 @@ class _Printer(Printer):
         value, args = out.value, out.value.args
         match value.op:
             case "load" | "const":
-                call = f"keep({_held(value)})"
+                call = f"keep({held(value)})"
             case "shift":
                 dy, dx, _ = value.attr
                 self.layout.cover(around_rows=abs(dy))
@@ -117,7 +117,7 @@ class _Printer(Printer):
         """The new values of slots; all are read before any is stored."""
         places, names = [], {}
         for i, (slot, node) in enumerate(schedule.leaves):
-            var = Var(_held(node), node.type)
+            var = Var(held(node), node.type)
             yield f"{kind(var)}* s{i} = keep({var.name});"
             places.append(self.slot(slot, var))
             if node.op == "load":
@@ -133,7 +133,7 @@ class _Printer(Printer):
         if guard.keeps:
             yield "} else {"
             for var, value in guard.keeps:
-                yield f"{var.name} = keep({_held(value)});"
+                yield f"{var.name} = keep({held(value)});"
         yield "}"
 
     def move(self, move: Move) -> Iterator[str]:
@@ -147,15 +147,15 @@ class _Printer(Printer):
         if copies and move.op == "swap":
             target = f"shifted(c, {movers}, {-dy}, {-dx})"
             for plane in move.planes:
-                old, rest = plane.old.attr, _held(plane.leaves)
+                old, rest = plane.old.attr, held(plane.leaves)
                 call = f"swap_plane(c, {old}, {movers}, target, {rest}, {dy}, {dx})"
                 yield f"{{ Plane* target = {target}; {plane.new.name} = {call}; give(c, target); }}"
                 if plane.into:
                     yield f"give(c, {plane.into});"
             return
         for plane in move.planes:
-            held = _held(plane.leaves) if copies else plane.old.attr
-            yield f"{plane.new.name} = {plane.into or f'keep({held})'};"
+            old = held(plane.leaves) if copies else plane.old.attr
+            yield f"{plane.new.name} = {plane.into or f'keep({old})'};"
         if fields:
             yield _call(
                 "Field", move.planes, f"swap_fields<{len(move.planes)}>(c, {movers}, {dy}, {dx}, all);"
@@ -214,15 +214,6 @@ class _Printer(Printer):
         yield " ".join(before)
         yield "\n".join([values.pointers(), LOOP, *values.lines, *stores, "}"])
         yield " ".join(after) + " }"
-
-
-def _held(value: Node) -> str:
-    """The variable that holds a plane or field, or a constant one of the context."""
-    if value.op == "load":
-        return str(value.attr)
-    if value.type == REAL:
-        return "c.calm"
-    return "c.everything" if value.attr else "c.nothing"
 
 
 def _call(type: str, planes: Sequence[Carried], call: str) -> str:
