@@ -41,18 +41,21 @@ class Printer:
 class Values(Generic[Named]):
     """Statements of a block, and the names of what they compute: of values by the id of their node, of anything else by a key."""
 
+    direct: tuple[str, ...] = ("shift",)
+    """Operations that are printed without names for their arguments; of a `when`, only the first one needs a name."""
+
     def __init__(self) -> None:
         self.lines: list[str] = []
         self.known: dict[object, Named] = {}
         self.count = 0
 
-    def needed(self, node: Node) -> Sequence[Node]:
-        """The arguments that get names before a node does."""
+    def node(self, node: Node) -> Named:
+        """The name or expression of a node."""
         raise NotImplementedError
 
-    def made(self, node: Node) -> None:
-        """Name a node, by adding it to `known`."""
-        raise NotImplementedError
+    def named(self, node: Node, value: Named) -> Named:
+        """A node's expression, or a name for it."""
+        return value
 
     def of(self, root: Node) -> Named:
         """The name of a value."""
@@ -66,12 +69,16 @@ class Values(Generic[Named]):
                 stack.append((node, True))
                 stack.extend((arg, False) for arg in reversed(needed))
             else:
-                self.made(node)
+                self.known[id(node)] = self.named(node, self.node(node))
         return self.known[id(root)]
 
-    def named(self, node: Node, value: Named) -> Named:
-        """A node's expression, or a name for it."""
-        return value
+    def needed(self, node: Node) -> Sequence[Node]:
+        """The arguments that get names before a node does."""
+        return node.args[:1] if node.op == "when" else () if node.op in self.direct else node.args
+
+    def args(self, node: Node) -> list[Named]:
+        """The names of these arguments."""
+        return [self.known[id(arg)] for arg in self.needed(node)]
 
     def fresh(self, prefix: str) -> str:
         """A name that the block does not have yet."""
@@ -87,33 +94,8 @@ class Values(Generic[Named]):
         self.lines, self.known = outer, known
 
 
-class WordValues(Values[Named]):
-    """Flags, a word at a time. `leaf` is the operation whose arguments are read directly."""
-
-    leaf = "shift"
-
-    def node(self, node: Node) -> Named:
-        """The expression of a node whose arguments have names."""
-        raise NotImplementedError
-
-    def lazy(self, node: Node) -> Named:
-        """The name of a `when`; its second argument is computed only where the first holds."""
-        raise NotImplementedError
-
-    def needed(self, node: Node) -> Sequence[Node]:
-        return node.args[:1] if node.op == "when" else () if node.op == self.leaf else node.args
-
-    def made(self, node: Node) -> None:
-        value = self.lazy(node) if node.op == "when" else self.node(node)
-        self.known[id(node)] = self.named(node, value)
-
-    def args(self, node: Node) -> list[Named]:
-        """The names of the arguments of a node that needs them."""
-        return [self.known[id(arg)] for arg in self.needed(node)]
-
-
-class WordText(WordValues[str]):
-    """Flags as text. `type` is the type of a word."""
+class WordText(Values[str]):
+    """Flags as text, a word at a time. `type` is the type of a word."""
 
     type: str
 
@@ -143,15 +125,8 @@ def drawn_where(draw: Node) -> Node | None:
 class CellValues(Values[Named]):
     """Floats, and flags that compare them. `choices` are all choices that the block computes."""
 
+    direct = ("select", "led", "shift")
     choices: list[Node]
-
-    def node(self, node: Node) -> Named:
-        """The name or expression of a node whose arguments have names; a shift reads its argument directly."""
-        raise NotImplementedError
-
-    def led(self, node: Node) -> Named:
-        """The name of a comparison that is computed only where its leader holds."""
-        raise NotImplementedError
 
     def variable(self, value: Named) -> Named:
         """A new variable, which choices change."""
@@ -161,18 +136,8 @@ class CellValues(Values[Named]):
         """Set variables to other values where a mask holds; these are computed only if it holds in some cell."""
         raise NotImplementedError
 
-    def needed(self, node: Node) -> Sequence[Node]:
-        return () if node.op in ("select", "led", "shift") else node.args
-
-    def made(self, node: Node) -> None:
-        if node.op == "select":
-            self.choice(node)
-        else:
-            value = self.led(node) if node.op == "led" else self.node(node)
-            self.known[id(node)] = self.named(node, value)
-
-    def choice(self, node: Node) -> None:
-        """Name a chain of choices, and others on the same masks: the components of a vector share their tests."""
+    def choice(self, node: Node) -> Named:
+        """The name of a chain of choices. Others on the same masks get names, too: the components of a vector share tests."""
         chains = self.alike(node)
         variables = [self.variable(self.of(chain[-1].args[2])) for chain in chains]
         for choices in reversed(list(zip(*chains, strict=True))):
@@ -182,6 +147,7 @@ class CellValues(Values[Named]):
             self.chosen(choices[0].args[0], variables, [choice.args[1] for choice in choices])
             self.known = known
         self.known |= {id(chain[0]): name for chain, name in zip(chains, variables, strict=True)}
+        return variables[0]
 
     def chain(self, node: Node) -> list[Node]:
         """A choice and those below it in its third argument, the outermost first."""

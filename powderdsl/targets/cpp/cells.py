@@ -349,6 +349,10 @@ class _Loop(CellValues[str]):
                 return self.temporary(f"splatf(c.param_real[{self.layout.param_reals[attr[0]]}][l])")
             case "draw":
                 return self.draw(node)
+            case "select":
+                return self.choice(node)
+            case "led":
+                return self.led(node)
             case "shift":
                 dy, dx, wraps = attr
                 field = str(node.args[0].attr)

@@ -298,6 +298,8 @@ class _Words(WordText):
                 return f"{self.plane(str(attr))}[i]"
             case "shift":
                 return self.shift(node)
+            case "when":
+                return self.lazy(node)
             case "const":
                 return self.name("valid" if attr else "splat(0)")
             case "param":

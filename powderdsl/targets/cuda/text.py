@@ -113,7 +113,7 @@ class _Printer(Printer):
 class _Words(WordText):
     """Values of a word of 32 columns, each as an expression or the name of a constant."""
 
-    type, leaf = "u32", "live"
+    type, direct = "u32", ("live",)
 
     def __init__(self, printer: _Printer):
         super().__init__()
@@ -143,6 +143,8 @@ class _Words(WordText):
                 return f"P({self.printer.number(attr)})[i]"
             case "shift":
                 return self.shift(node)
+            case "when":
+                return self.lazy(node)
             case "const":
                 return "valid" if attr else "0u"
             case "param":
@@ -223,6 +225,10 @@ class _Cells(CellValues[str]):
                 return self.name(f"draw_cell({self.layout.streams[stream]}, l, y, x, {bits})")
             case "shift":
                 return self.name(self.shift(node))
+            case "select":
+                return self.choice(node)
+            case "led":
+                return self.led(node)
         args = [self.known[id(arg)] for arg in node.args]
         if node.op in ("eq", "lt", "le"):
             name = self.fresh("b")

@@ -310,6 +310,10 @@ class Chunks(CellValues[Value]):
                 return load("v128.load32_splat", loop.lane >> 1, memory.at("reals", number))
             case "draw":
                 return self.draw(node)
+            case "select":
+                return self.choice(node)
+            case "led":
+                return self.led(node)
             case "shift":
                 dy, dx, wraps = attr
                 start = loop.starts[str(node.args[0].attr), dy, wraps or not dy]

@@ -11,9 +11,8 @@ from operator import or_
 from powderdsl.ir.ops import Node, ordered
 from powderdsl.schedule.costs import is_coin
 from powderdsl.schedule.types import Compute, alternatives, loaded
-from powderdsl.targets import printing
 from powderdsl.targets.layout import Layout, fixed_key, is_run, param_key
-from powderdsl.targets.printing import drawn_where, limited_draw
+from powderdsl.targets.printing import Values, drawn_where, limited_draw
 from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, load, op
 from powderdsl.targets.wasm.library import SOME, WORD, ZERO, Library, choose, some
 
@@ -109,7 +108,7 @@ class WordLoop(Loop):
                 f.set((place + self.at)[flags], value)
 
 
-class WordValues(printing.WordValues[Value]):
+class WordValues(Values[Value]):
     """Flags of a word. Values that are used once are not named."""
 
     def __init__(self, loop: WordLoop):
@@ -157,6 +156,8 @@ class WordValues(printing.WordValues[Value]):
                 return const("v128", -1 if node.attr else 0)
             case "shift":
                 return self.shift(node)
+            case "when":
+                return self.lazy(node)
             case "param":
                 number = self.memory.layout.param_planes[param_key(node)]
                 return load("v128.load", ZERO, self.memory.at("params", number))
