@@ -40,13 +40,12 @@ from powderdsl.model.elaborate import MAX_MOMENTS, MAX_RULES
 from powderdsl.model.examples import MAX_SIDE
 from powderdsl.model.expressions.typer import MAX_ROUNDS, MAX_SET_DEPTH
 from powderdsl.model.operations import FUNCTIONS
-from powderdsl.model.schema import KEYS, MAX_NAME, OPEN
+from powderdsl.model.schema import MAX_NAME, RECORDS, keys_of
 from powderdsl.model.text import show_offset
 from powderdsl.model.types import Kernel
 from powderdsl.syntax import parse, yaml_tree
 from powderdsl.syntax.parse import reserved_words
-from powderdsl.tasks.file import TASK_KEYS
-from powderdsl.worlds.scene.read import FILE_KEYS, SCENE_KEYS
+from powderdsl.tasks import file as _task_file  # noqa: F401  # declares the records of tasks
 from powderdsl.worlds.scene.statements import SETTING, STATEMENTS
 
 DOCS = Path(__file__).resolve().parent
@@ -65,13 +64,10 @@ SHAPES = {
     "lines": "expressions",
     "line": "an expression",
     "block": "a block",
-    "statements": "invariants",
+    "invariants": "invariants",
     "any": "see below",
 }
 """Shapes of `schema.Key`, as readers see them."""
-
-
-ALL_KEYS = {**KEYS, **TASK_KEYS, "scene": SCENE_KEYS, "scenes": FILE_KEYS}
 
 
 def table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
@@ -85,10 +81,10 @@ def keys(context: str) -> str:
     """The keys of one kind of mapping in a rule file."""
     rows = [
         (f"`{name}`" + (" *" if key.required else ""), SHAPES[key.shape], key.about)
-        for name, key in ALL_KEYS[context].items()
+        for name, key in keys_of(RECORDS[context]).items()
     ]
-    if context in OPEN:
-        rows.append((f"*{OPEN[context]}'s name*", "an expression", "its value"))
+    if others := RECORDS[context].OTHERS:
+        rows.append((f"*{others}'s name*", "an expression", "its value"))
     return table(("key", "value", "what it says"), rows)
 
 
@@ -303,7 +299,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "stages": stages,
     "planner": planner,
     "commands": commands,
-    **{f"keys {context}": partial(keys, context) for context in ALL_KEYS},
+    **{f"keys {context}": partial(keys, context) for context in RECORDS},
 }
 """What can stand between markers, by name."""
 

@@ -1,119 +1,179 @@
-"""Declarations of rule files: shapes and literals are checked, names are not resolved."""
+"""Declarations of rule files: shapes and literals are checked, names are not resolved.
+
+The fields of these records are the keys that rule files may have: messages and the docs list them from here.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import MISSING
 from itertools import chain
 
 from powderdsl.diagnostics import Source
+from powderdsl.model.builtins import MAX_SIDE_MULTIPLE
+from powderdsl.model.schema import Entry, Form, Record, keyed
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.yaml_tree import Scalar
 
 Pair = tuple[Scalar, Syntax]
 """A name and its value."""
 
+Words = tuple[Scalar, ...]
 
-@dataclass(frozen=True)
-class TypedDecl:
-    """A property, field or parameter as written: its kind and default are still syntax."""
+COLOR = Form(
+    "#[0-9A-Fa-f]{6}",
+    "a color",
+    'expected "#RRGGBB"',
+    'six hexadecimal digits in quotes: {}: "#RRGGBB"',
+    str.upper,
+)
+GLYPH = Form("[!->@-~]", "a glyph", "expected one printable ASCII character, not `?`", 'quote it: glyph: "#"')
+STEPS = Form(
+    "[0-9]{1,5} steps?",
+    "a number of steps",
+    "expected `50 steps`",
+    "write `50 steps`",
+    lambda text: int(text.split()[0]),
+)
 
-    name: Scalar
-    type: Syntax | None = None
-    default: Syntax | None = None
-    at: str = "place"
-    of: Syntax | None = None
-    resets: str | None = None
+
+class TagDecl(Entry, noun="a tag"):
+    about: str = keyed("what its elements have in common", "", short=True)
+
+
+class PropertyDecl(Entry, noun="a property", others="an element"):
+    type: Syntax | None = keyed("its kind", required=True, short=True)
+    default: Syntax | None = keyed("the value of elements that do not say")
+    about: str = keyed("what it is, in a sentence", "")
     values: tuple[Pair, ...] = ()
     """The values of single elements."""
-    about: str = ""
-    tint: TintDecl | None = None
 
 
-@dataclass(frozen=True)
-class TintDecl:
+class TintDecl(Entry, noun="a tint"):
     """How a field tints cells in pictures, as written."""
 
-    key: Scalar
-    color: str
-    full: int
-    most: Syntax | None
+    color: str = keyed(
+        'the color that cells are tinted toward, quoted: "#RRGGBB"', MISSING, name="to", form=COLOR
+    )
+    full: int = keyed("the length at which a cell would have that color", MISSING, bounds=(1, 1000))
+    most: Syntax | None = keyed(
+        "the most of that color that a cell can have, such as `50%`; all of it by default"
+    )
 
 
-@dataclass(frozen=True)
-class RampDecl:
+class FieldDecl(Entry, noun="a field", others="an element"):
+    type: Syntax | None = keyed("its kind", required=True)
+    at: str = keyed(
+        "`element`: it travels with it; `place`: it stays",
+        "place",
+        required=True,
+        choices=("element", "place"),
+    )
+    default: Syntax | None = keyed("its value in a fresh cell; that of one element beside it, by its name")
+    of: Syntax | None = keyed("the elements that have it; others read the default")
+    resets: str | None = keyed("`step`: back to the default when a step starts", choices=("step",))
+    tint: TintDecl | None = keyed("how it tints cells in pictures, if it is a vector")
+    about: str = keyed("what it is, in a sentence", "")
+    values: tuple[Pair, ...] = ()
+    """The defaults of single elements."""
+
+
+class ScratchDecl(Entry, noun="a scratch field"):
+    type: Syntax | None = keyed("its kind", short=True)
+
+
+class ParamDecl(Entry, noun="a parameter"):
+    type: Syntax | None = keyed("its kind", required=True)
+    default: Syntax | None = keyed("its value unless the user says otherwise", required=True, short=True)
+    about: str = keyed("what it does, in a sentence", "")
+
+
+TypedDecl = PropertyDecl | FieldDecl | ParamDecl
+
+
+class RampDecl(Entry, noun="a color_by"):
     """How an element's color follows a field, as written. `start` is None for the element's own color."""
 
-    key: Scalar
-    field: Scalar
-    start: str | None
-    end: str
-    over: Syntax | None
+    field: Scalar = keyed("the field that the color follows", MISSING)
+    start: str | None = keyed(
+        "the color at the low end of the range, quoted; the element's own by default",
+        name="from",
+        form=COLOR,
+    )
+    end: str = keyed(
+        'the color at the high end of the range, quoted: "#RRGGBB"', MISSING, name="to", form=COLOR
+    )
+    over: Syntax | None = keyed("the range, LOW..HIGH; all values of the field by default")
 
 
-@dataclass(frozen=True)
-class ElementDecl:
-    name: Scalar
-    id: int | None = None
+class ElementDecl(Entry, noun="an element", others="a property or field"):
+    id: int | None = keyed("the number it asks for, 0 to 255; a free one otherwise", bounds=(0, 255))
     id_scalar: Scalar | None = None
-    color: str = "#000000"
-    glyph: str = ""
-    about: str = ""
-    tags: tuple[Scalar, ...] = ()
+    color: str = keyed('its color, quoted: "#RRGGBB"', "#000000", required=True, form=COLOR)
+    ramp: RampDecl | None = keyed("how its color follows a field", name="color_by")
+    glyph: str = keyed(
+        "one character for ASCII art; the first free letter of its name otherwise", "", form=GLYPH
+    )
+    about: str = keyed("what it is, in a sentence", "")
+    tags: Words = keyed("the tags it carries", ())
+    override: bool = keyed("yes: replaces an element of another pack", False)
     values: tuple[Pair, ...] = ()
-    override: bool = False
-    ramp: RampDecl | None = None
 
 
-@dataclass(frozen=True)
-class AlsoDecl:
+class AlsoDecl(Entry, others="a property or field"):
     """Tags, values, a color and a ramp that a pack adds to an element of another pack, or a ruleset to one of its packs'."""
 
-    name: Scalar
-    tags: tuple[Scalar, ...] = ()
+    tags: Words = keyed("tags to add", (), short=True)
+    color: str | None = keyed('another color, quoted: "#RRGGBB"', form=COLOR)
+    ramp: RampDecl | None = keyed("how its color follows a field", name="color_by")
     values: tuple[Pair, ...] = ()
-    ramp: RampDecl | None = None
-    color: str | None = None
 
 
-@dataclass(frozen=True)
-class KernelDecl:
-    name: Scalar
-    rows: tuple[tuple[int, ...], ...]
-    wrap: bool
-    shape: Syntax | None = None
-    """`box(5)`, instead of rows."""
+class KernelDecl(Entry, noun="a kernel"):
+    rows: tuple[tuple[int, ...], ...] = keyed(
+        "rows of integer weights, an odd number of each, at most 31", (), shape="words"
+    )
+    shape: Syntax | None = keyed("instead of rows: a shape and its radius, `disc(3)`")
+    edges: str | None = keyed(
+        "`nothing` (the default) or `wrap`: what lies outside the grid", choices=("nothing", "wrap")
+    )
+
+    @property
+    def wrap(self) -> bool:
+        return self.edges == "wrap"
 
 
-@dataclass(frozen=True)
-class StreamDecl:
-    name: Scalar
-    bits: int = 16
+class StreamDecl(Entry, noun="a stream"):
+    bits: int = keyed("resolution of a draw: 16 or 32", 16, choices=("16", "32"))
+    about: str = keyed("what it is for", "")
 
 
-@dataclass(frozen=True)
-class TagDecl:
-    name: Scalar
-    about: str
+class SetDecl(Entry, noun="a set"):
+    members: Syntax = keyed("its elements", MISSING, short=True)
 
 
-@dataclass(frozen=True)
-class SetDecl:
-    name: Scalar
-    members: Syntax
-
-
-@dataclass(frozen=True)
-class Block:
+class Block(Record, noun="a block", prefixes=("for ", "repeat ")):
     """A block of a pass: lets, then one action (a substep of rules, or further blocks, maybe in a loop), then the rest."""
 
-    lets: tuple[Pair, ...] = ()
+    lets: tuple[Pair, ...] = keyed(
+        "names for values, fixed here, in order, before the rules run", (), name="let"
+    )
     header: Syntax | None = None
-    rules: tuple[Syntax, ...] = ()
+    rules: tuple[Syntax, ...] = keyed(
+        "a rule, a list of rules (one substep), or blocks in sequence", (), name="do", shape="block"
+    )
     blocks: tuple[Block, ...] = ()
-    symmetry: str | None = None
-    conflicts: str | None = None
-    then: tuple[Block, ...] = ()
+    then: tuple[Block, ...] = keyed(
+        "what comes after: a rule, a list of rules (one substep), or blocks in sequence", (), shape="block"
+    )
+    symmetry: str | None = keyed(
+        "`mirror`, `rotations` or `all`: the rules hold in these orientations at once",
+        choices=("mirror", "rotations", "all"),
+    )
+    conflicts: str | None = keyed(
+        "`drop_both`, `first_wins` or `overwrite`: what happens when rules claim one cell",
+        choices=("drop_both", "first_wins", "overwrite"),
+    )
 
     def walk(self) -> Iterator[Block]:
         """This block and all blocks in it, as they are written."""
@@ -127,58 +187,72 @@ class Block:
         return (*(value for _, value in self.lets), *([self.header] if self.header else []), *self.rules)
 
 
-@dataclass(frozen=True)
-class PassDecl:
-    name: Scalar
-    block: Block
-    about: str = ""
-    after: tuple[Scalar, ...] = ()
-    before: tuple[Scalar, ...] = ()
-    scratch: tuple[TypedDecl, ...] = ()
-    override: bool = False
+class PassDecl(Block, Entry, noun="a pass"):
+    about: str = keyed("what it does, in a sentence", "")
+    after: Words = keyed("passes that come before it", ())
+    before: Words = keyed("passes that come after it", ())
+    override: bool = keyed("yes: replaces a pass of another pack, in its place", False)
+    scratch: tuple[ScratchDecl, ...] = keyed(
+        "fields of this pass alone, which start at their default: a kind each", ()
+    )
 
 
-@dataclass(frozen=True)
-class TestDecl:
-    name: Scalar
-    given: Scalar | None
-    legend: tuple[tuple[Scalar, Scalar], ...]
-    steps: int
-    expect: Scalar | None
-    always: tuple[Syntax, ...]
-    seed: int | None
-    fields: tuple[tuple[Scalar, Scalar], ...]
-    expect_fields: tuple[tuple[Scalar, Scalar], ...]
-    often: tuple[tuple[Syntax, Syntax], ...]
+class TestDecl(Entry, noun="a test"):
+    given: Scalar | None = keyed("the start world, in ASCII", shape="text")
+    legend: tuple[tuple[Scalar, Scalar], ...] = keyed(
+        "what the characters mean, where glyphs will not do", (), maps="characters to elements"
+    )
+    fields: tuple[tuple[Scalar, Scalar], ...] = keyed(
+        "values of fields in the start world, a word a cell; `.` is the default",
+        (),
+        maps="fields to drawings",
+    )
+    steps: int = keyed("how many steps it runs: `50 steps`", 1, name="after", shape="text", form=STEPS)
+    expect: Scalar | None = keyed("what the world looks like then; `?` matches anything", shape="text")
+    expect_fields: tuple[tuple[Scalar, Scalar], ...] = keyed(
+        "values of fields then; `?` matches anything, `LOW..HIGH` a range", (), maps="fields to drawings"
+    )
+    always: tuple[Syntax, ...] = keyed("conditions that hold in every cell after every step", ())
+    often: tuple[tuple[Syntax, Syntax], ...] = keyed(
+        "how likely cells become something else: `egg -> hen: 2%`", (), shape="any"
+    )
     """Changes of cells, as `before -> after`, and their chances."""
+    seed: int | None = keyed("the seed; several are tried without one", bounds=(0, 2**31 - 1))
 
 
-Definition = TagDecl | TypedDecl | StreamDecl | KernelDecl | SetDecl | ElementDecl | PassDecl
+Definition = TagDecl | PropertyDecl | FieldDecl | StreamDecl | KernelDecl | SetDecl | ElementDecl | PassDecl
 
 
-@dataclass(frozen=True)
-class PackDecl:
+class PackDecl(Record, noun="a pack"):
     """One pack file."""
 
-    name: Scalar
+    name: Scalar = keyed("the pack's name", MISSING, name="pack")
     source: Source
-    about: str = ""
-    needs: tuple[Scalar, ...] = ()
-    provides: tuple[Scalar, ...] = ()
-    conflicts: tuple[Scalar, ...] = ()
-    tags: tuple[TagDecl, ...] = ()
-    properties: tuple[TypedDecl, ...] = ()
-    fields: tuple[TypedDecl, ...] = ()
-    streams: tuple[StreamDecl, ...] = ()
-    params: tuple[TypedDecl, ...] = ()
-    kernels: tuple[KernelDecl, ...] = ()
-    sets: tuple[SetDecl, ...] = ()
-    elements: tuple[ElementDecl, ...] = ()
-    also: tuple[AlsoDecl, ...] = ()
-    passes: tuple[PassDecl, ...] = ()
-    tests: tuple[TestDecl, ...] = ()
-    invariants: tuple[Syntax, ...] = ()
-    side_multiple: int = 1
+    about: str = keyed("what it is, in a sentence", "")
+    needs: Words = keyed("packs that must be loaded too", ())
+    provides: Words = keyed("packs that it stands in for, where others need them", ())
+    conflicts: Words = keyed("packs that must not be loaded too", ())
+    tags: tuple[TagDecl, ...] = keyed(
+        "tags that other packs give to their elements, with a sentence each", ()
+    )
+    properties: tuple[PropertyDecl, ...] = keyed("numbers that every element has", ())
+    fields: tuple[FieldDecl, ...] = keyed("state that cells carry", ())
+    streams: tuple[StreamDecl, ...] = keyed(
+        "sources of random numbers that rules share by name", (), shape="any"
+    )
+    params: tuple[ParamDecl, ...] = keyed("numbers that users override without editing the file", ())
+    side_multiple: int = keyed(
+        "rows and columns of all worlds are multiples of this number", 1, bounds=(1, MAX_SIDE_MULTIPLE)
+    )
+    kernels: tuple[KernelDecl, ...] = keyed("neighborhoods for `count` and `sum`", ())
+    sets: tuple[SetDecl, ...] = keyed("names for sets of elements", ())
+    elements: tuple[ElementDecl, ...] = keyed("the pack's elements", ())
+    also: tuple[AlsoDecl, ...] = keyed("tags and values for elements of other packs", ())
+    passes: tuple[PassDecl, ...] = keyed("what happens in a step", ())
+    invariants: tuple[Syntax, ...] = keyed(
+        "what is true of every world, a statement a line", (), shape="invariants"
+    )
+    tests: tuple[TestDecl, ...] = keyed("small worlds, and what becomes of them", (), shape="list")
 
     @property
     def definitions(self) -> tuple[Definition, ...]:
@@ -195,31 +269,36 @@ class PackDecl:
     @property
     def lines(self) -> Iterator[Syntax]:
         """The lines of its passes."""
-        return (line for one in self.passes for block in one.block.walk() for line in block.lines)
+        return (line for one in self.passes for block in one.walk() for line in block.lines)
 
 
-@dataclass(frozen=True)
-class RulesetDecl:
+class RulesetDecl(Record, noun="a ruleset"):
     """One ruleset file. `packs`, `slots`, `matrix`, `params` and `rename` are as written, without what it inherits.
 
     `base` is the ruleset that it extends; `beside` are rulesets that were named before it, of which it is not a part.
     """
 
-    name: Scalar
+    name: Scalar = keyed("the ruleset's name", MISSING, name="ruleset")
     source: Source
-    about: str = ""
-    packs: tuple[Scalar, ...] = ()
-    slots: int | None = None
-    matrix: tuple[Scalar, ...] = ()
-    params: tuple[Pair, ...] = ()
-    invariants: tuple[Syntax, ...] = ()
-    also: tuple[AlsoDecl, ...] = ()
-    rename: tuple[tuple[Scalar, Scalar], ...] = ()
+    about: str = keyed("what it is, in a sentence", "")
+    extends: Scalar | None = keyed("a ruleset that this one takes over, with all that it says")
+    packs: Words = keyed("the packs it is made of, besides those of the ruleset that it extends", ())
+    without: Words = keyed("packs of the ruleset that it extends, which are left out", ())
+    slots: int | None = keyed("how many element ids there are, vacant ones included", bounds=(1, 256))
+    matrix: Words = keyed("the channels of `World.matrix()`", ())
+    rename: tuple[tuple[Scalar, Scalar], ...] = keyed(
+        "other names for what packs define: `pack.word: name`", (), maps="qualified names to names"
+    )
     """Qualified names, and the names by which these definitions are known here."""
+    params: tuple[Pair, ...] = keyed(
+        "other values for the packs' parameters", (), maps="parameters to values"
+    )
+    also: tuple[AlsoDecl, ...] = keyed("other tags, values and colors for elements of its packs", ())
+    invariants: tuple[Syntax, ...] = keyed(
+        "what is true of every world, a statement a line", (), shape="invariants"
+    )
     left_out: tuple[PackDecl, ...] = ()
     """Packs of its own that are not loaded: the ids of their elements stay reserved."""
-    extends: Scalar | None = None
-    without: tuple[Scalar, ...] = ()
     base: RulesetDecl | None = None
     beside: tuple[RulesetDecl, ...] = ()
 

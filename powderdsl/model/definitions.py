@@ -7,16 +7,25 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from difflib import get_close_matches
+from typing import Any
 
 from powderdsl.diagnostics import Label, Span, suggest
 from powderdsl.model.composition.compose import Composition
 from powderdsl.model.composition.contested import given_values
 from powderdsl.model.composition.names import Named, report_unknown
-from powderdsl.model.declarations import KernelDecl, TintDecl, TypedDecl
+from powderdsl.model.declarations import (
+    ElementDecl,
+    FieldDecl,
+    KernelDecl,
+    ParamDecl,
+    PropertyDecl,
+    TintDecl,
+    TypedDecl,
+)
 from powderdsl.model.expressions.operators import Broken, Operand, Poisoned, Scope, SetOf, Unresolved
 from powderdsl.model.expressions.symbols import clamped, default_of, not_a_value, number_value, read_kind
 from powderdsl.model.expressions.typer import Typer
-from powderdsl.model.schema import KEYS
+from powderdsl.model.schema import keys_of
 from powderdsl.model.types import CHANCE, FLAG, Field, Kernel, Kind, Param, Property, Tint, Value
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.yaml_tree import Scalar
@@ -135,7 +144,7 @@ def _kind_of_literal(name: str, default: Syntax, typer: Typer) -> Kind:
     )  # fmt: skip
 
 
-def _param(named: Named[TypedDecl], typer: Typer) -> Param:
+def _param(named: Named[ParamDecl], typer: Typer) -> Param:
     kind = _kind("parameter", named.decl, typer)
     if named.decl.default is None:
         raise Poisoned
@@ -156,7 +165,7 @@ def _ruleset_params(composition: Composition) -> Iterator[tuple[Scalar, Syntax]]
 # Fields and properties
 
 
-def _field(named: Named[TypedDecl], typer: Typer) -> Field:
+def _field(named: Named[FieldDecl], typer: Typer) -> Field:
     decl, scope = named.decl, Scope(named.pack, {})
     kind = _kind("field", decl, typer)
     default = default_of(kind, typer.symbols.first_id)
@@ -180,7 +189,7 @@ def _tint(decl: TintDecl, kind: Kind, typer: Typer, scope: Scope) -> Tint:
     if kind.name != "vec2":
         fix = "cells show numbers and flags with `color_by`, under their element"
         raise typer.fail(
-            "PD401", f"a field of kind {kind} tints nothing", decl.key.span, "only vectors do", fix
+            "PD401", f"a field of kind {kind} tints nothing", decl.name.span, "only vectors do", fix
         )
     most = typer.constant(decl.most, CHANCE, scope) if decl.most else 1
     return Tint(decl.color, decl.full, float(most))  # type: ignore[arg-type]  # a chance is a number
@@ -202,18 +211,18 @@ def _element_values(typer: Typer) -> Given:
             given[name, word] = (syntax, pack)
         elif name not in composition.fields:
             if not key.is_optional:
-                keys = [own for own in KEYS["element"] if own != "override"]
+                keys = [own for own in keys_of(ElementDecl) if own != "override"]
                 known = (*composition.properties, *composition.fields, *keys)
                 report_unknown("property", key, known, typer.reporter, "PD108")
         elif field and element and _may_have(field, element.id, word, key, typer):
             with suppress(Poisoned):
                 value = typer.constant(syntax, field.kind, Scope(pack, {}))
                 own.setdefault(name, {})[element.id] = clamped(value, field.kind)
-    for noun, table in (("property", composition.properties), ("field", composition.fields)):
-        for name, named in table.items():
-            for key, _ in named.decl.values:
-                if composition.element(key.word, named.pack) is None and not key.is_optional:
-                    _report_unknown_key(key, noun, name, typer)
+    declared: list[Named[Any]] = [*composition.properties.values(), *composition.fields.values()]
+    for named in declared:
+        for key, _ in named.decl.values:
+            if composition.element(key.word, named.pack) is None and not key.is_optional:
+                _report_unknown_key(key, named, typer)
     for name, values in own.items():
         field = symbols.fields[name]
         kept = tuple((number, value) for number, value in sorted(values.items()) if value != field.default)
@@ -221,14 +230,14 @@ def _element_values(typer: Typer) -> Given:
     return given
 
 
-def _report_unknown_key(key: Scalar, noun: str, name: str, typer: Typer) -> None:
+def _report_unknown_key(key: Scalar, named: Named[Any], typer: Typer) -> None:
     """Report a key that should be an element's name: it may also be a misspelled key of the table."""
-    close = get_close_matches(key.text.lower(), sorted(KEYS[noun]), n=1, cutoff=0.75)
+    close = get_close_matches(key.text.lower(), sorted(keys_of(type(named.decl))), n=1, cutoff=0.75)
     if not close:
         report_unknown("element", key, typer.symbols.composition.elements, typer.reporter)
         return
     typer.reporter.error(
-        "PD108", f"unknown key `{key.text}`", key.span, f"not a key of the {noun} `{name}`",
+        "PD108", f"unknown key `{key.text}`", key.span, f"not a key of the {named.decl.NOUN.removeprefix('a ')} `{named.name}`",
         helps=[f"did you mean `{close[0]}`?"],
     )  # fmt: skip
 
@@ -250,7 +259,7 @@ def _may_have(field: Field, number: int, element: str, key: Scalar, typer: Typer
     return False
 
 
-def _values(named: Named[TypedDecl], given: Given, typer: Typer) -> tuple[Value | str, ...]:
+def _values(named: Named[PropertyDecl], given: Given, typer: Typer) -> tuple[Value | str, ...]:
     """A property's values by id."""
     composition, prop = typer.symbols.composition, typer.symbols.properties[named.name]
     default = named.decl.default

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from powderdsl.diagnostics import Span, suggest
 from powderdsl.model.builtins import DIRECTION_SETS, DIRECTIONS
 from powderdsl.model.composition.names import Named
-from powderdsl.model.declarations import Block, PassDecl, TypedDecl
+from powderdsl.model.declarations import Block, PassDecl, ScratchDecl
 from powderdsl.model.expressions.operators import (
     FALSE,
     IDENTITY,
@@ -108,7 +108,7 @@ class Elaborator:
         self._name, self._pack, self._word = named.name, named.pack, decl.name.text
         self._numbers = {
             id(rule): number
-            for number, rule in enumerate(rule for block in decl.block.walk() for rule in block.rules)
+            for number, rule in enumerate(rule for block in decl.walk() for rule in block.rules)
         }
         self._empty_lets: set[str] = set()
         self._lets: dict[str, int] = {}
@@ -118,12 +118,12 @@ class Elaborator:
         scope = Scope(named.pack, {})
         for item in decl.scratch:
             scope = scope.bind(**{item.name.text: self._scratch_field(item, scope)})
-        self._block(decl.block, scope, "", None, None)
+        self._block(decl, scope, "", None, None)
         if self._pending:
             self._moments.append(Moment(tuple(self._pending), (), "prove", ""))
         return Pass(self._name, named.pack, tuple(self._scratch), tuple(self._moments), decl.name.span)
 
-    def _scratch_field(self, decl: TypedDecl, scope: Scope) -> Operand:
+    def _scratch_field(self, decl: ScratchDecl, scope: Scope) -> Operand:
         name, span = f"{self._name}.{decl.name.text}", decl.name.span
         if not self._is_new(decl.name, scope) or decl.type is None:
             return Broken()

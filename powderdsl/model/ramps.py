@@ -30,7 +30,7 @@ def element_ramps(typer: Typer) -> dict[str, ColorRamp]:
             if field is None or name not in composition.elements:
                 continue
             ramp = _ramp(field, composition.elements[name], entry.ramp, typer)
-            here = pack, entry.ramp.key.span
+            here = pack, entry.ramp.name.span
             if name in found and found[name] != ramp:
                 report_replaced("color_by", name, places[name], here, composition, typer.reporter)
             places[name], found[name] = here, ramp

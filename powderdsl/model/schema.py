@@ -1,189 +1,142 @@
-"""The table of keys: what each mapping of a rule file may contain. Shape checks, docs and the JSON Schema use it."""
+"""Records of rule files, tasks, scenes and studies: dataclasses whose fields say their key, and their one reader."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from collections.abc import Mapping as Mapping_
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import MISSING, dataclass, field, fields, replace
 from difflib import get_close_matches
-from typing import Any
+from types import NoneType, UnionType
+from typing import Any, ClassVar, TypeVar, dataclass_transform, get_args, get_origin, get_type_hints
 
-from powderdsl.diagnostics import Reporter, Span, suggest
+from powderdsl.diagnostics import Reporter, Source, Span, suggest
 from powderdsl.diagnostics.printable import look_alikes, shown_character, spelled
-from powderdsl.model.builtins import MAX_SIDE_MULTIPLE
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.parse import parse_scalar
-from powderdsl.syntax.yaml_tree import Mapping, Node, Scalar, Sequence
+from powderdsl.syntax.yaml_tree import Mapping, Node, Scalar, Sequence, parse_yaml
+
+RECORDS: dict[str, type[Record]] = {}
+"""By name: that of the class in lower case, without `Decl`."""
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True)
+class Record:
+    """A mapping in a file, as a frozen dataclass. Its fields that are declared with `keyed` have a key.
+
+    `noun` has its article. `others` is what further keys name, if there may be any: their values are lines, and the
+    record has them in `values`. `prefixes` begin keys that are lines themselves: `for side in (left, right)`.
+    """
+
+    NOUN: ClassVar[str] = ""
+    OTHERS: ClassVar[str] = ""
+    PREFIXES: ClassVar[tuple[str, ...]] = ()
+
+    def __init_subclass__(cls, noun: str = "", others: str = "", prefixes: tuple[str, ...] = ()) -> None:
+        cls.NOUN, cls.OTHERS, cls.PREFIXES = noun, others, prefixes or cls.PREFIXES
+        RECORDS[cls.__name__.removesuffix("Decl").lower()] = dataclass(frozen=True, kw_only=True)(cls)
+
+
+class Entry(Record):
+    """A record below a key, which is its name. Keys of records with a noun are new names."""
+
+    name: Scalar
+
+
+R = TypeVar("R", bound=Record)
+E = TypeVar("E", bound=Entry)
+
+
+@dataclass(frozen=True)
+class Form:
+    """How a word is written: a pattern, a noun for such words, what to say of others, and the word's meaning."""
+
+    pattern: str
+    noun: str
+    label: str
+    fix: str = ""
+    """`{}` stands for the key."""
+    read: Callable[[str], Any] = str
+    code: str = "PD110"
+
+
+NAME_FORM = Form(
+    r"[A-Za-z0-9][A-Za-z0-9_-]{0,59}", "a name", "letters, digits, `-` and `_`, up to 60", code="PD111"
+)
+"""Names of tasks, scenes and studies, which are also names of files."""
 
 
 @dataclass(frozen=True)
 class Key:
-    """A key: the shape of its value, one line for the docs, and whether it is required.
+    """A key of a record.
 
-    Shapes: ``text word words number flag mapping list line lines statements block any``. A word may have to be one of
-    some `options`; a number lies within `bounds`.
+    `shape` follows from the field's type unless the declaration says another one: ``text word words number flag line
+    lines invariants mapping list block any``. A record's own reader makes the value of a ``list``, ``block`` or ``any``.
     """
 
-    shape: str
     about: str
+    """One line for messages, the docs and the JSON Schema."""
+    name: str = ""
+    """The key, if it is not the field's name."""
     required: bool = False
-    options: tuple[str, ...] = ()
+    """Whether the file must have it. A field without a default is required too: without it there is no record."""
+    choices: tuple[str, ...] = ()
     bounds: tuple[int, int] = (0, 0)
+    """Of a number."""
+    form: Form | None = None
+    """Of a word."""
+    short: bool = False
+    """Whether an entry that is no mapping says this."""
+    maps: str = ""
+    """From what to what a mapping leads that is no record: "parameters to values"."""
+    shape: str = ""
+    field: str = ""
+    type: Any = None
 
 
-_BLOCK = {
-    "let": Key("mapping", "names for values, fixed here, in order, before the rules run"),
-    "do": Key("block", "a rule, a list of rules (one substep), or blocks in sequence"),
-    "then": Key("block", "what comes after: a rule, a list of rules (one substep), or blocks in sequence"),
-    "symmetry": Key(
-        "word",
-        "`mirror`, `rotations` or `all`: the rules hold in these orientations at once",
-        options=("mirror", "rotations", "all"),
-    ),
-    "conflicts": Key(
-        "word",
-        "`drop_both`, `first_wins` or `overwrite`: what happens when rules claim one cell",
-        options=("drop_both", "first_wins", "overwrite"),
-    ),
+def keyed(about: str, default: Any = None, **how: Any) -> Any:
+    """A field of a record with a key; see `Key`."""
+    return field(default=default, metadata={"key": Key(about, **how)})
+
+
+_SHAPES: dict[Any, str] = {
+    str: "text",
+    Scalar: "word",
+    int: "number",
+    bool: "flag",
+    Syntax: "line",
+    tuple[Scalar, ...]: "words",
+    tuple[Syntax, ...]: "lines",
 }
-
-KEYS: dict[str, dict[str, Key]] = {
-    "pack": {
-        "pack": Key("word", "the pack's name", True),
-        "about": Key("text", "what it is, in a sentence"),
-        "needs": Key("words", "packs that must be loaded too"),
-        "provides": Key("words", "packs that it stands in for, where others need them"),
-        "conflicts": Key("words", "packs that must not be loaded too"),
-        "tags": Key("mapping", "tags that other packs give to their elements, with a sentence each"),
-        "properties": Key("mapping", "numbers that every element has"),
-        "fields": Key("mapping", "state that cells carry"),
-        "streams": Key("any", "sources of random numbers that rules share by name"),
-        "params": Key("mapping", "numbers that users override without editing the file"),
-        "side_multiple": Key(
-            "number",
-            "rows and columns of all worlds are multiples of this number",
-            bounds=(1, MAX_SIDE_MULTIPLE),
-        ),
-        "kernels": Key("mapping", "neighborhoods for `count` and `sum`"),
-        "sets": Key("mapping", "names for sets of elements"),
-        "elements": Key("mapping", "the pack's elements"),
-        "also": Key("mapping", "tags and values for elements of other packs"),
-        "passes": Key("mapping", "what happens in a step"),
-        "invariants": Key("statements", "what is true of every world, a statement a line"),
-        "tests": Key("list", "small worlds, and what becomes of them"),
-    },
-    "ruleset": {
-        "ruleset": Key("word", "the ruleset's name", True),
-        "about": Key("text", "what it is, in a sentence"),
-        "extends": Key("word", "a ruleset that this one takes over, with all that it says"),
-        "packs": Key("words", "the packs it is made of, besides those of the ruleset that it extends"),
-        "without": Key("words", "packs of the ruleset that it extends, which are left out"),
-        "slots": Key("number", "how many element ids there are, vacant ones included", bounds=(1, 256)),
-        "matrix": Key("words", "the channels of `World.matrix()`"),
-        "rename": Key("mapping", "other names for what packs define: `pack.word: name`"),
-        "params": Key("mapping", "other values for the packs' parameters"),
-        "also": Key("mapping", "other tags, values and colors for elements of its packs"),
-        "invariants": Key("statements", "what is true of every world, a statement a line"),
-    },
-    "property": {
-        "type": Key("line", "its kind", True),
-        "default": Key("line", "the value of elements that do not say"),
-        "about": Key("text", "what it is, in a sentence"),
-    },
-    "field": {
-        "type": Key("line", "its kind", True),
-        "at": Key(
-            "word", "`element`: it travels with it; `place`: it stays", True, options=("element", "place")
-        ),
-        "default": Key("line", "its value in a fresh cell; that of one element beside it, by its name"),
-        "of": Key("line", "the elements that have it; others read the default"),
-        "resets": Key("word", "`step`: back to the default when a step starts", options=("step",)),
-        "tint": Key("mapping", "how it tints cells in pictures, if it is a vector"),
-        "about": Key("text", "what it is, in a sentence"),
-    },
-    "tint": {
-        "to": Key("word", 'the color that cells are tinted toward, quoted: "#RRGGBB"', True),
-        "full": Key("number", "the length at which a cell would have that color", True, bounds=(1, 1000)),
-        "most": Key(
-            "line", "the most of that color that a cell can have, such as `50%`; all of it by default"
-        ),
-    },
-    "stream": {
-        "bits": Key("number", "resolution of a draw: 16 or 32", bounds=(16, 32)),
-        "about": Key("text", "what it is for"),
-    },
-    "param": {
-        "type": Key("line", "its kind", True),
-        "default": Key("line", "its value unless the user says otherwise", True),
-        "about": Key("text", "what it does, in a sentence"),
-    },
-    "kernel": {
-        "rows": Key("words", "rows of integer weights, an odd number of each, at most 31"),
-        "shape": Key("line", "instead of rows: a shape and its radius, `disc(3)`"),
-        "edges": Key(
-            "word",
-            "`nothing` (the default) or `wrap`: what lies outside the grid",
-            options=("nothing", "wrap"),
-        ),
-    },
-    "element": {
-        "id": Key("number", "the number it asks for, 0 to 255; a free one otherwise", bounds=(0, 255)),
-        "color": Key("word", 'its color, quoted: "#RRGGBB"', True),
-        "color_by": Key("mapping", "how its color follows a field"),
-        "glyph": Key("word", "one character for ASCII art; the first free letter of its name otherwise"),
-        "about": Key("text", "what it is, in a sentence"),
-        "tags": Key("words", "the tags it carries"),
-        "override": Key("flag", "yes: replaces an element of another pack"),
-    },
-    "also": {
-        "tags": Key("words", "tags to add"),
-        "color": Key("word", 'another color, quoted: "#RRGGBB"'),
-        "color_by": Key("mapping", "how its color follows a field"),
-    },
-    "color_by": {
-        "field": Key("word", "the field that the color follows", True),
-        "from": Key("word", "the color at the low end of the range, quoted; the element's own by default"),
-        "to": Key("word", 'the color at the high end of the range, quoted: "#RRGGBB"', True),
-        "over": Key("line", "the range, LOW..HIGH; all values of the field by default"),
-    },
-    "pass": {
-        "about": Key("text", "what it does, in a sentence"),
-        "after": Key("words", "passes that come before it"),
-        "before": Key("words", "passes that come after it"),
-        "override": Key("flag", "yes: replaces a pass of another pack, in its place"),
-        "scratch": Key("mapping", "fields of this pass alone, which start at their default: a kind each"),
-        **_BLOCK,
-    },
-    "block": _BLOCK,
-    "test": {
-        "given": Key("text", "the start world, in ASCII"),
-        "legend": Key("mapping", "what the characters mean, where glyphs will not do"),
-        "fields": Key("mapping", "values of fields in the start world, a word a cell; `.` is the default"),
-        "after": Key("text", "how many steps it runs: `50 steps`"),
-        "expect": Key("text", "what the world looks like then; `?` matches anything"),
-        "expect_fields": Key("mapping", "values of fields then; `?` matches anything, `LOW..HIGH` a range"),
-        "always": Key("any", "conditions that hold in every cell after every step"),
-        "often": Key("any", "how likely cells become something else: `egg -> hen: 2%`"),
-        "seed": Key("number", "the seed; several are tried without one", bounds=(0, 2**31 - 1)),
-    },
-}
-
-OPEN = {
-    "element": "a property or field",
-    "also": "a property or field",
-    "property": "an element",
-    "field": "an element",
-}
-"""Mappings that take further keys, and what these keys name."""
-
 VALUES = ("word", "number", "flag", "line")
+"""Shapes of a single value, which cannot be empty."""
 
-SECTIONS = ("text", "mapping", "words", "list", "statements", "any")
-"""Shapes without an empty value."""
 
-PREFIXES = {"pass": ("for ", "repeat "), "block": ("for ", "repeat ")}
-"""Keys that are read as lines: `for side in (left, right)`, `repeat 2`."""
+_KEYS: dict[type[Record], dict[str, Key]] = {}
+
+
+def keys_of(kind: type[Record]) -> dict[str, Key]:
+    """The keys of a record, its own before inherited ones."""
+    if kind in _KEYS:
+        return _KEYS[kind]
+    hints, keys = get_type_hints(kind), _KEYS.setdefault(kind, {})
+    for item in sorted(fields(kind), key=lambda item: item.name not in kind.__annotations__):  # type: ignore[arg-type]  # records are dataclasses
+        if "key" not in item.metadata:
+            continue
+        row: Key = item.metadata["key"]
+        hint = hints[item.name]
+        arms = [arm for arm in get_args(hint) if arm is not NoneType] if isinstance(hint, UnionType) else []
+        hint = arms[0] if len(arms) == 1 else hint
+        shape = "word" if hint is str and (row.choices or row.form) else _SHAPES.get(hint, "")
+        if not shape:
+            is_mapping = get_origin(hint) is tuple or (isinstance(hint, type) and issubclass(hint, Record))
+            shape = "mapping" if is_mapping else "any"
+        required = row.required or item.default is MISSING
+        name = row.name or item.name
+        keys[name] = replace(
+            row, name=name, required=required, shape=row.shape or shape, field=item.name, type=hint
+        )
+    return keys
+
 
 _MEANT = {
     "rules": "do",
@@ -194,9 +147,6 @@ _MEANT = {
     "constants": "params",
 }
 """Keys that people expect, and what they are called here."""
-
-HOMES = ("pack", "pass", "element", "task", "agent", "reward", "split", "color_by", "tint")
-"""Mappings to which a key may belong that stands in another one."""
 
 NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 MAX_NAME = 40
@@ -219,95 +169,152 @@ def comment_after(scalar: Scalar) -> Span | None:
     return Span(scalar.span.source, start + rest.index("#"), start + len(rest.rstrip()))
 
 
+def read_tree(source: Source, reporter: Reporter, start: str) -> Node | None:
+    """The located tree of a file, or None after a report. `start` says how such files start."""
+    tree = parse_yaml(source, reporter)
+    if tree is None and not reporter.has_errors:
+        reporter.error("PD107", f"{source.name} is empty", None, helps=[start])
+    return tree
+
+
 Entries = dict[str, tuple[Scalar, Node]]
 """The entries of a mapping by key: the key with its location, and its value."""
 
 
 class Reader:
-    """Reads located YAML by a table of keys, reporting what does not fit."""
+    """Reads records from located YAML, reporting what does not fit.
 
-    def __init__(self, reporter: Reporter, keys: Mapping_[str, dict[str, Key]] = KEYS):
+    `homes` are records to which a key may belong that stands in another one.
+    """
+
+    def __init__(self, reporter: Reporter, homes: tuple[type[Record], ...] = ()):
         self.reporter = reporter
-        self.keys = keys
+        self.homes = homes
 
-    def shape(self, node: Node, wanted: str, help_text: str = "") -> None:
-        """Report a node of the wrong shape."""
-        found = {Scalar: "a single value", Sequence: "a list", Mapping: "a mapping"}[type(node)]
-        helps = [help_text] if help_text else []
-        self.reporter.error(
-            "PD107", f"expected {wanted}, found {found}", first_line(node), f"this is {found}", helps=helps
+    # Records
+
+    def record(self, kind: type[R], node: Node, what: str, **given: Any) -> R | None:
+        """The record of a mapping; None after a report if a field without a default has no value.
+
+        Other fields that are absent, or wrong and reported, have their defaults.
+        """
+        return self.made(kind, **given, **self.values(kind, self.mapping(kind, node, what)))
+
+    def made(self, kind: type[R], **values: Any) -> R | None:
+        """A record of values by field, unless a field without a default lacks one."""
+        lacking = [one for one in keys_of(kind).values() if one.required and one.field not in values]
+        if any(getattr(kind, one.field, MISSING) is MISSING for one in lacking):
+            return None
+        return kind(**values)
+
+    def entry(self, kind: type[E], name: Scalar, node: Node) -> E | None:
+        """The record of one entry of a section. Without a mapping it is the value of its `short` key."""
+        keys = keys_of(kind)
+        short = next((row for row in keys.values() if row.short), None)
+        if short is None or (isinstance(node, Mapping) and len(keys) > 1):
+            noun = kind.NOUN.split(" ", 1)[-1]
+            return self.record(
+                kind, node, f"the {noun} `{name.text}`" if noun else f"`{name.text}`", name=name
+            )
+        value = self.value(short, name, node)
+        return self.made(kind, name=name, **({} if value is None else {short.field: value}))
+
+    def entries(self, kind: type[E], node: Node | None) -> Iterator[E]:
+        """The records of a section's entries."""
+        pairs = self.named(node, kind.NOUN) if kind.NOUN else self.pairs(node, "a mapping")
+        return (record for name, value in pairs if (record := self.entry(kind, name, value)) is not None)
+
+    def values(self, kind: type[Record], entries: Entries) -> dict[str, Any]:
+        """The values of entries by field. What is wrong is reported and left out."""
+        keys, found, others = keys_of(kind), {}, []
+        for name, (key, node) in entries.items():
+            if name in keys:
+                value = self.value(keys[name], key, node)
+                if value is not None:
+                    found[keys[name].field] = value
+            elif not name.startswith(kind.PREFIXES) and (line := self.line(node)):
+                others.append((key, line))
+        return found | {"values": tuple(others)} if kind.OTHERS else found
+
+    def value(self, row: Key, key: Scalar, node: Node) -> Any:
+        """The value of a key as its row says, None after a report."""
+        if row.shape in ("text", *VALUES):
+            return self._single(row, key, node)
+        if row.shape == "words":
+            return self.words(node)
+        if row.shape in ("lines", "invariants"):
+            return self.lines(node, "invariant" if row.shape == "invariants" else "expression")
+        if row.shape != "mapping":
+            return node
+        if get_origin(row.type) is not tuple:
+            return self._part(row, key, node) if is_record(row.type) else node
+        kind = get_args(row.type)[0]
+        if is_record(kind):
+            return tuple(self.entries(kind, node))
+        about = f"`{key.text}`: {row.about}"
+        pairs = (
+            self.pairs(node, f"a mapping from {row.maps}", about) if row.maps else self.named(node, "a value")
         )
+        if get_args(kind)[1] is Syntax:
+            return tuple((name, line) for name, part in pairs if (line := self.line(part)))
+        for name, part in pairs:
+            if not isinstance(part, Scalar):
+                self.shape(part, f"a single value for `{name.text}`", about)
+        return tuple((name, part) for name, part in pairs if isinstance(part, Scalar))
 
-    def read(self, node: Node, context: str, what: str) -> dict[str, Any]:
-        """The values of a mapping by key. What is absent, or wrong and reported, is left out."""
-        return self.values(self.mapping(node, context, what), context)
+    def _part(self, row: Key, key: Scalar, node: Node) -> Any:
+        """The record below a key."""
+        keys = keys_of(row.type)
+        if isinstance(node, Mapping) and not node.entries and not any(one.required for one in keys.values()):
+            helps = [", ".join(f"`{name}`: {one.about}" for name, one in keys.items())]
+            self.reporter.error("PD109", f"`{key.text}` says nothing", node.span, "empty", helps=helps)
+            return None
+        named = {"name": key} if issubclass(row.type, Entry) else {}
+        return self.record(row.type, node, f"`{key.text}`", **named)
 
-    def values(self, entries: Entries, context: str) -> dict[str, Any]:
-        """The values of entries, each read as the table says; entries with open keys are under `values`."""
-        table = self.keys[context]
-        found = {key: self._value(entries, key, table[key]) for key in entries if key in table}
-        if context in OPEN:
-            others = [entry for key, entry in entries.items() if key not in table]
-            found["values"] = tuple((key, line) for key, node in others if (line := self.line(node)))
-        return {key: value for key, value in found.items() if value is not None}
-
-    def _value(self, entries: Entries, key: str, row: Key) -> Any:
-        node = entries[key][1]
-        match row.shape:
-            case "text":
-                return self.text(entries, key)
-            case "word":
-                return self.choice(entries, key, row.options) if row.options else self.scalar(entries, key)
-            case "words":
-                return self.words(node)
-            case "number":
-                return self.number(entries, key, *row.bounds)
-            case "flag":
-                return self.choice(entries, key, ("yes", "no", "true", "false")) in ("yes", "true")
-            case "line":
-                return self.line(node) if isinstance(node, Scalar) else None
-            case "statements":
-                return self.lines(node, "invariant")
-        return node
-
-    def line(self, node: Node, start: str = "expression") -> Syntax | None:
-        """The syntax of a single line; `start` is the grammar's rule for it."""
-        if isinstance(node, Scalar):
-            return parse_scalar(node, start, self.reporter)
-        self.shape(node, "one line")
+    def _single(self, row: Key, key: Scalar, node: Node) -> Any:
+        """A value that is no list and no mapping."""
+        if not isinstance(node, Scalar):
+            is_set = row.shape == "line" and isinstance(node, Sequence)
+            fix = "a set is written `(a, b)`" if is_set else f"`{key.text}`: {row.about}"
+            self.shape(node, f"a single value for `{key.text}`", fix)
+        elif row.form is not None:
+            return self.formed(row.form, key.text, node)
+        elif row.choices or row.shape == "flag":
+            word = self.choice(key.text, node, row.choices or ("yes", "no", "true", "false"))
+            if row.shape == "flag":
+                return word in ("yes", "true")
+            return int(word) if word and row.shape == "number" else word
+        elif row.shape == "number":
+            return self.number(key.text, node, *row.bounds)
+        elif row.type is Syntax:
+            return self.line(node)
+        else:
+            return " ".join(node.text.split()) if row.type is str else node
         return None
 
-    def lines(self, node: Node | None, start: str = "expression") -> tuple[Syntax, ...]:
-        """A line, or a list of lines."""
-        items = () if node is None else node.items if isinstance(node, Sequence) else (node,)
-        return tuple(line for item in items if (line := self.line(item, start)))
-
-    def mapping(self, node: Node, context: str, what: str) -> Entries:
+    def mapping(self, kind: type[Record], node: Node, what: str) -> Entries:
         """The entries of a mapping by key, unknown keys reported and left out, missing ones reported."""
-        known = self.keys[context]
-        prefixes = PREFIXES.get(context, ())
+        known = keys_of(kind)
         if not isinstance(node, Mapping):
-            fix = "known keys: " + ", ".join(known)
-            if isinstance(node, Scalar) and node.text.startswith(prefixes):
-                fix = "a key ends with `:`"
+            is_loop = isinstance(node, Scalar) and node.text.startswith(kind.PREFIXES)
+            fix = "a key ends with `:`" if is_loop else "known keys: " + ", ".join(known)
             self.shape(node, f"a mapping with the keys of {what}", fix)
             return {}
         missing = {name for name, row in known.items() if row.required and node.get(name) is None}
         entries: Entries = {}
         for key, value in node.entries:
-            row = known.get(key.text)
             misspelled = get_close_matches(key.text.lower(), sorted(missing), n=1, cutoff=0.7)
-            if row is not None:
-                if not self._is_empty(key, value, row):
+            if key.text in known:
+                if not self._is_empty(key, value, known[key.text]):
                     entries[key.text] = (key, value)
-                    self._check_shape(row, key, value)
-            elif key.text.startswith(prefixes) or (context in OPEN and not misspelled):
+            elif key.text.startswith(kind.PREFIXES) or (kind.OTHERS and not misspelled):
                 entries[key.text] = (key, value)
             else:
                 missing -= set(misspelled)  # a key that is there under a wrong name is one mistake
                 self.reporter.error(
                     "PD108", f"unknown key `{key.text}`", key.span, f"not a key of {what}",
-                    helps=self._key_help(key.text, context, what),
+                    helps=self._key_help(key.text, kind, what),
                 )  # fmt: skip
         for name in sorted(missing):
             start = node.span.start
@@ -319,7 +326,11 @@ class Reader:
 
     def _is_empty(self, key: Scalar, value: Node, row: Key) -> bool:
         """Report a key that lacks its value, which YAML may take for a comment. Returns whether it does."""
-        if not isinstance(value, Scalar) or value.style != "plain" or value.text:
+        if isinstance(value, Scalar):
+            is_empty = value.style == "plain" and not value.text
+        else:
+            is_empty = row.required and isinstance(value, Sequence) and not value.items
+        if not is_empty:
             return False
         comment = comment_after(key)
         if row.required or row.shape in VALUES:
@@ -329,7 +340,7 @@ class Reader:
                 fix = f'put quotes around it: {key.text}: "{comment.text}"'
             self.reporter.error("PD109", f"`{key.text}` has no value", place, label, helps=[fix])
             return True
-        if row.shape not in SECTIONS or (row.shape == "text" and comment):
+        if row.shape == "block" or (row.shape == "text" and comment):
             return False
         self.reporter.report(
             "PD113", f"`{key.text}` is empty", key.span, "it has no entries",
@@ -337,30 +348,46 @@ class Reader:
         )  # fmt: skip
         return True
 
-    def _key_help(self, word: str, context: str, what: str) -> tuple[str, ...]:
+    def _key_help(self, word: str, kind: type[Record], what: str) -> tuple[str, ...]:
         """The fix for an unknown key: what it should be called, where it belongs, or that it is a rule."""
+        known = keys_of(kind)
         if any(sign in word for sign in ("->", ":=", " swaps ", " moves ", "swap ")):
             return ("YAML takes text before `: ` for a key: quote the rule",)
-        if context in PREFIXES and word == "repeat":
+        if kind.PREFIXES and word == "repeat":
             return ("say how often: `repeat 3:`",)
-        if context in PREFIXES and word == "for":
+        if kind.PREFIXES and word == "for":
             return ("say over what: `for side in (left, right):`",)
-        if word in _MEANT and _MEANT[word] in self.keys[context]:
+        if _MEANT.get(word) in known:
             return (f"did you mean `{_MEANT[word]}`?",)
-        close = suggest(word, self.keys[context], f"keys of {what}")
+        close = suggest(word, known, f"keys of {what}")
         if close and close[0].startswith("did"):
             return close
-        homes = [home for home in HOMES if home != context and word in self.keys.get(home, {})]
-        if homes:
-            article = "an" if homes[0] in ("element", "agent") else "a"
-            return (f"`{word}` is a key of {article} {homes[0]}: check the indentation",)
-        return close or ("known keys: " + ", ".join(self.keys[context]),)
+        home = next((one.NOUN for one in self.homes if one is not kind and word in keys_of(one)), None)
+        if home is not None:
+            return (f"`{word}` is a key of {home}: check the indentation",)
+        return close or ("known keys: " + ", ".join(known),)
 
-    def _check_shape(self, row: Key, key: Scalar, value: Node) -> None:
-        if row.shape in ("text", *VALUES) and not isinstance(value, Scalar):
-            is_set = row.shape == "line" and isinstance(value, Sequence)
-            fix = "a set is written `(a, b)`" if is_set else f"`{key.text}`: {row.about}"
-            self.shape(value, f"a single value for `{key.text}`", fix)
+    # Values
+
+    def shape(self, node: Node, wanted: str, help_text: str = "") -> None:
+        """Report a node of the wrong shape."""
+        found = {Scalar: "a single value", Sequence: "a list", Mapping: "a mapping"}[type(node)]
+        helps = [help_text] if help_text else []
+        self.reporter.error(
+            "PD107", f"expected {wanted}, found {found}", first_line(node), f"this is {found}", helps=helps
+        )
+
+    def line(self, node: Node, start: str = "expression") -> Syntax | None:
+        """The syntax of a single line; `start` is the grammar's rule for it."""
+        if isinstance(node, Scalar):
+            return parse_scalar(node, start, self.reporter)
+        self.shape(node, "one line")
+        return None
+
+    def lines(self, node: Node, start: str = "expression") -> tuple[Syntax, ...]:
+        """A line, or a list of lines."""
+        items = node.items if isinstance(node, Sequence) else (node,)
+        return tuple(line for item in items if (line := self.line(item, start)))
 
     def named(self, node: Node | None, what: str) -> Iterator[tuple[Scalar, Node]]:
         """Entries of a mapping whose keys are new names; bad names are reported and left out."""
@@ -395,9 +422,9 @@ class Reader:
         self.reporter.error("PD111", f"`{word}` cannot name {what}", key.span, label, helps=helps)
         return False
 
-    def words(self, node: Node | None) -> tuple[Scalar, ...]:
+    def words(self, node: Node) -> tuple[Scalar, ...]:
         """A word or a list of words."""
-        if node is None or (isinstance(node, Scalar) and node.text == ""):
+        if isinstance(node, Scalar) and node.text == "":
             return ()
         if isinstance(node, Mapping):
             self.shape(node, "a word or a list of words")
@@ -408,19 +435,18 @@ class Reader:
                 self.shape(item, "a word")
         return tuple(item for item in items if isinstance(item, Scalar))
 
-    def scalar(self, entries: Entries, key: str) -> Scalar | None:
-        value = entries.get(key, (None, None))[1]
-        return value if isinstance(value, Scalar) else None
+    def formed(self, form: Form, key: str, word: Scalar) -> Any:
+        """The meaning of a word of a form; None after reporting another word."""
+        if re.fullmatch(form.pattern, word.text.strip()):
+            return form.read(word.text.strip())
+        helps = [form.fix.format(key)] if form.fix else []
+        self.reporter.error(
+            form.code, f"`{word.text}` is not {form.noun}", word.span, form.label, helps=helps
+        )
+        return None
 
-    def text(self, entries: Entries, key: str) -> str:
-        value = self.scalar(entries, key)
-        return " ".join(value.text.split()) if value else ""
-
-    def number(self, entries: Entries, key: str, lo: int, hi: int) -> int | None:
+    def number(self, key: str, value: Scalar, lo: int, hi: int) -> int | None:
         """A decimal integer within bounds."""
-        value = self.scalar(entries, key)
-        if value is None:
-            return None
         if not re.fullmatch(r"-?(0|[1-9][0-9]*)", value.text):
             code, problem, label = "PD110", f"`{key}` must be an integer", "not an integer"
         elif len(value.text) > 12 or not lo <= int(value.text) <= hi:
@@ -430,11 +456,15 @@ class Reader:
         self.reporter.error(code, problem, value.span, label, helps=[f"write a number from {lo} to {hi}"])
         return None
 
-    def choice(self, entries: Entries, key: str, options: tuple[str, ...]) -> str | None:
-        value = self.scalar(entries, key)
-        if value is None or value.text in options:
-            return value.text if value else None
+    def choice(self, key: str, value: Scalar, options: tuple[str, ...]) -> str | None:
+        if value.text in options:
+            return value.text
         message = f"`{key}` must be one of " + ", ".join(f"`{option}`" for option in options)
         helps = suggest(value.text, options, "one of")
         self.reporter.error("PD110", message, value.span, "not one of them", helps=helps)
         return None
+
+
+def is_record(kind: Any) -> bool:
+    """Whether a type is that of a record."""
+    return isinstance(kind, type) and issubclass(kind, Record)

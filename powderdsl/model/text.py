@@ -66,7 +66,7 @@ def _pass_lines(decl: PassDecl) -> Iterator[str]:
     for item in decl.scratch:
         if item.type is not None:
             yield from _syntax_lines(f"scratch {item.name.text}", item.type, "    ")
-    yield from _block_lines(decl.block, "    ")
+    yield from _block_lines(decl, "    ")
 
 
 def _block_lines(block: Block, indent: str) -> Iterator[str]:

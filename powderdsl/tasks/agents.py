@@ -5,19 +5,19 @@ After a mistake has been reported, readers go on with values that are legal: no 
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 
 from powderdsl.diagnostics import Reporter, Span, suggest
-from powderdsl.model.schema import Entries, Reader, first_line
+from powderdsl.model.schema import Entry, Form, Reader, Record, first_line, keyed
 from powderdsl.model.state import slot_name
 from powderdsl.model.types import Expr, Ruleset
 from powderdsl.syntax import yaml_tree
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.parse import line_of, parse_scalar
+from powderdsl.syntax.yaml_tree import Node, Scalar
 from powderdsl.tasks.drawings import choice_ids, element_ids
 from powderdsl.tasks.goals import GoalChecker, parts_of
-from powderdsl.tasks.task import BLOW, NO_CHANGE, Agent, Expert, ExpertMove, Measure
+from powderdsl.tasks.task import BLOW, MAX_SIDE, NO_CHANGE, Agent, Expert, ExpertMove, Measure
 from powderdsl.worlds.raster import Shape, Size
 from powderdsl.worlds.scene.amounts import constants
 from powderdsl.worlds.scene.read import two_integers
@@ -27,33 +27,72 @@ ACTS = {"blow": BLOW, "nothing": NO_CHANGE}
 """Words of `may:` that are not elements."""
 
 
-def read_agent(
-    reader: Reader, key: yaml_tree.Scalar, node: yaml_tree.Node, rules: Ruleset, size: Size
-) -> Agent:
-    """The agent below a key."""
-    entries = reader.mapping(node, "agent", "an agent")
-    values = reader.values(entries, "agent")
-    choices = _choices(reader, values.get("may", ()), rules)
-    if "may" in entries and not values["may"]:
-        label = "nothing is allowed"
-        reader.reporter.error("PD804", "an agent that may do nothing", entries["may"][0].span, label)
-    blows = BLOW in choices
-    if blows and "speed" not in entries:
-        message, helps = "an agent that may blow lacks `speed`", ["`speed: 20` is the paper's"]
-        reader.reporter.error("PD109", message, key.span, "how fast?", helps=helps)
-    return Agent(
-        choices,
-        _pair(reader, values.get("brush"), "brush", 10, size),
-        _pair(reader, values.get("bins"), "bins", 16, size),
-        values.get("actions", 1),
-        values.get("steps_per_action", 1),
-        values.get("free_steps", 0),
-        _speed_field(reader, values.get("speed_field"), rules, blows, key.span),
-        _speed(reader, values.get("speed")),
+MAX_ACTIONS, MAX_STEPS, MAX_PLANS, MAX_MOVES = 1_000_000, 100_000, 10_000, 256
+"""The most actions of an episode, steps after one, plans of a search, and moves of an expert."""
+
+SPEED = Form(
+    r"-?(?![0.]*$)[0-9]{1,7}(\.[0-9]{1,6})?", "a speed: a number other than 0", "such as `20`", read=float
+)
+
+
+class AgentDecl(Entry, noun="an agent"):
+    may: tuple[Scalar, ...] = keyed("elements it may place, `any`, `blow`, `nothing`", (), required=True)
+    speed: Scalar | None = keyed("a number other than 0: the speed that blowing gives to cells")
+    speed_field: Scalar | None = keyed(
+        "the field that blowing sets; the ruleset's only vector, if it has one"
+    )
+    brush: Node | None = keyed("cells that an action changes: a number, or [rows, columns]; 10 by default")
+    bins: Node | None = keyed("places that it can act at: a number, or [rows, columns]; 16 by default")
+    actions: int = keyed("how many actions an episode has", 1, required=True, bounds=(1, MAX_ACTIONS))
+    steps_per_action: int = keyed("steps after each action; 1 by default", 1, bounds=(0, MAX_STEPS))
+    free_steps: int = keyed("steps after the last action, besides; 0 by default", 0, bounds=(0, MAX_STEPS))
+
+
+class ExpertDecl(Record, noun="an expert"):
+    search: int = keyed(
+        "random plans that are simulated in each world; the best one is played",
+        1,
+        required=True,
+        bounds=(1, MAX_PLANS),
     )
 
 
-def _choices(reader: Reader, words: Sequence[yaml_tree.Scalar], rules: Ruleset) -> tuple[int, ...]:
+class MoveDecl(Record, noun="a move"):
+    choose: Scalar | None = keyed("what it does: an element, `blow` or `nothing`", required=True)
+    toward: Scalar | None = keyed(
+        "where it blows: `left`, `right`, `above`, `below`, or both as `above.right`"
+    )
+    at: Node | None = keyed("where: `[row, column]`, or `most(CELLS)`, the block with most of these cells")
+    within: Scalar | None = keyed("a shape, in one line: only its cells count for `most`")
+    least: int | None = keyed(
+        "how many cells `most` must find for the move to apply; 1 by default",
+        bounds=(1, MAX_SIDE * MAX_SIDE),
+    )
+    condition: Syntax | None = keyed(
+        "when: a condition; the first move whose condition holds is played", name="if"
+    )
+
+
+def read_agent(reader: Reader, decl: AgentDecl, rules: Ruleset, size: Size) -> Agent:
+    """The agent that a task declares."""
+    choices, place = _choices(reader, decl.may, rules), decl.name.span
+    blows = BLOW in choices
+    if blows and decl.speed is None:
+        message, helps = "an agent that may blow lacks `speed`", ["`speed: 20` is the paper's"]
+        reader.reporter.error("PD109", message, place, "how fast?", helps=helps)
+    return Agent(
+        choices,
+        _pair(reader, decl.brush, "brush", 10, size),
+        _pair(reader, decl.bins, "bins", 16, size),
+        decl.actions,
+        decl.steps_per_action,
+        decl.free_steps,
+        _speed_field(reader, decl.speed_field, rules, blows, place),
+        reader.formed(SPEED, "speed", decl.speed) or 0.0 if decl.speed else 0.0,
+    )
+
+
+def _choices(reader: Reader, words: Sequence[Scalar], rules: Ruleset) -> tuple[int, ...]:
     """Element ids, ascending, then BLOW and NO_CHANGE."""
     elements: set[int] = set()
     for word in words:
@@ -65,17 +104,8 @@ def _choices(reader: Reader, words: Sequence[yaml_tree.Scalar], rules: Ruleset) 
     return (*sorted(elements), *sorted(acts, reverse=True))
 
 
-def _speed(reader: Reader, word: yaml_tree.Scalar | None) -> float:
-    if word is None:
-        return 0.0
-    if not re.fullmatch(r"-?[0-9]{1,7}(\.[0-9]{1,6})?", word.text) or float(word.text) == 0:
-        reader.reporter.error("PD110", "`speed` must be a number other than 0", word.span, "such as `20`")
-        return 0.0
-    return float(word.text)
-
-
 def _speed_field(
-    reader: Reader, named: yaml_tree.Scalar | None, rules: Ruleset, blows: bool, agent: Span
+    reader: Reader, named: Scalar | None, rules: Ruleset, blows: bool, agent: Span
 ) -> str | None:
     """The vector that blowing sets: the one named, or the only one there is."""
     vectors = [field.name for field in rules.fields if field.kind.name == "vec2" and not field.resets]
@@ -96,11 +126,11 @@ def _speed_field(
     return None
 
 
-def _pair(reader: Reader, node: yaml_tree.Node | None, key: str, usual: int, size: Size) -> Size:
+def _pair(reader: Reader, node: Node | None, key: str, usual: int, size: Size) -> Size:
     """Rows and columns: one number for both, or a list of two."""
     if node is None:
         return min(usual, size[0]), min(usual, size[1])
-    both = yaml_tree.Sequence((node, node), node.span) if isinstance(node, yaml_tree.Scalar) else node
+    both = yaml_tree.Sequence((node, node), node.span) if isinstance(node, Scalar) else node
     pair = two_integers(both)
     if pair is None or not all(1 <= count <= most for count, most in zip(pair, size, strict=True)):
         label = f"one number, or [rows, columns], from 1 to {size[0]} and {size[1]}"
@@ -109,7 +139,6 @@ def _pair(reader: Reader, node: yaml_tree.Node | None, key: str, usual: int, siz
     return pair
 
 
-MAX_MOVES = 256
 MOST = "most(CELLS)"
 _ROWS, _COLUMNS = {"above": -1, "below": 1}, {"left": -1, "right": 1}
 DIRECTIONS = {
@@ -122,11 +151,12 @@ DIRECTIONS = {
 
 
 def read_expert(
-    reader: Reader, node: yaml_tree.Node, agent: Agent, size: Size, rules: Ruleset, checker: GoalChecker
+    reader: Reader, node: Node, agent: Agent, size: Size, rules: Ruleset, checker: GoalChecker
 ) -> Expert | None:
     """The expert of a task, or None after reporting what is wrong with all of it."""
     if isinstance(node, yaml_tree.Mapping):
-        return Expert((), reader.read(node, "expert", "an expert").get("search", 1))
+        decl = reader.record(ExpertDecl, node, "an expert")
+        return None if decl is None else Expert((), decl.search)
     if not isinstance(node, yaml_tree.Sequence) or not node.items:
         reader.shape(node, "a list of moves", "each starts with `- choose: …`")
         return None
@@ -149,25 +179,24 @@ class _Move:
         self.reader, self.reporter, self.agent, self.size = reader, reader.reporter, agent, size
         self.rules, self.checker = rules, checker
 
-    def read(self, node: yaml_tree.Node) -> ExpertMove:
-        entries = self.reader.mapping(node, "move", "a move")
-        values = self.reader.values(entries, "move")
-        choice = self.choice(values.get("choose"))
-        cell, most = self.place(values.get("at"))
-        if cell is not None and ("within" in entries or "least" in entries):
+    def read(self, node: Node) -> ExpertMove:
+        decl = self.reader.record(MoveDecl, node, "a move") or MoveDecl()
+        choice = self.choice(decl.choose)
+        cell, most = self.place(decl.at)
+        if cell is not None and (decl.within is not None or decl.least is not None):
             message, helps = "only `at: most(CELLS)` counts cells", ["remove `within` and `least`"]
             self.reporter.error("PD804", message, first_line(node), "not used", helps=helps)
         return ExpertMove(
             choice or 0,
-            self.toward(entries, values.get("toward"), choice),
+            self.toward(decl, choice),
             cell,
             most,
-            self.condition(values.get("if")),
-            self.within(values.get("within")),
-            values.get("least", 1),
+            self.condition(decl.condition),
+            self.within(decl.within),
+            decl.least or 1,
         )
 
-    def choice(self, word: yaml_tree.Scalar | None) -> int | None:
+    def choice(self, word: Scalar | None) -> int | None:
         """A place among the agent's choices; None if it is missing, or after a report."""
         if word is None:
             return None
@@ -182,14 +211,15 @@ class _Move:
             return None
         return self.agent.choices.index(ids[0]) if ids else None
 
-    def toward(self, entries: Entries, word: yaml_tree.Scalar | None, choice: int | None) -> tuple[int, int]:
+    def toward(self, decl: MoveDecl, choice: int | None) -> tuple[int, int]:
         """Rows and columns; (0, 0) of what does not blow."""
-        if choice is None:
+        word = decl.toward
+        if choice is None or decl.choose is None:
             return 0, 0
         blows = self.agent.choices[choice] == BLOW
         if blows and word is None:
-            message, place = "a move that blows lacks `toward`", entries["choose"][1].span
-            self.reporter.error("PD109", message, place, "where?", helps=["`toward: right`"])
+            message, helps = "a move that blows lacks `toward`", ["`toward: right`"]
+            self.reporter.error("PD109", message, decl.choose.span, "where?", helps=helps)
         elif word is not None and not blows:
             message = "only `choose: blow` has a direction"
             self.reporter.error("PD804", message, word.span, "not used", helps=["remove `toward`"])
@@ -199,7 +229,7 @@ class _Move:
             self.reporter.error("PD804", message, word.span, "not a direction", helps=helps)
         return DIRECTIONS.get(word.text, (0, 0)) if word is not None else (0, 0)
 
-    def place(self, node: yaml_tree.Node | None) -> tuple[tuple[int, int] | None, Measure | None]:
+    def place(self, node: Node | None) -> tuple[tuple[int, int] | None, Measure | None]:
         """The cell, or the cells of which most are looked for; neither after a report."""
         if node is None:
             return (0, 0), None
@@ -209,7 +239,7 @@ class _Move:
                 label = f"[row, column] within {self.size[0]}×{self.size[1]} cells"
                 self.reporter.error("PD804", "no such cell", node.span, label)
             return cell, None
-        if not isinstance(node, yaml_tree.Scalar):
+        if not isinstance(node, Scalar):
             self.reader.shape(node, f"[row, column] or `{MOST}`")
             return None, None
         syntax = parse_scalar(node, "expression", self.reporter)
@@ -221,7 +251,7 @@ class _Move:
             return None, None
         return None, self.checker.measured("count", syntax.children[0])
 
-    def within(self, word: yaml_tree.Scalar | None) -> Shape | None:
+    def within(self, word: Scalar | None) -> Shape | None:
         span = line_of(word, "shape", self.reporter)
         statement = read_shape(span, self.reporter) if span is not None else None
         if statement is None:

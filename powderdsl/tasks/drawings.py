@@ -8,7 +8,7 @@ from pathlib import Path
 
 from powderdsl.arrays import NDArray, np
 from powderdsl.diagnostics import CompileError, Reporter, Span, suggest
-from powderdsl.model.schema import Reader, first_line
+from powderdsl.model.schema import Entry, Reader, first_line, keyed
 from powderdsl.model.types import Element, Expr, Ruleset
 from powderdsl.syntax import yaml_tree
 from powderdsl.syntax.ast import Syntax
@@ -332,17 +332,26 @@ LEAVE = 255
 """In a stamp: the cell stays as it is."""
 
 
-def read_stamp(key: yaml_tree.Scalar, node: yaml_tree.Node, reader: Reader, ruleset: Ruleset) -> Stamp | None:
+class StampDecl(Entry, noun="a stamp"):
+    art: yaml_tree.Scalar | None = keyed("ASCII art; `?` leaves a cell as it is", shape="text")
+    legend: tuple[tuple[yaml_tree.Scalar, yaml_tree.Scalar], ...] = keyed(
+        "what the characters mean, where glyphs will not do", (), maps="characters to elements"
+    )
+    scene: yaml_tree.Scalar | None = keyed(
+        "instead of art: a shipped scene, or a world's file beside the task's"
+    )
+
+
+def read_stamp(decl: StampDecl, reader: Reader, ruleset: Ruleset) -> Stamp | None:
     """The picture of a stamp, or None after a report."""
-    entries = reader.mapping(node, "stamp", "a stamp")
-    art, scene = reader.scalar(entries, "art"), reader.scalar(entries, "scene")
+    key, art, scene = decl.name, decl.art, decl.scene
     if (art is None) == (scene is None):
         label = "neither `art` nor `scene`" if art is None else "both `art` and `scene`"
         reader.reporter.error("PD109", f"the stamp `{key.text}` needs one picture", key.span, label)
         return None
     ids = _named(scene, reader, ruleset) if scene is not None else None
     if art is not None:
-        ids = _drawn(art, _legend(entries, reader), reader, ruleset)
+        ids = _drawn(art, _legend(decl, reader), reader, ruleset)
     if ids is None:
         return None
     if max(ids.shape) > MAX_SIDE:
@@ -352,15 +361,11 @@ def read_stamp(key: yaml_tree.Scalar, node: yaml_tree.Node, reader: Reader, rule
     return Stamp(key.text, tuple(map(tuple, ids.tolist())))
 
 
-def _legend(entries: dict[str, tuple[yaml_tree.Scalar, yaml_tree.Node]], reader: Reader) -> dict[str, str]:
-    node = entries["legend"][1] if "legend" in entries else None
-    found = {}
-    for key, value in node.entries if isinstance(node, yaml_tree.Mapping) else ():
-        if len(key.text) != 1 or not isinstance(value, yaml_tree.Scalar):
+def _legend(decl: StampDecl, reader: Reader) -> dict[str, str]:
+    for key, _ in decl.legend:
+        if len(key.text) != 1:
             reader.reporter.error("PD110", "a legend has single characters", key.span, "not one character")
-        else:
-            found[key.text] = value.text
-    return found
+    return {key.text: value.text for key, value in decl.legend if len(key.text) == 1}
 
 
 def _drawn(

@@ -12,16 +12,18 @@ from powderdsl.model.check import resolve_names
 from powderdsl.model.composition.palette import Palette
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.operations import FUNCTIONS as RULE_FUNCTIONS
-from powderdsl.model.schema import Entries, Key, Reader, first_line
+from powderdsl.model.schema import NAME_FORM, Entry, Reader, Record, first_line, keyed, read_tree
 from powderdsl.model.state import fits, size_problem
-from powderdsl.model.types import Expr, Ruleset
+from powderdsl.model.types import Ruleset
 from powderdsl.syntax import yaml_tree
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.parse import STATEMENTS, line_of, reserved_words
-from powderdsl.tasks.agents import read_agent, read_expert
+from powderdsl.syntax.yaml_tree import Node, Scalar
+from powderdsl.tasks.agents import AgentDecl, read_agent, read_expert
 from powderdsl.tasks.drawings import (
     Drawer,
     DrawingPlan,
+    StampDecl,
     element_ids,
     pass_on,
     read_items,
@@ -32,105 +34,80 @@ from powderdsl.tasks.goals import ACTION_WORDS, FUNCTIONS, GoalChecker
 from powderdsl.tasks.task import MAX_SIDE, Goal, Knob, Split, Stamp, Task
 from powderdsl.worlds.raster import Size
 from powderdsl.worlds.scene.amounts import Written, constants, number, read_amount, report_unknown
-from powderdsl.worlds.scene.read import can_be_called, two_integers
+from powderdsl.worlds.scene.read import two_integers
 from powderdsl.worlds.scene.statements import Statement, read_line, read_shape
 
-MAX_ACTIONS, MAX_STEPS, MAX_PLANS = 1_000_000, 100_000, 10_000
-"""The most actions of an episode, steps after one, and plans of a search."""
 
-_VARIANT = {
-    "knobs": Key("mapping", "other values for knobs"),
-    "let": Key("mapping", "other values or ranges for names of `let`"),
-    "parts": Key("mapping", "other statements for parts"),
-    "generate": Key("any", "other statements altogether"),
-}
+class KnobDecl(Entry, noun="a knob"):
+    default: Scalar | None = keyed(
+        "its value unless another is set; it may depend on knobs above it", required=True, shape="line"
+    )
+    range: Scalar | None = keyed("the values it may have: `LOW..HIGH`", required=True, shape="line")
+    about: str = keyed("what it does, in a sentence", "")
 
-TASK_KEYS: dict[str, dict[str, Key]] = {
-    "task": {
-        "task": Key("word", "the task's name", True),
-        "about": Key("text", "what is to be done, in a sentence"),
-        "family": Key("word", "what tasks of its kind have in common, such as `build` or `herd`"),
-        "rules": Key(
-            "word", "the rules of its worlds: a shipped ruleset, packs joined by `+`, or a file", True
-        ),
-        "params": Key("mapping", "other values for the rules' parameters"),
-        "size": Key("any", "[rows, columns]", True),
-        "fill": Key("word", "the element that is everywhere before anything is drawn", True),
-        "knobs": Key("mapping", "integers that are set from outside"),
-        "let": Key("mapping", "numbers and draws that statements and regions share, in order"),
-        "regions": Key("mapping", "names for sets of cells: a shape each, or a list of shapes"),
-        "stamps": Key("mapping", "pictures that statements paint"),
-        "parts": Key("mapping", "lists of statements with a name"),
-        "targets": Key("mapping", "pictures that rewards compare worlds with: lists of statements"),
-        "generate": Key("any", "statements, later ones over earlier ones"),
-        "agent": Key("mapping", "what an agent may do, and for how long", True),
-        "reward": Key("mapping", "what counts: `each`, `final`, or both; and `shaped`, for training"),
-        "end": Key("mapping", "conditions that end an episode: `success`, `failure`"),
-        "expert": Key("any", "how a good player acts: a list of moves, or `search: N`"),
-        "splits": Key("mapping", "other sets of worlds beside `train`"),
-    },
-    "knob": {
-        "default": Key("line", "its value unless another is set; it may depend on knobs above it", True),
-        "range": Key("line", "the values it may have: `LOW..HIGH`", True),
-        "about": Key("text", "what it does, in a sentence"),
-    },
-    "stamp": {
-        "art": Key("text", "ASCII art; `?` leaves a cell as it is"),
-        "legend": Key("mapping", "what the characters mean, where glyphs will not do"),
-        "scene": Key("word", "instead of art: a shipped scene, or a world's file beside the task's"),
-    },
-    "agent": {
-        "may": Key("words", "elements it may place, `any`, `blow`, `nothing`", True),
-        "speed": Key("word", "a number other than 0: the speed that blowing gives to cells"),
-        "speed_field": Key("word", "the field that blowing sets; the ruleset's only vector, if it has one"),
-        "brush": Key("any", "cells that an action changes: a number, or [rows, columns]; 10 by default"),
-        "bins": Key("any", "places that it can act at: a number, or [rows, columns]; 16 by default"),
-        "actions": Key("number", "how many actions an episode has", True, bounds=(1, MAX_ACTIONS)),
-        "steps_per_action": Key("number", "steps after each action; 1 by default", bounds=(0, MAX_STEPS)),
-        "free_steps": Key(
-            "number", "steps after the last action, besides; 0 by default", bounds=(0, MAX_STEPS)
-        ),
-    },
-    "reward": {
-        "each": Key("line", "given after every action"),
-        "final": Key("line", "given with the last action, after the free steps"),
-        "shaped": Key("line", "given after every action in place of both, where training asks for it"),
-    },
-    "end": {
-        "success": Key("line", "the episode ends, and the task is done"),
-        "failure": Key("line", "the episode ends, and the task is not done"),
-    },
-    "expert": {
-        "search": Key(
-            "number",
-            "random plans that are simulated in each world; the best one is played",
-            True,
-            bounds=(1, MAX_PLANS),
-        ),
-    },
-    "move": {
-        "choose": Key("word", "what it does: an element, `blow` or `nothing`", True),
-        "toward": Key("word", "where it blows: `left`, `right`, `above`, `below`, or both as `above.right`"),
-        "at": Key("any", "where: `[row, column]`, or `most(CELLS)`, the block with most of these cells"),
-        "within": Key("word", "a shape, in one line: only its cells count for `most`"),
-        "least": Key(
-            "number",
-            "how many cells `most` must find for the move to apply; 1 by default",
-            bounds=(1, MAX_SIDE * MAX_SIDE),
-        ),
-        "if": Key("line", "when: a condition; the first move whose condition holds is played"),
-    },
-    "split": {
-        "about": Key("text", "what it is for, in a sentence"),
-        **_VARIANT,
-        "stands": Key("list", "fixed worlds: a list of such changes, each with a name under `stand`"),
-    },
-    "stand": {
-        "stand": Key("word", "its name", True),
-        "about": Key("text", "what it shows, in a sentence"),
-        **_VARIANT,
-    },
-}
+
+class RewardDecl(Record, noun="a reward"):
+    each: Syntax | None = keyed("given after every action")
+    final: Syntax | None = keyed("given with the last action, after the free steps")
+    shaped: Syntax | None = keyed("given after every action in place of both, where training asks for it")
+
+
+class EndDecl(Record, noun="an end"):
+    success: Syntax | None = keyed("the episode ends, and the task is done")
+    failure: Syntax | None = keyed("the episode ends, and the task is not done")
+
+
+class Variant(Record):
+    """Changes of a task's worlds."""
+
+    knobs: Node | None = keyed("other values for knobs", shape="mapping")
+    let: Node | None = keyed("other values or ranges for names of `let`", shape="mapping")
+    parts: Node | None = keyed("other statements for parts", shape="mapping")
+    generate: Node | None = keyed("other statements altogether")
+
+
+class StandDecl(Variant, noun="a stand"):
+    stand: Scalar | None = keyed("its name", required=True)
+    about: str = keyed("what it shows, in a sentence", "")
+
+
+class SplitDecl(Variant, Entry, noun="a split"):
+    about: str = keyed("what it is for, in a sentence", "")
+    stands: Node | None = keyed(
+        "fixed worlds: a list of such changes, each with a name under `stand`", shape="list"
+    )
+
+
+class TaskDecl(Record, noun="a task"):
+    """A task's file as written."""
+
+    name: str = keyed("the task's name", "", name="task", required=True, form=NAME_FORM)
+    about: str = keyed("what is to be done, in a sentence", "")
+    family: str = keyed("what tasks of its kind have in common, such as `build` or `herd`", "", shape="word")
+    rules: Scalar | None = keyed(
+        "the rules of its worlds: a shipped ruleset, packs joined by `+`, or a file", required=True
+    )
+    params: tuple[tuple[Scalar, Scalar], ...] = keyed(
+        "other values for the rules' parameters", (), maps="parameters to values"
+    )
+    size: Node | None = keyed("[rows, columns]", required=True)
+    fill: Scalar | None = keyed("the element that is everywhere before anything is drawn", required=True)
+    knobs: tuple[KnobDecl, ...] = keyed("integers that are set from outside", ())
+    let: Node | None = keyed("numbers and draws that statements and regions share, in order", shape="mapping")
+    regions: Node | None = keyed(
+        "names for sets of cells: a shape each, or a list of shapes", shape="mapping"
+    )
+    stamps: tuple[StampDecl, ...] = keyed("pictures that statements paint", ())
+    parts: Node | None = keyed("lists of statements with a name", shape="mapping")
+    targets: Node | None = keyed(
+        "pictures that rewards compare worlds with: lists of statements", shape="mapping"
+    )
+    generate: Node | None = keyed("statements, later ones over earlier ones")
+    agent: AgentDecl | None = keyed("what an agent may do, and for how long", required=True)
+    reward: RewardDecl | None = keyed("what counts: `each`, `final`, or both; and `shaped`, for training")
+    end: EndDecl | None = keyed("conditions that end an episode: `success`, `failure`")
+    expert: Node | None = keyed("how a good player acts: a list of moves, or `search: N`")
+    splits: tuple[SplitDecl, ...] = keyed("other sets of worlds beside `train`", ())
 
 
 MAX_VARIANTS = 256
@@ -153,43 +130,27 @@ def read_task(
     Raises:
         CompileError: with everything that is wrong in the file, and in its rules.
     """
-    tree = yaml_tree.parse_yaml(source, reporter)
-    if tree is None and not reporter.has_errors:
-        helps = ["a task starts with `task: NAME`"]
-        reporter.error("PD107", f"{source.name} is empty", None, helps=helps)
+    tree = read_tree(source, reporter, "a task starts with `task: NAME`")
     reporter.raise_if_errors()
     assert tree is not None
-    reader = Reader(reporter, TASK_KEYS)
-    entries = reader.mapping(tree, "task", "a task")
-    values = reader.values(entries, "task")
-    word = values.get("rules")
-    written = _written_params(reader, values.get("params"))
+    reader = Reader(reporter, (TaskDecl, AgentDecl, RewardDecl, SplitDecl))
+    decl = reader.record(TaskDecl, tree, "a task")
+    word = decl.rules if decl is not None else None
     names = names_in_file(word.text, word.span, reporter) if word is not None and word.text else None
-    if word is None or names is None:
+    if decl is None or word is None or names is None:
         reporter.raise_if_errors()
         raise AssertionError("a task without rules was not reported")
-    rules = (*names, *packs)
+    rules, written = (*names, *packs), {name.text: value.text for name, value in decl.params}
     try:
         ruleset, _ = load_with_diagnostics(*rules, params={**written, **(params or {})}, palette=palette)
     except CompileError as error:
         pass_on(error, reporter, word.span)
         reporter.raise_if_errors()
         raise
-    loaded, decl = read(rules, Reporter())
-    typer, _ = resolve_names(loaded, decl, Reporter(), palette)
+    loaded, composed = read(rules, Reporter())
+    typer, _ = resolve_names(loaded, composed, Reporter(), palette)
     typer.reporter = typer.unknown.reporter = reporter
-    return _TaskReader(reader, entries, values, ruleset, typer, rules, knobs or {}).task()
-
-
-def _written_params(reader: Reader, node: yaml_tree.Node | None) -> dict[str, str]:
-    """The text of each parameter of the rules that the file sets."""
-    params = {}
-    for key, value in node.entries if isinstance(node, yaml_tree.Mapping) else ():
-        if isinstance(value, yaml_tree.Scalar):
-            params[key.text] = value.text
-        else:
-            reader.shape(value, "a single value")
-    return params
+    return _TaskReader(reader, decl, ruleset, typer, rules, knobs or {}).task()
 
 
 class _TaskReader:
@@ -198,14 +159,13 @@ class _TaskReader:
     def __init__(
         self,
         reader: Reader,
-        entries: Entries,
-        values: dict[str, Any],
+        decl: TaskDecl,
         ruleset: Ruleset,
         typer: Typer,
         rules: tuple[str, ...],
         given: Mapping[str, int],
     ):
-        self.reader, self.reporter, self.entries, self.values = reader, reader.reporter, entries, values
+        self.reader, self.reporter, self.decl = reader, reader.reporter, decl
         self.ruleset, self.typer, self.rules, self.given = ruleset, typer, rules, given
         own, _ = read(rules[:1], Reporter())
         self.own = {pack.name.text for pack in own}
@@ -214,46 +174,43 @@ class _TaskReader:
         self.broken: set[str] = set()
 
     def task(self) -> Task:
-        name, family = self.values.get("task"), self.values.get("family")
-        if name is not None:
-            can_be_called(name, "a task", self.reporter)
+        decl = self.decl
         size, fill, knobs = self.size(), self.fill(), self.knobs()
-        lets = read_lets(self.values.get("let"), self.reader)
+        lets = read_lets(decl.let, self.reader)
         for word, _ in lets:
             self.take(word)
+        regions = self.regions()
+        pictures = ((stamp, read_stamp(stamp, self.reader, self.ruleset)) for stamp in decl.stamps)
         plan = DrawingPlan(
             "train",
             fill,
             {knob.name: knob.value for knob in knobs},
             lets,
-            self.regions(),
-            self.stamps(),
-            self.lists("parts", "a part"),
-            self.lists("targets", "a target"),
-            read_items(self.values.get("generate"), self.reader),
+            regions,
+            {stamp.name.text: picture or Stamp(stamp.name.text, ((255,),)) for stamp, picture in pictures},
+            self.lists(decl.parts, "a part"),
+            self.lists(decl.targets, "a target"),
+            read_items(decl.generate, self.reader),
             frozenset(self.broken),
         )
         splits, used = self.splits(plan, size)
         checker = GoalChecker(self.typer, frozenset(plan.regions), frozenset(plan.targets), plan.knobs)
         agent = expert = None
-        if "agent" in self.entries:
-            agent = read_agent(self.reader, *self.entries["agent"], self.ruleset, size)
+        if decl.agent is not None:
+            agent = read_agent(self.reader, decl.agent, self.ruleset, size)
         goal = self.goal(checker)
-        if agent is not None and agent.choices and "expert" in self.values:
-            node = self.values["expert"]
-            expert = read_expert(self.reader, node, agent, size, self.ruleset, checker)
-        parts = self.values.get("parts")
-        for key, _ in parts.entries if isinstance(parts, yaml_tree.Mapping) else ():
+        if agent is not None and agent.choices and decl.expert is not None:
+            expert = read_expert(self.reader, decl.expert, agent, size, self.ruleset, checker)
+        for key, _ in decl.parts.entries if isinstance(decl.parts, yaml_tree.Mapping) else ():
             if key.text in plan.parts and key.text not in used:
                 message = f"the part `{key.text}` is never used"
                 self.reporter.report("PD507", message, key.span, "no list has it", helps=["remove it"])
         self.typer.unknown.report()
         self.reporter.raise_if_errors()
-        assert name is not None
         assert agent is not None
         return Task(
-            name.text,
-            self.values.get("about", ""),
+            decl.name,
+            decl.about,
             self.ruleset,
             size,
             knobs,
@@ -262,13 +219,13 @@ class _TaskReader:
             splits,
             expert,
             self.rules,
-            family.text if family else "",
+            decl.family,
         )
 
     # What worlds are made of
 
     def size(self) -> Size:
-        node = self.values.get("size")
+        node = self.decl.size
         if node is None:
             return 64, 64
         size = two_integers(node)
@@ -282,7 +239,7 @@ class _TaskReader:
         return size
 
     def fill(self) -> int:
-        name = self.values.get("fill")
+        name = self.decl.fill
         ids = element_ids(name, self.ruleset, self.reporter) if name else ()
         return ids[0] if ids else 0
 
@@ -309,21 +266,22 @@ class _TaskReader:
 
     def knobs(self) -> tuple[Knob, ...]:
         found: dict[str, Knob] = {}
-        for key, node in self.reader.named(self.values.get("knobs"), "a knob"):
-            self.take(key)
-            self.broken.add(key.text)
-            knob = self.knob(key, self.reader.mapping(node, "knob", "a knob"), found)
+        for decl in self.decl.knobs:
+            self.take(decl.name)
+            self.broken.add(decl.name.text)
+            knob = self.knob(decl, found)
             if knob is not None:
-                self.broken.discard(key.text)
-                found[key.text] = knob
+                self.broken.discard(knob.name)
+                found[knob.name] = knob
         for name in self.given:
             if name not in self.taken:
                 helps = suggest(name, found, "knobs") or ("the task has no knobs",)
                 self.reporter.error("PD803", f"no knob `{name}`", None, helps=helps)
         return tuple(found.values())
 
-    def knob(self, key: yaml_tree.Scalar, entries: Entries, above: Mapping[str, Knob]) -> Knob | None:
-        bounds, default = (self.line(entries, name, "operand") for name in ("range", "default"))
+    def knob(self, decl: KnobDecl, above: Mapping[str, Knob]) -> Knob | None:
+        key = decl.name
+        bounds, default = (self.line(word, "operand") for word in (decl.range, decl.default))
         if bounds is None or default is None:
             return None
         ends = bounds.children if bounds.kind == "range" else ()
@@ -351,52 +309,43 @@ class _TaskReader:
             if not low <= one <= high:
                 message = f"the knob `{key.text}` must lie in {low}..{high}"
                 self.reporter.error("PD803", message, span, f"{one} lies outside", notes=[f"it is {one}"])
-        return Knob(key.text, usual, low, high, chosen, self.reader.text(entries, "about"), key.span)
+        return Knob(key.text, usual, low, high, chosen, decl.about, key.span)
 
-    def line(self, entries: Entries, key: str, start: str) -> Syntax | None:
-        span = line_of(self.reader.scalar(entries, key), start, self.reporter)
+    def line(self, word: Scalar | None, start: str) -> Syntax | None:
+        span = line_of(word, start, self.reporter)
         return read_line(span, start, self.reporter) if span is not None else None
 
     def regions(self) -> dict[str, tuple[Statement, ...]]:
         found = {}
-        for key, node in self.reader.named(self.values.get("regions"), "a region"):
+        for key, node in self.reader.named(self.decl.regions, "a region"):
             self.take(key)
             shapes = []
             for item in node.items if isinstance(node, yaml_tree.Sequence) else (node,):
                 span = line_of(item, "shape", self.reporter)
-                if not isinstance(item, yaml_tree.Scalar):
+                if not isinstance(item, Scalar):
                     self.reader.shape(item, "a shape, such as `box rows 1:5 columns 2:8`")
                 elif span is not None:
                     shapes.append(read_shape(span, self.reporter))
             found[key.text] = tuple(one for one in shapes if one is not None)
         return found
 
-    def stamps(self) -> dict[str, Stamp]:
-        found = {}
-        for key, node in self.reader.named(self.values.get("stamps"), "a stamp"):
-            stamp = read_stamp(key, node, self.reader, self.ruleset)
-            found[key.text] = stamp or Stamp(key.text, ((255,),))
-        return found
-
-    def lists(self, section: str, what: str) -> dict[str, Any]:
-        named = self.reader.named(self.values.get(section), what)
-        return {key.text: read_items(node, self.reader) for key, node in named}
+    def lists(self, node: Node | None, what: str) -> dict[str, Any]:
+        return {key.text: read_items(item, self.reader) for key, item in self.reader.named(node, what)}
 
     # Splits
 
     def splits(self, plan: DrawingPlan, size: Size) -> tuple[tuple[Split, ...], set[str]]:
         """All splits, and the parts that any of them uses."""
-        plans = [("train", self.values.get("about", ""), [plan])]
-        for key, node in self.reader.named(self.values.get("splits"), "a split"):
-            entries = self.reader.mapping(node, "split", "a split")
-            base = self.varied(plan, entries, key.text)
-            variants = self.stands(base, entries["stands"][1]) if "stands" in entries else [base]
-            if key.text == "train":
+        plans = [("train", self.decl.about, [plan])]
+        for decl in self.decl.splits:
+            base = self.varied(plan, decl, decl.name.text)
+            if decl.name.text == "train":
                 label = "it is what the task itself says"
                 helps = ["choose another name, or change `generate`, `let` and `parts` of the task"]
                 message = "the split `train` is there already"
-                self.reporter.error("PD302", message, key.span, label, helps=helps)
-            plans.append((key.text, self.reader.text(entries, "about"), variants))
+                self.reporter.error("PD302", message, decl.name.span, label, helps=helps)
+            variants = [base] if decl.stands is None else self.stands(base, decl.stands)
+            plans.append((decl.name.text, decl.about, variants))
         splits, used = [], set()
         for name, about, variants in plans:
             drawers = [Drawer(variant, self.ruleset, size, self.reporter) for variant in variants]
@@ -404,7 +353,7 @@ class _TaskReader:
             used |= {part for drawer in drawers for part in drawer.used_parts}
         return tuple(splits), used
 
-    def stands(self, base: DrawingPlan, node: yaml_tree.Node) -> list[DrawingPlan]:
+    def stands(self, base: DrawingPlan, node: Node) -> list[DrawingPlan]:
         if not isinstance(node, yaml_tree.Sequence) or not node.items:
             self.reader.shape(node, "a list of stands", "each starts with `- stand: NAME`")
             return [base]
@@ -414,17 +363,16 @@ class _TaskReader:
             return [base]
         found = []
         for item in node.items:
-            entries = self.reader.mapping(item, "stand", "a stand")
-            name = self.reader.scalar(entries, "stand")
-            found.append(self.varied(base, entries, name.text if name else "?"))
+            decl = self.reader.record(StandDecl, item, "a stand")
+            if decl is not None:
+                found.append(self.varied(base, decl, decl.stand.text if decl.stand else "?"))
         return found
 
-    def varied(self, plan: DrawingPlan, entries: Entries, name: str) -> DrawingPlan:
+    def varied(self, plan: DrawingPlan, decl: Variant, name: str) -> DrawingPlan:
         """The plan with what a split or stand changes."""
-        nodes = {key: node for key, (_, node) in entries.items()}
         knobs = dict(plan.knobs)
         values = {name: number(value) for name, value in plan.knobs.items()}
-        for word, syntax in read_lets(nodes.get("knobs"), self.reader):
+        for word, syntax in read_lets(decl.knobs, self.reader):
             self.known(word, plan.knobs, "knob")
             amount = None if syntax is None else read_amount(syntax, values, self.reporter)
             if amount is not None and amount.op == "const":
@@ -432,15 +380,15 @@ class _TaskReader:
             elif amount is not None:
                 self.reporter.error("PD803", "a knob is one number", amount.span, "not an integer")
         lets = {word.text: (word, syntax) for word, syntax in plan.lets}
-        for word, syntax in read_lets(nodes.get("let"), self.reader):
+        for word, syntax in read_lets(decl.let, self.reader):
             self.known(word, lets, "number")
             if word.text in lets:
                 lets[word.text] = lets[word.text][0], syntax
         parts = dict(plan.parts)
-        for key, node in self.reader.named(nodes.get("parts"), "a part"):
+        for key, node in self.reader.named(decl.parts, "a part"):
             self.known(key, plan.parts, "part")
             parts[key.text] = read_items(node, self.reader)
-        items = read_items(nodes["generate"], self.reader) if "generate" in nodes else plan.items
+        items = plan.items if decl.generate is None else read_items(decl.generate, self.reader)
         return replace(plan, name=name, knobs=knobs, lets=list(lets.values()), parts=parts, items=items)
 
     def known(self, word: Written, known: Mapping[str, object], what: str) -> None:
@@ -448,13 +396,12 @@ class _TaskReader:
             report_unknown(what, word, known, self.reporter)
 
     def goal(self, checker: GoalChecker) -> Goal:
-        expressions: dict[str, Expr | None] = {}
-        for section, check in (("reward", checker.number), ("end", checker.condition)):
-            node = self.values.get(section)
-            if isinstance(node, yaml_tree.Mapping) and not node.entries:
-                helps = [", ".join(f"`{key}`: {row.about}" for key, row in TASK_KEYS[section].items())]
-                self.reporter.error("PD109", f"`{section}` says nothing", node.span, "empty", helps=helps)
-            elif node is not None:
-                lines = self.reader.read(node, section, f"`{section}`")
-                expressions |= {key: check(syntax) for key, syntax in lines.items()}
-        return Goal(*(expressions.get(key) for key in ("each", "final", "success", "failure", "shaped")))
+        reward, end = self.decl.reward or RewardDecl(), self.decl.end or EndDecl()
+        each, final, shaped = (
+            None if line is None else checker.number(line)
+            for line in (reward.each, reward.final, reward.shaped)
+        )
+        success, failure = (
+            None if line is None else checker.condition(line) for line in (end.success, end.failure)
+        )
+        return Goal(each, final, success, failure, shaped)

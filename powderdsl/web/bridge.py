@@ -19,10 +19,11 @@ from powderdsl.arrays import np
 from powderdsl.compiler import load_with_diagnostics, read, shipped
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter
 from powderdsl.diagnostics.render import diagnostic_data, render_text
+from powderdsl.model import declarations
 from powderdsl.model.builtins import RESERVED
 from powderdsl.model.operations import FUNCTIONS
 from powderdsl.model.parameter_values import set_params
-from powderdsl.model.schema import KEYS
+from powderdsl.model.schema import RECORDS, keys_of
 from powderdsl.model.state import qualified_slots, slot_name
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.standalone import standalone_module
@@ -271,13 +272,14 @@ def _is_shipped(name: str, text: str) -> bool:
 
 def _words(ruleset: Ruleset) -> dict[str, list[str]]:
     """What the editor completes, by kind."""
+    rule_records = [kind for kind in RECORDS.values() if kind.__module__ == declarations.__name__]
     return {
         "element": [one.name for one in ruleset.elements],
         "field": [*(one.name for one in ruleset.fields), *(one.name for one in ruleset.properties)],
         "parameter": [one.name.rpartition(".")[2] for one in ruleset.params],
         "function": sorted(FUNCTIONS),
         "keyword": sorted({*reserved_words(), *RESERVED}),
-        "key": sorted({key for keys in KEYS.values() for key in keys}),
+        "key": sorted({key for kind in rule_records for key in keys_of(kind)}),
     }
 
 

@@ -12,7 +12,7 @@ from powderdsl.ir.ops import Node, Program, nodes_of
 from powderdsl.ir.segments import segments
 from powderdsl.model.builtins import COORDINATES, DIRECTION_SETS, DIRECTIONS, KERNELS, KIND_WORDS
 from powderdsl.model.operations import FUNCTIONS, OPERATIONS
-from powderdsl.model.schema import KEYS, PREFIXES
+from powderdsl.model.schema import RECORDS, keys_of
 from powderdsl.model.types import Assign, Expr, Ruleset
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.parse import parse_text, parser
@@ -85,9 +85,14 @@ def expected() -> dict[str, frozenset[str]]:
     keys = {
         f"{context}.{key}"
         for context in ("pack", *SECTIONS.values(), "pass", "block")
-        for key in KEYS[context].keys() - NOT_RUN.get(context, set())
+        for key in keys_of(RECORDS[context]).keys() - NOT_RUN.get(context, set())
     }
-    keys |= {f"{context}.{prefix.strip()}" for context, found in PREFIXES.items() for prefix in found}
+    keys |= {
+        f"{context}.{prefix.strip()}"
+        for context, kind in RECORDS.items()
+        if context in ("pass", "block")
+        for prefix in kind.PREFIXES
+    }
     return {
         "keys": frozenset(keys),
         "syntax": frozenset(
@@ -125,7 +130,7 @@ def constructs(text: str, ruleset: Ruleset) -> Used:
                 for _, entry in value.entries
                 if isinstance(entry, Mapping)
                 for inner, _ in entry.entries
-                if inner.text in KEYS[context]
+                if inner.text in keys_of(RECORDS[context])
             }
         if key.text == "passes" and isinstance(value, Mapping):
             for _, entry in value.entries:
@@ -184,7 +189,7 @@ def _of_block(node: Tree, context: str) -> Iterator[tuple[str, str]]:
             yield from _of_block(item, "block")
     else:
         for key, value in node.entries:
-            prefix = next((p for p in PREFIXES[context] if key.text.startswith(p)), None)
+            prefix = next((p for p in RECORDS[context].PREFIXES if key.text.startswith(p)), None)
             yield "keys", f"{context}.{prefix.strip() if prefix else key.text}"
             if prefix:
                 yield from _of_line(key, ("header",))

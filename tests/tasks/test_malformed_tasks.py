@@ -139,7 +139,7 @@ MALFORMED = [
     ("actions: 8", "actions: 0", "PD402", "0"),
     ("actions: 8", "actions: many", "PD110", "many"),
     ("  actions: 8\n", "", "PD109", "m"),
-    ("may: [any, blow]", "may: []", "PD804", "may"),
+    ("may: [any, blow]", "may: []", "PD109", "may"),
     ("may: [any, blow]", "may: [any, wind]", "PD604", "wind"),
     ("  speed: 20\n", "", "PD109", "agent"),
     ("speed: 20", "speed: fast", "PD110", "fast"),

@@ -76,7 +76,9 @@ def findings(study: Study, outcomes: Sequence[Outcome]) -> list[Finding]:
     for measure in study.measures:
         by_values: dict[tuple[tuple[str, str], ...], dict[int, float]] = {}
         for outcome in finished:
-            by_values.setdefault(outcome.point.values, {})[outcome.point.seed] = outcome.values[measure.name]
+            by_values.setdefault(outcome.point.values, {})[outcome.point.seed] = outcome.values[
+                measure.name.text
+            ]
         cells = tuple(
             Cell(dict(values), by_seed, interval([*by_seed.values()], measure.scale))
             for values, by_seed in by_values.items()
@@ -140,7 +142,7 @@ def as_data(study: Study, size: str, outcomes: Sequence[Outcome]) -> dict[str, A
             numbers = asdict(cell.over_seeds)
             finite = {name: number if math.isfinite(number) else None for name, number in numbers.items()}
             cells.append({"values": cell.values, **finite, "samples": [*cell.by_seed.values()]})
-        described.append({"measure": finding.measure.name, "verdict": finding.verdict, "cells": cells})
+        described.append({"measure": finding.measure.name.text, "verdict": finding.verdict, "cells": cells})
     return {"study": study.name, "size": size, "points": points, "findings": described}
 
 

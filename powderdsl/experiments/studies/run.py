@@ -112,7 +112,7 @@ class StudyRun:
             return None
         try:
             return Outcome(
-                point, {item.name: _value(item, evaluations, point) for item in self.study.measures}
+                point, {item.name.text: _value(item, evaluations, point) for item in self.study.measures}
             )
         except ValueError as error:
             return Outcome(point, {}, f"{path}: {error}")
@@ -207,9 +207,11 @@ def _value(measure: Measure, evaluations: Any, point: Point) -> float:
     for key in keys:
         value = value.get(key) if isinstance(value, dict) else None
     if type(value) not in (int, float) or not abs(value) <= sys.float_info.max:
-        raise ValueError(f"the measure `{measure.name}` is not a finite number: {'/'.join(keys)}")
+        raise ValueError(f"the measure `{measure.name.text}` is not a finite number: {'/'.join(keys)}")
     if measure.scale == "log" and not value > 0:
-        raise ValueError(f"the measure `{measure.name}` is {value}; the scale `log` needs numbers above 0")
+        raise ValueError(
+            f"the measure `{measure.name.text}` is {value}; the scale `log` needs numbers above 0"
+        )
     return float(value)
 
 

@@ -5,19 +5,18 @@ from __future__ import annotations
 import itertools
 import math
 import os
-import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass, field, replace
 from pathlib import Path
 from string import Template
 from typing import Any
 
 from powderdsl.compiler import shipped, shipped_rules
 from powderdsl.diagnostics import CompileError, Diagnostic, Label, Reporter, Source, Span, suggest
-from powderdsl.model.schema import Key, Reader
+from powderdsl.model.schema import NAME_FORM, Entry, Form, Reader, Record, first_line, keyed, read_tree
 from powderdsl.syntax.sources import read_source
 from powderdsl.syntax.yaml_tree import Mapping as Mapping_
-from powderdsl.syntax.yaml_tree import Node, Scalar, parse_yaml
+from powderdsl.syntax.yaml_tree import Node, Scalar
 from powderdsl.system.reading import inside, is_path
 from powderdsl.system.writing import failure
 
@@ -34,30 +33,52 @@ READ something to read. All others are text."""
 Commands = Mapping[tuple[str, ...], Mapping[str, str]]
 """Commands that steps may call, with the meaning of each option (without dashes) and of the argument (``on``)."""
 
-STUDY_KEYS: dict[str, dict[str, Key]] = {
-    "study": {
-        "study": Key("word", "the study's name", True),
-        "about": Key("text", "what it asks, in a sentence"),
-        "seeds": Key("number", "how many runs there are of each combination", True, bounds=(1, 1000)),
-        "vary": Key("mapping", "settings that are varied", True),
-        "steps": Key("mapping", "commands, in order: a name each", True),
-        "measures": Key("mapping", "numbers to compare, out of what steps evaluated", True),
-    },
-    "axis": {
-        "about": Key("text", "what it is, for the figure"),
-        **{size: Key("words", f"its values at the size `{size}`", True) for size in SIZES},
-        "sets": Key("mapping", "for each value, other names and what they stand for with it"),
-    },
-    "measure": {
-        "of": Key("word", "the step whose run was evaluated", True),
-        "value": Key("word", "keys of its evaluation.json that lead to the number, with `/` between", True),
-        "about": Key("text", "what it is, for the figure"),
-        "expect": Key(
-            "word", "what the number is expected to do along the first setting", options=("rises", "falls")
-        ),
-        "scale": Key("word", "`log` where ratios count, such as those of losses", options=("linear", "log")),
-    },
-}
+VALUE = Form(
+    "[A-Za-z0-9_.+-]{1,60}",
+    "a value here",
+    "letters, digits and `_.+-`: folders are named after values",
+)
+
+
+class AxisDecl(Entry, noun="a setting"):
+    """A setting that is varied, as written."""
+
+    about: str = keyed("what it is, for the figure", "")
+    small: tuple[Scalar, ...] = keyed("its values at the size `small`", (), required=True)
+    paper: tuple[Scalar, ...] = keyed("its values at the size `paper`", (), required=True)
+    sets: Node | None = keyed("for each value, other names and what they stand for with it", shape="mapping")
+
+
+class Measure(Entry, noun="a measure"):
+    """A number in the ``evaluation.json`` of a step's run: the keys that lead to it, joined by ``/``.
+
+    On the scale ``log`` numbers are compared by their ratios: means are geometric.
+    """
+
+    of: Scalar = keyed("the step whose run was evaluated", MISSING)
+    keys: Scalar = keyed(
+        "keys of its evaluation.json that lead to the number, with `/` between", MISSING, name="value"
+    )
+    about: str = keyed("what it is, for the figure", "")
+    expect: str | None = keyed(
+        "what the number is expected to do along the first setting", choices=("rises", "falls")
+    )
+    scale: str = keyed(
+        "`log` where ratios count, such as those of losses", "linear", choices=("linear", "log")
+    )
+
+
+class StudyDecl(Record, noun="a study"):
+    """A study's file as written."""
+
+    name: str = keyed("the study's name", "", name="study", required=True, form=NAME_FORM)
+    about: str = keyed("what it asks, in a sentence", "")
+    seeds: int = keyed("how many runs there are of each combination", 1, required=True, bounds=(1, 1000))
+    vary: Node | None = keyed("settings that are varied", required=True, shape="mapping")
+    steps: Node | None = keyed("commands, in order: a name each", required=True, shape="mapping")
+    measures: Node | None = keyed(
+        "numbers to compare, out of what steps evaluated", required=True, shape="mapping"
+    )
 
 
 @dataclass(frozen=True)
@@ -106,21 +127,6 @@ class Axis:
     def name(self) -> str:
         """It stands for the value."""
         return self.key.text
-
-
-@dataclass(frozen=True)
-class Measure:
-    """A number in the ``evaluation.json`` of a step's run: the keys that lead to it, joined by ``/``.
-
-    On the scale ``log`` numbers are compared by their ratios: means are geometric.
-    """
-
-    name: str
-    of: Scalar
-    keys: Scalar
-    about: str
-    expect: str | None
-    scale: str
 
 
 @dataclass(frozen=True)
@@ -268,10 +274,7 @@ def read_study(source: Source, reporter: Reporter, commands: Commands, check: Ch
 
     `check`, of words and measures, reads no file that lies out of the study's folder.
     """
-    tree = parse_yaml(source, reporter)
-    if tree is None and not reporter.has_errors:
-        helps = ["a study starts with `study: NAME`"]
-        reporter.error("PD107", f"{source.name} is empty", None, helps=helps)
+    tree = read_tree(source, reporter, "a study starts with `study: NAME`")
     reporter.raise_if_errors()
     assert tree is not None
     study = _StudyReader(reporter, commands).study(tree)
@@ -284,7 +287,7 @@ class _StudyReader:
     """Reads one study, section by section."""
 
     def __init__(self, reporter: Reporter, commands: Commands):
-        self.reader, self.error, self.commands = Reader(reporter, STUDY_KEYS), reporter.error, commands
+        self.reader, self.error, self.commands = Reader(reporter), reporter.error, commands
         self.known = [SEED, SIZE]
         self.used: set[str] = set()
         self.is_hidden = False
@@ -292,52 +295,48 @@ class _StudyReader:
         self.steps: dict[str, StudyStep] = {}
 
     def study(self, tree: Node) -> Study:
-        entries = self.reader.mapping(tree, "study", "a study")
-        values = self.reader.values(entries, "study")
-        name, seeds = values.get("study"), values.get("seeds", 1)
-        if name is not None and not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,59}", name.text):
-            label = "letters, digits, `-` and `_`, up to 60"
-            self.error("PD111", "a study's name is a word", name.span, label)
-        axes = [self.axis(key, node) for key, node in self.reader.named(values.get("vary"), "a setting")]
-        for key, node in self.reader.named(values.get("steps"), "a step"):
+        decl = self.reader.record(StudyDecl, tree, "a study") or StudyDecl()
+        axes = [self.axis(key, node) for key, node in self.reader.named(decl.vary, "a setting")]
+        for key, node in self.reader.named(decl.steps, "a step"):
             self.step(key, node)
-        named = self.reader.named(values.get("measures"), "a measure")
+        named = self.reader.named(decl.measures, "a measure")
         measures = [measure for key, node in named if (measure := self.measure(key, node)) is not None]
+        entries, top = tree.entries if isinstance(tree, Mapping_) else (), first_line(tree)
         for size in SIZES:
-            points = math.prod((seeds, *(len(axis.values[size]) for axis in axes)))
-            if points > MAX_POINTS and name is not None:
+            points = math.prod((decl.seeds, *(len(axis.values[size]) for axis in axes)))
+            if points > MAX_POINTS:
                 message = f"{points:,} combinations at the size `{size}`"
-                self.error("PD806", message, name.span, f"at most {MAX_POINTS:,}")
+                self.error("PD806", message, top, f"at most {MAX_POINTS:,}")
         if not self.is_hidden:
             for axis in axes:
                 names = next(iter(axis.sets.values()), {}) or {axis.name: axis.key}
                 for unused in (name for name in names if name not in self.used):
                     helps = (f"write `${unused}` in a step, or leave it out",)
                     self.error("PD806", f"no step uses `{unused}`", names[unused].span, helps=helps)
-            if seeds > 1 and SEED not in self.used:
+            if decl.seeds > 1 and SEED not in self.used:
+                place = next(name.span for name, _ in entries if name.text == "seeds")
                 helps = ("write `seed: $seed` in a step that trains, or `seeds: 1`",)
-                self.error("PD806", "no step uses `$seed`", entries["seeds"][1].span, helps=helps)
-        steps, folder = tuple(self.steps.values()), Path(tree.span.source.name).parent
-        about, source = values.get("about", ""), tree.span.source
-        word = "" if name is None else name.text
-        return Study(word, about, seeds, tuple(axes), steps, tuple(measures), source, folder)
+                self.error("PD806", "no step uses `$seed`", place, helps=helps)
+        steps, source = tuple(self.steps.values()), tree.span.source
+        folder = Path(source.name).parent
+        return Study(decl.name, decl.about, decl.seeds, tuple(axes), steps, tuple(measures), source, folder)
 
     def axis(self, key: Scalar, node: Node) -> Axis:
         self.add_name(key)
         if isinstance(node, Mapping_):
-            values = dict.fromkeys(SIZES, ()) | self.reader.read(node, "axis", "a setting")
+            decl = self.reader.entry(AxisDecl, key, node)
         else:  # one list for every size
-            values = dict.fromkeys(SIZES, self.reader.words(node))
-        words = {size: values[size] for size in SIZES}
-        for size, scalars in words.items():
+            words = self.reader.words(node)
+            decl = AxisDecl(name=key, small=words, paper=words)
+        assert decl is not None
+        values = {"small": decl.small, "paper": decl.paper}
+        for size, scalars in values.items():
             if not scalars:
                 self.error("PD109", f"`{key.text}` has no values", key.span, f"none for `{size}`")
             for word in scalars:
-                if not re.fullmatch(r"[A-Za-z0-9_.+-]{1,60}", word.text):
-                    label = "letters, digits and `_.+-`: folders are named after values"
-                    self.error("PD110", "this cannot be a value here", word.span, label)
-        sets = self.sets(values["sets"], [*words["small"], *words["paper"]]) if "sets" in values else {}
-        return Axis(key, values.get("about") or key.text, words, sets)
+                self.reader.formed(VALUE, key.text, word)
+        sets = {} if decl.sets is None else self.sets(decl.sets, [*decl.small, *decl.paper])
+        return Axis(key, decl.about or key.text, values, sets)
 
     def sets(self, node: Node, values: list[Scalar]) -> dict[str, dict[str, Scalar]]:
         """What each value sets: the same names for all of them."""
@@ -406,12 +405,12 @@ class _StudyReader:
         return []
 
     def measure(self, key: Scalar, node: Node) -> Measure | None:
-        values = self.reader.read(node, "measure", "a measure")
-        of, keys = values.get("of"), values.get("value")
-        if of is None or keys is None:
+        measure = self.reader.entry(Measure, key, node)
+        if measure is None:
             self.is_hidden = True
             return None
-        self.names_are_known(keys)
+        of = measure.of
+        self.names_are_known(measure.keys)
         runs = [step.name for step in self.steps.values() if step.makes_run]
         if of.text not in runs:
             step = self.steps.get(of.text)
@@ -419,8 +418,7 @@ class _StudyReader:
             if step is not None and step.on is not None and step.on_step:
                 helps = (f"write `of: {step.on.text}`: what is found is kept with the run", *helps)
             self.error("PD806", f"no step `{of.text}` that makes a run", of.span, helps=helps)
-        about = values.get("about") or key.text
-        return Measure(key.text, of, keys, about, values.get("expect"), values.get("scale", "linear"))
+        return measure if measure.about else replace(measure, about=key.text)
 
     def names_are_known(self, word: Scalar) -> bool:
         """Note the names that a text uses; return False after reporting ``$NAME`` that is not varied."""

@@ -28,20 +28,22 @@ from powderdsl.model.declarations import (
     AlsoDecl,
     Definition,
     ElementDecl,
+    FieldDecl,
     KernelDecl,
     PackDecl,
+    ParamDecl,
     PassDecl,
+    PropertyDecl,
     RulesetDecl,
     SetDecl,
     StreamDecl,
     TagDecl,
-    TypedDecl,
 )
 from powderdsl.model.types import Element
 from powderdsl.syntax.parse import reserved_words
 from powderdsl.syntax.yaml_tree import Scalar
 
-T = TypeVar("T", bound=Definition)
+T = TypeVar("T", bound=Definition | ParamDecl)
 
 
 @dataclass(frozen=True)
@@ -57,10 +59,10 @@ class Composition:
     slots: int
     tags: dict[str, frozenset[int]]
     tag_decls: dict[str, Named[TagDecl]]
-    properties: dict[str, Named[TypedDecl]]
-    fields: dict[str, Named[TypedDecl]]
+    properties: dict[str, Named[PropertyDecl]]
+    fields: dict[str, Named[FieldDecl]]
     streams: dict[str, Named[StreamDecl]]
-    params: dict[str, Named[TypedDecl]]
+    params: dict[str, Named[ParamDecl]]
     kernels: dict[str, Named[KernelDecl]]
     sets: dict[str, Named[SetDecl]]
     passes: tuple[Named[PassDecl], ...]

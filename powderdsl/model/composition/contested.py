@@ -132,7 +132,7 @@ def defined_words(pack: PackDecl) -> Iterator[str]:
     yield from (one.name.text for one in (*pack.definitions, *pack.params, *pack.passes))
     for one in pack.passes:
         yield from (item.name.text for item in one.scratch)
-        yield from (name.text for block in one.block.walk() for name, _ in block.lets)
+        yield from (name.text for block in one.walk() for name, _ in block.lets)
 
 
 def words_of_tree(tree: Node | None) -> Iterator[str]:

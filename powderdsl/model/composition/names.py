@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
 from powderdsl.diagnostics import Label, Reporter, Span, suggest
-from powderdsl.model.declarations import Definition, PackDecl
+from powderdsl.model.declarations import Definition, PackDecl, ParamDecl
 from powderdsl.syntax.yaml_tree import Scalar
 
-T = TypeVar("T", bound=Definition)
+T = TypeVar("T", bound=Definition | ParamDecl)
 
 
 @dataclass(frozen=True)

@@ -400,7 +400,7 @@ def _report_unwritten(composition: Composition, reporter: Reporter) -> None:
     for name, field in composition.fields.items():
         if name not in words and field.decl.name.text not in words:
             _unused("field", name, field.span, reporter)
-    for block in (block for pack in composition.packs for one in pack.passes for block in one.block.walk()):
+    for block in (block for pack in composition.packs for one in pack.passes for block in one.walk()):
         inner = [line for one in block.walk() if one is not block for line in one.lines]
         later = {word for line in (*block.lines[len(block.lets) :], *inner) for word in words_of(line)}
         for scalar, value in reversed(block.lets):

@@ -12,7 +12,7 @@ from typing import Any
 from powderdsl.arrays import NDArray, np
 from powderdsl.diagnostics import Label, Reporter, Source, Span, suggest
 from powderdsl.model.fields import WordProblem, read_word
-from powderdsl.model.schema import Key, Reader, first_line
+from powderdsl.model.schema import NAME_FORM, Reader, Record, first_line, keyed, read_tree
 from powderdsl.model.state import Slot, slot_name, slots
 from powderdsl.model.types import Ruleset
 from powderdsl.syntax import yaml_tree
@@ -32,20 +32,24 @@ from powderdsl.worlds.scene.statements import (
     shape_of,
 )
 
-SCENE_KEYS = {
-    "scene": Key("word", "the scene's name", True),
-    "about": Key("text", "what it shows, in a sentence"),
-    "size": Key("any", "[rows, columns]", True),
-    "fill": Key("word", "the element that is everywhere before anything is drawn", True),
-    "draw": Key("any", "statements, one a line, later ones over earlier ones"),
-}
-"""The keys of a scene."""
 
-FILE_KEYS = {
-    "scenes": Key("list", "the scenes of the file", True),
-    "about": Key("text", "what they are for, in a sentence"),
-}
-"""The keys of a file with several scenes."""
+class SceneDecl(Record, noun="a scene"):
+    """A scene as written."""
+
+    name: str = keyed("the scene's name", "", name="scene", required=True, form=NAME_FORM)
+    about: str = keyed("what it shows, in a sentence", "")
+    size: yaml_tree.Node | None = keyed("[rows, columns]", required=True)
+    fill: yaml_tree.Scalar | None = keyed(
+        "the element that is everywhere before anything is drawn", required=True
+    )
+    draw: yaml_tree.Node | None = keyed("statements, one a line, later ones over earlier ones")
+
+
+class FileDecl(Record, noun="a file of scenes"):
+    """A file with several scenes."""
+
+    scenes: yaml_tree.Node | None = keyed("the scenes of the file", required=True, shape="list")
+    about: str = keyed("what they are for, in a sentence", "")
 
 
 SIZE_RULE = f"a world has at least one row and one column, and at most {MAX_CELLS:,} cells"
@@ -66,23 +70,20 @@ class Scene:
 
 def read_scenes(source: Source, reporter: Reporter) -> tuple[Scene, ...]:
     """The scenes of a file. Everything but element names is checked; what is wrong goes to the reporter."""
-    tree = yaml_tree.parse_yaml(source, reporter)
+    tree = read_tree(source, reporter, "a scene starts with `scene: NAME`")
     if tree is None:
-        if not reporter.has_errors:
-            helps = ["a scene starts with `scene: NAME`"]
-            reporter.error("PD107", f"{source.name} is empty", None, helps=helps)
         return ()
-    reader = Reader(reporter, {"scene": SCENE_KEYS, "file": FILE_KEYS})
+    reader = Reader(reporter)
     if not isinstance(tree, yaml_tree.Mapping) or tree.get("scenes") is None:
         scene = _read_scene(tree, reader)
         return (scene,) if scene else ()
-    entries = reader.mapping(tree, "file", "a file of scenes")
-    scenes: dict[str, Scene] = {}
-    items = entries["scenes"][1] if "scenes" in entries else yaml_tree.Sequence((), tree.span)
-    if not isinstance(items, yaml_tree.Sequence):
-        reader.shape(items, "a list of scenes")
+    file = reader.record(FileDecl, tree, "a file of scenes")
+    if file is None or not isinstance(file.scenes, yaml_tree.Sequence):
+        if file is not None and file.scenes is not None:
+            reader.shape(file.scenes, "a list of scenes")
         return ()
-    for item in items.items:
+    scenes: dict[str, Scene] = {}
+    for item in file.scenes.items:
         scene = _read_scene(item, reader)
         if scene and scene.name in scenes:
             first = Label(scenes[scene.name].span, "first one")
@@ -94,27 +95,18 @@ def read_scenes(source: Source, reporter: Reporter) -> tuple[Scene, ...]:
 
 
 def _read_scene(node: yaml_tree.Node, reader: Reader) -> Scene | None:
-    reporter = reader.reporter
-    entries = reader.mapping(node, "scene", "a scene")
-    name, fill = reader.scalar(entries, "scene"), reader.scalar(entries, "fill")
-    named = name is not None and can_be_called(name, "a scene", reporter)
-    size = _read_size(entries["size"][1], reporter) if "size" in entries else None
-    paints = _read_statements(entries["draw"][1], reader) if "draw" in entries else ()
+    decl = reader.record(SceneDecl, node, "a scene")
+    if decl is None:
+        return None
+    name = node.get("scene") if isinstance(node, yaml_tree.Mapping) else None
+    size = None if decl.size is None else _read_size(decl.size, reader.reporter)
+    paints = () if decl.draw is None else _read_statements(decl.draw, reader)
     for one in paints if size else ():
         if size and not mask(one.shape, size).any():
-            covers_nothing(one.span, "nothing of it lies", size, reporter)
-    if not (name and named and size and fill):
+            covers_nothing(one.span, "nothing of it lies", size, reader.reporter)
+    if name is None or not (decl.name and size and decl.fill):
         return None
-    return Scene(name.text, reader.text(entries, "about"), size, fill.text, paints, name.span, fill.span)
-
-
-def can_be_called(name: yaml_tree.Scalar, what: str, reporter: Reporter) -> bool:
-    """Whether a word can name a scene or a task; reports PD111 if not."""
-    if re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,59}", name.text):
-        return True
-    label = "letters, digits, `-` and `_`, up to 60"
-    reporter.error("PD111", f"{what}'s name is a word", name.span, label)
-    return False
+    return Scene(decl.name, decl.about, size, decl.fill.text, paints, name.span, decl.fill.span)
 
 
 def two_integers(node: yaml_tree.Node) -> Size | None:
