@@ -329,7 +329,7 @@ class Reader:
         if isinstance(value, Scalar):
             is_empty = value.style == "plain" and not value.text
         else:
-            is_empty = row.required and isinstance(value, Sequence) and not value.items
+            is_empty = row.required and row.shape == "words" and not getattr(value, "items", True)
         if not is_empty:
             return False
         comment = comment_after(key)
