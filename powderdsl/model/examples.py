@@ -1,27 +1,122 @@
-"""Tests inside packs: small worlds drawn in ASCII, and what must become of them."""
+"""Tests inside packs: small worlds drawn in ASCII, values of their fields drawn in words, and what becomes of them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from fractions import Fraction
 from itertools import chain
 from math import lcm
 
-from powderdsl.diagnostics import Reporter, Span
+from powderdsl.diagnostics import Label, Reporter, Span, suggest
+from powderdsl.model.builtins import DIRECTIONS, OCTANTS
 from powderdsl.model.composition.claim_scopes import words_of
 from powderdsl.model.composition.names import report_unknown
 from powderdsl.model.declarations import TestDecl
 from powderdsl.model.expressions.operators import Poisoned, Scope, Unresolved
-from powderdsl.model.expressions.symbols import Symbols
+from powderdsl.model.expressions.symbols import Symbols, clamped_number
 from powderdsl.model.expressions.typer import Typer
-from powderdsl.model.fields import GridReader, size_of
 from powderdsl.model.schema import comment_after
-from powderdsl.model.types import CHANCE, Example, Kernel, Often
-from powderdsl.syntax.ast import Syntax
+from powderdsl.model.types import CHANCE, Cell, Example, FieldGrid, Kernel, Kind, Often
 from powderdsl.syntax.yaml_tree import Scalar
 
 MAX_SIDE = 64
+
+FORMS = {
+    "int": ("an integer", "an integer such as `3` or `-2`"),
+    "flag": ("a flag", "`yes` or `no`"),
+    "element": ("an element", "an element's name"),
+    "direction": ("a direction", "a neighbor such as `left` or `above.right`"),
+    "real": ("a number", "a number such as `3` or `-0.25`"),
+    "vec2": ("a vector", "rows and columns, such as `1.5,-2`"),
+}
+"""For each kind: a noun for its words, and how they are written."""
+
+_FLAGS = {"yes": 1, "true": 1, "no": 0, "false": 0}
+_WHOLE = re.compile(r"-?[0-9]{1,7}")
+_NUMBER = re.compile(r"-?[0-9]{1,7}(\.[0-9]{1,20})?([eE][-+]?[0-9]{1,2})?")
+
+Bounds = tuple[float, float]
+"""The lowest and the highest value that a word allows: twice the same, but for a range."""
+
+
+class WordProblem(Exception):
+    """A word is not a value of its kind. Has a code, a message, a label, and maybe fixes."""
+
+    def __init__(self, code: str, message: str, label: str, *helps: str):
+        super().__init__(message)
+        self.code, self.message, self.label, self.helps = code, message, label, helps
+
+
+def read_word(word: str, kind: Kind, ids: Mapping[str, int], *, ranges: bool = False) -> tuple[Bounds, ...]:
+    """The bounds of each component of the value: two of a vector, one of other kinds.
+
+    Args:
+        ids: what words stand for which element.
+        ranges: numbers may be ranges, `1..3`.
+
+    Raises:
+        WordProblem: it is not a value of this kind.
+    """
+    parts = [word]
+    if kind.name == "vec2":
+        parts = (word[1:-1] if word.startswith("(") and word.endswith(")") else word).split(",")
+    values: list[Bounds] = []
+    for part in parts:
+        value: float | None = None
+        if kind.name == "flag":
+            value = _FLAGS.get(part)
+        elif kind.name == "element":
+            value = ids.get(part)
+        elif kind.name == "direction":
+            steps = [DIRECTIONS.get(step) for step in part.split(".")]
+            sums = sum(step[0] for step in steps if step), sum(step[1] for step in steps if step)
+            value = OCTANTS.index(sums) if None not in steps and sums in OCTANTS else None
+        else:
+            low, dots, high = part.partition("..") if ranges else (part, "", "")
+            ends = _number(low, kind), _number(high if dots else low, kind)
+            if ends[0] is not None and ends[1] is not None:
+                if ends[0] > ends[1]:
+                    label, fix = f"{low} is above {high}", f"write `{high}..{low}`"
+                    raise WordProblem("PD402", "a range that runs backwards", label, fix)
+                values.append((ends[0], ends[1]))
+        if value is not None:
+            values.append((value, value))
+    if not len(values) == len(parts) == 1 + (kind.name == "vec2"):
+        noun, form = FORMS[kind.name]
+        elements = [name for name in ids if len(name) > 1]
+        helps = suggest(word, elements, "elements") if kind.name == "element" else ()
+        raise WordProblem("PD110", f"`{word}` is not {noun}", f"expected {form}", *helps)
+    return tuple(values)
+
+
+def _number(word: str, kind: Kind) -> float | None:
+    whole = kind.name == "int"
+    if not (_WHOLE if whole else _NUMBER).fullmatch(word):
+        return None
+    value = Fraction(word)
+    if not kind.lo <= value <= kind.hi:
+        label, fix = (
+            f"the range is {kind.lo:g}..{kind.hi:g}",
+            "write a number in this range, or widen it where it is declared",
+        )
+        raise WordProblem("PD402", f"{word} lies outside {kind}", label, fix)
+    return int(value) if whole else float(clamped_number(value, kind))
+
+
+def direction_word(octant: int) -> str:
+    """A direction as drawings have it: `above.right`."""
+    rows, columns = OCTANTS[octant]
+    sides = {name: offset for name, offset in DIRECTIONS.items() if name != "here"}
+    return ".".join(name for name, offset in sides.items() if offset in ((rows, 0), (0, columns)))
+
+
+DEFAULT = "."
+"""The word of a cell that is as a fresh cell of its element has it."""
+
+ANYTHING = "?"
+"""The word of an expected cell that is not looked at."""
 
 
 def check_examples(typer: Typer) -> tuple[Example, ...]:
@@ -30,95 +125,223 @@ def check_examples(typer: Typer) -> tuple[Example, ...]:
     for pack in typer.symbols.composition.packs:
         for decl in pack.tests:
             with suppress(Poisoned, Unresolved):
-                examples.append(_example(decl, pack.name.text, typer))
+                examples.append(_ExampleReader(typer, pack.name.text, decl).example())
     return tuple(examples)
 
 
-def _example(decl: TestDecl, pack: str, typer: Typer) -> Example:
-    name, place = decl.name.text, decl.name.span
-    legend = _legend(decl, pack, typer)
-    if decl.given is None:
-        raise typer.fail("PD109", f"the test `{name}` has no start world", place, "`given` is missing")
-    given = _rows(decl.given, legend, typer, wildcard=False)
-    _check_sides(decl, decl.given, given, pack, typer)
-    expect = _rows(decl.expect, legend, typer, wildcard=True) if decl.expect else None
-    if expect and decl.expect and (len(expect), len(expect[0])) != (len(given), len(given[0])):
-        raise typer.fail("PD110", "`expect` has another size than `given`", decl.expect.span, size_of(given))
-    reader = GridReader(typer, pack, legend)
-    fields = reader.read(decl.fields, given, expected=False)
-    expect_fields = reader.read(decl.expect_fields, given, expected=True)
-    if not (expect or expect_fields or decl.always or decl.often):
-        label = "`expect`, `expect_fields`, `always` or `often` is missing"
-        raise typer.fail("PD109", f"the test `{name}` checks nothing", place, label)
-    scope = Scope(pack, {"world": _whole_world(len(given), len(given[0]))})
-    always = tuple(typer.condition(syntax, scope) for syntax in decl.always)
-    often = tuple(_often(change, chance, scope, typer) for change, chance in decl.often)
-    drawn = {legend[char] for char in "".join([*given, *(expect or ())]) if char in legend}
-    asked = [*decl.always, *(change for change, _ in decl.often)]
-    words = [*sorted(drawn), *(grid.name for grid in (*fields, *expect_fields))]
-    words += [word for syntax in asked for word in words_of(syntax)]
-    return Example(
-        name,
-        given,
-        tuple(sorted(legend.items())),
-        decl.steps,
-        expect,
-        always,
-        pack,
-        place,
-        decl.seed,
-        fields,
-        expect_fields,
-        often,
-        typer.symbols.composition.scopes.of_pack(pack, words),
-    )
+class _ExampleReader:
+    """Reads one test. Its methods raise Poisoned after reporting, Unresolved for a test that waits for a pack."""
 
+    def __init__(self, typer: Typer, pack: str, decl: TestDecl):
+        self.typer, self.pack, self.decl = typer, pack, decl
+        self.composition = typer.symbols.composition
+        self.legend = self._legend()
+        self.given: tuple[str, ...] = ()
 
-def _legend(decl: TestDecl, pack: str, typer: Typer) -> dict[str, str]:
-    """The elements, by global name, that the characters of a test stand for."""
-    composition = typer.symbols.composition
-    legend = {element.glyph: name for name, element in composition.elements.items()}
-    # Glyphs mean what they mean without packs that the author of the test does not know.
-    alone = composition.glyphs_alone(composition.scopes.of_pack(pack))
-    legend |= {glyph: name for name, glyph in alone.items()}
-    # What the pack's own file says comes first, whatever other packs took before.
-    own = {name: named.decl.glyph for name, named in composition.element_decls.items() if named.pack == pack}
-    legend |= {glyph: name for name, glyph in own.items() if glyph}
-    for key, value in decl.legend:
-        found = composition.element(value.word, pack)
-        if found is None:
-            if value.is_optional:
-                raise Unresolved(value.word)  # a test of what packs do together waits until both are loaded
-            report_unknown("element", value, composition.elements, typer.reporter)
+    def example(self) -> Example:
+        decl, typer, name, place = self.decl, self.typer, self.decl.name.text, self.decl.name.span
+        if decl.given is None:
+            raise typer.fail("PD109", f"the test `{name}` has no start world", place, "`given` is missing")
+        given = self.given = self._rows(decl.given, wildcard=False)
+        self._check_sides(decl.given)
+        expect = self._rows(decl.expect, wildcard=True) if decl.expect else None
+        size = f"`given` has {len(given)} row{'s' * (len(given) != 1)} of {len(given[0])}"
+        if expect and decl.expect and (len(expect), len(expect[0])) != (len(given), len(given[0])):
+            raise typer.fail("PD110", "`expect` has another size than `given`", decl.expect.span, size)
+        elements, names = self.composition.elements, self.composition.names
+        ids = {word: one.id for global_name, one in elements.items() for word in (one.qualified, global_name)}
+        for (where, word), meaning in names.meanings.items():
+            if where == self.pack and meaning in elements:
+                ids[word] = elements[meaning].id
+        ids |= {character: elements[meaning].id for character, meaning in self.legend.items()}
+        fields = self._grids(decl.fields, ids, size, expected=False)
+        expect_fields = self._grids(decl.expect_fields, ids, size, expected=True)
+        if not (expect or expect_fields or decl.always or decl.often):
+            label = "`expect`, `expect_fields`, `always` or `often` is missing"
+            raise typer.fail("PD109", f"the test `{name}` checks nothing", place, label)
+        height, width = len(given), len(given[0])
+        reach = ((dy, dx, 1) for dy in range(1 - height, height) for dx in range(1 - width, width))
+        scope = Scope(
+            self.pack, {"world": Kernel("world", tuple(reach), wrap=False)}
+        )  # sees all cells from each
+        always = tuple(typer.condition(syntax, scope) for syntax in decl.always)
+        often = []
+        for change, chance in decl.often:
+            before, after = (typer.condition(part, scope) for part in change.children)
+            part = Fraction(typer.constant(chance, CHANCE, scope))  # type: ignore[arg-type]  # a chance is a fraction
+            often.append(Often(before, after, part, change.span))
+        words = sorted(
+            {self.legend[char] for char in "".join([*given, *(expect or ())]) if char in self.legend}
+        )
+        words += [grid.name for grid in (*fields, *expect_fields)]
+        for syntax in (*decl.always, *(change for change, _ in decl.often)):
+            words += words_of(syntax)
+        return Example(
+            name,
+            given,
+            tuple(sorted(self.legend.items())),
+            decl.steps,
+            expect,
+            always,
+            self.pack,
+            place,
+            decl.seed,
+            fields,
+            expect_fields,
+            tuple(often),
+            self.composition.scopes.of_pack(self.pack, words),
+        )
+
+    def _legend(self) -> dict[str, str]:
+        """The elements, by global name, that the characters of a test stand for."""
+        composition = self.composition
+        legend = {element.glyph: name for name, element in composition.elements.items()}
+        # Glyphs mean what they mean without packs that the author of the test does not know.
+        alone = composition.glyphs_alone(composition.scopes.of_pack(self.pack))
+        legend |= {glyph: name for name, glyph in alone.items()}
+        # What the pack's own file says comes first, whatever other packs took before.
+        for name, named in composition.element_decls.items():
+            if named.pack == self.pack and named.decl.glyph:
+                legend[named.decl.glyph] = name
+        for key, value in self.decl.legend:
+            found = composition.element(value.word, self.pack)
+            if found is None:
+                if value.is_optional:
+                    raise Unresolved(
+                        value.word
+                    )  # a test of what packs do together waits until both are loaded
+                report_unknown("element", value, composition.elements, self.typer.reporter)
+                raise Poisoned
+            if len(key.text) != 1:
+                raise self.typer.fail(
+                    "PD110", "a legend explains single characters", key.span, "not one character"
+                )
+            legend[key.text] = found
+        return legend
+
+    def _check_sides(self, drawing: Scalar) -> None:
+        """Refuse a world of sides that the packs do not allow; where an unknown pack does not, the test is inactive."""
+        multiple, sides = self.composition.side_multiple, (len(self.given), len(self.given[0]))
+        if not any(side % multiple for side in sides):
+            return
+        known = self.composition.names.needs[self.pack]
+        least = lcm(*(pack.side_multiple for pack in self.composition.packs if pack.name.text in known))
+        if any(side % least for side in sides):
+            label = f"`side_multiple` asks for multiples of {multiple}"
+            raise self.typer.fail("PD110", f"a world of {sides[0]}×{sides[1]} cells", drawing.span, label)
+        self.typer.reporter.report(
+            "PD506", "this test is inactive: its world has sides that these rules do not allow", self.decl.name.span, "left out",
+            notes=[f"a loaded pack asks for sides that are multiples of {multiple}"],
+            helps=["it becomes active without the pack that says `side_multiple`"],
+        )  # fmt: skip
+        raise Unresolved("side_multiple")
+
+    def _rows(self, scalar: Scalar, *, wildcard: bool) -> tuple[str, ...]:
+        """The rows of a drawn world, a character a cell."""
+        comment = comment_after(scalar) if scalar.style == "plain" and "#" in self.legend else None
+        if comment is not None:  # on the line of the key, `#` begins a comment of YAML
+            whole = Span(comment.source, scalar.span.start, comment.end).text
+            raise self.typer.fail(
+                "PD110", "a drawing that stops at a comment", comment, "a comment, to YAML",
+                f'put quotes around the drawing: "{whole}"', "or draw it on the next lines, below `|`",
+            )  # fmt: skip
+        rows = tuple("".join(line.split()) for line in scalar.text.splitlines() if line.strip())
+        if not rows or len(set(map(len, rows))) != 1 or max(len(rows), len(rows[0])) > MAX_SIDE:
+            label = f"expected 1 to {MAX_SIDE} equal rows"
+            raise self.typer.fail("PD110", "rows of a world are equally long", scalar.span, label)
+        for char in sorted(set("".join(rows)) - self.legend.keys()):
+            if not (wildcard and char == "?"):
+                start = scalar.content.start + max(scalar.content.text.find(char), 0)
+                place = Span(scalar.span.source, start, start + 1)
+                known = " ".join(f"{glyph}={name}" for glyph, name in sorted(self.legend.items()))
+                raise self.typer.fail(
+                    "PD301", f"`{char}` stands for nothing", place, "not in the legend", f"known: {known}"
+                )
+        return rows
+
+    # Drawn fields: all mistakes are reported, and words that come again are read once
+
+    def _grids(
+        self, drawn: Sequence[tuple[Scalar, Scalar]], ids: Mapping[str, int], size: str, *, expected: bool
+    ) -> tuple[FieldGrid, ...]:
+        """The grids of `fields`, or of `expect_fields`."""
+        grids, failed = [], False
+        for key, scalar in drawn:
+            try:
+                grids.append(self._grid(key, scalar, ids, size, expected))
+            except Poisoned:
+                failed = True
+        if failed:
             raise Poisoned
-        if len(key.text) != 1:
-            raise typer.fail("PD110", "a legend explains single characters", key.span, "not one character")
-        legend[key.text] = found
-    return legend
+        return tuple(grids)
 
+    def _grid(
+        self, key: Scalar, scalar: Scalar, ids: Mapping[str, int], size: str, expected: bool
+    ) -> FieldGrid:
+        name = self.composition.names.of(self.pack, key.word)
+        kind = self._kind(key, name)
+        rows = [line.split() for line in scalar.text.splitlines() if line.strip()]
+        words = list(chain.from_iterable(rows))
+        content, places = scalar.content, [scalar.span] * len(words)
+        spans = [
+            Span(content.source, content.start + match.start(), content.start + match.end())
+            for match in re.finditer(r"\S+", content.text)
+        ]
+        if len(spans) == len(words):  # else YAML has changed the text while reading it
+            places = spans
+        everywhere = len(words) == 1
+        if not everywhere and list(map(len, rows)) != list(map(len, self.given)):
+            raise self.typer.fail(
+                "PD110", f"`{key.text}` has another size than `given`", places[0] if places else key.span, size,
+                f"write a word for each cell, or one for all of them: {FORMS[kind.name][1]}",
+            )  # fmt: skip
+        read: dict[str, Cell] = {DEFAULT: ()} | ({ANYTHING: None} if expected else {})
+        failed = False
+        for word, place in zip(words, places, strict=True):
+            if word in read:
+                continue
+            try:
+                if word == ANYTHING:
+                    form, fix = FORMS[kind.name][1], f"write `{DEFAULT}` for what a fresh cell has"
+                    raise WordProblem("PD110", "a start world leaves nothing open", form, fix)
+                read[word] = read_word(word, kind, ids, ranges=expected)
+            except WordProblem as wrong:
+                self.typer.fail(wrong.code, wrong.message, place, wrong.label, *wrong.helps)
+                read[word], failed = None, True
+        if failed:
+            raise Poisoned
+        if everywhere:
+            cells = tuple((read[words[0]],) * len(row) for row in self.given)
+        else:
+            cells = tuple(tuple(read[word] for word in row) for row in rows)
+        field = self.typer.symbols.fields.get(name)
+        if field is not None and field.of is not None and not everywhere and not expected:
+            drawing = zip(chain.from_iterable(cells), "".join(self.given), places, strict=True)
+            for cell, character, place in drawing:
+                if cell and ids[character] not in field.of:
+                    element = self.legend[character]
+                    self.typer.reporter.error(
+                        "PD407", f"`{element}` has no `{key.text}`", place, f"the cell holds `{element}`",
+                        secondary=(Label(field.span, "only some elements have it"),),
+                        helps=(f"write `{DEFAULT}` here, or add `{element}` to `of:` of `{key.text}`",),
+                    )  # fmt: skip
+                    raise Poisoned
+        return FieldGrid(name, cells, everywhere, key.span)
 
-def _check_sides(decl: TestDecl, drawing: Scalar, given: tuple[str, ...], pack: str, typer: Typer) -> None:
-    """Refuse a world of sides that the packs do not allow; where an unknown pack does not, the test is inactive."""
-    composition = typer.symbols.composition
-    multiple, sides = composition.side_multiple, (len(given), len(given[0]))
-    if not any(side % multiple for side in sides):
-        return
-    known = composition.names.needs[pack]
-    least = lcm(*(one.side_multiple for one in composition.packs if one.name.text in known))
-    if any(side % least for side in sides):
-        label = f"`side_multiple` asks for multiples of {multiple}"
-        raise typer.fail("PD110", f"a world of {sides[0]}×{sides[1]} cells", drawing.span, label)
-    typer.reporter.report(
-        "PD506", "this test is inactive: its world has sides that these rules do not allow", decl.name.span, "left out",
-        notes=[f"a loaded pack asks for sides that are multiples of {multiple}"],
-        helps=["it becomes active without the pack that says `side_multiple`"],
-    )  # fmt: skip
-    raise Unresolved("side_multiple")
-
-
-def _often(change: Syntax, chance: Syntax, scope: Scope, typer: Typer) -> Often:
-    before, after = (typer.condition(part, scope) for part in change.children)
-    return Often(before, after, Fraction(typer.constant(chance, CHANCE, scope)), change.span)  # type: ignore[arg-type]  # a chance is a fraction
+    def _kind(self, key: Scalar, name: str) -> Kind:
+        symbols = self.typer.symbols
+        found = symbols.fields.get(name) or symbols.properties.get(name)
+        if found is not None:
+            if found.kind.name in FORMS:
+                return found.kind
+            label = f"no cell has {found.kind} of its own"
+            raise self.typer.fail("PD407", f"`{name}` is not a field", key.span, label)
+        if symbols.is_declared(name, self.pack):
+            raise Poisoned  # what is wrong with its declaration has been reported
+        if key.is_optional:
+            raise Unresolved(name)  # the test waits for the pack that declares it
+        report_unknown("field", key, (*symbols.fields, *symbols.properties), self.typer.reporter)
+        raise Poisoned
 
 
 def check_assigned(examples: Sequence[Example], symbols: Symbols, reporter: Reporter) -> None:
@@ -146,38 +369,3 @@ def check_assigned(examples: Sequence[Example], symbols: Symbols, reporter: Repo
                     f"a cell that holds `{name}` has a value here",
                 )
                 reporter.error("PD407", message, grid.span, label, helps=["write `.` for such cells"])
-
-
-def _whole_world(height: int, width: int) -> Kernel:
-    """A kernel that sees all cells of a small world from each of them: `count(X in world) == 1`."""
-    offsets = ((dy, dx) for dy in range(1 - height, height) for dx in range(1 - width, width))
-    return Kernel("world", tuple((dy, dx, 1) for dy, dx in offsets), wrap=False)
-
-
-def _check_whole(scalar: Scalar, legend: dict[str, str], typer: Typer) -> None:
-    """Refuse a drawing on the line of its key whose rest is a comment to YAML, where `#` is a character of drawings."""
-    comment = comment_after(scalar) if scalar.style == "plain" and "#" in legend else None
-    if comment is not None:
-        whole = Span(comment.source, scalar.span.start, comment.end).text
-        raise typer.fail(
-            "PD110", "a drawing that stops at a comment", comment, "a comment, to YAML",
-            f'put quotes around the drawing: "{whole}"', "or draw it on the next lines, below `|`",
-        )  # fmt: skip
-
-
-def _rows(scalar: Scalar, legend: dict[str, str], typer: Typer, *, wildcard: bool) -> tuple[str, ...]:
-    """The rows of a drawn world, a character a cell."""
-    _check_whole(scalar, legend, typer)
-    rows = tuple("".join(line.split()) for line in scalar.text.splitlines() if line.strip())
-    if not rows or len({len(row) for row in rows}) != 1 or max(len(rows), len(rows[0])) > MAX_SIDE:
-        label = f"expected 1 to {MAX_SIDE} equal rows"
-        raise typer.fail("PD110", "rows of a world are equally long", scalar.span, label)
-    for char in sorted(set("".join(rows))):
-        if char not in legend and not (wildcard and char == "?"):
-            start = scalar.content.start + max(scalar.content.text.find(char), 0)
-            place = Span(scalar.span.source, start, start + 1)
-            known = " ".join(f"{glyph}={name}" for glyph, name in sorted(legend.items()))
-            raise typer.fail(
-                "PD301", f"`{char}` stands for nothing", place, "not in the legend", f"known: {known}"
-            )
-    return rows

@@ -57,7 +57,7 @@ class Paint:
 
 @dataclass(frozen=True)
 class Setting:
-    """A statement that gives the field `name` a value in the cells of `shape`: a word as `model.fields.words` reads it."""
+    """A statement that gives the field `name` a value in the cells of `shape`: a word as `model.examples.read_word` reads it."""
 
     name: str
     value: str

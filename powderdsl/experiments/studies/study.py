@@ -314,7 +314,7 @@ class _StudyReader:
                     helps = (f"write `${unused}` in a step, or leave it out",)
                     self.error("PD806", f"no step uses `{unused}`", names[unused].span, helps=helps)
             if decl.seeds > 1 and SEED not in self.used:
-                place = next(name.span for name, _ in entries if name.text == "seeds")
+                place = next(value.span for name, value in entries if name.text == "seeds")
                 helps = ("write `seed: $seed` in a step that trains, or `seeds: 1`",)
                 self.error("PD806", "no step uses `$seed`", place, helps=helps)
         steps, source = tuple(self.steps.values()), tree.span.source

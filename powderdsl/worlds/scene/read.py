@@ -11,7 +11,7 @@ from typing import Any
 
 from powderdsl.arrays import NDArray, np
 from powderdsl.diagnostics import Label, Reporter, Source, Span, suggest
-from powderdsl.model.fields import WordProblem, read_word
+from powderdsl.model.examples import WordProblem, read_word
 from powderdsl.model.schema import NAME_FORM, Reader, Record, first_line, keyed, read_tree
 from powderdsl.model.state import Slot, slot_name, slots
 from powderdsl.model.types import Ruleset
