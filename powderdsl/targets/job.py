@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple, Protocol, Self
 
 from powderdsl.diagnostics import CompileError
 from powderdsl.system.writing import failure
@@ -66,6 +66,79 @@ class Clock(NamedTuple):
     def step(self) -> Array:
         """The step of each world: int64 [B]."""
         return self.start + self.since if self.since else self.start
+
+
+Like = Mapping[str, tuple[Any, tuple[int, ...]]]
+"""The dtype and shape of each array of a state."""
+
+
+class PackedArrays(Mapping[str, Array]):
+    """A batch's state in memory of a backend. Slots are unpacked into arrays one by one, on first access."""
+
+    __slots__ = ("_arrays", "like")
+
+    def __init__(self, like: Like):
+        self.like = like
+        self._arrays: dict[str, Array] = {}
+
+    def unpack(self, name: str) -> Array:
+        """One slot as a new array of its storage dtype."""
+        raise NotImplementedError
+
+    def __getitem__(self, name: str) -> Array:
+        if name not in self._arrays:
+            self._arrays[name] = self.unpack(name)
+        return self._arrays[name]
+
+    def has(self, name: str) -> bool:
+        """Whether a slot's array has been made."""
+        return name in self._arrays
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.like)
+
+    def __len__(self) -> int:
+        return len(self.like)
+
+
+class OwnedBatch(PackedArrays):
+    """A batch that its owner releases when it is no longer used."""
+
+    __slots__ = ("_handle",)
+
+    def __init__(self, handle: int, like: Like):
+        super().__init__(like)
+        self._handle: int | None = handle
+
+    def release(self, handle: int) -> None:
+        """Use the memory of a batch for others."""
+        raise NotImplementedError
+
+    def __del__(self) -> None:
+        # Not a weakref.finalize, which takes as long as a quiet step. A signal may have ended `__init__` before its end.
+        if (handle := getattr(self, "_handle", None)) is not None:
+            self.release(handle)
+
+    @property
+    def handle(self) -> int:
+        """The batch, for the backend. Raises RuntimeError after `take`."""
+        if self._handle is None:
+            raise RuntimeError(
+                "these worlds were stepped with `reuse`: only those that came of it can be used"
+            )
+        return self._handle
+
+    def take(self) -> int:
+        """The batch, for a new owner. This state must not be used afterwards."""
+        handle, self._handle = self.handle, None
+        self._arrays.clear()
+        return handle
+
+    def __copy__(self) -> Self:
+        raise NotImplementedError
+
+    def __deepcopy__(self, memo: Any) -> Self:
+        return self.__copy__()
 
 
 def shape_of(state: Mapping[str, Array]) -> tuple[int, int, int]:

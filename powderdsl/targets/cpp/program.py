@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,11 +19,8 @@ from powderdsl.targets import cache
 from powderdsl.targets.codec import Piece, parameters, pieces
 from powderdsl.targets.cpp.build import current, load_library, loadable
 from powderdsl.targets.cpp.source import native_source
-from powderdsl.targets.job import Job
+from powderdsl.targets.job import Job, Like, OwnedBatch
 from powderdsl.targets.layout import Layout
-
-Like = Mapping[str, tuple[torch.dtype, tuple[int, ...]]]
-"""The dtype and shape of each tensor of a state."""
 
 BATCH_SIZES = 16
 """How many batch sizes a program keeps the inputs of parameters for."""
@@ -86,51 +83,24 @@ class Inputs(NamedTuple):
     reals: Tensor
 
 
-class PackedState(Mapping[str, Tensor]):
-    """A batch's state in native memory. Slots are unpacked into tensors one by one, on first access."""
+class PackedState(OwnedBatch):
+    """A batch's state in native memory."""
 
-    __slots__ = ("_handle", "_tensors", "like", "program")
+    __slots__ = ("program",)
 
     def __init__(self, program: NativeProgram, handle: int, like: Like):
-        self._tensors: dict[str, Tensor] = {}
-        self.program, self.like = program, like
-        self._handle: int | None = handle
+        self.program = program
+        super().__init__(handle, like)
 
-    def __del__(self) -> None:
-        # Not a weakref.finalize, which takes as long as a quiet step. A signal may have ended `__init__` before its end.
-        if getattr(self, "_handle", None) is not None:
-            self.program.library.pd_free(self._handle)
+    def release(self, handle: int) -> None:
+        self.program.library.pd_free(handle)
 
     def __copy__(self) -> PackedState:
         return PackedState(self.program, self.program.library.pd_copy(self.handle), self.like)
 
-    def __deepcopy__(self, memo: Any) -> PackedState:
-        return self.__copy__()
-
-    @property
-    def handle(self) -> int:
-        """The batch in native memory. Raises RuntimeError after `take`."""
-        if self._handle is None:
-            raise RuntimeError(
-                "these worlds were stepped with `reuse`: only those that came of it can be used"
-            )
-        return self._handle
-
-    def take(self) -> int:
-        """The batch, for a new owner. This state must not be used afterwards."""
-        handle, self._handle = self.handle, None
-        self._tensors.clear()
-        return handle
-
-    def __getitem__(self, name: str) -> Tensor:
-        if name not in self._tensors:
-            dtype, shape = self.like[name]
-            self._tensors[name] = self.write(name, torch.empty(shape, dtype=dtype))
-        return self._tensors[name]
-
-    def has(self, name: str) -> bool:
-        """Whether a slot's tensor has been made."""
-        return name in self._tensors
+    def unpack(self, name: str) -> Tensor:
+        dtype, shape = self.like[name]
+        return self.write(name, torch.empty(shape, dtype=dtype))
 
     def write(self, name: str, out: Tensor) -> Tensor:
         """One slot, written into a tensor of its storage dtype whose worlds are contiguous; returns it."""
@@ -154,7 +124,7 @@ class PackedState(Mapping[str, Tensor]):
         changed, library = self if reuse else self.__copy__(), self.program.library
         boxes = boxes.contiguous()
         for name, value in values.items():
-            changed._tensors.pop(name, None)
+            changed._arrays.pop(name, None)
             for part, number, bits, _ in self.program.parts(name, value):
                 numbers = part.contiguous()
                 if bits:
@@ -169,7 +139,7 @@ class PackedState(Mapping[str, Tensor]):
         `reuse`: write to this state itself, and return it.
         """
         changed, library = self if reuse else self.__copy__(), self.program.library
-        changed._tensors.clear()
+        changed._arrays.clear()
         places = places.contiguous()
         count, at = len(places), places.data_ptr()
         for name, value in state.items():
@@ -181,12 +151,6 @@ class PackedState(Mapping[str, Tensor]):
                 else:
                     library.pd_put_real(changed.handle, number, count, at, plane.data_ptr())
         return changed
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.like)
-
-    def __len__(self) -> int:
-        return len(self.like)
 
 
 class NativeProgram:

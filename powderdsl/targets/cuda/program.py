@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -13,7 +13,7 @@ from powderdsl.targets import words as torch_words
 from powderdsl.targets.codec import parameters, pieces
 from powderdsl.targets.cuda import build
 from powderdsl.targets.cuda.source import KernelSource, cuda_source
-from powderdsl.targets.job import Job, Runnable, unavailable
+from powderdsl.targets.job import Job, Like, PackedArrays, Runnable, unavailable
 from powderdsl.targets.torch.mixed import packed_program
 
 
@@ -101,29 +101,15 @@ def cuda_program(program: Program, device: torch.device) -> Runnable:
     raise unavailable("cuda", problem, _HELP)
 
 
-class DeviceState(Mapping[str, Tensor]):
-    """A batch's state in packed tensors. Slots are unpacked one by one, on first access."""
+class DeviceState(PackedArrays):
+    """A batch's state in packed tensors."""
 
-    def __init__(
-        self,
-        program: CudaProgram,
-        planes: Tensor,
-        reals: Tensor,
-        like: Mapping[str, tuple[torch.dtype, tuple[int, ...]]],
-    ):
-        self.program, self.planes, self.reals, self.like = program, planes, reals, like
-        self._tensors: dict[str, Tensor] = {}
+    def __init__(self, program: CudaProgram, planes: Tensor, reals: Tensor, like: Like):
+        self.program, self.planes, self.reals = program, planes, reals
+        super().__init__(like)
 
-    def __getitem__(self, name: str) -> Tensor:
-        if name not in self._tensors:
-            self._tensors[name] = self.program.unpack(self, name)
-        return self._tensors[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.like)
-
-    def __len__(self) -> int:
-        return len(self.like)
+    def unpack(self, name: str) -> Tensor:
+        return self.program.unpack(self, name)
 
 
 class CudaProgram:
