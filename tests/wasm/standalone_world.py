@@ -38,7 +38,7 @@ class StandaloneWorld:
     """A module in wasmtime, with its fields by name."""
 
     def __init__(self, ruleset: Ruleset, size: tuple[int, int]):
-        self.running = this_host()(standalone_module(ruleset, size)).instantiate()
+        self.running = this_host()(standalone_module(ruleset, size))()
         self.call, self.size = self.running.call, size
         self.slots = {slot.name: (number, slot) for number, slot in enumerate(slots(ruleset)[1:])}
 

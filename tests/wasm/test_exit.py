@@ -20,7 +20,7 @@ atexit.register(take_apart)  # what is registered first runs last
 from powderdsl.targets.wasm.wasmtime_host import WasmtimeModule
 
 module = WasmtimeModule(bytes.fromhex("0061736d01000000" "0503010001" "070a01066d656d6f72790200"))  # exports a memory
-running = module.instantiate()
+running = module()
 assert running.memory_size() == 1 << 16
 """
 

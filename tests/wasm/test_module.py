@@ -59,7 +59,7 @@ def test_powderworld_has_every_kind_of_function() -> None:
 def packed(world: Any) -> tuple[Instance, int]:
     state = world.state
     assert isinstance(state, WasmState)
-    return state.instance, state.batch
+    return state.instance, state.handle
 
 
 def test_worlds_keep_their_state_when_others_follow(torch) -> None:  # type: ignore[no-untyped-def]

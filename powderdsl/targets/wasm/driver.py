@@ -21,6 +21,7 @@ from powderdsl.targets.wasm.binary import (
     Callee,
     Function,
     Local,
+    Place,
     Value,
     const,
     load,
@@ -67,6 +68,8 @@ class Batches:
 
     def __init__(self, library: Library):
         self.library, self.memory, self.layout = library, library.memory, library.memory.layout
+        self.sizes = (24, len(self.layout.param_planes), 4 * len(self.layout.param_reals))
+        """Bytes of the parts of a batch, for each world."""
         self.calls: dict[str, Callee] = {}
 
     def define(self, *bodies: Body, export: bool = False) -> None:
@@ -74,24 +77,20 @@ class Batches:
         for body in bodies:
             self.calls[body.__name__.strip("_")] = self.library.module.define(body, export=export)
 
-    def clock_of(self, batch: Value, what: int, world: Value) -> Value:
-        """Where seed, index or step of a world lies."""
-        return batch + ((batch[WORLDS] * what + world) << 3) + HEADER
+    def part(self, batch: Value, number: int) -> Value:
+        """Where clocks (0), bits (1) or values (2) of parameters, or groups (3) begin, at a multiple of 16 bytes."""
+        at = batch + HEADER
+        for size in self.sizes[:number]:
+            at = (at + batch[WORLDS] * size + 15) & ~15
+        return at
 
-    def bits(self, batch: Value) -> Value:
-        """Where the bits of parameters lie."""
-        return batch + batch[WORLDS] * 24 + HEADER
-
-    def values(self, batch: Value) -> Value:
-        """Where the values of parameters lie."""
-        return (self.bits(batch) + batch[WORLDS] * len(self.layout.param_planes) + 15) & ~15
-
-    def first_group(self, batch: Value) -> Value:
-        return (self.values(batch) + batch[WORLDS] * (4 * len(self.layout.param_reals)) + 15) & ~15
+    def clock_of(self, batch: Value, what: int, world: Value) -> Place:
+        """Seed, index or step of a world."""
+        return load("i64.load", self.part(batch, 0) + ((batch[WORLDS] * what + world) << 3))
 
     @contextmanager
     def each_group(self, f: Function, batch: Value) -> Iterator[Local]:
-        first = f.let(self.first_group(batch))
+        first = f.let(self.part(batch, 3))
         stop = f.let(first + batch[GROUPS] * self.memory.group)
         with f.each(first, stop, self.memory.group) as group:
             yield group
@@ -170,7 +169,7 @@ class Driver(Batches):
     def allocate(self, f: Function, worlds: I32, rows: I32) -> Value:
         """A new batch. All worlds of an instance have the same number of rows."""
         library, memory = self.library, self.memory
-        per_world = 24 + len(self.layout.param_planes) + 4 * len(self.layout.param_reals)
+        per_world = sum(self.sizes)
         library.trap_from(f, worlds, per_world + memory.group)
         library.trap_from(f, rows, 8 * memory.stride + memory.row)
         with f.when(library.world_rows.equals(0)):
@@ -183,7 +182,7 @@ class Driver(Batches):
                 f.trap()
         count = f.let((worlds + 1) >> library.strips.equals(0))
         f.set(count, either(library.strips, worlds, count))
-        size = f.let((worlds * per_world + count * memory.group + (HEADER + 32 + 15)) & ~15)
+        size = f.let((worlds * per_world + count * memory.group + (HEADER + 4 * 15)) & ~15)
         before, batch = f.let(0), f.let(library.batches)
         with f.block() as chosen:
             with f.block() as missing, f.loop() as again:
@@ -209,8 +208,8 @@ class Driver(Batches):
     def release(self, f: Function, batch: I32) -> None:
         """Use the memory of a batch for others."""
         with self.each_group(f, batch) as group:
-            for member, real in self.memory.slots:
-                f.do(self.library.giver(real)(group[member]))
+            for member, _ in self.memory.slots:
+                f.do(self.library.give(group[member]))
         f.set(batch[NEXT_BATCH], self.library.batches)
         f.set(self.library.batches, batch)
 
@@ -219,11 +218,11 @@ class Driver(Batches):
         library, present = self.library, self.memory.present
         new = f.let(self.calls["allocate"](old[WORLDS], library.world_rows))
         begin = const("i32", HEADER)
-        f.do(op("memory.copy", new + begin, old + begin, self.first_group(old) - old - HEADER))
+        f.do(op("memory.copy", new + begin, old + begin, self.part(old, 3) - old - HEADER))
         apart = f.let(new - old)
         with self.each_group(f, old) as group:
-            for member, real in self.memory.slots:
-                f.do(library.giver(real)((group + apart)[member]))
+            for member, _ in self.memory.slots:
+                f.do(library.give((group + apart)[member]))
                 f.set((group + apart)[member], library.keep(group[member]))
             f.set((group + apart)[present], group[present])
         return new
@@ -241,22 +240,14 @@ class Driver(Batches):
     # Cells
 
     def load(
-        self,
-        f: Function,
-        batch: I32,
-        slot: I32,
-        planes: I32,
-        signed: I32,
-        size: I32,
-        address: I32,
-        apart: I32,
+        self, f: Function, batch: I32, slot: I32, planes: I32, signed: I32, size: I32, start: I32, apart: I32
     ) -> None:
         """Read cells [worlds, rows, columns] into planes from a slot on: integers of 1, 2 or 4 bytes, or f32 into a field if
         there are no planes. `apart`: bytes from one world to the next.
         """
         library, memory = self.library, self.memory
         with f.when(planes.equals(0)):
-            f.do(self.calls["load_real"](batch, slot, address, apart))
+            f.do(self.calls["load_real"](batch, slot, start, apart))
             f.leave()
         with self.each_group(f, batch) as group:
             f.set(group[memory.present], -1)
@@ -267,7 +258,7 @@ class Driver(Batches):
                 f.set(word(at), plane)
                 f.do(op("memory.fill", plane + memory.base, 0, library.cells))
         with (
-            self.each_lane(f, batch, address, apart, size) as (group, lane, source),
+            self.each_lane(f, batch, start, apart, size) as (group, lane, source),
             self.each_run(f) as (at, count),
         ):
             with f.each(0, planes) as bit:
@@ -284,23 +275,15 @@ class Driver(Batches):
             f.set(source, source + count * size)
 
     def store(
-        self,
-        f: Function,
-        batch: I32,
-        slot: I32,
-        planes: I32,
-        signed: I32,
-        size: I32,
-        address: I32,
-        apart: I32,
+        self, f: Function, batch: I32, slot: I32, planes: I32, signed: I32, size: I32, start: I32, apart: I32
     ) -> None:
         """Write cells, from first to last, each as 4 bytes of which `size` stay; `signed`: the last plane is the sign."""
         memory = self.memory
         with f.when(planes.equals(0)):
-            f.do(self.calls["store_real"](batch, slot, address, apart))
+            f.do(self.calls["store_real"](batch, slot, start, apart))
             f.leave()
         with (
-            self.each_lane(f, batch, address, apart, size) as (group, lane, target),
+            self.each_lane(f, batch, start, apart, size) as (group, lane, target),
             self.each_run(f) as (at, count),
         ):
             place, x = f.let(at + (lane << 3)), f.let(0)
@@ -332,7 +315,7 @@ class Driver(Batches):
         library, memory = self.library, self.memory
         with self.each_group(f, batch) as group:
             at = f.let(group + (slot << 2))
-            f.do(library.give_field(word(at)))
+            f.do(library.give(word(at)))
             field = f.let(library.take_field())
             f.set(word(at), field)
             f.do(op("memory.fill", field + HEADER, 0, library.live_size))
@@ -371,8 +354,8 @@ class Driver(Batches):
                         f.do(pass_())
                 f.do(self.calls["leave"]())
         with f.each(0, batch[WORLDS], some=False) as world:
-            at = f.let(self.clock_of(batch, 2, world))
-            f.set(load("i64.load", at), load("i64.load", at) + counted(steps))
+            clock = self.clock_of(batch, 2, world)
+            f.set(clock, clock + counted(steps))
 
     def world_of(self, f: Function, batch: Value, number: Value, lane: int) -> Local:
         """The world of a lane; unused lanes are the last world once more."""
@@ -383,12 +366,12 @@ class Driver(Batches):
     def enter(self, f: Function, batch: I32, number: I32) -> None:
         """A group becomes the one that runs: parameters, and what the keys of its worlds have in common at all steps."""
         library, memory, layout = self.library, self.memory, self.layout
-        f.set(library.group, self.first_group(batch) + number * memory.group)
+        f.set(library.group, self.part(batch, 3) + number * memory.group)
         f.set(library.present, library.group[memory.present])
         for lane in range(LANES):
             with f.scope():
                 worlds, world = f.let(batch[WORLDS]), self.world_of(f, batch, number, lane)
-                bits, values = f.let(self.bits(batch) + world), f.let(self.values(batch) + (world << 2))
+                bits, values = f.let(self.part(batch, 1) + world), f.let(self.part(batch, 2) + (world << 2))
                 for i in range(len(layout.param_planes)):
                     flags = 0 - counted(load("i32.load8_u", bits))
                     f.set(load("i64.load", 0, memory.at("params", i) + 8 * lane), flags)
@@ -396,7 +379,7 @@ class Driver(Batches):
                 for i in range(len(layout.param_reals)):
                     f.set(word(0, memory.at("reals", i) + 4 * lane), word(values))
                     f.set(values, values + (worlds << 2))
-                seed, index = (f.let(load("i64.load", self.clock_of(batch, i, world))) for i in range(2))
+                seed, index = (f.let(self.clock_of(batch, i, world)) for i in range(2))
                 parts = [op("i32.wrap_i64", part) for part in (seed, seed >> 32, index)]
                 for i, start in enumerate((START_0, START_1)):
                     key: Value = const("i32", start)
@@ -413,7 +396,7 @@ class Driver(Batches):
         library, memory = self.library, self.memory
         for lane in range(LANES):
             with f.scope():
-                start = load("i64.load", self.clock_of(batch, 2, self.world_of(f, batch, number, lane)))
+                start = self.clock_of(batch, 2, self.world_of(f, batch, number, lane))
                 step = f.let(start + counted(done))
                 self._twice(f, op("i32.wrap_i64", step), memory.at("clock") + 8 * lane)
                 for (modulus, bit), i in self.layout.step_planes.items():
@@ -439,7 +422,7 @@ class Driver(Batches):
         for slot in self.program.slots:
             if slot.resets:
                 held, real = library.group[memory.slot(slot.name, slot.type)], slot.type == REAL
-                f.do(library.giver(real)(held))
+                f.do(library.give(held))
                 if real and slot.default:
                     make = library.module.define(self._constant_field)
                     f.set(held, make(const("f32", slot.default)))

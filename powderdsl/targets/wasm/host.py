@@ -36,34 +36,26 @@ class RunningModule(Protocol):
         ...
 
 
-class CompiledModule(Protocol):
-    """A module, ready to be instantiated."""
-
-    def instantiate(self) -> RunningModule: ...
+Compiled = Callable[[], RunningModule]
+"""A module: makes its instances."""
 
 
-def this_host() -> Callable[[bytes], CompiledModule]:
+def this_host() -> Callable[[bytes], Compiled]:
     """The compiler of this process. Raises ImportError if there is none."""
     if sys.platform == "emscripten":
-        return BrowserModule
+        return browser_module
     from powderdsl.targets.wasm.wasmtime_host import WasmtimeModule
 
     return WasmtimeModule
 
 
-class BrowserModule:
+def browser_module(code: bytes) -> Compiled:
     """A module of JavaScript, compiled at once: on a page that is for a worker to do."""
+    import js
+    from pyodide.ffi import to_js
 
-    def __init__(self, code: bytes):
-        import js
-        from pyodide.ffi import to_js
-
-        self._module = js.WebAssembly.Module.new(to_js(code))
-
-    def instantiate(self) -> BrowserInstance:
-        import js
-
-        return BrowserInstance(js.WebAssembly.Instance.new(self._module).exports)
+    module = js.WebAssembly.Module.new(to_js(code))
+    return lambda: BrowserInstance(js.WebAssembly.Instance.new(module).exports)
 
 
 class BrowserInstance:

@@ -4,10 +4,10 @@ Addresses are bytes. Everything is aligned to 16 bytes. A group is two lanes of 
 
     plane   refs, some, haloed, next: i32 each. Rows of words, lane by lane, with `around` rows above and below, which
             hold the rows that follow on the torus if `haloed`. `some`: it may hold a flag; if not, all words are zero.
-    field   refs, some, –, next. A byte a line: whether it is `live`; other lines are zero and not to be read. Then the
+    field   refs, some, 2, next. A byte a line: whether it is `live`; other lines are zero and not to be read. Then the
             lines, of both lanes one after the other, with `reach` columns of the torus on both sides.
     batch   worlds, groups, next, size. Seeds, indices and steps, i64 a world each. The bits of parameters, a byte a
-            world each; then their float32 values. Then the groups.
+            world each. Their float32 values. The groups.
     group   the planes and fields of slots, i32 each; i64: the ids that are present, of those that passes ask for.
 """
 
@@ -45,6 +45,9 @@ HEADER = 16
 """Bytes of numbers before what planes, fields and batches hold."""
 
 REFS, SOME, HALOED, NEXT = (Member("i32.load", at) for at in (0, 4, 8, 12))
+FIELD = 2
+"""What fields have instead of `haloed`."""
+
 REFS_SOME = Member("i64.load", 0)
 """Both together."""
 
@@ -225,11 +228,9 @@ class Library:
         """Rows of a world; 0 before the first batch."""
         self.scratch, self.scratch_end = variable("i32"), variable("i32")
         self.bump = define(self._bump)
-        self.take = define(partial(self._take, self.planes, self.plane_size), "take")
-        self.take_field = define(partial(self._take, self.fields, self.field_size), "take_field")
-        self.give = define(partial(self._give, self.planes), "give")
-        self.give_field = define(partial(self._give, self.fields), "give_field")
-        self.keep = define(self._keep)
+        self.take = define(partial(self._take, self.planes, self.plane_size, 0), "take")
+        self.take_field = define(partial(self._take, self.fields, self.field_size, FIELD), "take_field")
+        self.give, self.keep = define(self._give), define(self._keep)
         self.own, self.own_field = define(self._own), define(self._own_field)
         self.edges = define(self._edges)
         self.mix = define(self._mix)
@@ -242,10 +243,6 @@ class Library:
         if key not in self.made:
             self.made[key] = make()
         return self.made[key]
-
-    def giver(self, real: bool) -> Callee:
-        """Releases a plane or a field."""
-        return self.give_field if real else self.give
 
     # Memory
 
@@ -268,22 +265,26 @@ class Library:
         with f.when(counted(count) * size >= self.module.most * PAGE // 2):
             f.trap()
 
-    def _take(self, free: Global, size: Global, f: Function) -> Value:
+    def _take(self, free: Global, size: Global, kind: int, f: Function) -> Value:
         place = f.let(free)
         with f.when(place):
             f.set(free, place[NEXT])
             f.otherwise()
             f.set(place, self.bump(size))
         f.set(place[REFS_SOME], 1)
-        f.set(place[HALOED], 0)
+        f.set(place[HALOED], kind)
         return place
 
-    def _give(self, free: Global, f: Function, given: I32) -> None:
-        left = f.let(given[REFS] - 1)
-        f.set(given[REFS], left)
-        with f.when(left.equals(0)):
-            f.set(given[NEXT], free)
-            f.set(free, given)
+    def _give(self, f: Function, held: I32) -> None:
+        """One owner less of a plane or field."""
+        left = f.let(held[REFS] - 1)
+        f.set(held[REFS], left)
+        with f.when(left.equals(0)), f.when(held[HALOED].equals(FIELD)):
+            f.set(held[NEXT], self.fields)
+            f.set(self.fields, held)
+            f.otherwise()
+            f.set(held[NEXT], self.planes)
+            f.set(self.planes, held)
 
     def _keep(self, f: Function, held: I32) -> Value:
         """One more owner of a plane or field, which is the result."""
@@ -295,20 +296,20 @@ class Library:
         with f.when(plane[REFS].equals(1)):
             f.set(plane[HALOED], 0)
             f.give(plane)
-        return self._copied(f, plane, self.take, self.give, self.memory.base, self.cells)
+        return self._copied(f, plane, self.take, self.memory.base, self.cells)
 
     def _own_field(self, f: Function, field: I32) -> Value:
         """A field of this owner alone, to be written over."""
         with f.when(field[REFS].equals(1)):
             f.give(field)
-        return self._copied(f, field, self.take_field, self.give_field, HEADER, self.field_size - HEADER)
+        return self._copied(f, field, self.take_field, HEADER, self.field_size - HEADER)
 
-    def _copied(self, f: Function, old: Local, take: Callee, give: Callee, first: int, size: Value) -> Value:
+    def _copied(self, f: Function, old: Local, take: Callee, first: int, size: Value) -> Value:
         """A copy of a plane or field, whose owner gives that back."""
         new, start = f.let(take()), const("i32", first)
         f.do(op("memory.copy", new + start, old + start, size))
         f.set(new[SOME], old[SOME])
-        f.do(give(old))
+        f.do(self.give(old))
         return new
 
     # Rows around the edges

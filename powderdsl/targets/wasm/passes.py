@@ -51,7 +51,6 @@ class Pass(Printer):
         self.schedule, self.library, self.f = schedule, library, Function()
         self.nothing = schedule.graph.node("const", FLAG, (), False)
         self.vars: dict[str, Local] = {}
-        self.types: dict[str, bool] = {}
 
     def made(self) -> Function:
         f, library, schedule = self.f, self.library, self.schedule
@@ -73,7 +72,7 @@ class Pass(Printer):
             at = memory.slot(slot, node.type)
             old = f.let(group[at])
             with f.when(old):
-                f.do(library.giver(node.type == REAL)(old))
+                f.do(library.give(old))
             f.set(group[at], value)
         self.give(dict.fromkeys(str(node.attr) for _, node in schedule.leaves if node.op == "load"))
         return f
@@ -90,14 +89,13 @@ class Pass(Printer):
         for var in variables:
             if var.name not in self.vars:
                 self.vars[var.name] = self.f.local("i32")
-            self.types[var.name] = var.type == REAL
 
     def of(self, node: Node) -> Local:
         return self.vars[str(node.attr)]
 
     def give(self, names: Iterable[str]) -> None:
         for name in names:
-            self.f.do(self.library.giver(self.types[name])(self.vars[name]))
+            self.f.do(self.library.give(self.vars[name]))
 
     def held(self, node: Node) -> Value:
         """The plane or field of a load or a constant."""
@@ -158,7 +156,7 @@ class Pass(Printer):
             self.cells(loop)
             for out in loop.outs:
                 if out.into is not None:
-                    self.f.do(self.library.give_field(self.vars[out.into]))
+                    self.f.do(self.library.give(self.vars[out.into]))
         self.give(sweeps.passing)
 
     def cells(self, loop: Compute) -> None:

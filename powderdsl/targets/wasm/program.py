@@ -16,11 +16,11 @@ from powderdsl.ir.text import structure
 from powderdsl.system.memo import Memo
 from powderdsl.targets.array_kind import Array, ArrayKind
 from powderdsl.targets.codec import parameters, pieces
-from powderdsl.targets.job import Job, shape_of
+from powderdsl.targets.job import Job, Like, OwnedBatch, shape_of
 from powderdsl.targets.layout import Layout
 from powderdsl.targets.wasm.driver import numbers_of
-from powderdsl.targets.wasm.host import CompiledModule, this_host
-from powderdsl.targets.wasm.library import GROUPS, HEADER
+from powderdsl.targets.wasm.host import Compiled, this_host
+from powderdsl.targets.wasm.library import GROUPS, HEADER, aligned
 from powderdsl.targets.wasm.source import wasm_module
 
 ROOM = 1 << 30
@@ -28,9 +28,6 @@ ROOM = 1 << 30
 
 _MODULES = Memo(versions=1, things=64)
 """The compiled modules of this process: tests, tasks and environments run the same rules on the same widths again."""
-
-Like = Mapping[str, tuple[Any, tuple[int, ...]]]
-"""The dtype and shape of each array of a state."""
 
 
 class WasmProgram:
@@ -51,10 +48,10 @@ class WasmProgram:
         self._digest = planes.slots, planes.params, planes.streams, passes
         self._instances: dict[tuple[int, int, bool], Instance] = {}
 
-    def module(self, width: int) -> tuple[CompiledModule, Layout]:
+    def module(self, width: int) -> tuple[Compiled, Layout]:
         """The module for a width, and its numbers."""
 
-        def make() -> tuple[CompiledModule, Layout]:
+        def make() -> tuple[Compiled, Layout]:
             made = wasm_module(self.planes, width, memo=self._memo)
             return self._compile(made.code), made.layout
 
@@ -85,7 +82,7 @@ class WasmProgram:
             state = dict(state)
         with instance as call:
             if isinstance(state, WasmState):
-                batch, like = state.take() if job.reuse else call("copy", state.batch), state.like
+                batch, like = state.take() if job.reuse else call("copy", state.handle), state.like
             else:
                 batch, like = instance.pack(state)
             instance.run(batch, job, shape[0])
@@ -101,7 +98,7 @@ class Instance:
     def __init__(self, program: WasmProgram, width: int):
         module, self.layout = program.module(width)
         self.program, self.kind = program, program.kind
-        self.running = module.instantiate()
+        self.running = module()
         self.call = self.running.call
         self.gone: list[int] = []
         """Batches that nobody uses any more."""
@@ -157,12 +154,12 @@ class Instance:
             return self.kind.from_bytes(self.running.read(at, size), dtype, shape)
 
     def input_bytes(self, params: Mapping[str, Array], worlds: int) -> bytes:
-        """Parameters as the module takes them, after the clocks."""
+        """What comes after the clocks: bits of parameters, and their values at a multiple of 16 bytes."""
         layout = self.layout
         bits, reals = parameters(self.kind.xp, params, layout.param_planes, layout.param_reals, worlds)
         head = bytes(self.kind.bytes_of(bits))[: worlds * len(layout.param_planes)]
-        padding = bytes(-len(head) - 8 * worlds & 15)  # the values begin at a multiple of 16 bytes
-        return head + padding + bytes(self.kind.bytes_of(reals))[: 4 * worlds * len(layout.param_reals)]
+        values = bytes(self.kind.bytes_of(reals))[: 4 * worlds * len(layout.param_reals)]
+        return bytes(-24 * worlds & 15) + head.ljust(aligned(len(head)), b"\0") + values
 
     def run(self, batch: int, job: Job, worlds: int) -> None:
         """Run a batch, and measure the time of passes if the job asks for it."""
@@ -185,50 +182,20 @@ class Instance:
             self.call("leave")
 
 
-class WasmState(Mapping[str, Array]):
-    """A batch's state in the memory of an instance. Slots are unpacked into arrays one by one, on first access."""
+class WasmState(OwnedBatch):
+    """A batch's state in the memory of an instance."""
 
-    _batch: int | None = None  # of the class: a signal may end `__init__` before its first line
+    def __init__(self, instance: Instance, handle: int, like: Like):
+        self.instance = instance
+        super().__init__(handle, like)
 
-    def __init__(self, instance: Instance, batch: int, like: Like):
-        self.instance, self.like = instance, like
-        self._batch = batch
-        self._arrays: dict[str, Array] = {}
-
-    def __del__(self) -> None:
+    def release(self, handle: int) -> None:
         # The collector may come in the middle of a call, of this or another thread: the next call releases it.
-        if self._batch is not None:
-            self.instance.gone.append(self._batch)
-
-    @property
-    def batch(self) -> int:
-        """The batch's address. Raises RuntimeError after `take`."""
-        if self._batch is None:
-            raise RuntimeError(
-                "these worlds were stepped with `reuse`: only those that came of it can be used"
-            )
-        return self._batch
-
-    def take(self) -> int:
-        """The batch, for a new owner. This state must not be used afterwards."""
-        batch, self._batch = self.batch, None
-        self._arrays.clear()
-        return batch
+        self.instance.gone.append(handle)
 
     def __copy__(self) -> WasmState:
         with self.instance as call:
-            return WasmState(self.instance, call("copy", self.batch), self.like)
+            return WasmState(self.instance, call("copy", self.handle), self.like)
 
-    def __deepcopy__(self, memo: Any) -> WasmState:
-        return self.__copy__()
-
-    def __getitem__(self, name: str) -> Array:
-        if name not in self._arrays:
-            self._arrays[name] = self.instance.read(self.batch, name, self.like)
-        return self._arrays[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.like)
-
-    def __len__(self) -> int:
-        return len(self.like)
+    def unpack(self, name: str) -> Array:
+        return self.instance.read(self.handle, name, self.like)

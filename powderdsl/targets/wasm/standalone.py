@@ -150,9 +150,8 @@ class Standalone(Batches):
                     value = word(load("i32.load8_u", self.cells_at + i) << 2, table)
                     f.set(word(i << 2, self.wide), value)
                 f.do(self._load(piece, self.wide, 4))
-        f.set(load("i64.load", self.batch, HEADER), op("i64.extend_i32_u", seed))
-        for number in (1, 2):
-            f.set(load("i64.load", self.batch, HEADER + 8 * number), 0)
+        for number, start in enumerate((counted(seed), *[const("i64", 0)] * 2)):
+            f.set(load("i64.load", self.batch, HEADER + 8 * number), start)
 
     def _load(self, piece: Piece, address: Value | int, size: int) -> Value:
         return self.calls["load"](self.batch, *numbers_of(piece, self.layout, size), address, 0)
@@ -251,19 +250,11 @@ class Standalone(Batches):
             f.do(self.calls["fill"](place, planes, top, bottom, left, right, value))
 
     def _fill(
-        self,
-        f: Function,
-        slot: I32,
-        planes: I32,
-        top: I32,
-        bottom: I32,
-        left: I32,
-        right: I32,
-        value: I32,
+        self, f: Function, slot: I32, planes: I32, top: I32, bottom: I32, left: I32, right: I32, value: I32
     ) -> None:
         """A box of equal cells: in planes from a slot on; without planes, in a field, by the bits of its value."""
         library, memory = self.library, self.memory
-        group = f.let(self.first_group(self.batch))
+        group = f.let(self.part(self.batch, 3))
         f.set(group[memory.present], -1)
         with f.each(top, bottom) as y:
             lane, row = f.let(y // library.rows), f.let(y % library.rows)
@@ -294,28 +285,28 @@ class Standalone(Batches):
     def set(
         self,
         f: Function,
-        number: I32,
+        field: I32,
         component: I32,
         top: I32,
         bottom: I32,
         left: I32,
         right: I32,
-        given: F64,
+        value: F64,
     ) -> None:
         f.do(self.calls["show"]())
         self._cut(f, top, bottom, self.face.rows)
         self._cut(f, left, right, self.memory.width)
         for i, slot in enumerate(self.face.fields):
-            with f.when(number.equals(i)), f.scope():
+            with f.when(field.equals(i)), f.scope():
                 with f.when(component >= len(slot.pieces)):
                     f.leave()
                 f.do(self.reads[i]())
                 convert = "f32.demote_f64" if slot.pieces[0].is_real else "i32.trunc_sat_f64_s"
-                value = f.let(op(convert, _within(given, slot.low, slot.high)))
+                stored = f.let(op(convert, _within(value, slot.low, slot.high)))
                 base = f.let(component * (self.count * slot.size))
                 with f.each(top, bottom) as y, f.each(left, right) as x:
                     place = base + (y * self.memory.width + x) * slot.size
-                    f.set(load(slot.load, place, self.buffers[slot.name]), value)
+                    f.set(load(slot.load, place, self.buffers[slot.name]), stored)
                 f.do(self.takes[i]())
 
     # Parameters
@@ -336,9 +327,9 @@ class Standalone(Batches):
             limit = value if threshold is None else _limit(value, threshold)
             limit = f.let(op("i64.trunc_sat_f64_s", limit))
             for bit, place in bits:
-                f.set(load("i64.load8_u", self.bits(self.batch) + place), (limit >> bit) & 1)
+                f.set(load("i64.load8_u", self.part(self.batch, 1) + place), (limit >> bit) & 1)
         if knob.name in layout.param_reals:
-            at = self.values(self.batch) + 4 * layout.param_reals[knob.name]
+            at = self.part(self.batch, 2) + 4 * layout.param_reals[knob.name]
             f.set(load("f32.load", at), op("f32.demote_f64", value))
 
     def parameter(self, f: Function, number: I32, value: F64) -> None:

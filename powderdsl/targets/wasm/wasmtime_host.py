@@ -64,7 +64,8 @@ class WasmtimeModule:
         self._engine = self.engine
         self._module = _owned(wasmtime.Module(self.engine, self._code))
 
-    def instantiate(self) -> WasmtimeInstance:
+    def __call__(self) -> WasmtimeInstance:
+        """A new instance. Raises MemoryError where there is no room for its memory."""
         try:
             return WasmtimeInstance(self._engine, self._module)
         except wasmtime.WasmtimeError:
