@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from typing import Any
 
 from powderdsl.compiler import lower, parts
@@ -64,8 +65,9 @@ def standalone_module(ruleset: Ruleset, size: tuple[int, int], memo: Memo | None
     held = pieces(program)
     element, *fields = (_stored(slot, ruleset, held[slot.name]) for slot in slots(ruleset))
     ids = tuple(sorted(element.id for element in ruleset.elements))
-    about = json.dumps(_about(ruleset, size), separators=(",", ":"), ensure_ascii=False).encode()
-    face = Face(size[0], ids, element, tuple(fields), tuple(map(_knob, ruleset.params)), about)
+    knobs = tuple(map(_knob, ruleset.params))
+    about = json.dumps(_about(ruleset, size, knobs), separators=(",", ":"), ensure_ascii=False).encode()
+    face = Face(size[0], ids, element, tuple(fields), knobs, about)
     return wasm_module(segments[0].planes, size[1], face=face, memo=memo).code
 
 
@@ -92,15 +94,13 @@ def _stored(slot: Slot, ruleset: Ruleset, parts: tuple[Piece, ...]) -> Stored:
     )
 
 
-def _range(param: Param) -> tuple[float, float]:
-    return (0.0, 1.0) if param.kind.name in ("chance", "flag") else (param.kind.lo, param.kind.hi)
-
-
 def _knob(param: Param) -> Knob:
-    return Knob(param.name, float(param.default), *_range(param), param.kind.name in ("int", "flag"))
+    kind = param.kind
+    low, high = (0.0, 1.0) if kind.name in ("chance", "flag") else (kind.lo, kind.hi)
+    return Knob(param.name, float(param.default), low, high, kind.name in ("int", "flag"))
 
 
-def _about(ruleset: Ruleset, size: tuple[int, int]) -> dict[str, Any]:
+def _about(ruleset: Ruleset, size: tuple[int, int], knobs: Sequence[Knob]) -> dict[str, Any]:
     """What a page needs to know, in the order of the numbers that functions take."""
     elements = []
     for element in sorted(ruleset.elements, key=lambda element: element.id):
@@ -111,19 +111,16 @@ def _about(ruleset: Ruleset, size: tuple[int, int]) -> dict[str, Any]:
     qualified = qualified_slots(ruleset)
     tints = {field.name: field.tint for field in ruleset.fields}
     fields = []
-    for slot in slots(ruleset):
-        if slot.name != "element":
-            kind, word = slot.kind, qualified.get(slot.name, slot.name)
-            row = {"name": slot.name, "qualified": word, "kind": kind.name, "type": storage(kind)}
-            row["components"] = slot.planes
-            if (tint := tints.get(slot.name)) is not None:
-                row["tint"] = _picked(tint, "color", "full", "most")
-            fields.append(row)
+    for slot in slots(ruleset)[1:]:
+        row = {"name": slot.name, "qualified": qualified.get(slot.name, slot.name), "kind": slot.kind.name}
+        row |= {"type": storage(slot.kind), "components": slot.planes}
+        if (tint := tints.get(slot.name)) is not None:
+            row["tint"] = _picked(tint, "color", "full", "most")
+        fields.append(row)
     parameters = []
-    for param in ruleset.params:
-        low, high = _range(param)
-        row = {"name": param.name, "kind": param.kind.name, "value": float(param.default)}
-        parameters.append(row | {"low": low, "high": high, "about": param.about})
+    for param, knob in zip(ruleset.params, knobs, strict=True):
+        row = {"name": param.name, "kind": param.kind.name, "value": knob.default}
+        parameters.append(row | {"low": knob.low, "high": knob.high, "about": param.about})
     return {
         "format": FORMAT,
         "ruleset": ruleset.name,

@@ -64,18 +64,23 @@ class Session:
         self._made: Any = None
 
     def check(self, files: Mapping[str, str], off: list[str]) -> dict[str, Any]:
-        """Load the files without the packs in `off`. Rules with mistakes leave the ones before in place."""
+        """Load the files without the packs in `off`. Rules with mistakes leave the ones before in place.
+
+        Diagnostics have the text that `check` prints.
+        """
         named = self._write(files, off)
         names = [str(self.folder / word) for word in named.words]
         names[-1] = "-".join([names[-1], *named.off])
         packs: list[str] = []
+        answer: dict[str, Any] = {"ok": True}
         try:
             packs = [Path(pack.source.name).name for pack in read(names, Reporter())[0]]
-            ruleset, remarks = load_with_diagnostics(*names)
+            self.ruleset, remarks = load_with_diagnostics(*names)
+            self.good, answer["words"] = named, _words(self.ruleset)
         except CompileError as error:
-            return {"ok": False, "diagnostics": self._data(error.diagnostics), "packs": packs}
-        self.ruleset, self.good = ruleset, named
-        return {"ok": True, "diagnostics": self._data(remarks), "packs": packs, "words": _words(ruleset)}
+            answer["ok"], remarks = False, error.diagnostics
+        data = [diagnostic_data(remark, utf16=True) | {"text": render_text(remark)} for remark in remarks]
+        return answer | {"diagnostics": data, "packs": packs}
 
     def _write(self, files: Mapping[str, str], off: list[str]) -> Named:
         """Write the files, and name them as `load` takes them: rulesets, and packs beside them."""
@@ -107,10 +112,6 @@ class Session:
             raise BadRequest("every pack is off")
         taken = {name: text for name, text in files.items() if Path(name).stem not in unread}
         return Named(taken, words, [name for name in off if name not in unread])
-
-    def _data(self, found: tuple[Diagnostic, ...]) -> list[dict[str, Any]]:
-        """Diagnostics with the text that `check` prints."""
-        return [diagnostic_data(one, utf16=True) | {"text": render_text(one)} for one in found]
 
     def compile(self, rows: int, columns: int) -> bytes:
         """The last good rules as a module of a world."""

@@ -1,4 +1,7 @@
-"""The playground as files: the page, rules as WebAssembly modules, start worlds, and the compiler for Pyodide."""
+"""The playground as files: the page, rules as WebAssembly modules, start worlds, and the compiler for Pyodide.
+
+The server shows them on loopback: only GET, only files of the site, only for pages of this server.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +16,13 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property, partial
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import metadata
 from pathlib import Path
 from random import Random
 from typing import Any
+from urllib.parse import unquote, urlsplit
 
 from powderdsl.analysis.changes import unchanging_ids
 from powderdsl.arrays import np
@@ -44,6 +50,19 @@ PARTS = HERE / "parts"
 MADE = HERE / "made"
 """Files about shipped rules, which `make wheel` compiles, so that the page of an installed wheel opens at once."""
 
+ADDRESS = "127.0.0.1"
+TYPES = {
+    "css": "text/css; charset=utf-8",
+    "html": "text/html; charset=utf-8",
+    "js": "text/javascript; charset=utf-8",
+    "json": "application/json",
+    "mjs": "text/javascript; charset=utf-8",
+    "png": "image/png",
+    "svg": "image/svg+xml",
+    "wasm": "application/wasm",
+    "zip": "application/zip",
+}
+
 SIZES = (64, 128, 256, 512)
 LIBRARIES = ("click", "lark", "pyyaml")
 """Python packages that the compiler needs in Pyodide."""
@@ -62,18 +81,24 @@ class Entry:
     def ruleset(self) -> Ruleset:
         return load(*self.names, params=self.params)
 
+    @property
+    def words(self) -> list[str]:
+        """The rulesets and packs that are named."""
+        return [word for name in self.names for word in split_names(name)[0]]
+
+    @property
+    def about(self) -> str:
+        """The sentence of the last file that is named: a ruleset, or a pack on top of one."""
+        packs, ruleset = read(self.words[-1:], Reporter())
+        return packs[-1].about if ruleset is None else ruleset.about
+
     def files(self) -> dict[str, str]:
         """The rule files by name, rulesets first; packs are found beside the ruleset that lists them."""
-        words = [word for name in self.names for word in split_names(name)[0]]
-        packs, ruleset = read(words, Reporter())
+        packs, ruleset = read(self.words, Reporter())
         sources = [pack.source for pack in packs]
         if ruleset is not None:
             sources = [one.source for whole in (ruleset, *ruleset.beside) for one in whole.lineage] + sources
         return {Path(source.name).name: source.text for source in sources}
-
-    def left_out(self) -> list[str]:
-        """Packs that a `-` in the names leaves out."""
-        return [word for name in self.names for word in split_names(name)[1]]
 
     @property
     def is_shipped(self) -> bool:
@@ -122,11 +147,8 @@ def shipped_files() -> dict[str, Make]:
 
 
 def _shipped_rows() -> list[dict[str, Any]]:
-    def make() -> bytes:
-        found = shipped_entries()
-        return _dump([_row(one) | {"example": len(one.names) > 1} for one in found])
-
-    rows: list[dict[str, Any]] = json.loads(kept("shipped.json", make))
+    rows: list[dict[str, Any]]
+    rows = json.loads(kept("shipped.json", lambda: _dump([_row(entry) for entry in shipped_entries()])))
     return rows
 
 
@@ -136,8 +158,9 @@ def _row(entry: Entry) -> dict[str, Any]:
     sizes = dict.fromkeys([*own, *((side, side) for side in SIZES)])
     return {
         "key": entry.key,
-        "about": _about(entry),
+        "about": entry.about,
         "sizes": [size for size in sizes if fits(entry.ruleset, size)],
+        "example": len(entry.names) > 1,
     }
 
 
@@ -158,9 +181,9 @@ def _sheet(entry: Entry) -> dict[str, Any]:
     return {
         "key": entry.key,
         "title": ruleset.name,
-        "about": _about(entry),
+        "about": entry.about,
         "files": entry.files(),
-        "off": entry.left_out(),
+        "off": [word for name in entry.names for word in split_names(name)[1]],
         "frame": frame_element(ruleset, ruleset.elements[0].id),
         "worlds": worlds,
         "shown": shown,
@@ -176,7 +199,7 @@ class Site:
     @cached_property
     def rows(self) -> list[dict[str, Any]]:
         """The rows of the catalog; the page opens the first one."""
-        rows = [{name: row[name] for name in ("key", "about", "sizes")} for row in _shipped_rows()]
+        rows = _shipped_rows()
         if self.first is None:
             return rows
         known = [row for row in rows if row["key"] == self.first.key]
@@ -217,6 +240,58 @@ class Site:
         return len(self.files)
 
 
+class SiteServer(ThreadingHTTPServer):
+    """Serves one site. A file that takes long to make does not hold others up."""
+
+    daemon_threads = True
+
+    def __init__(self, site: Site, port: int = 0):
+        super().__init__((ADDRESS, port), _Handler)
+        self.site = site
+
+    @property
+    def address(self) -> str:
+        return f"http://{ADDRESS}:{self.server_port}/"
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: SiteServer
+    protocol_version = "HTTP/1.1"
+
+    def do_GET(self) -> None:
+        own = {f"{name}:{self.server.server_port}" for name in (ADDRESS, "localhost")}
+        origin = self.headers.get("Origin")
+        # A page elsewhere can neither name this server (Host) nor read it from its own origin (Origin).
+        if self.headers.get("Host") not in own or (origin and origin not in {f"http://{one}" for one in own}):
+            self._answer(HTTPStatus.FORBIDDEN, b"this server answers its own page only", "txt")
+            return
+        path = unquote(urlsplit(self.path).path).lstrip("/") or "index.html"
+        try:
+            data = self.server.site.read(path)
+        except CompileError as error:
+            self._answer(HTTPStatus.INTERNAL_SERVER_ERROR, str(error).encode(), "txt")
+            return
+        if data is None:
+            self._answer(HTTPStatus.NOT_FOUND, b"no such file", "txt")
+        else:
+            self._answer(HTTPStatus.OK, data, path.rpartition(".")[2])
+
+    def _answer(self, status: HTTPStatus, data: bytes, suffix: str) -> None:
+        self.send_response(status)
+        self.send_header("Content-Type", TYPES.get(suffix, "text/plain; charset=utf-8"))
+        self.send_header("Content-Length", str(len(data)))
+        self.send_header("Cache-Control", "no-cache")
+        self.send_header("X-Content-Type-Options", "nosniff")
+        self.end_headers()
+        try:
+            self.wfile.write(data)
+        except (BrokenPipeError, ConnectionResetError):
+            self.close_connection = True
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
 def _write(path: Path, data: bytes) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary:
@@ -229,13 +304,6 @@ def index_page() -> bytes:
     inline = text.partition('<script type="importmap">')[2].partition("</script>")[0]
     digest = base64.b64encode(hashlib.sha256(inline.encode()).digest()).decode()
     return text.replace("IMPORTMAP", digest).encode()
-
-
-def _about(entry: Entry) -> str:
-    """The sentence of the last file that is named: a ruleset, or a pack on top of one."""
-    words = [word for name in entry.names for word in split_names(name)[0]]
-    packs, ruleset = read(words[-1:], Reporter())
-    return packs[-1].about if ruleset is None else ruleset.about
 
 
 def _dump(value: Any) -> bytes:

@@ -17,8 +17,7 @@ import pytest
 
 from powderdsl.simulation.standalone import standalone_module
 from powderdsl.web import site as site_module
-from powderdsl.web.server import SiteServer
-from powderdsl.web.site import PAGE, Entry, Site
+from powderdsl.web.site import PAGE, Entry, Site, SiteServer
 from tests.cli.commands import powderdsl as command
 
 

@@ -65,7 +65,7 @@ def command(
 def _serve(site: Site, port: int, opens: bool) -> None:
     import webbrowser
 
-    from powderdsl.web.server import SiteServer
+    from powderdsl.web.site import SiteServer
 
     try:
         server = SiteServer(site, port)
