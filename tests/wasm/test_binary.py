@@ -28,7 +28,7 @@ def ran(function: Function, *args: float) -> Any:
     module = Module(1, 1)
     module.add(function, "f", export=True)
     store = wasmtime.Store()
-    instance = wasmtime.Instance(store, wasmtime.Module(store.engine, module.code()), [])
+    instance = wasmtime.Instance(store, wasmtime.Module(store.engine, module.code), [])
     found: Any = instance.exports(store)["f"]
     return found(store, *args)
 

@@ -18,12 +18,13 @@ from powderdsl.ir.segments import segments
 from powderdsl.system.memo import Memo
 from powderdsl.targets.tensor_kind import Tensors
 from powderdsl.targets.wasm import program
+from powderdsl.targets.wasm.binary import Module
 from powderdsl.targets.wasm.program import Instance, WasmProgram, WasmState
-from powderdsl.targets.wasm.source import WasmModule, wasm_module
+from powderdsl.targets.wasm.source import wasm_module
 from tests.wasm.jobs import hashes, hashes_in_v8, write_job
 
 
-def module_of(name: str, width: int) -> WasmModule:
+def module_of(name: str, width: int) -> Module:
     (segment,) = segments(lower(powderdsl.load(name)))
     assert segment.planes is not None
     return wasm_module(segment.planes, width)
@@ -49,7 +50,7 @@ def test_modules_import_nothing_and_have_bounded_memory() -> None:
 
 def test_powderworld_has_every_kind_of_function() -> None:
     """What other tests compare with the reference includes these."""
-    text = module_of("powderworld", 64).module.listing()
+    text = module_of("powderworld", 64).listing()
     for name in ("words", "cells", "swap_1_1_same", "arrive_-1_0_nothing", "arrive_-1_0_everything"):
         assert f"$ {name}".replace(" ", "") in text
     for name in ("draw_below", "draw_below_planes", "coin", "copy_line", "look"):

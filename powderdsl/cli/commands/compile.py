@@ -138,7 +138,7 @@ def _kernels(program: Program, backend: str, pass_name: str | None) -> Iterator[
             from powderdsl.targets.wasm.source import wasm_module
 
             chosen = None if pass_name is None else pass_function_name(pass_name)
-            yield wasm_module(part.planes, SHOWN_WIDTH).module.listing(chosen)
+            yield wasm_module(part.planes, SHOWN_WIDTH).listing(chosen)
 
 
 def _check_known(what: str, name: str, known: Sequence[str], plural: str) -> None:

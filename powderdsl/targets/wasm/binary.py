@@ -467,6 +467,7 @@ class Module:
         """A custom section: hosts can read it, and running ignores it."""
         self._custom.append(_text(name) + octets)
 
+    @property
     def code(self) -> bytes:
         """The module in the binary format."""
         variables = [

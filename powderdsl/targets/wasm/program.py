@@ -17,7 +17,7 @@ from powderdsl.system.memo import Memo
 from powderdsl.targets.array_kind import Array, ArrayKind
 from powderdsl.targets.codec import parameters, pieces
 from powderdsl.targets.job import Job, Like, OwnedBatch, shape_of
-from powderdsl.targets.layout import Layout
+from powderdsl.targets.layout import layout_of
 from powderdsl.targets.wasm.driver import numbers_of
 from powderdsl.targets.wasm.host import Compiled, this_host
 from powderdsl.targets.wasm.library import GROUPS, HEADER, aligned
@@ -42,18 +42,17 @@ class WasmProgram:
 
     def __init__(self, program: Program, planes: Program, kind: ArrayKind, memo: Memo | None = None):
         self.kind, self.pieces, self.planes = kind, pieces(program), planes
-        self._compile = this_host()
+        self.layout, self._compile = layout_of(planes), this_host()
         self._memo = Memo() if memo is None else memo  # the schedules are the same for all widths
         passes = tuple(structure(pass_, places=False) for pass_ in planes.passes)
         self._digest = planes.slots, planes.params, planes.streams, passes
         self._instances: dict[tuple[int, int, bool], Instance] = {}
 
-    def module(self, width: int) -> tuple[Compiled, Layout]:
-        """The module for a width, and its numbers."""
+    def module(self, width: int) -> Compiled:
+        """The module for a width."""
 
-        def make() -> tuple[Compiled, Layout]:
-            made = wasm_module(self.planes, width, memo=self._memo)
-            return self._compile(made.code), made.layout
+        def make() -> Compiled:
+            return self._compile(wasm_module(self.planes, width, memo=self._memo).code)
 
         return _MODULES.of((self._digest, width), "", make)
 
@@ -96,9 +95,8 @@ class Instance:
     """
 
     def __init__(self, program: WasmProgram, width: int):
-        module, self.layout = program.module(width)
-        self.program, self.kind = program, program.kind
-        self.running = module()
+        self.program, self.kind, self.layout = program, program.kind, program.layout
+        self.running = program.module(width)()
         self.call = self.running.call
         self.gone: list[int] = []
         """Batches that nobody uses any more."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import reduce
 from operator import or_
 
@@ -12,7 +12,7 @@ from powderdsl.schedule.presence import asked_ids
 from powderdsl.schedule.stages import CPU, plan
 from powderdsl.schedule.types import Schedule
 from powderdsl.system.memo import Memo, collection_paused
-from powderdsl.targets.layout import Layout, layout_of
+from powderdsl.targets.layout import layout_of
 from powderdsl.targets.wasm.binary import Module
 from powderdsl.targets.wasm.driver import Driver
 from powderdsl.targets.wasm.library import PAGE, Library, Memory, extent_of
@@ -23,32 +23,18 @@ PAGES = 1 << 15
 """The most pages of 64 KiB that a module's memory has: 2 GiB, so that no sum of two sizes passes 32 bits."""
 
 
-@dataclass(frozen=True)
-class WasmModule:
-    """A module with the numbers of its slots and parameters."""
-
-    module: Module
-    layout: Layout
-    width: int
-
-    @property
-    def code(self) -> bytes:
-        return self.module.code()
-
-
 @collection_paused()
 def wasm_module(
     program: Program, width: int, *, face: Face | None = None, memo: Memo | None = None
-) -> WasmModule:
+) -> Module:
     """The module of a program on planes, for grids of this width.
 
     Args:
         face: the module is a world by itself (`standalone`), and exports only what that has.
         memo: where schedules of passes that have not changed are found.
     """
-    layout = layout_of(program)
     schedules = [_schedule(pass_, memo) for pass_ in program.passes]
-    memory = Memory(width, extent_of(schedules), layout)
+    memory = Memory(width, extent_of(schedules), layout_of(program))
     module = Module(memory.top // PAGE + 1, PAGES)
     library = Library(memory, module)
     passes = [pass_function(schedule, library) for schedule in schedules]
@@ -56,7 +42,7 @@ def wasm_module(
     calls = Driver(library, program, passes, asked).add(export=face is None)
     if face is not None:
         Standalone(library, face, calls).add()
-    return WasmModule(module, layout, width)
+    return module
 
 
 def _schedule(pass_: PassGraph, memo: Memo | None) -> Schedule:
