@@ -87,6 +87,11 @@ class Entry:
         return [word for name in self.names for word in split_names(name)[0]]
 
     @property
+    def off(self) -> list[str]:
+        """Packs that a `-` in the names leaves out."""
+        return [word for name in self.names for word in split_names(name)[1]]
+
+    @property
     def about(self) -> str:
         """The sentence of the last file that is named: a ruleset, or a pack on top of one."""
         packs, ruleset = read(self.words[-1:], Reporter())
@@ -183,7 +188,7 @@ def _sheet(entry: Entry) -> dict[str, Any]:
         "title": ruleset.name,
         "about": entry.about,
         "files": entry.files(),
-        "off": [word for name in entry.names for word in split_names(name)[1]],
+        "off": entry.off,
         "frame": frame_element(ruleset, ruleset.elements[0].id),
         "worlds": worlds,
         "shown": shown,
