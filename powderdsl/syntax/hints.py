@@ -36,7 +36,7 @@ TERMINAL_WORDS = {
 _VALUE_STARTS = {"NAME", "INTEGER", "LPAR"}
 _LITERALS = {"DECIMAL", "PERCENT", "YES", "NO", "TRUE", "FALSE"}
 _VALUES = _VALUE_STARTS | _LITERALS | {"CHANCE", "ANY", "ALL", "MINUS", "NOT"}
-_OPERATORS = {"PLUS", "MINUS", "STAR", "SLASH", "MOD", "COMPARE", "IS", "IN", "NOT", "_DOTS"}
+_OPERATORS = {"PLUS", "MINUS", "STAR", "SLASH", "DIV", "MOD", "COMPARE", "IS", "IN", "NOT", "_DOTS"}
 
 _CHARACTERS: tuple[tuple[str, str], ...] = (
     (r"\b(if|where|chance)\b.*‸=>", "write `>=`"),

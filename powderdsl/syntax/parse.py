@@ -150,7 +150,7 @@ def _report_syntax_error(
         message = f"unexpected character {shown_character(text[start])}"
         fix = character_help(text, start, line.start)
         span, label = Span(source, start, start + 1), f"not part of a {language.noun}"
-        reporter.error(language.syntax, message, span, label, helps=[fix] if fix else usage)
+        reporter.error(language.syntax, message, span, label, helps=usage or ([fix] if fix else []))
         return
     assert isinstance(error, UnexpectedToken)
     token = error.token
