@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from powderdsl.ir.ops import Offset
 from powderdsl.schedule.types import Carried, Leftover, Move
-from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, load, op
+from powderdsl.targets.wasm.binary import I32, Callee, Function, Local, Value, const, load, op
 from powderdsl.targets.wasm.library import (
     HALOED,
     LIVE,
@@ -39,61 +40,57 @@ def rows_that_move(library: Library, downwards: bool) -> Callee:
     """Lists the rows that movers leave or enter, if they move downwards from the bottom: planes of movers and of their
     targets → the end of the list.
     """
-    return library.lazily(("rows", downwards), lambda: _rows_that_move(library, downwards))
+    memory, cells = library.memory, library.cells
+
+    def rows(f: Function, movers: I32, targets: I32) -> Value:
+        end = f.let(word(ZERO, memory.at("rows")))
+        at = f.let(cells - memory.row if downwards else ZERO)
+        with f.each(0, cells, memory.row), f.scope():
+            flags = const("v128", 0)
+            if memory.words <= 4:
+                for w in range(memory.words):
+                    for plane in (movers, targets):
+                        flags = flags | load("v128.load", plane + at, memory.base + 16 * w)
+            else:
+                total = flags = f.let(flags)
+                with f.each(at, at + memory.row, 16) as one:
+                    for plane in (movers, targets):
+                        f.set(total, total | (plane + one)[memory.flags])
+            f.set(word(end), at)
+            f.set(end, end + (some(flags) << 2))
+            f.set(at, at - memory.row if downwards else at + memory.row)
+        return end
+
+    return library.lazily(("rows", downwards), lambda: library.module.define(rows, "rows_that_move"))
 
 
-def _rows_that_move(library: Library, downwards: bool) -> Callee:
-    memory, f = library.memory, Function(["i32", "i32"])
-    movers, targets = f.params
-    end = f.let(word(ZERO, memory.at("rows")))
-    cells = library.cells
-    at = f.let(cells - memory.row if downwards else ZERO)
-    with f.each(0, cells, memory.row), f.scope():
-        found = const("v128", 0)
-        if memory.words <= 4:
-            for w in range(memory.words):
-                for plane in (movers, targets):
-                    found = found | load("v128.load", plane + at, memory.base + 16 * w)
-        else:
-            total = f.let(found)
-            with f.each(at, at + memory.row, 16) as one:
-                for plane in (movers, targets):
-                    f.set(total, total | (plane + one)[memory.flags])
-            found = total
-        f.set(word(end), at)
-        f.set(end, end + (some(found) << 2))
-        f.set(at, at - memory.row if downwards else at + memory.row)
-    f.give(end)
-    return library.module.add(f, "rows_that_move")
-
-
-def mover(library: Library, kind: str, offset: tuple[int, int], leaves: Leftover) -> Callee:
+def mover(library: Library, kind: str, offset: Offset, leaves: Leftover) -> Callee:
     """Moves planes: those of movers and targets, the end of the list of rows, the end of the table of planes."""
-    key = ("mover", kind, offset, leaves)
-    return library.lazily(key, lambda: _Mover(library, kind, offset, leaves).made())
+    name = f"{kind}_{offset[0]}_{offset[1]}_{leaves}"
+    body = _Mover(library, kind, offset, leaves).body
+    return library.lazily(name, lambda: library.module.define(body, name))
 
 
 class _Mover:
-    def __init__(self, library: Library, kind: str, offset: tuple[int, int], leaves: Leftover):
+    """Writes a function that moves planes, some of them together."""
+
+    def __init__(self, library: Library, kind: str, offset: Offset, leaves: Leftover):
         self.library, self.memory, self.kind, self.leaves = library, library.memory, kind, leaves
         self.dy, self.dx = offset
-        self.f = Function(["i32"] * 4)
-        self.movers, self.targets, self.rows_end, self.end = self.f.params
 
-    def made(self) -> Callee:
-        f, memory = self.f, self.memory
+    def body(self, f: Function, movers: I32, targets: I32, rows_end: I32, end: I32) -> None:
+        memory = self.memory
+        self.f, self.movers, self.targets, self.rows_end = f, movers, targets, rows_end
         place = f.let(const("i32", memory.at("moving")))
         for count in (TOGETHER, 1) if memory.words == 1 else (1,):
             with f.block() as out, f.loop() as again, f.scope():
-                f.jump(out, self.end < place + 4 * count)
+                f.jump(out, end < place + 4 * count)
                 planes = [f.let(word(place, 4 * i)) for i in range(count)]
                 self.rows(planes)
                 for plane in planes:
                     f.set(plane[HALOED], 0)
                 f.set(place, place + 4 * count)
                 f.jump(again)
-        name = f"{self.kind}_{self.dy}_{self.dx}_{self.leaves}"
-        return self.library.module.add(f, name)
 
     def rows(self, planes: Sequence[Local]) -> None:
         f, memory = self.f, self.memory
@@ -186,41 +183,37 @@ def move_groups(
     f.do(library.give(entered))
 
 
-def exchanger(library: Library, offset: tuple[int, int]) -> Callee:
+def exchanger(library: Library, offset: Offset) -> Callee:
     """Movers and their targets exchange values of a field: movers, field."""
-    return library.lazily(("exchange", offset), lambda: _exchanger(library, *offset))
+    memory, (dy, dx) = library.memory, offset
 
+    def exchange(f: Function, movers: I32, field: I32) -> None:
+        line = f.let(0)
+        with f.each(0, 16, 8) as lane, f.each(lane, lane + library.cells, memory.row) as row:
+            with f.scope(), f.block() as skip:
+                flags = f.let(const("i64", 0))
+                with f.each(row, row + memory.row, 16) as at:
+                    f.set(flags, flags | (movers + at)[memory.half])
+                f.jump(skip, op("i64.eqz", flags))
+                other = f.let(library.other_line(line, dy, wraps=True))
+                f.jump(skip, op("i32.eqz", (field + line)[LIVE] | (field + other)[LIVE]))
+                here, there = (f.let(library.line_start(field, number)) for number in (line, other))
+                for number, start in ((line, here), (other, there)):
+                    with f.when(op("i32.eqz", (field + number)[LIVE])):
+                        with f.each(0, 4 * memory.width, 16) as at:
+                            f.set(load("v128.load", start + at), 0)
+                        f.set((field + number)[LIVE], 1)
+                x = f.let(0)
+                with f.each(row, row + memory.row, 16) as at:
+                    left = f.let((movers + at)[memory.half])
+                    _exchange_word(f, left, x, here, there, dx % memory.width, memory.width)
+                    f.set(x, x + WORD)
+                library.finish_line(f, here)
+                library.finish_line(f, there)
+            f.set(line, line + 1)
 
-def _exchanger(library: Library, dy: int, dx: int) -> Callee:
-    memory, f = library.memory, Function(["i32", "i32"])
-    movers, field = f.params
-    line = f.let(0)
-    with (
-        f.each(0, 16, 8) as lane,
-        f.each(lane, lane + library.cells, memory.row) as row,
-    ):
-        with f.scope(), f.block() as skip:
-            found = f.let(const("i64", 0))
-            with f.each(row, row + memory.row, 16) as at:
-                f.set(found, found | (movers + at)[memory.half])
-            f.jump(skip, op("i64.eqz", found))
-            other = f.let(library.other_line(line, dy, wraps=True))
-            f.jump(skip, op("i32.eqz", (field + line)[LIVE] | (field + other)[LIVE]))
-            here, there = (f.let(library.line_start(field, number)) for number in (line, other))
-            for number, start in ((line, here), (other, there)):
-                with f.when(op("i32.eqz", (field + number)[LIVE])):
-                    with f.each(0, 4 * memory.width, 16) as at:
-                        f.set(load("v128.load", start + at), 0)
-                    f.set((field + number)[LIVE], 1)
-            x = f.let(0)
-            with f.each(row, row + memory.row, 16) as at:
-                left = f.let((movers + at)[memory.half])
-                _exchange_word(f, left, x, here, there, dx % memory.width, memory.width)
-                f.set(x, x + WORD)
-            library.finish_line(f, here)
-            library.finish_line(f, there)
-        f.set(line, line + 1)
-    return library.module.add(f, f"exchange_{dy}_{dx}")
+    name = f"exchange_{dy}_{dx}"
+    return library.lazily(name, lambda: library.module.define(exchange, name))
 
 
 def _exchange_word(
