@@ -132,7 +132,6 @@ _TORCH = (
     "targets.tensor_kind",
     "targets.random",
     "targets.words",
-    "targets.torch.mixed",
     "targets.torch.program",
     "targets.arrays.program",
     "targets.cpp.program",

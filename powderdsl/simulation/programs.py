@@ -121,8 +121,7 @@ def make_program(
         raise unavailable("wasm", problem, _CPU if plain else _WASMTIME)
     if plain:
         return BackendProgram("wasm", _Modules(ruleset, lower(ruleset, memo), kind, memo or Memo()))
-    from powderdsl.targets.torch.mixed import packed_program
-    from powderdsl.targets.torch.program import TorchProgram
+    from powderdsl.targets.torch.program import TorchProgram, packed_program
 
     # These are made when first needed: native code that was compiled before needs none of them.
     lowered = cache(lambda: lower(ruleset))

@@ -94,6 +94,16 @@ class Values(Generic[Named]):
         self.lines, self.known = outer, known
 
 
+GATES = {
+    "not": "~{0}",
+    "and": "{0} & {1}",
+    "or": "{0} | {1}",
+    "xor": "{0} ^ {1}",
+    "select": "mux({0}, {1}, {2})",
+}
+"""The expression of each gate in C++ and CUDA, with the arguments by number."""
+
+
 class WordText(Values[str]):
     """Flags as text, a word at a time. `type` is the type of a word."""
 

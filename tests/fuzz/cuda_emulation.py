@@ -14,9 +14,10 @@ from powderdsl.model.types import Ruleset
 from powderdsl.simulation.programs import BackendProgram
 from powderdsl.simulation.simulator import Simulator
 from powderdsl.targets.cpp.build import find_compiler
-from powderdsl.targets.cuda.program import Arguments, Compile, CudaProgram, Launch, worlds_of
+from powderdsl.targets.cuda.build import Worlds
+from powderdsl.targets.cuda.program import Compile, CudaProgram, Launch
 from powderdsl.targets.cuda.source import KernelSource
-from powderdsl.targets.torch.mixed import packed_program
+from powderdsl.targets.torch.program import packed_program
 from tests.fuzz import EMULATED
 
 FLAGS = ("-std=c++17", "-O0", "-ffp-contract=off", "-fno-strict-aliasing", "-shared", "-fPIC", "-w")
@@ -45,8 +46,8 @@ def compiler_for(folder: Path, order: int) -> Compile:
                 os.replace(library, target)
         emulate = ctypes.CDLL(str(target)).emulate
 
-        def launch(arguments: Arguments) -> None:
-            if emulate(ctypes.byref(worlds_of(arguments)), arguments.blocks, order):
+        def launch(worlds: Worlds, blocks: int) -> None:
+            if emulate(ctypes.byref(worlds), blocks, order):
                 raise AssertionError("some threads wait at a barrier that others never reach")
 
         return launch

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 
-from powderdsl.ir.ops import REAL, Node, ordered
+from powderdsl.ir.ops import FLAG, REAL, Node, ordered
 from powderdsl.ir.single import all_ones, single
 from powderdsl.schedule.join import keeps
 from powderdsl.schedule.rows import ANY_PASS, RowLoop, Rows, region_of, rows_of
@@ -20,8 +20,22 @@ PLACE = (
 )
 """Where the words of row y lie in planes."""
 
-_INFIX = {"add": "+", "sub": "-", "mul": "*"}
-_CALLS = {"abs": "magnitude", "min": "smaller", "max": "larger", "sqrt": "root", "div": "divide"}
+_FLOATS = {
+    "eq": "bits_eq({0}, {1})",
+    "lt": "bits_lt({0}, {1})",
+    "le": "bits_le({0}, {1})",
+    "add": "{0} + {1}",
+    "sub": "{0} - {1}",
+    "mul": "{0} * {1}",
+    "div": "divide({0}, {1})",
+    "neg": "-{0}",
+    "abs": "magnitude({0})",
+    "min": "smaller({0}, {1})",
+    "max": "larger({0}, {1})",
+    "sqrt": "root({0})",
+    "settle": "settle({0}, {1}, {2}, SNAP)",
+}
+"""The expression of each operation on floats, with the arguments and then the attribute's numbers by number."""
 
 
 def sweeps_text(sweeps: Sweeps, layout: NativeLayout, reaches: Mapping[str, int]) -> str:
@@ -361,21 +375,10 @@ class _Loop(CellValues[str]):
                 self.layout.cover(reach=abs(dx) if within else 0)
                 return self.temporary(loaded if within else f"inside_columns({loaded}, x, {dx}, width)")
         args = [self.known[id(arg)] for arg in node.args]
-        match node.op:
-            case "eq" | "lt" | "le":
-                return self.temporary(f"bits_{node.op}({args[0]}, {args[1]})", "u32", "b")
-            case "add" | "sub" | "mul":
-                return self.temporary(f"{args[0]} {_INFIX[node.op]} {args[1]}")
-            case "div" if node.args[1].op == "const" and node.args[1].attr:
-                return self.temporary(quotient(args[0], float(node.args[1].attr)))
-            case "neg":
-                return self.temporary(f"-{args[0]}")
-            case "abs" | "min" | "max" | "sqrt" | "div":
-                return self.temporary(f"{_CALLS[node.op]}({', '.join(args)})")
-            case "settle":
-                lo, hi = attr
-                return self.temporary(f"settle({args[0]}, {literal(lo)}, {literal(hi)}, SNAP)")
-        raise AssertionError(f"no C++ kernel for {node.op}")
+        if node.op == "div" and node.args[1].op == "const" and node.args[1].attr:
+            return self.temporary(quotient(args[0], float(node.args[1].attr)))
+        text = _FLOATS[node.op].format(*args, *map(literal, attr or ()))
+        return self.temporary(text, "u32", "b") if node.type == FLAG else self.temporary(text)
 
     def draw(self, node: Node) -> str:
         stream, bits = node.attr

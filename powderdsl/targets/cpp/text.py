@@ -25,9 +25,8 @@ from powderdsl.schedule.types import (
 from powderdsl.schedule.words import difference, is_cleared
 from powderdsl.targets.cpp.cells import held, sweeps_text
 from powderdsl.targets.layout import NativeLayout, fixed_key, is_run, number, param_key
-from powderdsl.targets.printing import Printer, WordText, drawn_where, limited_draw
+from powderdsl.targets.printing import GATES, Printer, WordText, drawn_where, limited_draw
 
-_LOGIC = {"and": "&", "or": "|", "xor": "^"}
 LOOP = (
     "for (int y = 0, i = 0; y < height; y++) for (int w = 0; w < words; w++, i++) "
     "{ const V valid = c.valid(w); (void)valid;"
@@ -291,8 +290,8 @@ class _Words(WordText):
         if (draw := limited_draw(node)) is not None:
             return self.known[id(draw)]
         attr, args = node.attr, self.args(node)
-        if node.op in _LOGIC:
-            return f"{args[0]} {_LOGIC[node.op]} {args[1]}"
+        if node.op in GATES:
+            return GATES[node.op].format(*args)
         match node.op:
             case "load":
                 return f"{self.plane(str(attr))}[i]"
@@ -310,10 +309,6 @@ class _Words(WordText):
                 return f"{self.pointer(f'c.fixed[{self.layout.fixed[fixed_key(node)]}]')}[i]"
             case "chance" | "below_planes" | "below_param":
                 return self.draw(node, args)
-            case "not":
-                return f"~{args[0]}"
-            case "select":
-                return f"mux({', '.join(args)})"
         raise AssertionError(f"no C++ kernel for {node.op}")
 
     def draw(self, node: Node, args: Sequence[str]) -> str:

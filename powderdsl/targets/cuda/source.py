@@ -71,22 +71,14 @@ def cuda_source(program: Program, height: int, width: int, shared_limit: int) ->
         schedule = buffers(plan(pass_, CUDA), homes, pool, in_place=in_place)
         body = pass_text(barriers(schedule, pending), layout)
         passes.append(f"DEVICE void pass_{number}(const Block& c) {{\n(void)c;\n{body}\n}}")
-    uniform = (
-        4
-        * group
-        * (
-            2
-            + 2 * len(layout.streams)
-            + len(layout.step_planes)
-            + len(layout.param_planes)
-            + len(layout.param_reals)
-        )
-    )
+    numbers = len(layout.step_planes) + len(layout.param_planes) + len(layout.param_reals)
+    uniform = 4 * group * (2 + 2 * len(layout.streams) + numbers)
     planes = 4 * group * words * pool.size["flag"]
     fields = 4 * group * (height * width + words) * pool.size["real"]
     planes_fit = uniform + planes <= shared_limit
     fields_fit = planes_fit and uniform + planes + fields <= shared_limit
-    shared = uniform + (planes if planes_fit else 0) + (fields if fields_fit else 0)
+    scratch = planes * (not planes_fit) + fields * (not fields_fit)
+    shared = uniform + planes + fields - scratch
     # As many blocks as the chip's memory holds, but not so many that registers run out.
     blocks = max(1, min(shared_limit // (shared + RESERVED), REGISTERS // (threads * ENOUGH)))
     head = {
@@ -110,7 +102,6 @@ def cuda_source(program: Program, height: int, width: int, shared_limit: int) ->
         "}",
         (folder / "driver.cuh").read_text(encoding="utf-8"),
     ])  # fmt: skip
-    scratch = (0 if planes_fit else planes) + (0 if fields_fit else fields)
     return KernelSource(program.name, text, layout, group, threads, shared, scratch)
 
 

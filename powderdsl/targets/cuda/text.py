@@ -4,15 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from powderdsl.ir.ops import REAL, Node, ordered
+from powderdsl.ir.ops import FLAG, REAL, Node, ordered
 from powderdsl.schedule.lifetimes import Buffer
 from powderdsl.schedule.types import ANSWER, Compute, Guard, Out, Schedule, Statement, Sync
 from powderdsl.targets.layout import Layout, literal, param_key
-from powderdsl.targets.printing import CellValues, Printer, WordText
+from powderdsl.targets.printing import GATES, CellValues, Printer, WordText, drawn_where
 
-_LOGIC = {"and": "&", "or": "|", "xor": "^"}
-_ARITHMETIC = {"add": "+", "sub": "-", "mul": "*", "eq": "==", "lt": "<", "le": "<="}
-_CALLS = {"abs": "MAGNITUDE", "sqrt": "ROOT", "div": "divide", "min": "smaller", "max": "larger"}
+_FLOATS = {
+    "eq": "{0} == {1}",
+    "lt": "{0} < {1}",
+    "le": "{0} <= {1}",
+    "add": "{0} + {1}",
+    "sub": "{0} - {1}",
+    "mul": "{0} * {1}",
+    "div": "divide({0}, {1})",
+    "neg": "-{0}",
+    "abs": "MAGNITUDE({0})",
+    "min": "smaller({0}, {1})",
+    "max": "larger({0}, {1})",
+    "sqrt": "ROOT({0})",
+    "settle": "settle({0}, {1}, {2})",
+}
+"""The expression of each operation on floats, with the arguments and then the attribute's numbers by number."""
 
 
 def pass_text(schedule: Schedule, layout: Layout) -> str:
@@ -136,8 +149,8 @@ class _Words(WordText):
 
     def node(self, node: Node) -> str:
         args, attr = self.args(node), node.attr
-        if node.op in _LOGIC:
-            return f"{args[0]} {_LOGIC[node.op]} {args[1]}"
+        if node.op in GATES:
+            return GATES[node.op].format(*args)
         match node.op:
             case "load":
                 return f"P({self.printer.number(attr)})[i]"
@@ -158,21 +171,8 @@ class _Words(WordText):
                 return f"COLUMNS_{self.layout.fixed[1, modulus, bit]}[w]"
             case "inside":
                 return f"inside_word(y, w, {attr[0]}, {attr[1]})"
-            case "chance":
-                stream, bits, limit = attr
-                where = f"{args[0]} & valid" if args else "valid"
-                return f"draw_below({self.layout.streams[stream]}, l, y, w, {where}, {bits}, {limit}ull)"
-            case "below_planes":
-                bits = attr[1]
-                return self.below(node, args[: bits + 1], args[bits + 1 :])
-            case "below_param":
-                _, bits, name, view = attr
-                numbers = [self.layout.param_planes[name, view, i] for i in range(bits, -1, -1)]
-                return self.below(node, [f"PARAM_FLAG({number})" for number in numbers], args)
-            case "not":
-                return f"~{args[0]}"
-            case "select":
-                return f"mux({', '.join(args)})"
+            case "chance" | "below_planes" | "below_param":
+                return self.draw(node, args)
             case "live":
                 number = self.printer.number(node.args[0].attr)
                 dy, reach = attr
@@ -186,13 +186,19 @@ class _Words(WordText):
         value = f"columns({plane} + {row}, w, {dx})" if dx else f"{plane}[{row} + w]"
         return value if wraps else f"{value} & inside_word(y, w, {dy}, {dx})"
 
-    def below(self, node: Node, limit: list[str], where: list[str]) -> str:
-        """A draw below a limit, given plane by plane from the highest."""
-        stream, bits = node.attr[:2]
-        wanted = f"{where[0]} & valid" if where else "valid"
+    def draw(self, node: Node, args: Sequence[str]) -> str:
+        """A draw below a limit, which is a number, or is given plane by plane from the highest."""
+        stream, bits = self.layout.streams[node.attr[0]], node.attr[1]
+        where = drawn_where(node)
+        wanted = "valid" if where is None else f"{self.known[id(where)]} & valid"
+        if node.op == "chance":
+            return f"draw_below({stream}, l, y, w, {wanted}, {bits}, {node.attr[2]}ull)"
+        limit = args[: bits + 1]
+        if node.op == "below_param":
+            limit = [f"PARAM_FLAG({number})" for number in self.layout.limit(node)]
         name = self.fresh("limit")
         self.lines.append(f"const u32 {name}[] = {{{', '.join(limit)}}};")
-        return f"draw_below_planes({self.layout.streams[stream]}, l, y, w, {wanted}, {bits}, {name})"
+        return f"draw_below_planes({stream}, l, y, w, {wanted}, {bits}, {name})"
 
 
 class _Cells(CellValues[str]):
@@ -206,9 +212,9 @@ class _Cells(CellValues[str]):
         nodes = ordered(out.value for out in outs)
         self.choices = [node for node in nodes if node.op == "select"]
 
-    def name(self, text: str) -> str:
-        name = self.fresh("v")
-        self.lines.append(f"const float {name} = {text};")
+    def name(self, text: str, type: str = "float", prefix: str = "v") -> str:
+        name = self.fresh(prefix)
+        self.lines.append(f"const {type} {name} = {text};")
         return name
 
     def node(self, node: Node) -> str:
@@ -230,20 +236,10 @@ class _Cells(CellValues[str]):
             case "led":
                 return self.led(node)
         args = [self.known[id(arg)] for arg in node.args]
-        if node.op in ("eq", "lt", "le"):
-            name = self.fresh("b")
-            self.lines.append(f"const bool {name} = {args[0]} {_ARITHMETIC[node.op]} {args[1]};")
-            return name
-        if node.op in _ARITHMETIC:
-            return self.name(f"{args[0]} {_ARITHMETIC[node.op]} {args[1]}")
-        if node.op in _CALLS:
-            return self.name(f"{_CALLS[node.op]}({', '.join(args)})")
-        if node.op == "neg":
-            return self.name(f"-{args[0]}" if args[0][0] != "-" else f"-({args[0]})")
-        if node.op == "settle":
-            lo, hi = attr
-            return self.name(f"settle({args[0]}, {literal(lo)}, {literal(hi)})")
-        raise AssertionError(f"no cuda kernel for {node.op}")
+        text = _FLOATS[node.op].format(*args, *map(literal, attr or ()))
+        if text.startswith("--"):  # minus a negative number
+            text = f"-({text[1:]})"
+        return self.name(text, "bool", "b") if node.type == FLAG else self.name(text)
 
     def shift(self, node: Node) -> str:
         dy, dx, wraps = node.attr

@@ -7,16 +7,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import reduce
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from powderdsl.ir.ops import SNAP, Program, Threshold
+from powderdsl.ir.ops import SNAP, Program, Threshold, kernel_rows
+from powderdsl.ir.segments import segments
+from powderdsl.system.memo import collection_paused
 from powderdsl.system.random import base_keys
 from powderdsl.targets import random
 from powderdsl.targets.codec import limits, pieces
-from powderdsl.targets.job import Job
+from powderdsl.targets.job import Job, Runnable
+from powderdsl.targets.mixed import mixed_program
 from powderdsl.targets.torch.source import load_source, pass_source
 
 PassFunction = Callable[[Any, dict[str, Tensor]], dict[str, Tensor]]
@@ -37,8 +41,6 @@ class Kernels:
     base: Tensor
     idents: Tensor
     step: Tensor
-    flags: frozenset[str] = frozenset()
-    """Parameters that are flags."""
     snap: float = SNAP
     """Smaller magnitudes of float slots become zero at the end of a pass."""
     keys: Tensor = field(init=False)
@@ -76,24 +78,16 @@ class Kernels:
         """The weighted number of neighbors that hold: sums of rows first, each pattern of weights once."""
         look = self.roll if wraps else self.reach
         cells = self.full(x).to(torch.int32)
-        patterns: dict[int, list[tuple[int, int]]] = {}
-        for dy, dx, weight in weights:
-            patterns.setdefault(dy, []).append((dx, weight))
         sums: dict[tuple[tuple[int, int], ...], Tensor] = {}
-        total = None
-        for dy, pattern in patterns.items():
-            key = tuple(pattern)
-            if key not in sums:
-                row = None
-                for dx, weight in pattern:
-                    term = look(cells, 0, dx) if dx else cells
-                    term = term if weight == 1 else term * weight
-                    row = term if row is None else row + term
-                assert row is not None
-                sums[key] = row
-            part = look(sums[key], dy, 0) if dy else sums[key]
-            total = part if total is None else total + part
-        return torch.zeros_like(cells) if total is None else total
+        parts = []
+        for dy, pattern in kernel_rows(weights).items():
+            if pattern not in sums:
+                terms = [(look(cells, 0, dx) if dx else cells, weight) for dx, weight in pattern]
+                sums[pattern] = reduce(
+                    torch.add, [term if weight == 1 else term * weight for term, weight in terms]
+                )
+            parts.append(look(sums[pattern], dy, 0) if dy else sums[pattern])
+        return reduce(torch.add, parts) if parts else torch.zeros_like(cells)
 
     def draw(self, stream: str, bits: int) -> Tensor:
         """The first `bits` bits of a stream's draws, int64 [B, H, W]."""
@@ -115,10 +109,9 @@ class Kernels:
         _, height, width = self.shape
         if axis == "step":
             value = self.step[:, None, None]
-        elif axis == "row":
-            value = torch.arange(height, device=self.device)[:, None]
         else:
-            value = torch.arange(width, device=self.device)[None]
+            value = torch.arange(height if axis == "row" else width, device=self.device)
+            value = value[:, None] if axis == "row" else value[None]
         return (value % modulus).to(torch.int32)
 
     def param(self, name: str, kind: str) -> Tensor:
@@ -128,12 +121,6 @@ class Kernels:
     def limit(self, name: str, bits: int, strict: bool) -> Tensor:
         """A parameter as a chance [B, 1, 1]: how many of the possible draws lie below it, or not above it."""
         return limits(torch, self.params[name], Threshold(bits, strict))[:, None, None]
-
-    @staticmethod
-    def swap(
-        content: Tensor, movers: Tensor, targets: Tensor, there: Tensor, back: Tensor, rest: Tensor
-    ) -> Tensor:
-        return torch.where(movers, there, torch.where(targets, back, rest))
 
     @staticmethod
     def divide(a: Tensor, b: Tensor) -> Tensor:
@@ -166,7 +153,6 @@ class TorchProgram:
         self.program = program
         self._snap = snap
         self.device = device
-        self._slots = {slot.name: slot for slot in program.slots}
         self._pieces = pieces(program)
         self._streams = {name: (i, bits) for i, (name, _, bits) in enumerate(program.streams)}
         self._idents = torch.tensor(
@@ -192,9 +178,9 @@ class TorchProgram:
         with torch.no_grad():
             for i in range(job.steps):
                 kernels.begin(start + i)
-                for name, slot in self._slots.items():
+                for slot in self.program.slots:
                     if slot.resets:
-                        planes[name] = torch.full(
+                        planes[slot.name] = torch.full(
                             kernels.shape, slot.default, dtype=_DTYPES[slot.type.name], device=self.device
                         )
                 job.tick("")
@@ -202,15 +188,9 @@ class TorchProgram:
                     if job.passes is None or name in job.passes:
                         planes.update(function(kernels, planes))
                         job.tick(name)
-        return self._pack(planes, job.state, kernels)
-
-    def _pack(
-        self, slots: Mapping[str, Tensor], like: Mapping[str, Tensor], kernels: Kernels
-    ) -> dict[str, Tensor]:
-        """State slots in storage dtypes."""
         packed = {}
-        for name, old in like.items():
-            parts = [kernels.full(slots[piece.slot]) for piece in self._pieces[name]]
+        for name, old in job.state.items():
+            parts = [kernels.full(planes[piece.slot]) for piece in self._pieces[name]]
             if self._pieces[name][0].component is not None:
                 packed[name] = torch.stack(parts, 1)
             else:
@@ -219,18 +199,22 @@ class TorchProgram:
         return packed
 
 
+@collection_paused()
+def packed_program(
+    program: Program, device: torch.device, make: Callable[[Program, Program], Runnable]
+) -> Runnable:
+    """A program on bit planes, see `mixed_program`; passes that they cannot represent run on torch tensors."""
+    return mixed_program(segments(program), make, lambda cells: TorchProgram(cells, device))
+
+
 def compiled(source: str, name: str, constants: Mapping[str, object], device: torch.device) -> PassFunction:
     """The function of a pass's source on this device."""
     namespace: dict[str, object] = {"torch": torch}
+    dtypes: dict[type, torch.dtype] = {bool: torch.bool, float: torch.float32}
     for key, value in constants.items():
-        dtype = (
-            torch.bool
-            if isinstance(value, bool)
-            else torch.float32
-            if isinstance(value, float)
-            else torch.int32
-        )
-        if dtype == torch.int32 and max(value if isinstance(value, tuple) else (value,)) >= 1 << 31:
-            dtype = torch.int64  # thresholds of draws of 32 bits
+        dtype = dtypes.get(type(value))
+        if dtype is None:  # integers: thresholds of draws of 32 bits need more than 32
+            wide = max(value if isinstance(value, tuple) else (value,)) >= 1 << 31
+            dtype = torch.int64 if wide else torch.int32
         namespace[key] = torch.tensor(value, dtype=dtype, device=device)
     return load_source(source, name, namespace)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 from powderdsl.ir.ops import REAL, SNAP, Node
@@ -30,7 +30,36 @@ from powderdsl.targets.wasm.words import Loop
 
 CHUNK = 4
 BITS = struct.pack("<4I", 1, 2, 4, 8)
-_ARITHMETIC = {"add", "sub", "mul", "neg", "abs", "sqrt", "eq", "lt", "le"}
+
+
+def _best(f: Function, instruction: str, a: Value, b: Value) -> Value:
+    a, b = (arg if isinstance(arg, Local) else f.let(arg) for arg in (a, b))
+    return choose(op("f32x4.ne", a, a), a, op(instruction, b, a))
+
+
+def _settled(f: Function, value: Value, low: float, high: float) -> Value:
+    x = f.let(value)
+    f.set(x, x & op("f32x4.eq", x, x))
+    f.set(x, op("f32x4.pmin", op("f32x4.pmax", x, floats(low)), floats(high)))
+    return x & op("f32x4.ge", op("f32x4.abs", x), floats(SNAP))
+
+
+_FLOATS: dict[str, str | Callable[..., Value]] = {
+    "eq": "f32x4.eq",
+    "lt": "f32x4.lt",
+    "le": "f32x4.le",
+    "add": "f32x4.add",
+    "sub": "f32x4.sub",
+    "mul": "f32x4.mul",
+    "div": lambda f, a, b: op("v128.andnot", op("f32x4.div", a, b), op("f32x4.eq", b, floats(0))),
+    "neg": "f32x4.neg",
+    "abs": "f32x4.abs",
+    "min": lambda f, a, b: _best(f, "f32x4.pmin", a, b),
+    "max": lambda f, a, b: _best(f, "f32x4.pmax", a, b),
+    "sqrt": "f32x4.sqrt",
+    "settle": _settled,
+}
+"""Each operation on floats: its instruction, or a function of the arguments and the attribute's numbers."""
 
 
 class CellLoop(Loop):
@@ -319,21 +348,8 @@ class Chunks(CellValues[Value]):
                 start = loop.starts[str(node.args[0].attr), dy, wraps or not dy]
                 value = self.beside(start, dx)
                 return value if wraps or not dx else value & self.beside(const("i32", loop.columns), dx)
-            case "div":
-                return op("v128.andnot", op("f32x4.div", *args), op("f32x4.eq", args[1], floats(0)))
-            case "min" | "max":
-                a, b = (arg if isinstance(arg, Local) else self.f.let(arg) for arg in args)
-                best = op("f32x4.pmin" if node.op == "min" else "f32x4.pmax", b, a)
-                return choose(op("f32x4.ne", a, a), a, best)
-            case "settle":
-                lo, hi = attr
-                x = self.f.let(args[0])
-                self.f.set(x, x & op("f32x4.eq", x, x))
-                self.f.set(x, op("f32x4.pmin", op("f32x4.pmax", x, floats(lo)), floats(hi)))
-                return x & op("f32x4.ge", op("f32x4.abs", x), floats(SNAP))
-        if node.op in _ARITHMETIC:
-            return op(f"f32x4.{node.op}", *args)
-        raise AssertionError(f"no function for {node.op} of floats")
+        row = _FLOATS[node.op]
+        return op(row, *args) if isinstance(row, str) else row(self.f, *args, *(attr or ()))
 
     def beside(self, start: Value, dx: int) -> Value:
         return load("v128.load", (start + (self.loop.column << 2)) + 4 * dx)
