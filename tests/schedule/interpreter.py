@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from powderdsl.ir.ops import FLAG, REAL, Node, PassGraph, Threshold, ordered
+from powderdsl.ir.ops import FLAG, OPS, REAL, Node, PassGraph, Threshold, ordered
 from powderdsl.schedule.types import (
     ANSWER,
     Compute,
@@ -247,7 +248,9 @@ def _node(node: Node, args: list[Array], world: World) -> Any:
             return (args[0] and args[1]) if node.op == "and" else (args[0] or args[1])
         case "any":
             return bool(np.any(args[0]))
-    return _SIMPLE[node.op](*args)
+    if node.op in _SIMPLE:
+        return _SIMPLE[node.op](*args)
+    return np.vectorize(partial(OPS[node.op].value, attr))(*args)
 
 
 def _elements(world: World) -> list[tuple[int, Array]]:
