@@ -10,7 +10,7 @@ import operator
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial, reduce
+from functools import cache, lru_cache, partial, reduce
 from itertools import permutations
 from typing import Any, NamedTuple
 
@@ -57,8 +57,9 @@ def _opposite(a: Node, b: Node) -> bool:
 def simpler(build: Builder, op: str, args: tuple[Node, ...], attr: Hashable = None) -> Node | None:
     """Constants evaluated, except floats, and the algebra of flags: what an operation is without itself, if anything."""
     row = OPS[op]
-    if row.evaluate is not None and all(arg.op == "const" and arg.type != REAL for arg in args):
-        return build.const(row.value(attr, *(arg.attr for arg in args)), row.type_of(attr, args))
+    constants = [arg.attr for arg in args if arg.op == "const" and arg.type != REAL]
+    if row.evaluate is not None and len(constants) == len(args):
+        return build.const(row.value(attr, *constants), row.type_of(attr, args))
     match op, args:
         case "not", (a,):  # not not a = a
             return a.args[0] if a.op == "not" else None
@@ -118,10 +119,13 @@ class Gates(Builder):
         known = simpler(self, op, args, attr) if args and args[-1].type == FLAG else None
         if known is not None:
             return known
-        if op == "xor" and any(arg.op == "not" for arg in args):  # not a xor b = not (a xor b)
-            bare = [arg.args[0] if arg.op == "not" else arg for arg in args]
-            value = self.derive("xor", *bare)
-            return value if all(arg.op == "not" for arg in args) else self.not_(value)
+        if op == "xor":
+            a, b = args
+            if a.op == b.op == "not":  # not a xor not b = a xor b
+                return self.derive("xor", a.args[0], b.args[0])
+            for x, y in ((a, b), (b, a)):
+                if x.op == "not":  # not a xor b = not (a xor b)
+                    return self.not_(self.derive("xor", x.args[0], y))
         return super().derive(op, *args, attr=attr)
 
     def shift(self, a: Node, offset: Offset, wraps: bool = True) -> Node:
@@ -239,24 +243,26 @@ class Gates(Builder):
             planes.append(column[0] if column else self.no)
         return tuple(planes)
 
-    def truth_table(self, inputs: Sequence[Node], values: Sequence[bool | None]) -> Node:
-        """Any function of a few planes; values by number, None where the number never occurs."""
-        used = [i for i, plane in enumerate(inputs) if plane.op != "const"]
-        fixed = sum(1 << i for i, plane in enumerate(inputs) if plane is self.yes)
-        numbers = [fixed]
-        for i in used:
-            numbers += [number | 1 << i for number in numbers]
-        table = tuple([values[number] if number < len(values) else None for number in numbers])
+    def truth_table(self, inputs: Sequence[Node], matters: int, values: int) -> Node:
+        """Any function of a few planes: bit n of `values` is its value for the number n, if it `matters`."""
+        used = []
+        for i, plane in enumerate(inputs):
+            if plane.op != "const":
+                used.append(i)
+                continue
+            half = _half(len(inputs), i)
+            matters, values = (matters >> (1 << i), values >> (1 << i)) if plane.attr else (matters, values)
+            matters, values = matters & half, values & half
 
         def made(split: Split | bool) -> Node:
             if isinstance(split, bool):
                 return self.flag(split)
-            plane = inputs[used[split.input]]
+            plane = inputs[split.input]
             if split.high is None:
                 return self.derive("xor", plane, made(split.low))
             return self.select(plane, made(split.high), made(split.low))
 
-        return made(_best_split(table, len(used)))
+        return made(_best_split(matters, values, len(inputs), tuple(used)))
 
 
 class Split(NamedTuple):
@@ -269,21 +275,30 @@ class Split(NamedTuple):
     low: Split | bool
 
 
-def _split(table: Sequence[bool | None], order: Sequence[int]) -> Split | bool:
-    """Split a truth table on its inputs, the highest first; halves that agree where both matter are joined."""
-    cares = {value for value in table if value is not None}
-    if len(cares) < 2:
-        return True in cares
-    half = len(table) // 2
-    low, high = table[:half], table[half:]
-    for opposite in (False, True):
-        other = [None if b is None else b is not opposite for b in high]
-        if all(a is None or b is None or a is b for a, b in zip(low, other, strict=True)):
-            joined = _split([b if a is None else a for a, b in zip(low, other, strict=True)], order[1:])
-            return Split(_cost(joined) + 1, order[0], None, joined) if opposite else joined
-    yes, no = _split(high, order[1:]), _split(low, order[1:])
-    costs = _cost(yes), _cost(no)
-    return Split(sum(costs) + (2 if all(costs) else 1), order[0], yes, no)
+@cache
+def _half(inputs: int, i: int) -> int:
+    """The numbers of so many bits whose bit i is 0, as a set of bits."""
+    step = 1 << i
+    return ((1 << (1 << inputs)) - 1) // ((1 << 2 * step) - 1) * ((1 << step) - 1)
+
+
+def _split(matters: int, values: int, inputs: int, order: Sequence[int]) -> Split | bool:
+    """Split a truth table on its inputs in order; halves that agree where both matter are joined."""
+    if not matters & values or not matters & ~values:
+        return bool(matters & values)
+    first, rest = order[0], order[1:]
+    half, step = _half(inputs, first), 1 << first
+    low, high = matters & half, matters >> step & half
+    nos, yeses = values & low, values >> step & high
+    differ = (nos ^ yeses) & low & high
+    if differ in (0, low & high):
+        if differ:
+            yeses ^= high
+        joined = _split(low | high, nos | yeses & ~low, inputs, rest)
+        return Split(_cost(joined) + 1, first, None, joined) if differ else joined
+    parts = _split(high, yeses, inputs, rest), _split(low, nos, inputs, rest)
+    costs = _cost(parts[0]), _cost(parts[1])
+    return Split(sum(costs) + (2 if all(costs) else 1), first, *parts)
 
 
 def _cost(split: Split | bool) -> int:
@@ -291,18 +306,10 @@ def _cost(split: Split | bool) -> int:
 
 
 @lru_cache(maxsize=4096)
-def _best_split(table: tuple[bool | None, ...], inputs: int) -> Split | bool:
+def _best_split(matters: int, values: int, inputs: int, used: tuple[int, ...]) -> Split | bool:
     """The split that takes the fewest gates, of all orders of inputs; highest first where there are too many to try."""
-    orders: Iterable[tuple[int, ...]] = [tuple(reversed(range(inputs)))]
-    if inputs <= 5:
-        orders = permutations(range(inputs))
-    splits = []
-    for order in orders:
-        numbers = [0]
-        for i in reversed(order):
-            numbers += [number | 1 << i for number in numbers]
-        splits.append(_split([table[number] for number in numbers], order))
-    return min(splits, key=_cost)
+    orders = [used[::-1]] if len(used) > 5 else permutations(used)
+    return min((_split(matters, values, inputs, order) for order in orders), key=_cost)
 
 
 def plane_slots(slot: SlotType) -> tuple[SlotType, ...]:
@@ -359,7 +366,7 @@ class _Lowering(Gates):
         """The flag, float or integer (`Bits`) that each node has become."""
 
     def lower(self, node: Node, args: Sequence[Any]) -> Node | Bits:
-        whole = node.type.name == "int" or any(arg.type.name == "int" for arg in node.args)
+        whole = node.type.name == "int" or Bits in map(type, args)
         if whole and node.op not in _INTEGERS:
             raise NotBits(f"{node.op} of integers")
         row = (_INTEGERS if whole else _OTHERS).get(node.op)
@@ -379,10 +386,12 @@ class _Lowering(Gates):
         count = len(a.planes)
         if count > MAX_TABLE_BITS:
             raise NotBits(f"a table over {count} planes")
-        table: list[bool | None] = [None] * (1 << count)
+        matters = values = 0
         for number in range(type.lo, min(type.hi + 1, below or type.hi + 1)):
-            table[number & ((1 << count) - 1)] = bool(test(number))
-        return self.truth_table(a.planes, table)
+            place = number & ((1 << count) - 1)
+            matters |= 1 << place
+            values |= bool(test(number)) << place
+        return self.truth_table(a.planes, matters, values)
 
     def number_of(
         self, a: Bits, node: Node, function: Callable[[int], int], below: int | None = None

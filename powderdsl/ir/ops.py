@@ -10,6 +10,7 @@ import operator
 from collections.abc import Callable, Container, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import reduce
+from itertools import chain, starmap
 from typing import Any
 
 from powderdsl.ir.single import larger, single, smaller, square_root
@@ -63,6 +64,9 @@ class Threshold:
         return f"{'lt' if self.strict else 'le'}{self.bits}"
 
 
+_TYPE = operator.attrgetter("type")
+
+
 @dataclass(frozen=True)
 class Op:
     """A row of the table: the kinds of the arguments and of the result, and what follows from them.
@@ -89,7 +93,7 @@ class Op:
         if kind != "int":
             return FLAG if kind == "flag" else REAL
         assert self.bounds is not None
-        return integer(*self.bounds(*([attr] if self.attr else []), *(arg.type for arg in args)))
+        return integer(*self.bounds(*([attr] if self.attr else []), *map(_TYPE, args)))
 
     def value(self, attr: Any, *args: Any) -> Any:
         """The result for the values of the arguments, floats rounded to float32. Raises LookupError without `evaluate`."""
@@ -227,7 +231,7 @@ class Graph:
         if op in COMMUTATIVE and args[0].type != REAL and args[0].index > args[1].index:
             args = (args[1], args[0])
         # A const's type keeps 1 and 1.0 and True apart; -0.0 never arises as a constant.
-        key = (op, type.name, tuple(arg.index for arg in args), attr)
+        key = (op, type.name, args, attr)
         node = self._nodes.get(key)
         if node is None:
             node = self._nodes[key] = Node(op, type, args, attr, len(self._nodes), places)
@@ -336,7 +340,7 @@ class PassGraph:
         """The pass with other writes for each write of a slot, and another node for each guard."""
 
         def written(pairs: Iterable[tuple[str, Node]]) -> tuple[tuple[str, Node], ...]:
-            return tuple([new for slot, node in pairs for new in write(slot, node)])
+            return tuple(chain.from_iterable(starmap(write, pairs)))
 
         substeps = [
             replace(step, writes=written(step.writes), guards=tuple(map(guard, step.guards)))
@@ -418,11 +422,12 @@ def ordered(roots: Iterable[Node], known: Container[int] = ()) -> list[Node]:
 
 def nodes_of(pass_: PassGraph, *, substeps: bool = True) -> list[Node]:
     """All nodes that a pass needs, as `ordered`: for its outputs and, unless told otherwise, for its substeps."""
-    roots = [node for _, node in pass_.outputs]
-    if substeps:
-        writes = [node for step in pass_.substeps for _, node in step.writes]
-        roots = [*writes, *roots, *[guard for step in pass_.substeps for guard in step.guards]]
-    return ordered(roots)
+    writes: list[tuple[str, Node]] = []
+    guards: list[Node] = []
+    for step in pass_.substeps if substeps else ():
+        writes += step.writes
+        guards += step.guards
+    return ordered([*[node for _, node in (*writes, *pass_.outputs)], *guards])
 
 
 def walk(node: Node) -> Iterator[Node]:
@@ -450,7 +455,7 @@ def demand(holds: bool, message: str) -> None:
 def verify(program: Program, after: str) -> None:
     """Raise InvalidIR unless every pass of the program is legal: checked after lowering and after every stage."""
     slots = {slot.name: slot.type for slot in program.slots}
-    params = {name for name, _ in program.params}
+    params = dict(program.params)
     streams = {(name, bits) for name, _, bits in program.streams}
     for pass_ in program.passes:
         seen: dict[object, Node] = {}
@@ -471,22 +476,26 @@ def verify(program: Program, after: str) -> None:
                 demand(type.name == own.name, f"{name} gets a {type}")
                 inside = type.name != "int" or own.lo <= type.lo <= type.hi <= own.hi
                 demand(inside, f"{name} of {own} gets {type}")
-            guards = [guard for step in pass_.substeps for guard in step.guards]
-            demand(all(guard.type == FLAG for guard in guards), "a guard is not a flag")
+            for step in pass_.substeps:
+                demand({FLAG}.issuperset(map(_TYPE, step.guards)), "a guard is not a flag")
         except InvalidIR as error:
             raise InvalidIR(f"after {after}, pass {pass_.name}: {error}") from None
 
 
 def _verify_node(node: Node) -> None:
     demand(node.op in OPS, f"unknown operation {node.op}")
-    op = OPS[node.op]
-    kinds = [arg.type.name for arg in node.args]
-    wanted = [kind.removeprefix("*") for kind in op.args] * (len(kinds) if op.args[:1] == ("*flag",) else 1)
-    demand(len(kinds) == len(wanted), f"{node.op} has {len(kinds)} arguments")
+    op, alike = OPS[node.op], ""
+    wanted = op.args
+    if wanted and wanted[0].startswith("*"):
+        wanted = (wanted[0][1:],) * len(node.args)
+    demand(len(node.args) == len(wanted), f"{node.op} has {len(node.args)} arguments")
     demand(bool(op.attr) == (node.attr is not None), f"{node.op} has the attribute {node.attr!r}")
-    alike = sorted({kind for kind, want in zip(kinds, wanted, strict=True) if want == "="})
-    demand(len(alike) <= 1, f"{node.op} mixes {alike}")
-    for kind, want in zip(kinds, wanted, strict=True):
-        demand(want in ("=", "?", kind), f"{node.op} takes {want}, found {kind}")
+    for want, arg in zip(wanted, node.args, strict=True):
+        kind = arg.type.name
+        if want == "=":
+            alike = alike or kind
+            demand(kind == alike, f"{node.op} mixes {alike} and {kind}")
+        else:
+            demand(want in ("?", kind), f"{node.op} takes {want}, found {kind}")
     same = not node.args or node.type == op.type_of(node.attr, node.args)
-    demand(same and node.type.lo <= node.type.hi, f"{node.op} of {kinds} gives {node.type}")
+    demand(same and node.type.lo <= node.type.hi, f"{node.op} gives {node.type}")

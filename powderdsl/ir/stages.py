@@ -6,7 +6,7 @@ The comment on each rule is its equation. Floats are never re-associated.
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
 from math import frexp
@@ -18,22 +18,11 @@ from powderdsl.ir.single import single, square_root, stepped
 Rewrite = Callable[[Node, Builder], Node | None]
 """From a node to its replacement, or None for no change."""
 
-Rules = dict[str, list[Rewrite]]
+Rules = Mapping[str, Sequence[Rewrite]]
 """Rewrite rules by the operation that they apply to, in the order in which they are tried."""
 
 
-def on(rules: Rules, *ops: str) -> Callable[[Rewrite], Rewrite]:
-    """Adds the decorated rule for some operations."""
-
-    def add(rule: Rewrite) -> Rewrite:
-        for op in ops:
-            rules.setdefault(op, []).append(rule)
-        return rule
-
-    return add
-
-
-def rewrite_pass(pass_: PassGraph, *parts: Rules) -> PassGraph:
+def rewrite_pass(pass_: PassGraph, rules: Rules) -> PassGraph:
     """The pass rebuilt bottom-up in a fresh graph, every node rewritten until no rule applies."""
     build = Builder()
     done: dict[Node, Node] = {}
@@ -45,11 +34,11 @@ def rewrite_pass(pass_: PassGraph, *parts: Rules) -> PassGraph:
         """A node of the new graph, rewritten. Arguments that a rule has made are finished first, the last before the others."""
         if node in final:
             return final[node]
-        args = tuple([finish(arg) for arg in reversed(node.args)])[::-1]
+        args = tuple(map(finish, reversed(node.args)))[::-1]
         rebuilt = node if args == node.args else build.rebuild(node, args)
         if rebuilt not in final:
             final[rebuilt] = rebuilt  # the replacement may contain the node itself
-            for rule in (rule for part in parts for rule in part.get(rebuilt.op, ())):
+            for rule in rules.get(rebuilt.op, ()):
                 replacement = rule(rebuilt, build)
                 if replacement is not None and replacement is not rebuilt:
                     final[rebuilt] = finish(replacement)
@@ -59,20 +48,14 @@ def rewrite_pass(pass_: PassGraph, *parts: Rules) -> PassGraph:
 
     for node in nodes_of(pass_):
         build.place = node.places[0] if node.places else ""
-        done[node] = finish(build.rebuild(node, tuple([done[arg] for arg in node.args])))
+        done[node] = finish(build.rebuild(node, tuple(map(done.__getitem__, node.args))))
     return pass_.map(lambda slot, node: [(slot, done[node])], done.__getitem__)
 
 
-FOLD: Rules = {}
-"""Constant folding and the algebra of flags."""
-
-
-@on(FOLD, *OPS)
 def _simpler(node: Node, build: Builder) -> Node | None:
     return simpler(build, node.op, node.args, node.attr)
 
 
-@on(FOLD, "not")
 def _not_compared(node: Node, build: Builder) -> Node | None:
     """not (a ≤ b) = b < a, not (a < b) = b ≤ a: integers only, since a NaN is neither."""
     (a,) = node.args
@@ -81,7 +64,6 @@ def _not_compared(node: Node, build: Builder) -> Node | None:
     return build.derive("lt" if a.op == "le" else "le", a.args[1], a.args[0])
 
 
-@on(FOLD, "and", "or")
 def _of_sets(node: Node, build: Builder) -> Node | None:
     """x in S and x in T = x in S ∩ T, x in S or x in T = x in S ∪ T."""
     a, b = node.args
@@ -90,7 +72,6 @@ def _of_sets(node: Node, build: Builder) -> Node | None:
     return build.in_set(a.args[0], a.attr | b.attr if node.op == "or" else a.attr & b.attr)
 
 
-@on(FOLD, "in_set")
 def _in_set(node: Node, build: Builder) -> Node | None:
     """x in {} = no, x in everything = yes; what x cannot be is left out."""
     (a,) = node.args
@@ -100,7 +81,6 @@ def _in_set(node: Node, build: Builder) -> Node | None:
     return build.in_set(a, reachable)
 
 
-@on(FOLD, "eq", "lt", "le")
 def _compare(node: Node, build: Builder) -> Node | None:
     """Comparisons of integers that their ranges decide."""
     a, b = (arg.type for arg in node.args)
@@ -114,7 +94,6 @@ def _compare(node: Node, build: Builder) -> Node | None:
     return build.flag(always) if always or never else None
 
 
-@on(FOLD, "add", "sub", "quotient")
 def _neutral(node: Node, build: Builder) -> Node | None:
     """a + 0 = a, a - 0 = a, a div 1 = a. Zeros of either sign are alike: clamping makes them one, nothing tells them apart."""
     a, b = node.args
@@ -123,14 +102,12 @@ def _neutral(node: Node, build: Builder) -> Node | None:
     return b if node.op == "add" and a.op == "const" and a.attr == 0 else None
 
 
-@on(FOLD, "mod")
 def _small_mod(node: Node, build: Builder) -> Node | None:
     """x mod n = x where 0 ≤ x < n."""
     (a,) = node.args
     return a if a.type.lo >= 0 and a.type.hi < node.attr else None
 
 
-@on(FOLD, "select")
 def _nested(node: Node, build: Builder) -> Node | None:
     """select(c, a, select(c, b, d)) = select(c, a, d)."""
     condition, yes, no = node.args
@@ -139,14 +116,12 @@ def _nested(node: Node, build: Builder) -> Node | None:
     return None
 
 
-@on(FOLD, "swap", "arrive")
 def _movement(node: Node, build: Builder) -> Node | None:
     """Nothing moves, or everything is alike."""
     content, movers, rest = node.args
     return rest if is_const(movers, False) or (content.op == "const" and rest is content) else None
 
 
-@on(FOLD, "shift")
 def _shift_of_constant(node: Node, build: Builder) -> Node | None:
     (a,) = node.args
     dy, dx, wraps = node.attr
@@ -155,19 +130,16 @@ def _shift_of_constant(node: Node, build: Builder) -> Node | None:
     return build.shift_uniform(a, (dy, dx), wraps) if a.op in ("const", "param") else None
 
 
-@on(FOLD, "below")
 def _below(node: Node, build: Builder) -> Node | None:
     """A chance that nothing or everything is below."""
     limit, bits = node.args[0].type, node.attr[1]
     return build.flag(limit.hi > 0) if limit.hi <= 0 or limit.lo >= 1 << bits else None
 
 
-@on(FOLD, "count")
 def _count(node: Node, build: Builder) -> Node | None:
     return build.integer(0) if is_const(node.args[0], False) else None
 
 
-@on(FOLD, "div")
 def _divide(node: Node, build: Builder) -> Node | None:
     """x / 2^k = x · 2^-k, exactly."""
     a, b = node.args
@@ -176,7 +148,6 @@ def _divide(node: Node, build: Builder) -> Node | None:
     return None
 
 
-@on(FOLD, "lt")
 def _root(node: Node, build: Builder) -> Node | None:
     """c < √x = c' < x, where c' is the last float whose root does not exceed c: roots are rounded, but never out of order."""
     left, root = node.args
@@ -193,19 +164,44 @@ def _root(node: Node, build: Builder) -> Node | None:
     return build.derive("lt", build.real(square), root.args[0])
 
 
-@on(FOLD, "inside")
 def _inside(node: Node, build: Builder) -> Node | None:
     """A cell lies inside its own grid."""
     return build.flag(True) if node.attr[:2] == (0, 0) else None
 
 
-RESOLVE: Rules = {}
-"""Questions about properties become questions about elements: densities vanish, sets of ids remain."""
+_FOLDS: Rules = {
+    "not": [_not_compared],
+    "and": [_of_sets],
+    "or": [_of_sets],
+    "in_set": [_in_set],
+    "eq": [_compare],
+    "lt": [_compare, _root],
+    "le": [_compare],
+    "add": [_neutral],
+    "sub": [_neutral],
+    "quotient": [_neutral],
+    "mod": [_small_mod],
+    "select": [_nested],
+    "swap": [_movement],
+    "arrive": [_movement],
+    "shift": [_shift_of_constant],
+    "below": [_below],
+    "count": [_count],
+    "div": [_divide],
+    "inside": [_inside],
+}
+
+FOLD: Rules = {op: [_simpler, *_FOLDS.get(op, ())] for op in OPS}
+"""Constant folding and the algebra of flags."""
+
+
+def _then_fold(rules: Rules) -> Rules:
+    return {op: [*rules.get(op, ()), *FOLD[op]] for op in OPS}
+
 
 MAX_VALUES = 16
 
 
-@on(RESOLVE, "shift")
 def _shift_of_table(node: Node, build: Builder) -> Node | None:
     """shift(table(x)) = table(shift(x)), so that comparisons see the table."""
     (table,) = node.args
@@ -215,13 +211,11 @@ def _shift_of_table(node: Node, build: Builder) -> Node | None:
     return build.derive("table", build.shift(table.args[0], (dy, dx)), attr=table.attr)
 
 
-@on(RESOLVE, "in_set")
 def _in_set_of_table(node: Node, build: Builder) -> Node | None:
     """table(x) in S = x in {i : table[i] in S}."""
     return _where(node.args[0], node.attr.__contains__, build) if node.args[0].op == "table" else None
 
 
-@on(RESOLVE, "eq", "lt", "le")
 def _table_compare(node: Node, build: Builder) -> Node | None:
     """table(x) < c = x in {i : table[i] < c}; between two tables, one such pair for each value of the first."""
     a, b = node.args
@@ -255,6 +249,17 @@ def _where(table: Node, holds: Callable[[int], bool], build: Builder) -> Node:
     """x in {i : table[i] holds}."""
     return build.in_set(table.args[0], frozenset(i for i, v in enumerate(table.attr) if holds(v)))
 
+
+RESOLVE = _then_fold(
+    {
+        "shift": [_shift_of_table],
+        "in_set": [_in_set_of_table],
+        "eq": [_table_compare],
+        "lt": [_table_compare],
+        "le": [_table_compare],
+    }
+)
+"""Questions about properties become questions about elements: densities vanish, sets of ids remain."""
 
 _LOGIC = ("and", "or", "not", "eq", "lt", "le")
 Tables = dict[Node, frozenset[Node]]
@@ -302,15 +307,10 @@ def _conjuncts(node: Node) -> list[Node]:
     return [part for arg in node.args for part in _conjuncts(arg)] if node.op == "and" else [node]
 
 
-SHARE: Rules = {}
-"""Shifts move outwards over what is computed cell by cell: one read a neighbor and value, shared by all rules."""
-
-
 def _wraps(node: Node) -> bool:
     return node.op == "shift" and node.attr[2]
 
 
-@on(SHARE, "shift")
 def _shift_of_shift(node: Node, build: Builder) -> Node | None:
     """shift(shift(x, a), b) = shift(x, a + b), where both wrap."""
     (inner,) = node.args
@@ -320,7 +320,6 @@ def _shift_of_shift(node: Node, build: Builder) -> Node | None:
     return build.shift(inner.args[0], (dy + ey, dx + ex))
 
 
-@on(SHARE, "in_set", "not", "and", "or", "xor", "eq", "lt", "le")
 def _of_shifts(node: Node, build: Builder) -> Node | None:
     """shift(a) and shift(b) = shift(a and b), not shift(a) = shift(not a), shift(x) < c = shift(x < c).
 
@@ -333,6 +332,22 @@ def _of_shifts(node: Node, build: Builder) -> Node | None:
         return None
     args = tuple([arg.args[0] if arg in shifts else arg for arg in node.args])
     return build.shift(build.rebuild(node, args), shifts[0].attr[:2])
+
+
+SHARE = _then_fold(
+    {
+        "shift": [_shift_of_shift],
+        "in_set": [_of_shifts],
+        "not": [_of_shifts],
+        "and": [_of_shifts],
+        "or": [_of_shifts],
+        "xor": [_of_shifts],
+        "eq": [_of_shifts],
+        "lt": [_of_shifts],
+        "le": [_of_shifts],
+    }
+)
+"""Shifts move outwards over what is computed cell by cell: one read a neighbor and value, shared by all rules."""
 
 
 def prune(pass_: PassGraph) -> PassGraph:
@@ -366,12 +381,12 @@ class Stage:
 
 
 PIPELINE: tuple[Stage, ...] = (
-    Stage("fold", "folds constants and flags that are always equal", lambda p: rewrite_pass(p, FOLD)),
+    Stage("fold", "folds constants and flags that are always equal", partial(rewrite_pass, rules=FOLD)),
     # Before sharing: what a neighbor's property decides becomes a question about its element.
     Stage("specialise", "replaces the properties of a cell whose element is known", specialise),
-    Stage("resolve", "turns tests of properties into tests of the element", lambda p: rewrite_pass(p, RESOLVE, FOLD)),
+    Stage("resolve", "turns tests of properties into tests of the element", partial(rewrite_pass, rules=RESOLVE)),
     # After resolving: only now is it clear which neighbors are read.
-    Stage("share", "reads each value of a neighbor once", lambda p: rewrite_pass(p, SHARE, FOLD)),
+    Stage("share", "reads each value of a neighbor once", partial(rewrite_pass, rules=SHARE)),
     # Last: substeps whose rules have turned out never to fire no longer write anything.
     Stage("prune", "removes substeps that change nothing", prune),
 )  # fmt: skip

@@ -90,10 +90,12 @@ def test_truth_tables(bounds: tuple[int, int]) -> None:
     count = len(a.planes)
     every = 1 << (hi - lo + 1)
     for members in range(0, every, max(1, every // 97)):
-        table: list[bool | None] = [None] * (1 << count)
+        matters = values = 0
         for number in range(lo, hi + 1):
-            table[number & ((1 << count) - 1)] = bool(members >> (number - lo) & 1)
-        node = gates.truth_table(a.planes, table)
+            place = number & ((1 << count) - 1)
+            matters |= 1 << place
+            values |= (members >> (number - lo) & 1) << place
+        node = gates.truth_table(a.planes, matters, values)
         for number in range(lo, hi + 1):
             assert value_of(node, assignment("a", number, a)) == bool(members >> (number - lo) & 1)
 
