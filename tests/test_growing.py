@@ -8,7 +8,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import powderdsl
+from powderdsl.compiler import load
+from powderdsl.diagnostics import CompileError
+from powderdsl.model.operations import FUNCTIONS, Operation
 
 PACKAGE = Path(powderdsl.__file__).parent
 
@@ -81,3 +86,22 @@ def test_an_operation_that_others_express_is_one_row_and_the_oracles(tmp_path: P
         text=True,
     )
     assert result.returncode == 0, result.stderr
+
+
+def test_what_repeats_its_argument_does_not_grow_without_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(FUNCTIONS, "twice", Operation("twice", usage="twice(A)", meaning="A + A"))
+    rules = tmp_path / "twice.yaml"
+    for depth in (4, 30):
+        nested = "twice(" * depth + "x" + ")" * depth
+        rules.write_text(
+            f"pack: twice\nelements: {{air: {{id: 0, color: '#101010'}}}}\nfields: {{x: {{type: 0..1, at: place}}}}\n"
+            f"passes: {{a: {{do: 'x += {nested}'}}}}\n",
+            "utf-8",
+        )
+        if depth == 4:
+            load(str(rules))
+        else:
+            with pytest.raises(CompileError, match="PD508"):
+                load(str(rules))

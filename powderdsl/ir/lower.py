@@ -22,7 +22,6 @@ from powderdsl.ir.ops import (
     Threshold,
     Type,
     component_names,
-    component_of,
     integer,
     kernel_rows,
 )
@@ -370,7 +369,7 @@ def lower_ruleset(ruleset: Ruleset) -> Program:
     }
     passes = []
     for pass_ in live_passes(ruleset):
-        graph = _PassLowering(ruleset, Graph(), ranges).lower(pass_)
+        graph = _PassLowering(ruleset, pass_, Graph(), ranges).lower()
         for name, last in graph.outputs:
             if name in ranges:
                 ranges[name] = integer(min(ranges[name].lo, last.type.lo), max(ranges[name].hi, last.type.hi))
@@ -402,7 +401,7 @@ def live_passes(ruleset: Ruleset) -> tuple[Pass, ...]:
 
 def lower_pass(ruleset: Ruleset, pass_: Pass, graph: Graph) -> dict[str, Node]:
     """The nodes of the slots that a pass writes, in a graph that several passes may share."""
-    return dict(_PassLowering(ruleset, graph).lower(pass_).outputs)
+    return dict(_PassLowering(ruleset, pass_, graph).lower().outputs)
 
 
 def lower_substep(ruleset: Ruleset, pass_: Pass, number: int, graph: Graph) -> dict[str, Node]:
@@ -411,20 +410,12 @@ def lower_substep(ruleset: Ruleset, pass_: Pass, number: int, graph: Graph) -> d
     Scratch fields and values that `let` fixed in earlier substeps are inputs too, the latter as ``let NAME``; values
     that this substep fixes are among the results.
     """
-    lowering = _PassLowering(ruleset, graph)
-    build = lowering.build
-    scratch = scratch_slots(pass_)
-    lowering.slots |= scratch
-    for slot in scratch.values():
-        for name in part_names(slot.name, slot.kind):
-            lowering.state[name] = build.input(name, ir_type(slot.kind, ruleset.slots))
+    lowering = _PassLowering(ruleset, pass_, graph)
     for moment in pass_.moments[:number]:
         for let in moment.lets:
-            kind = let.value.kind
-            names = [f"let {name}" for name in part_names(let.name, kind)]
-            lowering.lets[let.name] = tuple(
-                [build.input(name, ir_type(kind, ruleset.slots)) for name in names]
-            )
+            type = ir_type(let.value.kind, ruleset.slots)
+            names = [f"let {name}" for name in part_names(let.name, let.value.kind)]
+            lowering.lets[let.name] = tuple([lowering.build.input(name, type) for name in names])
     before = dict(lowering.state)
     moment = pass_.moments[number]
     lowering.substep(moment)
@@ -438,40 +429,36 @@ def lower_substep(ruleset: Ruleset, pass_: Pass, number: int, graph: Graph) -> d
 class _PassLowering:
     """Lowers one pass: keeps the current node of every slot, and the values of lets."""
 
-    def __init__(self, ruleset: Ruleset, graph: Graph, ranges: Mapping[str, Type] | None = None):
-        self.ruleset = ruleset
+    def __init__(self, ruleset: Ruleset, pass_: Pass, graph: Graph, ranges: Mapping[str, Type] | None = None):
+        self.ruleset, self.pass_ = ruleset, pass_
         self.build = Builder(graph)
-        self.slots = {slot.name: slot for slot in slots(ruleset)}
+        self.slots = {slot.name: slot for slot in slots(ruleset)} | scratch_slots(pass_)
         """The state's arrays, and scratch fields."""
-        types = {
-            name: ir_type(slot.kind, ruleset.slots)
-            for slot in self.slots.values()
-            for name in part_names(slot.name, slot.kind)
-        } | dict(ranges or {})
-        self.state = {name: self.build.input(name, type) for name, type in types.items()}
+        self.state: dict[str, Node] = {}
+        for slot in self.slots.values():
+            type = ir_type(slot.kind, ruleset.slots)
+            for name in part_names(slot.name, slot.kind):
+                self.state[name] = self.build.input(name, (ranges or {}).get(name, type))
         self.lets: dict[str, Parts] = {}
 
-    def lower(self, pass_: Pass) -> PassGraph:
-        build = self.build
-        found = dict(self.state)
-        scratch = scratch_slots(pass_)
-        self.slots |= scratch
-        for slot in scratch.values():
+    def lower(self) -> PassGraph:
+        build, before = self.build, dict(self.state)
+        for slot in scratch_slots(self.pass_).values():
             # The number nearest to zero: the same in both components of a vector.
             default = slot.default[0] if isinstance(slot.default, tuple) else slot.default
             for name in part_names(slot.name, slot.kind):
-                self.state[name] = build.const(default, ir_type(slot.kind, self.ruleset.slots))
-        substeps = tuple(self.substep(moment) for moment in pass_.moments)
+                self.state[name] = build.const(default, before[name].type)
+        substeps = tuple([self.substep(moment) for moment in self.pass_.moments])
         outputs = []
-        for name, before in found.items():
-            last = self.state[name]
-            if last is before:
-                continue
-            if before.type == REAL:
-                kind = self.slots[component_of(name)[0]].kind
-                last = build.derive("settle", last, attr=(float(kind.lo), float(kind.hi)))
-            outputs.append((name, last))
-        return PassGraph(pass_.name, pass_.pack, substeps, tuple(outputs))
+        for slot in slots(self.ruleset):
+            for name in part_names(slot.name, slot.kind):
+                last = self.state[name]
+                if last is not before[name]:
+                    limits = (float(slot.kind.lo), float(slot.kind.hi))
+                    outputs.append(
+                        (name, build.derive("settle", last, attr=limits) if slot.is_real else last)
+                    )
+        return PassGraph(self.pass_.name, self.pass_.pack, substeps, tuple(outputs))
 
     def inputs(self) -> Inputs:
         return Inputs(self.ruleset, self.build, dict(self.state), self.lets)

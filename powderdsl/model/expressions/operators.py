@@ -253,9 +253,16 @@ def compare(typer: Typer, sign: str, left: Placed, right: Placed, span: Span) ->
         return _compare_draw(typer, op, left, right, span)
     if kinds & {"element", "direction", "flag", "vec2"}:
         return _compare_discrete(typer, op, left, right, span)
-    if kinds == {"int"}:
-        return _compare_integers(typer, op, a, b, span)
-    return Expr(op, FLAG, tuple(typer.of_kind(value, REAL, span) for value in (a, b)), span=span)
+    kind = INTEGER if kinds == {"int"} else REAL
+    if kind == INTEGER:
+        # A bound such as 1.5 is rounded to the integer that means the same.
+        if op == "eq" and not (is_integer(a) and is_integer(b)):
+            return FALSE
+        if isinstance(a, Number) and not is_integer(a):
+            a = Number(Fraction(floor(a.value) + (op == "le")))
+        elif isinstance(b, Number) and not is_integer(b):
+            b = Number(Fraction(ceil(b.value) - (op == "le")))
+    return Expr(op, FLAG, tuple(typer.of_kind(value, kind, span) for value in (a, b)), span=span)
 
 
 def _compare_discrete(typer: Typer, op: str, left: Placed, right: Placed, span: Span) -> Expr:
@@ -270,17 +277,6 @@ def _compare_discrete(typer: Typer, op: str, left: Placed, right: Placed, span: 
             return Expr(op, FLAG, (left[0], right[0]), span=span)  # type: ignore[arg-type]  # both are Expr: see above
     fix = "compare `length(…)`, or `.row` and `.column`"
     raise typer.fail("PD401", "vectors are not compared", span, "one side is a vector", fix)
-
-
-def _compare_integers(typer: Typer, op: str, left: Value, right: Value, span: Span) -> Expr:
-    """Integers with integers; a bound such as 1.5 is rounded to the integer that means the same."""
-    if op == "eq" and not (is_integer(left) and is_integer(right)):
-        return FALSE
-    if isinstance(left, Number) and not is_integer(left):
-        left = Number(Fraction(floor(left.value) + (op == "le")))
-    elif isinstance(right, Number) and not is_integer(right):
-        right = Number(Fraction(ceil(right.value) - (op == "le")))
-    return Expr(op, FLAG, tuple(typer.of_kind(value, INTEGER, span) for value in (left, right)), span=span)
 
 
 def _compare_draw(typer: Typer, op: str, left: Placed, right: Placed, span: Span) -> Expr:
@@ -444,12 +440,12 @@ def _on_vectors(typer: Typer, op: str, left: Value, right: Value, span: Span) ->
     return Expr(op, VEC2, tuple(args), span=span)  # type: ignore[arg-type]  # vectors, or made real
 
 
-def negate(typer: Typer, value: Value, span: Span) -> Value:
-    kind = kind_name(value)
-    if kind in ("element", "flag"):
-        raise typer.wrong(value, "a number", span, "an item of a list has a blank after its `-`")
-    if isinstance(value, Expr) and kind == "vec2":
+def negate(typer: Typer, syntax: Syntax, scope: Scope) -> Value:
+    value, span = typer.value_of(syntax.children[0], scope), syntax.span
+    if isinstance(value, Expr) and value.kind.name == "vec2":
         return Expr("neg", VEC2, (value,), span=span)
+    if kind_name(value) in ("element", "flag"):
+        raise typer.wrong(value, "a number", span, "an item of a list has a blank after its `-`")
     return arithmetic(typer, "neg", [(value, span)], span)
 
 

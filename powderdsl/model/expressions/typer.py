@@ -670,7 +670,7 @@ HANDLERS: dict[str, Callable[[Typer, Syntax, Scope], Operand]] = {
         ("add", "sub", "mul", "div"),
         lambda typer, at, scope: binary(typer, at, *[typer.value_of(child, scope) for child in at.children]),
     ),
-    "neg": lambda typer, at, scope: negate(typer, typer.value_of(at.children[0], scope), at.span),
+    "neg": negate,
     "quotient": quotient,
     "mod": modulo,
 }
