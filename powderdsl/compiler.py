@@ -23,8 +23,8 @@ from powderdsl.model.composition.contested import words_of_tree
 from powderdsl.model.composition.layout import own_slots
 from powderdsl.model.composition.palette import Palette
 from powderdsl.model.declarations import PackDecl, RulesetDecl
+from powderdsl.model.definitions import set_params
 from powderdsl.model.packs import read_file
-from powderdsl.model.parameter_values import set_params
 from powderdsl.model.types import Ruleset
 from powderdsl.syntax.sources import path_beside, read_source
 from powderdsl.syntax.yaml_tree import parse_yaml

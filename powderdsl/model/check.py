@@ -13,7 +13,7 @@ from powderdsl.model.composition.contested import report_contested, report_missp
 from powderdsl.model.composition.layout import matrix_channels, state_order
 from powderdsl.model.composition.palette import Palette
 from powderdsl.model.declarations import PackDecl, RulesetDecl
-from powderdsl.model.definitions import define_symbols
+from powderdsl.model.definitions import define_symbols, element_ramps
 from powderdsl.model.elaborate import Elaborated, Elaborator
 from powderdsl.model.examples import check_assigned, check_examples
 from powderdsl.model.expressions.symbols import (
@@ -33,7 +33,6 @@ from powderdsl.model.logic.needless import (
     without_dead_overrides,
 )
 from powderdsl.model.logic.satisfy import Facts
-from powderdsl.model.ramps import element_ramps
 from powderdsl.model.types import (
     Declared,
     Ruleset,

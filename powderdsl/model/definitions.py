@@ -1,34 +1,55 @@
-"""Declarations -> symbols of the checker: kernels, parameters, properties, fields and sets, with their values."""
+"""Declarations -> symbols of the checker: kernels, parameters, properties, fields, sets and ramps, with their values."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from difflib import get_close_matches
 from typing import Any
 
-from powderdsl.diagnostics import Label, Span, suggest
+from powderdsl.diagnostics import Label, Reporter, Span, suggest
 from powderdsl.model.composition.compose import Composition
-from powderdsl.model.composition.contested import given_values
+from powderdsl.model.composition.contested import given_values, report_replaced
 from powderdsl.model.composition.names import Named, report_unknown
 from powderdsl.model.declarations import (
     ElementDecl,
     FieldDecl,
     KernelDecl,
-    ParamDecl,
-    PropertyDecl,
-    TintDecl,
+    RampDecl,
     TypedDecl,
 )
 from powderdsl.model.expressions.operators import Broken, Operand, Poisoned, Scope, SetOf, Unresolved
-from powderdsl.model.expressions.symbols import clamped, default_of, not_a_value, number_value, read_kind
+from powderdsl.model.expressions.symbols import (
+    clamped,
+    default_of,
+    not_a_value,
+    number_value,
+    read_bounds,
+    read_kind,
+)
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.schema import keys_of
-from powderdsl.model.types import CHANCE, FLAG, Field, Kernel, Kind, Param, Property, Tint, Value
+from powderdsl.model.types import (
+    CHANCE,
+    FLAG,
+    ColorRamp,
+    Element,
+    Field,
+    Kernel,
+    Kind,
+    Param,
+    Property,
+    Ruleset,
+    Tint,
+    Value,
+)
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.yaml_tree import Scalar
+
+ORDERED = ("int", "flag", "real")
+"""Kinds of fields that a color can follow: their values have an order."""
 
 KINDS = {
     "parameter": (("chance", "int", "real", "flag"), "kinds: chance, LOW..HIGH, real(LOW..HIGH), flag"),
@@ -45,24 +66,24 @@ def define_symbols(typer: Typer) -> list[tuple[str, int, Span]]:
         Where elements' own values of properties stand: property, id, place.
     """
     symbols, composition = typer.symbols, typer.symbols.composition
-    _check_param_names(typer)
     for name, kernel in composition.kernels.items():
         if kernel.decl.shape is not None:
             symbols.constants[name] = _shaped(kernel, kernel.decl.shape, typer)
     for name, param in composition.params.items():
-        with suppress(Poisoned):
-            symbols.params[name] = _param(param, typer)
-    for key, syntax in _ruleset_params(composition):
-        known = symbols.params.get(key.text)
-        if known is None:
-            helps = suggest(key.text, symbols.params, "parameters")
+        word = composition.names.of(param.pack, param.decl.name.text)
+        other = composition.definitions.get(word)
+        if other is not None and composition.names.knows(param.pack, word):
+            # A rule would read the other one without a sign.
             typer.reporter.error(
-                "PD309", f"unknown parameter `{key.text}`", key.span, "no loaded pack defines it", helps=helps
-            )
-            continue
+                "PD308", f"the parameter `{word}` hides another `{word}`", param.span, "the same word",
+                secondary=[Label(other.span, "this one")], helps=["rename the parameter"],
+            )  # fmt: skip
         with suppress(Poisoned):
-            value = typer.constant(syntax, known.kind, Scope("", {}))
-            symbols.params[key.text] = replace(known, default=value)
+            kind, default = _kind("parameter", param.decl, typer), param.decl.default
+            if default is not None:
+                value = typer.constant(default, kind, Scope(param.pack, {}))
+                symbols.params[name] = Param(name, kind, value, param.decl.about, param.span)
+    _set_by_rulesets(composition, typer)
     for name, prop in composition.properties.items():
         with suppress(Poisoned):
             kind = _kind("property", prop.decl, typer)
@@ -72,8 +93,15 @@ def define_symbols(typer: Typer) -> list[tuple[str, int, Span]]:
             symbols.fields[name] = _field(field, typer)
     given = _element_values(typer)
     for name, prop in composition.properties.items():
-        if name in symbols.properties:
-            symbols.properties[name] = replace(symbols.properties[name], values=_values(prop, given, typer))
+        known = symbols.properties.get(name)
+        if known is None:
+            continue
+        default, usual = prop.decl.default, default_of(known.kind)
+        values = [_value(known, default, prop.pack, typer) if default else usual] * composition.slots
+        for element in composition.elements.values():
+            if (name, element.name) in given:
+                values[element.id] = _value(known, *given[name, element.name], typer)
+        symbols.properties[name] = replace(known, values=tuple(values))
     for name, named in composition.sets.items():
         try:
             if name not in symbols.constants:
@@ -83,21 +111,10 @@ def define_symbols(typer: Typer) -> list[tuple[str, int, Span]]:
         except Unresolved:
             symbols.constants.setdefault(name, SetOf(()))
     typer.used.clear()
-    ids = {name: element.id for name, element in composition.elements.items()}
-    return [(name, ids[of], syntax.span) for (name, of), (syntax, _) in given.items() if of in ids]
-
-
-def _check_param_names(typer: Typer) -> None:
-    """A parameter may not hide a global word that its pack knows: a rule would read the other one without a sign."""
-    composition = typer.symbols.composition
-    for named in composition.params.values():
-        name = composition.names.of(named.pack, named.decl.name.text)
-        other = composition.definitions.get(name)
-        if other is not None and composition.names.knows(named.pack, name):
-            typer.reporter.error(
-                "PD308", f"the parameter `{name}` hides another `{name}`", named.span, "the same word",
-                secondary=[Label(other.span, "this one")], helps=["rename the parameter"],
-            )  # fmt: skip
+    elements = composition.elements
+    return [
+        (name, elements[of].id, syntax.span) for (name, of), (syntax, _) in given.items() if of in elements
+    ]
 
 
 def _shaped(named: Named[KernelDecl], shape: Syntax, typer: Typer) -> Operand:
@@ -117,24 +134,21 @@ def _shaped(named: Named[KernelDecl], shape: Syntax, typer: Typer) -> Operand:
 
 def _kind(noun: str, decl: TypedDecl, typer: Typer) -> Kind:
     """The kind of a definition. Raises Poisoned after reporting one that it may not have."""
-    if decl.type is None:
-        if noun == "parameter" and decl.default is not None:
-            return _kind_of_literal(decl.name.text, decl.default, typer)
+    if decl.type is not None:
+        kind = read_kind(decl.type, typer)
+        allowed, fix = KINDS[noun]
+        if kind.name not in allowed:
+            raise typer.fail("PD401", f"a {noun} cannot be a {kind}", decl.type.span, "", fix)
+        return kind
+    default = decl.default
+    if noun != "parameter" or default is None:
         raise Poisoned
-    kind = read_kind(decl.type, typer)
-    allowed, fix = KINDS[noun]
-    if kind.name not in allowed:
-        raise typer.fail("PD401", f"a {noun} cannot be a {kind}", decl.type.span, "", fix)
-    return kind
-
-
-def _kind_of_literal(name: str, default: Syntax, typer: Typer) -> Kind:
-    """`rate: 2%` is a chance, `wet: yes` a flag; other numbers must say their range."""
+    # `rate: 2%` is a chance, `wet: yes` a flag; other numbers must say their range.
     if default.kind == "percent":
         return CHANCE
     if default.kind in ("yes", "no"):
         return FLAG
-    value, chance = default.span.text, ""
+    name, value, chance = decl.name.text, default.span.text, ""
     if re.fullmatch(r"0?\.[0-9]+|[0-9]{1,2}", value):
         chance = f"`{100 * float(value):g}%`, or " if "." in value else f"`{value}%`, or "
     bounds = "real(0..1)" if "." in value else "0..9"
@@ -144,22 +158,22 @@ def _kind_of_literal(name: str, default: Syntax, typer: Typer) -> Kind:
     )  # fmt: skip
 
 
-def _param(named: Named[ParamDecl], typer: Typer) -> Param:
-    kind = _kind("parameter", named.decl, typer)
-    if named.decl.default is None:
-        raise Poisoned
-    value = typer.constant(named.decl.default, kind, Scope(named.pack, {}))
-    return Param(named.name, kind, value, named.decl.about, named.span)
-
-
-def _ruleset_params(composition: Composition) -> Iterator[tuple[Scalar, Syntax]]:
-    """The values that rulesets give to parameters, bases first; values for packs that are left out are skipped."""
-    loaded = {pack.name.text for pack in composition.packs}
+def _set_by_rulesets(composition: Composition, typer: Typer) -> None:
+    """Give parameters the values of rulesets, bases first; values for packs that are left out are skipped."""
+    params, loaded = typer.symbols.params, {pack.name.text for pack in composition.packs}
     for ruleset in composition.lineage:
         for key, syntax in ruleset.params:
-            pack = key.text.partition(".")[0]
-            if pack in loaded or not any(pack in one.members for one in ruleset.lineage):
-                yield key, syntax
+            pack, known = key.text.partition(".")[0], params.get(key.text)
+            if pack not in loaded and any(pack in one.members for one in ruleset.lineage):
+                continue
+            if known is None:
+                helps = suggest(key.text, params, "parameters")
+                message = f"unknown parameter `{key.text}`"
+                typer.reporter.error("PD309", message, key.span, "no loaded pack defines it", helps=helps)
+                continue
+            with suppress(Poisoned):
+                value = typer.constant(syntax, known.kind, Scope("", {}))
+                params[key.text] = replace(known, default=value)
 
 
 # Fields and properties
@@ -171,28 +185,23 @@ def _field(named: Named[FieldDecl], typer: Typer) -> Field:
     default = default_of(kind, typer.symbols.first_id)
     if decl.default:
         default = typer.constant(decl.default, kind, scope)
-    of = None
+    of = tint = None
     if decl.of is not None:
         of = frozenset(typer.set_of(typer.evaluate(decl.of, scope), decl.of.span).ids)
         if decl.at != "element":
             label = "a field of a place belongs to no element"
             raise typer.fail("PD401", "`of` needs `at: element`", decl.of.span, label)
-    resets = decl.resets is not None
+    if decl.tint is not None:
+        if kind.name != "vec2":
+            message, place = f"a field of kind {kind} tints nothing", decl.tint.name.span
+            fix = "cells show numbers and flags with `color_by`, under their element"
+            raise typer.fail("PD401", message, place, "only vectors do", fix)
+        most = typer.constant(decl.tint.most, CHANCE, scope) if decl.tint.most else 1
+        tint = Tint(decl.tint.color, decl.tint.full, float(most))  # type: ignore[arg-type]  # a chance is a number
     return Field(
-        named.name, kind, clamped(default, kind), decl.at, resets, of, named.pack, named.span,
-        word=named.word, tint=_tint(decl.tint, kind, typer, scope) if decl.tint else None,
+        named.name, kind, clamped(default, kind), decl.at, decl.resets is not None, of, named.pack, named.span,
+        word=named.word, tint=tint,
     )  # fmt: skip
-
-
-def _tint(decl: TintDecl, kind: Kind, typer: Typer, scope: Scope) -> Tint:
-    """The tint of a field. Raises Poisoned after reporting that it is not a vector."""
-    if kind.name != "vec2":
-        fix = "cells show numbers and flags with `color_by`, under their element"
-        raise typer.fail(
-            "PD401", f"a field of kind {kind} tints nothing", decl.name.span, "only vectors do", fix
-        )
-    most = typer.constant(decl.most, CHANCE, scope) if decl.most else 1
-    return Tint(decl.color, decl.full, float(most))  # type: ignore[arg-type]  # a chance is a number
 
 
 Given = Mapping[tuple[str, str], tuple[Syntax, str]]
@@ -212,34 +221,30 @@ def _element_values(typer: Typer) -> Given:
         elif name not in composition.fields:
             if not key.is_optional:
                 keys = [own for own in keys_of(ElementDecl) if own != "override"]
-                known = (*composition.properties, *composition.fields, *keys)
-                report_unknown("property", key, known, typer.reporter, "PD108")
+                names = (*composition.properties, *composition.fields, *keys)
+                report_unknown("property", key, names, typer.reporter, "PD108")
         elif field and element and _may_have(field, element.id, word, key, typer):
             with suppress(Poisoned):
                 value = typer.constant(syntax, field.kind, Scope(pack, {}))
                 own.setdefault(name, {})[element.id] = clamped(value, field.kind)
     declared: list[Named[Any]] = [*composition.properties.values(), *composition.fields.values()]
-    for named in declared:
-        for key, _ in named.decl.values:
-            if composition.element(key.word, named.pack) is None and not key.is_optional:
-                _report_unknown_key(key, named, typer)
+    for known in declared:
+        for key, _ in known.decl.values:
+            if composition.element(key.word, known.pack) is not None or key.is_optional:
+                continue
+            # It should be an element's name, but may also be a misspelled key.
+            close = get_close_matches(key.text.lower(), sorted(keys_of(type(known.decl))), n=1, cutoff=0.75)
+            if close:
+                label = f"not a key of the {known.decl.NOUN.removeprefix('a ')} `{known.name}`"
+                helps = [f"did you mean `{close[0]}`?"]
+                typer.reporter.error("PD108", f"unknown key `{key.text}`", key.span, label, helps=helps)
+            else:
+                report_unknown("element", key, composition.elements, typer.reporter)
     for name, values in own.items():
         field = symbols.fields[name]
-        kept = tuple((number, value) for number, value in sorted(values.items()) if value != field.default)
-        symbols.fields[name] = replace(field, own=kept)
+        changed = tuple((number, value) for number, value in sorted(values.items()) if value != field.default)
+        symbols.fields[name] = replace(field, own=changed)
     return given
-
-
-def _report_unknown_key(key: Scalar, named: Named[Any], typer: Typer) -> None:
-    """Report a key that should be an element's name: it may also be a misspelled key of the table."""
-    close = get_close_matches(key.text.lower(), sorted(keys_of(type(named.decl))), n=1, cutoff=0.75)
-    if not close:
-        report_unknown("element", key, typer.symbols.composition.elements, typer.reporter)
-        return
-    typer.reporter.error(
-        "PD108", f"unknown key `{key.text}`", key.span, f"not a key of the {named.decl.NOUN.removeprefix('a ')} `{named.name}`",
-        helps=[f"did you mean `{close[0]}`?"],
-    )  # fmt: skip
 
 
 def _may_have(field: Field, number: int, element: str, key: Scalar, typer: Typer) -> bool:
@@ -257,19 +262,6 @@ def _may_have(field: Field, number: int, element: str, key: Scalar, typer: Typer
         secondary=[Label(field.span, "declared here")], helps=[fix],
     )  # fmt: skip
     return False
-
-
-def _values(named: Named[PropertyDecl], given: Given, typer: Typer) -> tuple[Value | str, ...]:
-    """A property's values by id."""
-    composition, prop = typer.symbols.composition, typer.symbols.properties[named.name]
-    default = named.decl.default
-    values = [
-        _value(prop, default, named.pack, typer) if default else default_of(prop.kind)
-    ] * composition.slots
-    for name, element in composition.elements.items():
-        if (prop.name, name) in given:
-            values[element.id] = _value(prop, *given[prop.name, name], typer)
-    return tuple(values)
 
 
 def _value(prop: Property, syntax: Syntax, pack: str, typer: Typer) -> Value | str:
@@ -291,3 +283,125 @@ def _value(prop: Property, syntax: Syntax, pack: str, typer: Typer) -> Value | s
         return number_value(expr, kind)
     typer.fail("PD405", "expected a constant or a parameter", syntax.span, "depends on the world")
     return default_of(kind)
+
+
+# Colors that follow fields
+
+
+def element_ramps(typer: Typer) -> dict[str, ColorRamp]:
+    """The ramps by global names of elements. Of several for one element the last holds. Reports what is wrong."""
+    composition, symbols = typer.symbols.composition, typer.symbols
+    places: dict[str, tuple[str, Span]] = {}
+    ramps: dict[str, ColorRamp] = {}
+    for pack, name, entry in composition.entries():
+        if entry.ramp is None:
+            continue
+        word, element = entry.ramp.field, composition.elements.get(name)
+        field_name = composition.names.of(pack, word.word)
+        field = symbols.fields.get(field_name)
+        with suppress(Poisoned):
+            if field_name in composition.properties:
+                fix = "a property is the same in all cells of an element: choose its `color` accordingly, or declare a field"
+                raise typer.fail(
+                    "PD401", f"`{word.word}` is a property", word.span, "a color follows a field", fix
+                )
+            if field_name not in composition.fields and not word.is_optional:
+                report_unknown("field", word, symbols.fields, typer.reporter)
+            if field is None or element is None:
+                continue
+            ramp, here = _ramp(field, element, entry.ramp, typer), (pack, entry.ramp.name.span)
+            if name in ramps and ramps[name] != ramp:
+                report_replaced("color_by", name, places[name], here, composition, typer.reporter)
+            places[name], ramps[name] = here, ramp
+    return ramps
+
+
+def _ramp(field: Field, element: Element, decl: RampDecl, typer: Typer) -> ColorRamp:
+    """The ramp of an element. Raises Poisoned after reporting that cells cannot show the field, or not this range."""
+    kind = field.kind
+    declared = (Label(field.span, "declared here"),)
+    if kind.name not in ORDERED:
+        fix = "a color follows numbers and flags: LOW..HIGH, real(LOW..HIGH), flag"
+        if kind.name == "vec2":
+            fix = f"declare a field for its length, `real(0..{kind.hi:g})`, and assign it in a pass"
+        typer.reporter.error(
+            "PD401", f"a color cannot follow a field of kind {kind}", decl.field.span, "its values have no order",
+            secondary=declared, helps=[fix],
+        )  # fmt: skip
+        raise Poisoned
+    if field.of is not None and element.id not in field.of:
+        typer.reporter.error(
+            "PD407", f"`{element.name}` has no `{field.name}`", decl.field.span, f"`of:` leaves `{element.name}` out",
+            secondary=declared, helps=[f"add `{element.name}` to `of:`, or remove `color_by`"],
+        )  # fmt: skip
+        raise Poisoned
+    least, most = (0, 1) if kind.name == "flag" else (int(kind.lo), int(kind.hi))
+    lo, hi = read_bounds(decl.over, typer) if decl.over is not None else (least, most)
+    if not least <= lo <= hi <= most and decl.over is not None:
+        typer.reporter.error(
+            "PD402", f"`{field.name}` does not reach all of {lo}..{hi}", decl.over.span, f"its values are {least}..{most}",
+            secondary=declared, helps=[f"write a range within `{least}..{most}`, or leave out `over` for all of it"],
+        )  # fmt: skip
+        raise Poisoned
+    if lo == hi:
+        place, fix = decl.field.span, f"widen the kind of `{field.name}`, or remove `color_by`"
+        if decl.over is not None:
+            place, fix = decl.over.span, "give a range of at least two values"
+        raise typer.fail(
+            "PD402", f"a range of the single value {lo}", place, "the color cannot change here", fix
+        )
+    return ColorRamp(field.name, decl.start or element.color, decl.end, lo, hi, kind.name == "real")
+
+
+# Values of parameters from elsewhere than rule files: commands, tasks, studies and programs
+
+
+def set_params(ruleset: Ruleset, values: Mapping[str, Any], reporter: Reporter) -> Ruleset:
+    """The ruleset with other parameter values, checked against their kinds."""
+    if not isinstance(values, Mapping):
+        raise TypeError(f"params takes a mapping from names to values, found {type(values).__name__}")
+    known = {param.name: param for param in ruleset.params}
+    found: dict[str, Value] = {}
+    for name, value in values.items():
+        if name not in known:
+            names = ", ".join(sorted(known)) or "none"
+            helps = suggest(name, known, "parameters") or (f"parameters: {names}",)
+            reporter.error("PD309", f"unknown parameter `{name}`", None, helps=helps)
+            continue
+        try:
+            found[name] = param_value(known[name], value)
+        except ValueError as error:
+            notes = [f"it is {_kind_in_words(known[name].kind)}"]
+            reporter.error("PD402", f"parameter `{name}`: {error}", None, notes=notes)
+    return ruleset.with_params(found)
+
+
+def _kind_in_words(kind: Kind) -> str:
+    if kind.name == "chance":
+        return "a chance: write a percentage from 0% to 100%, or a number from 0 to 1"
+    if kind.name == "flag":
+        return "a flag: write yes or no"
+    return f"{'an integer' if kind.name == 'int' else 'a number'} from {kind.lo:g} to {kind.hi:g}"
+
+
+def param_value(param: Param, value: Any) -> Value:
+    """A value for a parameter from text (``"5%"``, ``"yes"``) or a number. Raises ValueError."""
+    text = value.strip() if isinstance(value, str) else None
+    flags = {"yes": 1.0, "true": 1.0, "no": 0.0, "false": 0.0}
+    try:
+        if text is not None and text.endswith("%"):
+            number = float(text[:-1]) / 100
+        else:
+            number = float(value if text is None else flags.get(text, text))
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{repr(value) if text is None else f'`{text}`'} is not a number") from None
+    kind = param.kind.name
+    lo, hi = (0.0, 1.0) if kind in ("chance", "flag") else (param.kind.lo, param.kind.hi)
+    if not lo <= number <= hi:
+        bounds = "0%..100%" if kind == "chance" else f"{lo:g}..{hi:g}"
+        raise ValueError(f"{text or format(number, 'g')} lies outside {bounds}")
+    if kind not in ("int", "flag"):
+        return number
+    if number != int(number):
+        raise ValueError(f"{number:g} is not an integer")
+    return int(number)

@@ -477,6 +477,6 @@ class Ruleset:
                 yield pass_, moment
 
     def with_params(self, values: dict[str, Value]) -> Ruleset:
-        """The same ruleset with other defaults; the values are checked by `parameter_values.set_params`."""
+        """The same ruleset with other defaults; the values are checked by `definitions.set_params`."""
         params = tuple(replace(p, default=values.get(p.name, p.default)) for p in self.params)
         return replace(self, params=params)

@@ -21,8 +21,8 @@ from powderdsl.diagnostics import CompileError, Reporter
 from powderdsl.diagnostics.render import diagnostic_data, render_text
 from powderdsl.model import declarations
 from powderdsl.model.builtins import RESERVED
+from powderdsl.model.definitions import set_params
 from powderdsl.model.operations import FUNCTIONS
-from powderdsl.model.parameter_values import set_params
 from powderdsl.model.schema import RECORDS, keys_of
 from powderdsl.model.state import qualified_slots, slot_name
 from powderdsl.model.types import Ruleset

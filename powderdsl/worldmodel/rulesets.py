@@ -16,7 +16,7 @@ from powderdsl.model.check import check
 from powderdsl.model.composition.names import with_stand_ins
 from powderdsl.model.composition.palette import Palette
 from powderdsl.model.declarations import ElementDecl, PackDecl
-from powderdsl.model.parameter_values import set_params
+from powderdsl.model.definitions import set_params
 from powderdsl.model.types import Ruleset
 from powderdsl.system.random import MASK, base_keys, mix
 from powderdsl.system.writing import failure

@@ -26,9 +26,9 @@ from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Severity, 
 from powderdsl.ir.text import print_program
 from powderdsl.model.check import check
 from powderdsl.model.declarations import PackDecl, RulesetDecl
+from powderdsl.model.definitions import set_params
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.packs import read_file
-from powderdsl.model.parameter_values import set_params
 from powderdsl.model.state import slots
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Example, Invariant, Local, Ruleset, Symmetric
