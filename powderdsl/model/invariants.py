@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 from powderdsl.diagnostics import Reporter, Span, suggest
 from powderdsl.model.composition.claim_scopes import names_left_out, with_optional, words_of
@@ -92,11 +93,15 @@ def _claim(typer: Typer, line: Syntax, pack: str) -> tuple[Claim, frozenset[int]
     """The claim of a line, and the elements that start worlds must not hold. Raises Poisoned or Unresolved."""
     typer.absent.clear()
     typer.start_rule(line.span)
-    where = Scope(pack, {})
-    without = _without(typer, line.children[1], where) if line.kind == "without" else frozenset()
-    typer.absent.clear()
-    said = line.children[0] if line.kind == "without" else line
-    return _CLAIMS[said.kind](typer, said, where), without
+    scope, without = Scope(pack, {}), frozenset[int]()
+    if line.kind == "without":
+        line, what = line.children
+        without = frozenset(typer.set_of(typer.evaluate(what, scope), what.span).ids)
+        if without == frozenset(typer.symbols.ids):
+            label = "no world is without all of these"
+            raise typer.fail("PD511", "this invariant cannot hold", what.span, label)
+        typer.absent.clear()  # a world is without elements of packs that are not loaded
+    return _Statement(typer, scope).claim(line), without
 
 
 def _can_hold(typer: Typer | None, line: Syntax, pack: str) -> bool:
@@ -109,166 +114,145 @@ def _can_hold(typer: Typer | None, line: Syntax, pack: str) -> bool:
         return True
 
 
-def _without(typer: Typer, what: Syntax, scope: Scope) -> frozenset[int]:
-    """The elements that a world starts without; elements of packs that are not loaded are ignored."""
-    ids = frozenset(typer.set_of(typer.evaluate(what, scope), what.span).ids)
-    if ids == frozenset(typer.symbols.ids):
-        raise typer.fail("PD511", "this invariant cannot hold", what.span, "no world is without all of these")
-    return ids
-
-
-def _words(typer: Typer, words: tuple[Syntax, ...], wanted: tuple[tuple[str, ...], ...]) -> None:
-    """Report the first word that is not one of the words wanted in its position."""
-    for word, options in zip(words, wanted, strict=True):
-        if word.text not in options:
-            listed = " or ".join(f"`{option}`" for option in options)
-            close = [fix for fix in suggest(word.text, options) if fix.startswith("did")]
-            raise typer.fail(
-                "PD201", f"unexpected `{word.text}`", word.span, f"expected {listed}",
-                *tuple(close) or _FORMS)  # fmt: skip
-
-
 _FORMS = (
     "forms: `SET never changes`, `count(SET) is constant`, `count(SET) never rises`, `never CONDITION`, "
     "`FIELD stays in LOW..HIGH`, `nothing reaches beyond N cells`, `mirrored worlds agree`",
 )
 
 
-def _number(typer: Typer, text: str, span: Span, least: int, most: int) -> int:
-    if len(text) > 6 or not least <= int(text) <= most:
-        raise typer.fail(
-            "PD402", f"{text[:12]} lies outside {least}..{most}", span, "out of range",
-            f"write a number from {least} to {most}")  # fmt: skip
-    return int(text)
+@dataclass(frozen=True)
+class _Statement:
+    """Reads what an invariant says. Its methods raise Poisoned after reporting, or Unresolved."""
 
+    typer: Typer
+    scope: Scope
 
-def _trend(typer: Typer, line: Syntax, scope: Scope) -> Claim:
-    """`SET never changes`, `count(…) never rises`, `count(…) never falls`."""
-    what, word = line.children
-    total = what.kind == "call" and what.text in ("count", "sum")
-    _words(typer, (word,), (tuple(TRENDS) if total else ("changes",),))
-    if total:
-        return _total_of(typer, what, TRENDS[word.text], scope)
-    return Unchanging(frozenset(_elements(typer, what, scope)))
+    def claim(self, line: Syntax) -> Claim:
+        typer, scope, parts = self.typer, self.scope, line.children
+        match line.kind:
+            case "trend":  # `SET never changes`, `count(…) never rises`, `count(…) never falls`
+                is_total = parts[0].kind == "call" and parts[0].text in ("count", "sum")
+                self.words(parts[1:], tuple(TRENDS) if is_total else ("changes",))
+                if is_total:
+                    return self.total(parts[0], TRENDS[parts[1].text])
+                ids = typer.set_of(typer.evaluate(parts[0], scope), parts[0].span).ids
+                if not ids:
+                    self.says_nothing(parts[0].span, "no element is meant", is_empty=True)
+                return Unchanging(frozenset(ids))
+            case "total":  # `count(…) is constant`, `sum(…) is constant`
+                (what,) = parts
+                if what.kind != "is_" or what.children[0].kind != "call" or what.children[1].kind != "name":
+                    raise typer.fail("PD201", "this states nothing", what.span, "not an invariant", *_FORMS)
+                self.words(what.children[1:], ("constant",))
+                return self.total(what.children[0], "constant")
+            case "never":  # `never CONDITION`, `never CONDITION for N steps`
+                duration, steps = line.child("duration"), 1
+                if duration is not None:
+                    self.words(duration.children, ("steps", "step"))
+                    steps = self.number(duration, 1, MAX_STEPS)
+                condition = typer.condition(parts[0], scope)
+                if condition == TRUE:
+                    raise typer.fail(
+                        "PD511", "this invariant cannot hold", parts[0].span, "every cell fulfills this",
+                        "say what no cell may fulfill")  # fmt: skip
+                return Never(self.asked(condition, parts[0].span), steps)
+            case "reach":  # `nothing reaches beyond N cells`
+                self.words(parts, ("nothing",), ("reaches",), ("beyond",), ("cells", "cell"))
+                return Local(self.number(line, 0, MAX_RADIUS))
+            case "agree":  # `mirrored worlds agree`, `rotated worlds agree`
+                self.words(parts, ("mirrored", "rotated"), ("worlds",), ("agree",))
+                return Symmetric(parts[0].text)
+        return self.stays(line)
 
+    def total(self, call: Syntax, trend: str) -> Total:
+        typer, scope = self.typer, self.scope
+        if call.text not in ("count", "sum") or not call.children:
+            raise typer.fail(
+                "PD406", "a total is written `count(SET)` or `sum(VALUE)`", call.span, "not a total", *_FORMS
+            )
+        for child in call.children:
+            if child.kind == "in_" and isinstance(typer.evaluate(child.children[1], scope), Kernel):
+                raise typer.fail(
+                    "PD406", "an invariant counts the whole world", call.span, "has a neighborhood"
+                )
+        operands = [(typer.evaluate(child, scope), child.span) for child in call.children]
+        if all(isinstance(operand, (SetOf, Absent)) for operand, _ in operands):
+            ids = frozenset(
+                number for operand, span in operands for number in typer.set_of(operand, span).ids
+            )
+            if not ids:
+                self.says_nothing(call.span, "no element is counted", is_empty=True)
+            elif ids == frozenset(typer.symbols.ids):
+                self.says_nothing(call.span, "all cells are counted")
+            return Total(member(ELEMENT_HERE, tuple(sorted(ids)), call.span), trend, ids)
+        if call.text == "sum" and len(operands) == 1:
+            (operand, span), *_ = operands
+            value = typer.value(operand, span)
+            if isinstance(value, Expr) and value.kind.name not in ("int", "flag"):
+                fix = "floats are rounded: their sums are constant for no rule"
+                raise typer.wrong(value, "an integer", span, fix)
+            if isinstance(value, Number):
+                raise typer.wrong(value, "something that worlds have", span)
+            return Total(value, trend, None)
+        flags = [typer.flag(operand, span) for operand, span in operands]
+        return Total(self.asked(disjunction(flags, call.span), call.span), trend, None)
 
-def _elements(typer: Typer, what: Syntax, scope: Scope) -> tuple[int, ...]:
-    ids = typer.set_of(typer.evaluate(what, scope), what.span).ids
-    if not ids:
-        _says_nothing(typer, what.span, "no element is meant", is_empty=True)
-    return ids
+    def stays(self, line: Syntax) -> Claim:
+        """`FIELD stays in LOW..HIGH`."""
+        typer = self.typer
+        what, bounds = line.children
+        operand = typer.evaluate(what, self.scope)
+        if isinstance(operand, Absent):
+            raise Unresolved(operand.name)
+        numbers = kind_name(operand) in ("int", "real", "vec2")
+        if not isinstance(operand, Expr) or operand.op not in ("field", "property") or not numbers:
+            raise typer.wrong(
+                operand, "a field of numbers", what.span, "for anything else say `never CONDITION`"
+            )
+        lo, hi = read_bounds(bounds, typer)
+        name, kind = str(operand.value), operand.kind
+        field = typer.symbols.fields.get(name)
+        outside = hi < kind.lo or lo > kind.hi
+        defaults = field.defaults if field else ()
+        parts = [
+            (value, part) for value in defaults for part in (value if isinstance(value, tuple) else (value,))
+        ]
+        beyond = [value for value, part in parts if not lo <= part <= hi]
+        if outside or beyond:
+            found = f"`{name}` holds {kind}" if outside else f"a fresh cell has {beyond[0]}"
+            raise typer.fail("PD511", "this invariant cannot hold", bounds.span, found, "widen the bounds")
+        return Bounded(name, lo, hi)
 
+    def asked(self, condition: Expr, span: Span) -> Expr:
+        """The condition, unless it is not a question: it may depend on an absent pack, or be false by its words."""
+        if condition == FALSE:
+            self.says_nothing(span, "no cell can fulfill this", is_empty=True)
+        elif condition == TRUE:
+            self.says_nothing(span, "every cell fulfills this")
+        return condition
 
-def _total(typer: Typer, line: Syntax, scope: Scope) -> Claim:
-    """`count(…) is constant`, `sum(…) is constant`."""
-    (what,) = line.children
-    if what.kind != "is_" or what.children[0].kind != "call" or what.children[1].kind != "name":
-        raise typer.fail("PD201", "this states nothing", what.span, "not an invariant", *_FORMS)
-    _words(typer, (what.children[1],), (("constant",),))
-    return _total_of(typer, what.children[0], "constant", scope)
+    def says_nothing(self, span: Span, label: str, *, is_empty: bool = False) -> None:
+        """Report an invariant that no world can break. What is empty may need a pack that is not loaded."""
+        if is_empty and self.typer.absent:
+            raise Unresolved(", ".join(sorted(self.typer.absent)))
+        message = "this invariant is always true"
+        self.typer.reporter.report("PD510", message, span, label, helps=["remove it"])
 
+    def words(self, words: tuple[Syntax, ...], *wanted: tuple[str, ...]) -> None:
+        """Report the first word that is not one of the words wanted in its position."""
+        for word, options in zip(words, wanted, strict=True):
+            if word.text not in options:
+                listed = " or ".join(f"`{option}`" for option in options)
+                close = tuple(fix for fix in suggest(word.text, options) if fix.startswith("did"))
+                message, label = f"unexpected `{word.text}`", f"expected {listed}"
+                raise self.typer.fail("PD201", message, word.span, label, *close or _FORMS)
 
-def _total_of(typer: Typer, call: Syntax, trend: str, scope: Scope) -> Total:
-    if call.text not in ("count", "sum") or not call.children:
-        raise typer.fail(
-            "PD406", "a total is written `count(SET)` or `sum(VALUE)`", call.span, "not a total", *_FORMS
-        )
-    for child in call.children:
-        if child.kind == "in_" and isinstance(typer.evaluate(child.children[1], scope), Kernel):
-            raise typer.fail("PD406", "an invariant counts the whole world", call.span, "has a neighborhood")
-    operands = [(typer.evaluate(child, scope), child.span) for child in call.children]
-    if all(isinstance(operand, (SetOf, Absent)) for operand, _ in operands):
-        ids = frozenset(number for operand, span in operands for number in typer.set_of(operand, span).ids)
-        if not ids:
-            _says_nothing(typer, call.span, "no element is counted", is_empty=True)
-        elif ids == frozenset(typer.symbols.ids):
-            _says_nothing(typer, call.span, "all cells are counted")
-        return Total(member(ELEMENT_HERE, tuple(sorted(ids)), call.span), trend, ids)
-    if call.text == "sum" and len(operands) == 1:
-        (operand, span), *_ = operands
-        value = typer.value(operand, span)
-        if isinstance(value, Expr) and value.kind.name not in ("int", "flag"):
-            fix = "floats are rounded: their sums are constant for no rule"
-            raise typer.wrong(value, "an integer", span, fix)
-        if isinstance(value, Number):
-            raise typer.wrong(value, "something that worlds have", span)
-        return Total(value, trend, None)
-    flags = [typer.flag(operand, span) for operand, span in operands]
-    return Total(_asked(typer, disjunction(flags, call.span), call.span), trend, None)
-
-
-def _never(typer: Typer, line: Syntax, scope: Scope) -> Claim:
-    """`never CONDITION`, `never CONDITION for N steps`."""
-    duration = line.child("duration")
-    steps = 1
-    if duration is not None:
-        _words(typer, duration.children, (("steps", "step"),))
-        steps = _number(typer, duration.text, duration.span, 1, MAX_STEPS)
-    condition = typer.condition(line.children[0], scope)
-    if condition == TRUE:
-        raise typer.fail(
-            "PD511", "this invariant cannot hold", line.children[0].span, "every cell fulfills this",
-            "say what no cell may fulfill")  # fmt: skip
-    return Never(_asked(typer, condition, line.children[0].span), steps)
-
-
-def _asked(typer: Typer, condition: Expr, span: Span) -> Expr:
-    """The condition, unless it is not a question: it may depend on a pack that is not loaded, or be false by its words."""
-    if condition == FALSE:
-        _says_nothing(typer, span, "no cell can fulfill this", is_empty=True)
-    elif condition == TRUE:
-        _says_nothing(typer, span, "every cell fulfills this")
-    return condition
-
-
-def _stays(typer: Typer, line: Syntax, scope: Scope) -> Claim:
-    """`FIELD stays in LOW..HIGH`."""
-    what, bounds = line.children
-    operand = typer.evaluate(what, scope)
-    if isinstance(operand, Absent):
-        raise Unresolved(operand.name)
-    numbers = kind_name(operand) in ("int", "real", "vec2")
-    if not isinstance(operand, Expr) or operand.op not in ("field", "property") or not numbers:
-        raise typer.wrong(operand, "a field of numbers", what.span, "for anything else say `never CONDITION`")
-    lo, hi = read_bounds(bounds, typer)
-    name, kind = str(operand.value), operand.kind
-    field = typer.symbols.fields.get(name)
-    outside = hi < kind.lo or lo > kind.hi
-    defaults = field.defaults if field else ()
-    parts = [
-        (value, part) for value in defaults for part in (value if isinstance(value, tuple) else (value,))
-    ]
-    beyond = [value for value, part in parts if not lo <= part <= hi]
-    if outside or beyond:
-        found = f"`{name}` holds {kind}" if outside else f"a fresh cell has {beyond[0]}"
-        raise typer.fail("PD511", "this invariant cannot hold", bounds.span, found, "widen the bounds")
-    return Bounded(name, lo, hi)
-
-
-def _reach(typer: Typer, line: Syntax, scope: Scope) -> Claim:
-    """`nothing reaches beyond N cells`."""
-    _words(typer, line.children, (("nothing",), ("reaches",), ("beyond",), ("cells", "cell")))
-    return Local(_number(typer, line.text, line.span, 0, MAX_RADIUS))
-
-
-def _agree(typer: Typer, line: Syntax, scope: Scope) -> Claim:
-    """`mirrored worlds agree`, `rotated worlds agree`."""
-    _words(typer, line.children, (("mirrored", "rotated"), ("worlds",), ("agree",)))
-    return Symmetric(line.children[0].text)
-
-
-def _says_nothing(typer: Typer, span: Span, label: str, *, is_empty: bool = False) -> None:
-    """Report an invariant that no world can break. What is empty may need a pack that is not loaded: Unresolved."""
-    if is_empty and typer.absent:
-        raise Unresolved(", ".join(sorted(typer.absent)))
-    typer.reporter.report("PD510", "this invariant is always true", span, label, helps=["remove it"])
-
-
-_CLAIMS: dict[str, Callable[[Typer, Syntax, Scope], Claim]] = {
-    "trend": _trend,
-    "total": _total,
-    "never": _never,
-    "stays": _stays,
-    "reach": _reach,
-    "agree": _agree,
-}
+    def number(self, line: Syntax, least: int, most: int) -> int:
+        text = line.text
+        if len(text) > 6 or not least <= int(text) <= most:
+            message, fix = (
+                f"{text[:12]} lies outside {least}..{most}",
+                f"write a number from {least} to {most}",
+            )
+            raise self.typer.fail("PD402", message, line.span, "out of range", fix)
+        return int(text)
