@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, TypeVar
+from typing import Annotated, Any, NamedTuple
 
 from powderdsl.diagnostics import suggest
 from powderdsl.system.reading import is_path, parse_json, read_bytes
-from powderdsl.system.settings import Limits, read_record
+from powderdsl.system.settings import Limits, checked_record
 
 FOLDER = Path(__file__).parent / "levels"
 
@@ -19,7 +19,6 @@ MAX_SIDE = 512
 FEWEST_ACTIONS = 8
 """Action spaces are never smaller."""
 
-Record = TypeVar("Record")
 Count = Annotated[int, Limits(1, 1 << 30)]
 Cells = Annotated[int, Limits(0, 1 << 30)]
 
@@ -136,7 +135,7 @@ def find_level(level: str | Path | Level) -> Level:
 def read_level(path: Path) -> Level:
     """A level's file. Raises ValueError, which says what is wrong; OSError: it cannot be read."""
     try:
-        level = _checked(Level, parse_json(read_bytes(path, MAX_BYTES)), "")
+        level = checked_record(Level, parse_json(read_bytes(path, MAX_BYTES)))
         if max(level.brush, level.grid) > level.side:
             raise ValueError(f"`brush` and `grid` must be at most {level.side}, the side of its worlds")
         for task in level.tasks:
@@ -148,13 +147,5 @@ def read_level(path: Path) -> Level:
 
 def read_task(info: Any) -> GoalTask:
     """The task of ``options["task_info"]``. Raises ValueError."""
-    found = _checked(TaskInfo, info, "task_info")
+    found = checked_record(TaskInfo, info, "task_info")
     return GoalTask(found.task_name, found.tol, found.action_seq)
-
-
-def _checked(kind: type[Record], data: Any, path: str) -> Record:
-    problems: list[str] = []
-    record = read_record(kind, data, problems, path)
-    if record is None:
-        raise ValueError("; ".join(problems[:8]))
-    return record

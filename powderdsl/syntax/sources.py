@@ -5,9 +5,10 @@ from __future__ import annotations
 import errno
 from pathlib import Path
 
-from powderdsl.diagnostics import Reporter, Source, Span
+from powderdsl.diagnostics import Reporter, Source, Span, suggest
 from powderdsl.syntax.yaml_tree import MAX_CHARACTERS
 from powderdsl.system.reading import inside, read_bytes
+from powderdsl.system.writing import failure
 
 MAX_BYTES = 4 * MAX_CHARACTERS
 
@@ -37,6 +38,27 @@ def read_source(path: Path, reporter: Reporter, *, limit: int = MAX_BYTES) -> So
     except (ValueError, OSError, RuntimeError):  # it lies elsewhere; it is a loop of links
         name = str(path)
     return Source(name, text)
+
+
+def shipped_names(folder: Path) -> list[str]:
+    """Names of the YAML files in a folder that comes with powderdsl."""
+    return sorted(path.stem for path in folder.glob("*.yaml"))
+
+
+def find_source(text: str, folder: Path, noun: str, reporter: Reporter) -> Source:
+    """A shipped file of a folder by name, or a file by its path. `noun` says what it is, for messages.
+
+    Raises:
+        CompileError: PD801 for an unknown name, PD101 or PD102 for what cannot be read.
+    """
+    known = shipped_names(folder)
+    if text not in known and not text.lower().endswith((".yaml", ".yml")):
+        helps = suggest(text, known) or ("shipped: " + ", ".join(known),)
+        raise failure("PD801", f"no {noun} `{text[:80]}`", helps=helps)
+    source = read_source(folder / f"{text}.yaml" if text in known else Path(text), reporter)
+    reporter.raise_if_errors()
+    assert source is not None
+    return source
 
 
 def path_beside(name: str, span: Span, reporter: Reporter) -> Path | None:

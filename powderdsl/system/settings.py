@@ -110,6 +110,15 @@ def read_record(kind: type[Record], data: Any, problems: list[str], path: str = 
     return None if len(problems) > before else kind(**values)
 
 
+def checked_record(kind: type[Record], data: Any, path: str = "") -> Record:
+    """The record that a file describes. Raises ValueError with what is wrong."""
+    problems: list[str] = []
+    record = read_record(kind, data, problems, path)
+    if record is None:
+        raise ValueError("; ".join(problems[:8]))
+    return record
+
+
 @cache
 def _fields_of(kind: Any) -> dict[str, tuple[Any, bool]]:
     """The type of each field of a record, and whether it is required."""

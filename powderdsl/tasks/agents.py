@@ -8,9 +8,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from powderdsl.diagnostics import Reporter, Span, suggest
+from powderdsl.model.builtins import DIRECTIONS, OCTANTS
+from powderdsl.model.examples import WordProblem, read_word
 from powderdsl.model.schema import Entry, Form, Reader, Record, first_line, keyed
 from powderdsl.model.state import slot_name
-from powderdsl.model.types import Expr, Ruleset
+from powderdsl.model.types import DIRECTION, Expr, Ruleset
 from powderdsl.syntax import yaml_tree
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.parse import line_of, parse_scalar
@@ -140,14 +142,6 @@ def _pair(reader: Reader, node: Node | None, key: str, usual: int, size: Size) -
 
 
 MOST = "most(CELLS)"
-_ROWS, _COLUMNS = {"above": -1, "below": 1}, {"left": -1, "right": 1}
-DIRECTIONS = {
-    **{row: (dy, 0) for row, dy in _ROWS.items()},
-    **{column: (0, dx) for column, dx in _COLUMNS.items()},
-    **{f"{row}.{column}": (dy, dx) for row, dy in _ROWS.items() for column, dx in _COLUMNS.items()},
-    **{f"{column}.{row}": (dy, dx) for row, dy in _ROWS.items() for column, dx in _COLUMNS.items()},
-}
-"""Where a move blows: rows and columns."""
 
 
 def read_expert(
@@ -223,11 +217,14 @@ class _Move:
         elif word is not None and not blows:
             message = "only `choose: blow` has a direction"
             self.reporter.error("PD804", message, word.span, "not used", helps=["remove `toward`"])
-        elif word is not None and word.text not in DIRECTIONS:
-            helps = list(suggest(word.text, DIRECTIONS, "directions"))
-            message = f"unknown direction `{word.text}`"
-            self.reporter.error("PD804", message, word.span, "not a direction", helps=helps)
-        return DIRECTIONS.get(word.text, (0, 0)) if word is not None else (0, 0)
+        elif word is not None:
+            try:
+                ((octant, _),) = read_word(word.text, DIRECTION, {})
+                return OCTANTS[int(octant)]
+            except WordProblem as wrong:
+                close = suggest(word.text, DIRECTIONS, "directions")
+                self.reporter.error("PD804", wrong.message, word.span, wrong.label, helps=close)
+        return 0, 0
 
     def place(self, node: Node | None) -> tuple[tuple[int, int] | None, Measure | None]:
         """The cell, or the cells of which most are looked for; neither after a report."""
@@ -267,15 +264,13 @@ class _Move:
         condition = self.checker.condition(syntax) if syntax is not None else None
         if condition is None or syntax is None:
             return None
-        if any(_is_past(part) for part in parts_of(condition)):
+        # A move knows neither what was before nor the last action.
+        if any(
+            part.op in ("start", "before") or (part.op == "action" and part.value not in ("taken", "left"))
+            for part in parts_of(condition)
+        ):
             message, label = "a move sees the world as it is now", "what was before is not known here"
             helps = ["use `count(…)`, `share(…)`, `taken` or `left`"]
             self.reporter.error("PD406", message, syntax.span, label, helps=helps)
             return None
         return condition
-
-
-def _is_past(part: Expr) -> bool:
-    """Whether a part of a condition depends on what was before, or on the last action."""
-    is_deed = part.op == "action" and part.value not in ("taken", "left")
-    return is_deed or part.op in ("start", "before")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from powderdsl.compiler import shipped
 from powderdsl.diagnostics import Diagnostic, Reporter, Severity, suggest
-from powderdsl.syntax.sources import read_source
+from powderdsl.syntax.sources import find_source, shipped_names
 from powderdsl.system.reading import open_regular
 from powderdsl.system.writing import failure
 
@@ -22,7 +22,7 @@ MAX_HEAD = 1 << 16
 
 def shipped_tasks() -> list[str]:
     """Names of the tasks that come with powderdsl."""
-    return sorted(path.stem for path in shipped("tasks").glob("*.yaml"))
+    return shipped_names(shipped("tasks"))
 
 
 def is_task(name: str) -> bool:
@@ -67,13 +67,7 @@ def load_task(
     for name, value in (knobs or {}).items():
         if isinstance(value, bool) or not isinstance(value, int):
             raise TypeError(f"the knob `{name}` takes an integer, found {value!r}")
-    text, known = str(name_or_path), shipped_tasks()
-    if text not in known and not text.lower().endswith((".yaml", ".yml")):
-        helps = suggest(text, known) or ("shipped: " + ", ".join(known),)
-        raise failure("PD801", f"no task `{text[:80]}`", helps=helps)
-    source = read_source(shipped("tasks") / f"{text}.yaml" if text in known else Path(text), reporter)
-    reporter.raise_if_errors()
-    assert source is not None
+    source = find_source(str(name_or_path), shipped("tasks"), "task", reporter)
     return read_task(source, reporter, knobs=knobs, params=params, packs=packs, palette=palette)
 
 

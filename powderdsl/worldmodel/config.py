@@ -8,7 +8,7 @@ from typing import Any
 
 from powderdsl.compiler import BACKENDS
 from powderdsl.model.composition.palette import MAX_ELEMENTS
-from powderdsl.system.settings import check_settings, read_record, setting
+from powderdsl.system.settings import check_settings, checked_record, setting
 
 TEST_SEEDS = 1 << 32
 """The first seed of worlds that models are tested on. Training takes seeds below it."""
@@ -116,12 +116,8 @@ class TrainConfig(Checked):
     @staticmethod
     def of(values: Mapping[str, Any]) -> TrainConfig:
         """The configuration in a run's JSON, without its palette and what is no setting. Raises ValueError."""
-        names, problems = {one.name for one in fields(TrainConfig)} - {"palette"}, list[str]()
-        settings = {name: value for name, value in values.items() if name in names}
-        config = read_record(TrainConfig, settings, problems)
-        if config is None:
-            raise ValueError("; ".join(problems))
-        return config
+        names = {one.name for one in fields(TrainConfig)} - {"palette"}
+        return checked_record(TrainConfig, {name: values[name] for name in values if name in names})
 
 
 PRESETS = {

@@ -14,11 +14,10 @@ from typing import Any
 from powderdsl.compiler import shipped, shipped_rules
 from powderdsl.diagnostics import CompileError, Diagnostic, Label, Reporter, Source, Span, suggest
 from powderdsl.model.schema import NAME_FORM, Entry, Form, Reader, Record, first_line, keyed, read_tree
-from powderdsl.syntax.sources import read_source
+from powderdsl.syntax.sources import find_source, shipped_names
 from powderdsl.syntax.yaml_tree import Mapping as Mapping_
 from powderdsl.syntax.yaml_tree import Node, Scalar
 from powderdsl.system.reading import inside, is_path
-from powderdsl.system.writing import failure
 
 SIZES = ("small", "paper")
 SEED, SIZE = "seed", "size"
@@ -238,7 +237,7 @@ def _pack(text: str, folder: Path) -> str:
 
 def shipped_studies() -> list[str]:
     """Names of the studies that come with powderdsl."""
-    return sorted(path.stem for path in (shipped("tasks") / "studies").glob("*.yaml"))
+    return shipped_names(shipped("tasks") / "studies")
 
 
 Check = Callable[[Study, Reporter], None]
@@ -257,15 +256,8 @@ def check_paths(study: Study, reporter: Reporter) -> None:
 
 def load_study(name_or_path: str, commands: Commands, check: Check = check_paths) -> Study:
     """A shipped study by name, or a file. Raises CompileError with everything that is wrong."""
-    reporter, path = Reporter(), Path(name_or_path)
-    if name_or_path in shipped_studies():
-        path = shipped("tasks") / "studies" / f"{name_or_path}.yaml"
-    elif path.suffix.lower() not in (".yaml", ".yml"):
-        helps = suggest(name_or_path, shipped_studies()) or ("shipped: " + ", ".join(shipped_studies()),)
-        raise failure("PD801", f"no study `{name_or_path[:80]}`", helps=helps)
-    source = read_source(path, reporter)
-    reporter.raise_if_errors()
-    assert source is not None
+    reporter = Reporter()
+    source = find_source(name_or_path, shipped("tasks") / "studies", "study", reporter)
     return read_study(source, reporter, commands, check)
 
 
