@@ -216,8 +216,9 @@ class _Cutter:
         with self.inner() as inner:
             self.ask(lazy, guard)
         nothing = constant(graph, FLAG)
+        names = {out.var.name for out in mine}
         # A mask may be what a slot held before: nothing, where masks are skipped.
-        kept = tuple((var, nothing if value.attr in asked else value) for var, value in self.kept(guard))
+        kept = tuple((var, nothing if value.attr in names else value) for var, value in self.kept(guard))
         question = self.answer(first)
         self.emit(Compute((question,), place, "words"))
         keeps = (*((out.var, nothing) for out in mine), *kept)
