@@ -54,13 +54,13 @@ def sources_of(node: Node) -> list[tuple[Node, Offset]]:
 
 def movable(node: Node, have: Have, most: int) -> bool:
     """Whether a flag can be recomputed at a neighbor with at most `most` gates."""
-    seen: set[tuple[int, Offset]] = set()
+    seen: set[tuple[Node, Offset]] = set()
     stack = [(node, (0, 0))]
     while stack:
-        top, (dy, dx) = stack.pop()
-        if (id(top), (dy, dx)) in seen or is_constant(top):
+        place = top, (dy, dx) = stack.pop()
+        if place in seen or is_constant(top):
             continue
-        seen.add((id(top), (dy, dx)))
+        seen.add(place)
         if len(seen) > most:
             return False
         if have(top):
@@ -83,9 +83,7 @@ def gate_cost(node: Node, have: Have, limit: int = 1000) -> int:
     """The number of gates that recompute a flag in another row; `limit` if that is impossible."""
     if have(node) or is_constant(node):
         return 0
-    if node.op in UNIFORM:
-        return limit
-    if is_movement(node) or of_floats(node) or node.op in DRAWS:
+    if node.op in (*UNIFORM, *DRAWS) or is_movement(node) or of_floats(node):
         return limit
     if node.op == "shift":
         _, dx, wraps = node.attr
@@ -118,8 +116,7 @@ def stored_parts(source: Node, have: Have, most: int) -> list[Node]:
         return []
     if source.op in ARITHMETIC:
         parts = [part for arg in source.args for part in stored_parts(arg, have, most)]
-        ids = {id(part) for part in parts}
-        if float_cost(source, lambda node: have(node) or id(node) in ids) <= most:
+        if float_cost(source, lambda node: have(node) or node in parts) <= most:
             return parts
     return [source]
 

@@ -135,7 +135,7 @@ def _last_reads(sweeps: Sweeps, after: set[str]) -> dict[str, tuple[int, int]]:
     """By field that may be written over: the least lag with which that can be done to a row, and its last reader."""
     reads: dict[str, tuple[int, int]] = {}
     kept = after | sweeps.made()
-    for number, (loop, part, lag) in enumerate(zip(sweeps.loops, sweeps.parts, sweeps.lags, strict=True)):
+    for number, (loop, part, lag) in enumerate(sweeps.placed()):
         for read in field_reads(loop):
             if part > 0 or (read.live and read.dy):
                 kept.add(read.name)
@@ -147,7 +147,7 @@ def _overtaken(sweeps: Sweeps, after: set[str]) -> Sweeps:
     """Loops with fields that overwrite a field which earlier loops of the part have read in all rows so far."""
     reads = _last_reads(sweeps, after)
     loops = []
-    for number, (loop, part, lag) in enumerate(zip(sweeps.loops, sweeps.parts, sweeps.lags, strict=True)):
+    for number, (loop, part, lag) in enumerate(sweeps.placed()):
         free = [
             name for name, (least, reader) in reads.items() if least <= lag and reader < number and part == 0
         ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 from dataclasses import dataclass, replace
 from functools import reduce
 from operator import or_
@@ -43,26 +43,25 @@ def presence(schedule: Schedule) -> Schedule:
     before `cut`, which takes masks apart.
     """
     bits = _element_bits(schedule)
-    found = {var.name: slot for slot, var in schedule.finds}
     leaves = [node for slot, node in schedule.leaves if slot.startswith(_ELEMENT)]
+    slots = [(slot, bits[var.name]) for slot, var in schedule.finds if var.name in bits]
     if not bits or any(
-        found.get(name, f"{_ELEMENT}{bit}") != f"{_ELEMENT}{bit}" for name, bit in bits.items()
-    ):
-        # Constants, or planes of other slots, become the element.
+        slot != f"{_ELEMENT}{bit}" for slot, bit in slots
+    ):  # constants, or planes of other slots, become the element
         return replace(schedule, body=(*schedule.body, Forget())) if leaves else schedule
     body: list[Statement] = []
     times = _times(schedule, bits)
     for statement, after in zip(schedule.body, (*schedule.body[1:], None), strict=True):
         if isinstance(statement, Guard):
-            olds = {name: old for name, old in statement.olds.items() if name in bits}
-            if olds and not _only_swaps(statement, olds):
+            if not _only_swaps(statement, bits):
                 statement = replace(statement, body=(Forget(), *statement.body))
-        writes = isinstance(statement, Compute) and any(out.var.name in bits for out in statement.outs)
-        if isinstance(statement, Compute) and isinstance(after, Guard):
-            writes = False
-            if {out.var.name for out in statement.outs} == {mask.attr for mask in after.when}:
-                statement = replace(statement, when=_asked(statement.results, bits, times, schedule.graph))
-        body += [statement, Forget()] if writes else [statement]
+            body.append(statement)
+        elif isinstance(statement, Compute) and isinstance(after, Guard):
+            asked = statement.made() == {mask.attr for mask in after.when}
+            when = _asked(statement.results, bits, times, schedule.graph) if asked else None
+            body.append(replace(statement, when=when))
+        else:
+            body += [statement] if statement.made().isdisjoint(bits) else [statement, Forget()]
     if any(node.op != "load" for node in leaves):
         body.append(Forget())
     return replace(schedule, body=tuple(body), when=_pass_asks(schedule, bits))
@@ -71,8 +70,9 @@ def presence(schedule: Schedule) -> Schedule:
 def _element_bits(schedule: Schedule) -> dict[str, int]:
     """For each variable that holds a bit of the element: which bit. Empty if there are more than MAX_PLANES."""
     bits: dict[str, int] = {}
-    ends = [(slot, str(node.attr)) for slot, node in schedule.leaves if node.op == "load"]
-    for slot, name in (*((slot, var.name) for slot, var in schedule.finds), *ends):
+    slots = [(slot, var.name) for slot, var in schedule.finds]
+    slots += [(slot, str(node.attr)) for slot, node in schedule.leaves if node.op == "load"]
+    for slot, name in slots:
         if slot.startswith(_ELEMENT):
             bits[name] = int(slot.removeprefix(_ELEMENT))
     pairs = [
@@ -97,27 +97,24 @@ def _times(schedule: Schedule, bits: dict[str, int]) -> dict[str, Time]:
     current: dict[int, str] = {}
     begins: dict[str, int] = {}
     ends: dict[str, int] = {}
-    computed = (out.var for one in flat(schedule.body) if isinstance(one, Compute) for out in one.outs)
-    for var in (*(var for _, var in schedule.finds), *computed):
+    loops = [statement for statement in flat(schedule.body) if isinstance(statement, Compute)]
+    for var in (*dict(schedule.finds).values(), *(out.var for loop in loops for out in loop.outs)):
         if (bit := bits.get(var.name)) is not None:
             if bit in changed:
                 change, changed = change + 1, set()
             changed.add(bit)
             begins[var.name] = change
-            if bit in current:
-                ends[current[bit]] = change
+            ends[current.get(bit, "")] = change
             current[bit] = var.name
     return {name: (begin, ends.get(name, change + 1)) for name, begin in begins.items()}
 
 
-def _only_swaps(guard: Guard, olds: dict[str, Node]) -> bool:
+def _only_swaps(guard: Guard, bits: Container[str]) -> bool:
     """Whether a guard preserves the count of each element: it swaps cells, or writes no elements."""
-    values = {out.var.name: out.value for one in guard.body if isinstance(one, Compute) for out in one.outs}
-    for name, old in olds.items():
-        value = values[name]
-        if value.op != "swap" or value.args[0] is not old or value.args[2] is not old:
-            return False
-    return True
+    loops = [statement for statement in guard.body if isinstance(statement, Compute)]
+    values = {out.var.name: out.value for loop in loops for out in loop.outs}
+    changed = [(values[name], old) for name, old in guard.olds.items() if name in bits]
+    return all(value.op == "swap" and value.args[0] is old is value.args[2] for value, old in changed)
 
 
 def _pass_asks(schedule: Schedule, bits: dict[str, int]) -> Node | None:
@@ -126,13 +123,9 @@ def _pass_asks(schedule: Schedule, bits: dict[str, int]) -> Node | None:
     Until something changes, slots hold their values from the beginning of the pass, so every mask is judged as if it
     were the first.
     """
-    values: dict[str, Node] = {}
-    guards: dict[str, tuple[Guard, Node]] = {}
-    for statement in schedule.body:
-        if isinstance(statement, Compute):
-            values |= {out.var.name: out.value for out in statement.outs}
-        elif isinstance(statement, Guard):
-            guards |= {var.name: (statement, old) for var, old in statement.keeps}
+    loops = [statement for statement in schedule.body if isinstance(statement, Compute)]
+    values = {out.var.name: out.value for loop in loops for out in loop.outs}
+    guards = {name: one for one in schedule.body if isinstance(one, Guard) for name in one.made()}
     slots = {var.name: slot for slot, var in schedule.finds}
     masks: list[Node] = []
     for slot, node in schedule.leaves:
@@ -143,8 +136,9 @@ def _pass_asks(schedule: Schedule, bits: dict[str, int]) -> Node | None:
             node, choices = kept
             masks += choices
         while node.op == "load" and node.attr in guards:
-            guard, node = guards[node.attr]
+            guard = guards[node.attr]
             masks += guard.when
+            node = guard.olds[node.attr]
         if node.op != "load" or slots.get(node.attr) != slot:
             return None
     return _asked([values.get(str(mask.attr), mask) for mask in masks], bits, {}, schedule.graph)
@@ -170,7 +164,7 @@ def _asked(masks: list[Node], bits: dict[str, int], times: dict[str, Time], grap
 
 def asked_ids(schedule: Schedule) -> int:
     """All ids whose presence a schedule tests."""
-    nodes = ordered([*schedule.values(), *([schedule.when] if schedule.when else [])])
+    nodes = ordered(filter(None, [*schedule.values(), schedule.when]))
     return reduce(or_, (node.attr for node in nodes if node.op == "present"), 0)
 
 

@@ -75,10 +75,10 @@ class Rows:
 def rows_of(sweeps: Sweeps, reaches: Mapping[str, int]) -> Rows:
     """The plan of loops that run together."""
     rings, saved, waiting = _waiting(sweeps)
-    made = {out.var.name for loop in sweeps.loops for out in loop.outs}
+    made = sweeps.made()
     loops = []
     turned = 0
-    for loop, part, lag in zip(sweeps.loops, sweeps.parts, sweeps.lags, strict=True):
+    for loop, part, lag in sweeps.placed():
         chains = chains_of(loop) if loop.over == "choices" else []
         _, planes = region_of(loop)
         # Choices test their masks themselves.
@@ -92,13 +92,11 @@ def rows_of(sweeps: Sweeps, reaches: Mapping[str, int]) -> Rows:
 
 def _waiting(sweeps: Sweeps) -> tuple[dict[str, Ring], dict[str, tuple[int, int]], int]:
     """The rings of passing fields, the rows that are saved of others, and the number of rows that wait in all."""
-    lags = {
-        out.var.name: lag for loop, lag in zip(sweeps.loops, sweeps.lags, strict=True) for out in loop.outs
-    }
+    lags = {name: lag for loop, _, lag in sweeps.placed() for name in loop.made()}
     depths = dict.fromkeys(sweeps.passing, 1)
     bare: dict[str, int | None] = dict.fromkeys(sweeps.passing, 0)
     below = {out.into: 0 for loop in sweeps.loops for out in loop.outs if out.into is not None}
-    for loop, lag in zip(sweeps.loops, sweeps.lags, strict=True):
+    for loop, _, lag in sweeps.placed():
         for read in field_reads(loop):
             if (name := read.name) in depths:
                 depths[name] = max(depths[name], lag - lags[name] - read.dy + 1)

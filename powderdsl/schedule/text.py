@@ -78,8 +78,8 @@ def _statement(statement: Statement, indent: str, names: _Names) -> Iterator[str
                 into = f" into {names.of(out.into)}" if out.into else ""
                 rest = f" else {values.text(out.otherwise)}" if out.otherwise is not None else ""
                 yield f"{indent}{names.of(out.var.name)} = {value}{rest}{into}"
-        case Sweeps(loops, parts, lags):
-            for loop, part, lag in zip(loops, parts, lags, strict=True):
+        case Sweeps(loops, parts):
+            for loop, part, lag in statement.placed():
                 if len(loops) > 1:
                     behind = f", {lag} behind" if lag else ""
                     yield f"{indent}row by row{f', part {part}' if parts[-1] else ''}{behind}"

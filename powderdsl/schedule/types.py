@@ -251,7 +251,7 @@ class Sweeps(Statement):
 
     Each loop runs `lags` rows behind the first of its part: then the rows that it reads of earlier loops are there. A
     loop that reads an earlier one around the edge is in a later part, which begins when all rows are done.
-    `passing` lists fields that only loops of one part read: they need memory for a few rows.
+    `passing` lists fields that only loops of one part read: they need memory for a few rows. Stages change it as a whole.
     """
 
     loops: tuple[Compute, ...]
@@ -261,6 +261,10 @@ class Sweeps(Statement):
 
     def blocks(self) -> tuple[Block, ...]:
         return (self.loops,)
+
+    def placed(self) -> Iterator[tuple[Compute, int, int]]:
+        """Each loop with its part and lag."""
+        return zip(self.loops, self.parts, self.lags, strict=True)
 
     def defined(self) -> Iterable[Var]:
         return [var for loop in self.loops for var in loop.defined()]
