@@ -88,8 +88,9 @@ class _Cutter:
         self.same: dict[str, Node] = {}
         """For each variable that is only another name: the load of the variable that it names."""
         nodes = ordered(schedule.values())
-        self.comparisons = [node for node in nodes if is_comparison(node)]
-        self.led = {node.args[1]: node for node in nodes if node.op == "led"}
+        led = {node.args[1]: node for node in nodes if node.op == "led"}
+        self.comparisons = {node: led.get(node, node) for node in nodes if is_comparison(node)}
+        """What is computed for each comparison: itself, or only where another one holds."""
         offsets: dict[Node, set[Offset]] = {}
         for node in nodes:
             for source, offset in sources_of(node):
@@ -171,14 +172,13 @@ class _Cutter:
 
     def hoist_comparisons(self, masks: Compute) -> None:
         """Compute the comparisons of masks before the guard, with all others that the same loop can compute."""
-        nodes = (node for out in masks.outs for node in walk(out.value) if is_comparison(node))
-        asked = [self.led.get(node, node) for node in nodes if not self.have(node)]
-        asked = [node for node in dict.fromkeys(asked) if not self.have(node)]
-        if asked:
+        nodes = [node for value in masks.results for node in walk(value) if is_comparison(node)]
+        computed = dict.fromkeys(self.comparisons[node] for node in nodes if not self.have(node))
+        if asked := [node for node in computed if not self.have(node)]:
             self.ensure(self.needs_of(asked), masks.place)
             ready = [
                 node
-                for node in (self.led.get(node, node) for node in self.comparisons)
+                for node in self.comparisons.values()
                 if not self.have(node) and not self.needs(node) and self.there.issuperset(loaded([node]))
             ]
             self.ensure([*asked, *ready], masks.place)

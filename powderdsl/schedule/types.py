@@ -452,7 +452,11 @@ def map_each(schedule: Schedule, kind: type[Kind], change: Callable[[Kind], Iter
 
 def map_values(schedule: Schedule, rule: Rule) -> Schedule:
     """The schedule with every value rewritten by a rule, see `rewritten`."""
-    new = rewritten(schedule.values(), schedule.graph, rule)
+    return with_values(schedule, rewritten(schedule.values(), schedule.graph, rule))
+
+
+def with_values(schedule: Schedule, new: Callable[[Node], Node]) -> Schedule:
+    """The schedule with every value replaced by another."""
     changed = map_blocks(schedule, lambda body: tuple(statement.with_values(new) for statement in body))
     return replace(changed, leaves=tuple((slot, new(node)) for slot, node in schedule.leaves))
 

@@ -30,11 +30,11 @@ from powderdsl.schedule.types import (
     load,
     loaded,
     made_in,
-    map_blocks,
     map_each,
     read_by,
     read_elsewhere,
     rewritten,
+    with_values,
 )
 
 WORTH = 3
@@ -91,14 +91,14 @@ def early(schedule: Schedule) -> Schedule:
         if node in planes:
             rest = [new[part] for part in conjuncts(node) if part not in planes[node]]
             new[node] = combined("and", dict.fromkeys([*planes[node].values(), *rest]), graph)
-    changed = map_blocks(schedule, lambda body: tuple(one.with_values(new.__getitem__) for one in body))
+    changed = with_values(schedule, new.__getitem__)
     body: list[Statement] = []
     for i, statement in enumerate(changed.body):
         if i in before:
-            when = when_present([out.value for out in before[i]], schedule)
-            body.append(Compute(tuple(before[i]), when=when))
+            loop = Compute(tuple(before[i]))
+            body.append(replace(loop, when=when_present(loop.results, schedule)))
         body.append(statement)
-    return replace(schedule, body=tuple(body))
+    return replace(changed, body=tuple(body))
 
 
 def _gates(parts: Iterable[Node]) -> Iterable[Node]:
