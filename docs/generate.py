@@ -35,7 +35,7 @@ from powderdsl.model.builtins import (
     RESERVED,
     shaped_kernel,
 )
-from powderdsl.model.composition.pass_order import MAX_PASSES
+from powderdsl.model.composition.names import MAX_PASSES
 from powderdsl.model.elaborate import MAX_MOMENTS, MAX_RULES
 from powderdsl.model.examples import MAX_SIDE
 from powderdsl.model.expressions.typer import MAX_ROUNDS, MAX_SET_DEPTH

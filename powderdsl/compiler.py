@@ -15,13 +15,11 @@ from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from powderdsl.analysis.outgrown import with_outgrown
 from powderdsl.diagnostics import CompileError, Label, Reporter, Severity, Source, Span, suggest
-from powderdsl.model.check import check
-from powderdsl.model.composition.compose import compose
-from powderdsl.model.composition.contested import words_of_tree
+from powderdsl.model.check import check, with_outgrown
+from powderdsl.model.composition.compose import Palette, compose
 from powderdsl.model.composition.layout import own_slots
-from powderdsl.model.composition.palette import Palette
+from powderdsl.model.composition.names import words_of_tree
 from powderdsl.model.declarations import PackDecl, RulesetDecl
 from powderdsl.model.definitions import set_params
 from powderdsl.model.packs import read_file

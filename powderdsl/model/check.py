@@ -1,25 +1,25 @@
-"""Declarations -> checked model. One straight function; each step reports all it can."""
+"""Declarations -> checked model. One straight function; each step reports all it can.
+
+Some packs of a composition are also checked alone: what they are for their authors, without added packs.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 
-from powderdsl.diagnostics import CompileError, Reporter, Span
-from powderdsl.model.added_conflicts import AddedPacks
-from powderdsl.model.composition.compose import compose
-from powderdsl.model.composition.contested import report_contested, report_misspelled
-from powderdsl.model.composition.layout import matrix_channels, state_order
-from powderdsl.model.composition.palette import Palette
+from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Severity, Span
+from powderdsl.model.composition.added_packs import AddedPacks, Difference, report_contested
+from powderdsl.model.composition.compose import Palette, compose
+from powderdsl.model.composition.layout import lay_out
+from powderdsl.model.composition.names import needs_of, report_misspelled, words_of
 from powderdsl.model.declarations import PackDecl, RulesetDecl
 from powderdsl.model.definitions import define_symbols, element_ramps
 from powderdsl.model.elaborate import Elaborated, Elaborator
 from powderdsl.model.examples import check_assigned, check_examples
-from powderdsl.model.expressions.symbols import (
-    Symbols,
-    base_symbols,
-)
+from powderdsl.model.expressions.symbols import Symbols, base_symbols
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.invariants import check_invariants
 from powderdsl.model.logic.conflicts import check_logic
@@ -33,11 +33,11 @@ from powderdsl.model.logic.needless import (
     without_dead_overrides,
 )
 from powderdsl.model.logic.satisfy import Facts
-from powderdsl.model.types import (
-    Declared,
-    Ruleset,
-    Stream,
-)
+from powderdsl.model.text import place_of
+from powderdsl.model.types import Declared, Ruleset, Stream
+
+OF_COMPOSITIONS = ("PD315", "PD316")
+"""Warnings for whoever puts packs together: what is misspelled beside all known words, which of two values is lost."""
 
 
 def resolve_names(
@@ -68,7 +68,7 @@ def check(
     """The checked model of some packs. Raises CompileError; warnings and notes stay with the reporter.
 
     Args:
-        palette: ids that were recorded earlier, see `model/composition/palette.py`.
+        palette: ids that were recorded earlier, see `model/composition/compose.py`.
         elsewhere: words that packs define which are not loaded, with the pack.
         alone: no pack counts as added to others: rules that meet are errors.
     """
@@ -99,15 +99,12 @@ def check(
     }
     check_assigned(examples, symbols, reporter)
     facts = _facts(symbols)
-    passes, undecided = check_logic(
-        passes,
-        facts,
-        elaborated,
-        reporter,
-        None if alone else AddedPacks(composition, partial(_alone, packs)),
-    )
+    added = None
+    if not alone:
+        added = AddedPacks(composition, partial(_check_some, Declared(tuple(packs), None), alone=True))
+    passes, undecided = check_logic(passes, facts, elaborated, reporter, added)
     report_unused(composition, typer, produced_ids(passes, facts))
-    matrix = matrix_channels(composition, symbols, passes, reporter)
+    order, matrix = lay_out(symbols, passes, reporter)
     reporter.raise_if_errors()
     undecided += report_needless(passes, symbols.fields, facts, reporter)
     found = Ruleset(
@@ -123,7 +120,7 @@ def check(
         passes=without_dead_overrides(passes, frozenset(name for name, ids in stored.items() if not ids)),
         matrix=matrix,
         side_multiple=composition.side_multiple,
-        order=state_order(composition, symbols, passes),
+        order=order,
         tests=examples,
         invariants=invariants,
         declared=Declared(tuple(packs), ruleset),
@@ -139,11 +136,6 @@ def _typer_of(packs: Sequence[PackDecl], names: tuple[str, ...]) -> Typer | None
         return resolve_names([pack for pack in packs if pack.name.text in names], None, Reporter())[0]
     except CompileError:
         return None
-
-
-def _alone(packs: Sequence[PackDecl], names: tuple[str, ...], reporter: Reporter) -> Ruleset:
-    """The model of some of these packs by themselves. Raises CompileError."""
-    return check([pack for pack in packs if pack.name.text in names], None, reporter, alone=True)
 
 
 def _facts(symbols: Symbols) -> Facts:
@@ -162,3 +154,91 @@ def _streams(symbols: Symbols, elaborated: Elaborated, reporter: Reporter) -> tu
             message = f"streams `{other}` and `{stream.name}` would draw the same numbers"
             reporter.error("PD302", message, None, helps=["rename one of them"])
     return tuple(streams)
+
+
+# Some packs alone
+
+
+def restricted(ruleset: Ruleset, packs: Collection[str]) -> Ruleset | None:
+    """The model of some of a ruleset's packs, with its parameters; None if they are not a ruleset of their own."""
+    model = _check_some(ruleset.declared, packs, Reporter())
+    if model is None:
+        return None
+    names = {param.name for param in model.params}
+    return model.with_params({p.name: p.default for p in ruleset.params if p.name in names})
+
+
+def without(ruleset: Ruleset, pack: str) -> Ruleset | None:
+    """The model without one pack and the packs that need it; None if the rest is not a ruleset."""
+    assert ruleset.declared is not None
+    needs = needs_of(ruleset.declared.packs)
+    return restricted(ruleset, [name for name in needs if pack not in needs[name]])
+
+
+def _check_some(
+    declared: Declared | None, packs: Collection[str], reporter: Reporter, *, alone: bool = False
+) -> Ruleset | None:
+    """The model of some packs; None after reporting why they are not a ruleset of their own."""
+    if declared is None:
+        return None
+    gone = {pack.name.text for pack in declared.packs} - set(packs)
+    chosen = [pack for pack in declared.packs if pack.name.text not in gone]
+    try:
+        return check(chosen, _bare(declared.ruleset, gone), reporter, alone=alone)
+    except CompileError:
+        return None
+
+
+def _bare(decl: RulesetDecl | None, gone: set[str]) -> RulesetDecl | None:
+    """A ruleset that names nothing of packs that are gone: no channels, and no invariants if some of them are its own."""
+    if decl is None:
+        return None
+    invariants = decl.invariants if gone.isdisjoint(decl.members) else ()
+    beside = tuple(bare for one in decl.beside if (bare := _bare(one, gone)))
+    base = _bare(decl.base, gone)
+    return replace(decl, matrix=(), slots=None, invariants=invariants, base=base, beside=beside)
+
+
+def with_outgrown(ruleset: Ruleset, remarks: tuple[Diagnostic, ...]) -> tuple[Diagnostic, ...]:
+    """The same remarks, where warnings that nobody would get without the added packs are notes (PD515)."""
+    warnings = [
+        one
+        for one in remarks
+        if one.severity is Severity.WARNING and one.primary.span and one.code not in OF_COMPOSITIONS
+    ]
+    if not warnings or ruleset.declared is None or len(ruleset.packs) < 2:
+        return remarks
+    composition = compose(ruleset.declared.packs, ruleset.declared.ruleset, Reporter())
+    notes: dict[Diagnostic, Diagnostic] = {}
+    authors: list[PackDecl | RulesetDecl] = [*composition.packs, *composition.lineage]
+    for author in authors:
+        own = {
+            one: one.primary.span
+            for one in warnings
+            if one.primary.span and one.primary.span.source == author.source
+        }
+        if not own:
+            continue
+        words = _known_words(author)
+        scope = composition.scope(author.name.text if isinstance(author, PackDecl) else author, words)
+        added, reporter = ruleset.added_to(scope), Reporter()
+        if not added or _check_some(ruleset.declared, scope, reporter) is None:
+            continue
+        known = {(one.code, one.primary.span) for one in reporter.diagnostics}
+        for one, span in own.items():
+            if (one.code, span) not in known:
+                message = f"{Difference(added).with_packs}, {one.message}: {place_of(span)}"
+                notes[one] = replace(one, code="PD515", message=message, helps=())
+    return tuple(notes.get(one, one) for one in remarks)
+
+
+def _known_words(author: PackDecl | RulesetDecl) -> list[str]:
+    """The words of a pack's own rules and elements, or a ruleset's invariants, by which it shows what it knows."""
+    if isinstance(author, RulesetDecl):
+        return [word for line in author.invariants for word in words_of(line)]
+    lines = chain(author.lines, (one.members for one in author.sets))
+    words = [word for line in lines for word in words_of(line)]
+    words += [also.name.word for also in author.also]
+    for entry in author.entries:
+        words += [scalar.word for scalar in (*(key for key, _ in entry.values), *entry.tags)]
+    return words

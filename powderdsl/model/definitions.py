@@ -10,8 +10,8 @@ from difflib import get_close_matches
 from typing import Any
 
 from powderdsl.diagnostics import Label, Reporter, Span, suggest
+from powderdsl.model.composition.added_packs import report_replaced
 from powderdsl.model.composition.compose import Composition
-from powderdsl.model.composition.contested import given_values, report_replaced
 from powderdsl.model.composition.names import Named, report_unknown
 from powderdsl.model.declarations import (
     ElementDecl,
@@ -71,7 +71,7 @@ def define_symbols(typer: Typer) -> list[tuple[str, int, Span]]:
             symbols.constants[name] = _shaped(kernel, kernel.decl.shape, typer)
     for name, param in composition.params.items():
         word = composition.names.of(param.pack, param.decl.name.text)
-        other = composition.definitions.get(word)
+        other = composition.names.definitions.get(word)
         if other is not None and composition.names.knows(param.pack, word):
             # A rule would read the other one without a sign.
             typer.reporter.error(
@@ -213,7 +213,7 @@ def _element_values(typer: Typer) -> Given:
     symbols, composition = typer.symbols, typer.symbols.composition
     given: dict[tuple[str, str], tuple[Syntax, str]] = {}
     own: dict[str, dict[int, Value]] = {}
-    for pack, name, word, key, syntax in given_values(composition):
+    for pack, name, word, key, syntax in composition.given_values():
         element = composition.elements.get(word)
         field = symbols.fields.get(name)
         if name in composition.properties:

@@ -11,8 +11,7 @@ from math import lcm
 
 from powderdsl.diagnostics import Label, Reporter, Span, suggest
 from powderdsl.model.builtins import DIRECTIONS, OCTANTS
-from powderdsl.model.composition.claim_scopes import words_of
-from powderdsl.model.composition.names import report_unknown
+from powderdsl.model.composition.names import report_unknown, words_of
 from powderdsl.model.declarations import TestDecl
 from powderdsl.model.expressions.operators import Poisoned, Scope, Unresolved
 from powderdsl.model.expressions.symbols import Symbols, clamped_number
@@ -189,7 +188,7 @@ class _ExampleReader:
             fields,
             expect_fields,
             tuple(often),
-            self.composition.scopes.of_pack(self.pack, words),
+            self.composition.scope(self.pack, words),
         )
 
     def _legend(self) -> dict[str, str]:
@@ -197,7 +196,7 @@ class _ExampleReader:
         composition = self.composition
         legend = {element.glyph: name for name, element in composition.elements.items()}
         # Glyphs mean what they mean without packs that the author of the test does not know.
-        alone = composition.glyphs_alone(composition.scopes.of_pack(self.pack))
+        alone = composition.glyphs_alone(composition.scope(self.pack))
         legend |= {glyph: name for name, glyph in alone.items()}
         # What the pack's own file says comes first, whatever other packs took before.
         for name, named in composition.element_decls.items():

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from powderdsl.diagnostics import Reporter, Span, suggest
-from powderdsl.model.composition.claim_scopes import names_left_out, with_optional, words_of
-from powderdsl.model.composition.compose import Composition
+from powderdsl.model.composition.compose import Composition, with_optional
+from powderdsl.model.composition.names import words_of
 from powderdsl.model.declarations import RulesetDecl
 from powderdsl.model.expressions.operators import (
     ELEMENT_HERE,
@@ -58,14 +58,13 @@ def check_invariants(
     """
     written: list[tuple[str, Syntax, RulesetDecl | None]]
     written = [(pack.name.text, line, None) for pack in composition.packs for line in pack.invariants]
-    gone = names_left_out(composition.ruleset) - composition.names.owners.keys()
+    gone = composition.left_out
     for ruleset in composition.lineage:
         written += [(ruleset.name.text, with_optional(line, gone), ruleset) for line in ruleset.invariants]
     found = []
     reporter = typer.reporter
     for pack, line, author in written:
-        words, scopes = words_of(line), composition.scopes
-        scope = scopes.of_ruleset(author, words) if author else scopes.of_pack(pack, words)
+        scope = composition.scope(author or pack, words_of(line))
         typer.reporter = Reporter()
         try:
             claim, without = _claim(typer, line, pack)

@@ -9,7 +9,7 @@ from typing import Any
 from powderdsl.compiler import load_with_diagnostics, names_in_file, read
 from powderdsl.diagnostics import CompileError, Reporter, Source, suggest
 from powderdsl.model.check import resolve_names
-from powderdsl.model.composition.palette import Palette
+from powderdsl.model.composition.compose import Palette
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.operations import FUNCTIONS as RULE_FUNCTIONS
 from powderdsl.model.schema import NAME_FORM, Entry, Reader, Record, first_line, keyed, read_tree
@@ -259,8 +259,8 @@ class _TaskReader:
     def is_name(self, word: str) -> bool:
         """Whether a word means something in the task's own rules."""
         symbols = self.typer.symbols
-        owner = symbols.composition.names.owners.get(word)
-        return (owner is None or owner[0] in self.own) and bool(
+        named = symbols.composition.names.definitions.get(word)
+        return (named is None or named.pack in self.own) and bool(
             self.ruleset.element(word) or symbols.constants.get(word)
         )
 

@@ -13,7 +13,7 @@ from powderdsl.system.reading import open_regular
 from powderdsl.system.writing import failure
 
 if TYPE_CHECKING:
-    from powderdsl.model.composition.palette import Palette
+    from powderdsl.model.composition.compose import Palette
     from powderdsl.tasks.task import Task
 
 MAX_HEAD = 1 << 16

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 from powderdsl.compiler import BACKENDS
-from powderdsl.model.composition.palette import MAX_ELEMENTS
+from powderdsl.model.composition.compose import MAX_ELEMENTS
 from powderdsl.system.settings import check_settings, checked_record, setting
 
 TEST_SEEDS = 1 << 32

@@ -13,8 +13,8 @@ import torch
 from powderdsl.compiler import read
 from powderdsl.diagnostics import CompileError, Reporter, suggest
 from powderdsl.model.check import check
+from powderdsl.model.composition.compose import Palette
 from powderdsl.model.composition.names import with_stand_ins
-from powderdsl.model.composition.palette import Palette
 from powderdsl.model.declarations import ElementDecl, PackDecl
 from powderdsl.model.definitions import set_params
 from powderdsl.model.types import Ruleset

@@ -31,7 +31,7 @@ from powderdsl.experiments.runs import (
     read_run,
     recorded_palette,
 )
-from powderdsl.model.composition.palette import Palette
+from powderdsl.model.composition.compose import Palette
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
 from powderdsl.system.interrupts import held_back

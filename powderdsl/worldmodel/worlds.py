@@ -11,7 +11,7 @@ from torch import Tensor
 
 from powderdsl.compiler import load
 from powderdsl.diagnostics import CompileError, Reporter, Span, suggest
-from powderdsl.model.composition.palette import Palette
+from powderdsl.model.composition.compose import Palette
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.programs import starting_backend

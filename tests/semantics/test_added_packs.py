@@ -13,7 +13,7 @@ import pytest
 import powderdsl as library
 from powderdsl.analysis.ledger import ledger
 from powderdsl.diagnostics import Severity
-from powderdsl.model.restrict import restricted
+from powderdsl.model.check import restricted
 from powderdsl.model.text import place_of
 from powderdsl.testing.generators.cases import Start
 from powderdsl.testing.pack_tests.runner import run_examples

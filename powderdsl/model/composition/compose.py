@@ -1,32 +1,33 @@
-"""Declarations of several packs -> one composition: every name defined once, passes in order."""
+"""Declarations of several packs -> one composition: every name defined once, an id for each element, passes in order.
+
+Ids are assigned here, or recorded in a palette, which has the qualified name of the element of each id, or None where
+an id is free. Worlds, datasets and checkpoints keep one, so that they mean the same elements whatever else is loaded
+later.
+"""
 
 from __future__ import annotations
 
-from collections import ChainMap
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from collections.abc import Set as AbstractSet
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import cached_property
+from itertools import pairwise
 from math import lcm
-from typing import Any, TypeVar
+from typing import Any
 
 from powderdsl.diagnostics import Label, Reporter, Span
 from powderdsl.model.builtins import RESERVED
-from powderdsl.model.composition.claim_scopes import ClaimScopes, names_left_out, title_of, with_waiting
 from powderdsl.model.composition.names import (
     NameBook,
     Named,
     Names,
     needed_first,
+    order_passes,
     report_unknown,
     with_stand_ins,
 )
-from powderdsl.model.composition.palette import Claim, Palette, composed_ids, recorded_ids, report_ids
-from powderdsl.model.composition.pass_order import order_passes
 from powderdsl.model.declarations import (
     AlsoDecl,
-    Definition,
     ElementDecl,
     FieldDecl,
     KernelDecl,
@@ -40,10 +41,15 @@ from powderdsl.model.declarations import (
     TagDecl,
 )
 from powderdsl.model.types import Element
+from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.parse import reserved_words
 from powderdsl.syntax.yaml_tree import Scalar
 
-T = TypeVar("T", bound=Definition | ParamDecl)
+MAX_ELEMENTS = 256
+"""Ids fit into a byte."""
+
+Palette = Sequence[str | None]
+"""By id: an element's qualified name, or None."""
 
 
 @dataclass(frozen=True)
@@ -77,28 +83,32 @@ class Composition:
     """Ids of elements of a ruleset's own packs that are left out."""
 
     @cached_property
-    def scopes(self) -> ClaimScopes:
-        """The scopes of invariants and tests."""
-        return ClaimScopes(self.packs, self.ruleset, self.names)
-
-    @cached_property
-    def definitions(self) -> Mapping[str, Named[Any]]:
-        """Everything that has a global name, parameters and passes left out."""
-        tables = (
-            self.element_decls,
-            self.tag_decls,
-            self.properties,
-            self.fields,
-            self.streams,
-            self.sets,
-            self.kernels,
-        )
-        return ChainMap(*tables)
-
-    @cached_property
     def lineage(self) -> tuple[RulesetDecl, ...]:
         """The rulesets that are loaded, what inherits after what it extends."""
         return self.ruleset.lineage if self.ruleset else ()
+
+    @cached_property
+    def left_out(self) -> frozenset[str]:
+        """Names of packs that a ruleset leaves out: its own lines may use them as if they ended in `?`."""
+        packs = self.ruleset.left_out if self.ruleset else ()
+        return frozenset(decl.name.text for pack in packs for decl in pack.definitions)
+
+    def scope(self, author: str | RulesetDecl, words: Iterable[str] = ()) -> tuple[str, ...]:
+        """The packs that the author of a pack or ruleset knew, in load order. All others were added.
+
+        These are a ruleset's packs, or the pack and those of the ruleset that lists it; the packs that define some
+        words that the author uses; and all that these need.
+        """
+        if isinstance(author, RulesetDecl):
+            known, speaker = [*author.members], ""
+        else:
+            home = next(filter(None, (one.lister(author) for one in self.lineage)), None)
+            known, speaker = [author, *(home.members if home else ())], author
+        for word in words:
+            named = self.names.definitions.get(self.names.of(speaker, word))
+            known += [named.pack] if named else []
+        reached = {need for pack in known for need in self.names.needs.get(pack, (pack,))}
+        return tuple(pack.name.text for pack in self.packs if pack.name.text in reached)
 
     def entries(self) -> Iterator[tuple[str, str, ElementDecl | AlsoDecl]]:
         """The entries of all elements: the pack or ruleset, the element's global name (as written if absent), the entry.
@@ -109,13 +119,25 @@ class Composition:
         for name, named in self.element_decls.items():
             yield named.pack, name, named.decl
         members = {name for one in self.lineage for name in one.members}
-        ordered = needed_first(self.packs)
-        gone = names_left_out(self.ruleset) - self.names.owners.keys()
-        of_rulesets = [(one.name.text, with_waiting(also, gone)) for one in self.lineage for also in one.also]
-        of_packs = [(pack.name.text, also) for pack in ordered for also in pack.also]
-        own = [entry for entry in of_packs if entry[0] in members]
-        for giver, also in (*own, *of_rulesets, *(entry for entry in of_packs if entry[0] not in members)):
+        own: list[tuple[str, AlsoDecl]] = []
+        added: list[tuple[str, AlsoDecl]] = []
+        for pack in needed_first(self.packs):
+            (own if pack.name.text in members else added).extend((pack.name.text, one) for one in pack.also)
+        own += [(one.name.text, _waiting(also, self.left_out)) for one in self.lineage for also in one.also]
+        for giver, also in (*own, *added):
             yield giver, self.element(also.name.word, giver) or also.name.word, also
+
+    def given_values(self) -> Iterator[tuple[str, str, str, Scalar, Syntax]]:
+        """Every value of a single element, in rising precedence: those of entries, then those beside the property or field.
+
+        Each is a pack, a property or field and an element by global name (one that is absent as written), key and value.
+        """
+        for pack, element, entry in self.entries():
+            for key, syntax in entry.values:
+                yield pack, self.names.of(pack, key.word), element, key, syntax
+        for name, typed in (*self.properties.items(), *self.fields.items()):
+            for key, syntax in typed.decl.values:
+                yield typed.pack, name, self.element(key.word, typed.pack) or key.word, key, syntax
 
     def glyphs_alone(self, packs: Sequence[str]) -> dict[str, str]:
         """The glyphs of elements, by global name, as they are where only some packs are loaded."""
@@ -135,6 +157,25 @@ class Composition:
         return next((one for one, element in self.elements.items() if element.qualified == word), None)
 
 
+def _waiting(also: AlsoDecl, names: frozenset[str]) -> AlsoDecl:
+    """What a ruleset adds to an element, with a `?` behind some names."""
+
+    def optional(scalar: Scalar) -> Scalar:
+        return replace(scalar, text=f"{scalar.text}?") if scalar.text in names else scalar
+
+    tags = tuple(map(optional, also.tags))
+    values = tuple((optional(key), value) for key, value in also.values)
+    return replace(also, name=optional(also.name), tags=tags, values=values)
+
+
+def with_optional(syntax: Syntax, names: frozenset[str]) -> Syntax:
+    """The expression with a `?` behind some names."""
+    kind = "optional_name" if syntax.kind == "name" and syntax.text in names else syntax.kind
+    return replace(
+        syntax, kind=kind, children=tuple(with_optional(child, names) for child in syntax.children)
+    )
+
+
 def compose(
     packs: Sequence[PackDecl],
     ruleset: RulesetDecl | None,
@@ -150,34 +191,39 @@ def compose(
     reporter.raise_if_errors()  # every name of a missing pack would be reported too
     renames = ruleset.renames if ruleset else ()
     book = NameBook(packs, renames, reporter, RESERVED | reserved_words() | {"elements"})
-    passes_book = NameBook(packs, renames, reporter)
-
-    def table(kind: str, decls_of: Callable[[PackDecl], Sequence[T]]) -> dict[str, Named[T]]:
-        """The declarations of a kind by global name."""
-        found = [book.define(decl, kind, pack.name.text) for pack in packs for decl in decls_of(pack)]
-        return {named.name: named for named in found if named}
-
-    versions = _versions(packs, book, reporter)
+    versions = book.versions("element", lambda pack: pack.elements)
+    if not versions:
+        reporter.error(
+            "PD109", "no element is defined", packs[0].name.span if packs else None, "a world needs elements",
+            helps=["define `elements:`, or load `core` too"],
+        )  # fmt: skip
     groups = _groups(packs, ruleset)
-    claims = _claims(groups, ruleset is not None, versions)
-    natural = composed_ids(claims)
-    ids = natural if palette is None else recorded_ids(claims, palette)
-    report_ids(claims, ids, reporter, recorded=palette is not None)
-    elements = _elements([found[0] for found in versions.values()], ids, reporter)
-    tag_decls = table("tag", lambda pack: pack.tags)
-    properties = table("property", lambda pack: pack.properties)
-    fields = table("field", lambda pack: pack.fields)
-    streams = table("stream", lambda pack: pack.streams)
-    kernels = table("kernel", lambda pack: pack.kernels)
-    sets = table("set", lambda pack: pack.sets)
-    passes = _passes(packs, passes_book, reporter)
-    params = [Named(p.name.text, decl, f"{p.name.text}.{decl.name.text}") for p in packs for decl in p.params]
-    for param in params:
-        book.check_word(param.decl.name, "parameter")
-    names = book.finish()
-    _check_renamed(ruleset, book.renamed | passes_book.renamed, reporter)
+    wishes = _wishes(groups, ruleset is not None, versions, reporter)
+    natural = _composed_ids(wishes)
+    ids = natural if palette is None else _recorded_ids(wishes, palette)
+    _report_ids(wishes, ids, reporter, recorded=palette is not None)
+    declared = [found[0] for found in versions.values()]
+    elements = _elements(declared, ids, reporter)
+    tables: dict[str, dict[str, Named[Any]]] = {}
+    for table, kind in _KINDS.items():
+        found = [book.define(decl, kind, pack.name.text) for pack in packs for decl in getattr(pack, table)]
+        tables[table] = {named.name: named for named in found if named}
+    params: dict[str, Named[ParamDecl]] = {}
+    for pack in packs:
+        for decl in pack.params:
+            book.check_word(decl.name, "parameter")
+            name = f"{pack.name.text}.{decl.name.text}"
+            params[name] = Named(pack.name.text, decl, name)
+    pass_book = NameBook(packs, renames, reporter)
+    passes: dict[str, Named[PassDecl]] = {}
+    for name, (effective, *overridden) in pass_book.versions("pass", lambda pack: pack.passes).items():
+        decls = [*(one.decl for one in reversed(overridden)), effective.decl]
+        after = tuple(scalar for decl in decls for scalar in decl.after)
+        before = tuple(scalar for decl in decls for scalar in decl.before)
+        passes[name] = replace(effective, decl=replace(effective.decl, after=after, before=before))
+    _check_renamed(ruleset, book.renamed | pass_book.renamed, reporter)
     composition = Composition(
-        name=title_of(packs, ruleset),
+        name=_title(packs, ruleset),
         about=ruleset.about if ruleset else (packs[0].about if len(packs) == 1 else ""),
         packs=tuple(packs),
         ruleset=ruleset,
@@ -185,21 +231,47 @@ def compose(
         element_decls={name: versions[name][0] for name in elements},
         slots=max(_slots(ruleset, elements, palette, reporter), *(number + 1 for number in ids.values()), 1),
         tags={},
-        tag_decls=tag_decls,
-        properties=properties,
-        fields=fields,
-        streams=streams,
-        params={param.name: param for param in params},
-        kernels=kernels,
-        sets=sets,
-        passes=order_passes(passes, passes_book.finish(), reporter),
-        names=names,
+        tag_decls=tables["tags"],
+        properties=tables["properties"],
+        fields=tables["fields"],
+        streams=tables["streams"],
+        params=params,
+        kernels=tables["kernels"],
+        sets=tables["sets"],
+        passes=order_passes(passes, pass_book.finish(), reporter),
+        names=book.finish(),
         order={number: natural.get(word, number) for word, number in ids.items()},
         side_multiple=lcm(*(pack.side_multiple for pack in packs)),
         groups=tuple(tuple(pack.name.text for pack in group) for group in groups),
-        reserved=tuple(ids[claim.name] for claim in claims if claim.name in ids and not claim.is_loaded),
+        reserved=tuple(ids[wish.name] for wish in wishes if wish.name in ids and not wish.is_loaded),
     )
-    return replace(composition, tags=_tags(composition, reporter), elements=_colored(composition))
+    return _with_entries(composition, reporter)
+
+
+_KINDS = {
+    "tags": "tag",
+    "properties": "property",
+    "fields": "field",
+    "streams": "stream",
+    "kernels": "kernel",
+    "sets": "set",
+}
+"""Sections of packs, and a definition of each."""
+
+
+def _title(packs: Sequence[PackDecl], ruleset: RulesetDecl | None) -> str:
+    """The title of what is loaded: a ruleset, packs left out of it, packs added: ``ruleset-pack+pack``."""
+    loaded = [pack.name.text for pack in packs]
+    if ruleset is None:
+        return "+".join(loaded)
+    named = [ruleset]
+    for one in reversed(ruleset.beside):  # a ruleset that a later one extends has no title of its own
+        if all(one.source.name not in {base.source.name for base in known.lineage} for known in named):
+            named.insert(0, one)
+    members = list(dict.fromkeys(name for one in named for name in one.members))
+    gone = [f"-{name}" for name in members if name not in loaded]
+    added = [f"+{name}" for name in loaded if name not in members]
+    return "".join(["+".join(one.name.text for one in named), *gone, *added])
 
 
 def _slots(
@@ -218,7 +290,7 @@ def _slots(
     return max(wanted, len(palette or ()))
 
 
-def _check_renamed(ruleset: RulesetDecl | None, renamed: AbstractSet[str], reporter: Reporter) -> None:
+def _check_renamed(ruleset: RulesetDecl | None, renamed: set[str], reporter: Reporter) -> None:
     """Report names under `rename:` that no pack defines. Those of packs that are left out may wait."""
     waiting = {pack.name.text for pack in ruleset.left_out} if ruleset else ()
     for old, _ in ruleset.renames if ruleset else ():
@@ -244,18 +316,16 @@ def _check_needs(packs: Sequence[PackDecl], reporter: Reporter) -> None:
                 rival = rival or stands_in.get(other.text)
                 stands_in.setdefault(other.text, pack)
             if rival is not None:
-                message = f"packs `{pack.name.text}` and `{rival.name.text}` cannot be loaded together"
-                secondary = [Label(rival.name.span, "loaded too")]
-                helps = ["leave one of them out"]
                 reporter.error(
-                    "PD306", message, other.span, "declared here", secondary=secondary, helps=helps
-                )
+                    "PD306", f"packs `{pack.name.text}` and `{rival.name.text}` cannot be loaded together",
+                    other.span, "declared here", secondary=[Label(rival.name.span, "loaded too")],
+                    helps=["leave one of them out"],
+                )  # fmt: skip
     for name, needing in missing.items():
         first, *others = needing
         count = f" and {len(others)} others need" if others else " needs"
-        close = get_close_matches(name, sorted(loaded.keys() - needing.keys()), n=1, cutoff=0.75)
         fix = f"load it too, as in `{name}+{first}`"
-        if close:
+        if close := get_close_matches(name, sorted(loaded.keys() - needing.keys()), n=1, cutoff=0.75):
             fix = f"did you mean `{close[0]}`?"
         elif others:
             fix = (
@@ -267,69 +337,22 @@ def _check_needs(packs: Sequence[PackDecl], reporter: Reporter) -> None:
         )  # fmt: skip
 
 
-def _versions(
-    packs: Sequence[PackDecl], book: NameBook, reporter: Reporter
-) -> dict[str, list[Named[ElementDecl]]]:
-    """The declarations of each element by global name, in load order: the effective one first, then the overridden ones."""
-    found: dict[str, list[Named[ElementDecl]]] = {}
-    for pack in packs:
-        for decl in pack.elements:
-            known = book.override(decl.name.text, pack.name.text, "element") if decl.override else None
-            if known is not None:
-                _check_same_id(decl, found[known], reporter)
-                found[known].insert(0, Named(pack.name.text, decl, known))
-                continue
-            if decl.override:
-                _report_no_base(decl.name, reporter)
-            if named := book.define(decl, "element", pack.name.text):
-                found[named.name] = [named]
-    if not found:
-        reporter.error(
-            "PD109", "no element is defined", packs[0].name.span if packs else None, "a world needs elements",
-            helps=["define `elements:`, or load `core` too"],
-        )  # fmt: skip
-    return found
+# Ids
 
 
-def _report_no_base(name: Scalar, reporter: Reporter) -> None:
-    reporter.error(
-        "PD301", f"`{name.text}` overrides nothing", name.span, "no pack before this one defines it",
-        helps=["remove `override`, or load the other pack first"],
-    )  # fmt: skip
+@dataclass(frozen=True)
+class Wish:
+    """An element that wants an id. `name` is the global one; `own` says that a ruleset lists its pack."""
 
-
-def _passes(packs: Sequence[PackDecl], book: NameBook, reporter: Reporter) -> dict[str, Named[PassDecl]]:
-    """The passes by global name. One that overrides another has its name, and its place in the order."""
-    found: dict[str, Named[PassDecl]] = {}
-    for pack in packs:
-        for decl in pack.passes:
-            known = book.override(decl.name.text, pack.name.text, "pass") if decl.override else None
-            if known is not None:
-                old = found[known].decl
-                decl = replace(decl, after=(*old.after, *decl.after), before=(*old.before, *decl.before))
-                found[known] = Named(pack.name.text, decl, known, "pass")
-                continue
-            if decl.override:
-                _report_no_base(decl.name, reporter)
-            if named := book.define(decl, "pass", pack.name.text):
-                found[named.name] = named
-    return found
-
-
-def _asking(versions: Sequence[Named[ElementDecl]]) -> ElementDecl | None:
-    """The latest declaration of an element that asks for an id."""
-    return next((one.decl for one in versions if one.decl.id is not None), None)
-
-
-def _check_same_id(decl: ElementDecl, before: Sequence[Named[ElementDecl]], reporter: Reporter) -> None:
-    """Warn if an element that overrides asks for another id than the one it replaces."""
-    old = _asking(before)
-    if old and old.id_scalar and decl.id_scalar and decl.id != old.id:
-        reporter.report(
-            "PD318", f"`{decl.name.text}` gets the id {decl.id} instead of {old.id}", decl.id_scalar.span,
-            "its channel moves too", secondary=[Label(old.id_scalar.span, "the id of the element that it replaces")],
-            helps=["leave out `id`: an element that overrides another keeps its id"],
-        )  # fmt: skip
+    name: str
+    qualified: str
+    pack: str
+    decl: ElementDecl
+    own: bool
+    replaces: tuple[str, ...] = ()
+    """Qualified names of the elements that it overrides, the latest first: it takes over their id."""
+    is_loaded: bool = True
+    """False for elements of packs that a ruleset leaves out: their ids stay reserved."""
 
 
 def _groups(packs: Sequence[PackDecl], ruleset: RulesetDecl | None) -> list[list[PackDecl]]:
@@ -339,41 +362,137 @@ def _groups(packs: Sequence[PackDecl], ruleset: RulesetDecl | None) -> list[list
     further pack follows by itself, after the packs that it needs: the order in which packs are named matters little.
     """
     own = ruleset.placed if ruleset else ()
-    left_out = ruleset.left_out if ruleset else ()
-    first = [pack for pack in (*packs, *left_out) if pack.name.text in own]
-    first.sort(key=lambda pack: own.index(pack.name.text))
+    by_name = {pack.name.text: pack for pack in (*(ruleset.left_out if ruleset else ()), *packs)}
+    first = [by_name[name] for name in own if name in by_name]
     others = needed_first([pack for pack in packs if pack.name.text not in own])
     return [*([first] if first else []), *([pack] for pack in others)]
 
 
-def _claims(
-    groups: Sequence[Sequence[PackDecl]], own: bool, versions: Mapping[str, list[Named[ElementDecl]]]
-) -> list[Claim]:
+def _wishes(
+    groups: Sequence[Sequence[PackDecl]],
+    own: bool,
+    versions: Mapping[str, list[Named[ElementDecl]]],
+    reporter: Reporter,
+) -> list[Wish]:
     """All elements in the order in which ids are decided. In each group, elements that ask for an id come first.
 
-    `own` says that the first group is a ruleset's.
+    `own` says that the first group is a ruleset's. Warns of an element that overrides another one and asks for another
+    id than that has.
     """
     by_decl = {id(found[-1].decl): found for found in versions.values()}
-    claims: list[Claim] = []
+    wishes: list[Wish] = []
     for number, group in enumerate(groups):
         listed = not own or number == 0
-        decls = [(pack.name.text, decl) for pack in group for decl in pack.elements]
-        found = [_claim(pack, decl, by_decl.get(id(decl)), listed) for pack, decl in decls]
-        claims += sorted(filter(None, found), key=lambda claim: claim.decl.id is None)
-    return claims
+        of_group = []
+        for pack, decl in ((one.name.text, decl) for one in group for decl in one.elements):
+            found = by_decl.get(id(decl))
+            qualified = f"{pack}.{decl.name.text}"
+            if found is not None:
+                names = [f"{one.pack}.{one.decl.name.text}" for one in found]
+                asking = [one.decl for one in found if one.decl.id is not None] or [found[0].decl]
+                _check_same_id(asking, reporter)
+                asked = replace(found[0].decl, id=asking[0].id, id_scalar=asking[0].id_scalar)
+                of_group.append(Wish(found[0].name, names[0], found[0].pack, asked, listed, tuple(names[1:])))
+            elif not decl.override:  # defined by a pack that is left out: the id stays reserved
+                of_group.append(Wish(f"-{qualified}", qualified, pack, decl, listed, is_loaded=False))
+        wishes += sorted(of_group, key=lambda wish: wish.decl.id is None)
+    return wishes
 
 
-def _claim(
-    pack: str, decl: ElementDecl, versions: Sequence[Named[ElementDecl]] | None, own: bool
-) -> Claim | None:
-    """The claim of an element, as its last override states it; None for a declaration that is an override itself."""
-    if versions is None:
-        qualified = f"{pack}.{decl.name.text}"  # defined by a pack that is left out: the id stays reserved
-        return None if decl.override else Claim(f"-{qualified}", qualified, pack, decl, own, is_loaded=False)
-    names = [f"{one.pack}.{one.decl.name.text}" for one in versions]
-    final, asking = versions[0], _asking(versions) or versions[0].decl
-    asked = replace(final.decl, id=asking.id, id_scalar=asking.id_scalar)
-    return Claim(final.name, names[0], final.pack, asked, own, tuple(names[1:]))
+def _check_same_id(asking: Sequence[ElementDecl], reporter: Reporter) -> None:
+    """Warn of declarations of one element, the latest first, that ask for another id than the one before."""
+    for decl, old in pairwise(asking):
+        if decl.id_scalar and old.id_scalar and decl.id != old.id:
+            reporter.report(
+                "PD318", f"`{decl.name.text}` gets the id {decl.id} instead of {old.id}", decl.id_scalar.span,
+                "its channel moves too", secondary=[Label(old.id_scalar.span, "the id of the element that it replaces")],
+                helps=["leave out `id`: an element that overrides another keeps its id"],
+            )  # fmt: skip
+
+
+def _composed_ids(wishes: Iterable[Wish]) -> dict[str, int]:
+    """Ids by global name. Earlier wishes are decided first, so further packs change nothing.
+
+    An element has the id that its file gives, unless that is taken. All others have the lowest free id above those of
+    the ruleset's packs, or, without a ruleset, above all ids so far.
+    """
+    ids: dict[str, int] = {}
+    taken: set[int] = set()
+    highest = -1
+    for wish in wishes:
+        number = wish.decl.id
+        if number is None or number in taken:
+            free = [n for n in range(MAX_ELEMENTS) if n not in taken]
+            if not free:
+                break
+            number = next((n for n in free if n > highest), free[0])
+        ids[wish.name] = number
+        taken.add(number)
+        if wish.own:
+            highest = max(highest, number)
+    return ids
+
+
+def _recorded_ids(wishes: Iterable[Wish], palette: Palette) -> dict[str, int]:
+    """Ids by global name, where a palette has them; others get its free ids, then those behind its end.
+
+    An element that asks for a free id of the palette gets it.
+    """
+    known = {name: number for number, name in enumerate(palette) if name is not None}
+    ids: dict[str, int] = {}
+    later: list[Wish] = []
+    for wish in wishes:
+        name = next((name for name in (wish.qualified, *wish.replaces) if name in known), None)
+        if name is None:
+            later.append(wish)
+        else:
+            ids[wish.name] = known[name]
+    free = [n for n in range(len(palette)) if palette[n] is None and n not in ids.values()]
+    for wish in later:
+        if (wanted := wish.decl.id) is not None and wanted in free:
+            ids[wish.name] = wanted
+            free.remove(wanted)
+    waiting = [wish.name for wish in later if wish.name not in ids]
+    return ids | dict(zip(waiting, (*free, *range(len(palette), MAX_ELEMENTS)), strict=False))
+
+
+def _report_ids(
+    wishes: Sequence[Wish], ids: Mapping[str, int], reporter: Reporter, *, recorded: bool
+) -> None:
+    """Report elements without an id, two elements of one pack with the same id, and ids that differ from the file."""
+    loaded = [wish for wish in wishes if wish.is_loaded]
+    lacking = [wish for wish in loaded if wish.name not in ids]
+    if lacking:
+        reporter.error(
+            "PD508", f"{len(loaded)} elements", lacking[0].decl.name.span, f"the limit is {MAX_ELEMENTS}",
+            helps=["load fewer packs"],
+        )  # fmt: skip
+    holders = {ids[wish.name]: wish for wish in wishes if wish.name in ids}
+    by_number: dict[tuple[str, int], Wish] = {}
+    for wish in loaded:
+        wanted, scalar = wish.decl.id, wish.decl.id_scalar
+        if wanted is None or scalar is None:
+            continue
+        first = by_number.setdefault((wish.pack, wanted), wish)
+        if first is not wish:
+            used = {other.decl.id for other in loaded} | {
+                number for number, holder in holders.items() if holder.is_loaded and holder is not wish
+            }
+            free = next((n for n in range(MAX_ELEMENTS) if n not in used), None)
+            reporter.error(
+                "PD303", f"elements `{first.decl.name.text}` and `{wish.decl.name.text}` have the same id {wanted}",
+                scalar.span, "already taken", secondary=[Label(first.decl.name.span, "by this one")],
+                helps=[] if free is None else [f"id {free} is free; an element without `id:` gets a free one"],
+            )  # fmt: skip
+        elif not recorded and ids.get(wish.name, wanted) != wanted:
+            reporter.report(
+                "PD313", f"`{wish.qualified}` has id {ids[wish.name]} here, not {wanted}",
+                scalar.span, f"`{holders[wanted].qualified}` has id {wanted}",
+                notes=["saved worlds, datasets and checkpoints know elements by name, not by id"],
+            )  # fmt: skip
+
+
+# Elements
 
 
 def _elements(
@@ -391,8 +510,8 @@ def _elements(
             )  # fmt: skip
     declared = [named for named in declared if named.name in ids]
     glyphs = _glyphs(declared)
-    return {
-        named.name: Element(
+    elements = [
+        Element(
             named.name,
             named.pack,
             ids[named.name],
@@ -403,8 +522,9 @@ def _elements(
             named.span,
             named.word,
         )
-        for named in sorted(declared, key=lambda named: ids[named.name])
-    }
+        for named in declared
+    ]
+    return {element.name: element for element in sorted(elements, key=lambda element: element.id)}
 
 
 def _glyphs(elements: Sequence[Named[ElementDecl]]) -> dict[str, str]:
@@ -418,39 +538,31 @@ def _glyphs(elements: Sequence[Named[ElementDecl]]) -> dict[str, str]:
     for named in elements:
         word, glyph = named.decl.name.text, named.decl.glyph
         if not glyph or owners[glyph] is not named:
-            letters = [*word, *word.upper(), *"0123456789@$&*+=<>"]
-            allowed = (c for c in letters if c.isalnum() or c in "@$&*+=<>")
+            signs = "@$&*+=<>"
+            letters = [*word, *word.upper(), *"0123456789", *signs]
+            allowed = (c for c in letters if c.isalnum() or c in signs)
             glyph = next((c for c in allowed if c not in taken), "?")
         taken.add(glyph)
         glyphs[named.name] = glyph
     return glyphs
 
 
-def _colored(composition: Composition) -> dict[str, Element]:
-    """The elements, with the colors that `also` gives them."""
-    colors = {
-        name: entry.color
-        for _, name, entry in composition.entries()
-        if isinstance(entry, AlsoDecl) and entry.color is not None
-    }
-    return {
-        name: replace(element, color=colors.get(name, element.color))
-        for name, element in composition.elements.items()
-    }
-
-
-def _tags(composition: Composition, reporter: Reporter) -> dict[str, frozenset[int]]:
-    """The ids of the elements that carry each tag. Reports tags and elements that no pack defines."""
-    elements = composition.elements
+def _with_entries(composition: Composition, reporter: Reporter) -> Composition:
+    """The composition with the tags and colors that entries give elements. Reports tags and elements that nothing defines."""
+    elements = dict(composition.elements)
     members: dict[str, set[int]] = {tag: set() for tag in composition.tag_decls}
-    for pack, element, entry in composition.entries():
-        if isinstance(entry, AlsoDecl) and element not in elements and not entry.name.is_optional:
+    for pack, name, entry in composition.entries():
+        element = elements.get(name)
+        if isinstance(entry, AlsoDecl) and element and entry.color is not None:
+            elements[name] = replace(element, color=entry.color)
+        elif isinstance(entry, AlsoDecl) and not element and not entry.name.is_optional:
             report_unknown("element", entry.name, elements, reporter)
         for scalar in entry.tags:
             tag = composition.names.of(pack, scalar.word)
             if tag in members:
-                members[tag] |= {elements[element].id} if element in elements else set()
+                members[tag] |= {element.id} if element else set()
             elif not scalar.is_optional:
                 more = "; to make a tag, declare it under `tags:`"
                 report_unknown("tag", scalar, members, reporter, more=more)
-    return {tag: frozenset(ids) for tag, ids in members.items()}
+    tags = {tag: frozenset(ids) for tag, ids in members.items()}
+    return replace(composition, tags=tags, elements=elements)

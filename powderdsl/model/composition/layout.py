@@ -8,7 +8,6 @@ its rules are the first to assign, and its fields. So channels stay where they a
 from __future__ import annotations
 
 from powderdsl.diagnostics import Reporter, suggest
-from powderdsl.model.composition.claim_scopes import names_left_out
 from powderdsl.model.composition.compose import Composition
 from powderdsl.model.expressions.symbols import Symbols
 from powderdsl.model.types import Assign, MatrixChannel, Pass
@@ -17,51 +16,31 @@ from powderdsl.syntax.yaml_tree import Scalar
 COMPONENTS = ("row", "column")
 
 
-def state_order(composition: Composition, symbols: Symbols, passes: tuple[Pass, ...]) -> tuple[str, ...]:
-    """The names of all that a cell holds besides its element: stored properties and fields, block by block."""
-    return tuple(name for block in _blocks(composition, symbols, passes) for name in block)
+def lay_out(
+    symbols: Symbols, passes: tuple[Pass, ...], reporter: Reporter
+) -> tuple[tuple[str, ...], tuple[MatrixChannel, ...]]:
+    """The names of all that a cell holds besides its element, in order, and the channels of `World.matrix()`.
 
-
-def matrix_channels(
-    composition: Composition, symbols: Symbols, passes: tuple[Pass, ...], reporter: Reporter
-) -> tuple[MatrixChannel, ...]:
-    """The channels of `World.matrix()`. Reports names in a ruleset's `matrix:` that no loaded pack has."""
-    own, *others = _blocks(composition, symbols, passes)
+    Reports names in a ruleset's `matrix:` that no loaded pack has.
+    """
+    composition = symbols.composition
+    blocks = _blocks(symbols, passes)
+    order = tuple(name for block in blocks for name in block)
     elements = composition.elements.values()
     names = {element.id: element.name for element in elements}
     size = own_slots(composition)
     first = [MatrixChannel(names.get(number, ""), id=number) for number in range(size)]
     written = composition.ruleset.placing.matrix if composition.ruleset else ()
-    channels: list[MatrixChannel] = []
+    channels = [] if written else [*first, *_holding(blocks[0], symbols)]
     for scalar in written:
-        channels += first if scalar.word == "elements" else _written(scalar, composition, symbols, reporter)
+        channels += first if scalar.word == "elements" else _written(scalar, symbols, reporter)
     if written and all(scalar.word != "elements" for scalar in written):
-        return tuple(channels)  # a ruleset that shows no elements shows none of further packs either
-    if not written:
-        channels = [*first, *_holding(own, symbols)]
-    for (pack,), block in zip(composition.groups[1:], others, strict=True):
+        return order, tuple(channels)  # a ruleset that shows no elements shows none of further packs either
+    for (pack,), block in zip(composition.groups[1:], blocks[1:], strict=True):
         added = [element for element in elements if element.pack == pack and element.id >= size]
         channels += [MatrixChannel(element.name, id=element.id) for element in added]
         channels += _holding(block, symbols)
-    return tuple(channels)
-
-
-def _written(
-    scalar: Scalar, composition: Composition, symbols: Symbols, reporter: Reporter
-) -> list[MatrixChannel]:
-    """The channels that a name under `matrix:` stands for; always 0 if its pack is not loaded."""
-    name = scalar.word
-    found = _named(name, composition, symbols)
-    waits = scalar.is_optional or not names_left_out(composition.ruleset).isdisjoint(name.split("."))
-    if not found and not waits:
-        known = ["elements", *symbols.properties, *symbols.fields]
-        helps = [
-            *suggest(name.partition(".")[0], known, "channels"),
-            f"if its pack may be absent, write `{name}?`",
-        ]
-        message, label = f"unknown channel `{scalar.text}`", "not a field or property"
-        reporter.error("PD310", message, scalar.span, label, helps=helps)
-    return found or [MatrixChannel(name)]
+    return order, tuple(channels)
 
 
 def own_slots(composition: Composition) -> int:
@@ -69,14 +48,15 @@ def own_slots(composition: Composition) -> int:
     if composition.ruleset is not None and composition.ruleset.placing.slots:
         return composition.ruleset.placing.slots
     own = composition.groups[0]
-    kept = [element.id for element in composition.elements.values() if element.pack in own]
-    return max([*kept, *composition.reserved], default=-1) + 1
+    ids = [element.id for element in composition.elements.values() if element.pack in own]
+    return max([*ids, *composition.reserved], default=-1) + 1
 
 
-def _blocks(composition: Composition, symbols: Symbols, passes: tuple[Pass, ...]) -> list[list[str]]:
+def _blocks(symbols: Symbols, passes: tuple[Pass, ...]) -> list[list[str]]:
     """Stored properties and fields, by group of packs."""
-    place = {pack: number for number, group in enumerate(composition.groups) for pack in group}
-    blocks: list[list[str]] = [[] for _ in composition.groups]
+    groups = symbols.composition.groups
+    place = {pack: number for number, group in enumerate(groups) for pack in group}
+    blocks: list[list[str]] = [[] for _ in groups]
     first: dict[str, int] = {}
     for pass_ in passes:
         for rule in (rule for moment in pass_.moments for rule in moment.rules):
@@ -103,14 +83,25 @@ def _channels(name: str, symbols: Symbols) -> list[MatrixChannel]:
     return [MatrixChannel(name, name)]
 
 
-def _named(name: str, composition: Composition, symbols: Symbols) -> list[MatrixChannel]:
-    """The channels of a field, a property or a component, by its plain or qualified name."""
-    base, _, part = name.rpartition(".")
-    if part in COMPONENTS and base:
-        channels = _named(base, composition, symbols)
-        return [channel for channel in channels if channel.part == part]
-    if base:
-        name = composition.names.qualified(base, part) or name
-    if name not in symbols.properties and name not in symbols.fields:
-        return []
-    return _channels(name, symbols)
+def _written(scalar: Scalar, symbols: Symbols, reporter: Reporter) -> list[MatrixChannel]:
+    """The channels that a name under `matrix:` stands for: of a field, a property or a component, plain or qualified.
+
+    One that is always 0 if its pack is not loaded.
+    """
+    composition, word = symbols.composition, scalar.word
+    base, _, part = word.rpartition(".")
+    name, component = (base, part) if part in COMPONENTS and base else (word, "")
+    pack, point, own = name.rpartition(".")
+    name = (composition.names.qualified(pack, own) if point else None) or name
+    if name in symbols.properties or name in symbols.fields:
+        channels = [one for one in _channels(name, symbols) if not component or one.part == component]
+        if channels:
+            return channels
+    if not scalar.is_optional and composition.left_out.isdisjoint(word.split(".")):
+        known = ["elements", *symbols.properties, *symbols.fields]
+        helps = suggest(word.partition(".")[0], known, "channels")
+        reporter.error(
+            "PD310", f"unknown channel `{scalar.text}`", scalar.span, "not a field or property",
+            helps=[*helps, f"if its pack may be absent, write `{word}?`"],
+        )  # fmt: skip
+    return [MatrixChannel(word)]

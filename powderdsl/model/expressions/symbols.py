@@ -73,7 +73,7 @@ class Symbols:
     def is_declared(self, name: str, pack: str) -> bool:
         """Whether some pack declares the name, even if its declaration is wrong."""
         meant = self.composition.names.of(pack, name)
-        return meant in self.composition.definitions or f"{pack}.{name}" in self.composition.params
+        return meant in self.composition.names.definitions or f"{pack}.{name}" in self.composition.params
 
 
 def base_symbols(composition: Composition) -> Symbols:

@@ -10,8 +10,8 @@ from math import lcm
 from typing import TYPE_CHECKING
 
 from powderdsl.diagnostics import Label, Reporter, Span
-from powderdsl.model.added_conflicts import AddedPacks, may_settle, report_added
 from powderdsl.model.builtins import MAX_SIDE_MULTIPLE
+from powderdsl.model.composition.added_packs import AddedPacks, may_settle, report_added
 from powderdsl.model.expressions.operators import (
     ELEMENT_HERE,
     TRUE,

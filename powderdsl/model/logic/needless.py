@@ -12,9 +12,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from powderdsl.diagnostics import Label, Reporter, Span
-from powderdsl.model.composition.claim_scopes import words_of
+from powderdsl.model.composition.added_packs import pack_words
 from powderdsl.model.composition.compose import Composition
-from powderdsl.model.declarations import PackDecl
+from powderdsl.model.composition.names import words_of
 from powderdsl.model.expressions.operators import ELEMENT_HERE, look, member, negation
 from powderdsl.model.logic.satisfy import (
     HERE,
@@ -407,20 +407,6 @@ def _report_unwritten(composition: Composition, reporter: Reporter) -> None:
             if scalar.text not in later:
                 _unused("value", scalar.text, scalar.span, reporter)
             later |= set(words_of(value))
-
-
-def pack_words(pack: PackDecl) -> Iterator[str]:
-    """Every name in a pack's rules, sets, invariants, tests and color ramps."""
-    yield from (one.ramp.field.word.rpartition(".")[2] for one in pack.entries if one.ramp)
-    for lines in (
-        pack.lines,
-        pack.invariants,
-        [one.members for one in pack.sets],
-        [line for test in pack.tests for line in test.always],
-        [decl.of for decl in pack.fields if decl.of is not None],
-    ):
-        for line in lines:
-            yield from words_of(line)
 
 
 # What rules produce and override

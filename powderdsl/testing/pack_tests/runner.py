@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 from powderdsl.arrays import NDArray, np
 from powderdsl.diagnostics import Span
 from powderdsl.model import reference
+from powderdsl.model.check import restricted, without
 from powderdsl.model.examples import direction_word
-from powderdsl.model.restrict import restricted, without
 from powderdsl.model.text import one_line, show_number, show_single, show_value
 from powderdsl.model.types import Cell, Example, FieldGrid, Kind, Ruleset
 from powderdsl.simulation.programs import starting_backend

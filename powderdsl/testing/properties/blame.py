@@ -8,8 +8,9 @@ from typing import Any
 
 from powderdsl.arrays import np
 from powderdsl.diagnostics import Span
+from powderdsl.model.check import without
+from powderdsl.model.composition.added_packs import Cause, Difference
 from powderdsl.model.declarations import PackDecl
-from powderdsl.model.restrict import Cause, Difference, without
 from powderdsl.model.state import slots
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Pass, Ruleset

@@ -11,7 +11,7 @@ from typing import Any
 
 from powderdsl.arrays import np
 from powderdsl.diagnostics import CompileError, Span
-from powderdsl.model.restrict import Difference
+from powderdsl.model.composition.added_packs import Difference
 from powderdsl.model.state import slots
 from powderdsl.model.text import one_line, place_of
 from powderdsl.model.types import Invariant, Ruleset

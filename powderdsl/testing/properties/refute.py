@@ -14,7 +14,7 @@ from powderdsl.analysis.changes import RuleLine
 from powderdsl.analysis.ledger import Ledger
 from powderdsl.arrays import np
 from powderdsl.diagnostics import Diagnostic, Label, Reporter
-from powderdsl.model.restrict import Cause, Difference
+from powderdsl.model.composition.added_packs import Cause, Difference
 from powderdsl.model.text import place_of
 from powderdsl.model.types import Ruleset
 from powderdsl.testing.properties.breaks import Alike

@@ -12,8 +12,8 @@ from powderdsl.analysis.ledger import Ledger, Proven
 from powderdsl.analysis.ledger import ledger as make_ledger
 from powderdsl.analysis.proofs import prove
 from powderdsl.arrays import np
+from powderdsl.model.check import restricted
 from powderdsl.model.expressions.operators import ELEMENT_HERE, member
-from powderdsl.model.restrict import restricted
 from powderdsl.model.types import Never, Ruleset, Symmetric, Total
 from powderdsl.simulation.draw import shown_fields
 from powderdsl.testing.generators.cases import Start

@@ -1,0 +1,239 @@
+"""What added packs change for the packs whose authors did not know them: values, conflicts, claims and warnings.
+
+The packs that an author knew are a scope, see `Composition.scope`. Packs outside it were added. A conflict, a claim
+(an invariant or a test) or a warning is judged by its scope alone; what only added packs bring about is reported at
+what they do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+
+from powderdsl.diagnostics import Label, Reporter, Span
+from powderdsl.model.composition.compose import Composition
+from powderdsl.model.composition.names import listed, words_of
+from powderdsl.model.declarations import PackDecl
+from powderdsl.model.types import Moment, Move, Transform
+from powderdsl.syntax.ast import Syntax
+
+CODES = ("PD501", "PD502")
+
+CheckAlone = Callable[[tuple[str, ...], Reporter], object]
+"""Checks some of the packs alone; None if something is wrong with them."""
+
+
+@dataclass(frozen=True)
+class Cause:
+    """Something in the file of an added pack: a rule with its text, or what it does to other packs in a few words."""
+
+    pack: str
+    span: Span
+    does: str
+    is_rule: bool = False
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Why a claim or a warning is not the same with more packs than those of its scope.
+
+    `packs` are the added packs that matter, in load order; `causes` is what in their files does it, as far as that is
+    known.
+    """
+
+    packs: tuple[str, ...]
+    causes: tuple[Cause, ...] = ()
+
+    @property
+    def with_packs(self) -> str:
+        """``with `steam` and `salt` ``."""
+        return f"with {listed([f'`{pack}`' for pack in self.packs])}"
+
+
+def pack_words(pack: PackDecl) -> Iterator[str]:
+    """Every name in a pack's rules, sets, invariants, tests and color ramps."""
+    yield from (one.ramp.field.word.rpartition(".")[2] for one in pack.entries if one.ramp)
+    lines = [*pack.lines, *pack.invariants, *(one.members for one in pack.sets)]
+    lines += [line for test in pack.tests for line in test.always]
+    lines += [decl.of for decl in pack.fields if decl.of is not None]
+    for line in lines:
+        yield from words_of(line)
+
+
+# Values
+
+
+def report_contested(composition: Composition, reporter: Reporter) -> None:
+    """Report values that are replaced by others."""
+    known: dict[tuple[str, str], tuple[str, Span, Syntax]] = {}
+    for pack, name, element, key, syntax in composition.given_values():
+        if element in composition.elements and (name in composition.properties or name in composition.fields):
+            if (name, element) in known:
+                before, place, value = known[name, element]
+                if _meaning(value) != _meaning(syntax):
+                    report_replaced(name, element, (before, place), (pack, key.span), composition, reporter)
+            known[name, element] = pack, key.span, syntax
+
+
+def report_replaced(
+    what: str,
+    element: str,
+    lost: tuple[str, Span],
+    held: tuple[str, Span],
+    composition: Composition,
+    reporter: Reporter,
+) -> None:
+    """Report that a pack replaces what another one gives an element: a note if it needs that pack, else a warning.
+
+    What a ruleset gives replaces that of its packs without a word; a pack that is added to it may replace it.
+    """
+    (before, old), (after, new) = lost, held
+    needs = composition.names.needs
+    if after not in needs:  # a ruleset knows what its packs say
+        return
+    if before not in needs or before in needs[after]:
+        reporter.report(
+            "PD317", f"`{after}` replaces the `{what}` of `{element}`", new, "this value is used",
+            secondary=[Label(old, f"the one that `{before}` gives")],
+        )  # fmt: skip
+        return
+    reporter.report(
+        "PD316", f"packs `{before}` and `{after}` give `{element}` a different `{what}`", new, "this value is used",
+        secondary=[Label(old, "this one is lost")],
+        helps=[f"say `needs: {before}` in `{after}` if it means to replace it", "or remove one of them"],
+    )  # fmt: skip
+
+
+def _meaning(value: Syntax) -> object:
+    """Numbers by what they come to, anything else by its words."""
+    text = " ".join(value.span.text.split())
+    try:
+        return Fraction(text[:-1]) / 100 if text.endswith("%") else Fraction(text)
+    except (ValueError, ZeroDivisionError):
+        return text
+
+
+# Conflicts: users who add packs cannot change the rules that meet. So the first rule wins, as with
+# `conflicts: first_wins`, where that changes nothing for the packs that the author of the rules knew.
+
+
+@dataclass(frozen=True)
+class Given:
+    """What an added pack does to an element: `word` is a tag or a value that it gives, or empty for the element itself.
+
+    `noun` says which: ``tag`` or ``value``.
+    """
+
+    pack: str
+    element: str
+    noun: str
+    word: str
+    span: Span
+
+
+@dataclass
+class AddedPacks:
+    """Finds conflicts that a pack has only because other packs were added to it."""
+
+    composition: Composition
+    check_alone: CheckAlone
+    _conflicts: dict[tuple[str, ...], frozenset[Span] | None] = field(default_factory=dict)
+
+    def causes(self, pack: str, place: Span, ids: Sequence[int]) -> tuple[Given, ...]:
+        """The changes by added packs that cause a conflict in `pack`; empty if it has the conflict without them.
+
+        Args:
+            place: where the conflict is reported. ids: elements with which the rules meet.
+        """
+        packs = {decl.name.text: decl for decl in self.composition.packs}
+        words = frozenset(pack_words(packs[pack]))
+        scope = self.composition.scope(pack, words)
+        if len(scope) == len(packs):
+            return ()
+        if scope not in self._conflicts:
+            self._conflicts[scope] = self._conflicts_alone(scope)
+        alone = self._conflicts[scope]
+        if alone is None or place in alone:
+            return ()
+        names = {element.id: name for name, element in self.composition.elements.items()}
+        elements = [names[number] for number in dict.fromkeys(ids) if number in names]
+        return tuple(given for name in elements for given in self._given(name, scope, words))
+
+    def _conflicts_alone(self, scope: tuple[str, ...]) -> frozenset[Span] | None:
+        """Where rules of some packs alone meet; None if something else is wrong with them."""
+        reporter = Reporter()
+        self.check_alone(scope, reporter)
+        errors = [one for one in reporter.diagnostics if one.severity.value == "error"]
+        if any(one.code not in CODES for one in errors):
+            return None
+        return frozenset(one.primary.span for one in errors if one.primary.span is not None)
+
+    def _given(self, element: str, scope: tuple[str, ...], words: frozenset[str]) -> list[Given]:
+        """The tags among some words that packs outside a scope give an element, else such values, else the element itself."""
+        composition = self.composition
+        tags: list[Given] = []
+        values: list[Given] = []
+        for pack, name, entry in composition.entries():
+            if name != element or pack in scope or pack not in composition.names.needs:
+                continue
+            for noun, given, scalars in (
+                ("tag", tags, entry.tags),
+                ("value", values, tuple(key for key, _ in entry.values)),
+            ):
+                for scalar in scalars:
+                    word = composition.names.of(pack, scalar.word)
+                    if word.rpartition(".")[2] in words:
+                        given.append(Given(pack, element, noun, word, scalar.span))
+        named = composition.element_decls[element]
+        brings = [] if named.pack in scope else [Given(named.pack, element, "", "", named.span)]
+        return tags or values or brings
+
+
+def may_settle(moment: Moment) -> bool:
+    """Whether `first_wins` changes nothing where no two rules meet.
+
+    Moves may go where another one leaves, and transforms into one element may all have their effects: under the policy
+    they may not.
+    """
+    transforms = [rule for rule in moment.rules if isinstance(rule, Transform)]
+    targets = [rule.target for rule in transforms]
+    return all(targets.count(rule.target) == 1 for rule in transforms if rule.effects) and not any(
+        isinstance(rule, Move) for rule in moment.rules
+    )
+
+
+def report_added(
+    code: str, rules: Sequence[Span], notes: Sequence[str], causes: Sequence[Given], pass_name: str, settled: bool,
+    assigns: bool, reporter: Reporter,
+) -> None:  # fmt: skip
+    """Report a conflict that added packs cause, at their change: a warning if `settled`, because one rule wins.
+
+    Args:
+        rules: what the rules claim. assigns: whether they assign a field.
+    """
+    first, *more = causes
+    words = [f"`{one.word}`" for one in causes if one.word and one.element == first.element]
+    several = len(words) > 1
+    what = f"adds `{first.element}`"
+    if words:
+        what = f"gives `{first.element}` the {first.noun}{'s' * several} {listed(words)}"
+    secondary = [Label(one.span, "and this" if one.word else "this element too") for one in more]
+    secondary += [
+        Label(span, "claims it too" if number else "claims the cell")
+        for number, span in enumerate(dict.fromkeys(rules))
+    ]
+    helps = [f"give `{first.element}` other values, so that it does not fulfill the conditions of both rules"]
+    if first.noun == "tag":
+        needless = "all of them" if several else "that"
+        helps = [f"leave out {' or '.join(words)} here, if `{first.element}` need not be {needless}"]
+    if settled:
+        winner = "the assignment that stands last holds" if assigns else (
+            "the rule that stands first holds, as with `conflicts: first_wins`")  # fmt: skip
+        notes = [*notes, winner]
+    else:
+        helps.append(f"or ask the author of `{pass_name}` for a policy, such as `conflicts: first_wins`")
+    reporter.report(
+        "PD517" if settled else code, f"`{first.pack}` {what}: two rules of `{pass_name}` may claim one cell with it",
+        first.span, "because of this", secondary=secondary, notes=notes, helps=helps,
+    )  # fmt: skip
