@@ -174,15 +174,18 @@ def read(names: Sequence[str | Path], reporter: Reporter) -> tuple[list[PackDecl
     if not names:
         example = "name a shipped ruleset or a file: `powderworld`"
         reporter.error("PD304", "no rules were named", None, helps=[example])
-    kept = [pack for name, pack in packs.items() if name not in left_out]
+    loaded = {name: pack for name, pack in packs.items() if name not in left_out}
     if not rulesets:
-        return kept, None
+        return list(loaded.values()), None
     *beside, last = rulesets
-    loaded = {pack.name.text for pack in kept}
-    gone = [name for one in last.lineage for name in one.members if name not in loaded]
-    spare = packs | _left_out_by(last, reporter)
-    reserved = tuple(spare[name] for name in dict.fromkeys(gone) if name in spare)
-    return kept, replace(last, beside=tuple(beside), left_out=reserved)
+    for one in last.lineage:
+        for scalar in one.without:  # the ids of their elements stay reserved
+            lister = one.base.lister(scalar.text) if one.base else None
+            if lister is not None and scalar.text not in last.members:
+                reader.read(scalar.text, lister)
+    members = dict.fromkeys(name for one in last.lineage for name in one.members)
+    reserved = tuple(packs[name] for name in members if name not in loaded and name in packs)
+    return list(loaded.values()), replace(last, beside=tuple(beside), left_out=reserved)
 
 
 def split_names(name: str | Path) -> tuple[list[str], list[str]]:
@@ -198,19 +201,15 @@ def split_names(name: str | Path) -> tuple[list[str], list[str]]:
     minus: list[str] = []
     parts = text.split("+")
     while parts:
-        spans = range(min(len(parts), MAX_PLUSES + 1), 0, -1)
-        count = next((n for n in spans if _names_a_file("+".join(parts[:n]))), 1)
+        count = min(len(parts), MAX_PLUSES + 1)
         head, rest = _without("+".join(parts[:count]))
+        while count > 1 and (not _is_there(head) or any("+" in word for word in rest)):
+            count -= 1  # names of packs have no `+`
+            head, rest = _without("+".join(parts[:count]))
         parts = parts[count:]
         plus.append(head)
         minus.extend(rest)
     return plus, minus
-
-
-def _names_a_file(part: str) -> bool:
-    """Whether a word is a path of a file, perhaps with packs left out; names of packs have no ``+``."""
-    head, rest = _without(part)
-    return _is_there(head) and not any("+" in word for word in rest)
 
 
 def _without(part: str) -> tuple[str, list[str]]:
@@ -300,71 +299,52 @@ class _Reader:
             helps = [f"to start from it, write `extends: {word}`"]
             self.reporter.error("PD304", message, span, label, helps=helps)
         elif decl is not None:
-            self.read_ruleset(decl)
+            ruleset = self.with_base(decl, (decl,))
+            if ruleset is None or any(one.source.name == ruleset.source.name for one in self.rulesets):
+                return
+            self.rulesets.append(ruleset)
+            for member in ruleset.members:
+                self.read(member, ruleset.lister(member))
 
-    def read_ruleset(self, written: RulesetDecl) -> None:
-        """A ruleset with what it inherits, and its packs: each is looked for beside the file that lists it."""
-        found = _with_base(written, (written,), self)
-        if found is None or any(one.source.name == found.source.name for one in self.rulesets):
-            return
-        self.rulesets.append(found)
-        for name in found.members:
-            lister = found.lister(name)
-            assert lister is not None
-            self.read(name, lister)
-
-
-def _left_out_by(ruleset: RulesetDecl, reporter: Reporter) -> dict[str, PackDecl]:
-    """The packs that rulesets leave out of those that they extend: the ids of their elements stay reserved."""
-    reader = _Reader(reporter)
-    for one in ruleset.lineage:
-        for scalar in one.without:
-            lister = one.base.lister(scalar.text) if one.base else None
-            if lister is not None and scalar.text not in ruleset.members:
-                reader.read(scalar.text, lister)
-    return reader.packs
-
-
-def _with_base(decl: RulesetDecl, path: tuple[RulesetDecl, ...], reader: _Reader) -> RulesetDecl | None:
-    """The ruleset with the one that it extends; `path` leads from the first one to this one."""
-    reporter = reader.reporter
-    if decl.extends is None:
-        return decl
-    span, name = decl.extends.span, decl.extends.text
-    base = reader.declaration(_find_beside(name, reporter, decl, span))
-    if base is None:
-        return None
-    if isinstance(base, PackDecl):
-        reporter.error(
-            "PD304", f"`{name}` is a pack, not a ruleset", span, "only a ruleset can be extended",
-            helps=["list it under `packs:`"],
-        )  # fmt: skip
-        return None
-    sources = [one.source.name for one in path]
-    if base.source.name in sources:
-        cycle = [one.name.text for one in path[sources.index(base.source.name) :]]
-        reporter.error(
-            "PD314", "rulesets extend each other: " + " extends ".join(f"`{one}`" for one in [*cycle, cycle[0]]),
-            span, "this leads back" if len(cycle) > 1 else "this is the ruleset itself",
-            secondary=[Label(one.extends.span, "by way of this") for one in path[:-1] if one.extends],
-            helps=["take one `extends` out"],
-        )  # fmt: skip
-        return None
-    if len(path) > MAX_BASES:
-        reporter.error(
-            "PD508", f"more than {MAX_BASES} rulesets extend each other in a row", span, "one too many",
-            helps=["list packs instead of extending"],
-        )  # fmt: skip
-        return None
-    whole = _with_base(base, (*path, base), reader)
-    if whole is None:
-        return None
-    for scalar in decl.without:
-        if scalar.text not in whole.members:
-            message = f"`{scalar.text}` is left out, but `{name}` does not have it"
-            helps = suggest(scalar.text, whole.members, "packs")
-            reporter.error("PD304", message, scalar.span, "not there", helps=helps)
-    return replace(decl, base=whole)
+    def with_base(self, decl: RulesetDecl, path: tuple[RulesetDecl, ...]) -> RulesetDecl | None:
+        """The ruleset with the one that it extends; `path` leads from the first one to this one."""
+        reporter = self.reporter
+        if decl.extends is None:
+            return decl
+        span, name = decl.extends.span, decl.extends.text
+        base = self.declaration(_find_beside(name, reporter, decl, span))
+        if isinstance(base, PackDecl):
+            reporter.error(
+                "PD304", f"`{name}` is a pack, not a ruleset", span, "only a ruleset can be extended",
+                helps=["list it under `packs:`"],
+            )  # fmt: skip
+        if not isinstance(base, RulesetDecl):
+            return None
+        sources = [one.source.name for one in path]
+        if base.source.name in sources:
+            cycle = [one.name.text for one in path[sources.index(base.source.name) :]]
+            reporter.error(
+                "PD314", "rulesets extend each other: " + " extends ".join(f"`{one}`" for one in [*cycle, cycle[0]]),
+                span, "this leads back" if len(cycle) > 1 else "this is the ruleset itself",
+                secondary=[Label(one.extends.span, "by way of this") for one in path[:-1] if one.extends],
+                helps=["take one `extends` out"],
+            )  # fmt: skip
+            return None
+        if len(path) > MAX_BASES:
+            reporter.error(
+                "PD508", f"more than {MAX_BASES} rulesets extend each other in a row", span, "one too many",
+                helps=["list packs instead of extending"],
+            )  # fmt: skip
+            return None
+        whole = self.with_base(base, (*path, base))
+        if whole is None:
+            return None
+        for scalar in decl.without:
+            if scalar.text not in whole.members:
+                message = f"`{scalar.text}` is left out, but `{name}` does not have it"
+                helps = suggest(scalar.text, whole.members, "packs")
+                reporter.error("PD304", message, scalar.span, "not there", helps=helps)
+        return replace(decl, base=whole)
 
 
 def _find(word: str, reporter: Reporter, ruleset: RulesetDecl | None) -> Path | None:
@@ -372,19 +352,19 @@ def _find(word: str, reporter: Reporter, ruleset: RulesetDecl | None) -> Path | 
     if ruleset is not None:
         span = next((s.span for s in ruleset.packs if s.text == word), None)
         return _find_beside(word, reporter, ruleset, span)
-    looks_like_path = is_path(word)
-    candidates = [Path(word)] if looks_like_path else [shipped("rules") / f"{word}.yaml", Path(word)]
-    for path in candidates:
-        if _is_there(str(path)):
-            return path
+    path = shipped("rules") / f"{word}.yaml"
+    if not is_path(word) and path.is_file():
+        return path
+    if _is_there(word):
+        return Path(word)
     folder = os.path.isdir(word)
-    if looks_like_path:
+    if is_path(word):
         message = f"`{word}` is a folder" if folder else f"no file `{word}`"
         helps = ["name a rule file in it"] if folder else ["check the path"]
         reporter.error("PD101", message, None, helps=helps)
-        return None
-    notes = [f"`{word}` is a folder: name a rule file in it"] if folder else []
-    _report_unknown(word, None, reporter, notes)
+    else:
+        notes = [f"`{word}` is a folder: name a rule file in it"] if folder else []
+        _report_unknown(word, None, reporter, notes)
     return None
 
 

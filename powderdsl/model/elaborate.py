@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 from powderdsl.diagnostics import Span, suggest
@@ -106,10 +107,8 @@ class Elaborator:
     def _pass(self, named: Named[PassDecl]) -> Pass:
         decl = named.decl
         self._name, self._pack, self._word = named.name, named.pack, decl.name.text
-        self._numbers = {
-            id(rule): number
-            for number, rule in enumerate(rule for block in decl.walk() for rule in block.rules)
-        }
+        rules = [rule for block in decl.walk() for rule in block.rules]
+        self._numbers = {id(rule): number for number, rule in enumerate(rules)}
         self._empty_lets: set[str] = set()
         self._lets: dict[str, int] = {}
         self._pending: list[Let] = []
@@ -190,11 +189,11 @@ class Elaborator:
         variables = [binding.children[0].text for binding in header.children]
         for variable in variables:
             self.typer.used.discard(variable)
-        before = [label] if label else []
-        return [
-            (inner, ", ".join([*before, *(f"{name} = {_show(inner.locals[name])}" for name in variables)]))
-            for inner in scopes
-        ]
+        labeled = []
+        for inner in scopes:
+            words = [f"{name} = {_show(inner.locals[name])}" for name in variables]
+            labeled.append((inner, ", ".join([label, *words] if label else words)))
+        return labeled
 
     def _let(self, name: str, syntax: Syntax, scope: Scope) -> Operand:
         self.typer.start_rule(syntax.span)
@@ -223,26 +222,21 @@ class Elaborator:
     def _moment(
         self, rules: tuple[Syntax, ...], scope: Scope, label: str, symmetry: str | None, policy: str | None
     ) -> None:
-        found: list[Rule] = []
         self._label = label
         self._tried += len(rules) * len(ORIENTATIONS[symmetry])
-        if self._tried > MAX_TRIED:
-            raise self._too_many(rules)
-        for syntax in rules:
+        typed: list[Rule] = []
+        for syntax in rules if self._tried <= MAX_TRIED else ():
             copies: list[Rule] = []
             for matrix in ORIENTATIONS[symmetry]:
                 rules_here = self._rule(syntax, replace(scope, orientation=matrix))
                 copies += [rule for rule in rules_here if rule not in copies]
-            found += copies
-        self._rules += len(found)
-        if self._rules > MAX_RULES or len(self._moments) >= MAX_MOMENTS:
-            raise self._too_many(rules)
-        self._moments.append(Moment(tuple(self._pending), tuple(found), policy or "prove", label))
+            typed += copies
+        self._rules += len(typed)
+        if self._tried > MAX_TRIED or self._rules > MAX_RULES or len(self._moments) >= MAX_MOMENTS:
+            message = f"loops unroll to more than {MAX_MOMENTS} substeps or {MAX_RULES} rules"
+            raise self.typer.fail("PD508", message, rules[0].span, "here", "loop over fewer things")
+        self._moments.append(Moment(tuple(self._pending), tuple(typed), policy or "prove", label))
         self._pending = []
-
-    def _too_many(self, rules: tuple[Syntax, ...]) -> Poisoned:
-        message = f"loops unroll to more than {MAX_MOMENTS} substeps or {MAX_RULES} rules"
-        return self.typer.fail("PD508", message, rules[0].span, "here", "loop over fewer things")
 
     # Rules
 
@@ -250,9 +244,15 @@ class Elaborator:
         self.typer.absent.clear()
         self.typer.start_rule(syntax.span)
         try:
-            rules = {
-                "transform": self._transform, "swap": self._swap, "move": self._move, "assign": self._assign, "push": self._push,
-            }[syntax.kind](syntax, scope)  # fmt: skip
+            match syntax.kind:
+                case "swap" | "move":
+                    rules = [self._movement(syntax, scope)]
+                case "transform":
+                    rules = [self._transform(syntax, scope)]
+                case "push":
+                    rules = self._push(syntax, scope)
+                case _:
+                    rules = [self._update(syntax.children[0], scope, self._mask((), syntax, scope))]
         except Poisoned:
             self.result.active.add(syntax.span)
             return []
@@ -269,8 +269,9 @@ class Elaborator:
             self.result.inactive[syntax.span] = ", ".join(sorted(self.typer.absent))
         return rules
 
-    def _mask(self, subjects: list[Expr], syntax: Syntax, scope: Scope) -> Expr:
-        parts = subjects
+    def _mask(self, subjects: Sequence[Syntax], syntax: Syntax, scope: Scope) -> Expr:
+        """The condition of a rule: what its subjects are, and its clauses."""
+        parts = [self.typer.condition(subject, scope) for subject in subjects]
         for kind in ("condition", "where"):
             if clause := syntax.child(kind):
                 parts.append(self.typer.condition(clause.children[0], scope))
@@ -282,47 +283,39 @@ class Elaborator:
             parts.append(self.typer.chance_draw(name, clause.children[0], scope))
         return conjunction(parts, syntax.span)
 
-    def _transform(self, syntax: Syntax, scope: Scope) -> list[Rule]:
+    def _transform(self, syntax: Syntax, scope: Scope) -> Rule:
         who, target = syntax.children[:2]
-        mask = self._mask([self.typer.condition(who, scope)], syntax, scope)
+        mask = self._mask([who], syntax, scope)
         value = self.typer.of_kind(self.typer.evaluate(target, scope), ELEMENT, target.span)
-        return [Transform(mask, value, self._effects(syntax, scope), syntax.span)]
+        return Transform(mask, value, self._effects(syntax, scope), syntax.span)
 
-    def _swap(self, syntax: Syntax, scope: Scope) -> list[Rule]:
-        subject, place = syntax.children[:2]
-        subjects = [self.typer.condition(child, scope) for child in subject.children]
-        offset = self._neighbor(place, scope)
+    def _movement(self, syntax: Syntax, scope: Scope) -> Rule:
+        who, where = syntax.children[:2]
+        subjects = who.children if syntax.kind == "swap" else (who,)
+        place = self.typer.place(self.typer.evaluate(where, scope), where.span)
+        if place.offset == (0, 0):
+            raise self.typer.fail("PD401", "a cell cannot move to itself", where.span, "expected a neighbor")
+        offset = self.typer.offset(place.offset, where.span)
         mask = self._mask(subjects, syntax, scope)
-        return [Swap(mask, offset, self._effects(syntax, scope), syntax.span)]
-
-    def _move(self, syntax: Syntax, scope: Scope) -> list[Rule]:
-        who, place, leaving = syntax.children[:3]
-        offset = self._neighbor(place, scope)
-        mask = self._mask([self.typer.condition(who, scope)], syntax, scope)
-        behind = self.typer.evaluate(leaving, scope)
+        if syntax.kind == "swap":
+            return Swap(mask, offset, self._effects(syntax, scope), syntax.span)
+        leaving = syntax.children[2]
+        behind, left = self.typer.evaluate(leaving, scope), None
         if isinstance(behind, Place):
             if behind.offset != offset:
-                fix = f"write `leaving {place.span.text}`, or name an element"
+                fix = f"write `leaving {where.span.text}`, or name an element"
                 message, label = "what is left behind is what was there", "another place than the target"
                 raise self.typer.fail("PD405", message, leaving.span, label, fix)
-            return [Move(mask, offset, None, self._effects(syntax, scope), syntax.span)]
-        left = self.typer.of_kind(behind, ELEMENT, leaving.span)
-        if left.op != "const":
-            raise self.typer.fail("PD405", "what is left behind must be one element", leaving.span, "name it")
-        return [Move(mask, offset, left, self._effects(syntax, scope), syntax.span)]
-
-    def _neighbor(self, syntax: Syntax, scope: Scope) -> Offset:
-        place = self.typer.place(self.typer.evaluate(syntax, scope), syntax.span)
-        if place.offset == (0, 0):
-            raise self.typer.fail("PD401", "a cell cannot move to itself", syntax.span, "expected a neighbor")
-        return self.typer.offset(place.offset, syntax.span)
+        else:
+            left = self.typer.of_kind(behind, ELEMENT, leaving.span)
+            if left.op != "const":
+                message = "what is left behind must be one element"
+                raise self.typer.fail("PD405", message, leaving.span, "name it")
+        return Move(mask, offset, left, self._effects(syntax, scope), syntax.span)
 
     def _effects(self, syntax: Syntax, scope: Scope) -> tuple[Assign, ...]:
         clause = syntax.child("then")
-        return tuple(self._update(update, scope, None) for update in clause.children) if clause else ()
-
-    def _assign(self, syntax: Syntax, scope: Scope) -> list[Rule]:
-        return [self._update(syntax.children[0], scope, self._mask([], syntax, scope))]
+        return tuple([self._update(update, scope, None) for update in clause.children]) if clause else ()
 
     def _update(self, syntax: Syntax, scope: Scope, mask: Expr | None) -> Assign:
         target, value = syntax.children
@@ -330,20 +323,17 @@ class Elaborator:
         operand = self.typer.evaluate(value, scope)
         if syntax.text == ":=":
             expr = self.typer.of_kind(operand, kind, value.span)
-            self._check_fits(expr, kind, value.span, name)
+            if kind.name == "int" and (expr.kind.lo < kind.lo or expr.kind.hi > kind.hi):
+                message = f"a value of {expr.kind} goes into `{name}`, which holds {kind}"
+                helps = [f"widen the field, or say `clamp(…, {kind.lo:g}, {kind.hi:g})`"]
+                label = "it is clamped to the bounds"
+                self.typer.reporter.report("PD408", message, value.span, label, helps=helps)
         elif kind.name in ("int", "real", "vec2"):
-            wide = Kind(kind.name, -1e6, 1e6)
-            expr = self.typer.of_kind(operand, wide, value.span)
+            expr = self.typer.of_kind(operand, Kind(kind.name, -1e6, 1e6), value.span)
         else:
             message, label = f"`{syntax.text}` needs a number", f"`{name}` is a {kind}"
             raise self.typer.fail("PD407", message, syntax.span, label, "assign with `:=`")
         return Assign(name, offset, syntax.text, expr, mask, syntax.span)
-
-    def _check_fits(self, value: Expr, kind: Kind, span: Span, name: str) -> None:
-        if kind.name == "int" and (value.kind.lo < kind.lo or value.kind.hi > kind.hi):
-            message = f"a value of {value.kind} goes into `{name}`, which holds {kind}"
-            helps = [f"widen the field, or say `clamp(…, {kind.lo:g}, {kind.hi:g})`"]
-            self.typer.reporter.report("PD408", message, span, "it is clamped to the bounds", helps=helps)
 
     def _target(self, syntax: Syntax, scope: Scope) -> tuple[str, Kind, Offset]:
         """The field that is assigned, its kind, and where."""
@@ -376,22 +366,18 @@ class Elaborator:
             return own.args[0], own.value
         if own is not None:
             return own, (0, 0)
-        offset = self.typer.offset(self._owner(syntax, scope).offset, syntax.span)
-        word = Span(syntax.span.source, syntax.span.end - len(syntax.text), syntax.span.end)
-        return self.typer.lookup(syntax.text, word, scope, after_dot=True), offset
-
-    def _owner(self, syntax: Syntax, scope: Scope) -> Place:
-        """The neighbor before the dot of an assigned field."""
         before = syntax.children[0]
-        operand = self.typer.evaluate(before, scope)
-        if isinstance(operand, SetOf):
+        owner = self.typer.evaluate(before, scope)
+        if isinstance(owner, SetOf):
             fix = f"write `{syntax.text} := … where {before.span.text}`"
-            raise self.typer.wrong(operand, "a neighbor before the dot", before.span, fix)
-        if isinstance(operand, Expr) and operand.kind.name == "vec2":
+            raise self.typer.wrong(owner, "a neighbor before the dot", before.span, fix)
+        if isinstance(owner, Expr) and owner.kind.name == "vec2":
             fix = f"assign the whole vector: `{before.span.text} := vector(…, …)`"
             message = "a part of a vector cannot be assigned"
             raise self.typer.fail("PD407", message, syntax.span, "only a part", fix)
-        return self.typer.place(operand, before.span)
+        offset = self.typer.offset(self.typer.place(owner, before.span).offset, syntax.span)
+        word = Span(syntax.span.source, syntax.span.end - len(syntax.text), syntax.span.end)
+        return self.typer.lookup(syntax.text, word, scope, after_dot=True), offset
 
     def _push(self, syntax: Syntax, scope: Scope) -> list[Rule]:
         target, amount, source = syntax.children[:3]
@@ -399,7 +385,7 @@ class Elaborator:
         if kind.name != "vec2":
             message, fix = f"`{name}` is not a vector", "`push` works on vec2 fields"
             raise self.typer.fail("PD401", message, target.span, f"this is a {kind}", fix)
-        mask = self._mask([self.typer.condition(source, scope)], syntax, scope)
+        mask = self._mask([source], syntax, scope)
         strength = self.typer.of_kind(self.typer.evaluate(amount, scope), REAL, amount.span)
         part = {0: Expr("const", REAL, value=0.0), 1: strength, -1: Expr("neg", REAL, (strength,))}
         rules: list[Rule] = []

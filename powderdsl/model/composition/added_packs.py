@@ -15,7 +15,6 @@ from powderdsl.diagnostics import Label, Reporter, Span
 from powderdsl.model.composition.compose import Composition
 from powderdsl.model.composition.names import listed, words_of
 from powderdsl.model.declarations import PackDecl
-from powderdsl.model.types import Moment, Move, Transform
 from powderdsl.syntax.ast import Syntax
 
 CODES = ("PD501", "PD502")
@@ -188,52 +187,3 @@ class AddedPacks:
         named = composition.element_decls[element]
         brings = [] if named.pack in scope else [Given(named.pack, element, "", "", named.span)]
         return tags or values or brings
-
-
-def may_settle(moment: Moment) -> bool:
-    """Whether `first_wins` changes nothing where no two rules meet.
-
-    Moves may go where another one leaves, and transforms into one element may all have their effects: under the policy
-    they may not.
-    """
-    transforms = [rule for rule in moment.rules if isinstance(rule, Transform)]
-    targets = [rule.target for rule in transforms]
-    return all(targets.count(rule.target) == 1 for rule in transforms if rule.effects) and not any(
-        isinstance(rule, Move) for rule in moment.rules
-    )
-
-
-def report_added(
-    code: str, rules: Sequence[Span], notes: Sequence[str], causes: Sequence[Given], pass_name: str, settled: bool,
-    assigns: bool, reporter: Reporter,
-) -> None:  # fmt: skip
-    """Report a conflict that added packs cause, at their change: a warning if `settled`, because one rule wins.
-
-    Args:
-        rules: what the rules claim. assigns: whether they assign a field.
-    """
-    first, *more = causes
-    words = [f"`{one.word}`" for one in causes if one.word and one.element == first.element]
-    several = len(words) > 1
-    what = f"adds `{first.element}`"
-    if words:
-        what = f"gives `{first.element}` the {first.noun}{'s' * several} {listed(words)}"
-    secondary = [Label(one.span, "and this" if one.word else "this element too") for one in more]
-    secondary += [
-        Label(span, "claims it too" if number else "claims the cell")
-        for number, span in enumerate(dict.fromkeys(rules))
-    ]
-    helps = [f"give `{first.element}` other values, so that it does not fulfill the conditions of both rules"]
-    if first.noun == "tag":
-        needless = "all of them" if several else "that"
-        helps = [f"leave out {' or '.join(words)} here, if `{first.element}` need not be {needless}"]
-    if settled:
-        winner = "the assignment that stands last holds" if assigns else (
-            "the rule that stands first holds, as with `conflicts: first_wins`")  # fmt: skip
-        notes = [*notes, winner]
-    else:
-        helps.append(f"or ask the author of `{pass_name}` for a policy, such as `conflicts: first_wins`")
-    reporter.report(
-        "PD517" if settled else code, f"`{first.pack}` {what}: two rules of `{pass_name}` may claim one cell with it",
-        first.span, "because of this", secondary=secondary, notes=notes, helps=helps,
-    )  # fmt: skip

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 
 from powderdsl.diagnostics import Label, Reporter, Span
 from powderdsl.model.builtins import MAX_SIDE_MULTIPLE
-from powderdsl.model.composition.added_packs import AddedPacks, may_settle, report_added
+from powderdsl.model.composition.added_packs import AddedPacks, Given
+from powderdsl.model.composition.names import listed
 from powderdsl.model.expressions.operators import (
     ELEMENT_HERE,
     TRUE,
@@ -37,12 +38,10 @@ from powderdsl.model.logic.satisfy import (
     substeps,
 )
 from powderdsl.model.operations import OPERATIONS
-from powderdsl.model.types import FLAG, Assign, Expr, Move, Offset, Pass, Rule, Swap, Transform
+from powderdsl.model.types import FLAG, Assign, Expr, Moment, Move, Offset, Pass, Rule, Swap, Transform
 
 if TYPE_CHECKING:
     from powderdsl.model.elaborate import Elaborated
-
-ASSIGN = "two rules may assign"
 
 ALL_SUBSTEPS = 3
 """Work for the conflicts of all substeps together, as a multiple of that for one."""
@@ -67,6 +66,7 @@ class Conflict:
     second: Span
     notes: tuple[str, ...]
     helps: tuple[str, ...]
+    assigns: bool = False
 
     def report(self, labels: list[str], example: str, reporter: Reporter) -> None:
         """Report it once for all rounds that have it. `example` is for the first of them."""
@@ -79,6 +79,39 @@ class Conflict:
         reporter.error(
             self.code, self.message + where, self.second, "two of these can overlap" if one else "claims it too",
             secondary=[] if one else [Label(self.first, "claims a cell")], notes=notes, helps=self.helps,
+        )  # fmt: skip
+
+    def report_added(
+        self, causes: Sequence[Given], pass_name: str, example: str, settled: bool, reporter: Reporter
+    ) -> None:
+        """Report it at the changes by added packs that cause it: a warning if `settled`, because one rule wins."""
+        first, *more = causes
+        words = [f"`{one.word}`" for one in causes if one.word and one.element == first.element]
+        several = len(words) > 1
+        what = f"adds `{first.element}`"
+        if words:
+            what = f"gives `{first.element}` the {first.noun}{'s' * several} {listed(words)}"
+        secondary = [Label(one.span, "and this" if one.word else "this element too") for one in more]
+        secondary.append(Label(self.first, "claims the cell"))
+        if self.second != self.first:
+            secondary.append(Label(self.second, "claims it too"))
+        helps = [
+            f"give `{first.element}` other values, so that it does not fulfill the conditions of both rules"
+        ]
+        if first.noun == "tag":
+            needless = "all of them" if several else "that"
+            helps = [f"leave out {' or '.join(words)} here, if `{first.element}` need not be {needless}"]
+        notes = [example] if example else []
+        if not settled:
+            helps.append(f"or ask the author of `{pass_name}` for a policy, such as `conflicts: first_wins`")
+        elif self.assigns:
+            notes.append("the assignment that stands last holds")
+        else:
+            notes.append("the rule that stands first holds, as with `conflicts: first_wins`")
+        message = f"`{first.pack}` {what}: two rules of `{pass_name}` may claim one cell with it"
+        reporter.report(
+            "PD517" if settled else self.code, message, first.span, "because of this",
+            secondary=secondary, notes=notes, helps=helps,
         )  # fmt: skip
 
 
@@ -211,27 +244,29 @@ def _report_conflicts(
         if not causes:
             conflict.report(found.labels, words, reporter)
             continue
-        assigns = conflict.message.startswith(ASSIGN)
-        resolves = assigns or all(may_settle(passes[at].moments[number]) for at, number in found.places)
-        if resolves and not assigns:
+        settled = conflict.assigns or all(_may_settle(passes[at].moments[n]) for at, n in found.places)
+        if settled and not conflict.assigns:
             resolved.update(found.places)
-        notes = [words] if words else []
-        report_added(
-            conflict.code,
-            (conflict.first, conflict.second),
-            notes,
-            causes,
-            pass_.name,
-            resolves,
-            assigns,
-            reporter,
-        )
+        conflict.report_added(causes, pass_.name, words, settled, reporter)
     changed = list(passes)
     for at, number in sorted(resolved):
         moments = list(changed[at].moments)
         moments[number] = replace(moments[number], policy="first_wins")
         changed[at] = replace(changed[at], moments=tuple(moments))
     return tuple(changed)
+
+
+def _may_settle(moment: Moment) -> bool:
+    """Whether `first_wins` changes nothing where no two rules meet.
+
+    Moves may go where another one leaves, and transforms into one element may all have their effects: under the policy
+    they may not.
+    """
+    transforms = [rule for rule in moment.rules if isinstance(rule, Transform)]
+    targets = [rule.target for rule in transforms]
+    return all(targets.count(rule.target) == 1 for rule in transforms if rule.effects) and not any(
+        isinstance(rule, Move) for rule in moment.rules
+    )
 
 
 def _too_much(work: list[tuple[int, int, Pass]], reporter: Reporter) -> bool:
@@ -352,8 +387,8 @@ _EXCLUDE = "make their conditions exclude each other, or put one under `then:`"
 def _conflict(first: Rule, second: Rule) -> Conflict:
     here, there = _claim(first), _claim(second)
     if isinstance(first, Assign):
-        message = f"{ASSIGN} `{first.field}` of one cell in the same substep"
-        return Conflict("PD502", message, here, there, (), (_EXCLUDE,))
+        message = f"two rules may assign `{first.field}` of one cell in the same substep"
+        return Conflict("PD502", message, here, there, (), (_EXCLUDE,), assigns=True)
     if first is second or first.span == second.span:
         message = "a cell may be both mover and target"
         note = "the moves of one substep happen at once: no cell may take part in two of them"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -95,26 +95,27 @@ def translated(sample: Start, ruleset: Ruleset, target: Ruleset) -> Start | None
 
 def difference(prop: Property, ruleset: Ruleset, found: Counterexample) -> Difference:
     """The added packs that break an invariant which holds in its scope, and how they do it."""
-    added = ruleset.added_to(prop.scope)
-    owners = pack_of_line(ruleset)
-    lines = [span for span in found.culprits if owners.get(span) in added]
-    packs = added
-    if not lines:  # only packs that matter: rules of others may have happened too
+    packs = added = ruleset.added_to(prop.scope)
+    causes = _rules(ruleset, found.culprits, added)
+    states = found.before, found.after
+    there = {int(number) for state in states for number in np.unique(state["element"])}
+    if not causes:  # only packs that matter: rules of others may have happened too
         packs = tuple(pack for pack in added[:MOST] if not _still(prop, ruleset, found, pack)) or added
         if not is_paired(prop.claim):
             last = reference_states(marked(ruleset), found.sample, found.steps)[-1]
-            lines = _happened(ruleset, last, packs)
-    causes = [Cause(owners[span], span, one_line(span), True) for span in lines]
-    causes = causes or list(_elements(found, ruleset, packs))
+            causes = _rules(ruleset, _happened(ruleset, last), packs)
+    if not causes:
+        held = [found.sample.fields.get(slot.name) for slot in slots(ruleset) if slot.kind.name == "element"]
+        held_ids = {int(number) for values in held if values is not None for number in np.unique(values)}
+        causes = [
+            Cause(element.pack, element.span, f"brings `{element.name}`")
+            for element in ruleset.elements
+            if element.id in there | held_ids and element.pack in packs
+        ]
     if causes:
         named = {cause.pack for cause in causes}
         return Difference(tuple(pack for pack in added if pack in named), tuple(causes))
-    names = {element.id: element.name for element in ruleset.elements}
-    near = frozenset(
-        names[number]
-        for state in (found.before, found.after)
-        for number in np.unique(state["element"]).tolist()
-    )
+    near = frozenset(element.name for element in ruleset.elements if element.id in there)
     return Difference(packs, tuple(cause for pack in packs for cause in doings(pack, ruleset, near)[:3]))
 
 
@@ -124,9 +125,7 @@ def difference_of_test(result: ExampleResult, runner: Runner) -> Difference | No
         return None
     ruleset, example, sim = runner.ruleset, result.example, runner.sim
     world = sim.step(start_of(example, sim, result.seed), steps=max(result.step, 1))
-    owners = pack_of_line(ruleset)
-    happened = _happened(ruleset, world.state, result.added)
-    causes = [Cause(owners[span], span, one_line(span), True) for span in happened]
+    causes = _rules(ruleset, _happened(ruleset, world.state), result.added)
     drawn = {char for rows in (example.given, example.expect or (), result.after) for char in "".join(rows)}
     near = frozenset(name for char, name in example.legend if char in drawn)
     for pack in result.added:
@@ -135,32 +134,18 @@ def difference_of_test(result: ExampleResult, runner: Runner) -> Difference | No
     return Difference(result.added, tuple(causes))
 
 
-def _happened(ruleset: Ruleset, state: Mapping[str, Any], packs: tuple[str, ...]) -> list[Span]:
-    """The lines of some packs that happened on the way to a state, by its marks."""
-    owners = pack_of_line(ruleset)
-    return [
-        span
-        for number, span in enumerate(rule_spans(ruleset))
-        if owners[span] in packs and bool(state[f"{MARK}{number}"].any())
-    ]
+def _happened(ruleset: Ruleset, state: Mapping[str, Any]) -> list[Span]:
+    """The lines that happened on the way to a state, by its marks."""
+    return [span for number, span in enumerate(rule_spans(ruleset)) if state[f"{MARK}{number}"].any()]
 
 
-def pack_of_line(ruleset: Ruleset) -> dict[Span, str]:
-    """The pack of each line of rules."""
-    return {
+def _rules(ruleset: Ruleset, lines: Iterable[Span], packs: tuple[str, ...]) -> list[Cause]:
+    """Those of some lines of rules that are of some packs."""
+    owners = {
         rule.span: pass_.pack for pass_ in ruleset.passes for moment in pass_.moments for rule in moment.rules
     }
-
-
-def _elements(found: Counterexample, ruleset: Ruleset, added: tuple[str, ...]) -> Iterator[Cause]:
-    """The elements of added packs that the world holds."""
-    names = {slot.name for slot in slots(ruleset) if slot.kind.name == "element"}
-    arrays = [found.before["element"], found.after["element"]]
-    arrays += [values for name, values in found.sample.fields.items() if name in names]
-    there = {int(number) for values in arrays for number in np.unique(values)}
-    for element in ruleset.elements:
-        if element.id in there and element.pack in added:
-            yield Cause(element.pack, element.span, f"brings `{element.name}`")
+    mine = [span for span in lines if owners.get(span) in packs]
+    return [Cause(owners[span], span, one_line(span), True) for span in mine]
 
 
 def _still(prop: Property, ruleset: Ruleset, found: Counterexample, pack: str) -> bool:
@@ -178,31 +163,28 @@ def _still(prop: Property, ruleset: Ruleset, found: Counterexample, pack: str) -
 
 def doings(pack: str, ruleset: Ruleset, near: frozenset[str] = frozenset()) -> list[Cause]:
     """Changes that a pack makes to others, besides its rules: to some elements, or else all of them."""
-    found = list(_doings(pack, ruleset))
-    close = [cause for name, cause in found if name in near]
-    return close or [cause for name, cause in found if name] or [cause for _, cause in found]
+    changes = list(_changes(pack, ruleset))
+    close = [cause for name, cause in changes if name in near]
+    return close or [cause for name, cause in changes if name] or [cause for _, cause in changes]
 
 
-def _doings(pack: str, ruleset: Ruleset) -> Iterator[tuple[str, Cause]]:
+def _changes(pack: str, ruleset: Ruleset) -> Iterator[tuple[str, Cause]]:
     """The other pack's element that it does something to, or nothing; and what it does."""
     assert ruleset.declared is not None
     decl: PackDecl = next(one for one in ruleset.declared.packs if one.name.text == pack)
     for also in decl.also:
         name = also.name.word
         if ruleset.element(name) is not None:
-            given = [
-                *(f"the tag `{tag.text.removesuffix('?')}`" for tag in also.tags),
-                *(f"`{key.text.removesuffix('?')}`" for key, _ in also.values),
+            given = [f"the tag `{tag.word}`" for tag in also.tags] + [
+                f"`{key.word}`" for key, _ in also.values
             ]
             yield name, Cause(pack, also.name.span, f"gives `{name}` {' and '.join(given)}")
     for element in decl.elements:
         if element.override:
-            name = element.name.text
-            yield name, Cause(pack, element.name.span, f"replaces `{name}`")
+            yield element.name.text, Cause(pack, element.name.span, f"replaces `{element.name.text}`")
     for prop in decl.properties:
         for key, _ in prop.values:
-            name = key.word
-            yield name, Cause(pack, key.span, f"gives `{name}` a value of `{prop.name.text}`")
+            yield key.word, Cause(pack, key.span, f"gives `{key.word}` a value of `{prop.name.text}`")
     for pass_ in decl.passes:
         yield "", Cause(pack, pass_.name.span, f"has the pass `{pass_.name.text}`")
     for element in decl.elements:
