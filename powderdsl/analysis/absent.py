@@ -151,9 +151,9 @@ class Lacking:
         """The expression as it is in this world: what asks for these elements is false, a count of them is 0."""
         if expr.op == "let":
             return self.constants.get(str(expr.value), expr)
-        holders = self.facts.field_sets.get(str(expr.value)) if expr.op == "field" else None
-        if holders is not None and not holders & self.ids:
-            return Expr("const", expr.kind, value=self.facts.field_defaults[str(expr.value)])
+        limited = self.facts.fields.get(str(expr.value)) if expr.op == "field" else None
+        if limited and limited.of is not None and not limited.of & self.ids:
+            return Expr("const", expr.kind, value=limited.default)
         args = tuple(self.rewrite(arg) for arg in expr.args)
         same = all(new is old for new, old in zip(args, expr.args, strict=True))
         return self._folded(expr if same else replace(expr, args=args))

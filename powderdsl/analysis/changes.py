@@ -117,12 +117,10 @@ def is_not(number: int, at: Offset = HERE) -> Condition:
 
 def facts_of(ruleset: Ruleset) -> Facts:
     """Facts about cells, for questions to `model.logic.satisfy`."""
-    limited = {f.name: f for f in ruleset.fields if f.of is not None}
     return Facts(
         tuple(element.id for element in ruleset.elements),
         {prop.name: prop for prop in ruleset.properties},
-        {name: f.of for name, f in limited.items() if f.of is not None},
-        {name: f.default for name, f in limited.items()},
+        {field.name: field for field in ruleset.fields},
         ruleset.side_multiple,
     )
 

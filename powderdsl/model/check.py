@@ -92,13 +92,12 @@ def check(
         for name, element in composition.elements.items()
     )
     passes = tuple(elaborated.passes)
-    facts = _facts(symbols)
+    names = {element.id: name for name, element in composition.elements.items()}
+    facts = Facts(symbols.ids, symbols.properties, symbols.fields, composition.side_multiple, names)
     stored = overridden_ids(passes, sorted(elaborated.overridden), facts)
-    symbols.properties = {
-        name: replace(p, stored=stored.get(name, frozenset())) for name, p in symbols.properties.items()
-    }
+    for name, ids in stored.items():
+        symbols.properties[name] = replace(symbols.properties[name], stored=ids)
     check_assigned(examples, symbols, reporter)
-    facts = _facts(symbols)
     added = None
     if not alone:
         added = AddedPacks(composition, partial(_check_some, Declared(tuple(packs), None), alone=True))
@@ -136,13 +135,6 @@ def _typer_of(packs: Sequence[PackDecl], names: tuple[str, ...]) -> Typer | None
         return resolve_names([pack for pack in packs if pack.name.text in names], None, Reporter())[0]
     except CompileError:
         return None
-
-
-def _facts(symbols: Symbols) -> Facts:
-    limited = {name: f.of for name, f in symbols.fields.items() if f.of is not None}
-    defaults: dict[str, object] = {name: symbols.fields[name].default for name in limited}
-    names = {element.id: name for name, element in symbols.composition.elements.items()}
-    return Facts(symbols.ids, symbols.properties, limited, defaults, symbols.composition.side_multiple, names)
 
 
 def _streams(symbols: Symbols, elaborated: Elaborated, reporter: Reporter) -> tuple[Stream, ...]:

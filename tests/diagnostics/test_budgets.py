@@ -98,7 +98,7 @@ def above(first: Expr, second: Expr, least: int) -> Expr:
 @pytest.mark.parametrize("conditions", [(above(A, B, 150),), (above(B, A, 150),)])
 def test_work_does_not_depend_on_the_side(conditions: tuple[Expr, ...]) -> None:
     budget = Budget()
-    facts = Facts((0, 1), {}, {}, {}, {}, budget)
+    facts = Facts((0, 1), {}, {}, budget=budget)
     assert decide(facts, [(one, (0, 0)) for one in conditions]) is True
     assert BUDGET - budget.left < 3_000
 
@@ -108,7 +108,7 @@ def test_one_hard_question_leaves_work_for_the_next() -> None:
     total = Expr("add", integer(0, 750), (Expr("add", integer(0, 500), (names[0], names[1])), names[2]))
     odd = Expr("mod", integer(0, 63), (total,), 64)
     never = [Expr("eq", FLAG, (odd, Expr("const", integer(n, n), value=n))) for n in (1, 2)]
-    facts = Facts((0, 1), {}, {}, {})
+    facts = Facts((0, 1), {}, {})
     assert decide(facts, [(one, (0, 0)) for one in never]) is None
     assert satisfiable(facts, [(one, (0, 0)) for one in never])
     assert decide(facts, [(above(A, B, 199), (0, 0)), (above(B, A, 1), (0, 0))]) is False

@@ -10,10 +10,14 @@ from __future__ import annotations
 from powderdsl.diagnostics import Reporter, suggest
 from powderdsl.model.composition.compose import Composition
 from powderdsl.model.expressions.symbols import Symbols
-from powderdsl.model.types import Assign, MatrixChannel, Pass
+from powderdsl.model.logic.satisfy import substeps, writes_of
+from powderdsl.model.types import MatrixChannel, Pass
 from powderdsl.syntax.yaml_tree import Scalar
 
 COMPONENTS = ("row", "column")
+
+Channels = dict[str, list[MatrixChannel]]
+"""By the name of a property or field."""
 
 
 def lay_out(
@@ -24,23 +28,30 @@ def lay_out(
     Reports names in a ruleset's `matrix:` that no loaded pack has.
     """
     composition = symbols.composition
-    blocks = _blocks(symbols, passes)
-    order = tuple(name for block in blocks for name in block)
-    elements = composition.elements.values()
-    names = {element.id: element.name for element in elements}
+    known: Channels = {name: [MatrixChannel(name, name)] for name in (*symbols.properties, *symbols.fields)}
+    for name, field in symbols.fields.items():
+        if field.kind.name == "vec2":
+            known[name] = [MatrixChannel(f"{name}.{part}", name, part=part) for part in COMPONENTS]
     size = own_slots(composition)
-    first = [MatrixChannel(names.get(number, ""), id=number) for number in range(size)]
+    blocks = _blocks(symbols, passes)
+    parts: list[list[MatrixChannel]] = []
+    """The channels of elements and those of what lasts from step to step, in turn, by group of packs."""
+    for (pack, *_), block in zip(composition.groups, blocks, strict=True):
+        elements = {element.id: element for element in composition.elements.values()}
+        added = [MatrixChannel(e.name, id=e.id) for e in elements.values() if e.pack == pack and e.id >= size]
+        if not parts:
+            names = [elements[number].name if number in elements else "" for number in range(size)]
+            added = [MatrixChannel(name, id=number) for number, name in enumerate(names)]
+        lasting = [name for name in block if name not in symbols.fields or not symbols.fields[name].resets]
+        parts += [added, [channel for name in lasting for channel in known[name]]]
     written = composition.ruleset.placing.matrix if composition.ruleset else ()
-    channels = [] if written else [*first, *_holding(blocks[0], symbols)]
-    for scalar in written:
-        channels += first if scalar.word == "elements" else _written(scalar, symbols, reporter)
-    if written and all(scalar.word != "elements" for scalar in written):
-        return order, tuple(channels)  # a ruleset that shows no elements shows none of further packs either
-    for (pack,), block in zip(composition.groups[1:], blocks[1:], strict=True):
-        added = [element for element in elements if element.pack == pack and element.id >= size]
-        channels += [MatrixChannel(element.name, id=element.id) for element in added]
-        channels += _holding(block, symbols)
-    return order, tuple(channels)
+    if written:
+        own = [_written(scalar, known, composition, reporter) for scalar in written]
+        shown = [parts[0] if channels is None else channels for channels in own]
+        # A ruleset that shows no elements shows none of further packs either.
+        parts = [*shown, *parts[2:]] if None in own else shown
+    order = tuple(name for block in blocks for name in block)
+    return order, tuple(channel for part in parts for channel in part)
 
 
 def own_slots(composition: Composition) -> int:
@@ -58,10 +69,9 @@ def _blocks(symbols: Symbols, passes: tuple[Pass, ...]) -> list[list[str]]:
     place = {pack: number for number, group in enumerate(groups) for pack in group}
     blocks: list[list[str]] = [[] for _ in groups]
     first: dict[str, int] = {}
-    for pass_ in passes:
-        for rule in (rule for moment in pass_.moments for rule in moment.rules):
-            for update in (rule,) if isinstance(rule, Assign) else rule.effects:
-                first[update.field] = min(place[pass_.pack], first.get(update.field, place[pass_.pack]))
+    for pass_, moment, _ in substeps(passes):
+        for write in (write for rule in moment.rules for write in writes_of(rule)):
+            first[write.field] = min(place[pass_.pack], first.get(write.field, place[pass_.pack]))
     for name, prop in symbols.properties.items():
         if prop.stored:
             blocks[max(first.get(name, 0), place[prop.pack])].append(name)
@@ -70,38 +80,25 @@ def _blocks(symbols: Symbols, passes: tuple[Pass, ...]) -> list[list[str]]:
     return blocks
 
 
-def _holding(names: list[str], symbols: Symbols) -> list[MatrixChannel]:
-    """The channels of what lasts from step to step."""
-    lasting = [name for name in names if name not in symbols.fields or not symbols.fields[name].resets]
-    return [channel for name in lasting for channel in _channels(name, symbols)]
-
-
-def _channels(name: str, symbols: Symbols) -> list[MatrixChannel]:
-    field = symbols.fields.get(name)
-    if field is not None and field.kind.name == "vec2":
-        return [MatrixChannel(f"{name}.{part}", name, part=part) for part in COMPONENTS]
-    return [MatrixChannel(name, name)]
-
-
-def _written(scalar: Scalar, symbols: Symbols, reporter: Reporter) -> list[MatrixChannel]:
+def _written(
+    scalar: Scalar, known: Channels, composition: Composition, reporter: Reporter
+) -> list[MatrixChannel] | None:
     """The channels that a name under `matrix:` stands for: of a field, a property or a component, plain or qualified.
 
-    One that is always 0 if its pack is not loaded.
+    None for all elements; one channel that is always 0 if its pack is not loaded.
     """
-    composition, word = symbols.composition, scalar.word
+    word = scalar.word
+    if word == "elements":
+        return None
     base, _, part = word.rpartition(".")
     name, component = (base, part) if part in COMPONENTS and base else (word, "")
     pack, point, own = name.rpartition(".")
     name = (composition.names.qualified(pack, own) if point else None) or name
-    if name in symbols.properties or name in symbols.fields:
-        channels = [one for one in _channels(name, symbols) if not component or one.part == component]
-        if channels:
-            return channels
-    if not scalar.is_optional and composition.left_out.isdisjoint(word.split(".")):
-        known = ["elements", *symbols.properties, *symbols.fields]
-        helps = suggest(word.partition(".")[0], known, "channels")
+    channels = [one for one in known.get(name, ()) if not component or one.part == component]
+    if not channels and not scalar.is_optional and composition.left_out.isdisjoint(word.split(".")):
+        helps = suggest(word.partition(".")[0], ["elements", *known], "channels")
         reporter.error(
             "PD310", f"unknown channel `{scalar.text}`", scalar.span, "not a field or property",
             helps=[*helps, f"if its pack may be absent, write `{word}?`"],
         )  # fmt: skip
-    return [MatrixChannel(word)]
+    return channels or [MatrixChannel(word)]

@@ -196,7 +196,7 @@ def check_logic(
     if _too_much(work, reporter):
         return passes, []
     passes = _report_conflicts(conflicts, passes, facts, added, reporter)
-    relaxed = replace(facts.relaxed(), budget=Budget())
+    relaxed = facts.relaxed()
     for span, fate in fates.items():
         if fate.is_decided:
             _report_fate(span, fate, relaxed, elaborated, reporter)

@@ -412,33 +412,28 @@ def _report_unwritten(composition: Composition, reporter: Reporter) -> None:
 # What rules produce and override
 
 
-def overridden_ids(passes: tuple[Pass, ...], names: Iterable[str], facts: Facts) -> dict[str, frozenset[int]]:
+def overridden_ids(passes: tuple[Pass, ...], names: Sequence[str], facts: Facts) -> dict[str, frozenset[int]]:
     """For each of these properties the ids whose cells may hold their own value: the ids that some rule assigns it to.
 
     A value of its own may fulfill the condition of another such rule, so this continues until nothing is added.
     """
-    found: dict[str, frozenset[int]] = {name: frozenset() for name in names}
-    while True:
-        more = {name: found[name] | _overridden_ids(passes, name, facts) for name in found}
-        if more == found:
-            return found
-        found = more
+    found: dict[str, frozenset[int]] = {}
+    more: dict[str, set[int]] = {name: set() for name in names}
+    while more != found:
+        found = {name: frozenset(ids) for name, ids in more.items()}
         stored = {name: replace(facts.properties[name], stored=ids) for name, ids in found.items()}
-        facts = replace(facts, properties={**facts.properties, **stored})
-
-
-def _overridden_ids(passes: tuple[Pass, ...], name: str, facts: Facts) -> frozenset[int]:
-    """The ids that some rule assigns a property to, if cells hold values of their own as `facts` say."""
-    found: set[int] = set()
-    for _, moment, lets in substeps(passes):
-        for assign in (write for rule in moment.rules for write in writes_of(rule) if write.field == name):
-            if assign.mask is None or assign.offset != HERE:
-                return frozenset(facts.ids)
-            for number in facts.ids:
-                here = (member(ELEMENT_HERE, (number,)), HERE)
-                if number not in found and satisfiable(facts, [here, (assign.mask, HERE)], lets):
-                    found.add(number)
-    return frozenset(found)
+        now = replace(facts, properties={**facts.properties, **stored})
+        for _, moment, lets in substeps(passes):
+            for write in (write for rule in moment.rules for write in writes_of(rule) if write.field in more):
+                reached = more[write.field]
+                if write.mask is None or write.offset != HERE:
+                    reached.update(facts.ids)
+                    continue
+                for number in facts.ids:
+                    here = (member(ELEMENT_HERE, (number,)), HERE)
+                    if number not in reached and satisfiable(now, [here, (write.mask, HERE)], lets):
+                        reached.add(number)
+    return found
 
 
 def without_dead_overrides(passes: tuple[Pass, ...], dead: frozenset[str]) -> tuple[Pass, ...]:

@@ -67,9 +67,8 @@ class Facts:
 
     ids: tuple[int, ...]
     properties: dict[str, Property]
-    field_sets: dict[str, frozenset[int]]
-    """Fields that exist only on some elements: elsewhere they read their default."""
-    field_defaults: dict[str, object]
+    fields: dict[str, Field]
+    """Those that exist only on some elements read their default elsewhere."""
     side_multiple: int = 1
     """The sides of all worlds are multiples of this number."""
     names: dict[int, str] = field(default_factory=dict, compare=False, repr=False)
@@ -78,14 +77,11 @@ class Facts:
 
     def relaxed(self) -> Facts:
         """The same cells, but with any element's properties: what a rule could meet in other packs."""
-        ids = frozenset(self.ids)
-        free = {
-            name: replace(p, values=("?",) * len(p.values))
-            if p.kind.name == "chance"
-            else replace(p, stored=ids)
-            for name, p in self.properties.items()
-        }
-        return replace(self, properties=free)
+        free = dict(self.properties)
+        for name, p in free.items():
+            unknown = replace(p, values=("?",) * len(p.values))
+            free[name] = unknown if p.kind.name == "chance" else replace(p, stored=frozenset(self.ids))
+        return replace(self, properties=free, budget=Budget())
 
 
 def decide(facts: Facts, conditions: Conditions, lets: Lets | None = None) -> bool | None:
@@ -346,9 +342,8 @@ class _Search:
                 if prop.stored:
                     keys.append(self._key("property", prop.name, at))
                 return _Term("property", node, tuple(keys), about=prop)
-            case "field" if node.value in self.facts.field_sets:
-                name = str(node.value)
-                about = self.facts.field_sets[name], self.facts.field_defaults[name]
+            case "field" if (limited := self.facts.fields.get(str(node.value))) and limited.of is not None:
+                about = limited.of, limited.default
                 return _Term(
                     "field", node, (self._key("element", None, at), self._key("value", node, at)), about=about
                 )
