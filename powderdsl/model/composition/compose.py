@@ -135,7 +135,8 @@ class Composition:
         for pack, element, entry in self.entries():
             for key, syntax in entry.values:
                 yield pack, self.names.of(pack, key.word), element, key, syntax
-        for name, typed in (*self.properties.items(), *self.fields.items()):
+        beside: dict[str, Named[Any]] = {**self.properties, **self.fields}
+        for name, typed in beside.items():
             for key, syntax in typed.decl.values:
                 yield typed.pack, name, self.element(key.word, typed.pack) or key.word, key, syntax
 

@@ -14,7 +14,7 @@ from fractions import Fraction
 from typing import Any, NamedTuple, TypeVar
 
 from powderdsl.model.operations import OPERATIONS, Bounds
-from powderdsl.model.types import FLAG, Assign, Expr, Moment, Offset, Pass, Property, Rule
+from powderdsl.model.types import FLAG, Assign, Expr, Field, Moment, Offset, Pass, Property, Rule
 
 HERE: Offset = (0, 0)
 
