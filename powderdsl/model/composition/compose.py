@@ -38,7 +38,6 @@ from powderdsl.model.declarations import (
     RulesetDecl,
     SetDecl,
     StreamDecl,
-    TagDecl,
 )
 from powderdsl.model.types import Element
 from powderdsl.syntax.ast import Syntax
@@ -64,7 +63,6 @@ class Composition:
     element_decls: dict[str, Named[ElementDecl]]
     slots: int
     tags: dict[str, frozenset[int]]
-    tag_decls: dict[str, Named[TagDecl]]
     properties: dict[str, Named[PropertyDecl]]
     fields: dict[str, Named[FieldDecl]]
     streams: dict[str, Named[StreamDecl]]
@@ -232,7 +230,6 @@ def compose(
         element_decls={name: versions[name][0] for name in elements},
         slots=max(_slots(ruleset, elements, palette, reporter), *(number + 1 for number in ids.values()), 1),
         tags={},
-        tag_decls=tables["tags"],
         properties=tables["properties"],
         fields=tables["fields"],
         streams=tables["streams"],
@@ -246,7 +243,7 @@ def compose(
         groups=tuple(tuple(pack.name.text for pack in group) for group in groups),
         reserved=tuple(ids[wish.name] for wish in wishes if wish.name in ids and not wish.is_loaded),
     )
-    return _with_entries(composition, reporter)
+    return _with_entries(composition, tables["tags"], reporter)
 
 
 _KINDS = {
@@ -548,10 +545,10 @@ def _glyphs(elements: Sequence[Named[ElementDecl]]) -> dict[str, str]:
     return glyphs
 
 
-def _with_entries(composition: Composition, reporter: Reporter) -> Composition:
+def _with_entries(composition: Composition, tags: Iterable[str], reporter: Reporter) -> Composition:
     """The composition with the tags and colors that entries give elements. Reports tags and elements that nothing defines."""
     elements = dict(composition.elements)
-    members: dict[str, set[int]] = {tag: set() for tag in composition.tag_decls}
+    members: dict[str, set[int]] = {tag: set() for tag in tags}
     for pack, name, entry in composition.entries():
         element = elements.get(name)
         if isinstance(entry, AlsoDecl) and element and entry.color is not None:
@@ -565,5 +562,5 @@ def _with_entries(composition: Composition, reporter: Reporter) -> Composition:
             elif not scalar.is_optional:
                 more = "; to make a tag, declare it under `tags:`"
                 report_unknown("tag", scalar, members, reporter, more=more)
-    tags = {tag: frozenset(ids) for tag, ids in members.items()}
-    return replace(composition, tags=tags, elements=elements)
+    ids_of = {tag: frozenset(ids) for tag, ids in members.items()}
+    return replace(composition, tags=ids_of, elements=elements)

@@ -182,6 +182,8 @@ class _Search:
             self._split(self._resolve(condition)[0], at)
         self._numbers: dict[Key, int] = {}
         self._domains: dict[int, list[Any]] = {}
+        self._cuts: dict[object, set[float]] = {}
+        """Constants that the draws of each stream are compared with: between two of them all draws are alike."""
         self._cut: set[int] = set()
         """Variables of which conditions on them alone leave less than all values."""
         self._chosen: dict[int, Any] = {}
@@ -297,7 +299,7 @@ class _Search:
         if what == "side":
             return list(range(self.facts.side_multiple))
         if what == "draw":
-            cuts = self._cuts(name)
+            cuts = sorted(self._cuts.get(name, (0.0, 1.0)))
             between = ((a + b) / 2 for a, b in itertools.pairwise(cuts))
             # A draw of 16 or 32 bits may be a threshold itself: neither above nor below it.
             return [*between, *(c for c in cuts if (c * 2**17) % 2 == 1 or (c * 2**33) % 2 == 1)]
@@ -310,17 +312,6 @@ class _Search:
             case "flag":
                 return [0, 1]
         return list(range(int(kind.lo), int(kind.hi) + 1))
-
-    def _cuts(self, stream: object) -> list[float]:
-        """The constants that a stream's draws are compared with: between two of them all draws are alike."""
-        cuts = {0.0, 1.0}
-        for node in (node for condition, _ in self._conditions for node in condition.walk()):
-            if node.op == "lt" and any(arg.kind.name == "draw" for arg in node.args):
-                parts = [part for arg in node.args for part in arg.walk()]
-                if any(part.op == "draw" and part.value == stream for part in parts):
-                    numbers = [part.value for part in parts if part.op == "const"]
-                    cuts.update(float(n) % 1 for n in numbers if isinstance(n, (int, Fraction)))
-        return sorted(cuts)
 
     def _term(self, node: Expr, at: Offset) -> _Term:
         """The expression at a place. Raises _Unknown if one of its variables cannot be enumerated."""
@@ -359,6 +350,13 @@ class _Search:
         if _is_opaque(node):
             return self._variable(node, "value", node, at)
         args = tuple([self._term(arg, at) for arg in node.args])
+        if node.op == "lt" and any(arg.kind.name == "draw" for arg in node.args):
+            parts = list(node.walk())
+            numbers = [part.value for part in parts if isinstance(part.value, (int, Fraction))]
+            for part in parts:
+                if part.op == "draw":
+                    cuts = self._cuts.setdefault(part.value, {0.0, 1.0})
+                    cuts.update(float(number) % 1 for number in numbers)
         return _Term(node.op, node, tuple(dict.fromkeys([key for arg in args for key in arg.keys])), args)
 
     def _variable(self, node: Expr, what: str, name: object, at: Offset) -> _Term:
