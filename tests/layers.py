@@ -16,7 +16,7 @@ _STEPS = (
     "simulation.observe",
     "simulation.simulator",
 )
-_SIMULATION = (*_STEPS, "simulation.provenance", "simulation.tracing", "simulation.media")
+_SIMULATION = (*_STEPS, "simulation.tracing", "simulation.media")
 _WORLDS = ("worlds", "worlds.store")
 _SCREEN = (*_BACK, *_SIMULATION, *_WORLDS)
 _TESTING = (
@@ -70,11 +70,10 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "simulation.observe",
     ),
     "simulation.standalone": _BACK,
-    "simulation.provenance": (*_FRONT, "targets", "simulation.simulator"),
     "simulation.tracing": (
         *_FRONT,
         "model.reference",
-        "simulation.provenance",
+        "targets",
         "simulation.simulator",
     ),  # explains by what the oracle does
     "simulation.media": ("arrays", "system", "simulation.draw"),

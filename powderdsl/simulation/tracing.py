@@ -1,4 +1,11 @@
-"""Why a cell holds what it holds: its writes in one step on the reference interpreter, and the rules that nearly wrote it."""
+"""Why cells hold what they hold.
+
+`trace` explains one cell in one step: its writes on the reference interpreter, and the rules that nearly wrote it.
+
+`Recorder` names the rule that last wrote the element of each cell of a batch, on any backend and device. The rules get one
+more field, and every rule that writes an element sets the field to its number in that cell. Backends need no support for
+it, and ordinary simulators do not change.
+"""
 
 from __future__ import annotations
 
@@ -15,26 +22,27 @@ from powderdsl.diagnostics.printable import printable
 from powderdsl.diagnostics.render import source_lines
 from powderdsl.model import reference
 from powderdsl.model.expressions.operators import look
-from powderdsl.model.reference import Array
-from powderdsl.model.state import Slot, scratch_slots, slot_name, slots
+from powderdsl.model.state import Slot, scratch_slots, slot_name
 from powderdsl.model.text import element_name, one_line, place_of, show_expr, show_offset, show_value
 from powderdsl.model.types import (
     ELEMENT,
     FLAG,
     Assign,
     Expr,
+    Field,
     Kind,
     Let,
     Moment,
     Move,
     Offset,
-    Pass,
     Rule,
     Ruleset,
     Swap,
+    Transform,
+    integer,
 )
-from powderdsl.simulation.provenance import NumberedRule, numbered_rules
-from powderdsl.simulation.simulator import World
+from powderdsl.simulation.simulator import Simulator, World
+from powderdsl.targets.array_kind import Array
 
 Cell = tuple[int, int]
 """(row, column)."""
@@ -42,45 +50,90 @@ Cell = tuple[int, int]
 HERE: Offset = (0, 0)
 _LEAVES = ("element", "property", "field", "let", "draw", "coordinate", "param", "inside", "count", "sum")
 
-HOW = {
-    "assign": "a field was assigned",
-    "effect": "a field was assigned by `then`",
-    "become": "the cell became another element",
-    "leave": "the element moved away; this is what it left",
-    "arrive": "what stood in another cell came here",
+_WITHOUT_RULE = {
     "limit": "no rule: cells of this element keep the field's default",
     "settle": "no rule: at the end of a pass floats are cut off at their bounds, and tiny ones are zero",
     "reset": "no rule: the field starts each step at its default",
 }
-"""The kinds of writes. The last three have no rule."""
+"""The kinds of writes that have no rule. The others are ``assign``, ``effect``, ``become``, ``leave``, ``arrive``."""
+
+
+@dataclass(frozen=True)
+class NumberedRule:
+    """A rule of the checked model. One line of a file makes several under loops and symmetries.
+
+    `number` counts from 1 in the order in which they run; `moment` counts the pass's substeps from 0; `label` has the
+    loop variables, such as ``side = left``.
+    """
+
+    number: int
+    pack: str
+    pass_name: str
+    moment: int
+    label: str
+    rule: Rule
+
+    @property
+    def span(self) -> Span:
+        return self.rule.span
+
+    @property
+    def place(self) -> str:
+        """`file:line`."""
+        return place_of(self.span)
+
+
+def numbered_rules(ruleset: Ruleset) -> tuple[NumberedRule, ...]:
+    """All rules in the order in which they run; rule number n is at index n − 1."""
+    rules: list[NumberedRule] = []
+    for pass_ in ruleset.passes:
+        for position, moment in enumerate(pass_.moments):
+            for rule in moment.rules:
+                number = len(rules) + 1
+                rules.append(NumberedRule(number, pass_.pack, pass_.name, position, moment.label, rule))
+    return tuple(rules)
+
+
+# What happens in a step
 
 
 @dataclass(frozen=True)
 class RecordedSubstep:
-    """A substep of the step: what it found, and its rules. Arrays have a batch of one."""
+    """A substep of the step: what it found, and its rules. Arrays have a batch of one.
 
-    pass_: Pass
-    moment: Moment
+    `table` has the slots of the state and of its pass, `lets` the expression of each `let` of the pass so far and what
+    that read, `masks` where each rule happened, by `id` of the rule.
+    """
+
+    policy: str
     rules: tuple[NumberedRule, ...]
     at: reference.Context
-    table: dict[str, Slot]
-    """Slots of the state, and scratch fields of the pass."""
-    lets: dict[str, tuple[Let, reference.Context]]
-    """For each `let` of the pass so far, its expression and what that read."""
+    table: Mapping[str, Slot]
+    lets: Mapping[str, tuple[Let, reference.Context]]
     masks: Mapping[int, Array]
-    """Where each rule happened, by `id` of the rule."""
 
-    def near(self, cell: Cell, offset: Offset) -> Cell:
-        """The neighbor of a cell; the grid wraps around."""
+    def near(self, cell: Cell, offset: Offset, way: int = 1) -> Cell:
+        """The neighbor of a cell, or, with -1, the cell whose neighbor it is; the grid wraps around."""
         _, height, width = self.at.shape
-        return (cell[0] + offset[0]) % height, (cell[1] + offset[1]) % width
-
-    def behind(self, cell: Cell, offset: Offset) -> Cell:
-        """The cell whose neighbor this one is."""
-        return self.near(cell, (-offset[0], -offset[1]))
+        return (cell[0] + way * offset[0]) % height, (cell[1] + way * offset[1]) % width
 
     def happened(self, rule: Rule, cell: Cell) -> bool:
         return bool(self.masks[id(rule)][(0, *cell)])
+
+    def parts(self, rule: Rule, cell: Cell) -> tuple[Part, ...]:
+        """A rule's condition in one cell, split at its `and`s. Flags fixed by `let` are split too, as they were fixed."""
+        assert rule.mask is not None
+        return tuple(self._split(rule.mask, self.at, "", cell))
+
+    def _split(self, expr: Expr, at: reference.Context, of: str, cell: Cell) -> Iterator[Part]:
+        if expr.op == "and":
+            for arg in expr.args:
+                yield from self._split(arg, at, of, cell)
+        elif expr.op == "let" and expr.kind == FLAG:
+            let, then = self.lets[expr.value]
+            yield from self._split(let.value, then, _written(expr.value), cell)
+        elif not (expr.op == "const" and expr.value):
+            yield Part(expr, at, of, self, cell)
 
 
 @dataclass(frozen=True)
@@ -109,7 +162,7 @@ class Write:
         """The parts of the condition that let its rule happen; none without a rule."""
         if self.rule is None or self.substep is None or self.cell is None:
             return ()
-        return _parts(self.rule.rule, self.substep, self.cell)
+        return self.substep.parts(self.rule.rule, self.cell)
 
 
 @dataclass
@@ -128,21 +181,17 @@ class RecordedStep:
     writes: list[Write] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self._slots = {slot.name: slot for slot in slots(self.ruleset)}
-        self._moments = self.ruleset.substeps()
         self._rules = iter(numbered_rules(self.ruleset))
-        self._lets: dict[str, tuple[Let, reference.Context]] = {}
 
-    def begins(self, at: reference.Context, masks: Mapping[int, Array]) -> None:
+    def begins(
+        self, moment: Moment, at: reference.Context, masks: Mapping[int, Array], table: Mapping[str, Slot]
+    ) -> None:
         """Record a substep: see `reference.Watch`."""
-        pass_, moment = next(self._moments)
-        found = replace(at, lets=dict(at.lets))
-        if moment is pass_.moments[0]:
-            self._lets.clear()
-        self._lets.update((let.name, (let, found)) for let in moment.lets)
+        now = replace(at, lets=dict(at.lets))
+        fixed = {let.name: (let, now) for let in moment.lets}
+        lets = {name: fixed[name] if name in fixed else self.substeps[-1].lets[name] for name in at.lets}
         rules = tuple(islice(self._rules, len(moment.rules)))
-        table = {**self._slots, **scratch_slots(pass_)}
-        self.substeps.append(RecordedSubstep(pass_, moment, rules, found, table, dict(self._lets), masks))
+        self.substeps.append(RecordedSubstep(moment.policy, rules, now, table, lets, masks))
 
     def wrote(self, change: reference.Change, before: Array, after: Array, mask: Array | None = None) -> None:
         """Record a write to the cell. One without a rule counts if it changes something."""
@@ -169,26 +218,9 @@ def record_step(world: World, cell: Cell) -> RecordedStep:
     return step
 
 
-def value_at(expr: Expr, at: reference.Context, cell: Cell) -> Any:
-    """The value of an expression in one cell: a NumPy number, or two of a vector."""
-    return pick(reference.evaluate(expr, at), cell)
-
-
 def pick(array: Array, cell: Cell) -> Any:
-    """One cell's value of a reference array."""
+    """One cell's value of a reference array: a NumPy number, or two of a vector."""
     return array[0, ..., cell[0], cell[1]]
-
-
-def anchors(rule: Rule, cell: Cell, substep: RecordedSubstep, slot: str) -> tuple[Cell, ...]:
-    """The cells in which a rule's condition must hold for it to write a slot of this cell."""
-    found: list[Offset] = []
-    if isinstance(rule, Assign):
-        found += [rule.offset] if rule.field == slot else []
-    else:
-        if substep.table[slot].travels:
-            found += [(0, 0)] + ([rule.offset] if isinstance(rule, (Swap, Move)) else [])
-        found += [effect.offset for effect in rule.effects if effect.field == slot]
-    return tuple(dict.fromkeys(substep.behind(cell, offset) for offset in found))
 
 
 # Conditions
@@ -233,20 +265,96 @@ class Part:
 
     @cached_property
     def holds(self) -> bool:
-        return bool(value_at(self.expr, self.at, self.cell))
+        return bool(pick(reference.evaluate(self.expr, self.at), self.cell))
 
     @cached_property
     def reads(self) -> tuple[Read, ...]:
         """Everything that the condition read, each value once."""
-        found: dict[str, Read] = {}
+        reads: dict[str, Read] = {}
         for read in _reads(self.expr, self.at, self.cell, HERE, self.substep):
-            found.setdefault(read.text, read)
-        return tuple(found.values())
+            reads.setdefault(read.text, read)
+        return tuple(reads.values())
 
     @property
     def about_itself(self) -> bool:
         """Whether it only asks which element the cell is. If that fails, the rule is about other cells."""
         return self.expr.op == "member" and self.expr.args[0].op == "element"
+
+
+def _written(name: str) -> str:
+    """The name of a `let` in the file: copies under loops are numbered."""
+    return name.partition("#")[0]
+
+
+def _reads(
+    expr: Expr, at: reference.Context, cell: Cell, offset: Offset, substep: RecordedSubstep
+) -> Iterator[Read]:
+    if expr.op == "look":
+        dy, dx = expr.value
+        yield from _reads(expr.args[0], at, cell, (offset[0] + dy, offset[1] + dx), substep)
+    elif expr.op not in _LEAVES:
+        for arg in expr.args:
+            yield from _reads(arg, at, cell, offset, substep)
+    else:
+        yield _leaf(expr, at, substep.near(cell, offset), offset, substep)
+        if expr.op == "let" and expr.value in substep.lets:
+            let, then = substep.lets[expr.value]
+            yield from _reads(let.value, then, cell, offset, substep)
+
+
+def _leaf(expr: Expr, at: reference.Context, place: Cell, offset: Offset, substep: RecordedSubstep) -> Read:
+    ruleset, value = at.ruleset, pick(reference.evaluate(expr, at), place)
+    if expr.op == "element" and offset != HERE:
+        text = show_offset(offset)
+    else:
+        text = _written(show_expr(ruleset, look(expr, offset)))
+    element, counted = None, []
+    if expr.op == "property" or (expr.op in ("field", "let") and offset != HERE):
+        element = element_name(ruleset, int(pick(reference.evaluate(Expr("element", ELEMENT), at), place)))
+    if expr.op == "count":  # the neighbors with a weight where the argument holds
+        holds, kernel = reference.evaluate(expr.args[0], at), expr.value
+        for dy, dx, weight in kernel.weights[: 1 << 10]:
+            there = substep.near(place, (dy, dx))
+            inside = there == (place[0] + dy, place[1] + dx)
+            if weight and (inside or kernel.wrap) and holds[(0, *there)]:
+                counted.append(there)
+    return Read(
+        text,
+        plain(ruleset, expr.kind, value),
+        show_at_cell(ruleset, expr.kind, value),
+        None if expr.op in ("param", "coordinate") else place,
+        element,
+        tuple(counted),
+    )
+
+
+def plain(ruleset: Ruleset, kind: Kind, value: Any) -> Any:
+    """A cell's value as plain data: elements by name, directions as rules name them, the rest as numbers.
+
+    JSON has no infinities, which values within a pass may be: these are text.
+    """
+    if kind.name in ("element", "direction"):
+        return show_at_cell(ruleset, kind, value)
+    numbers = np.asarray(value).tolist()
+    if isinstance(numbers, list):
+        return [number if isfinite(number) else str(number) for number in numbers]
+    return bool(numbers) if kind.name == "flag" else numbers if isfinite(numbers) else str(numbers)
+
+
+def show_at_cell(ruleset: Ruleset, kind: Kind, value: Any) -> str:
+    """A cell's value as a rule file would write it; draws in per cent, as chances are."""
+    number = np.asarray(value).tolist()
+    match kind.name:
+        case "element" | "flag" | "direction" | "chance":
+            return show_value(ruleset, kind, number)
+        case "draw":
+            return f"{number * 100:.6g}%"
+        case "vec2":
+            return "({:.7g}, {:.7g})".format(*number)
+    return str(number) if kind.name == "int" else f"{number:.7g}"
+
+
+# Traces
 
 
 @dataclass(frozen=True)
@@ -317,33 +425,31 @@ def trace(
     if step < 1:
         raise ValueError("the first step is step 1")
     wanted = _slots(world, of)
-    alone = world.select([number])
-    cell = (row, column)
+    alone, cell = world.select([number]), (row, column)
     recorded = record_step(world.sim.step(alone, step - 1), cell)
-    names = {slot.name for slot in wanted}
-    writes = [write for write in recorded.writes if write.slot.name in names]
-    lines = {(write.rule.span, write.substep.pass_.name) for write in writes if write.rule and write.substep}
-    misses = _misses(recorded, sorted(names), every_rule)
+    writes = [write for write in recorded.writes if write.slot.name in wanted]
+    misses = _misses(recorded, sorted(wanted), every_rule)
     if not every_rule:
-        misses = [one for one in misses if (one.rule.span, one.rule.pass_name) not in lines]
+        lines = {(write.rule.span, write.rule.pass_name) for write in writes if write.rule}
+        misses = [miss for miss in misses if (miss.rule.span, miss.rule.pass_name) not in lines]
     return Trace(
         world.sim.ruleset,
         number,
         cell,
         int(alone.step[0]) + step,
-        tuple(wanted),
-        {name: pick(array, cell) for name, array in recorded.begin.items() if name in names},
-        {name: pick(array, cell) for name, array in recorded.end.items() if name in names},
+        tuple(wanted.values()),
+        {name: pick(array, cell) for name, array in recorded.begin.items() if name in wanted},
+        {name: pick(array, cell) for name, array in recorded.end.items() if name in wanted},
         tuple(writes),
         tuple(misses),
     )
 
 
-def _slots(world: World, names: Iterable[str] | None) -> list[Slot]:
+def _slots(world: World, names: Iterable[str] | None) -> dict[str, Slot]:
     """The slots of some names, or all of the state. Raises KeyError."""
-    known, ruleset = {slot.name: slot for slot in world.sim.slots}, world.sim.ruleset
+    known, ruleset = dict(world.sim.slot_by_name), world.sim.ruleset
     if names is None:
-        return list(known.values())
+        return known
     for pass_ in ruleset.passes:
         known |= scratch_slots(pass_)
     wanted = list(dict.fromkeys(slot_name(ruleset, name) for name in names))
@@ -352,138 +458,46 @@ def _slots(world: World, names: Iterable[str] | None) -> list[Slot]:
             raise KeyError(f"`{name}` follows from the element: ask for `element`")
         if name not in known:
             raise KeyError("; ".join([f"no field `{name}`", *suggest(name, known, "fields")]))
-    return [known[name] for name in wanted]
+    return {name: known[name] for name in wanted}
 
 
 def _misses(step: RecordedStep, names: Sequence[str], every_rule: bool) -> list[Miss]:
     """Rules that did not happen where they would have written the cell. Unless all are asked for, a line counts once a cell."""
-    found: dict[Any, Miss] = {}
+    misses: dict[Any, Miss] = {}
     for substep in step.substeps:
         for rule in substep.rules:
-            places = dict.fromkeys(
-                place
-                for name in names
-                if name in substep.table
-                for place in anchors(rule.rule, step.cell, substep, name)
-            )
-            for place in places:
+            offsets = [offset for name in names for offset in _writes_at(rule.rule, substep.table.get(name))]
+            for place in dict.fromkeys(substep.near(step.cell, offset, -1) for offset in offsets):
                 key = (rule.number if every_rule else (rule.span, rule.pass_name), place)
-                if key in found or substep.happened(rule.rule, place):
+                if key in misses or substep.happened(rule.rule, place):
                     continue
-                parts = _parts(rule.rule, substep, place)
+                parts = substep.parts(rule.rule, place)
                 failed = list(islice((part for part in parts if not part.holds), 2))
                 # Of a rule that nearly happened one part fails, which is not what element the cell is, or none.
                 nearly = len(failed) == 1 and len(parts) > 1 and not failed[0].about_itself
                 if every_rule or nearly or not failed:
-                    found[key] = Miss(rule, place, parts, substep.moment.policy)
-    return list(found.values())
+                    misses[key] = Miss(rule, place, parts, substep.policy)
+    return list(misses.values())
 
 
-# Conditions
+def _writes_at(rule: Rule, slot: Slot | None) -> Iterator[Offset]:
+    """Where a rule writes a slot, from the cell in which its condition holds."""
+    if slot is None:
+        return
+    if isinstance(rule, Assign):
+        if rule.field == slot.name:
+            yield rule.offset
+        return
+    if slot.travels:
+        yield HERE
+        if isinstance(rule, (Swap, Move)):
+            yield rule.offset
+    for effect in rule.effects:
+        if effect.field == slot.name:
+            yield effect.offset
 
 
-def _parts(rule: Rule, substep: RecordedSubstep, cell: Cell) -> tuple[Part, ...]:
-    """A rule's condition in one cell, split at its `and`s. Flags fixed by `let` are split too, as they were fixed."""
-    assert rule.mask is not None
-    return tuple(_apart(Part(rule.mask, substep.at, "", substep, cell)))
-
-
-def _apart(part: Part) -> Iterator[Part]:
-    expr, substep = part.expr, part.substep
-    if expr.op == "and":
-        for arg in expr.args:
-            yield from _apart(Part(arg, part.at, part.of, substep, part.cell))
-    elif expr.op == "let" and expr.kind == FLAG:
-        let, found = substep.lets[expr.value]
-        yield from _apart(Part(let.value, found, _written(expr.value), substep, part.cell))
-    elif not (expr.op == "const" and expr.value):
-        yield part
-
-
-def _written(name: str) -> str:
-    """The name of a `let` in the file: copies under loops are numbered."""
-    return name.partition("#")[0]
-
-
-def _reads(
-    expr: Expr, at: reference.Context, cell: Cell, offset: Offset, substep: RecordedSubstep
-) -> Iterator[Read]:
-    if expr.op == "look":
-        dy, dx = expr.value
-        yield from _reads(expr.args[0], at, cell, (offset[0] + dy, offset[1] + dx), substep)
-    elif expr.op not in _LEAVES:
-        for arg in expr.args:
-            yield from _reads(arg, at, cell, offset, substep)
-    else:
-        yield _leaf(expr, at, substep.near(cell, offset), offset, substep)
-        if expr.op == "let" and expr.value in substep.lets:
-            let, found = substep.lets[expr.value]
-            yield from _reads(let.value, found, cell, offset, substep)
-
-
-def _leaf(expr: Expr, at: reference.Context, place: Cell, offset: Offset, substep: RecordedSubstep) -> Read:
-    ruleset = at.ruleset
-    value = value_at(expr, at, place)
-    if expr.op == "element" and offset != HERE:
-        text = show_offset(offset)
-    else:
-        text = _written(show_expr(ruleset, look(expr, offset)))
-    element = None
-    if expr.op == "property" or (expr.op in ("field", "let") and offset != HERE):
-        element = element_name(ruleset, int(value_at(Expr("element", ELEMENT), at, place)))
-    return Read(
-        text,
-        plain(ruleset, expr.kind, value),
-        show_at_cell(ruleset, expr.kind, value),
-        None if expr.op in ("param", "coordinate") else place,
-        element,
-        tuple(_counted(expr, at, place, substep)) if expr.op == "count" else (),
-    )
-
-
-def _counted(expr: Expr, at: reference.Context, place: Cell, substep: RecordedSubstep) -> Iterator[Cell]:
-    """The neighbors that a count found: those with a weight where its argument holds."""
-    holds = reference.evaluate(expr.args[0], at)
-    kernel = expr.value
-    for dy, dx, weight in kernel.weights[: 1 << 10]:
-        there = substep.near(place, (dy, dx))
-        inside = there == (place[0] + dy, place[1] + dx)
-        if weight and (inside or kernel.wrap) and holds[(0, *there)]:
-            yield there
-
-
-def plain(ruleset: Ruleset, kind: Kind, value: Any) -> Any:
-    """A cell's value as plain data: elements by name, directions as rules name them, the rest as numbers."""
-    if kind.name == "element":
-        return element_name(ruleset, int(value))
-    if kind.name == "direction":
-        return show_at_cell(ruleset, kind, value)
-    if kind.name == "flag":
-        return bool(value)
-    numbers = np.asarray(value).tolist()
-    return [_finite(one) for one in numbers] if isinstance(numbers, list) else _finite(numbers)
-
-
-def _finite(number: float) -> float | str:
-    """JSON has no infinities; values within a pass may be infinite."""
-    return number if isfinite(number) else str(number)
-
-
-def show_at_cell(ruleset: Ruleset, kind: Kind, value: Any) -> str:
-    """A cell's value as a rule file would write it; draws in per cent, as chances are."""
-    if kind.name in ("element", "flag", "direction"):
-        return show_value(ruleset, kind, int(value))
-    if kind.name == "chance":
-        return show_value(ruleset, kind, float(value))
-    if kind.name == "draw":
-        return f"{float(value) * 100:.6g}%"
-    if kind.name == "vec2":
-        return "({:.7g}, {:.7g})".format(*(float(part) for part in value))
-    return str(int(value)) if kind.name == "int" else f"{float(value):.7g}"
-
-
-SCHEMA = 1
-"""The version of the plain data. It increases when a key changes its meaning or is removed."""
+# Text
 
 MAX_MISSES = 12
 """The most rules that nearly happened in a text, unless all are asked for."""
@@ -506,7 +520,7 @@ def trace_text(trace: Trace, *, color: bool = False, every_rule: bool = False) -
     if again:
         blocks.append("\n".join(["written again, as it was:", *again]))
     shown = trace.misses if every_rule else trace.misses[:MAX_MISSES]
-    blocks += [_miss_text(trace, one, color) for one in shown]
+    blocks += [_miss_text(trace, miss, color) for miss in shown]
     if len(shown) < len(trace.misses):
         blocks.append(f"{len(trace.misses) - len(shown)} more rules nearly happened: --all")
     return "\n\n".join(blocks)
@@ -524,14 +538,14 @@ def _head(trace: Trace) -> str:
     for slot in trace.slots:
         if slot.name not in trace.after:
             continue  # a scratch field lives in its pass
-        before, after = _values(trace, slot, trace.before[slot.name], trace.after[slot.name])
+        before, after = (
+            show_at_cell(trace.ruleset, slot.kind, values[slot.name])
+            for values in (trace.before, trace.after)
+        )
         rule = trace.writer(slot.name)
         by = f", by {rule.place}" if rule else ""
-        lines.append(
-            f"  {slot.name}: {before} -> {after}{by}"
-            if before != after
-            else f"  {slot.name}: {after}, as before"
-        )
+        change = f"{after}, as before" if before == after else f"{before} -> {after}{by}"
+        lines.append(f"  {slot.name}: {change}")
     if not any(write.rule for write in trace.writes):
         lines.append("  no rule wrote it")
     return "\n".join(map(printable, lines))
@@ -541,71 +555,62 @@ def _writes_text(trace: Trace, writes: list[Write], color: bool) -> str:
     lines = []
     for write in writes:
         if write.changed:
-            before, after = _values(trace, write.slot, write.before, write.after)
+            before, after = (
+                show_at_cell(trace.ruleset, write.slot.kind, value) for value in (write.before, write.after)
+            )
             moved = f", moved here from {_at(write.source)}" if write.source else ""
             lines.append(_painted(f"{write.slot.name}: {before} -> {after}", "32;1", color) + moved)
     first = writes[0]
-    rule, cell = first.rule, first.cell
-    if rule is None or cell is None:
-        return "\n".join([*lines, f"  = {HOW[first.how]}"])
-    notes = [_rule_note(rule, cell, trace.cell), *(_part_text(part, cell) for part in first.parts)]
-    return "\n".join([*lines, *_source(notes, Label(rule.span))])
+    if first.rule is None or first.cell is None:
+        return "\n".join([*lines, f"  = {_WITHOUT_RULE[first.how]}"])
+    return "\n".join(lines + _source(trace, first.rule, first.cell, first.parts, [Label(first.rule.span)]))
 
 
 def _miss_text(trace: Trace, miss: Miss, color: bool) -> str:
     span = miss.rule.span
-    labels = [Label(part.span or span, _reads_text(part, miss.cell)) for part in miss.failed]
+    labels = [Label(part.span or span, _reads_text(part)) for part in miss.failed]
     if not labels:
         labels = [Label(span, "all of its condition holds: it gave way to a rule that claims a cell too")]
     elif all(label.span and label.span.line != span.line for label in labels):
         labels.append(Label(span, ""))
-    notes = [_rule_note(miss.rule, miss.cell, trace.cell)]
-    notes += [_part_text(part, miss.cell) for part in miss.parts if part.holds]
     head = _painted("almost" if len(miss.failed) <= 1 else "not", "33;1", color)
     but = " and ".join(f"`{part.text}`" for part in miss.failed) or f"`conflicts: {miss.policy}`"
-    return "\n".join([f"{head}, but for {printable(but)}", *_source(notes, *labels)])
+    held = [part for part in miss.parts if part.holds]
+    return "\n".join(
+        [f"{head}, but for {printable(but)}", *_source(trace, miss.rule, miss.cell, held, labels)]
+    )
 
 
-def _source(notes: list[str], *labels: Label) -> list[str]:
-    """The source lines of labels, and notes below them."""
+def _source(
+    trace: Trace, rule: NumberedRule, asked: Cell, held: Iterable[Part], labels: list[Label]
+) -> list[str]:
+    """The source lines of labels, and below them the rule and the parts of its condition that hold."""
+    label = f" ({rule.label})" if rule.label else ""
+    where = f", asked at {_at(asked)}" if asked != trace.cell else ""
+    notes = [f"pass {rule.pass_name} of {rule.pack}, substep {rule.moment + 1}{label}{where}"]
+    for part in held:
+        values = _reads_text(part)
+        come = f" (`{part.of}`, {place_of(part.span)})" if part.of and part.span else ""
+        notes.append(f"holds: {part.text}{come}{'; ' if values else ''}{values}")
     lines, gutter = source_lines(labels)
     return [*lines, *(f"{' ' * gutter} = {printable(note)}" for note in notes)]
 
 
-def _rule_note(rule: NumberedRule, asked: Cell, cell: Cell) -> str:
-    label = f" ({rule.label})" if rule.label else ""
-    where = f", asked at {_at(asked)}" if asked != cell else ""
-    return f"pass {rule.pass_name} of {rule.pack}, substep {rule.moment + 1}{label}{where}"
-
-
-def _part_text(part: Part, asked: Cell) -> str:
-    """`holds: text; values`."""
-    values = _reads_text(part, asked)
-    come = f" (`{part.of}`, {place_of(part.span)})" if part.of and part.span else ""
-    return f"{'holds' if part.holds else 'fails'}: {part.text}{come}{'; ' if values else ''}{values}"
-
-
-def _reads_text(part: Part, asked: Cell) -> str:
-    return ", ".join(_read_text(read, asked) for read in part.reads)
-
-
-def _read_text(read: Read, asked: Cell) -> str:
-    text = f"{read.text} is {read.shown}"
-    there = _at(read.cell) if read.cell and read.cell != asked else ""
-    where = " at ".join(filter(None, [read.element, there]))
-    if read.counted:
-        cells = " ".join(_at(cell) for cell in read.counted[:MAX_CELLS])
-        where = cells + (" …" if len(read.counted) > MAX_CELLS else "")
-    return f"{text} ({where})" if where else text
+def _reads_text(part: Part) -> str:
+    texts = []
+    for read in part.reads:
+        there = _at(read.cell) if read.cell and read.cell != part.cell else ""
+        where = " at ".join(filter(None, [read.element, there]))
+        if read.counted:
+            more = " …" if len(read.counted) > MAX_CELLS else ""
+            where = " ".join(map(_at, read.counted[:MAX_CELLS])) + more
+        texts.append(f"{read.text} is {read.shown}" + (f" ({where})" if where else ""))
+    return ", ".join(texts)
 
 
 def _at(cell: Cell) -> str:
     """`row,column`."""
     return f"{cell[0]},{cell[1]}"
-
-
-def _values(trace: Trace, slot: Slot, *values: object) -> list[str]:
-    return [show_at_cell(trace.ruleset, slot.kind, value) for value in values]
 
 
 def _painted(text: str, style: str, color: bool) -> str:
@@ -614,9 +619,17 @@ def _painted(text: str, style: str, color: bool) -> str:
 
 # Plain data
 
+SCHEMA = 1
+"""The version of the plain data. It increases when a key changes its meaning or is removed."""
+
 
 def trace_data(trace: Trace) -> dict[str, Any]:
     """Rows and columns count from 0, steps, lines, columns of text, rules and substeps from 1."""
+
+    def change(slot: Slot, before: Any, after: Any) -> dict[str, Any]:
+        values = {"before": before, "after": after}
+        return {key: plain(trace.ruleset, slot.kind, value) for key, value in values.items()}
+
     return {
         "schema": SCHEMA,
         "ruleset": trace.ruleset.name,
@@ -624,24 +637,20 @@ def trace_data(trace: Trace) -> dict[str, Any]:
         "cell": trace.cell,
         "step": trace.step,
         "slots": {
-            slot.name: {
-                "before": plain(trace.ruleset, slot.kind, trace.before[slot.name]),
-                "after": plain(trace.ruleset, slot.kind, trace.after[slot.name]),
-                "writer": _rule_data(trace.writer(slot.name)),
-            }
+            slot.name: change(slot, trace.before[slot.name], trace.after[slot.name])
+            | {"writer": _rule_data(trace.writer(slot.name))}
             for slot in trace.slots
             if slot.name in trace.after
         },
         "writes": [
             {
                 "slot": write.slot.name,
-                "before": plain(trace.ruleset, write.slot.kind, write.before),
-                "after": plain(trace.ruleset, write.slot.kind, write.after),
+                **change(write.slot, write.before, write.after),
                 "how": write.how,
                 "rule": _rule_data(write.rule),
                 "cell": write.cell,
                 "source": write.source,
-                "parts": list(map(_part_data, write.parts)),
+                "parts": _parts_data(write.parts),
             }
             for write in trace.writes
         ],
@@ -649,8 +658,8 @@ def trace_data(trace: Trace) -> dict[str, Any]:
             {
                 "rule": _rule_data(miss.rule),
                 "cell": miss.cell,
-                "failed": list(map(_part_data, miss.failed)),
-                "held": [_part_data(part) for part in miss.parts if part.holds],
+                "failed": _parts_data(miss.failed),
+                "held": _parts_data(part for part in miss.parts if part.holds),
                 "gave_way": miss.policy if not miss.failed else None,
             }
             for miss in trace.misses
@@ -672,19 +681,118 @@ def _rule_data(rule: NumberedRule | None) -> dict[str, Any] | None:
     }
 
 
-def _part_data(part: Part) -> dict[str, Any]:
-    return {
-        "text": part.text,
-        "holds": part.holds,
-        "let": part.of or None,
-        **_place(part.span),
-        "reads": [
-            {name: value for name, value in vars(read).items() if name != "shown"} for read in part.reads
-        ],
-    }
+def _parts_data(parts: Iterable[Part]) -> list[dict[str, Any]]:
+    return [
+        {
+            "text": part.text,
+            "holds": part.holds,
+            "let": part.of or None,
+            **_place(part.span),
+            "reads": [
+                {name: value for name, value in vars(read).items() if name != "shown"} for read in part.reads
+            ],
+        }
+        for part in parts
+    ]
 
 
 def _place(span: Span | None) -> dict[str, Any]:
     if span is None:
         return {"file": None, "line": None, "column": None}
     return {"file": span.source.name, "line": span.line, "column": span.column}
+
+
+# All cells at once
+
+SLOT = "last writer"
+"""The field of the numbers. Names in rule files have no blanks, so none is the same."""
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Worlds after a step, and what wrote their elements in it.
+
+    `numbers` is int16 [B, H, W] on the worlds' device: the number of the rule in `rules` that last wrote the element
+    of a cell in the last step, 0 where none did. A rule that writes the element that was there counts too.
+    """
+
+    world: World
+    numbers: Array
+    rules: tuple[NumberedRule, ...]
+
+    def rule_at(self, row: int, column: int, world: int = 0) -> NumberedRule | None:
+        """The rule that last wrote a cell's element; None if there is none. Raises IndexError outside the grid."""
+        number = int(self.numbers[world, row, column])
+        return self.rules[number - 1] if number else None
+
+
+class Recorder:
+    """Steps worlds of a simulator and records which rules wrote their elements. Compiles the rules once more."""
+
+    def __init__(self, sim: Simulator):
+        self.sim = sim
+        self.rules = numbered_rules(sim.ruleset)
+        self._marked = sim.of(_marked(sim.ruleset))
+
+    def step(self, world: World, steps: int = 1, **options: Any) -> Provenance:
+        """Like `Simulator.step`, which takes the same options, gives the same worlds and raises the same errors.
+
+        After 0 steps no rule has written.
+        """
+        self.sim.check(world)
+        xp = self.sim.kind.xp
+        dtype = getattr(xp, self._marked.slot_by_name[SLOT].dtype)
+        nothing = xp.asarray(xp.zeros_like(world.ids), dtype=dtype)
+        start = replace(world, sim=self._marked, state={**world.state, SLOT: nothing})
+        end = self._marked.step(start, steps, **options)
+        state = dict(end.state)
+        numbers = xp.asarray(state.pop(SLOT), dtype=xp.int16)
+        return Provenance(replace(end, sim=self.sim, state=state), numbers, self.rules)
+
+
+def _marked(ruleset: Ruleset) -> Ruleset:
+    """The same rules, with a field that holds the number of the rule that last wrote a cell's element in this step."""
+    numbers = iter(range(1, 1 << 31))
+    passes = []
+    for pass_ in ruleset.passes:
+        moments = []
+        for moment in pass_.moments:
+            numbered = list(zip(moment.rules, numbers, strict=False))
+            if moment.policy in ("prove", "overwrite"):
+                rules = (*moment.rules, *_marks_in_order(numbered))
+            else:  # of the cells that rules claim each has one writer
+                rules = tuple(_marked_rule(rule, number) for rule, number in numbered)
+            moments.append(replace(moment, rules=rules))
+        passes.append(replace(pass_, moments=tuple(moments)))
+    kind = integer(0, max(1, next(numbers) - 1))
+    slot = Field(SLOT, kind, 0, "place", True, None, ruleset.elements[0].pack, ruleset.elements[0].span)
+    return replace(ruleset, fields=(*ruleset.fields, slot), passes=tuple(passes))
+
+
+def _marks_in_order(numbered: Sequence[tuple[Rule, int]]) -> Iterator[Assign]:
+    """Assignments of the numbers of rules that all happen where their conditions hold, in the order of their writes.
+
+    What becomes of cells, or is left behind, is written before anything arrives.
+    """
+    for rule, number in numbered:
+        if isinstance(rule, (Transform, Move)):
+            yield _mark(number, HERE, rule.mask, rule)
+    for rule, number in numbered:
+        if isinstance(rule, (Swap, Move)):
+            yield _mark(number, rule.offset, rule.mask, rule)
+        if isinstance(rule, Swap):
+            yield _mark(number, HERE, rule.mask, rule)
+
+
+def _mark(number: int, place: Offset, mask: Expr | None, rule: Rule) -> Assign:
+    value = Expr("const", integer(number, number), value=number)
+    return Assign(SLOT, place, ":=", value, mask, rule.span)
+
+
+def _marked_rule(rule: Rule, number: int) -> Rule:
+    """The rule with effects that leave its number in every cell whose element it writes."""
+    if isinstance(rule, Assign):
+        return rule  # assignments never write elements
+    places = [rule.offset, HERE] if isinstance(rule, (Swap, Move)) else [HERE]
+    marks = tuple(_mark(number, place, None, rule) for place in places)
+    return replace(rule, effects=(*rule.effects, *marks))

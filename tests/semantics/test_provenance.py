@@ -9,9 +9,8 @@ import pytest
 
 from powderdsl.compiler import load
 from powderdsl.model.types import Ruleset
-from powderdsl.simulation.provenance import SLOT, Provenance, Recorder
 from powderdsl.simulation.simulator import compile
-from powderdsl.simulation.tracing import record_step
+from powderdsl.simulation.tracing import SLOT, Provenance, Recorder, record_step
 from powderdsl.testing.generators.cases import Start, random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.fuzz import STARTS_AT_ONCE
