@@ -58,7 +58,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "targets.cuda": ("diagnostics", "system", "ir", "schedule", "targets", "targets.torch", "targets.cpp"),
     "compiler": _COMPILER[:-1],
     "simulation": (),
-    "simulation.draw": _FRONT,
+    "simulation.draw": (*_FRONT, "targets"),
     "simulation.state_checks": (*_FRONT, "targets"),
     "simulation.native": _BACK,
     "simulation.programs": (*_BACK, "simulation.native"),

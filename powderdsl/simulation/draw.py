@@ -13,9 +13,7 @@ from typing import Any
 
 from powderdsl.arrays import NDArray, np
 from powderdsl.model.types import ColorRamp, Element, Field, Ruleset
-
-Array = Any
-"""A NumPy array or a torch tensor. Torch is imported only once a tensor is given."""
+from powderdsl.targets.array_kind import Array, ArrayKind
 
 OUTLINES = ((255, 0, 160), (0, 160, 255), (255, 160, 0), (0, 200, 80))
 """Colors of regions, in their order in the file; they repeat after the fourth."""
@@ -75,26 +73,6 @@ def _shares(color: str) -> tuple[float, float, float]:
     return red, green, blue
 
 
-def tint_cells(image: Array, vectors: Array, tint: CellTint) -> None:
-    """Tint pictures uint8 [..., H, W, 3] in place by vectors float32 [..., 2, H, W], NumPy arrays or tensors.
-
-    Each operation is one of float32, and bytes are cut off, so that all libraries and the page draw the same bytes.
-    """
-    here = not _is_tensor(vectors) or vectors.device.type == "cpu"  # asking a GPU would mean waiting for it
-    if here and not bool((vectors != 0).any()):
-        return
-    row, column = vectors[..., 0, :, :], vectors[..., 1, :, :]
-    share = row * row + column * column
-    share = (share.sqrt() if _is_tensor(share) else np.sqrt(share)) / tint.full
-    share = share.clip(max=tint.most) if _is_tensor(share) else np.minimum(share, np.float32(tint.most))
-    rest = 1 - share
-    for channel, color in enumerate(tint.color):
-        part = image[..., channel]
-        part = part.float() if _is_tensor(part) else part.astype(np.float32)
-        part = (part / 255 * rest + share * color) * 255
-        image[..., channel] = part if _is_tensor(part) else part.astype(np.uint8)
-
-
 def shown_fields(ruleset: Ruleset) -> tuple[str, ...]:
     """The fields that pictures of its worlds show."""
     followed = {ramp.field for ramp in ramps(ruleset.elements)}
@@ -147,27 +125,50 @@ def _beside(value: float, way: int) -> float:
 
 def rgb(
     ids: Array,
-    colors: NDArray[np.uint8],
+    colors: Array,
     *,
     ramps: Sequence[Ramp] = (),
     tints: Sequence[CellTint] = (),
     fields: Mapping[str, Array] | None = None,
-) -> NDArray[np.uint8]:
+    kind: ArrayKind | None = None,
+) -> Array:
     """Pictures uint8 [..., H, W, 3] of ids [..., H, W], which all have a color: [n, 3], as of `palette`.
 
     With `ramps`, cells of their elements have the color of their value in `fields`, arrays [..., H, W] by name. With
-    `tints`, cells are tinted by vectors in `fields`, float [..., 2, H, W], after that and in order.
+    `tints`, cells are tinted by vectors in `fields`, float [..., 2, H, W], after that and in order. Everything is of
+    `kind`; without one, ids and fields may be tensors too, and pictures are NumPy arrays.
     """
-    cells = to_numpy(ids)
-    image = colors[cells]
-    values = {name: to_numpy(value) for name, value in (fields or {}).items()}
+    values = fields or {}
+    if kind is None:
+        kind, ids = ArrayKind(), to_numpy(ids)
+        values = {name: to_numpy(value) for name, value in values.items()}
+    xp = kind.xp
+    image = kind.entries(colors[:, :3], ids)
     for ramp in ramps:
-        ramped = cells == ramp.id
-        reached = values[ramp.field][ramped].astype(ramp.starts.dtype)
-        image[ramped] = ramp.colors[np.searchsorted(ramp.starts, reached, side="right")]
+        field = kind.contiguous(xp.asarray(values[ramp.field], dtype=ramp.starts.dtype))
+        reached = xp.searchsorted(ramp.starts, field, side="right")
+        image = xp.where((ids == ramp.id)[..., None], kind.entries(ramp.colors[:, :3], reached), image)
     for tint in tints:
-        tint_cells(image, values[tint.field].astype(np.float32), tint)
+        tint_cells(kind, image, values[tint.field], tint)
     return image
+
+
+def tint_cells(kind: ArrayKind, image: Array, vectors: Array, tint: CellTint) -> None:
+    """Tint pictures uint8 [..., H, W, 3] in place by vectors [..., 2, H, W].
+
+    Each operation is one of float32, and bytes are cut off, so that all libraries and the page draw the same bytes.
+    """
+    xp = kind.xp
+    vectors = xp.asarray(vectors, dtype=xp.float32)
+    if kind.on_cpu and not bool((vectors != 0).any()):  # asking a GPU would mean waiting for it
+        return
+    row, column = vectors[..., 0, :, :], vectors[..., 1, :, :]
+    share = xp.clip(xp.sqrt(row * row + column * column) / tint.full, 0, tint.most)
+    rest = 1 - share
+    for channel, color in enumerate(tint.color):
+        part = xp.asarray(image[..., channel], dtype=xp.float32)
+        part = (part / 255 * rest + share * color) * 255
+        image[..., channel] = xp.asarray(part, dtype=xp.uint8)
 
 
 def scale(image: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
@@ -209,12 +210,8 @@ def outline(
 
 def to_numpy(image: Array) -> NDArray[Any]:
     """An array, or a tensor on any device, as a NumPy array."""
-    return image.detach().cpu().numpy() if _is_tensor(image) else np.asarray(image)
-
-
-def _is_tensor(value: object) -> bool:
     # Asking torch itself would import it for people who only use arrays.
-    return hasattr(value, "detach")
+    return image.detach().cpu().numpy() if hasattr(image, "detach") else np.asarray(image)
 
 
 def _components(color: str) -> tuple[int, int, int]:

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
-from typing import Any
+from itertools import groupby
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,10 +18,11 @@ from torch import Tensor
 from powderdsl.ir.lower import ir_type, part_names
 from powderdsl.ir.ops import component_of
 from powderdsl.model.state import Slot, property_dtype, property_values, slots
-from powderdsl.model.types import MatrixChannel, Ruleset
-from powderdsl.simulation.draw import CellTint, Ramp, palette, ramps, tint_cells, tints
+from powderdsl.model.types import Ruleset
+from powderdsl.simulation.draw import Ramp, palette, ramps, rgb, tints
 from powderdsl.targets.cpp.program import PackedState
 from powderdsl.targets.job import shape_of
+from powderdsl.targets.tensor_kind import Tensors
 from powderdsl.targets.words import pack, word_count
 
 State = Mapping[str, Tensor]
@@ -29,17 +31,13 @@ SHIFT = 20
 """Low bits of a float32 that a code of `compact` drops: three bits of the mantissa remain."""
 
 
-@dataclass(frozen=True)
-class Channel:
-    """Where one channel of cells in float32 comes from.
+class Channel(NamedTuple):
+    """A channel of `matrix`: 1 where the element has the id `one_hot`; the values of a slot, or of its component
+    ``name.row``, if `read`; or else what a table says of the slot's numbers."""
 
-    `kind` is ``zero``; ``one_hot``, 1 where the slot has the number `value`; ``table``, entry `value` of the tables at
-    the slot's number; or ``slot``, the slot's value. Components of vectors have slots of their own: ``name.row``.
-    """
-
-    kind: str
-    slot: str = ""
-    value: int = 0
+    slot: str
+    one_hot: int | None = None
+    read: bool = False
 
 
 class Observer:
@@ -57,7 +55,7 @@ class Observer:
 
     @torch.no_grad()
     def read(self, state: State, name: str, out: Any = None) -> Tensor:
-        """A slot. Raises ValueError, TypeError: the buffer does not fit."""
+        """A slot."""
         slot, (batch, height, width) = self.slots[name], shape_of(state)
         shape = (batch, 2, height, width) if slot.planes == 2 else (batch, height, width)
         return _write_slot(state, name, self.buffer(out, shape, getattr(torch, slot.dtype)))
@@ -66,16 +64,21 @@ class Observer:
     def rgb(self, state: State, out: Any = None) -> Tensor:
         """Pictures uint8 [B, H, W, 3], a pixel a cell, in the elements' colors, which may follow fields; then tints."""
         out, colors = self.buffer(out, (*shape_of(state), 3), torch.uint8), self._palette
-        if isinstance(state, PackedState):
-            library, (slot, bits, _) = state.program.library, state.program.planes_of("element")
-            library.pd_rgb(state.handle, slot, bits, colors.data_ptr(), out.data_ptr(), out.stride(0))
-        else:
-            ids = state["element"].flatten().int()
-            out.copy_(colors[:, :3].index_select(0, ids).view(out.shape))  # faster than an index
+        if not isinstance(state, PackedState):
+            looks: Any = {"ramps": self._ramps, "tints": self._tints, "fields": state}
+            return out.copy_(rgb(state["element"], colors, kind=Tensors(self.device), **looks))
+        program = state.program
+        slot, bits, _ = program.planes_of("element")
+        _native(state, "rgb", out, slot, bits, colors)
         for ramp in self._ramps:
-            _write_ramp(state, ramp, out)
+            real = ramp.starts.dtype == torch.float32
+            field = (program.layout.reals[ramp.field], 0, 0) if real else program.planes_of(ramp.field)
+            places = slot, bits, ramp.id, int(real), *map(int, field), len(ramp.starts)
+            _native(state, "ramp", out, *places, ramp.starts, ramp.colors)
         for tint in self._tints:
-            _write_tint(state, tint, out)
+            row, column = (program.layout.reals[piece.slot] for piece in program.pieces[tint.field])
+            numbers = torch.tensor([*tint.color, tint.full, tint.most])
+            _native(state, "tint", out, row, column, numbers)
         return out
 
     @torch.no_grad()
@@ -85,34 +88,19 @@ class Observer:
         channels, tables = self._channels
         out = self.buffer(out, (batch, len(channels), height, width), torch.float32)
         if isinstance(state, PackedState):
-            wanted = torch.tensor([_native_channel(one, state) for one in channels], dtype=torch.int32)
-            state.program.library.pd_channels(
-                state.handle,
-                len(channels),
-                wanted.data_ptr(),
-                tables.data_ptr(),
-                out.data_ptr(),
-                out.stride(0),
-            )
-            return out
-        at = 0
-        while at < len(channels):
-            channel, end = channels[at], at + 1
-            if channel.kind == "one_hot":  # consecutive numbers together
-                while end < len(channels) and channels[end] == replace(
-                    channel, value=channel.value + end - at
-                ):
-                    end += 1
-                last = channel.value + end - at
-                numbers = torch.arange(channel.value, last, device=out.device, dtype=torch.uint8)
-                out[:, at:end] = state[channel.slot][:, None] == numbers[:, None, None]
-            elif channel.kind == "table":
-                out[:, at] = tables[channel.value][state[channel.slot].int()]
-            elif channel.kind == "slot":
-                out[:, at] = _component(state, channel.slot)
+            wanted = [_native_channel(channel, at, state) for at, channel in enumerate(channels)]
+            numbers = torch.tensor(wanted, dtype=torch.int32)
+            return _native(state, "channels", out, len(channels), numbers, tables)
+        ids = state["element"].flatten().int()
+        for read, run in groupby(range(len(channels)), lambda at: channels[at].read):
+            first, *others = run
+            places = slice(first, first + len(others) + 1)
+            if read:
+                for at in (first, *others):
+                    out[:, at] = _component(state, channels[at].slot)
             else:
-                out[:, at] = 0
-            at = end
+                values = tables[places].index_select(1, ids)
+                out[:, places] = values.view(-1, batch, height, width).movedim(0, 1)
         return out
 
     @torch.no_grad()
@@ -130,13 +118,9 @@ class Observer:
         batch, height, width = shape_of(state)
         out = self.buffer(out, (batch, len(self._bits), height, word_count(width)), torch.int64)
         if isinstance(state, PackedState):
-            program = state.program
-            slots = [program.planes_of(name)[0] + bit for name, bit in self._bits]
-            numbers = torch.tensor(slots, dtype=torch.int32)
-            program.library.pd_planes(
-                state.handle, len(slots), numbers.data_ptr(), out.data_ptr(), out.stride(0)
-            )
-            return out
+            places = [state.program.planes_of(name)[0] + bit for name, bit in self._bits]
+            numbers = torch.tensor(places, dtype=torch.int32)
+            return _native(state, "planes", out, len(places), numbers)
         for place, (name, bit) in enumerate(self._bits):
             out[:, place] = pack((state[name] >> bit) & 1 != 0)
         return out
@@ -164,19 +148,12 @@ class Observer:
         byte there. Fields that do not last read as 0.
         """
         channels, tables = self._channels
-        sources, rows = [], []
-        for channel in channels:
-            name = channel.slot if channel.slot in self.compact_names else "element"
-            sources.append(self.compact_names.index(name))
-            row = torch.zeros(256, device=self.device)
-            if channel.kind == "one_hot":
-                row[channel.value] = 1
-            elif channel.kind == "table":
-                row = tables[channel.value]
-            elif channel.kind == "slot" and channel.slot == name:
-                row = self.compact_values[sources[-1]]
-            rows.append(row)
-        return tuple(sources), torch.stack(rows)
+        names, tables = self.compact_names, tables.clone()
+        sources = [names.index(channel.slot if channel.slot in names else "element") for channel in channels]
+        for at, channel in enumerate(channels):
+            if channel.read and channel.slot in names:
+                tables[at] = self.compact_values[sources[at]]
+        return tuple(sources), tables
 
     @property
     def plane_names(self) -> tuple[str, ...]:
@@ -210,11 +187,14 @@ class Observer:
     @cached_property
     def _ramps(self) -> tuple[Ramp, ...]:
         """As tensors, with four bytes a color."""
-        found = []
-        for ramp in ramps(self.ruleset.elements):
-            starts = torch.from_numpy(ramp.starts).to(self.device)
-            found.append(replace(ramp, starts=starts, colors=self._colors(ramp.colors, len(ramp.colors))))
-        return tuple(found)
+        return tuple(
+            replace(
+                ramp,
+                starts=torch.from_numpy(ramp.starts).to(self.device),
+                colors=self._colors(ramp.colors, len(ramp.colors)),
+            )
+            for ramp in ramps(self.ruleset.elements)
+        )
 
     def _colors(self, colors: Any, count: int) -> Tensor:
         """Colors uint8 [n, 3] with a fourth byte, and black up to `count` of them."""
@@ -224,23 +204,23 @@ class Observer:
 
     @cached_property
     def _channels(self) -> tuple[tuple[Channel, ...], Tensor]:
-        """The channels of `matrix:`, and the tables float32 [n, 256] of properties among them."""
-        properties: list[Tensor] = []
-        channels = tuple(self._channel_of(channel, properties) for channel in self.ruleset.matrix)
-        return channels, torch.stack(properties) if properties else torch.zeros(1, 256, device=self.device)
+        """The channels of `matrix:`, and a table for each, float32 [C, 256]: what it says of elements.
 
-    def _channel_of(self, channel: MatrixChannel, tables: list[Tensor]) -> Channel:
-        name = channel.source
-        if channel.id is not None:
-            return Channel("one_hot", "element", channel.id)
-        if name in self.slots:
-            return Channel("slot", f"{name}.{channel.part}" if channel.part else name)
-        prop = self.ruleset.property(name)
-        if prop is None:
-            return Channel("zero")
-        values = torch.tensor(property_values(self.ruleset, name), dtype=torch.float64)
-        tables.append(values.to(getattr(torch, property_dtype(prop))).float().to(self.device))
-        return Channel("table", "element", len(tables) - 1)
+        Tables of channels that are read, and of names that no loaded pack has, are zero.
+        """
+        channels = []
+        tables = torch.zeros(len(self.ruleset.matrix), 256)
+        for table, channel in zip(tables, self.ruleset.matrix, strict=True):
+            name, read = channel.source, channel.source in self.slots
+            slot = f"{name}.{channel.part}" if channel.part else name
+            channels.append(Channel(slot if read else "element", channel.id, read))
+            prop = self.ruleset.property(name)
+            if channel.id is not None:
+                table[channel.id] = 1
+            elif prop is not None and not read:
+                values = torch.tensor(property_values(self.ruleset, name), dtype=torch.float64)
+                table[:] = values.to(getattr(torch, property_dtype(prop)))
+        return tuple(channels), tables.to(self.device)
 
     def buffer(self, out: Any, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
         """The given buffer, if it fits, or a new one."""
@@ -266,32 +246,12 @@ def _write_slot(state: State, name: str, out: Tensor) -> Tensor:
     return out.copy_(state[name])
 
 
-def _write_ramp(state: State, ramp: Ramp, out: Tensor) -> None:
-    """Color the cells of a ramp's element in pictures uint8 [B, H, W, 3]; others stay."""
-    if isinstance(state, PackedState):
-        program = state.program
-        slot, bits, _ = program.planes_of("element")
-        real = ramp.starts.dtype == torch.float32
-        field = (program.layout.reals[ramp.field], 0, False) if real else program.planes_of(ramp.field)
-        program.library.pd_ramp(
-            state.handle, slot, bits, ramp.id, int(real), field[0], field[1], int(field[2]), len(ramp.starts),
-            ramp.starts.data_ptr(), ramp.colors.data_ptr(), out.data_ptr(), out.stride(0),
-        )  # fmt: skip
-        return
-    reached = torch.bucketize(state[ramp.field].to(ramp.starts.dtype), ramp.starts, right=True)
-    cells = (state["element"] == ramp.id)[..., None]
-    torch.where(cells, ramp.colors[:, :3][reached], out, out=out)
-
-
-def _write_tint(state: State, tint: CellTint, out: Tensor) -> None:
-    """Tint pictures uint8 [B, H, W, 3]."""
-    if isinstance(state, PackedState):
-        program = state.program
-        row, column = (program.layout.reals[piece.slot] for piece in program.pieces[tint.field])
-        numbers = torch.tensor([*tint.color, tint.full, tint.most])
-        program.library.pd_tint(state.handle, row, column, numbers.data_ptr(), out.data_ptr(), out.stride(0))
-    else:
-        tint_cells(out, state[tint.field], tint)
+def _native(state: PackedState, view: str, out: Tensor, *arguments: Any) -> Tensor:
+    """Let native code write a view of worlds into `out`; returns it."""
+    write = getattr(state.program.library, f"pd_{view}")
+    places = (one.data_ptr() if isinstance(one, Tensor) else one for one in (*arguments, out))
+    write(state.handle, *places, out.stride(0))
+    return out
 
 
 def _component(state: State, name: str) -> Tensor:
@@ -300,17 +260,15 @@ def _component(state: State, name: str) -> Tensor:
     return state[name] if component is None else state[vector][:, component]
 
 
-def _native_channel(channel: Channel, state: PackedState) -> tuple[int, int, int, int]:
+def _native_channel(channel: Channel, number: int, state: PackedState) -> tuple[int, int, int, int]:
     """A channel as native code has it: kind, first plane or float slot, planes, value."""
     program = state.program
-    if channel.kind == "zero":
-        return 0, 0, 0, 0
     if channel.slot in program.layout.reals:
         return 4, program.layout.reals[channel.slot], 0, 0
     slot, bits, signed = program.planes_of(channel.slot)
-    if channel.kind == "slot":
+    if channel.read:
         return 3, slot, bits, int(signed)
-    return (1 if channel.kind == "one_hot" else 2), slot, bits, channel.value
+    return (2, slot, bits, number) if channel.one_hot is None else (1, slot, bits, channel.one_hot)
 
 
 def _write_codes(state: State, slot: Slot, name: str, out: Tensor) -> None:
@@ -322,10 +280,7 @@ def _write_codes(state: State, slot: Slot, name: str, out: Tensor) -> None:
         return
     floor = _floor(slot)
     if isinstance(state, PackedState) and slot.dtype == "float32" and not state.has(slot.name):
-        program = state.program
-        program.library.pd_codes(
-            state.handle, program.layout.reals[name], floor, out.data_ptr(), out.stride(0)
-        )
+        _native(state, "codes", out, state.program.layout.reals[name], floor)
     else:
         value = (_component(state, name) if slot.planes == 2 else state[name]).to(torch.float32)
         one = torch.tensor(floor, device=out.device).view(torch.int32)
