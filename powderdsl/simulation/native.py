@@ -16,16 +16,16 @@ import hashlib
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from contextvars import copy_context
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from math import prod
 from pathlib import Path
 
 import torch
 
+from powderdsl.diagnostics import CompileError
 from powderdsl.ir.ops import Program
 from powderdsl.ir.segments import segments
 from powderdsl.model.fingerprint import fingerprint
@@ -48,9 +48,6 @@ from powderdsl.targets.cpp.source import known_width
 from powderdsl.targets.job import Job, Runnable, shape_of, unavailable
 from powderdsl.targets.mixed import mixed_program
 from powderdsl.targets.torch.program import TorchProgram
-
-Lowered = Callable[[], Program]
-"""Returns a ruleset in IR; the first call does the work."""
 
 SOURCES = ("compiler.py", "simulation/native.py", "model", "analysis", "ir", "schedule", "targets")
 
@@ -85,106 +82,90 @@ def generator() -> str:
     return found.hexdigest()
 
 
-def latest_width(ruleset: Ruleset, lowered: Lowered) -> int:
-    """What the code compiled last is for, or 0. Without any, what cannot be lowered is reported here.
-
-    Raises NoCompiler if there is no compiler.
-    """
-    code = recall(start_key(ruleset))
-    if code is None:
-        lowered()
-    return 0 if code is None else code.width
-
-
-def native_program(ruleset: Ruleset, lowered: Lowered, threads: int, width: int) -> Runnable:
-    """A program, from the cache or compiled now; passes that do not fit bit planes run on cells.
-
-    Raises:
-        NoCompiler: there is no C++ compiler, or it failed.
-    """
-    key = start_key(ruleset, width)
-    code = recall(key)
-    if code is None:
-        with turn(current().place(), key):
-            code = recall(key)  # from another process, while this one waited
-            if code is None:
-                found = segments(lowered())
-                if len(found) > 1 or found[0].planes is None:
-                    return mixed_program(
-                        found,
-                        lambda numbers, planes: NativeProgram(
-                            compile_program(numbers, planes, width), threads
-                        ),
-                        lambda numbers: TorchProgram(numbers, torch.device("cpu")),
-                    )
-                code = compile_program(found[0].program, found[0].planes, width)
-                remember(key, code)
-                remember(start_key(ruleset), code)
-    return NativeProgram(code, threads)
-
-
-def native_by_width(ruleset: Ruleset, lowered: Lowered, threads: int) -> ByWidth:
-    """The backend `native`. Without a compiler, there is an error at once: CompileError (PD701)."""
-
-    @_compiler_needed()
-    def make(width: int) -> Runnable:
-        return native_program(ruleset, lowered, threads, width)
-
-    with _compiler_needed():
-        latest_width(ruleset, lowered)
-    return ByWidth(make)
-
-
-@contextmanager
-def _compiler_needed() -> Iterator[None]:
-    try:
-        yield
-    except NoCompiler as error:
-        raise unavailable("native", str(error), f"run on the backend `wasm`, or {INSTALL}") from None
-
-
-def auto_by_width(
-    ruleset: Ruleset,
-    lowered: Lowered,
-    threads: int,
-    first: tuple[str, Callable[[], Runnable]],
-    cells: Callable[[], Runnable],
-) -> ByWidth:
-    """The backend `auto`: an `AutoProgram` for every width."""
-    try:
-        latest = latest_width(ruleset, lowered)
-    except NoCompiler:
-        latest = 0
-        lowered()
-
-    def make(width: int) -> AutoProgram:
-        def ready() -> Runnable | None:
-            code = recall(start_key(ruleset, width))
-            return None if code is None else NativeProgram(code, threads)
-
-        return AutoProgram(*first, cells, ready, lambda: native_program(ruleset, lowered, threads, width))
-
-    return ByWidth(make, latest)
-
-
 class ByWidth:
-    """A program for each known width of grids, and one for all others (`known_width`), made when the first such grid comes.
+    """Native code for each known width of grids, and for all others (`known_width`), made when the first such grid comes.
 
     It is built with the settings that are in effect now. What it tells is about the width stepped last.
+
+    Args:
+        lowered: the ruleset in IR; the first call does the work.
+        first: for `auto`, the backend that starts at once, and its program, the same at each call.
+        cells: gives the program that runs everything on cells.
+
+    Raises:
+        CompileError: PD701 if there is no compiler, unless another backend starts.
     """
 
-    def __init__(self, make: Callable[[int], Runnable], width: int | None = None):
-        """`width`: the program for it is made at once."""
-        self._make, self._how = make, current()
+    def __init__(
+        self,
+        ruleset: Ruleset,
+        lowered: Callable[[], Program],
+        threads: int,
+        first: tuple[str, Callable[[], Runnable]] | None,
+        cells: Callable[[], Runnable],
+    ):
+        self._ruleset, self._lowered, self._threads, self._how = ruleset, lowered, threads, current()
+        self._first, self._cells = first, cells
         self._programs: dict[int, Runnable] = {}
-        self._latest = None if width is None else self.of(width)
+        self._latest: Runnable | None = None
+        try:
+            code = recall(start_key(ruleset))
+        except NoCompiler as error:
+            if first is None:
+                raise _refusal(error) from None
+            code = None
+        if code is None:
+            lowered()  # what cannot be lowered is reported here
+        if first is not None:
+            self._latest = self._of(0 if code is None else code.width)
 
-    def of(self, width: int) -> Runnable:
-        """The program for a known width; 0 for all others."""
+    def _of(self, width: int) -> Runnable:
         program = self._programs.get(width)
         if program is None:
             with building(self._how):
                 program = self._programs.setdefault(width, self._make(width))
+        return program
+
+    def _make(self, width: int) -> Runnable:
+        if self._first is not None:
+            return AutoProgram(
+                *self._first, self._cells, partial(self._recalled, width), partial(self._compiled, width)
+            )
+        try:
+            return self._compiled(width)
+        except NoCompiler as error:
+            raise _refusal(error) from None
+
+    def _recalled(self, width: int) -> Runnable | None:
+        """Native code that was compiled before. Raises NoCompiler if none could be made."""
+        code = recall(start_key(self._ruleset, width))
+        return None if code is None else NativeProgram(code, self._threads)
+
+    def _compiled(self, width: int) -> Runnable:
+        """Native code, from the cache or compiled now; passes that do not fit bit planes run on cells.
+
+        Raises NoCompiler: there is no C++ compiler, or it failed.
+        """
+        codes = []
+
+        def compiled(program: Program, planes: Program) -> NativeProgram:
+            codes.append(compile_program(program, planes, width))
+            return NativeProgram(codes[-1], self._threads)
+
+        program = self._recalled(width)
+        if program is not None:
+            return program
+        key = start_key(self._ruleset, width)
+        with turn(current().place(), key):
+            program = self._recalled(width)  # from another process, while this one waited
+            if program is None:
+                parts = segments(self._lowered())
+                program = mixed_program(
+                    parts, compiled, lambda cells: TorchProgram(cells, torch.device("cpu"))
+                )
+                if len(parts) == len(codes) == 1:
+                    remember(key, codes[0])
+                    remember(start_key(self._ruleset), codes[0])
         return program
 
     @property
@@ -199,8 +180,12 @@ class ByWidth:
 
     def run(self, job: Job) -> Mapping[str, Array]:
         """The state `job.steps` later."""
-        self._latest = program = self.of(known_width(shape_of(job.state)[-1]))
+        self._latest = program = self._of(known_width(shape_of(job.state)[-1]))
         return program.run(job)
+
+
+def _refusal(error: NoCompiler) -> CompileError:
+    return unavailable("native", str(error), f"run on the backend `wasm`, or {INSTALL}")
 
 
 class AutoProgram:

@@ -132,12 +132,10 @@ def make_program(
     if backend == "wasm":
         return BackendProgram("wasm", wasm(), cells)
     if backend == "native" or (backend == "auto" and kind.on_cpu):
-        from powderdsl.simulation.native import auto_by_width, native_by_width
+        from powderdsl.simulation.native import ByWidth
 
-        if backend == "native":
-            return BackendProgram("native", native_by_width(ruleset, lowered, threads), cells)
-        first = ("torch", cells) if problem else ("wasm", wasm)
-        return BackendProgram(backend, auto_by_width(ruleset, lowered, threads, first, cells), cells)
+        first = None if backend == "native" else ("torch", cells) if problem else ("wasm", wasm)
+        return BackendProgram(backend, ByWidth(ruleset, lowered, threads, first, cells), cells)
     if backend == "cuda" or (backend == "auto" and device.type == "cuda"):
         from powderdsl.targets.cuda.program import cuda_program
 
