@@ -12,7 +12,6 @@ import operator
 from array import array
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from fractions import Fraction
 from functools import cache, lru_cache
 from itertools import repeat
 from operator import index
@@ -123,8 +122,6 @@ def checked(numbers: Iterable[Any], kind: Type) -> Values:
         return array(kind.code, map(float, listed))
     if kind is bool_:
         return bytes(map(bool, listed))
-    if {*map(type, listed)} & {float, Fraction}:
-        listed = [*map(int, listed)]
     whole = [*map(index, listed)]
     if whole and not kind.low <= min(whole) <= max(whole) <= kind.high:
         raise OverflowError(f"{min(whole)} to {max(whole)} are out of bounds for {kind}")
@@ -201,7 +198,7 @@ _COMPARISONS: dict[str, Callable[[Any, Any], bool]] = {
 
 def arithmetic(op: str, a: Values, b: Values, kind: Type, count: int) -> Values:
     """An operation on values of one type. Raises TypeError if the type does not have it."""
-    if op not in {"b": _OF_FLAGS, "f": _OF_FLOATS}.get(kind.kind, _OPERATIONS):
+    if op not in {"b": _OF_FLAGS, "f": _OF_FLOATS}.get(kind.kind, (*_OF_INTEGERS, "minimum", "maximum")):
         raise TypeError(f"{op} of {kind} is not there without NumPy")
     if len(a) == len(b) == 1:
         count = 1

@@ -37,13 +37,12 @@ def _reduction(call: Callable[[Values], Any], result: Type | None = None) -> Any
 
     def method(self: ndarray, axis: Any = None) -> ndarray:
         full, kind = self.full, result or self.dtype
-        if call is sum:
-            _check("sum", self, "bi")
-        if self.dtype.kind == "f" and kind is not bool_ and any(value != value for value in full):
-            raise TypeError("extremes of NaN are not there without NumPy")
-        axes = range(self.ndim) if axis is None else [axis] if isinstance(axis, int) else axis
-        gone = [range(self.ndim)[one] for one in axes]
-        rest = [one for one in range(self.ndim) if one not in gone]
+        real = self.dtype.kind == "f" and kind is not bool_
+        if (call is sum and self.dtype.kind not in "bi") or (real and any(value != value for value in full)):
+            raise TypeError("sums of such numbers and extremes of NaN are not there without NumPy")
+        axes = range(self.ndim)
+        gone = [axes[one] for one in (axes if axis is None else [axis] if isinstance(axis, int) else axis)]
+        rest = [one for one in axes if one not in gone]
         shape = tuple(self.shape[one] for one in rest)
         if rest and rest[-1] > gone[0]:
             offsets = self.offsets()
@@ -179,10 +178,7 @@ class ndarray:
     def _selected(self, key: Any) -> tuple[list[Offsets], Shape, bool]:
         """Where the values are that a key selects, their shape, and whether arrays select them."""
         items = [_part(one) for one in (key if isinstance(key, tuple) else (key,))]
-        taken = sum(_axes_taken(one) for one in items)
-        if taken > self.ndim:
-            raise IndexError(f"the array has {self.ndim} axes, found an index for {taken}")
-        rest = [slice(None)] * (self.ndim - taken)
+        rest = [slice(None)] * (self.ndim - sum(map(_axes_taken, items)))
         dots = next((place for place, one in enumerate(items) if one is ...), None)
         items = items + rest if dots is None else items[:dots] + rest + items[dots + 1 :]
         arrays = []
@@ -215,24 +211,18 @@ class ndarray:
     # Operations
 
     def __neg__(self) -> ndarray:
-        _check("neg", self, "iuf")
-        return _mapped(operator.neg, self)
+        return _mapped(operator.neg, self, "iuf")
 
     def __invert__(self) -> ndarray:
-        _check("invert", self, "bi")
         return _binary("xor", self, True if self.dtype is bool_ else -1)
 
     def __abs__(self) -> ndarray:
-        _check("abs", self, "if")
-        return _mapped(operator.abs, self)
+        return _mapped(operator.abs, self, "if")
 
 
-def _check(op: str, array: ndarray, kinds: str) -> None:
+def _mapped(call: Callable[[Any], Any], array: ndarray, kinds: str) -> ndarray:
     if array.dtype.kind not in kinds:
-        raise TypeError(f"{op} of {array.dtype} is not there without NumPy")
-
-
-def _mapped(call: Callable[[Any], Any], array: ndarray) -> ndarray:
+        raise TypeError(f"{call} of {array.dtype} is not there without NumPy")
     return ndarray(array.shape, array.dtype, numbers.packed([*map(call, array.values)], array.dtype))
 
 
@@ -390,10 +380,7 @@ def roll(values: ndarray, shift: Any, axis: Any) -> ndarray:
 def concatenate(arrays: Sequence[ndarray], axis: int = 0) -> ndarray:
     kind = reduce(numbers.promoted, [one.dtype for one in arrays])
     at = range(arrays[0].ndim)[axis]
-    rests = {(one.shape[:at], one.shape[at + 1 :]) for one in arrays}
-    if len(rests) > 1:
-        raise ValueError("arrays of different shapes cannot be joined")
-    before, after = arrays[0].shape[:at], arrays[0].shape[at + 1 :]
+    ((before, after),) = {(one.shape[:at], one.shape[at + 1 :]) for one in arrays}
     parts = numbers.alike([numbers.converted(one.full, one.dtype, kind) for one in arrays], kind)
     lengths = [prod(one.shape[at:]) for one in arrays]
     blocks = [
@@ -455,8 +442,6 @@ def _operand(one: Any, kind: Type, shape: Shape) -> Values:
 
 def _binary(op: str, x: Any, y: Any) -> ndarray:
     a, b, kind, shape = _matched(x, y)
-    if op == "truediv" and kind.kind != "f":
-        a, b, kind = numbers.converted(a, kind, float64), numbers.converted(b, kind, float64), float64
     return ndarray(shape, kind, numbers.arithmetic(op, a, b, kind, prod(shape)))
 
 
@@ -467,8 +452,6 @@ def _compare(op: str, x: Any, y: Any) -> ndarray:
 
 def _operator(call: Callable[[str, Any, Any], ndarray], op: str, swapped: bool = False) -> Any:
     def operator(self: ndarray, other: Any) -> Any:
-        if not isinstance(other, (ndarray, bool, int, float)):
-            return NotImplemented
         return call(op, other, self) if swapped else call(op, self, other)
 
     return operator
@@ -510,13 +493,13 @@ def clip(values: Any, low: Any, high: Any) -> ndarray:
 
 def sqrt(x: ndarray) -> ndarray:
     """NaN below 0."""
-    _check("sqrt", x, "f")
-    return _mapped(lambda value: math.sqrt(value) if value >= 0 else math.nan, x)
+    return _mapped(lambda value: math.sqrt(value) if value >= 0 else math.nan, x, "f")
 
 
 def floor(x: ndarray) -> ndarray:
-    _check("floor", x, "f")
-    return _mapped(lambda value: float(math.floor(value)) if value and math.isfinite(value) else value, x)
+    return _mapped(
+        lambda value: float(math.floor(value)) if value and math.isfinite(value) else value, x, "f"
+    )
 
 
 def isnan(x: ndarray) -> ndarray:
