@@ -58,8 +58,8 @@ def storage(kind: Kind) -> str:
 
 
 def stored_range(kind: Kind) -> tuple[float, float]:
-    """The smallest and the largest number in which values of a kind are stored."""
-    known = {"flag": (0, 1), "direction": (0, 7), "element": (0, 255)}
+    """The smallest and the largest number in which values of a kind are stored or given."""
+    known = {"flag": (0, 1), "chance": (0, 1), "direction": (0, 7), "element": (0, 255)}
     return known.get(kind.name, (kind.lo, kind.hi))
 
 

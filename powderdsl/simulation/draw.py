@@ -106,21 +106,17 @@ def _first_values(change: int, ramp: ColorRamp) -> list[int | float]:
             found.append(math.ceil(place) if change > 0 else math.floor(place) + 1)
             continue
         value = float(np.float32(float(place)))
-        while not reaches(value, place):
-            value = _beside(value, 1)
-        while reaches(before := _beside(value, -1), place):
-            value = before
-        found.append(value)
+        found.append(value if reaches(value, place) else _above(value))
     return found
 
 
-def _beside(value: float, way: int) -> float:
-    """The next float32 above a number (1), or below it (-1)."""
+def _above(value: float) -> float:
+    """The next float32 above a number."""
     if value == 0:
-        return way * 2.0**-149
+        return 2.0**-149
     (bits,) = struct.unpack("<i", struct.pack("<f", value))
-    (found,) = struct.unpack("<f", struct.pack("<i", bits + (way if value > 0 else -way)))
-    return float(found)
+    (above,) = struct.unpack("<f", struct.pack("<i", bits + (1 if value > 0 else -1)))
+    return float(above)
 
 
 def rgb(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from operator import index
 from typing import TYPE_CHECKING, Any
 
@@ -16,8 +16,8 @@ from powderdsl.model.state import Slot, check_sides, property_dtype, property_va
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.programs import array_kind, make_program
 from powderdsl.simulation.state_checks import (
-    Parameters,
     check_ids,
+    checked_parameter,
     checked_values,
     given_mapping,
     looked_up,
@@ -26,12 +26,14 @@ from powderdsl.simulation.state_checks import (
 )
 from powderdsl.system.memo import Memo
 from powderdsl.targets.array_kind import Array
-from powderdsl.targets.job import Clock, Job, profile_of, shape_of
+from powderdsl.targets.job import Clock, Job, PassClock, shape_of
 
 if TYPE_CHECKING:
     from powderdsl.simulation.observe import Observer
 
 MAX_CELLS = 1 << 31
+BATCH_SIZES = 16
+"""How many batch sizes the default parameters are kept for."""
 
 
 @dataclass(frozen=True)
@@ -147,7 +149,8 @@ class Simulator:
         self.device = self.kind.device
         self.slot_by_name: dict[str, Slot] = {slot.name: slot for slot in slots(ruleset)}
         self._how: dict[str, Any] = {"threads": threads, "tensors": tensors, "memo": memo}
-        self._params = Parameters(ruleset, self.kind)
+        self._defaults = lru_cache(BATCH_SIZES)(self._default_parameters)
+        """Parameters of a batch: the same mapping for the same size, which programs recognize. Nobody writes to it."""
         self._tables: dict[str, Array] = {}
         self._program = make_program(ruleset, backend, self.kind, threads, memo)
 
@@ -387,9 +390,9 @@ class Simulator:
         clock = _clock_of(world)
         batch = clock.seed.shape[0]
         if params is None:
-            values = self._params.defaults(batch)
+            values = self._defaults(batch)
         else:
-            values = self._params.checked(given_mapping("params", params), batch)
+            values = self._parameters(given_mapping("params", params), batch)
         if random is not None:
             draws = self._draws(given_mapping("random", random), world)
         if passes is not None:
@@ -437,18 +440,31 @@ class Simulator:
 
     def parameters(self, params: Mapping[str, Any], batch: int) -> dict[str, Array]:
         """All parameters as float64 [B]: given values, and defaults. Raises KeyError, TypeError, ValueError."""
-        checked = self._params.checked(params, batch)
-        return {name: self.kind.copied(value) for name, value in checked.items()}
+        return {name: self.kind.copied(value) for name, value in self._parameters(params, batch).items()}
+
+    def _default_parameters(self, batch: int) -> Mapping[str, Array]:
+        params = self.ruleset.params
+        return {param.name: self.kind.put([float(param.default)] * batch, "float64") for param in params}
+
+    def _parameters(self, given: Mapping[str, Any], batch: int) -> Mapping[str, Array]:
+        values, known = self._defaults(batch), {param.name: param for param in self.ruleset.params}
+        for name, value in given.items():
+            if name not in known:
+                raise unknown_name("parameter", name, known)
+            values = {**values, name: checked_parameter(self.kind, value, known[name], batch)}
+        return values
 
     def profile(self, world: World, steps: int = 1) -> dict[str, float]:
         """Seconds that each pass takes over some steps, in the order they run; empty if the backend cannot report them.
 
         Native code counts processor time on one thread.
         """
-        params = self._params.defaults(len(world))
-        job = Job(world.state, _clock_of(world), _whole_count(steps), params, {}, None)
-        seconds = profile_of(self._program, job)
-        return {name: seconds.get(name, 0.0) for name in self.passes} if seconds else {}
+        clock, params = PassClock(self.device), self._defaults(len(world))
+        self._program.run(
+            Job(world.state, _clock_of(world), _whole_count(steps), params, {}, None, timing=clock)
+        )
+        known = [name for name in self.passes if name in clock.seconds]
+        return {name: clock.seconds[name] for name in self.passes} if known else {}
 
 
 def compile(

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from functools import lru_cache
 from typing import Any
 
 from powderdsl.diagnostics import suggest
 from powderdsl.model.state import SNAP, Slot, slots, stored_range
-from powderdsl.model.types import Ruleset
+from powderdsl.model.types import Param, Ruleset
 from powderdsl.targets.array_kind import Array, ArrayKind
 
 CHUNK = 1 << 20
@@ -135,42 +134,15 @@ def _integers(kind: ArrayKind, array: Array, slot: Slot, ruleset: Ruleset) -> Ar
     return values
 
 
-# Parameters
-
-BATCH_SIZES = 16
-"""How many batch sizes the defaults are kept for."""
-
-
-class Parameters:
-    """Parameters of one ruleset as float64 [B]."""
-
-    def __init__(self, ruleset: Ruleset, kind: ArrayKind):
-        self._known = {param.name: param for param in ruleset.params}
-        self._kind = kind
-        self.defaults = lru_cache(BATCH_SIZES)(self._defaults)
-        """The defaults for a batch: the same mapping for the same size, which programs recognize. Nobody writes to it."""
-
-    def _defaults(self, batch: int) -> Mapping[str, Array]:
-        values = {name: [float(param.default)] * batch for name, param in self._known.items()}
-        return {name: self._kind.put(value, "float64") for name, value in values.items()}
-
-    def checked(self, params: Mapping[str, Any], batch: int) -> Mapping[str, Array]:
-        """All parameters: copies of given values, and defaults. Raises KeyError, TypeError, ValueError."""
-        values = self.defaults(batch)
-        if not params:
-            return values
-        values, xp = dict(values), self._kind.xp
-        for name, value in params.items():
-            if name not in self._known:
-                raise unknown_name("parameter", name, self._known)
-            kind = self._known[name].kind
-            lo, hi = (0.0, 1.0) if kind.name in ("chance", "flag") else (kind.lo, kind.hi)
-            array = xp.asarray(self._kind.given(value, name), dtype=xp.float64)
-            if array.ndim > 1 or (array.ndim == 1 and len(array) != batch):
-                raise ValueError(f"{name} takes one value or {batch}, found shape {list(array.shape)}")
-            if not bool(((array >= lo) & (array <= hi)).all()):
-                raise ValueError(f"{name} takes {lo:g}..{hi:g}")
-            if kind.name in ("int", "flag") and not bool((array == xp.floor(array)).all()):
-                raise ValueError(f"{name} takes integers")
-            values[name] = self._kind.copied(xp.broadcast_to(array, (batch,)))
-        return values
+def checked_parameter(kind: ArrayKind, value: Any, param: Param, batch: int) -> Array:
+    """Given values of a parameter: float64 [B] in memory of their own. Raises TypeError, ValueError."""
+    xp, name = kind.xp, param.name
+    lo, hi = stored_range(param.kind)
+    array = xp.asarray(kind.given(value, name), dtype=xp.float64)
+    if array.ndim > 1 or (array.ndim == 1 and len(array) != batch):
+        raise ValueError(f"{name} takes one value or {batch}, found shape {list(array.shape)}")
+    if not bool(((array >= lo) & (array <= hi)).all()):
+        raise ValueError(f"{name} takes {lo:g}..{hi:g}")
+    if param.kind.name in ("int", "flag") and not bool((array == xp.floor(array)).all()):
+        raise ValueError(f"{name} takes integers")
+    return kind.copied(xp.broadcast_to(array, (batch,)))

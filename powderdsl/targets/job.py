@@ -15,25 +15,21 @@ from powderdsl.targets.array_kind import Array
 class PassClock:
     """Seconds by pass. Work before the first pass has the name ``""``."""
 
-    def __init__(self, device: Any = None):
-        """`device`: that of the arrays, if they have one."""
+    def __init__(self, device: Any):
+        """`device`: that of the arrays."""
         self._device = device
-        self._seconds: defaultdict[str, float] = defaultdict(float)
+        self.seconds: defaultdict[str, float] = defaultdict(float)
         self._last = self._now()
 
     def tick(self, name: str) -> None:
         """Count the time since the last call for a pass."""
         now = self._now()
-        self._seconds[name] += now - self._last
+        self.seconds[name] += now - self._last
         self._last = now
 
     def add(self, name: str, seconds: float) -> None:
         """Count time that a program measured itself."""
-        self._seconds[name] += seconds
-
-    def passes(self) -> dict[str, float]:
-        """Seconds by pass."""
-        return {name: seconds for name, seconds in self._seconds.items() if name}
+        self.seconds[name] += seconds
 
     def _now(self) -> float:
         # A GPU works asynchronously: without waiting, the time would count for a later pass.
@@ -42,13 +38,6 @@ class PassClock:
 
             torch.cuda.synchronize(self._device)
         return time.perf_counter()
-
-
-def profile_of(program: Runnable, job: Job) -> Mapping[str, float]:
-    """Seconds by pass over `job.steps`; empty if a program cannot report them."""
-    clock = PassClock(getattr(job.clock.seed, "device", None))
-    program.run(job._replace(timing=clock))
-    return clock.passes()
 
 
 class Clock(NamedTuple):
