@@ -15,7 +15,7 @@ from powderdsl.arrays import NDArray, np
 from powderdsl.cli.exits import BadInput
 from powderdsl.diagnostics.printable import printable, unguarded
 from powderdsl.model.types import Element, Field
-from powderdsl.simulation.draw import contact_sheet, palette, ramps, rgb, scale, shown_fields, tints, to_numpy
+from powderdsl.simulation.draw import contact_sheet, looks, rgb, scale, shown_fields, to_numpy
 from powderdsl.worlds.ascii import write_ascii
 
 if TYPE_CHECKING:
@@ -40,8 +40,7 @@ def pictures(world: World, *, most: int, factor: int | None) -> NDArray[np.uint8
         raise BadInput(f"a picture of {longest * factor:,} pixels a side: choose a smaller --scale or --size")
     few = world.select(slice(0, shown))
     rules = few.sim.ruleset
-    colors, ramped, tinted = palette(rules.elements), ramps(rules.elements), tints(rules.fields)
-    image = rgb(few.ids, colors, ramps=ramped, tints=tinted, fields=fields_of(few))
+    image = rgb(few.ids, fields=fields_of(few), **looks(rules.elements, rules.fields))
     images = scale(image, factor)
     return images[0] if shown == 1 else contact_sheet(images, columns=columns)
 
@@ -113,7 +112,7 @@ class LiveView:
         self.elements = elements
         self.in_place = self.stream.isatty() and os.environ.get("TERM") != "dumb"
         self.color = self.in_place and not os.environ.get("NO_COLOR") and _can_encode(self.stream)
-        self._colors, self._ramps, self._tints = palette(elements), ramps(elements), tints(fields)
+        self._looks = looks(elements, fields)
         self._height = 0
         self._frame_seconds, self._due = 1 / fps if fps else 0.0, time.perf_counter()
 
@@ -141,7 +140,7 @@ class LiveView:
             ids = ids[::step, ::step]
             shown = {name: value[..., ::step, ::step] for name, value in shown.items()}
         if self.color:
-            text = render_frame(rgb(ids, self._colors, ramps=self._ramps, tints=self._tints, fields=shown))
+            text = render_frame(rgb(ids, fields=shown, **self._looks))
         else:
             text = write_ascii(ids, self.elements).rstrip("\n")
         caption = printable(caption)

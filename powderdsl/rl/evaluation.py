@@ -19,17 +19,7 @@ from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.experiments.runs import Estimate, RunFolder, find_run, mean_and_interval, write_json
 from powderdsl.rl.config import BASELINES, TrainConfig, chosen_policies
 from powderdsl.rl.policies import TrainedPolicy, config_of, load_policy, task_of
-from powderdsl.simulation.draw import (
-    OUTLINES,
-    contact_sheet,
-    outline,
-    palette,
-    ramps,
-    rgb,
-    scale,
-    shown_fields,
-    tints,
-)
+from powderdsl.simulation.draw import OUTLINES, contact_sheet, looks, outline, rgb, scale, shown_fields
 from powderdsl.simulation.simulator import World
 from powderdsl.tasks.episodes import Episodes, TaskProgram, compile_task
 from powderdsl.tasks.players import ExpertPlayer
@@ -373,8 +363,7 @@ class Film:
         self._returns = torch.zeros(count, dtype=torch.float64)
         self._over = torch.zeros(count, dtype=torch.bool)
         self._fields = shown_fields(task.ruleset)
-        self._colors, self._font = palette(task.ruleset.elements), ImageFont.load_default()
-        self._looks: Any = {"ramps": ramps(task.ruleset.elements), "tints": tints(task.ruleset.fields)}
+        self._looks, self._font = looks(task.ruleset.elements, task.ruleset.fields), ImageFont.load_default()
 
     def begin(self, episodes: Episodes) -> None:
         """The worlds at their start."""
@@ -411,7 +400,7 @@ class Film:
         """One world, uint8 [H·factor + LINE, W·factor, 3]."""
         task, factor = self.task, self.factor
         fields = {name: values[world] for name, values in scene.fields.items()}
-        picture = np.array(scale(rgb(scene.ids[world], self._colors, fields=fields, **self._looks), factor))
+        picture = np.array(scale(rgb(scene.ids[world], fields=fields, **self._looks), factor))
         for number, masks in enumerate(self.regions.values()):
             outline(picture, masks[world % len(masks)], factor, OUTLINES[number % len(OUTLINES)])
         words = ""

@@ -61,22 +61,24 @@ class CellTint:
 
 def tints(fields: Sequence[Field]) -> tuple[CellTint, ...]:
     """The tints of the fields that have one, in their order."""
-    return tuple(
-        CellTint(one.name, _shares(one.tint.color), float(one.tint.full), float(np.float32(one.tint.most)))
-        for one in fields
-        if one.tint is not None
-    )
+    tints = []
+    for field in fields:
+        if (tint := field.tint) is not None:
+            red, green, blue = (float(np.float32(part) / np.float32(255)) for part in _components(tint.color))
+            most = float(np.float32(tint.most))
+            tints.append(CellTint(field.name, (red, green, blue), float(tint.full), most))
+    return tuple(tints)
 
 
-def _shares(color: str) -> tuple[float, float, float]:
-    red, green, blue = (float(np.float32(part) / np.float32(255)) for part in _components(color))
-    return red, green, blue
+def looks(elements: Sequence[Element], fields: Sequence[Field]) -> dict[str, Any]:
+    """How `rgb` shows worlds of these elements and fields: its `colors`, `ramps` and `tints`."""
+    return {"colors": palette(elements), "ramps": ramps(elements), "tints": tints(fields)}
 
 
 def shown_fields(ruleset: Ruleset) -> tuple[str, ...]:
     """The fields that pictures of its worlds show."""
-    followed = {ramp.field for ramp in ramps(ruleset.elements)}
-    return tuple(sorted(followed | {tint.field for tint in tints(ruleset.fields)}))
+    followed = {element.ramp.field for element in ruleset.elements if element.ramp is not None}
+    return tuple(sorted(followed | {field.name for field in ruleset.fields if field.tint is not None}))
 
 
 @lru_cache(maxsize=256)

@@ -66,20 +66,20 @@ def start_key(ruleset: Ruleset, width: int | None = None) -> str:
     """
     compiler = find_compiler()
     params = tuple(replace(param, default=0, about="") for param in ruleset.params)
-    said = fingerprint(replace(ruleset, params=params))
-    return cache_key(f"{said}{generator()} {width}", compiler, flags_for(compiler, current().level))
+    model = fingerprint(replace(ruleset, params=params))
+    return cache_key(f"{model}{generator()} {width}", compiler, flags_for(compiler, current().level))
 
 
 @cache
 def generator() -> str:
     """A hash of the source files that generate C++."""
     here = Path(__file__).resolve().parents[1]
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for name in SOURCES:
         files = sorted(p for p in (here / name).rglob("*") if p.suffix in (".py", ".hpp")) or [here / name]
         for path in files:
-            found.update(path.read_bytes())
-    return found.hexdigest()
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 class ByWidth:

@@ -171,13 +171,13 @@ class Observer:
     @cached_property
     def _bits(self) -> tuple[tuple[str, int], ...]:
         """The slot and bit of each plane: flags and integers, slot by slot, lowest bit first. Floats have none."""
-        found = []
+        bits: list[tuple[str, int]] = []
         for slot in self.slots.values():
             if not slot.is_real:
                 type = ir_type(slot.kind, self.ruleset.slots)
                 count = 1 if type.name == "flag" else type.bits
-                found += [(slot.name, bit) for bit in range(count)]
-        return tuple(found)
+                bits += [(slot.name, bit) for bit in range(count)]
+        return tuple(bits)
 
     @cached_property
     def _palette(self) -> Tensor:

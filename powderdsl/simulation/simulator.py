@@ -304,8 +304,8 @@ class Simulator:
                 if self.ruleset.property(name) is None:
                     world.read(name)
                 wanted = self._shaped(value, name, world.shape)
-                held = self.kind.entries(self.table(name), state["element"])
-                if not bool((xp.asarray(wanted, dtype=xp.float64) == held).all()):
+                current = self.kind.entries(self.table(name), state["element"])
+                if not bool((xp.asarray(wanted, dtype=xp.float64) == current).all()):
                     raise ValueError(
                         f"`{name}` follows from the element here: no rule of {self.ruleset.name} changes it"
                     )
@@ -343,10 +343,10 @@ class Simulator:
         if self.kind.sort(mask) != "bool":
             raise TypeError(f"where must be a bool mask, found {mask.dtype}")
         if element is not None:
-            found = self.ruleset.element(element)
-            if found is None:
+            painted = self.ruleset.element(element)
+            if painted is None:
                 raise unknown_name("element", element, self.elements)
-            element_ids = xp.full_like(world.ids, found.id)
+            element_ids = xp.full_like(world.ids, painted.id)
             world = replace(world, state=self._renewed(world.state, element_ids, mask))
         for name, value in fields.items():
             if name not in self.slot_by_name:

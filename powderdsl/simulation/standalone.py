@@ -96,7 +96,7 @@ def _stored(slot: Slot, ruleset: Ruleset, parts: tuple[Piece, ...]) -> Stored:
 
 def _knob(param: Param) -> Knob:
     kind = param.kind
-    low, high = stored_range(kind)
+    low, high = (0.0, 1.0) if kind.name in ("chance", "flag") else (kind.lo, kind.hi)
     return Knob(param.name, float(param.default), low, high, kind.name in ("int", "flag"))
 
 

@@ -15,7 +15,7 @@ from powderdsl.model.composition.added_packs import Difference
 from powderdsl.model.state import slots
 from powderdsl.model.text import one_line, place_of
 from powderdsl.model.types import Invariant, Ruleset
-from powderdsl.simulation.draw import palette, ramps, rgb, scale, tints
+from powderdsl.simulation.draw import contact_sheet, looks, rgb, scale
 from powderdsl.system.writing import failure, write_text
 from powderdsl.testing.generators.cases import Array, Start, fresh
 from powderdsl.testing.generators.trees import (
@@ -160,13 +160,10 @@ def side_by_side(columns: Sequence[Sequence[str]]) -> Iterator[str]:
 
 def picture(found: Counterexample, ruleset: Ruleset) -> Array:
     """Before and after side by side, uint8 [H', W', 3]."""
-    from powderdsl.simulation.draw import contact_sheet
-
-    colors, ramped, tinted = palette(ruleset.elements), ramps(ruleset.elements), tints(ruleset.fields)
+    shown = looks(ruleset.elements, ruleset.fields)
     factor = max(1, min(32, 512 // max(found.sample.shape)))
     images = [
-        scale(rgb(state["element"], colors, ramps=ramped, tints=tinted, fields=state), factor)
-        for state in (found.before, found.after)
+        scale(rgb(state["element"], fields=state, **shown), factor) for state in (found.before, found.after)
     ]
     return contact_sheet(images, columns=2, gap=8)
 
