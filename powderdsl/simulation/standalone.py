@@ -63,29 +63,29 @@ def standalone_module(ruleset: Ruleset, size: tuple[int, int], memo: Memo | None
         helps = ("use smaller numbers or kernels there",)
         raise failure("PD702", f"{ruleset.name} does not fit into WebAssembly", notes=notes, helps=helps)
     held = pieces(program)
-    element, *fields = (_stored(slot, ruleset, held[slot.name]) for slot in slots(ruleset))
+    (element,) = held["element"]
+    fields = tuple(_stored(slot, ruleset, held[slot.name]) for slot in slots(ruleset)[1:])
     ids = tuple(sorted(element.id for element in ruleset.elements))
     knobs = tuple(map(_knob, ruleset.params))
     about = json.dumps(_about(ruleset, size, knobs), separators=(",", ":"), ensure_ascii=False).encode()
-    face = Face(size[0], ids, element, tuple(fields), knobs, about)
+    face = Face(size[0], ids, element, fields, knobs, about)
     return wasm_module(segments[0].planes, size[1], face=face, memo=memo).code
 
 
 def _stored(slot: Slot, ruleset: Ruleset, parts: tuple[Piece, ...]) -> Stored:
     prop = ruleset.property(slot.name)
-    if slot.name == "element":
-        usual: list[Any] = [0.0]
-    elif prop is not None:
-        usual = property_values(ruleset, slot.name)
+    if prop is not None:
+        usual: Sequence[Any] = property_values(ruleset, slot.name)
     else:
         usual = [slot.fresh(identity) for identity in range(256)]
+    number = float if slot.dtype == "float32" else int
     by_component = zip(*usual, strict=True) if slot.planes == 2 else [usual]
     low, high = stored_range(slot.kind)
     return Stored(
         slot.name,
         parts,
         *_CELLS[slot.dtype],
-        tuple(tuple(map(float, one)) for one in by_component),
+        tuple(tuple(map(number, values)) for values in by_component),
         float(low),
         float(high),
         prop.stored if prop is not None else slot.of,

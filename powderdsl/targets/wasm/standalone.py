@@ -20,8 +20,10 @@ The section `powderdsl` of the module is JSON: the size, and elements, fields an
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 
 from powderdsl.ir.ops import SNAP, Threshold
 from powderdsl.targets.codec import Piece
@@ -32,7 +34,7 @@ from powderdsl.targets.wasm.library import HEADER, LIVE, PAGE, SOME, Library, al
 
 @dataclass(frozen=True)
 class Stored:
-    """An array of the state: its parts, how a cell is loaded, its bytes, and the values that cells may have.
+    """An array of the state but the element: its parts, how a cell is loaded, its bytes, and the values that cells may have.
 
     `usual`: by component and id, the value of a fresh cell. `holders`: the ids of elements whose cells can have another
     one; None for all. `of_element`: it comes and goes with the element.
@@ -63,11 +65,11 @@ class Knob:
 
 @dataclass(frozen=True)
 class Face:
-    """What a module needs to stand alone. `fields` are all slots but the element; `about` is for the custom section."""
+    """What a module needs to stand alone; `about` is for the custom section."""
 
     rows: int
     ids: tuple[int, ...]
-    element: Stored
+    element: Piece
     fields: tuple[Stored, ...]
     knobs: tuple[Knob, ...]
     about: bytes
@@ -83,20 +85,17 @@ class Standalone(Batches):
         self.end = library.memory.top
         self.count = face.rows * self.memory.width
         self.valid = self._data(bytes(i if i in face.ids else face.ids[0] for i in range(256)))
-        self.usual = {
-            slot.name: [self._values(slot.pieces[0], values) for values in slot.usual] for slot in face.fields
-        }
-        self.holders = {
-            slot.name: self._data(bytes(i in slot.holders for i in range(256)))
-            for slot in face.fields
-            if slot.holders is not None
-        }
-        self.buffers: dict[str, int] = {}
-        for slot in (face.element, *face.fields):
-            self.buffers[slot.name] = self._place(self.count * slot.size * len(slot.usual))
-        self.cells_at = const("i32", self.buffers["element"])
+        self.cells_at = const("i32", self._place(self.count))
         self.wide = self._place(4 * self.count)
         """Cells of 4 bytes, while fresh values are spread."""
+        self.parts = {slot.name: list(self._parts(slot)) for slot in face.fields}
+        """The pieces of fields, where their cells lie for the host, and tables of fresh values."""
+
+    def _parts(self, slot: Stored) -> Iterator[tuple[Piece, int, int]]:
+        at = self._place(self.count * slot.size * len(slot.pieces))
+        for i, (piece, values) in enumerate(zip(slot.pieces, slot.usual, strict=True)):
+            table = self._data(struct.pack(f"<256{'f' if piece.is_real else 'i'}", *values))
+            yield piece, at + i * self.count * slot.size, table
 
     def _place(self, size: int) -> int:
         """Static memory, with room for what `store` writes beyond."""
@@ -107,10 +106,6 @@ class Standalone(Batches):
         place = self._place(len(octets))
         self.library.module.data(place, octets)
         return place
-
-    def _values(self, piece: Piece, values: tuple[float, ...]) -> int:
-        kind, numbers = ("f", values) if piece.is_real else ("i", tuple(map(int, values)))
-        return self._data(struct.pack(f"<{len(numbers)}{kind}", *numbers))
 
     def add(self) -> None:
         """Add all functions, and grow the memory by what they need."""
@@ -142,14 +137,11 @@ class Standalone(Batches):
         with f.each(0, self.count) as i:
             cell = load("i32.load8_u", self.cells_at + i)
             f.set(cell, load("i32.load8_u", cell, self.valid))
-        (piece,) = self.face.element.pieces
-        f.do(self._load(piece, self.cells_at, 1))
-        for slot in self.face.fields:
-            for piece, table in zip(slot.pieces, self.usual[slot.name], strict=True):
-                with f.each(0, self.count) as i:
-                    value = word(load("i32.load8_u", self.cells_at + i) << 2, table)
-                    f.set(word(i << 2, self.wide), value)
-                f.do(self._load(piece, self.wide, 4))
+        f.do(self._load(self.face.element, self.cells_at, 1))
+        for piece, _, usual in chain.from_iterable(self.parts.values()):
+            with f.each(0, self.count) as i:
+                f.set(word(i << 2, self.wide), word(load("i32.load8_u", self.cells_at + i) << 2, usual))
+            f.do(self._load(piece, self.wide, 4))
         for number, start in enumerate((counted(seed), *[const("i64", 0)] * 2)):
             f.set(load("i64.load", self.batch, HEADER + 8 * number), start)
 
@@ -169,30 +161,26 @@ class Standalone(Batches):
         return self.batch + HEADER
 
     def show(self, f: Function) -> Value:
-        (piece,) = self.face.element.pieces
-        f.do(self._store(piece, self.cells_at, 1))
+        f.do(self._store(self.face.element, self.cells_at, 1))
         return self.cells_at
 
     # Fields
 
-    def _at(self, slot: Stored, component: int) -> int:
-        return self.buffers[slot.name] + component * self.count * slot.size
-
     def _read(self, slot: Stored, f: Function) -> None:
         """Writes the values of a field into its buffer."""
-        for component, piece in enumerate(slot.pieces):
-            f.do(self._store(piece, self._at(slot, component), slot.size))
+        for piece, at, _ in self.parts[slot.name]:
+            f.do(self._store(piece, at, slot.size))
 
     def _take_values(self, slot: Stored, f: Function) -> None:
         """The values in a field's buffer become the field's, cut to what cells can have; the ids have been shown."""
-        for component, piece in enumerate(slot.pieces):
-            at, table = self._at(slot, component), self.usual[slot.name][component]
+        low, high = slot.low, slot.high
+        for piece, at, usual in self.parts[slot.name]:
             with f.scope(), f.each(0, self.count) as i:
                 place = f.let(i * slot.size)
                 identity = f.let(load("i32.load8_u", self.cells_at + i))
                 cell = load(slot.load, place, at)
                 if piece.is_real:
-                    value = f.let(_within(cell, slot.low, slot.high))
+                    value = f.let(_within(cell, low, high))
                     # Without a number, and for small ones, the comparison does not hold.
                     large = op("f32.ge", op("f32.abs", value), const("f32", SNAP))
                     f.set(cell, either(large, value, const("f32", 0)))
@@ -201,21 +189,20 @@ class Standalone(Batches):
                     if slot.names_element:
                         f.set(value, load("i32.load8_u", value, self.valid))
                     else:
-                        low, high = int(slot.low), int(slot.high)
-                        f.set(value, either(op("i32.lt_s", value, low), low, value))
-                        f.set(value, either(op("i32.gt_s", value, high), high, value))
+                        f.set(value, either(op("i32.lt_s", value, int(low)), int(low), value))
+                        f.set(value, either(op("i32.gt_s", value, int(high)), int(high), value))
                     f.set(cell, value)
-                if slot.name in self.holders:
-                    holds = load("i32.load8_u", identity, self.holders[slot.name])
-                    with f.when(holds.equals(0)):
-                        f.set(cell, load("f32.load" if piece.is_real else "i32.load", identity << 2, table))
-            f.do(self._load(piece, const("i32", at), slot.size))
+                if slot.holders is not None:
+                    holders = self._data(bytes(i in slot.holders for i in range(256)))
+                    with f.when(load("i32.load8_u", identity, holders).equals(0)):
+                        f.set(cell, load("f32.load" if piece.is_real else "i32.load", identity << 2, usual))
+            f.do(self._load(piece, at, slot.size))
 
     def field(self, f: Function, number: I32) -> int:
         for i, slot in enumerate(self.face.fields):
             with f.when(number.equals(i)):
                 f.do(self.reads[i]())
-                f.give(self.buffers[slot.name])
+                f.give(self.parts[slot.name][0][1])
         return 0
 
     def take(self, f: Function, number: I32) -> None:
@@ -240,12 +227,11 @@ class Standalone(Batches):
             f.leave()
         with f.when(op("i32.ne", load("i32.load8_u", element, self.valid), element)):
             f.leave()
-        parts: list[tuple[Piece, Value]] = [(self.face.element.pieces[0], element)]
+        fresh: list[tuple[Piece, Value]] = [(self.face.element, element)]
         for slot in self.face.fields:
             if slot.of_element:
-                values = [word(element << 2, table) for table in self.usual[slot.name]]
-                parts += zip(slot.pieces, values, strict=True)
-        for piece, value in parts:
+                fresh += [(piece, word(element << 2, usual)) for piece, _, usual in self.parts[slot.name]]
+        for piece, value in fresh:
             place, planes, *_ = numbers_of(piece, self.layout, 0)
             f.do(self.calls["fill"](place, planes, top, bottom, left, right, value))
 
@@ -306,7 +292,7 @@ class Standalone(Batches):
                 base = f.let(component * (self.count * slot.size))
                 with f.each(top, bottom) as y, f.each(left, right) as x:
                     place = base + (y * self.memory.width + x) * slot.size
-                    f.set(load(slot.load, place, self.buffers[slot.name]), stored)
+                    f.set(load(slot.load, place, self.parts[slot.name][0][1]), stored)
                 f.do(self.takes[i]())
 
     # Parameters
