@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from powderdsl.ir.ops import FLAG, REAL, Node, ordered
 from powderdsl.ir.single import all_ones, single
@@ -127,6 +127,11 @@ def held(value: Node) -> str:
     return "c.everything" if value.attr else "c.nothing"
 
 
+def on_all(type: str, items: Iterable[str], call: str) -> str:
+    """A call on an array of pointers, which is named `all` in it."""
+    return f"{{ {type} all[] = {{{', '.join(items)}}}; {call} }}"
+
+
 class _Loop(CellValues[str]):
     """The text of row y of a loop. Its values are those of the cells of a chunk: floats, or flags as bits."""
 
@@ -157,13 +162,12 @@ class _Loop(CellValues[str]):
     def marking(self) -> Iterator[str]:
         """Which rows of the region's planes have anything, found for all lanes at once."""
         if planes := self.plan.marked:
-            call = f"mark_rows(c, {self.number}, all, {len(planes)});"
-            yield f"{{ const Plane* const all[] = {{{', '.join(planes)}}}; {call} }}"
+            yield on_all("const Plane* const", planes, f"mark_rows(c, {self.number}, all, {len(planes)});")
 
     def turns(self) -> str:
         masks = self.plan.masks
         call = f"turn_masks(c, all, {len(masks)}, {self.plan.first_mask});"
-        return f"{{ const Plane* const all[] = {{{', '.join(masks)}}}; {call} }}"
+        return on_all("const Plane* const", masks, call)
 
     def after(self) -> str:
         ends = [f"{out.var.name}->still = !some{out.var.name};" for out in self.lasting]

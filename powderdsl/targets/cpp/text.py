@@ -8,7 +8,6 @@ from powderdsl.ir.ops import REAL, Node
 from powderdsl.schedule.costs import DRAWS, is_coin
 from powderdsl.schedule.rows import reaches_of
 from powderdsl.schedule.types import (
-    Carried,
     Compute,
     Forget,
     Guard,
@@ -23,7 +22,7 @@ from powderdsl.schedule.types import (
     variables,
 )
 from powderdsl.schedule.words import difference, is_cleared
-from powderdsl.targets.cpp.cells import held, sweeps_text
+from powderdsl.targets.cpp.cells import held, on_all, sweeps_text
 from powderdsl.targets.layout import NativeLayout, fixed_key, is_run, number, param_key
 from powderdsl.targets.printing import GATES, Printer, WordText, drawn_where, limited_draw
 
@@ -152,23 +151,23 @@ class _Printer(Printer):
                 if plane.into:
                     yield f"give(c, {plane.into});"
             return
+        news = []
         for plane in move.planes:
             old = held(plane.leaves) if copies else plane.old.attr
             yield f"{plane.new.name} = {plane.into or f'keep({old})'};"
+            news.append(f"&{plane.new.name}")
         if fields:
-            yield _call(
-                "Field", move.planes, f"swap_fields<{len(move.planes)}>(c, {movers}, {dy}, {dx}, all);"
-            )
+            yield on_all("Field** const", news, f"swap_fields<{len(news)}>(c, {movers}, {dy}, {dx}, all);")
             return
-        self.layout.cover(moving=len(move.planes))
+        self.layout.cover(moving=len(news))
         if copies:
             olds = ", ".join(str(plane.old.attr) for plane in move.planes)
-            news = ", ".join(f"&{plane.new.name}" for plane in move.planes)
-            call = f"arrive_over(c, {movers}, {dy}, {dx}, olds, news, {len(move.planes)});"
-            yield f"{{ Plane* const olds[] = {{{olds}}}; Plane** const news[] = {{{news}}}; {call} }}"
+            call = f"arrive_over(c, {movers}, {dy}, {dx}, olds, news, {len(news)});"
+            yield f"{{ Plane* const olds[] = {{{olds}}}; Plane** const news[] = {{{', '.join(news)}}}; {call} }}"
         for leaves, planes in groups.items() if groups and not copies else ():
             function = "swap_planes" if move.op == "swap" else f"arrive_planes<{leaves.upper()}>"
-            yield _call("Plane", planes, f"{function}(c, {movers}, {dy}, {dx}, all, {len(planes)});")
+            call = f"{function}(c, {movers}, {dy}, {dx}, all, {len(planes)});"
+            yield on_all("Plane** const", (f"&{plane.new.name}" for plane in planes), call)
 
     def update(self, loop: Compute) -> Iterator[str]:
         """Planes that change only in words where a mask holds. Empty ones that can only lose flags need no copy."""
@@ -213,11 +212,6 @@ class _Printer(Printer):
         yield " ".join(before)
         yield "\n".join([values.pointers(), LOOP, *values.lines, *stores, "}"])
         yield " ".join(after) + " }"
-
-
-def _call(type: str, planes: Sequence[Carried], call: str) -> str:
-    """A call on the new variables of a movement."""
-    return f"{{ {type}** const all[] = {{{', '.join(f'&{plane.new.name}' for plane in planes)}}}; {call} }}"
 
 
 CLEAN = ("load", "const", "inside", "when", "shift", *DRAWS)
