@@ -68,7 +68,7 @@ class Rows:
 
     @property
     def outs(self) -> list[Out]:
-        """What all loops compute."""
+        """The variables that all loops compute."""
         return [out for part in self.loops for out in part.loop.outs]
 
 
@@ -117,18 +117,18 @@ def _waiting(sweeps: Sweeps) -> tuple[dict[str, Ring], dict[str, tuple[int, int]
 
 
 def region_of(loop: Compute) -> tuple[list[Node], list[str]]:
-    """Where a loop has work: fields that are live in some row (`live`), and planes."""
+    """The parts of a loop's region: fields that must be live in some row (`live`), and planes."""
     parts = alternatives(loop.region)
     return [part for part in parts if part.op == "live"], [str(p.attr) for p in parts if p.op == "load"]
 
 
 def is_copy(loop: Compute) -> bool:
-    """Whether a loop only copies fields."""
+    """Tell whether a loop only copies fields."""
     return all(out.value.op == "load" and out.var.type == REAL for out in loop.outs)
 
 
 def reaches_of(schedule: Schedule) -> dict[str, int]:
-    """How many columns of each field are read beyond the edges; ANY_PASS for fields that slots may get."""
+    """The columns of each field that are read beyond the edges; ANY_PASS for fields that slots may get."""
     reaches = {str(node.attr): ANY_PASS for node in schedule.results if node.op == "load"}
     copies: list[tuple[str, Node]] = []  # a field whose rows may be those of another one
     for statement in flat(schedule.body):

@@ -35,7 +35,7 @@ class Piece:
 
     @property
     def signed(self) -> bool:
-        """Whether the highest plane is a sign bit."""
+        """True if the highest plane is a sign bit."""
         return self.type.name == "int" and self.type.signed
 
     @property
@@ -45,11 +45,11 @@ class Piece:
 
 def pieces(program: Program) -> dict[str, tuple[Piece, ...]]:
     """The pieces of each state array of a program on numbers, by the array's name."""
-    found: dict[str, tuple[Piece, ...]] = {}
+    groups: dict[str, tuple[Piece, ...]] = {}
     for slot in program.slots:
         piece = Piece(slot.state or slot.name, slot.component, slot.name, slot.type)
-        found[piece.state] = (*found.get(piece.state, ()), piece)
-    return found
+        groups[piece.state] = (*groups.get(piece.state, ()), piece)
+    return groups
 
 
 def limits(xp: Any, values: Any, threshold: Threshold) -> Any:

@@ -94,7 +94,7 @@ def native_layout(program: Program) -> NativeLayout:
 
 
 def is_run(numbers: Sequence[int]) -> bool:
-    """Whether each number follows on the one before."""
+    """Tell whether each number is the one before plus 1."""
     return [*numbers] == [*range(numbers[0], numbers[0] + len(numbers))]
 
 
@@ -110,7 +110,7 @@ def param_key(node: Node) -> tuple[str, Threshold | None, int]:
 
 
 def fixed_key(node: Node) -> tuple[int, int, int]:
-    """What a plane that never changes depends on: the row (0) or column (1) and a bit of it, or a neighbor (2)."""
+    """The key of a plane that never changes: it depends on a bit of the row (0) or column (1), or on a neighbor (2)."""
     if node.op == "inside":
         return 2, node.attr[0], node.attr[1]
     axis, modulus, bit = node.attr

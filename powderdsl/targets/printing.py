@@ -1,4 +1,4 @@
-"""What the printers of C++, CUDA and WebAssembly share: a method for each kind of statement, and values that are computed once."""
+"""The common part of the printers of C++, CUDA and WebAssembly: a method for each kind of statement, and named values."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from powderdsl.schedule.types import Compute, Out, Statement
 from powderdsl.schedule.words import is_whole
 
 Named = TypeVar("Named")
-"""What stands for a value in the text of a target: its name, or its code."""
+"""The type that stands for a value in the text of a target: its name, or its code."""
 
 
 class Printer:
     """Prints each statement by the method that is named after its class."""
 
     def printed(self, statement: Statement) -> Any:
-        """What a statement's method makes of it."""
+        """The result of a statement's method."""
         return getattr(self, type(statement).__name__.lower())(statement)
 
     def compute(self, loop: Compute) -> Any:
@@ -152,7 +152,7 @@ class CellValues(Values[Named]):
         variables = [self.variable(self.of(chain[-1].args[2])) for chain in chains]
         for choices in reversed(list(zip(*chains, strict=True))):
             known = self.known
-            olds = {id(one.args[2]): name for one, name in zip(choices, variables, strict=True)}
+            olds = {id(choice.args[2]): name for choice, name in zip(choices, variables, strict=True)}
             self.known = known | olds  # valid only here, since the variables change
             self.chosen(choices[0].args[0], variables, [choice.args[1] for choice in choices])
             self.known = known

@@ -28,10 +28,10 @@ from powderdsl.system.writing import scratch_folder
 from powderdsl.targets import cache
 
 INSTALL = "install g++ or clang++, or `pip install powderdsl[native]`"
-"""What to do where there is no compiler."""
+"""Advice where there is no compiler."""
 
 MISSING = "no C++ compiler"
-"""How the messages of `NoCompiler` begin where none was found."""
+"""The beginning of the messages of `NoCompiler` where none was found."""
 
 
 class NoCompilerWarning(UserWarning):
@@ -145,7 +145,7 @@ def flags_for(compiler: Compiler, level: str, machine: str = "", features: str =
 
 @lru_cache(maxsize=1)
 def processor() -> str:
-    """What code for this processor depends on: the machine and its instruction sets."""
+    """The machine and its instruction sets, on which compiled code depends."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         return next((line for line in lines if line.startswith(("flags", "Features"))), platform.machine())

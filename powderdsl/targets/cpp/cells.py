@@ -18,7 +18,7 @@ AT_ONCE = 4
 PLACE = (
     "const int lane = strips ? y / height : l, row = strips ? y - lane * height : y; (void)lane; (void)row;"
 )
-"""Where the words of row y lie in planes."""
+"""The lane, and the row of planes, in which the words of row y lie."""
 
 _FLOATS = {
     "eq": "bits_eq({0}, {1})",
@@ -160,7 +160,7 @@ class _Loop(CellValues[str]):
         yield from self.marking()
 
     def marking(self) -> Iterator[str]:
-        """Which rows of the region's planes have anything, found for all lanes at once."""
+        """Mark the rows in which the region's planes have anything, for all lanes at once."""
         if planes := self.plan.marked:
             yield on_all("const Plane* const", planes, f"mark_rows(c, {self.number}, all, {len(planes)});")
 
@@ -207,7 +207,7 @@ class _Loop(CellValues[str]):
                 yield f"finish_row<{'REACH' if reach == ANY_PASS else reach}>(c, o{name});"
 
     def quiet(self) -> Iterator[str]:
-        """What a row outside the region gets."""
+        """The values of a row outside the region."""
         for var, value in self.plan.loop.unchanged():
             if var.name in self.rows.rings:
                 yield f"{self.at(var.name, 0)} = nothing;"
@@ -268,7 +268,7 @@ class _Loop(CellValues[str]):
         return [f"const float* {name} = {call};" for call, name in self.pointers.items()]
 
     def busy(self, live: Node) -> str:
-        """Whether a field has anything in a row."""
+        """A test that a field has anything in a row."""
         name, dy = str(live.args[0].attr), live.attr[0]
         if name in self.rows.rings:
             return f"{self.at(name, dy)} != nothing"
@@ -329,7 +329,7 @@ class _Loop(CellValues[str]):
         return name
 
     def is_bare(self, name: str) -> bool:
-        """Whether a field's rows have zeros beyond the edges."""
+        """Tell whether a field's rows have zeros beyond the edges."""
         return name in self.rows.rings and self.rows.rings[name].bare is not None
 
     def row(self, field: str, dy: int, *, wraps: bool = True) -> str:

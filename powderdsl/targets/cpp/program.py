@@ -23,7 +23,7 @@ from powderdsl.targets.job import Job, Like, OwnedBatch
 from powderdsl.targets.layout import Layout
 
 BATCH_SIZES = 16
-"""How many batch sizes a program keeps the inputs of parameters for."""
+"""The most batch sizes for which a program keeps the inputs of parameters."""
 
 
 @dataclass(frozen=True)
@@ -217,7 +217,7 @@ class NativeProgram:
         return handle, like
 
     def parts(self, name: str, value: Tensor) -> Iterator[tuple[Tensor, int, int, bool]]:
-        """What slots hold of a state tensor: each part with its field's number and 0, or as `planes_of` says."""
+        """The parts of a state tensor in slots, each with its field's number and 0 bits, or as `planes_of` says."""
         for piece in self.pieces[name]:
             number = (self.layout.reals[piece.slot], 0, False) if piece.is_real else self._planes[name]
             yield piece.of(value), *number

@@ -264,7 +264,7 @@ class _Words(WordText):
         return name if self.is_clean(node) else self.name(f"{name} & valid")
 
     def is_clean(self, node: Node) -> bool:
-        """Whether bits beyond the width are known to be zero."""
+        """Tell whether bits beyond the width are known to be zero."""
         if id(node) not in self.clear:
             match node.op:
                 case "coordinate":

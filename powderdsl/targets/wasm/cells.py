@@ -86,8 +86,8 @@ class CellLoop(Loop):
                     self.starts = {}
                     self.lay() if self.loop.over == "choices" else self.body()
                 f.set(line, line + 1)
-        for out, place, found in zip(self.loop.outs, self.outs, self.somewhere, strict=True):
-            f.set(place[SOME], found)
+        for out, place, some_live in zip(self.loop.outs, self.outs, self.somewhere, strict=True):
+            f.set(place[SOME], some_live)
             if out.var.type != REAL:
                 f.set(place[HALOED], 0)
         return self.added("cells")
@@ -95,7 +95,7 @@ class CellLoop(Loop):
     # Lines
 
     def find_starts(self) -> None:
-        """Where the lines of fields begin that are read; found before the loop over their cells."""
+        """Find where the lines begin that are read, before the loop over their cells."""
         for node in self.nodes:
             if node.type != REAL or node.op not in ("load", "shift"):
                 continue
@@ -120,7 +120,7 @@ class CellLoop(Loop):
         return (plane + at)[self.memory.half]
 
     def row_flags(self, planes: Sequence[str]) -> Value:
-        """Whether planes hold a flag in this row of the lane."""
+        """A test that planes hold a flag in this row of the lane."""
         f, memory = self.f, self.memory
         flags = const("i64", 0)
         if memory.words <= 4:
@@ -360,12 +360,12 @@ class Chunks(CellValues[Value]):
         loop, f = self.loop, self.f
         y = f.let((loop.row - loop.lane) // self.memory.row)
         at = f.let(self.library.word_number(loop.at - loop.lane, y))
-        found = f.let(const("v128", 0))
+        numbers = f.let(const("v128", 0))
         for i in range(CHUNK):
             within = (loop.column + i) & (WORD - 1)
             number = self.library.draw_float()(at, loop.lane, within, const("i32", keys), const("i32", bits))
-            f.set(found, op("f32x4.replace_lane", found, number, tail=bytes([i])))
-        return found
+            f.set(numbers, op("f32x4.replace_lane", numbers, number, tail=bytes([i])))
+        return numbers
 
     def led(self, node: Node) -> Value:
         """A comparison, computed only where its leader holds somewhere in the chunk, together with others it leads."""

@@ -68,12 +68,12 @@ class WordLoop(Loop):
         """The function."""
         f, library, memory = self.f, self.library, self.memory
         stop = f.let(library.cells)
-        kept = [f.let(const("v128", 0)) for _ in self.outs]
+        any_flags = [f.let(const("v128", 0)) for _ in self.outs]
         self.y = self.row = self.x = None
         if memory.words == 1:
             with f.each(0, stop, 16) as at:
                 self.at = at
-                self.body(kept)
+                self.body(any_flags)
         else:
             y = f.let(0)
             with f.each(0, stop, memory.row) as row:
@@ -81,17 +81,17 @@ class WordLoop(Loop):
                 self.y, self.row, self.x, self.within = y, row, x, within
                 with f.loop() as again:
                     self.at = f.let(row + within)
-                    self.body(kept)
+                    self.body(any_flags)
                     f.set(x, x + WORD)
                     f.set(within, within + 16)
                     f.jump(again, within < memory.row)
                 f.set(y, y + 1)
-        for place, any_flag in zip(self.outs, kept, strict=True):
+        for place, any_flag in zip(self.outs, any_flags, strict=True):
             before = place[SOME] if self.updates else ZERO
             f.set(place[SOME], before | some(any_flag))
         return self.added("words")
 
-    def body(self, kept: Sequence[Local]) -> None:
+    def body(self, any_flags: Sequence[Local]) -> None:
         f, flags = self.f, self.memory.flags
         values = WordValues(self)
         with f.scope(), f.block() as skip:
@@ -103,7 +103,7 @@ class WordLoop(Loop):
                 value = values.clean(out.value)
                 again = not isinstance(value, Local) or self.updates or len(self.outs) > 1
                 new.append(f.let(value) if again else value)
-            for place, some_flag, value in zip(self.outs, kept, new, strict=True):
+            for place, some_flag, value in zip(self.outs, any_flags, new, strict=True):
                 f.set(some_flag, some_flag | value)
                 f.set((place + self.at)[flags], value)
 
