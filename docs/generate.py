@@ -59,7 +59,7 @@ SHAPES = {
     "words": "words",
     "number": "a number",
     "flag": "`yes` or `no`",
-    "mapping": "a mapping",
+    **dict.fromkeys(("mapping", "record", "section", "pairs"), "a mapping"),
     "list": "a list",
     "lines": "expressions",
     "line": "an expression",

@@ -70,7 +70,7 @@ class Key:
     """A key of a record.
 
     `shape` follows from the field's type unless the declaration says another one: ``text word words number flag line
-    lines invariants mapping list block any``. A record's own reader makes the value of a ``list``, ``block`` or ``any``.
+    lines invariants record section pairs``. The node of a ``mapping``, ``list``, ``block`` or ``any`` is kept.
     """
 
     about: str
@@ -126,12 +126,13 @@ def keys_of(kind: type[Record]) -> dict[str, Key]:
         hint = hints[item.name]
         arms = [arm for arm in get_args(hint) if arm is not NoneType] if isinstance(hint, UnionType) else []
         hint = arms[0] if len(arms) == 1 else hint
-        shape = "word" if hint is str and (row.choices or row.form) else _SHAPES.get(hint, "")
-        if not shape:
-            is_mapping = get_origin(hint) is tuple or (isinstance(hint, type) and issubclass(hint, Record))
-            shape = "mapping" if is_mapping else "any"
-        required = row.required or item.default is MISSING
-        name = row.name or item.name
+        shape = "word" if hint is str and (row.choices or row.form) else _SHAPES.get(hint, "any")
+        if shape == "any" and get_origin(hint) is tuple:
+            hint = get_args(hint)[0]
+            shape = "pairs" if get_origin(hint) is tuple else "section"
+        elif shape == "any" and isinstance(hint, type):
+            shape = "record"
+        required, name = row.required or item.default is MISSING, row.name or item.name
         keys[name] = replace(
             row, name=name, required=required, shape=row.shape or shape, field=item.name, type=hint
         )
@@ -238,60 +239,57 @@ class Reader:
 
     def value(self, row: Key, key: Scalar, node: Node) -> Any:
         """The value of a key as its row says, None after a report."""
-        if row.shape in ("text", *VALUES):
-            return self._single(row, key, node)
-        if row.shape == "words":
-            return self.words(node)
-        if row.shape in ("lines", "invariants"):
-            return self.lines(node, "invariant" if row.shape == "invariants" else "expression")
-        if row.shape != "mapping":
-            return node
-        if get_origin(row.type) is not tuple:
-            return self._part(row, key, node) if is_record(row.type) else node
-        kind = get_args(row.type)[0]
-        if is_record(kind):
-            return tuple(self.entries(kind, node))
         about = f"`{key.text}`: {row.about}"
-        pairs = (
-            self.pairs(node, f"a mapping from {row.maps}", about) if row.maps else self.named(node, "a value")
-        )
-        if get_args(kind)[1] is Syntax:
-            return tuple((name, line) for name, part in pairs if (line := self.line(part)))
-        for name, part in pairs:
-            if not isinstance(part, Scalar):
-                self.shape(part, f"a single value for `{name.text}`", about)
-        return tuple((name, part) for name, part in pairs if isinstance(part, Scalar))
+        match row.shape:
+            case "words":
+                return self.words(node)
+            case "lines" | "invariants":
+                return self.lines(node, "invariant" if row.shape == "invariants" else "expression")
+            case "section":
+                return tuple(self.entries(row.type, node))
+            case "record":
+                return self._part(row.type, key, node)
+            case "pairs":
+                wanted = f"a mapping from {row.maps}"
+                pairs = self.pairs(node, wanted, about) if row.maps else self.named(node, "a value")
+                if row.type == tuple[Scalar, Syntax]:
+                    return tuple((name, line) for name, part in pairs if (line := self.line(part)))
+                words = []
+                for name, part in pairs:
+                    if isinstance(part, Scalar):
+                        words.append((name, part))
+                    else:
+                        self.shape(part, f"a single value for `{name.text}`", about)
+                return tuple(words)
+            case "mapping" | "list" | "block" | "any":
+                return node
+        if not isinstance(node, Scalar):
+            is_set = row.shape == "line" and isinstance(node, Sequence)
+            self.shape(
+                node, f"a single value for `{key.text}`", "a set is written `(a, b)`" if is_set else about
+            )
+            return None
+        if row.form is not None:
+            return self.formed(row.form, key.text, node)
+        if row.shape == "flag":
+            return self.choice(key.text, node, ("yes", "no", "true", "false")) in ("yes", "true")
+        if row.choices:
+            word = self.choice(key.text, node, row.choices)
+            return int(word) if word and row.shape == "number" else word
+        if row.shape == "number":
+            return self.number(key.text, node, *row.bounds)
+        if row.type is Syntax:
+            return self.line(node)
+        return " ".join(node.text.split()) if row.type is str else node
 
-    def _part(self, row: Key, key: Scalar, node: Node) -> Any:
+    def _part(self, kind: type[Record], key: Scalar, node: Node) -> Any:
         """The record below a key."""
-        keys = keys_of(row.type)
+        keys = keys_of(kind)
         if isinstance(node, Mapping) and not node.entries and not any(one.required for one in keys.values()):
             helps = [", ".join(f"`{name}`: {one.about}" for name, one in keys.items())]
             self.reporter.error("PD109", f"`{key.text}` says nothing", node.span, "empty", helps=helps)
             return None
-        named = {"name": key} if issubclass(row.type, Entry) else {}
-        return self.record(row.type, node, f"`{key.text}`", **named)
-
-    def _single(self, row: Key, key: Scalar, node: Node) -> Any:
-        """A value that is no list and no mapping."""
-        if not isinstance(node, Scalar):
-            is_set = row.shape == "line" and isinstance(node, Sequence)
-            fix = "a set is written `(a, b)`" if is_set else f"`{key.text}`: {row.about}"
-            self.shape(node, f"a single value for `{key.text}`", fix)
-        elif row.form is not None:
-            return self.formed(row.form, key.text, node)
-        elif row.choices or row.shape == "flag":
-            word = self.choice(key.text, node, row.choices or ("yes", "no", "true", "false"))
-            if row.shape == "flag":
-                return word in ("yes", "true")
-            return int(word) if word and row.shape == "number" else word
-        elif row.shape == "number":
-            return self.number(key.text, node, *row.bounds)
-        elif row.type is Syntax:
-            return self.line(node)
-        else:
-            return " ".join(node.text.split()) if row.type is str else node
-        return None
+        return self.record(kind, node, f"`{key.text}`", **({"name": key} if issubclass(kind, Entry) else {}))
 
     def mapping(self, kind: type[Record], node: Node, what: str) -> Entries:
         """The entries of a mapping by key, unknown keys reported and left out, missing ones reported."""
@@ -463,8 +461,3 @@ class Reader:
         helps = suggest(value.text, options, "one of")
         self.reporter.error("PD110", message, value.span, "not one of them", helps=helps)
         return None
-
-
-def is_record(kind: Any) -> bool:
-    """Whether a type is that of a record."""
-    return isinstance(kind, type) and issubclass(kind, Record)
