@@ -451,11 +451,13 @@ def negate(typer: Typer, syntax: Syntax, scope: Scope) -> Value:
 
 def quotient(typer: Typer, syntax: Syntax, scope: Scope) -> Value:
     """`a div b`: integers, rounded down; 0 where b is 0."""
-    values = [(typer.value_of(child, scope), child.span) for child in syntax.children]
-    for value, span in values:
+    values: list[Placed] = []
+    for child in syntax.children:
+        value = typer.value_of(child, scope)
         if kind_name(value) == "real":
-            raise typer.wrong(value, "an integer", span, "`div` divides integers; for floats say `/`")
-        typer.of_kind(value, INTEGER, span)
+            raise typer.wrong(value, "an integer", child.span, "`div` divides integers; for floats say `/`")
+        whole = typer.of_kind(value, INTEGER, child.span)
+        values.append((Number(Fraction(whole.value)) if whole.op == "const" else whole, child.span))
     _check_divisor(typer, "quotient", values[1][0], syntax)
     return arithmetic(typer, "quotient", values, syntax.span)
 
@@ -571,7 +573,8 @@ def _applied(typer: Typer, function: Operation, operands: list[tuple[Operand, Sp
         first, *others = ((typer.value(*operand), operand[1]) for operand in operands)
         if not others:
             return arithmetic(typer, function.name, [first], span)
-        return reduce(lambda a, b: (arithmetic(typer, function.name, [a, b], span), span), others, first)[0]
+        result, _ = reduce(lambda a, b: (arithmetic(typer, function.name, [a, b], span), span), others, first)
+        return typer.of_kind(result, INTEGER, span) if is_integer(result) else result
     assert function.gives is not None
     args, value = [], None
     for operand, kind in zip(operands, function.takes, strict=True):

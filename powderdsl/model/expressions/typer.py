@@ -268,6 +268,8 @@ class Typer:
         helps = _HELPS.get(kind.name, ())
         if isinstance(value, Expr):
             source = value.kind.name
+            if source == kind.name == "int" and value.op == "const":
+                return self._constant(Fraction(value.value), kind, span)
             if source == kind.name or (source == "real" and kind.name == "chance"):
                 return value
             if kind.name == "real" and source == "draw" and value.op in ("add", "sub", "look"):
