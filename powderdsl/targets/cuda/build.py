@@ -81,23 +81,16 @@ def check(code: int, what: str) -> None:
         raise NoCuda(f"{what}: {(text.value or b'unknown error').decode()} ({code})")
 
 
-def device_attribute(device: int, number: int) -> int:
-    """A property of a device, by its number in the driver's interface. Raises NoCuda."""
-    value, handle = ctypes.c_int(), ctypes.c_int()
+def device_limits(device: int) -> tuple[int, str]:
+    """Bytes of shared memory that a block may have on a device, and its architecture, such as ``sm_90``. Raises NoCuda."""
+    value, handle, values = ctypes.c_int(), ctypes.c_int(), []
     check(driver().cuInit(0), "the CUDA driver does not start")
     check(driver().cuDeviceGet(ctypes.byref(handle), device), f"no CUDA device {device}")
-    check(driver().cuDeviceGetAttribute(ctypes.byref(value), number, handle), "a question to the device")
-    return value.value
-
-
-def shared_limit(device: int) -> int:
-    """Bytes of shared memory that a block may have on a device. Raises NoCuda."""
-    return device_attribute(device, _SHARED_LIMIT)
-
-
-def architecture(device: int) -> str:
-    """The architecture of a device, such as ``sm_90``. Raises NoCuda."""
-    return f"sm_{device_attribute(device, _MAJOR)}{device_attribute(device, _MINOR)}"
+    for number in (_SHARED_LIMIT, _MAJOR, _MINOR):
+        check(driver().cuDeviceGetAttribute(ctypes.byref(value), number, handle), "a question to the device")
+        values.append(value.value)
+    shared, major, minor = values
+    return shared, f"sm_{major}{minor}"
 
 
 def machine_code(source: KernelSource, architecture: str, version: str) -> bytes:

@@ -36,7 +36,7 @@ def cuda_program(program: Program, device: torch.device) -> Runnable:
     def compile(source: KernelSource) -> Launch:
         try:
             with torch.cuda.device(device):
-                architecture = build.architecture(torch.cuda.current_device())
+                torch.empty(1, device=device)  # makes the context current in this thread
                 start = build.load_kernel(build.machine_code(source, architecture, version), source)
         except build.NoCuda as error:
             raise unavailable("cuda", str(error), _HELP) from None
@@ -52,11 +52,13 @@ def cuda_program(program: Program, device: torch.device) -> Runnable:
             raise build.NoCuda("its kernels run on a CUDA device")
         with torch.cuda.device(device):
             torch.empty(1, device=device)  # creates the context
-            limit = build.shared_limit(torch.cuda.current_device())
+            shared_limit, architecture = build.device_limits(torch.cuda.current_device())
         build.nvrtc(version)
     except build.NoCuda as error:
         raise unavailable("cuda", str(error), _HELP) from None
-    return packed_program(program, device, lambda cells, planes: CudaProgram(cells, planes, compile, limit))
+    return packed_program(
+        program, device, lambda cells, planes: CudaProgram(cells, planes, compile, shared_limit)
+    )
 
 
 class DeviceState(PackedArrays):

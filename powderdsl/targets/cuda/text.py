@@ -60,67 +60,59 @@ class _Printer(Printer):
         yield "}"
 
     def words(self, loop: Compute) -> Iterator[str]:
-        answers = [out for out in loop.outs if out.var.type == ANSWER]
-        stored = [out for out in loop.outs if out.var.type != ANSWER]
         values = _Words(self)
-        places = {out.var.name: f"P({self.number(out.var.name)})" for out in stored}
-        for out in answers:
-            yield f"bool {out.var.name} = false;"
+        answers: list[str] = []
+        held: list[str] = []
+        asks, stores, back = [], [], []
+        for out in sorted(loop.outs, key=lambda out: out.var.type == ANSWER):
+            name = out.var.name
+            if out.var.type == ANSWER:
+                answers.append(name)
+                asks.append(f"{name} |= ({values.of(out.value.args[0])} & valid) != 0;")
+                continue
+            held.append(f"o_{name}[ROUNDS]")
+            own = f"o_{name}[k]" if loop.held else f"o_{name}"
+            stores.append(f"{'' if loop.held else 'const u32 '}{own} = {values.of(out.value)} & valid;")
+            back.append(f"P({self.number(name)})[i] = {own};")
+        yield from (f"bool {name} = false;" for name in answers)
+        body = ["FOR_WORDS(k, i) { PLACE(i);", *values.lines, *asks, *stores]
         if loop.held:
-            yield f"{{ u32 {', '.join(f'o_{out.var.name}[ROUNDS]' for out in stored)};"
-        stores = []
-        for out in stored:
-            value = f"{values.of(out.value)} & valid"
-            if loop.held:
-                stores.append(f"o_{out.var.name}[k] = {value};")
-            else:
-                stores.append(f"const u32 o_{out.var.name} = {value};")
-        asks = [f"{out.var.name} |= ({values.of(out.value.args[0])} & valid) != 0;" for out in answers]
-        if not loop.held:
-            stores += [f"{places[out.var.name]}[i] = o_{out.var.name};" for out in stored]
-        yield "\n".join(["FOR_WORDS(k, i) { PLACE(i);", *values.lines, *asks, *stores, "}"])
-        if loop.held:
-            yield "SYNC();"
-            back = " ".join(f"{places[out.var.name]}[i] = o_{out.var.name}[k];" for out in stored)
-            yield f"FOR_WORDS(k, i) {{ {back} }} }}"
-        for out in answers:
-            yield f"{out.var.name} = ANY({out.var.name});"
+            yield f"{{ u32 {', '.join(held)};"
+            yield "\n".join([*body, "}"])
+            yield f"SYNC();\nFOR_WORDS(k, i) {{ {' '.join(back)} }} }}"
+        else:
+            yield "\n".join([*body, *back, "}"])
+        yield from (f"{name} = ANY({name});" for name in answers)
 
     def cells(self, loop: Compute) -> Iterator[str]:
         cells = _Cells(self, loop.outs)
-        lives = {out.var.name: f"n_{out.var.name}" for out in loop.outs}
-        stores, ends, quiet = [], [], []
+        lives, stores, ends = [], [], []
+        dirty, quiet = "", []
         for out in loop.outs:
-            name, number = out.var.name, self.number(out.var.name)
+            live, number = f"n_{out.var.name}", self.number(out.var.name)
             value = cells.of(out.value)
+            lives.append(f" u32 {live} = 0;")
             if out.var.type == REAL:
                 stores.append(
-                    f"{{ const float v = {value}; if (inside) F({number})[cell] = v; BALLOT({lives[name]}, inside && v != 0); }}"
+                    f"{{ const float v = {value}; if (inside) F({number})[cell] = v; BALLOT({live}, inside && v != 0); }}"
                 )
-                ends.append(f"N({number})[i] = {lives[name]};")
-            else:
-                stores.append(f"BALLOT({lives[name]}, inside && {value});")
-                ends.append(f"P({number})[i] = {lives[name]};")
-                if out.otherwise is not None:
-                    quiet.append(f"P({number})[i] = {'valid' if out.otherwise.attr else '0'};")
-        yield f"FOR_BUSY_WORDS(i, [&](int i) {{ PLACE(i); {self.need(loop, quiet)} }}) {{ PLACE(i);"
-        yield "".join(f" u32 {name} = 0;" for name in lives.values())
+                ends.append(f"N({number})[i] = {live};")
+                if out.otherwise is not None and out.otherwise.op == "const":  # old values must be cleared
+                    dirty += f" | N({number})[i]"
+                continue
+            stores.append(f"BALLOT({live}, inside && {value});")
+            ends.append(f"P({number})[i] = {live};")
+            if out.otherwise is not None:
+                quiet.append(f"P({number})[i] = {'valid' if out.otherwise.attr else '0'};")
+        need = "return true;"
+        if loop.region is not None:
+            region = _Words(self)
+            busy = region.of(loop.region)
+            need = f"{' '.join(region.lines)} if (({busy}) != 0{dirty}) return true; {' '.join(quiet)} return false;"
+        yield f"FOR_BUSY_WORDS(i, [&](int i) {{ PLACE(i); {need} }}) {{ PLACE(i);"
+        yield "".join(lives)
         yield from (f"const u32 {name} = P({number})[i];" for number, name in cells.masks.items())
         yield from ("LANES { CELL;", *cells.lines, *stores, "}", f"ONCE {{ {' '.join(ends)} }}", "}")
-
-    def need(self, loop: Compute, quiet: list[str]) -> str:
-        """The expression for whether a word has work: the region, and fields whose old values must be cleared."""
-        if loop.region is None:
-            return "return true;"
-        region = _Words(self)
-        busy = region.of(loop.region)
-        dirty = [
-            f" | N({self.number(out.var.name)})[i]"
-            for out in loop.outs
-            if out.var.type == REAL and out.otherwise is not None and out.otherwise.op == "const"
-        ]
-        lines = " ".join(region.lines)
-        return f"{lines} if (({busy}) != 0{''.join(dirty)}) return true; {' '.join(quiet)} return false;"
 
 
 class _Words(WordText):
