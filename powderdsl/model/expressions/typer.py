@@ -460,6 +460,8 @@ class Typer:
                 return Place(self.offset(offset, syntax.span))
             case Expr():
                 return look(value, self.offset(base.offset, syntax.span), syntax.span)
+            case Number():  # a `let` value, the same in every cell
+                return value
             case SetOf():
                 message = f"`{syntax.text}` is not a field or property"
                 label = f"this is {'an element' if value.name else 'a set of elements'}"
