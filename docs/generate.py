@@ -22,6 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # runs from a chec
 
 from powderdsl.cli.dispatch import COMMANDS
 from powderdsl.compiler import MAX_BASES, shipped_rules
+from powderdsl.experiments.studies import study as _study_file  # noqa: F401  # declares the records of studies
 from powderdsl.ir.stages import PIPELINE
 from powderdsl.model.builtins import (
     DIRECTION_SETS,

@@ -353,7 +353,7 @@ def _find(word: str, reporter: Reporter, ruleset: RulesetDecl | None) -> Path | 
         span = next((s.span for s in ruleset.packs if s.text == word), None)
         return _find_beside(word, reporter, ruleset, span)
     path = shipped("rules") / f"{word}.yaml"
-    if not is_path(word) and path.is_file():
+    if not is_path(word) and _is_there(str(path)):
         return path
     if _is_there(word):
         return Path(word)
@@ -383,7 +383,7 @@ def _find_beside(word: str, reporter: Reporter, ruleset: RulesetDecl, span: Span
             reporter.error("PD112", f"`{name}` leaves the ruleset's folder", span, str(error))
             return None
     path = shipped("rules") / name
-    if path.is_file():
+    if _is_there(str(path)):
         return path
     _report_unknown(word, span, reporter)
     return None

@@ -380,7 +380,7 @@ def roll(values: ndarray, shift: Any, axis: Any) -> ndarray:
 def concatenate(arrays: Sequence[ndarray], axis: int = 0) -> ndarray:
     kind = reduce(numbers.promoted, [one.dtype for one in arrays])
     at = range(arrays[0].ndim)[axis]
-    ((before, after),) = {(one.shape[:at], one.shape[at + 1 :]) for one in arrays}
+    ((before, after),) = dict.fromkeys((one.shape[:at], one.shape[at + 1 :]) for one in arrays)
     parts = numbers.alike([numbers.converted(one.full, one.dtype, kind) for one in arrays], kind)
     lengths = [prod(one.shape[at:]) for one in arrays]
     blocks = [

@@ -236,7 +236,7 @@ class _Needs:
 
 
 def _either(a: Sets, b: Sets) -> Sets:
-    return _least(one | other for one in a for other in b)
+    return _least(one | other for one in sorted(a) for other in sorted(b))
 
 
 def _least(sets: Iterable[int]) -> Sets:

@@ -9,6 +9,7 @@ from difflib import get_close_matches
 
 TERMINAL_WORDS = {
     "NAME": "a name",
+    "QUALIFIED": "a name",
     "INTEGER": "an integer",
     "DECIMAL": "a number",
     "PERCENT": "a percentage",

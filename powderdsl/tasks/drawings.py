@@ -163,7 +163,7 @@ class Drawer:
     cells: int = 0
 
     def __post_init__(self) -> None:
-        names: dict[str, Expr | None] = dict.fromkeys(self.plan.broken)
+        names: dict[str, Expr | None] = dict.fromkeys(sorted(self.plan.broken))
         self.names = names | {name: number(value) for name, value in self.plan.knobs.items()}
         """The amounts of names; None for a name whose definition has been reported."""
 

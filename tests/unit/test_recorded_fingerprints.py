@@ -27,9 +27,9 @@ splits:
   test: {knobs: {many: 5}}
 """
 RECORDED = {
-    "task": "6bef710526bd9ce7",
+    "task": "45bb04584a5c6f10",
     "goal": "b5ca4d0c7989337c",
-    "splits": "04f902ab5213621d",
+    "splits": "ed992e1d0651b1c6",
     "agent": "e387b8aca9904ca3",
 }
 

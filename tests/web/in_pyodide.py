@@ -50,7 +50,7 @@ model = load("powderworld")
 assert part.planes is not None
 Path("module.wasm").write_bytes(wasm_module(part.planes, 64, memo=memo).code)
 
-sim = Simulator(model, memo=memo)
+sim = Simulator(model, "wasm", tensors=False, memo=memo)
 ids = np.frombuffer(Path("ids").read_bytes(), np.uint8).reshape(2, 64, 64)
 velocity = np.frombuffer(Path("velocity").read_bytes(), np.float32).reshape(2, 2, 64, 64)
 world = sim.step(sim.replace(sim.world(ids, seed=3), velocity=velocity), STEPS)

@@ -141,15 +141,8 @@ def shape_of(tree: Syntax, reporter: Reporter) -> Statement | None:
 
 
 def read_line(line: Span, start: str, reporter: Reporter) -> Syntax | None:
-    """The syntax of a line of the language of statements, names as one word. None after reporting PD605."""
-    tree = parse_text(line, start, reporter, _usage(line))
-    return None if tree is None else _joined(tree)
-
-
-def _joined(tree: Syntax) -> Syntax:
-    """The tree with `pack.element` as the text of its identifiers."""
-    text = tree.text.replace(" ", ".") if tree.kind == "identifier" else tree.text
-    return replace(tree, text=text, children=tuple(map(_joined, tree.children)))
+    """The syntax of a line of the language of statements, or None after reporting PD605."""
+    return parse_text(line, start, reporter, _usage(line))
 
 
 def _numbers(tree: Syntax, parts: Sequence[Syntax], reporter: Reporter) -> tuple[Syntax | None, ...] | None:
