@@ -67,7 +67,7 @@ class EmulatedSimulator(Simulator):
     def __init__(self, ruleset: Ruleset, folder: Path, order: int = 0, shared_limit: int = 232_448):
         super().__init__(ruleset, "reference", "cpu")
         self.backend = EMULATED
-        self._how = folder, order, shared_limit
+        self._emulated = folder, order, shared_limit
         compile = compiler_for(folder, order)
         program = packed_program(
             lower(ruleset),
@@ -78,4 +78,4 @@ class EmulatedSimulator(Simulator):
 
     def like(self, ruleset: Ruleset) -> EmulatedSimulator:
         """Another ruleset, emulated in the same way."""
-        return EmulatedSimulator(ruleset, *self._how)
+        return EmulatedSimulator(ruleset, *self._emulated)
