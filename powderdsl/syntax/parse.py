@@ -78,7 +78,7 @@ def reserved_words(language: Language = RULES) -> frozenset[str]:
 
 
 def line_of(node: Node | None, start: str, reporter: Reporter) -> Span | None:
-    """The place of a line in a file; None for other nodes, or after reporting escapes, where carets would be wrong."""
+    """The span of a line of text. Returns None for other nodes, and after reporting escapes, which would shift carets."""
     if not isinstance(node, Scalar):
         return None
     if node.style == "quoted" and node.content.text.split() != node.text.split():
@@ -98,7 +98,7 @@ def parse_scalar(scalar: Scalar, start: str, reporter: Reporter) -> Syntax | Non
 
 
 def parse_text(line: Span, start: str, reporter: Reporter, usage: Sequence[str] = ()) -> Syntax | None:
-    """Parse a line from a start symbol. Reports at most one syntax error, with `usage` as its help if that is given."""
+    """Parse a line from a start symbol. Reports at most one syntax error, whose help is `usage` if given."""
     language = LANGUAGES[start]
     length, first = line.end - line.start, Span(line.source, line.start, line.start + 1)
     helps = usage or ["give parts of it names with `let:`"]

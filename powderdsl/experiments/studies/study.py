@@ -294,12 +294,12 @@ class _StudyReader:
         named = self.reader.named(decl.measures, "a measure")
         measures = [measure for key, node in named if (measure := self.measure(key, node)) is not None]
         entries = tree.entries if isinstance(tree, Mapping_) else ()
-        spans = [value.span for key, value in entries if key.text == "study"]
+        place = next((value.span for key, value in entries if key.text == "study"), first_line(tree))
         for size in SIZES:
             points = math.prod((decl.seeds, *(len(axis.values[size]) for axis in axes)))
             if points > MAX_POINTS:
                 message = f"{points:,} combinations at the size `{size}`"
-                self.error("PD806", message, (*spans, first_line(tree))[0], f"at most {MAX_POINTS:,}")
+                self.error("PD806", message, place, f"at most {MAX_POINTS:,}")
         if not self.is_hidden:
             for axis in axes:
                 names = next(iter(axis.sets.values()), {}) or {axis.name: axis.key}

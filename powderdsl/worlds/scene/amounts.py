@@ -1,4 +1,4 @@
-"""Integers in statements: written out, named, drawn (`a..b`), and arithmetic on them, as in rules."""
+"""Integers in drawing statements: constants, names, draws (`a..b`) and the arithmetic of rules."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ AMOUNTS = {
     "div": "quotient",
     "range": "uniform",
 }
-"""The operation of each kind of syntax. All are on integers, so that `/` rounds down as `div` does. ``uniform`` draws an
-integer between two others, both included."""
+"""The operation of each kind of syntax. Operands are integers, so `/` rounds down, as `div` does. ``uniform`` draws an
+integer from a range that includes both ends."""
 
 MAX_DIGITS = 9
 
 
 class Written(Protocol):
-    """A word of a file, and where it is."""
+    """A word of a file and its location."""
 
     @property
     def text(self) -> str: ...
@@ -48,7 +48,7 @@ def constants(amounts: Iterable[Expr | None]) -> tuple[int | None, ...] | None:
 def read_amount(
     syntax: Syntax, names: Mapping[str, Expr | None], reporter: Reporter, what: str = "a number"
 ) -> Expr | None:
-    """The integer expression of syntax, its range as its kind, constants folded; None after a report (PD606, PD802).
+    """Turn syntax into an integer expression with its range; constants are folded. Returns None after PD606 or PD802.
 
     Args:
         names: the amounts of names; None for a name whose definition has been reported.

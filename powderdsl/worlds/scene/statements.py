@@ -97,7 +97,7 @@ def amounts_of(
             fits &= written is None
             continue
         low, high = int(amount.kind.lo), int(amount.kind.hi)
-        # A computed range may begin before the world: it is cut off there, as everything is that lies outside.
+        # A computed range may begin outside the world, where shapes are cut off anyway.
         is_cut = statement.kind in RANGES and lowest == 0 and written.kind not in ("integer", "neg")
         least = -most if is_cut else max(lowest, -most)
         greatest = 100 if statement.kind == "scatter" else most
@@ -146,7 +146,7 @@ def read_line(line: Span, start: str, reporter: Reporter) -> Syntax | None:
 
 
 def _numbers(tree: Syntax, parts: Sequence[Syntax], reporter: Reporter) -> tuple[Syntax | None, ...] | None:
-    """The numbers of a statement in the order of NUMBERS: ranges that are not written are open at both ends."""
+    """The numbers of a statement in the order of NUMBERS. A missing range is open at both ends."""
     numbers: list[Syntax | None] = []
     zero, one = (Syntax("integer", (), digit, tree.span) for digit in "01")
     ranges = {part.kind: part.children[0] for part in parts if part.kind in ("rows", "columns")}
