@@ -154,10 +154,8 @@ class Change(NamedTuple):
 class Watch(Protocol):
     """Is told what a step does, and changes nothing. Contexts continue changing."""
 
-    def begins(
-        self, moment: Moment, at: Context, masks: Mapping[int, Array], table: Mapping[str, Slot]
-    ) -> None:
-        """The lets of a substep are fixed; `masks` says where each rule will happen, by `id`; `table` has all slots."""
+    def begins(self, moment: Moment, at: Context, masks: Mapping[int, Array]) -> None:
+        """The lets of a substep are fixed; `masks` says where each rule will happen, by `id`."""
 
     def wrote(self, change: Change, before: Array, after: Array, mask: Array | None = None) -> None:
         """A slot was written where the mask holds; without a mask, anywhere."""
@@ -356,7 +354,7 @@ def run_moment(moment: Moment, at: Context, table: Mapping[str, Slot]) -> State:
         at.lets[let.name] = evaluate(let.value, at)
     masks = masks_of(moment, at)
     if at.watch is not None:
-        at.watch.begins(moment, at, masks, table)
+        at.watch.begins(moment, at, masks)
     claims = [rule for rule in moment.rules if not isinstance(rule, Assign)]
     assigns = [rule for rule in moment.rules if isinstance(rule, Assign)]
     effects = [(rule, effect) for rule in claims for effect in rule.effects]

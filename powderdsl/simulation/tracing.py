@@ -9,10 +9,10 @@ it, and ordinary simulators do not change.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import groupby, islice
+from itertools import count, groupby, islice
 from math import isfinite
 from typing import Any
 
@@ -62,7 +62,7 @@ _WITHOUT_RULE = {
 class NumberedRule:
     """A rule of the checked model. One line of a file makes several under loops and symmetries.
 
-    `number` counts from 1 in the order in which they run; `moment` counts the pass's substeps from 0; `label` has the
+    `number` counts from 1 in the order in which they run; `moment` counts the pass's substeps from 1; `label` has the
     loop variables, such as ``side = left``.
     """
 
@@ -85,30 +85,28 @@ class NumberedRule:
 
 def numbered_rules(ruleset: Ruleset) -> tuple[NumberedRule, ...]:
     """All rules in the order in which they run; rule number n is at index n − 1."""
-    rules: list[NumberedRule] = []
-    for pass_ in ruleset.passes:
-        for position, moment in enumerate(pass_.moments):
-            for rule in moment.rules:
-                number = len(rules) + 1
-                rules.append(NumberedRule(number, pass_.pack, pass_.name, position, moment.label, rule))
-    return tuple(rules)
+    numbers = count(1)
+    return tuple(
+        NumberedRule(next(numbers), pass_.pack, pass_.name, position, moment.label, rule)
+        for pass_ in ruleset.passes
+        for position, moment in enumerate(pass_.moments, 1)
+        for rule in moment.rules
+    )
 
 
 # What happens in a step
 
 
 @dataclass(frozen=True)
-class RecordedSubstep:
-    """A substep of the step: what it found, and its rules. Arrays have a batch of one.
+class Substep:
+    """A substep as it happened: what it found, and its rules. Arrays have a batch of one.
 
-    `table` has the slots of the state and of its pass, `lets` the expression of each `let` of the pass so far and what
-    that read, `masks` where each rule happened, by `id` of the rule.
+    `lets` has the expression of each `let` so far and what that read, `masks` where each rule happened, by `id`.
     """
 
     policy: str
     rules: tuple[NumberedRule, ...]
     at: reference.Context
-    table: Mapping[str, Slot]
     lets: Mapping[str, tuple[Let, reference.Context]]
     masks: Mapping[int, Array]
 
@@ -123,17 +121,17 @@ class RecordedSubstep:
     def parts(self, rule: Rule, cell: Cell) -> tuple[Part, ...]:
         """A rule's condition in one cell, split at its `and`s. Flags fixed by `let` are split too, as they were fixed."""
         assert rule.mask is not None
-        return tuple(self._split(rule.mask, self.at, "", cell))
+        return tuple(self._split(rule.mask, self.at, None, cell))
 
-    def _split(self, expr: Expr, at: reference.Context, of: str, cell: Cell) -> Iterator[Part]:
+    def _split(self, expr: Expr, at: reference.Context, let: str | None, cell: Cell) -> Iterator[Part]:
         if expr.op == "and":
             for arg in expr.args:
-                yield from self._split(arg, at, of, cell)
+                yield from self._split(arg, at, let, cell)
         elif expr.op == "let" and expr.kind == FLAG:
-            let, then = self.lets[expr.value]
-            yield from self._split(let.value, then, _written(expr.value), cell)
+            fixed, then = self.lets[expr.value]
+            yield from self._split(fixed.value, then, _written(expr.value), cell)
         elif not (expr.op == "const" and expr.value):
-            yield Part(expr, at, of, self, cell)
+            yield Part(expr, at, let, self, cell)
 
 
 @dataclass(frozen=True)
@@ -148,7 +146,7 @@ class Write:
     before: Any
     after: Any
     how: str
-    substep: RecordedSubstep | None
+    substep: Substep | None
     rule: NumberedRule | None = None
     cell: Cell | None = None
     source: Cell | None = None
@@ -173,38 +171,32 @@ class RecordedStep:
     reference's: integers int64, floats float32, [1, H, W] or [1, 2, H, W].
     """
 
-    ruleset: Ruleset
+    rules: Iterator[NumberedRule]
     cell: Cell
     begin: reference.State
     end: reference.State = field(default_factory=dict)
-    substeps: list[RecordedSubstep] = field(default_factory=list)
+    substeps: list[Substep] = field(default_factory=list)
     writes: list[Write] = field(default_factory=list)
 
-    def __post_init__(self) -> None:
-        self._rules = iter(numbered_rules(self.ruleset))
-
-    def begins(
-        self, moment: Moment, at: reference.Context, masks: Mapping[int, Array], table: Mapping[str, Slot]
-    ) -> None:
+    def begins(self, moment: Moment, at: reference.Context, masks: Mapping[int, Array]) -> None:
         """Record a substep: see `reference.Watch`."""
         now = replace(at, lets=dict(at.lets))
-        fixed = {let.name: (let, now) for let in moment.lets}
-        lets = {name: fixed[name] if name in fixed else self.substeps[-1].lets[name] for name in at.lets}
-        rules = tuple(islice(self._rules, len(moment.rules)))
-        self.substeps.append(RecordedSubstep(moment.policy, rules, now, table, lets, masks))
+        earlier = self.substeps[-1].lets if self.substeps else {}
+        lets = {**earlier, **{let.name: (let, now) for let in moment.lets}}
+        rules = tuple(islice(self.rules, len(moment.rules)))
+        self.substeps.append(Substep(moment.policy, rules, now, lets, masks))
 
     def wrote(self, change: reference.Change, before: Array, after: Array, mask: Array | None = None) -> None:
         """Record a write to the cell. One without a rule counts if it changes something."""
         substep = self.substeps[-1] if self.substeps else None
-        values = pick(before, self.cell), pick(after, self.cell)
+        write = Write(change.slot, pick(before, self.cell), pick(after, self.cell), change.how, substep)
         if change.rule is None:
-            write = Write(change.slot, *values, change.how, substep)
             self.writes += [write] if write.changed else []
         elif substep is not None and mask is not None and mask[(0, *self.cell)]:
             rule = next(numbered for numbered in substep.rules if numbered.rule is change.rule)
             source = None if change.source is None else substep.near(self.cell, change.source)
             asked = substep.near(self.cell, change.asked)
-            self.writes.append(Write(change.slot, *values, change.how, substep, rule, asked, source))
+            self.writes.append(replace(write, rule=rule, cell=asked, source=source))
 
 
 def record_step(world: World, cell: Cell) -> RecordedStep:
@@ -212,7 +204,7 @@ def record_step(world: World, cell: Cell) -> RecordedStep:
     ruleset, to_numpy = world.sim.ruleset, world.sim.kind.to_numpy
     state = {name: to_numpy(value) for name, value in world.state.items()}
     clock = reference.Clock(*(to_numpy(part) for part in (world.seed, world.index, world.step)))
-    step = RecordedStep(ruleset, cell, reference.widened(ruleset, state))
+    step = RecordedStep(iter(numbered_rules(ruleset)), cell, reference.widened(ruleset, state))
     params = reference.parameters(ruleset, 1, {})
     step.end = reference.widened(ruleset, reference.step(ruleset, state, clock, params, watch=step))
     return step
@@ -246,22 +238,18 @@ class Read:
 class Part:
     """One of the conditions that must all hold for a rule to happen, in one cell.
 
-    `at` is the state that it reads; `of` names the `let` that it comes from.
+    `at` is the state that it reads; `let` names the one that it comes from.
     """
 
     expr: Expr
     at: reference.Context
-    of: str
-    substep: RecordedSubstep
+    let: str | None
+    substep: Substep
     cell: Cell
 
     @property
     def text(self) -> str:
         return show_expr(self.at.ruleset, self.expr)
-
-    @property
-    def span(self) -> Span | None:
-        return self.expr.span
 
     @cached_property
     def holds(self) -> bool:
@@ -271,61 +259,55 @@ class Part:
     def reads(self) -> tuple[Read, ...]:
         """Everything that the condition read, each value once."""
         reads: dict[str, Read] = {}
-        for read in _reads(self.expr, self.at, self.cell, HERE, self.substep):
+        for read in self._reads(self.expr, self.at, HERE):
             reads.setdefault(read.text, read)
         return tuple(reads.values())
 
-    @property
-    def about_itself(self) -> bool:
-        """Whether it only asks which element the cell is. If that fails, the rule is about other cells."""
-        return self.expr.op == "member" and self.expr.args[0].op == "element"
+    def _reads(self, expr: Expr, at: reference.Context, offset: Offset) -> Iterator[Read]:
+        if expr.op == "look":
+            dy, dx = expr.value
+            yield from self._reads(expr.args[0], at, (offset[0] + dy, offset[1] + dx))
+        elif expr.op not in _LEAVES:
+            for arg in expr.args:
+                yield from self._reads(arg, at, offset)
+        else:
+            yield self._leaf(expr, at, offset)
+            if expr.op == "let" and expr.value in self.substep.lets:
+                let, then = self.substep.lets[expr.value]
+                yield from self._reads(let.value, then, offset)
+
+    def _leaf(self, expr: Expr, at: reference.Context, offset: Offset) -> Read:
+        ruleset, place = at.ruleset, self.substep.near(self.cell, offset)
+        value = pick(reference.evaluate(expr, at), place)
+        if expr.op == "element" and offset != HERE:
+            text = show_offset(offset)
+        else:
+            text = _written(show_expr(ruleset, look(expr, offset)))
+        element, counted = None, []
+        if expr.op == "property" or (expr.op in ("field", "let") and offset != HERE):
+            element = element_name(
+                ruleset, int(pick(reference.evaluate(Expr("element", ELEMENT), at), place))
+            )
+        if expr.op == "count":  # the neighbors with a weight where the argument holds
+            holds, kernel = reference.evaluate(expr.args[0], at), expr.value
+            for dy, dx, weight in kernel.weights:
+                there = self.substep.near(place, (dy, dx))
+                inside = there == (place[0] + dy, place[1] + dx)
+                if weight and (inside or kernel.wrap) and holds[(0, *there)]:
+                    counted.append(there)
+        return Read(
+            text,
+            plain(ruleset, expr.kind, value),
+            show_at_cell(ruleset, expr.kind, value),
+            None if expr.op in ("param", "coordinate") else place,
+            element,
+            tuple(counted),
+        )
 
 
 def _written(name: str) -> str:
     """The name of a `let` in the file: copies under loops are numbered."""
     return name.partition("#")[0]
-
-
-def _reads(
-    expr: Expr, at: reference.Context, cell: Cell, offset: Offset, substep: RecordedSubstep
-) -> Iterator[Read]:
-    if expr.op == "look":
-        dy, dx = expr.value
-        yield from _reads(expr.args[0], at, cell, (offset[0] + dy, offset[1] + dx), substep)
-    elif expr.op not in _LEAVES:
-        for arg in expr.args:
-            yield from _reads(arg, at, cell, offset, substep)
-    else:
-        yield _leaf(expr, at, substep.near(cell, offset), offset, substep)
-        if expr.op == "let" and expr.value in substep.lets:
-            let, then = substep.lets[expr.value]
-            yield from _reads(let.value, then, cell, offset, substep)
-
-
-def _leaf(expr: Expr, at: reference.Context, place: Cell, offset: Offset, substep: RecordedSubstep) -> Read:
-    ruleset, value = at.ruleset, pick(reference.evaluate(expr, at), place)
-    if expr.op == "element" and offset != HERE:
-        text = show_offset(offset)
-    else:
-        text = _written(show_expr(ruleset, look(expr, offset)))
-    element, counted = None, []
-    if expr.op == "property" or (expr.op in ("field", "let") and offset != HERE):
-        element = element_name(ruleset, int(pick(reference.evaluate(Expr("element", ELEMENT), at), place)))
-    if expr.op == "count":  # the neighbors with a weight where the argument holds
-        holds, kernel = reference.evaluate(expr.args[0], at), expr.value
-        for dy, dx, weight in kernel.weights[: 1 << 10]:
-            there = substep.near(place, (dy, dx))
-            inside = there == (place[0] + dy, place[1] + dx)
-            if weight and (inside or kernel.wrap) and holds[(0, *there)]:
-                counted.append(there)
-    return Read(
-        text,
-        plain(ruleset, expr.kind, value),
-        show_at_cell(ruleset, expr.kind, value),
-        None if expr.op in ("param", "coordinate") else place,
-        element,
-        tuple(counted),
-    )
 
 
 def plain(ruleset: Ruleset, kind: Kind, value: Any) -> Any:
@@ -335,23 +317,21 @@ def plain(ruleset: Ruleset, kind: Kind, value: Any) -> Any:
     """
     if kind.name in ("element", "direction"):
         return show_at_cell(ruleset, kind, value)
-    numbers = np.asarray(value).tolist()
-    if isinstance(numbers, list):
-        return [number if isfinite(number) else str(number) for number in numbers]
-    return bool(numbers) if kind.name == "flag" else numbers if isfinite(numbers) else str(numbers)
+    numbers = [number if isfinite(number) else str(number) for number in value.reshape(-1).tolist()]
+    return numbers if kind.name == "vec2" else numbers[0]
 
 
 def show_at_cell(ruleset: Ruleset, kind: Kind, value: Any) -> str:
     """A cell's value as a rule file would write it; draws in per cent, as chances are."""
-    number = np.asarray(value).tolist()
+    number = value.tolist()
     match kind.name:
-        case "element" | "flag" | "direction" | "chance":
-            return show_value(ruleset, kind, number)
         case "draw":
             return f"{number * 100:.6g}%"
         case "vec2":
             return "({:.7g}, {:.7g})".format(*number)
-    return str(number) if kind.name == "int" else f"{number:.7g}"
+        case "real" | "number":
+            return f"{number:.7g}"
+    return show_value(ruleset, kind, number)
 
 
 # Traces
@@ -361,17 +341,15 @@ def show_at_cell(ruleset: Ruleset, kind: Kind, value: Any) -> str:
 class Miss:
     """A rule that would have written the cell, and did not. `cell` is where its condition was asked.
 
-    `failed` are the parts that do not hold. If all hold, the rule gave way to another one under `conflicts:`.
+    `failed` are the parts that do not hold, `held` the others. If none failed, the rule gave way to another one under
+    the policy of `conflicts:`.
     """
 
     rule: NumberedRule
     cell: Cell
-    parts: tuple[Part, ...]
+    failed: tuple[Part, ...]
+    held: tuple[Part, ...]
     policy: str
-
-    @property
-    def failed(self) -> tuple[Part, ...]:
-        return tuple(part for part in self.parts if not part.holds)
 
 
 @dataclass(frozen=True)
@@ -417,29 +395,29 @@ def trace(
     Raises:
         IndexError: the world has no such cell, or the batch no such world. ValueError: step 0. KeyError: an unknown name.
     """
-    count, height, width = world.shape
-    if not 0 <= number < count:
-        raise IndexError(f"there is no world {number}: the batch has {count}, counted from 0")
+    batch, height, width = world.shape
+    if not 0 <= number < batch:
+        raise IndexError(f"there is no world {number}: the batch has {batch}, counted from 0")
     if not (0 <= row < height and 0 <= column < width):
         raise IndexError(f"there is no cell {row},{column}: the world has {height} rows and {width} columns, counted from 0")  # fmt: skip
     if step < 1:
         raise ValueError("the first step is step 1")
-    wanted = _slots(world, of)
+    slots = _slots(world, of)
     alone, cell = world.select([number]), (row, column)
     recorded = record_step(world.sim.step(alone, step - 1), cell)
-    writes = [write for write in recorded.writes if write.slot.name in wanted]
-    misses = _misses(recorded, sorted(wanted), every_rule)
+    writes = [write for write in recorded.writes if write.slot.name in slots]
+    misses = _misses(recorded, slots.values(), every_rule)
     if not every_rule:
-        lines = {(write.rule.span, write.rule.pass_name) for write in writes if write.rule}
-        misses = [miss for miss in misses if (miss.rule.span, miss.rule.pass_name) not in lines]
+        lines = {_line(write.rule) for write in writes if write.rule}
+        misses = [miss for miss in misses if _line(miss.rule) not in lines]
     return Trace(
         world.sim.ruleset,
         number,
         cell,
         int(alone.step[0]) + step,
-        tuple(wanted.values()),
-        {name: pick(array, cell) for name, array in recorded.begin.items() if name in wanted},
-        {name: pick(array, cell) for name, array in recorded.end.items() if name in wanted},
+        tuple(slots.values()),
+        {name: pick(array, cell) for name, array in recorded.begin.items() if name in slots},
+        {name: pick(array, cell) for name, array in recorded.end.items() if name in slots},
         tuple(writes),
         tuple(misses),
     )
@@ -461,106 +439,101 @@ def _slots(world: World, names: Iterable[str] | None) -> dict[str, Slot]:
     return {name: known[name] for name in wanted}
 
 
-def _misses(step: RecordedStep, names: Sequence[str], every_rule: bool) -> list[Miss]:
+def _line(rule: NumberedRule) -> tuple[Span, str]:
+    """A key that is equal for all rules of one line in one pass."""
+    return rule.span, rule.pass_name
+
+
+def _misses(step: RecordedStep, slots: Iterable[Slot], every_rule: bool) -> list[Miss]:
     """Rules that did not happen where they would have written the cell. Unless all are asked for, a line counts once a cell."""
     misses: dict[Any, Miss] = {}
     for substep in step.substeps:
-        for rule in substep.rules:
-            offsets = [offset for name in names for offset in _writes_at(rule.rule, substep.table.get(name))]
+        for numbered in substep.rules:
+            rule = numbered.rule
+            offsets = [offset for slot in slots for offset in _writes_at(rule, slot)]
             for place in dict.fromkeys(substep.near(step.cell, offset, -1) for offset in offsets):
-                key = (rule.number if every_rule else (rule.span, rule.pass_name), place)
-                if key in misses or substep.happened(rule.rule, place):
+                key = (numbered.number if every_rule else _line(numbered), place)
+                if key in misses or substep.happened(rule, place):
                     continue
-                parts = substep.parts(rule.rule, place)
-                failed = list(islice((part for part in parts if not part.holds), 2))
-                # Of a rule that nearly happened one part fails, which is not what element the cell is, or none.
-                nearly = len(failed) == 1 and len(parts) > 1 and not failed[0].about_itself
-                if every_rule or nearly or not failed:
-                    misses[key] = Miss(rule, place, parts, substep.policy)
+                parts = substep.parts(rule, place)
+                failed = tuple(islice((part for part in parts if not part.holds), None if every_rule else 2))
+                if not every_rule and failed:
+                    # Of a rule that nearly happened one part fails, which is not what element the cell is.
+                    asks = failed[0].expr
+                    about_itself = asks.op == "member" and asks.args[0].op == "element"
+                    if len(failed) > 1 or len(parts) == 1 or about_itself:
+                        continue
+                held = tuple(part for part in parts if part not in failed)
+                misses[key] = Miss(numbered, place, failed, held, substep.policy)
     return list(misses.values())
 
 
-def _writes_at(rule: Rule, slot: Slot | None) -> Iterator[Offset]:
+def _writes_at(rule: Rule, slot: Slot) -> Iterator[Offset]:
     """Where a rule writes a slot, from the cell in which its condition holds."""
-    if slot is None:
-        return
-    if isinstance(rule, Assign):
-        if rule.field == slot.name:
-            yield rule.offset
-        return
+    assigns = [rule] if isinstance(rule, Assign) else rule.effects
+    yield from (assign.offset for assign in assigns if assign.field == slot.name)
     if slot.travels:
-        yield HERE
-        if isinstance(rule, (Swap, Move)):
-            yield rule.offset
-    for effect in rule.effects:
-        if effect.field == slot.name:
-            yield effect.offset
+        yield from (offset for _, offset in _element_writes(rule))
+
+
+def _element_writes(rule: Rule) -> list[tuple[bool, Offset]]:
+    """Where a rule writes elements and what travels with them, and whether they arrive there: that comes after all else."""
+    match rule:
+        case Transform():
+            return [(False, HERE)]
+        case Move():
+            return [(False, HERE), (True, rule.offset)]
+        case Swap():
+            return [(True, rule.offset), (True, HERE)]
+    return []
 
 
 # Text
-
-MAX_MISSES = 12
-"""The most rules that nearly happened in a text, unless all are asked for."""
 
 MAX_CELLS = 9
 """The most cells that a count names in a text."""
 
 
-def trace_text(trace: Trace, *, color: bool = False, every_rule: bool = False) -> str:
+def trace_text(trace: Trace, *, color: bool = False) -> str:
     """The whole trace, without a line break at its end."""
-    blocks, again = [_head(trace)], []
-    for _, group in groupby(trace.writes, key=_event):
-        writes = list(group)
-        rule = writes[0].rule
-        if any(write.changed for write in writes):
-            blocks.append(_writes_text(trace, writes, color))
-        elif rule is not None:
-            names = ", ".join(dict.fromkeys(write.slot.name for write in writes))
-            again.append(printable(f"  {names}: {rule.place}, pass {rule.pass_name}"))
-    if again:
-        blocks.append("\n".join(["written again, as it was:", *again]))
-    shown = trace.misses if every_rule else trace.misses[:MAX_MISSES]
-    blocks += [_miss_text(trace, miss, color) for miss in shown]
-    if len(shown) < len(trace.misses):
-        blocks.append(f"{len(trace.misses) - len(shown)} more rules nearly happened: --all")
+    blocks = [_head(trace)]
+    blocks += [_writes_text(trace, list(writes), color) for _, writes in groupby(trace.writes, _event)]
+    blocks += [_miss_text(trace, miss, color) for miss in trace.misses]
     return "\n\n".join(blocks)
 
 
-def _event(write: Write) -> tuple[int, int, object]:
+def _event(write: Write) -> tuple[object, ...]:
     """A key that is equal for all writes of one rule in one substep."""
-    if write.rule is None:
-        return id(write.substep), 0, write.how
-    return id(write.substep), write.rule.number, write.cell
+    return id(write.substep), id(write.rule), write.cell, _WITHOUT_RULE.get(write.how)
+
+
+def _change(trace: Trace, slot: Slot, before: Any, after: Any) -> str:
+    old, new = (show_at_cell(trace.ruleset, slot.kind, value) for value in (before, after))
+    return f"{slot.name}: {new}, as before" if old == new else f"{slot.name}: {old} -> {new}"
 
 
 def _head(trace: Trace) -> str:
     lines = [f"cell {_at(trace.cell)} in step {trace.step} of {trace.ruleset.name}"]
     for slot in trace.slots:
-        if slot.name not in trace.after:
-            continue  # a scratch field lives in its pass
-        before, after = (
-            show_at_cell(trace.ruleset, slot.kind, values[slot.name])
-            for values in (trace.before, trace.after)
-        )
-        rule = trace.writer(slot.name)
-        by = f", by {rule.place}" if rule else ""
-        change = f"{after}, as before" if before == after else f"{before} -> {after}{by}"
-        lines.append(f"  {slot.name}: {change}")
+        if slot.name in trace.after:  # a scratch field lives in its pass
+            change = _change(trace, slot, trace.before[slot.name], trace.after[slot.name])
+            rule = trace.writer(slot.name)
+            lines.append(f"  {change}, by {rule.place}" if rule and " -> " in change else f"  {change}")
     if not any(write.rule for write in trace.writes):
         lines.append("  no rule wrote it")
     return "\n".join(map(printable, lines))
 
 
 def _writes_text(trace: Trace, writes: list[Write], color: bool) -> str:
-    lines = []
+    lines, first = [], writes[0]
     for write in writes:
         if write.changed:
-            before, after = (
-                show_at_cell(trace.ruleset, write.slot.kind, value) for value in (write.before, write.after)
-            )
             moved = f", moved here from {_at(write.source)}" if write.source else ""
-            lines.append(_painted(f"{write.slot.name}: {before} -> {after}", "32;1", color) + moved)
-    first = writes[0]
+            change = _change(trace, write.slot, write.before, write.after)
+            lines.append(_painted(change, "32;1", color) + moved)
+    if not lines:
+        names = dict.fromkeys(write.slot.name for write in writes)
+        lines = [f"{printable(', '.join(names))}: written again, as before"]
     if first.rule is None or first.cell is None:
         return "\n".join([*lines, f"  = {_WITHOUT_RULE[first.how]}"])
     return "\n".join(lines + _source(trace, first.rule, first.cell, first.parts, [Label(first.rule.span)]))
@@ -568,17 +541,15 @@ def _writes_text(trace: Trace, writes: list[Write], color: bool) -> str:
 
 def _miss_text(trace: Trace, miss: Miss, color: bool) -> str:
     span = miss.rule.span
-    labels = [Label(part.span or span, _reads_text(part)) for part in miss.failed]
+    labels = [Label(part.expr.span or span, _reads_text(part)) for part in miss.failed]
     if not labels:
         labels = [Label(span, "all of its condition holds: it gave way to a rule that claims a cell too")]
     elif all(label.span and label.span.line != span.line for label in labels):
         labels.append(Label(span, ""))
     head = _painted("almost" if len(miss.failed) <= 1 else "not", "33;1", color)
     but = " and ".join(f"`{part.text}`" for part in miss.failed) or f"`conflicts: {miss.policy}`"
-    held = [part for part in miss.parts if part.holds]
-    return "\n".join(
-        [f"{head}, but for {printable(but)}", *_source(trace, miss.rule, miss.cell, held, labels)]
-    )
+    source = _source(trace, miss.rule, miss.cell, miss.held, labels)
+    return "\n".join([f"{head}, but for {printable(but)}", *source])
 
 
 def _source(
@@ -587,10 +558,10 @@ def _source(
     """The source lines of labels, and below them the rule and the parts of its condition that hold."""
     label = f" ({rule.label})" if rule.label else ""
     where = f", asked at {_at(asked)}" if asked != trace.cell else ""
-    notes = [f"pass {rule.pass_name} of {rule.pack}, substep {rule.moment + 1}{label}{where}"]
+    notes = [f"pass {rule.pass_name} of {rule.pack}, substep {rule.moment}{label}{where}"]
     for part in held:
-        values = _reads_text(part)
-        come = f" (`{part.of}`, {place_of(part.span)})" if part.of and part.span else ""
+        values, span = _reads_text(part), part.expr.span
+        come = f" (`{part.let}`, {place_of(span)})" if part.let and span else ""
         notes.append(f"holds: {part.text}{come}{'; ' if values else ''}{values}")
     lines, gutter = source_lines(labels)
     return [*lines, *(f"{' ' * gutter} = {printable(note)}" for note in notes)]
@@ -638,62 +609,38 @@ def trace_data(trace: Trace) -> dict[str, Any]:
         "step": trace.step,
         "slots": {
             slot.name: change(slot, trace.before[slot.name], trace.after[slot.name])
-            | {"writer": _rule_data(trace.writer(slot.name))}
+            | {"writer": _data(trace.writer(slot.name))}
             for slot in trace.slots
             if slot.name in trace.after
         },
         "writes": [
-            {
-                "slot": write.slot.name,
-                **change(write.slot, write.before, write.after),
-                "how": write.how,
-                "rule": _rule_data(write.rule),
-                "cell": write.cell,
-                "source": write.source,
-                "parts": _parts_data(write.parts),
-            }
+            {"slot": write.slot.name, **change(write.slot, write.before, write.after)}
+            | {name: _data(getattr(write, name)) for name in ("how", "rule", "cell", "source", "parts")}
             for write in trace.writes
         ],
         "almost": [
-            {
-                "rule": _rule_data(miss.rule),
-                "cell": miss.cell,
-                "failed": _parts_data(miss.failed),
-                "held": _parts_data(part for part in miss.parts if part.holds),
-                "gave_way": miss.policy if not miss.failed else None,
-            }
+            {name: _data(getattr(miss, name)) for name in ("rule", "cell", "failed", "held")}
+            | {"gave_way": None if miss.failed else miss.policy}
             for miss in trace.misses
         ],
     }
 
 
-def _rule_data(rule: NumberedRule | None) -> dict[str, Any] | None:
-    if rule is None:
-        return None
-    return {
-        "number": rule.number,
-        "pack": rule.pack,
-        "pass": rule.pass_name,
-        "moment": rule.moment + 1,
-        "label": rule.label,
-        "text": one_line(rule.span),
-        **_place(rule.span),
-    }
-
-
-def _parts_data(parts: Iterable[Part]) -> list[dict[str, Any]]:
-    return [
-        {
-            "text": part.text,
-            "holds": part.holds,
-            "let": part.of or None,
-            **_place(part.span),
-            "reads": [
-                {name: value for name, value in vars(read).items() if name != "shown"} for read in part.reads
-            ],
-        }
-        for part in parts
-    ]
+def _data(value: Any) -> Any:
+    """Rules, parts of conditions and what they read, as plain data."""
+    match value:
+        case tuple():
+            return [_data(item) for item in value]
+        case NumberedRule():
+            numbered = {"number": value.number, "pack": value.pack, "pass": value.pass_name}
+            numbered |= {"moment": value.moment, "label": value.label, "text": one_line(value.span)}
+            return numbered | _place(value.span)
+        case Part():
+            part = {"text": value.text, "holds": value.holds, "let": value.let}
+            return part | _place(value.expr.span) | {"reads": _data(value.reads)}
+        case Read():
+            return {name: item for name, item in vars(value).items() if name != "shown"}
+    return value
 
 
 def _place(span: Span | None) -> dict[str, Any]:
@@ -752,14 +699,19 @@ class Recorder:
 
 def _marked(ruleset: Ruleset) -> Ruleset:
     """The same rules, with a field that holds the number of the rule that last wrote a cell's element in this step."""
-    numbers = iter(range(1, 1 << 31))
-    passes = []
+    numbers, passes = count(1), []
     for pass_ in ruleset.passes:
         moments = []
         for moment in pass_.moments:
             numbered = list(zip(moment.rules, numbers, strict=False))
-            if moment.policy in ("prove", "overwrite"):
-                rules = (*moment.rules, *_marks_in_order(numbered))
+            if moment.policy in ("prove", "overwrite"):  # all rules happen where their conditions hold
+                marks = [
+                    (arrives, _mark(number, offset, rule, rule.mask))
+                    for rule, number in numbered
+                    for arrives, offset in _element_writes(rule)
+                ]
+                marks.sort(key=lambda mark: mark[0])
+                rules = (*moment.rules, *(mark for _, mark in marks))
             else:  # of the cells that rules claim each has one writer
                 rules = tuple(_marked_rule(rule, number) for rule, number in numbered)
             moments.append(replace(moment, rules=rules))
@@ -769,30 +721,15 @@ def _marked(ruleset: Ruleset) -> Ruleset:
     return replace(ruleset, fields=(*ruleset.fields, slot), passes=tuple(passes))
 
 
-def _marks_in_order(numbered: Sequence[tuple[Rule, int]]) -> Iterator[Assign]:
-    """Assignments of the numbers of rules that all happen where their conditions hold, in the order of their writes.
-
-    What becomes of cells, or is left behind, is written before anything arrives.
-    """
-    for rule, number in numbered:
-        if isinstance(rule, (Transform, Move)):
-            yield _mark(number, HERE, rule.mask, rule)
-    for rule, number in numbered:
-        if isinstance(rule, (Swap, Move)):
-            yield _mark(number, rule.offset, rule.mask, rule)
-        if isinstance(rule, Swap):
-            yield _mark(number, HERE, rule.mask, rule)
-
-
-def _mark(number: int, place: Offset, mask: Expr | None, rule: Rule) -> Assign:
-    value = Expr("const", integer(number, number), value=number)
-    return Assign(SLOT, place, ":=", value, mask, rule.span)
-
-
 def _marked_rule(rule: Rule, number: int) -> Rule:
     """The rule with effects that leave its number in every cell whose element it writes."""
     if isinstance(rule, Assign):
-        return rule  # assignments never write elements
-    places = [rule.offset, HERE] if isinstance(rule, (Swap, Move)) else [HERE]
-    marks = tuple(_mark(number, place, None, rule) for place in places)
+        return rule
+    marks = [_mark(number, offset, rule) for _, offset in _element_writes(rule)]
     return replace(rule, effects=(*rule.effects, *marks))
+
+
+def _mark(number: int, place: Offset, rule: Rule, mask: Expr | None = None) -> Assign:
+    """The assignment of a rule's number to a cell that it writes."""
+    value = Expr("const", integer(number, number), value=number)
+    return Assign(SLOT, place, ":=", value, mask, rule.span)

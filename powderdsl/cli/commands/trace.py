@@ -67,5 +67,5 @@ def command(
     if as_json:
         print_json(trace_data(found))
     else:
-        text = trace_text(found, color=color_wanted(sys.stdout), every_rule=every_rule)
+        text = trace_text(found, color=color_wanted(sys.stdout))
         write_styled(sys.stdout, f"{text}\n")
