@@ -25,7 +25,7 @@ ROWS = {
     "targets/torch/source.py": '    "distance": "({0} - {1}).abs()",\n',
     "targets/cpp/cells.py": '    "distance": "magnitude({0} - {1})",\n',
     "targets/cuda/text.py": '    "distance": "MAGNITUDE({0} - {1})",\n',
-    "targets/wasm/cells.py": '    "distance": lambda f, a, b: op("f32x4.abs", op("f32x4.sub", a, b)),\n',
+    "targets/wasm/cells.py": '    "distance": lambda a, b: op("f32x4.abs", op("f32x4.sub", a, b)),\n',
 }
 """The rows of an operation on integers or floats, each written before that of `abs`."""
 

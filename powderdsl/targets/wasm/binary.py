@@ -1,7 +1,8 @@
 """The binary format of WebAssembly: typed expressions, functions, modules, and their text.
 
 An expression (`Value`) is the code that leaves it on the stack, with its type. Variables and items in memory (`Place`) are
-expressions that can be set. Nothing here knows rules or planes.
+expressions that can be set. Statements belong to the function that is being written (`body`): `at += 16`
+changes a variable when the function runs, `at + 16` is an expression. Nothing here knows rules or planes.
 """
 
 from __future__ import annotations
@@ -10,11 +11,12 @@ import inspect
 import struct
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cache
 from io import BytesIO
 from itertools import groupby
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 TYPES = {"i32": 0x7F, "i64": 0x7E, "f32": 0x7D, "f64": 0x7C, "v128": 0x7B}
 
@@ -184,6 +186,19 @@ class Value:
         """A member of the record at this address."""
         return load(member.load, self, member.offset)
 
+    def __setitem__(self, member: Member, value: Value | int) -> None:
+        place = self[member]
+        if not isinstance(value, Place) or value.code != place.code:  # after `|=`, it has been set
+            place.set(value)
+
+
+def _changing(operator: str) -> Callable[[Any, Value | int], Any]:
+    def change(self: Place, other: Value | int) -> Place:
+        self.set(getattr(self, operator)(other))
+        return self
+
+    return change
+
 
 class Place(Value):
     """A value that can be set, by code before and after that of its new value."""
@@ -193,6 +208,13 @@ class Place(Value):
     def __init__(self, type: str, code: bytes, before: bytes, after: bytes):
         super().__init__(type, code)
         self.before, self.after = before, after
+
+    def set(self, value: Value | int) -> None:
+        body.emit(self.before, _codes([value], self.type), self.after)
+
+    __iadd__, __isub__, __imul__ = _changing("__add__"), _changing("__sub__"), _changing("__mul__")
+    __iand__, __ior__, __ixor__ = _changing("__and__"), _changing("__or__"), _changing("__xor__")
+    __ilshift__, __irshift__ = _changing("__lshift__"), _changing("__rshift__")
 
 
 class _Variable(Place):
@@ -228,16 +250,16 @@ V128: TypeAlias = Local
 """Parameters of functions, by type (`Module.define`)."""
 
 
-Body: TypeAlias = "Callable[..., Value | int | None]"
-"""Writes a function that it is given with its parameters, and returns the result, if it has one."""
+Writer: TypeAlias = "Callable[..., Value | int | None]"
+"""Writes a function, given its parameters, and returns the result, if it has one."""
 
 
-def op(name: str, *args: Value | int, tail: bytes = b"") -> Value:
+def op(name: str, *args: Value | float, tail: bytes = b"") -> Value:
     """An instruction on its arguments, where numbers are of its own type, or i32 beside vectors; `tail`: its immediates."""
     return Value(RESULTS[name], _codes(args, _NUMBERS[name]) + OPCODES[name] + tail)
 
 
-def _codes(values: Iterable[Value | int], type: str) -> bytes:
+def _codes(values: Iterable[Value | float], type: str) -> bytes:
     """The code of values; numbers are of a type."""
     return b"".join([value.code if isinstance(value, Value) else const(type, value).code for value in values])
 
@@ -295,74 +317,96 @@ class Callee:
 
 
 class Function:
-    """A function under construction. Parameters are the first locals."""
+    """A function. Parameters are the first locals."""
 
     def __init__(self, params: Sequence[str] = ()):
         self.types = list(params)
         self.params = [Local(type, i) for i, type in enumerate(params)]
         self.result = ""
         self.body = bytearray()
-        self._depth = 0
-        self._free: dict[str, list[int]] = {}
-        self._scopes: list[list[Local]] = []
+        self.depth = 0
+        self.free: dict[str, list[int]] = {}
+        self.scopes: list[list[Local]] = []
 
-    def local(self, type: str) -> Local:
+    def code(self) -> bytes:
+        """Locals and body, as in the code section."""
+        groups = groupby(self.types[len(self.params) :])
+        declared = [unsigned(len(list(group))) + bytes([TYPES[type]]) for type, group in groups]
+        return _vector(declared) + bytes(self.body) + OPCODES["end"]
+
+
+class Body:
+    """The body of the function that is being written: statements are added to it."""
+
+    def __init__(self) -> None:
+        self._written: ContextVar[Function] = ContextVar("written")
+
+    @property
+    def function(self) -> Function:
+        return self._written.get()
+
+    @contextmanager
+    def of(self, function: Function) -> Iterator[None]:
+        """Statements inside are those of a function."""
+        token = self._written.set(function)
+        yield
+        self._written.reset(token)
+
+    def emit(self, *code: bytes) -> None:
+        """Add instructions to the function that is being written."""
+        self.function.body += b"".join(code)
+
+    def variable(self, type: str) -> Local:
         """A variable that holds anything; in a scope, until its end."""
-        free = self._free.get(type)
-        if free:
+        function = self.function
+        if free := function.free.get(type):
             local = Local(type, free.pop())
         else:
-            local = Local(type, len(self.types))
-            self.types.append(type)
-        if self._scopes:
-            self._scopes[-1].append(local)
+            local = Local(type, len(function.types))
+            function.types.append(type)
+        if function.scopes:
+            function.scopes[-1].append(local)
         return local
 
     @contextmanager
     def scope(self) -> Iterator[None]:
         """The variables made inside can be used again for others after it."""
-        self._scopes.append([])
+        function = self.function
+        function.scopes.append([])
         yield
-        for local in self._scopes.pop():
-            self._free.setdefault(local.type, []).append(local.index)
+        for local in function.scopes.pop():
+            function.free.setdefault(local.type, []).append(local.index)
 
-    def let(self, value: Value | int) -> Local:
-        """A new variable with a value; a number is an i32."""
-        value = value if isinstance(value, Value) else const("i32", value)
-        local = self.local(value.type)
-        self.set(local, value)
+    def let(self, value: Value | int, type: str = "i32") -> Local:
+        """A new variable with a value; `type`: that of a number."""
+        local = self.variable(value.type if isinstance(value, Value) else type)
+        local.set(value)
         return local
 
     def do(self, value: Value) -> None:
         """Run code, and drop what it leaves."""
-        self.body += value.code
-        if value.type:
-            self.body += OPCODES["drop"]
-
-    def set(self, target: Place, value: Value | int) -> None:
-        """Set a variable or an item in memory."""
-        self.body += target.before + _codes([value], target.type) + target.after
+        self.emit(value.code, OPCODES["drop"] if value.type else b"")
 
     def give(self, value: Value | int) -> None:
         """The result of the function is this; a number is an i32."""
-        value = value if isinstance(value, Value) else const("i32", value)
-        self.result = value.type
-        self.body += value.code + OPCODES["return"]
+        self.function.result = value.type if isinstance(value, Value) else "i32"
+        self.emit(_codes([value], "i32"), OPCODES["return"])
 
     def leave(self) -> None:
         """Return nothing."""
-        self.body += OPCODES["return"]
+        self.emit(OPCODES["return"])
 
     def trap(self) -> None:
-        self.body += OPCODES["unreachable"]
+        self.emit(OPCODES["unreachable"])
 
     @contextmanager
     def _nested(self, name: str) -> Iterator[int]:
-        self.body += OPCODES[name] + b"\x40"
-        self._depth += 1
-        yield self._depth
-        self._depth -= 1
-        self.body += OPCODES["end"]
+        function = self.function
+        self.emit(OPCODES[name], b"\x40")
+        function.depth += 1
+        yield function.depth
+        function.depth -= 1
+        self.emit(OPCODES["end"])
 
     def block(self) -> AbstractContextManager[int]:
         """A block, by its label; jumping to it leaves it."""
@@ -372,20 +416,18 @@ class Function:
         """A loop, by its label; jumping to it begins it again."""
         return self._nested("loop")
 
-    @contextmanager
-    def when(self, condition: Value) -> Iterator[None]:
+    def when(self, condition: Value) -> AbstractContextManager[int]:
         """Statements that run if a condition (i32) is not zero."""
-        self.body += condition.code
-        with self._nested("if"):
-            yield
+        self.emit(condition.code)
+        return self._nested("if")
 
     def otherwise(self) -> None:
-        self.body += OPCODES["else"]
+        self.emit(OPCODES["else"])
 
     def jump(self, label: int, condition: Value | None = None) -> None:
         """Jump to a block or loop, if a condition holds."""
-        self.body += OPCODES["br"] if condition is None else condition.code + OPCODES["br_if"]
-        self.body += unsigned(self._depth - label)
+        self.emit(OPCODES["br"] if condition is None else condition.code + OPCODES["br_if"])
+        self.emit(unsigned(self.function.depth - label))
 
     @contextmanager
     def each(
@@ -398,14 +440,11 @@ class Function:
                 self.jump(out, number >= stop)
             with self.loop() as again:
                 yield number
-                self.set(number, number + step)
+                number += step
                 self.jump(again, number < stop)
 
-    def code(self) -> bytes:
-        """Locals and body, as in the code section."""
-        groups = groupby(self.types[len(self.params) :])
-        declared = [unsigned(len(list(group))) + bytes([TYPES[type]]) for type, group in groups]
-        return _vector(declared) + bytes(self.body) + OPCODES["end"]
+
+body = Body()
 
 
 class Module:
@@ -422,14 +461,14 @@ class Module:
         self._start: list[bytes] = []
         self._custom: list[bytes] = []
 
-    def define(self, body: Body, name: str = "", *, export: bool = False) -> Callee:
-        """Add a function; `body` has its parameters, annotated with their types (`I32`), and usually its name."""
-        _, *params = inspect.signature(body).parameters.values()
+    def define(self, write: Writer, name: str = "", *, export: bool = False) -> Callee:
+        """Add a function; `write` has its parameters, annotated with their types (`I32`), and usually its name."""
+        params = inspect.signature(write).parameters.values()
         function = Function([param.annotation.lower() for param in params])
-        result = body(function, *function.params)
-        if result is not None:
-            function.give(result)
-        return self.add(function, name or body.__name__.strip("_"), export=export)
+        with body.of(function):
+            if (result := write(*function.params)) is not None:
+                body.give(result)
+        return self.add(function, name or write.__name__.strip("_"), export=export)
 
     def add(self, function: Function, name: str, *, export: bool = False) -> Callee:
         params = [bytes([TYPES[param.type]]) for param in function.params]

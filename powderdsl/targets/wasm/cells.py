@@ -6,13 +6,14 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 
 from powderdsl.ir.ops import REAL, SNAP, Node
 from powderdsl.schedule.rows import chains_of, region_of
 from powderdsl.schedule.types import Compute, loaded
 from powderdsl.targets.layout import param_key
 from powderdsl.targets.printing import CellValues
-from powderdsl.targets.wasm.binary import I32, Callee, Function, Local, Value, const, floats, load, op, vector
+from powderdsl.targets.wasm.binary import I32, Local, Value, body, const, floats, load, op, vector
 from powderdsl.targets.wasm.library import (
     HALOED,
     LIVE,
@@ -32,15 +33,15 @@ CHUNK = 4
 BITS = struct.pack("<4I", 1, 2, 4, 8)
 
 
-def _best(f: Function, instruction: str, a: Value, b: Value) -> Value:
-    a, b = (arg if isinstance(arg, Local) else f.let(arg) for arg in (a, b))
+def _best(instruction: str, a: Value, b: Value) -> Value:
+    a, b = (arg if isinstance(arg, Local) else body.let(arg) for arg in (a, b))
     return choose(op("f32x4.ne", a, a), a, op(instruction, b, a))
 
 
-def _settled(f: Function, value: Value, low: float, high: float) -> Value:
-    x = f.let(value)
-    f.set(x, x & op("f32x4.eq", x, x))
-    f.set(x, op("f32x4.pmin", op("f32x4.pmax", x, floats(low)), floats(high)))
+def _settled(value: Value, low: float, high: float) -> Value:
+    x = body.let(value)
+    x &= op("f32x4.eq", x, x)
+    x.set(op("f32x4.pmin", op("f32x4.pmax", x, floats(low)), floats(high)))
     return x & op("f32x4.ge", op("f32x4.abs", x), floats(SNAP))
 
 
@@ -51,11 +52,11 @@ _FLOATS: dict[str, str | Callable[..., Value]] = {
     "add": "f32x4.add",
     "sub": "f32x4.sub",
     "mul": "f32x4.mul",
-    "div": lambda f, a, b: op("v128.andnot", op("f32x4.div", a, b), op("f32x4.eq", b, floats(0))),
+    "div": lambda a, b: op("v128.andnot", op("f32x4.div", a, b), op("f32x4.eq", b, floats(0))),
     "neg": "f32x4.neg",
     "abs": "f32x4.abs",
-    "min": lambda f, a, b: _best(f, "f32x4.pmin", a, b),
-    "max": lambda f, a, b: _best(f, "f32x4.pmax", a, b),
+    "min": partial(_best, "f32x4.pmin"),
+    "max": partial(_best, "f32x4.pmax"),
     "sqrt": "f32x4.sqrt",
     "settle": _settled,
 }
@@ -65,6 +66,8 @@ _FLOATS: dict[str, str | Callable[..., Value]] = {
 class CellLoop(Loop):
     """A loop over cells."""
 
+    kind = "cells"
+
     def __init__(self, library: Library, loop: Compute):
         olds = [old for _, old in loop.unchanged() if old.op == "load"]
         region = [] if loop.region is None else [loop.region]
@@ -72,25 +75,23 @@ class CellLoop(Loop):
         self.columns = self.memory.at("columns") + 4 * self.memory.halo
         self.starts: dict[tuple[str, int, bool], Local] = {}
 
-    def made(self) -> Callee:
-        """The function."""
-        f, library, memory = self.f, self.library, self.memory
-        line = self.line = f.let(0)
-        self.somewhere = [f.let(0) for _ in self.outs]
-        with f.each(0, 16, 8) as lane:
+    def write(self) -> None:
+        library, memory = self.library, self.memory
+        line = self.line = body.let(0)
+        self.somewhere = [body.let(0) for _ in self.outs]
+        with body.each(0, 16, 8) as lane:
             self.lane = lane
-            with f.each(lane, lane + library.cells, memory.row) as row:
+            with body.each(lane, lane + library.cells, memory.row) as row:
                 self.row = row
-                with f.scope(), f.block() as skip:
+                with body.scope(), body.block() as skip:
                     self.skip = skip
                     self.starts = {}
                     self.lay() if self.loop.over == "choices" else self.body()
-                f.set(line, line + 1)
+                line += 1
         for out, place, some_live in zip(self.loop.outs, self.outs, self.somewhere, strict=True):
-            f.set(place[SOME], some_live)
+            place[SOME] = some_live
             if out.var.type != REAL:
-                f.set(place[HALOED], 0)
-        return self.added("cells")
+                place[HALOED] = 0
 
     # Lines
 
@@ -104,16 +105,16 @@ class CellLoop(Loop):
             key = (name, dy, wraps or not dy)
             if key not in self.starts:
                 line = self.library.other_line(self.line, dy, wraps=key[2])
-                line = line if isinstance(line, Local) else self.f.let(line)
-                self.starts[key] = self.f.let(self.library.line(self.held[name], line))
+                line = line if isinstance(line, Local) else body.let(line)
+                self.starts[key] = body.let(self.library.line(self.held[name], line))
 
     def live(self, field: Value, line: Value | None = None) -> Value:
         return (field + (self.line if line is None else line))[LIVE]
 
     def set_live(self, place: int, value: Value) -> None:
-        f, value = self.f, self.f.let(value)
-        f.set((self.outs[place] + self.line)[LIVE], value)
-        f.set(self.somewhere[place], self.somewhere[place] | value)
+        value = body.let(value)
+        (self.outs[place] + self.line)[LIVE] = value
+        self.somewhere[place] |= value
 
     def flags(self, plane: Value, at: Value) -> Value:
         """The word of a plane for this lane; `at`: bytes from its first word."""
@@ -121,23 +122,23 @@ class CellLoop(Loop):
 
     def row_flags(self, planes: Sequence[str]) -> Value:
         """A test that planes hold a flag in this row of the lane."""
-        f, memory = self.f, self.memory
+        memory = self.memory
         flags = const("i64", 0)
         if memory.words <= 4:
             for name in planes:
                 for w in range(memory.words):
                     flags = flags | load("i64.load", self.held[name] + self.row, memory.base + 16 * w)
             return op("i64.ne", flags, 0)
-        total = f.let(flags)
+        total = body.let(flags)
         for name in planes:
-            with f.each(0, memory.row, 16) as at:
-                f.set(total, total | self.flags(self.held[name], self.row + at))
+            with body.each(0, memory.row, 16) as at:
+                total |= self.flags(self.held[name], self.row + at)
         return op("i64.ne", total, 0)
 
     def copy(self, place: int, source: Local) -> None:
         """A line as it is in another field."""
         self.set_live(place, self.live(source))
-        with self.f.when(self.live(source)):
+        with body.when(self.live(source)):
             self.copy_cells(
                 *(self.library.line_start(field, self.line) for field in (self.outs[place], source))
             )
@@ -145,18 +146,18 @@ class CellLoop(Loop):
     def copy_cells(self, to: Value, source: Value) -> None:
         library = self.library
         copy = library.lazily("copy_line", lambda: library.module.define(self._copy_line))
-        self.f.do(copy(to, source))
+        body.do(copy(to, source))
 
-    def _copy_line(self, f: Function, to: I32, source: I32) -> None:
+    def _copy_line(self, to: I32, source: I32) -> None:
         begin = -4 * self.memory.halo
-        with f.each(0, 4 * self.memory.stride - 16, 16) as at:
-            f.set(load("v128.load", (to + begin) + at), load("v128.load", (source + begin) + at))
+        with body.each(0, 4 * self.memory.stride - 16, 16) as at:
+            load("v128.load", (to + begin) + at).set(load("v128.load", (source + begin) + at))
 
     # Values, chunk by chunk
 
     def skipped(self) -> None:
         """Skip a line outside the region."""
-        f, loop = self.f, self.loop
+        loop = self.loop
         if loop.region is None:
             return
         fields, planes = region_of(loop)
@@ -166,7 +167,7 @@ class CellLoop(Loop):
             busy = busy | self.live(self.held[str(live.args[0].attr)], line)
         if planes:
             busy = busy | self.row_flags(planes)
-        with f.when(op("i32.eqz", busy)):
+        with body.when(op("i32.eqz", busy)):
             for i, out in enumerate(loop.outs):
                 assert out.otherwise is not None
                 if out.otherwise.op == "load":
@@ -175,64 +176,64 @@ class CellLoop(Loop):
                     self.set_live(i, ZERO)
                 else:
                     if out.otherwise.attr:
-                        f.set(self.somewhere[i], 1)
+                        self.somewhere[i].set(1)
                     for w in range(self.memory.words):
                         columns = (1 << min(WORD, self.memory.width - WORD * w)) - 1
                         word = load("i64.load", self.outs[i] + self.row, self.memory.base + 16 * w)
-                        f.set(word, columns if out.otherwise.attr else 0)
-            f.jump(self.skip)
+                        word.set(columns if out.otherwise.attr else 0)
+            body.jump(self.skip)
 
     def body(self) -> None:
-        f, memory, library = self.f, self.memory, self.library
+        memory, library = self.memory, self.library
         self.skipped()
         self.find_starts()
         fields = [i for i, out in enumerate(self.loop.outs) if out.var.type == REAL]
         flags = [i for i, out in enumerate(self.loop.outs) if out.var.type != REAL]
-        lines = {i: f.let(library.line_start(self.outs[i], self.line)) for i in fields}
-        alive = {i: f.let(const("v128", 0)) for i in fields}
+        lines = {i: body.let(library.line_start(self.outs[i], self.line)) for i in fields}
+        alive = {i: body.let(0, "v128") for i in fields}
         with self.each_word() as (at, x, stop):
-            bits = {i: f.let(const("i64", 0)) for i in flags}
+            bits = {i: body.let(0, "i64") for i in flags}
             planes = [str(node.attr) for node in self.nodes if node.op == "load" and node.type != REAL]
-            words = {name: f.let(self.flags(self.held[name], at)) for name in dict.fromkeys(planes)}
-            with f.each(x, stop, CHUNK) as column, f.scope():
+            words = {name: body.let(self.flags(self.held[name], at)) for name in dict.fromkeys(planes)}
+            with body.each(x, stop, CHUNK) as column, body.scope():
                 self.column, self.at = column, at
                 chunks = Chunks(self, words)
                 values = [chunks.of(out.value) for out in self.loop.outs]
-                values = [value if isinstance(value, Local) else f.let(value) for value in values]
+                values = [value if isinstance(value, Local) else body.let(value) for value in values]
                 for i in fields:
-                    f.set(load("v128.load", lines[i] + (column << 2)), values[i])
+                    load("v128.load", lines[i] + (column << 2)).set(values[i])
                     inside = values[i]
                     if memory.width % CHUNK:
                         inside = inside & load("v128.load", column << 2, self.columns)
-                    f.set(alive[i], alive[i] | inside)
+                    alive[i] |= inside
                 for i in flags:
-                    f.set(bits[i], bits[i] | (counted(op("i32x4.bitmask", values[i])) << counted(column)))
+                    bits[i] |= counted(op("i32x4.bitmask", values[i])) << counted(column)
             for i in flags:
                 if not memory.whole:
-                    f.set(bits[i], bits[i] & (library.everything + at)[memory.half])
-                f.set(self.somewhere[i], self.somewhere[i] | op("i64.ne", bits[i], const("i64", 0)))
-                f.set((self.outs[i] + at)[memory.half], bits[i])
+                    bits[i] &= (library.everything + at)[memory.half]
+                self.somewhere[i] |= op("i64.ne", bits[i], 0)
+                (self.outs[i] + at)[memory.half] = bits[i]
         for i in fields:
-            self.set_live(i, some(op("i32x4.shl", alive[i], const("i32", 1))))
-            library.finish_line(f, lines[i])
+            self.set_live(i, some(op("i32x4.shl", alive[i], 1)))
+            library.finish_line(lines[i])
 
     @contextmanager
     def each_word(self) -> Iterator[tuple[Value, Value, Value]]:
         """The words of a row: bytes from the plane's first word, the first column, the column after the last."""
-        f, memory = self.f, self.memory
+        memory = self.memory
         if memory.words == 1:
             yield self.row, ZERO, const("i32", memory.width)
             return
-        at, x = f.let(self.row), f.let(0)
-        with f.loop() as again:
+        at, x = body.let(self.row), body.let(0)
+        with body.loop() as again:
             stop = x + WORD
             if not memory.whole:
-                stop = f.let(stop)
-                f.set(stop, either(stop < memory.width, stop, const("i32", memory.width)))
+                stop = body.let(stop)
+                stop.set(either(stop < memory.width, stop, memory.width))
             yield at, x, stop
-            f.set(at, at + 16)
-            f.set(x, x + WORD)
-            f.jump(again, x < memory.width)
+            at += 16
+            x += WORD
+            body.jump(again, x < memory.width)
 
     # Chains of choices
 
@@ -241,7 +242,7 @@ class CellLoop(Loop):
 
         What follows from the results comes last, if they are not the new fields themselves.
         """
-        f, library, memory, outs = self.f, self.library, self.memory, self.loop.outs
+        library, memory, outs = self.library, self.memory, self.loop.outs
         chains = chains_of(self.loop)
         bases = [self.held[str(chain[0].args[2].attr)] for chain in chains]
         masks = [str(choice.args[0].attr) for choice in chains[0]]
@@ -250,52 +251,51 @@ class CellLoop(Loop):
         if continued:
             for base in bases:
                 any_flag = any_flag | self.live(base)
-        with f.when(op("i32.eqz", any_flag)):
+        with body.when(op("i32.eqz", any_flag)):
             for i in range(len(outs)):
                 self.set_live(i, ZERO) if continued else self.copy(i, bases[i])
-            f.jump(self.skip)
+            body.jump(self.skip)
         self.find_starts()
         for i in range(len(outs)):
             self.set_live(i, const("i32", 1))
-        lines = [f.let(library.line_start(place, self.line)) for place in self.outs]
+        lines = [body.let(library.line_start(place, self.line)) for place in self.outs]
         running = lines
         if continued:
             first = memory.at("chains") + 4 * memory.halo
-            running = [f.let(first + 4 * memory.stride * i) for i in range(len(chains))]
+            running = [body.let(first + 4 * memory.stride * i) for i in range(len(chains))]
         for chain, line in zip(chains, running, strict=True):
             self.copy_cells(line, self.starts[str(chain[0].args[2].attr), 0, True])
         with self.each_word() as (at, x, _):
             for level, mask in enumerate(masks):
-                with f.scope():
+                with body.scope():
                     self.choose(at, x, mask, [chain[level] for chain in chains], running)
         if continued:
-            with f.each(0, memory.width, CHUNK) as self.column, f.scope():
+            with body.each(0, memory.width, CHUNK) as self.column, body.scope():
                 values = Chunks(self, {})
                 for chain, line in zip(chains, running, strict=True):
-                    values.known[id(chain[-1])] = f.let(load("v128.load", line + (self.column << 2)))
+                    values.known[id(chain[-1])] = body.let(load("v128.load", line + (self.column << 2)))
                 for out, line in zip(outs, lines, strict=True):
-                    f.set(load("v128.load", line + (self.column << 2)), values.of(out.value))
+                    load("v128.load", line + (self.column << 2)).set(values.of(out.value))
         for start in lines:
-            library.finish_line(f, start)
+            library.finish_line(start)
 
     def choose(self, at: Value, x: Value, mask: str, choices: Sequence[Node], lines: Sequence[Local]) -> None:
         """Choices on a mask, in the chunks of a word in which it holds: `x` is the word's first column."""
-        f = self.f
-        left = f.let(self.flags(self.held[mask], at))
-        with f.block() as done, f.loop() as again:
-            f.jump(done, op("i64.eqz", left))
-            nibble = f.let(op("i64.ctz", left) & (WORD - CHUNK))
-            self.column = f.let(x + op("i32.wrap_i64", nibble))
-            chosen = f.let(spread(op("i32.wrap_i64", left >> nibble)))
-            f.set(left, left & (const("i64", -1) ^ (const("i64", 15) << nibble)))
+        left = body.let(self.flags(self.held[mask], at))
+        with body.block() as done, body.loop() as again:
+            body.jump(done, op("i64.eqz", left))
+            nibble = body.let(op("i64.ctz", left) & (WORD - CHUNK))
+            self.column = body.let(x + op("i32.wrap_i64", nibble))
+            chosen = body.let(spread(op("i32.wrap_i64", left >> nibble)))
+            left &= const("i64", -1) ^ (const("i64", 15) << nibble)
             values = Chunks(self, {})
             places = [line + (self.column << 2) for line in lines]
             for choice, place in zip(choices, places, strict=True):
-                values.known[id(choice.args[2])] = f.let(load("v128.load", place))
+                values.known[id(choice.args[2])] = body.let(load("v128.load", place))
             for choice, place in zip(choices, places, strict=True):
                 new = choose(chosen, values.of(choice.args[1]), values.known[id(choice.args[2])])
-                f.set(load("v128.load", place), new)
-            f.jump(again)
+                load("v128.load", place).set(new)
+            body.jump(again)
 
 
 def spread(bits: Value) -> Value:
@@ -308,7 +308,7 @@ class Chunks(CellValues[Value]):
 
     def __init__(self, loop: CellLoop, words: dict[str, Local]):
         super().__init__()
-        self.loop, self.f, self.library, self.words = loop, loop.f, loop.library, words
+        self.loop, self.library, self.words = loop, loop.library, words
         self.memory = loop.memory
         self.choices = [node for node in loop.nodes if node.op == "select"]
         self.uses = Counter(id(arg) for node in loop.nodes for arg in node.args)
@@ -322,7 +322,7 @@ class Chunks(CellValues[Value]):
 
     def named(self, node: Node, value: Value) -> Value:
         once = isinstance(value, Local) or node.op == "const" or self.uses[id(node)] < 2
-        return value if once else self.f.let(value)
+        return value if once else body.let(value)
 
     def node(self, node: Node) -> Value:
         attr, args = node.attr, [self.known[id(arg)] for arg in node.args if id(arg) in self.known]
@@ -349,7 +349,7 @@ class Chunks(CellValues[Value]):
                 value = self.beside(start, dx)
                 return value if wraps or not dx else value & self.beside(const("i32", loop.columns), dx)
         row = _FLOATS[node.op]
-        return op(row, *args) if isinstance(row, str) else row(self.f, *args, *(attr or ()))
+        return op(row, *args) if isinstance(row, str) else row(*args, *(attr or ()))
 
     def beside(self, start: Value, dx: int) -> Value:
         return load("v128.load", (start + (self.loop.column << 2)) + 4 * dx)
@@ -357,39 +357,38 @@ class Chunks(CellValues[Value]):
     def draw(self, node: Node) -> Value:
         stream, bits = node.attr
         keys = self.memory.at("keys", self.memory.layout.streams[stream])
-        loop, f = self.loop, self.f
-        y = f.let((loop.row - loop.lane) // self.memory.row)
-        at = f.let(self.library.word_number(loop.at - loop.lane, y))
-        numbers = f.let(const("v128", 0))
+        loop = self.loop
+        y = body.let((loop.row - loop.lane) // self.memory.row)
+        at = body.let(self.library.word_number(loop.at - loop.lane, y))
+        numbers = body.let(0, "v128")
         for i in range(CHUNK):
             within = (loop.column + i) & (WORD - 1)
-            number = self.library.draw_float()(at, loop.lane, within, const("i32", keys), const("i32", bits))
-            f.set(numbers, op("f32x4.replace_lane", numbers, number, tail=bytes([i])))
+            number = self.library.draw_float()(at, loop.lane, within, keys, bits)
+            numbers.set(op("f32x4.replace_lane", numbers, number, tail=bytes([i])))
         return numbers
 
     def led(self, node: Node) -> Value:
         """A comparison, computed only where its leader holds somewhere in the chunk, together with others it leads."""
         leader = node.args[0]
         first = self.of(leader)
-        first = self.known[id(leader)] = first if isinstance(first, Local) else self.f.let(first)
+        first = self.known[id(leader)] = first if isinstance(first, Local) else body.let(first)
         led = [one for one in self.loop.nodes if one.op == "led" and one.args[0] is leader]
-        values = [self.f.let(const("v128", 0)) for _ in led]
-        with self.f.when(some(first)), self.inner():
+        values = [body.let(0, "v128") for _ in led]
+        with body.when(some(first)), self.inner():
             for one, value in zip(led, values, strict=True):
-                self.f.set(value, self.of(one.args[1]) & first)
+                value.set(self.of(one.args[1]) & first)
         self.known |= {id(one): value for one, value in zip(led, values, strict=True)}
         return self.known[id(node)]
 
     def variable(self, value: Value) -> Value:
-        return self.f.let(value)
+        return body.let(value)
 
     def chosen(self, mask: Node, variables: Sequence[Value], values: Sequence[Node]) -> None:
-        f = self.f
-        bits = f.let(self.nibble(mask) & 15)
-        with f.when(bits):
-            lanes = f.let(spread(bits))
+        bits = body.let(self.nibble(mask) & 15)
+        with body.when(bits):
+            lanes = body.let(spread(bits))
             new = [self.of(value) for value in values]
-            new = [value if len(new) == 1 else f.let(value) for value in new]
+            new = [value if len(new) == 1 else body.let(value) for value in new]
             for variable, value in zip(variables, new, strict=True):
                 assert isinstance(variable, Local)
-                f.set(variable, choose(lanes, value, variable))
+                variable.set(choose(lanes, value, variable))

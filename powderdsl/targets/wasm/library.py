@@ -27,13 +27,13 @@ from powderdsl.targets.wasm.binary import (
     I64,
     V128,
     Callee,
-    Function,
     Global,
     Local,
     Member,
     Module,
     Place,
     Value,
+    body,
     const,
     load,
     op,
@@ -246,166 +246,160 @@ class Library:
 
     # Memory
 
-    def _bump(self, f: Function, size: I32) -> Value:
+    def _bump(self, size: I32) -> Value:
         """New memory: bytes, a multiple of 16 → address. Traps where the module's limit is reached."""
-        place = f.let(self.top)
-        with f.when(size >= self.module.most * PAGE):
-            f.trap()
-        end = f.let(place + size)
-        pages, before = f.let((end + (PAGE - 1)) >> 16), op("memory.size")
-        with f.when(pages >= before + 1):
+        place = body.let(self.top)
+        with body.when(size >= self.module.most * PAGE):
+            body.trap()
+        end = body.let(place + size)
+        pages, before = body.let((end + (PAGE - 1)) >> 16), op("memory.size")
+        with body.when(pages >= before + 1):
             grown = op("memory.grow", pages - before)
-            with f.when(grown.equals(-1)):
-                f.trap()
-        f.set(self.top, end)
+            with body.when(grown.equals(-1)):
+                body.trap()
+        self.top.set(end)
         return place
 
-    def trap_from(self, f: Function, count: Value, size: int) -> None:
+    def trap_from(self, count: Value, size: int) -> None:
         """Trap if items of a size, together with as much again, do not fit into the memory."""
-        with f.when(counted(count) * size >= self.module.most * PAGE // 2):
-            f.trap()
+        with body.when(counted(count) * size >= self.module.most * PAGE // 2):
+            body.trap()
 
-    def _take(self, free: Global, size: Global, kind: int, f: Function) -> Value:
-        place = f.let(free)
-        with f.when(place):
-            f.set(free, place[NEXT])
-            f.otherwise()
-            f.set(place, self.bump(size))
-        f.set(place[REFS_SOME], 1)
-        f.set(place[HALOED], kind)
+    def _take(self, free: Global, size: Global, kind: int) -> Value:
+        place = body.let(free)
+        with body.when(place):
+            free.set(place[NEXT])
+            body.otherwise()
+            place.set(self.bump(size))
+        place[REFS_SOME] = 1
+        place[HALOED] = kind
         return place
 
-    def _give(self, f: Function, held: I32) -> None:
+    def _give(self, held: I32) -> None:
         """One owner less of a plane or field."""
-        left = f.let(held[REFS] - 1)
-        f.set(held[REFS], left)
-        with f.when(left.equals(0)), f.when(held[HALOED].equals(FIELD)):
-            f.set(held[NEXT], self.fields)
-            f.set(self.fields, held)
-            f.otherwise()
-            f.set(held[NEXT], self.planes)
-            f.set(self.planes, held)
+        left = body.let(held[REFS] - 1)
+        held[REFS] = left
+        with body.when(left.equals(0)), body.when(held[HALOED].equals(FIELD)):
+            held[NEXT] = self.fields
+            self.fields.set(held)
+            body.otherwise()
+            held[NEXT] = self.planes
+            self.planes.set(held)
 
-    def _keep(self, f: Function, held: I32) -> Value:
+    def _keep(self, held: I32) -> Value:
         """One more owner of a plane or field, which is the result."""
-        f.set(held[REFS], held[REFS] + 1)
+        held[REFS] += 1
         return held
 
-    def _own(self, f: Function, plane: I32) -> Value:
+    def _own(self, plane: I32) -> Value:
         """A plane of this owner alone, to be written over."""
-        with f.when(plane[REFS].equals(1)):
-            f.set(plane[HALOED], 0)
-            f.give(plane)
-        return self._copied(f, plane, self.take, self.memory.base, self.cells)
+        with body.when(plane[REFS].equals(1)):
+            plane[HALOED] = 0
+            body.give(plane)
+        return self._copied(plane, self.take, self.memory.base, self.cells)
 
-    def _own_field(self, f: Function, field: I32) -> Value:
+    def _own_field(self, field: I32) -> Value:
         """A field of this owner alone, to be written over."""
-        with f.when(field[REFS].equals(1)):
-            f.give(field)
-        return self._copied(f, field, self.take_field, HEADER, self.field_size - HEADER)
+        with body.when(field[REFS].equals(1)):
+            body.give(field)
+        return self._copied(field, self.take_field, HEADER, self.field_size - HEADER)
 
-    def _copied(self, f: Function, old: Local, take: Callee, first: int, size: Value) -> Value:
+    def _copied(self, old: Local, take: Callee, first: int, size: Value) -> Value:
         """A copy of a plane or field, whose owner gives that back."""
-        new, start = f.let(take()), const("i32", first)
-        f.do(op("memory.copy", new + start, old + start, size))
-        f.set(new[SOME], old[SOME])
-        f.do(self.give(old))
+        new = body.let(take())
+        body.do(op("memory.copy", new + first, old + first, size))
+        new[SOME] = old[SOME]
+        body.do(self.give(old))
         return new
 
     # Rows around the edges
 
-    def _edges(self, f: Function, plane: I32) -> None:
+    def _edges(self, plane: I32) -> None:
         """To be called before rows above and below are read. Beyond an edge, strips see the other strip."""
         memory, rows, around = self.memory, self.rows, self.memory.extent.around
-        with f.when(plane[HALOED]):
-            f.leave()
-        f.set(plane[HALOED], 1)
+        with body.when(plane[HALOED]):
+            body.leave()
+        plane[HALOED] = 1
         if not around:
             return
-        turn = load("v128.load", ZERO, memory.at("turn"))
-        with f.each(1, around + 1) as k:
+        turn = load("v128.load", 0, memory.at("turn"))
+        with body.each(1, around + 1) as k:
             for target, source in (
                 (around - k, (rows * around - k) % rows),
                 (rows + (k + (around - 1)), (k - 1) % rows),
             ):
-                to, came = (f.let(plane + place * memory.row) for place in (target, source))
-                with f.each(0, memory.row, 16) as w:
+                to, came = (body.let(plane + place * memory.row) for place in (target, source))
+                with body.each(0, memory.row, 16) as w:
                     seen = op("i8x16.swizzle", (came + w)[memory.flags], turn)
-                    f.set(load("v128.load", to + w, HEADER), seen)
+                    load("v128.load", to + w, HEADER).set(seen)
 
     # Draws
 
-    def _mix(self, f: Function, x: I32) -> Value:
+    def _mix(self, x: I32) -> Value:
         """The finalizer of keys."""
         for by, factor in ((16, FIRST), (15, SECOND)):
-            f.set(x, x ^ (x >> by))
-            f.set(x, x * factor)
+            x ^= x >> by
+            x *= factor
         return x ^ (x >> 16)
 
-    def mixed(self, f: Function, numbers: Value, key: Value | None = None) -> Local:
+    def mixed(self, numbers: Value, key: Value | None = None) -> Local:
         """The finalizer of keys, on a vector; with a second key added between the multiplications, that of draws."""
-        h = f.let(numbers)
-
-        def fold(by: int) -> None:
-            f.set(h, h ^ op("i32x4.shr_u", h, by))
-
-        fold(16)
-        f.set(h, op("i32x4.mul", h, integers(FIRST)))
-        fold(15)
-        f.set(h, op("i32x4.mul", op("i32x4.add", h, key) if key is not None else h, integers(SECOND)))
-        fold(16)
+        h = body.let(numbers)
+        h ^= op("i32x4.shr_u", h, 16)
+        h.set(op("i32x4.mul", h, integers(FIRST)))
+        h ^= op("i32x4.shr_u", h, 15)
+        h.set(op("i32x4.mul", op("i32x4.add", h, key) if key is not None else h, integers(SECOND)))
+        h ^= op("i32x4.shr_u", h, 16)
         return h
 
     def first_number(self, word_number: Value, keys: Value) -> Value:
         """What `ahead` takes for bit 0 of a word, by the number of the word in the hash."""
         return op("i32x4.add", splat(word_number * GOLDEN), load("v128.load", keys))
 
-    def ahead(self, f: Function, number: Local, keys: Value, count: int) -> list[Local]:
+    def ahead(self, number: Local, keys: Value, count: int) -> list[Local]:
         """The next bits of the draws of a word: `number` is the word's and the bit's times GOLDEN, with the first key."""
         drawn = []
         for i in range(count):
             at = op("i32x4.add", number, integers(i * GOLDEN)) if i else number
-            drawn.append(self.mixed(f, at, load("v128.load", keys, 16)))
-        f.set(number, op("i32x4.add", number, integers(count * GOLDEN)))
+            drawn.append(self.mixed(at, load("v128.load", keys, 16)))
+        number.set(op("i32x4.add", number, integers(count * GOLDEN)))
         return drawn
 
-    def _draw_below(self, f: Function, at: I32, wanted: V128, keys: I32, limit: I64) -> Value:
+    def _draw_below(self, at: I32, wanted: V128, keys: I32, limit: I64) -> Value:
         """Which of the wanted cells draw below a constant, given as its bits from the highest, in the word numbered `at`.
 
         Of the cells still open, those whose draw has a 0 where the limit has a 1 are below it; equal bits leave a cell open.
         """
-        number = f.let(self.first_number(at, keys))
-        below = f.let(const("v128", 0))
-        with f.block() as done, f.loop() as again:
-            for drawn in self.ahead(f, number, keys, AHEAD):
-                wants = f.let(op("i64x2.splat", op("i64.shr_s", limit, 63)))
-                self._compare(f, below, wanted, drawn, wants)
-                f.set(limit, limit << 1)
-            f.jump(done, limit.equals(0))
-            f.jump(again, some(wanted))
+        number = body.let(self.first_number(at, keys))
+        below = body.let(0, "v128")
+        with body.block() as done, body.loop() as again:
+            for drawn in self.ahead(number, keys, AHEAD):
+                wants = body.let(op("i64x2.splat", op("i64.shr_s", limit, 63)))
+                self._compare(below, wanted, drawn, wants)
+                limit <<= 1
+            body.jump(done, limit.equals(0))
+            body.jump(again, some(wanted))
         return below
 
-    def _compare(self, f: Function, below: Local, still_open: Local, drawn: Value, limit: Value) -> None:
-        f.set(below, below | op("v128.andnot", still_open & limit, drawn))
-        f.set(still_open, op("v128.andnot", still_open, limit ^ drawn))
+    def _compare(self, below: Local, still_open: Local, drawn: Value, limit: Value) -> None:
+        below |= op("v128.andnot", still_open & limit, drawn)
+        still_open.set(op("v128.andnot", still_open, limit ^ drawn))
 
-    def _draw_below_planes(
-        self, f: Function, at: I32, wanted: V128, keys: I32, limit: I32, end: I32
-    ) -> Value:
+    def _draw_below_planes(self, at: I32, wanted: V128, keys: I32, limit: I32, end: I32) -> Value:
         """The same with a limit given plane by plane, from an address to an end."""
-        number = f.let(self.first_number(at, keys))
-        below = f.let(wanted & load("v128.load", limit))
-        f.set(wanted, op("v128.andnot", wanted, load("v128.load", limit)))
-        with f.block() as done:
+        number = body.let(self.first_number(at, keys))
+        below = body.let(wanted & load("v128.load", limit))
+        wanted.set(op("v128.andnot", wanted, load("v128.load", limit)))
+        with body.block() as done:
             for count in (AHEAD, 1):
-                with f.block() as out, f.loop() as again:
-                    f.jump(out, end < limit + 16 * (count + 1))
-                    f.jump(done, some(wanted).equals(0))
-                    with f.scope():
-                        for i, drawn in enumerate(self.ahead(f, number, keys, count)):
-                            self._compare(f, below, wanted, drawn, load("v128.load", limit, 16 * (i + 1)))
-                    f.set(limit, limit + 16 * count)
-                    f.jump(again)
+                with body.block() as out, body.loop() as again:
+                    body.jump(out, end < limit + 16 * (count + 1))
+                    body.jump(done, some(wanted).equals(0))
+                    with body.scope():
+                        for i, drawn in enumerate(self.ahead(number, keys, count)):
+                            self._compare(below, wanted, drawn, load("v128.load", limit, 16 * (i + 1)))
+                    limit += 16 * count
+                    body.jump(again)
         return below
 
     def word_number(self, at: Value, y: Value | None) -> Value:
@@ -418,42 +412,42 @@ class Library:
         assert y is not None
         return (at << 2) - (y << 5)
 
-    def _coin(self, f: Function, place: I32, keys: I32) -> Value:
+    def _coin(self, place: I32, keys: I32) -> Value:
         """The plane of the highest bit of a stream's draws. Several passes ask for it: it is made once a step."""
-        plane = f.let(word(place))
-        with f.when(plane.equals(0)):
-            f.set(plane, self.take())
-            f.set(word(place), plane)
-            f.set(plane[SOME], 1)
-            y = f.let(0)
-            with f.each(0, self.cells, self.memory.row) as row:
-                with f.each(row, row + self.memory.row, 16) as at, f.scope():
+        plane = body.let(word(place))
+        with body.when(plane.equals(0)):
+            plane.set(self.take())
+            word(place).set(plane)
+            plane[SOME] = 1
+            y = body.let(0)
+            with body.each(0, self.cells, self.memory.row) as row:
+                with body.each(row, row + self.memory.row, 16) as at, body.scope():
                     number = self.first_number(self.word_number(at, y), keys)
-                    bit = self.mixed(f, number, load("v128.load", keys, 16))
-                    f.set((plane + at)[self.memory.flags], bit)
-                f.set(y, y + 1)
+                    bit = self.mixed(number, load("v128.load", keys, 16))
+                    (plane + at)[self.memory.flags] = bit
+                y += 1
         return plane
 
     def draw_float(self) -> Callee:
         """A draw of a cell as float32: number of the word, lane in bytes, column in the word, keys, bits."""
         return self.lazily("draw_float", lambda: self.module.define(self._draw_float))
 
-    def _draw_float(self, f: Function, at: I32, lane: I32, column: I32, keys: I32, bits: I32) -> Value:
-        number = f.let(self.first_number(at, keys))
-        total = f.let(const("i64", 0))
+    def _draw_float(self, at: I32, lane: I32, column: I32, keys: I32, bits: I32) -> Value:
+        number = body.let(self.first_number(at, keys))
+        total = body.let(0, "i64")
         scratch = const("i32", self.memory.at("limits"))
-        with f.each(0, bits):
-            (drawn,) = self.ahead(f, number, keys, 1)
-            f.set(load("v128.load", scratch), drawn)
+        with body.each(0, bits):
+            (drawn,) = self.ahead(number, keys, 1)
+            load("v128.load", scratch).set(drawn)
             bit = (load("i64.load", scratch + lane) >> counted(column)) & 1
-            f.set(total, (total << 1) + bit)
-        half = op("f64.add", op("f64.convert_i64_u", total), const("f64", 0.5))
+            total.set((total << 1) + bit)
+        half = op("f64.add", op("f64.convert_i64_u", total), 0.5)
         count = op("f64.convert_i64_u", 1 << counted(bits))
         return op("f32.demote_f64", op("f64.div", half, count))
 
     # Columns
 
-    def columns(self, f: Function, row: Value, at: Value, x: Value, dx: int, *, wraps: bool) -> Value:
+    def columns(self, row: Value, at: Value, x: Value, dx: int, *, wraps: bool) -> Value:
         """The flags `dx` columns to the right, of any row with more than a word. Beyond the width they are garbage.
 
         Args:
@@ -482,33 +476,33 @@ class Library:
         """64 columns of a row from a column on: address of the row, column."""
         width = self.memory.width
 
-        def columns(f: Function, row: I32, first: I32) -> Value:
-            filled, flags = f.let(0), f.let(const("v128", 0))
+        def columns(row: I32, first: I32) -> Value:
+            filled, flags = body.let(0), body.let(0, "v128")
             if wraps:
-                f.set(first, op("i32.rem_s", first, width))
-            with f.when(op("i32.lt_s", first, 0)):
+                first.set(op("i32.rem_s", first, width))
+            with body.when(op("i32.lt_s", first, 0)):
                 if not wraps:
-                    f.set(filled, 0 - first)
-                f.set(first, first + width if wraps else 0)
-            with f.block() as out, f.loop() as again:
-                f.jump(out, filled >= WORD)
+                    filled.set(0 - first)
+                first.set(first + width if wraps else 0)
+            with body.block() as out, body.loop() as again:
+                body.jump(out, filled >= WORD)
                 if not wraps:
-                    f.jump(out, first >= width)
-                within = f.let(first & (WORD - 1))
+                    body.jump(out, first >= width)
+                within = body.let(first & (WORD - 1))
                 part = load("v128.load", row + ((first >> 6) << 4)) >> within
-                f.set(flags, flags | (part << filled))
-                left, rest = f.let(WORD - within), f.let(width - first)
-                f.set(left, either(left < rest, left, rest))
-                f.set(filled, filled + left)
-                f.set(first, first + left)
+                flags |= part << filled
+                left, rest = body.let(WORD - within), body.let(width - first)
+                left.set(either(left < rest, left, rest))
+                filled += left
+                first += left
                 if wraps:
-                    f.set(first, either(first < width, first, 0))
-                f.jump(again)
+                    first.set(either(first < width, first, 0))
+                body.jump(again)
             return flags
 
         return self.module.define(columns, "columns" if wraps else "columns_inside")
 
-    def rotated(self, f: Function, row: Value, dx: int, *, wraps: bool) -> Value:
+    def rotated(self, row: Value, dx: int, *, wraps: bool) -> Value:
         """The flags `dx` columns to the right, of rows of one word. Beyond the width they are garbage."""
         width = self.memory.width
         if not wraps:
@@ -518,7 +512,7 @@ class Library:
         by = dx % width
         if not by:
             return row
-        held = row if isinstance(row, Local) else f.let(row)
+        held = row if isinstance(row, Local) else body.let(row)
         return (held >> by) | (held << (width - by))
 
     # Lines of fields
@@ -533,12 +527,12 @@ class Library:
 
     def other_line(self, line: Value, dy: int, *, wraps: bool) -> Value:
         """The line `dy` below; outside the world, one that is never live."""
-        return word(word(ZERO, self.memory.table(dy, wraps=wraps)) + (line << 2)) if dy else line
+        return word(word(0, self.memory.table(dy, wraps=wraps)) + (line << 2)) if dy else line
 
-    def finish_line(self, f: Function, start: Value) -> None:
+    def finish_line(self, start: Value) -> None:
         """Fill the columns of the torus beside a line."""
         width, reach, halo = self.memory.width, self.memory.extent.reach, self.memory.halo
-        before = f.let(start - 4 * halo) if reach else start
+        before = body.let(start - 4 * halo) if reach else start
         for i in range(reach):
             for at, source in ((width + i, i % width), (-1 - i, (width - 1 - i) % width)):
-                f.set(word(before, 4 * (halo + at)), word(before, 4 * (halo + source)))
+                word(before, 4 * (halo + at)).set(word(before, 4 * (halo + source)))

@@ -24,7 +24,7 @@ from powderdsl.schedule.types import (
 )
 from powderdsl.schedule.words import difference, is_cleared, moved, targets
 from powderdsl.targets.printing import Printer
-from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, op
+from powderdsl.targets.wasm.binary import Callee, Local, Value, body, const, op
 from powderdsl.targets.wasm.cells import CellLoop
 from powderdsl.targets.wasm.library import SOME, ZERO, Library, word
 from powderdsl.targets.wasm.moves import exchanger, groups_in_place, move_groups
@@ -35,8 +35,7 @@ ONE = const("i32", 1)
 
 def pass_function(schedule: Schedule, library: Library) -> Callee:
     """The function of a pass."""
-    printer = Pass(schedule, library)
-    return library.module.add(printer.made(), pass_function_name(schedule.name))
+    return library.module.define(Pass(schedule, library).write, pass_function_name(schedule.name))
 
 
 def pass_function_name(name: str) -> str:
@@ -48,54 +47,53 @@ class Pass(Printer):
     """Variables are locals that hold the addresses of planes and fields."""
 
     def __init__(self, schedule: Schedule, library: Library):
-        self.schedule, self.library, self.f = schedule, library, Function()
+        self.schedule, self.library = schedule, library
         self.nothing = schedule.graph.node("const", FLAG, (), False)
         self.vars: dict[str, Local] = {}
 
-    def made(self) -> Function:
-        f, library, schedule = self.f, self.library, self.schedule
+    def write(self) -> None:
+        library, schedule = self.library, self.schedule
         memory, group = library.memory, library.group
         changed = {slot for slot, _ in schedule.leaves}
         if schedule.when is not None:
-            with f.when(op("i32.eqz", self.answer(schedule.when))):
-                f.leave()
+            with body.when(op("i32.eqz", self.answer(schedule.when))):
+                body.leave()
         for slot, var in schedule.finds:
             at = memory.slot(slot, var.type)
             if slot in changed:  # nothing else refers to it while the pass runs, so it may be overwritten
                 self.define(var, group[at])
-                f.set(group[at], 0)
+                group[at] = 0
             else:
                 self.define(var, library.keep(group[at]))
         self.block(schedule.body)
-        values = [f.let(self.kept(node)) for _, node in schedule.leaves]
+        values = [body.let(self.kept(node)) for _, node in schedule.leaves]
         for (slot, node), value in zip(schedule.leaves, values, strict=True):
             at = memory.slot(slot, node.type)
-            old = f.let(group[at])
-            with f.when(old):
-                f.do(library.give(old))
-            f.set(group[at], value)
+            old = body.let(group[at])
+            with body.when(old):
+                body.do(library.give(old))
+            group[at] = value
         self.give(dict.fromkeys(str(node.attr) for _, node in schedule.leaves if node.op == "load"))
-        return f
 
     # Variables
 
     def define(self, var: Var, value: Value) -> Local:
         self.declare([var])
-        self.f.set(self.vars[var.name], value)
+        self.vars[var.name].set(value)
         return self.vars[var.name]
 
     def declare(self, variables: Iterable[Var]) -> None:
         """Variables that are set later."""
         for var in variables:
             if var.name not in self.vars:
-                self.vars[var.name] = self.f.local("i32")
+                self.vars[var.name] = body.variable("i32")
 
     def of(self, node: Node) -> Local:
         return self.vars[str(node.attr)]
 
     def give(self, names: Iterable[str]) -> None:
         for name in names:
-            self.f.do(self.library.give(self.vars[name]))
+            body.do(self.library.give(self.vars[name]))
 
     def held(self, node: Node) -> Value:
         """The plane or field of a load or a constant."""
@@ -116,11 +114,11 @@ class Pass(Printer):
             case "any":
                 return self.of(node.args[0])[SOME]
             case "present":
-                return op("i64.ne", self.library.present & node.attr, const("i64", 0))
+                return op("i64.ne", self.library.present & node.attr, 0)
             case "const":
                 return const("i32", bool(node.attr))
         first, second = (self.answer(arg) for arg in node.args)
-        return op("i32.ne", first, ZERO) & op("i32.ne", second, ZERO) if node.op == "and" else first | second
+        return op("i32.ne", first, 0) & op("i32.ne", second, 0) if node.op == "and" else first | second
 
     # Statements
 
@@ -132,17 +130,17 @@ class Pass(Printer):
         self.give(release.names)
 
     def forget(self, _: Forget) -> None:
-        self.f.set(self.library.present, const("i64", -1))
+        self.library.present.set(-1)
 
     @contextmanager
     def where(self, condition: Value, keeps: Iterable[tuple[Var, Node]]) -> Iterator[None]:
         """Statements that run if a condition holds; if not, variables that they define get other values."""
         values = list(keeps)
         self.declare(var for var, _ in values)
-        with self.f.when(condition):
+        with body.when(condition):
             yield
             if values:
-                self.f.otherwise()
+                body.otherwise()
                 for var, value in values:
                     self.define(var, self.kept(value))
 
@@ -156,7 +154,7 @@ class Pass(Printer):
             self.cells(loop)
             for out in loop.outs:
                 if out.into is not None:
-                    self.f.do(self.library.give(self.vars[out.into]))
+                    body.do(self.library.give(self.vars[out.into]))
         self.give(sweeps.passing)
 
     def cells(self, loop: Compute) -> None:
@@ -191,10 +189,10 @@ class Pass(Printer):
     def call(self, made: CellLoop | WordLoop) -> None:
         """Call a loop with what it reads and what it writes."""
         for name in made.haloed:
-            self.f.do(self.library.edges(self.vars[name]))
+            body.do(self.library.edges(self.vars[name]))
         function = made.made()
         outs = (self.vars[out.var.name] for out in made.loop.outs)
-        self.f.do(function(*map(self.read, made.reads), *outs))
+        body.do(function(*map(self.read, made.reads), *outs))
 
     def read(self, name: str | tuple[str, int]) -> Value:
         if isinstance(name, str):
@@ -202,22 +200,22 @@ class Pass(Printer):
         memory, (table, number) = self.library.memory, name
         place = memory.at(table, number)
         if table == "fixed":
-            return word(ZERO, place)
-        return self.library.coin(const("i32", place), const("i32", memory.at("keys", number)))
+            return word(0, place)
+        return self.library.coin(place, memory.at("keys", number))
 
     def update(self, loop: Compute) -> None:
         """Planes that change only in words where a mask holds."""
-        f, library = self.f, self.library
+        library = self.library
         for out in loop.outs:
             assert out.otherwise is not None
             self.define(out.var, self.of(out.otherwise) if out.into else self.kept(out.otherwise))
         made = WordLoop(library, loop)
-        with f.when(reduce(or_, (self.vars[name][SOME] for name in made.mask_names), ZERO)):
+        with body.when(reduce(or_, (self.vars[name][SOME] for name in made.mask_names), ZERO)):
             for out in loop.outs:
                 plane = self.vars[out.var.name]
                 needed = plane[SOME] if is_cleared(out, self.schedule.graph) else ONE  # 0 stays 0
-                with f.when(needed):
-                    f.set(plane, library.own(plane))
+                with body.when(needed):
+                    plane.set(library.own(plane))
             self.call(made)
 
     def whole(self, out: Out) -> None:
@@ -243,24 +241,24 @@ class Pass(Printer):
 
     def move(self, move: Move) -> None:
         """Planes that move, or fields that exchange values; those that nothing moves stay as they are."""
-        f, library, graph = self.f, self.library, self.schedule.graph
+        library, graph = self.library, self.schedule.graph
         movers, fields = self.of(move.movers), move.planes[0].new.type == REAL
         groups = None if fields else groups_in_place(move)
         if groups is None and not fields:
             self.run(WordLoop(library, moved(move, graph)))
             for plane in move.planes:
                 if plane.into is not None:
-                    f.do(library.give(self.vars[plane.into]))
+                    body.do(library.give(self.vars[plane.into]))
             return
         for plane in move.planes:
             old = self.of(plane.old) if plane.into is not None else self.kept(plane.old)
             held = self.define(plane.new, old)
             if fields:
-                with f.when(movers[SOME] & held[SOME]):
-                    f.set(held, library.own_field(held))
-                    f.do(exchanger(library, move.offset)(movers, held))
+                with body.when(movers[SOME] & held[SOME]):
+                    held.set(library.own_field(held))
+                    body.do(exchanger(library, move.offset)(movers, held))
         if groups is not None:
-            with f.when(movers[SOME]), f.scope():
+            with body.when(movers[SOME]), body.scope():
                 entered = WordLoop(library, targets(move, graph)).made()
                 planes = {kind: [self.vars[one.new.name] for one in group] for kind, group in groups.items()}
-                move_groups(library, f, move, movers, planes, entered)
+                move_groups(library, move, movers, planes, entered)

@@ -27,7 +27,7 @@ from itertools import chain
 
 from powderdsl.ir.ops import SNAP, Threshold
 from powderdsl.targets.codec import Piece
-from powderdsl.targets.wasm.binary import F64, I32, Callee, Function, Local, Value, const, load, op
+from powderdsl.targets.wasm.binary import F64, I32, Callee, Local, Value, body, const, load, op
 from powderdsl.targets.wasm.driver import Batches, numbers_of
 from powderdsl.targets.wasm.library import HEADER, LIVE, PAGE, SOME, Library, aligned, counted, either, word
 
@@ -124,26 +124,26 @@ class Standalone(Batches):
 
     # The world
 
-    def _start(self, f: Function) -> None:
+    def _start(self) -> None:
         """Makes a world of the first element, with seed 0."""
-        f.set(self.batch, self.calls["allocate"](1, self.face.rows))
+        self.batch.set(self.calls["allocate"](1, self.face.rows))
         for set_knob, knob in zip(self.knobs, self.face.knobs, strict=True):
-            f.do(set_knob(const("f64", knob.default)))
-        f.do(op("memory.fill", self.cells_at, self.face.ids[0], self.count))
-        f.do(self.calls["begin"](0))
+            body.do(set_knob(const("f64", knob.default)))
+        body.do(op("memory.fill", self.cells_at, self.face.ids[0], self.count))
+        body.do(self.calls["begin"](0))
 
-    def begin(self, f: Function, seed: I32) -> None:
+    def begin(self, seed: I32) -> None:
         """The ids in the buffer become a world of a seed, with fresh cells."""
-        with f.each(0, self.count) as i:
+        with body.each(0, self.count) as i:
             cell = load("i32.load8_u", self.cells_at + i)
-            f.set(cell, load("i32.load8_u", cell, self.valid))
-        f.do(self._load(self.face.element, self.cells_at, 1))
+            cell.set(load("i32.load8_u", cell, self.valid))
+        body.do(self._load(self.face.element, self.cells_at, 1))
         for piece, _, usual in chain.from_iterable(self.parts.values()):
-            with f.each(0, self.count) as i:
-                f.set(word(i << 2, self.wide), word(load("i32.load8_u", self.cells_at + i) << 2, usual))
-            f.do(self._load(piece, self.wide, 4))
+            with body.each(0, self.count) as i:
+                word(i << 2, self.wide).set(word(load("i32.load8_u", self.cells_at + i) << 2, usual))
+            body.do(self._load(piece, self.wide, 4))
         for number, start in enumerate((counted(seed), *[const("i64", 0)] * 2)):
-            f.set(load("i64.load", self.batch, HEADER + 8 * number), start)
+            load("i64.load", self.batch, HEADER + 8 * number).set(start)
 
     def _load(self, piece: Piece, address: Value | int, size: int) -> Value:
         return self.calls["load"](self.batch, *numbers_of(piece, self.layout, size), address, 0)
@@ -151,126 +151,123 @@ class Standalone(Batches):
     def _store(self, piece: Piece, address: Value | int, size: int) -> Value:
         return self.calls["store"](self.batch, *numbers_of(piece, self.layout, size), address, 0)
 
-    def cells(self, f: Function) -> Value:
+    def cells(self) -> Value:
         return self.cells_at
 
-    def step(self, f: Function, count: I32) -> None:
-        f.do(self.calls["run"](self.batch, count))
+    def step(self, count: I32) -> None:
+        body.do(self.calls["run"](self.batch, count))
 
-    def clock(self, f: Function) -> Value:
+    def clock(self) -> Value:
         return self.batch + HEADER
 
-    def show(self, f: Function) -> Value:
-        f.do(self._store(self.face.element, self.cells_at, 1))
+    def show(self) -> Value:
+        body.do(self._store(self.face.element, self.cells_at, 1))
         return self.cells_at
 
     # Fields
 
-    def _read(self, slot: Stored, f: Function) -> None:
+    def _read(self, slot: Stored) -> None:
         """Writes the values of a field into its buffer."""
         for piece, at, _ in self.parts[slot.name]:
-            f.do(self._store(piece, at, slot.size))
+            body.do(self._store(piece, at, slot.size))
 
-    def _take_values(self, slot: Stored, f: Function) -> None:
+    def _take_values(self, slot: Stored) -> None:
         """The values in a field's buffer become the field's, cut to what cells can have; the ids have been shown."""
         low, high = slot.low, slot.high
         for piece, at, usual in self.parts[slot.name]:
-            with f.scope(), f.each(0, self.count) as i:
-                place = f.let(i * slot.size)
-                identity = f.let(load("i32.load8_u", self.cells_at + i))
+            with body.scope(), body.each(0, self.count) as i:
+                place = body.let(i * slot.size)
+                identity = body.let(load("i32.load8_u", self.cells_at + i))
                 cell = load(slot.load, place, at)
                 if piece.is_real:
-                    value = f.let(_within(cell, low, high))
+                    value = body.let(_within(cell, low, high))
                     # Without a number, and for small ones, the comparison does not hold.
-                    large = op("f32.ge", op("f32.abs", value), const("f32", SNAP))
-                    f.set(cell, either(large, value, const("f32", 0)))
+                    large = op("f32.ge", op("f32.abs", value), SNAP)
+                    cell.set(either(large, value, 0))
                 else:
-                    value = f.let(cell)
+                    value = body.let(cell)
                     if slot.names_element:
-                        f.set(value, load("i32.load8_u", value, self.valid))
+                        value.set(load("i32.load8_u", value, self.valid))
                     else:
-                        f.set(value, either(op("i32.lt_s", value, int(low)), int(low), value))
-                        f.set(value, either(op("i32.gt_s", value, int(high)), int(high), value))
-                    f.set(cell, value)
+                        value.set(either(op("i32.lt_s", value, int(low)), int(low), value))
+                        value.set(either(op("i32.gt_s", value, int(high)), int(high), value))
+                    cell.set(value)
                 if slot.holders is not None:
                     holders = self._data(bytes(i in slot.holders for i in range(256)))
-                    with f.when(load("i32.load8_u", identity, holders).equals(0)):
-                        f.set(cell, load("f32.load" if piece.is_real else "i32.load", identity << 2, usual))
-            f.do(self._load(piece, at, slot.size))
+                    with body.when(load("i32.load8_u", identity, holders).equals(0)):
+                        cell.set(load("f32.load" if piece.is_real else "i32.load", identity << 2, usual))
+            body.do(self._load(piece, at, slot.size))
 
-    def field(self, f: Function, number: I32) -> int:
+    def field(self, number: I32) -> int:
         for i, slot in enumerate(self.face.fields):
-            with f.when(number.equals(i)):
-                f.do(self.reads[i]())
-                f.give(self.parts[slot.name][0][1])
+            with body.when(number.equals(i)):
+                body.do(self.reads[i]())
+                body.give(self.parts[slot.name][0][1])
         return 0
 
-    def take(self, f: Function, number: I32) -> None:
-        f.do(self.calls["show"]())
+    def take(self, number: I32) -> None:
+        body.do(self.calls["show"]())
         for i, take in enumerate(self.takes):
-            with f.when(number.equals(i)):
-                f.do(take())
+            with body.when(number.equals(i)):
+                body.do(take())
 
     # Boxes
 
-    def _cut(self, f: Function, start: Local, stop: Local, most: int) -> None:
+    def _cut(self, start: Local, stop: Local, most: int) -> None:
         """A side of a box, within the grid; nothing is done with an empty one."""
-        f.set(stop, either(op("i32.gt_s", stop, most), most, stop))
-        f.set(start, either(op("i32.lt_s", start, 0), 0, start))
-        with f.when(op("i32.ge_s", start, stop)):
-            f.leave()
+        stop.set(either(op("i32.gt_s", stop, most), most, stop))
+        start.set(either(op("i32.lt_s", start, 0), 0, start))
+        with body.when(op("i32.ge_s", start, stop)):
+            body.leave()
 
-    def paint(self, f: Function, element: I32, top: I32, bottom: I32, left: I32, right: I32) -> None:
-        self._cut(f, top, bottom, self.face.rows)
-        self._cut(f, left, right, self.memory.width)
-        with f.when(element >= 256):
-            f.leave()
-        with f.when(op("i32.ne", load("i32.load8_u", element, self.valid), element)):
-            f.leave()
+    def paint(self, element: I32, top: I32, bottom: I32, left: I32, right: I32) -> None:
+        self._cut(top, bottom, self.face.rows)
+        self._cut(left, right, self.memory.width)
+        with body.when(element >= 256):
+            body.leave()
+        with body.when(op("i32.ne", load("i32.load8_u", element, self.valid), element)):
+            body.leave()
         fresh: list[tuple[Piece, Value]] = [(self.face.element, element)]
         for slot in self.face.fields:
             if slot.of_element:
                 fresh += [(piece, word(element << 2, usual)) for piece, _, usual in self.parts[slot.name]]
         for piece, value in fresh:
             place, planes, *_ = numbers_of(piece, self.layout, 0)
-            f.do(self.calls["fill"](place, planes, top, bottom, left, right, value))
+            body.do(self.calls["fill"](place, planes, top, bottom, left, right, value))
 
-    def _fill(
-        self, f: Function, slot: I32, planes: I32, top: I32, bottom: I32, left: I32, right: I32, value: I32
-    ) -> None:
+    def _fill(self, slot: I32, planes: I32, top: I32, bottom: I32, left: I32, right: I32, value: I32) -> None:
         """A box of equal cells: in planes from a slot on; without planes, in a field, by the bits of its value."""
         library, memory = self.library, self.memory
-        group = f.let(self.part(self.batch, 3))
-        f.set(group[memory.present], -1)
-        with f.each(top, bottom) as y:
-            lane, row = f.let(y // library.rows), f.let(y % library.rows)
-            with f.each(slot, slot + planes, some=False) as number:
-                at = f.let(group + (number << 2))
-                plane = f.let(library.own(word(at)))
-                f.set(word(at), plane)
-                flag = f.let(counted((value >> (number - slot)) & 1))
-                f.set(plane[SOME], plane[SOME] | op("i32.wrap_i64", flag))
-                with f.each(left, right) as x:
-                    half = f.let(plane + row * memory.row + ((x >> 6) << 4) + (lane << 3))[memory.half]
-                    by = f.let(counted(x & 63))
-                    f.set(half, half & (const("i64", -1) ^ (1 << by)) | (flag << by))
-            with f.when(planes.equals(0)):
-                at = f.let(group + (slot << 2))
-                field = f.let(library.own_field(word(at)))
-                f.set(word(at), field)
-                line = f.let(lane * library.rows + row)
-                start, alive = f.let(library.line_start(field, line)), f.let(0)
-                with f.when((field + line)[LIVE].equals(0)):
-                    f.do(op("memory.fill", start, 0, 4 * memory.width))
-                with f.each(left, right) as x:
-                    f.set(word(start + (x << 2)), value)
-                with f.each(0, 4 * memory.width, 4) as x:
-                    f.set(alive, alive | (word(start + x) << 1))
-                self.close_line(f, field, line, start, alive)
+        group = body.let(self.part(self.batch, 3))
+        group[memory.present] = -1
+        with body.each(top, bottom) as y:
+            lane, row = body.let(y // library.rows), body.let(y % library.rows)
+            with body.each(slot, slot + planes, some=False) as number:
+                at = body.let(group + (number << 2))
+                plane = body.let(library.own(word(at)))
+                word(at).set(plane)
+                flag = body.let(counted((value >> (number - slot)) & 1))
+                plane[SOME] |= op("i32.wrap_i64", flag)
+                with body.each(left, right) as x:
+                    half = body.let(plane + row * memory.row + ((x >> 6) << 4) + (lane << 3))[memory.half]
+                    by = body.let(counted(x & 63))
+                    half.set(half & (const("i64", -1) ^ (1 << by)) | (flag << by))
+            with body.when(planes.equals(0)):
+                at = body.let(group + (slot << 2))
+                field = body.let(library.own_field(word(at)))
+                word(at).set(field)
+                line = body.let(lane * library.rows + row)
+                start, alive = body.let(library.line_start(field, line)), body.let(0)
+                with body.when((field + line)[LIVE].equals(0)):
+                    body.do(op("memory.fill", start, 0, 4 * memory.width))
+                with body.each(left, right) as x:
+                    word(start + (x << 2)).set(value)
+                with body.each(0, 4 * memory.width, 4) as x:
+                    alive |= word(start + x) << 1
+                self.close_line(field, line, start, alive)
 
     def set(
         self,
-        f: Function,
         field: I32,
         component: I32,
         top: I32,
@@ -279,63 +276,63 @@ class Standalone(Batches):
         right: I32,
         value: F64,
     ) -> None:
-        f.do(self.calls["show"]())
-        self._cut(f, top, bottom, self.face.rows)
-        self._cut(f, left, right, self.memory.width)
+        body.do(self.calls["show"]())
+        self._cut(top, bottom, self.face.rows)
+        self._cut(left, right, self.memory.width)
         for i, slot in enumerate(self.face.fields):
-            with f.when(field.equals(i)), f.scope():
-                with f.when(component >= len(slot.pieces)):
-                    f.leave()
-                f.do(self.reads[i]())
+            with body.when(field.equals(i)), body.scope():
+                with body.when(component >= len(slot.pieces)):
+                    body.leave()
+                body.do(self.reads[i]())
                 convert = "f32.demote_f64" if slot.pieces[0].is_real else "i32.trunc_sat_f64_s"
-                stored = f.let(op(convert, _within(value, slot.low, slot.high)))
-                base = f.let(component * (self.count * slot.size))
-                with f.each(top, bottom) as y, f.each(left, right) as x:
+                stored = body.let(op(convert, _within(value, slot.low, slot.high)))
+                base = body.let(component * (self.count * slot.size))
+                with body.each(top, bottom) as y, body.each(left, right) as x:
                     place = base + (y * self.memory.width + x) * slot.size
-                    f.set(load(slot.load, place, self.parts[slot.name][0][1]), stored)
-                f.do(self.takes[i]())
+                    load(slot.load, place, self.parts[slot.name][0][1]).set(stored)
+                body.do(self.takes[i]())
 
     # Parameters
 
-    def _knob(self, knob: Knob, f: Function, value: F64) -> None:
+    def _knob(self, knob: Knob, value: F64) -> None:
         """Sets a parameter: its value, cut to its range, as bits and floats."""
         layout = self.layout
-        with f.when(op("f64.ne", value, value)):
-            f.leave()
-        f.set(value, _within(value, knob.low, knob.high))
+        with body.when(op("f64.ne", value, value)):
+            body.leave()
+        value.set(_within(value, knob.low, knob.high))
         if knob.whole:
-            f.set(value, op("f64.floor", op("f64.add", value, const("f64", 0.5))))
+            value.set(op("f64.floor", op("f64.add", value, 0.5)))
         views: dict[Threshold | None, list[tuple[int, int]]] = {}
         for (name, threshold, bit), place in layout.param_planes.items():
             if name == knob.name:
                 views.setdefault(threshold, []).append((bit, place))
         for threshold, bits in views.items():
             limit = value if threshold is None else _limit(value, threshold)
-            limit = f.let(op("i64.trunc_sat_f64_s", limit))
+            limit = body.let(op("i64.trunc_sat_f64_s", limit))
             for bit, place in bits:
-                f.set(load("i64.load8_u", self.part(self.batch, 1) + place), (limit >> bit) & 1)
+                load("i64.load8_u", self.part(self.batch, 1) + place).set((limit >> bit) & 1)
         if knob.name in layout.param_reals:
             at = self.part(self.batch, 2) + 4 * layout.param_reals[knob.name]
-            f.set(load("f32.load", at), op("f32.demote_f64", value))
+            load("f32.load", at).set(op("f32.demote_f64", value))
 
-    def parameter(self, f: Function, number: I32, value: F64) -> None:
+    def parameter(self, number: I32, value: F64) -> None:
         for i, set_knob in enumerate(self.knobs):
-            with f.when(number.equals(i)):
-                f.do(set_knob(value))
+            with body.when(number.equals(i)):
+                body.do(set_knob(value))
 
 
 def _within(value: Value, low: float, high: float) -> Value:
     """A float, cut to a range."""
     kind = value.type
-    return op(f"{kind}.min", op(f"{kind}.max", value, const(kind, low)), const(kind, high))
+    return op(f"{kind}.min", op(f"{kind}.max", value, low), high)
 
 
 def _limit(value: Value, threshold: Threshold) -> Value:
     """As `codec.limits`: how many draws lie below a chance, or not above it."""
     count = 1 << threshold.bits
-    scaled = op("f64.sub", op("f64.mul", value, const("f64", count)), const("f64", 0.5))
+    scaled = op("f64.sub", value * count, 0.5)
     if threshold.strict:
         limit = op("f64.ceil", scaled)
     else:
-        limit = op("f64.add", op("f64.floor", scaled), const("f64", 1))
+        limit = op("f64.floor", scaled) + 1
     return _within(limit, 0, count)

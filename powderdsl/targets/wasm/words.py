@@ -13,7 +13,7 @@ from powderdsl.schedule.costs import is_coin
 from powderdsl.schedule.types import Compute, alternatives, loaded
 from powderdsl.targets.layout import Layout, fixed_key, is_run, param_key
 from powderdsl.targets.printing import Values, drawn_where, limited_draw
-from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, const, load, op
+from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, body, const, load, op
 from powderdsl.targets.wasm.library import SOME, WORD, ZERO, Library, choose, some
 
 
@@ -32,6 +32,8 @@ class Loop:
     `reads` are names of variables, or tables and numbers of planes that are there anyway (`plane_name`).
     """
 
+    kind: str
+
     def __init__(self, library: Library, loop: Compute, reads: Iterable[str | tuple[str, int]]):
         self.library, self.loop, self.memory = library, loop, library.memory
         self.reads = list(dict.fromkeys(reads))
@@ -42,13 +44,21 @@ class Loop:
         self.haloed: list[str] = []
         """The planes of which other rows are read."""
 
-    def added(self, kind: str) -> Callee:
+    def write(self) -> None:
+        """Write the function."""
+        raise NotImplementedError
+
+    def made(self) -> Callee:
         """The function in the module, under the name of its place in the rules."""
-        return self.library.module.add(self.f, f"{kind}_{self.loop.place.rpartition('/')[2]}")
+        with body.of(self.f):
+            self.write()
+        return self.library.module.add(self.f, f"{self.kind}_{self.loop.place.rpartition('/')[2]}")
 
 
 class WordLoop(Loop):
     """A loop over words."""
+
+    kind = "words"
 
     def __init__(self, library: Library, loop: Compute):
         values = [out.value for out in loop.outs]
@@ -64,48 +74,46 @@ class WordLoop(Loop):
             if out.into in olds:  # what is overwritten holds the old value
                 self.held[str(out.into)] = place
 
-    def made(self) -> Callee:
-        """The function."""
-        f, library, memory = self.f, self.library, self.memory
-        stop = f.let(library.cells)
-        any_flags = [f.let(const("v128", 0)) for _ in self.outs]
+    def write(self) -> None:
+        library, memory = self.library, self.memory
+        stop = body.let(library.cells)
+        any_flags = [body.let(0, "v128") for _ in self.outs]
         self.y = self.row = self.x = None
         if memory.words == 1:
-            with f.each(0, stop, 16) as at:
+            with body.each(0, stop, 16) as at:
                 self.at = at
                 self.body(any_flags)
         else:
-            y = f.let(0)
-            with f.each(0, stop, memory.row) as row:
-                within, x = f.let(0), f.let(0)
+            y = body.let(0)
+            with body.each(0, stop, memory.row) as row:
+                within, x = body.let(0), body.let(0)
                 self.y, self.row, self.x, self.within = y, row, x, within
-                with f.loop() as again:
-                    self.at = f.let(row + within)
+                with body.loop() as again:
+                    self.at = body.let(row + within)
                     self.body(any_flags)
-                    f.set(x, x + WORD)
-                    f.set(within, within + 16)
-                    f.jump(again, within < memory.row)
-                f.set(y, y + 1)
+                    x += WORD
+                    within += 16
+                    body.jump(again, within < memory.row)
+                y += 1
         for place, any_flag in zip(self.outs, any_flags, strict=True):
             before = place[SOME] if self.updates else ZERO
-            f.set(place[SOME], before | some(any_flag))
-        return self.added("words")
+            place[SOME] = before | some(any_flag)
 
     def body(self, any_flags: Sequence[Local]) -> None:
-        f, flags = self.f, self.memory.flags
+        flags = self.memory.flags
         values = WordValues(self)
-        with f.scope(), f.block() as skip:
+        with body.scope(), body.block() as skip:
             if self.updates:
                 wanted = reduce(or_, [(self.held[name] + self.at)[flags] for name in self.mask_names])
-                f.jump(skip, some(wanted).equals(0))
+                body.jump(skip, some(wanted).equals(0))
             new = []
             for out in self.loop.outs:
                 value = values.clean(out.value)
                 again = not isinstance(value, Local) or self.updates or len(self.outs) > 1
-                new.append(f.let(value) if again else value)
+                new.append(body.let(value) if again else value)
             for place, some_flag, value in zip(self.outs, any_flags, new, strict=True):
-                f.set(some_flag, some_flag | value)
-                f.set((place + self.at)[flags], value)
+                some_flag |= value
+                (place + self.at)[flags] = value
 
 
 class WordValues(Values[Value]):
@@ -113,13 +121,13 @@ class WordValues(Values[Value]):
 
     def __init__(self, loop: WordLoop):
         super().__init__()
-        self.loop, self.f, self.library, self.memory = loop, loop.f, loop.library, loop.memory
+        self.loop, self.library, self.memory = loop, loop.library, loop.memory
         self.uses = Counter(id(arg) for node in loop.nodes for arg in node.args)
         self.uses.update(id(out.value) for out in loop.loop.outs)
 
     def named(self, node: Node, value: Value) -> Value:
         again = self.uses[id(node)] > 1 and not isinstance(value, Local) and node.op != "const"
-        return self.f.let(value) if again else value
+        return body.let(value) if again else value
 
     def clean(self, node: Node) -> Value:
         """The value with zeros beyond the grid's width."""
@@ -140,7 +148,7 @@ class WordValues(Values[Value]):
                 return self.plane(node)
             case "coordinate" if node.attr[0] == "step":
                 number = self.memory.layout.step_planes[node.attr[1:]]
-                return load("v128.load", ZERO, self.memory.at("steps", number))
+                return load("v128.load", 0, self.memory.at("steps", number))
             case "coordinate":
                 return self.plane(node)
             case "and" | "or" | "xor":
@@ -160,7 +168,7 @@ class WordValues(Values[Value]):
                 return self.lazy(node)
             case "param":
                 number = self.memory.layout.param_planes[param_key(node)]
-                return load("v128.load", ZERO, self.memory.at("params", number))
+                return load("v128.load", 0, self.memory.at("params", number))
             case "chance" | "below_planes" | "below_param":
                 return self.draw(node, args)
         raise AssertionError(f"no function for {node.op} of flags")
@@ -172,24 +180,24 @@ class WordValues(Values[Value]):
 
     def lazy(self, node: Node) -> Value:
         """A conjunction whose second part is computed only where the first holds somewhere in the word."""
-        value = self.f.let(const("v128", 0))
-        with self.f.when(some(self.of(node.args[0]))), self.inner():
-            self.f.set(value, self.of(node.args[1]))
+        value = body.let(0, "v128")
+        with body.when(some(self.of(node.args[0]))), self.inner():
+            value.set(self.of(node.args[1]))
         return value
 
     def shift(self, node: Node) -> Value:
         dy, dx, wraps = node.attr
-        loop, memory, f = self.loop, self.memory, self.f
+        loop, memory = self.loop, self.memory
         plane = loop.held[str(node.args[0].attr)]
         offset = memory.base + dy * memory.row
         if memory.words == 1:
             row = load("v128.load", plane + loop.at, offset)
-            value = self.library.rotated(f, row, dx, wraps=wraps) if dx else row
+            value = self.library.rotated(row, dx, wraps=wraps) if dx else row
         elif dx:
             assert loop.row is not None
             assert loop.x is not None
-            start = f.let(plane + loop.row + offset)
-            value = self.library.columns(f, start, loop.within, loop.x, dx, wraps=wraps)
+            start = body.let(plane + loop.row + offset)
+            value = self.library.columns(start, loop.within, loop.x, dx, wraps=wraps)
         else:
             value = load("v128.load", plane + loop.at, offset)
         if dy and not wraps:
@@ -201,7 +209,7 @@ class WordValues(Values[Value]):
     def draw(self, node: Node, args: Sequence[Value]) -> Value:
         """A draw below a limit, which is a number, or is given plane by plane from the highest."""
         layout, memory, bits = self.memory.layout, self.memory, node.attr[1]
-        keys = const("i32", memory.at("keys", layout.streams[node.attr[0]]))
+        keys = memory.at("keys", layout.streams[node.attr[0]])
         where = drawn_where(node)
         if where is not None:
             wanted = self.clean(where)
@@ -216,9 +224,9 @@ class WordValues(Values[Value]):
         together = bool(planes) and is_run(planes)
         limit = memory.at("params", planes[0]) if together else memory.at("limits")
         if not together:
-            of_params = [load("v128.load", ZERO, memory.at("params", plane)) for plane in planes]
+            of_params = [load("v128.load", 0, memory.at("params", plane)) for plane in planes]
             for i, plane in enumerate(of_params or args[: bits + 1]):
-                self.f.set(load("v128.load", ZERO, memory.at("limits", i)), plane)
-        end = const("i32", limit + 16 * (bits + 1))
-        drawn = self.library.draw_below_planes(at, wanted, keys, const("i32", limit), end)
-        return drawn if together else self.f.let(drawn)
+                load("v128.load", 0, memory.at("limits", i)).set(plane)
+        end = limit + 16 * (bits + 1)
+        drawn = self.library.draw_below_planes(at, wanted, keys, limit, end)
+        return drawn if together else body.let(drawn)
