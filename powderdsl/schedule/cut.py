@@ -33,7 +33,6 @@ from powderdsl.schedule.floats import is_comparison, of_floats, unchanged
 from powderdsl.schedule.types import (
     ANSWER,
     Block,
-    Carried,
     Compute,
     Forget,
     Guard,
@@ -50,6 +49,7 @@ from powderdsl.schedule.types import (
     connected,
     constant,
     is_movement,
+    leftover,
     load,
     loaded,
 )
@@ -87,7 +87,7 @@ class _Cutter:
         """The variables defined so far."""
         self.same: dict[str, Node] = {}
         """For each variable that is only another name: the load of the variable that it names."""
-        nodes = ordered(schedule.values())
+        nodes = ordered(schedule.values)
         led = {node.args[1]: node for node in nodes if node.op == "led"}
         self.comparisons = {node: led.get(node, node) for node in nodes if is_comparison(node)}
         """What is computed for each comparison: itself, or only where another one holds."""
@@ -110,7 +110,7 @@ class _Cutter:
 
     def emit(self, statement: Statement) -> None:
         self.statements.append(statement)
-        self.there |= statement.made()
+        self.there.update(statement.vars)
 
     @contextmanager
     def inner(self) -> Iterator[list[Statement]]:
@@ -136,8 +136,13 @@ class _Cutter:
     def renamed(self, node: Node) -> Node:
         return self.variable(node) if node.op == "load" else node
 
-    def kept(self, guard: Guard) -> tuple[tuple[Var, Node], ...]:
-        return tuple((var, self.renamed(value)) for var, value in guard.keeps)
+    def kept(self, guard: Guard) -> dict[str, Node]:
+        """The values that variables have if a guard's body is skipped."""
+        return {name: self.renamed(old) for name, old in guard.olds.items()}
+
+    def guard(self, when: Node, body: Block, outs: Iterable[tuple[Var, Node]], place: str) -> None:
+        """Emit statements that run only if an answer is true, and the values of variables if it is not."""
+        self.emit(Guard(tuple(Out(var, old, old) for var, old in outs), place, when=when, body=body))
 
     # Statements
 
@@ -166,7 +171,7 @@ class _Cutter:
             if named.get(out.value) is not out.var:
                 value = self.variable(out.value)
                 if out.var.name in kept:
-                    self.emit(Compute((Out(out.var, value),), loop.place, "words"))
+                    self.emit(Compute((Out(out.var, value),), loop.place, over="words"))
                 else:
                     self.alias({out.var.name: value})
 
@@ -200,7 +205,7 @@ class _Cutter:
         graph, place = self.graph, masks.place
         split = {out.var.name: self.split(out.value) for out in masks.outs}
         needs = self.needs_of(masks.results)
-        asked = {node.attr for node in guard.when if node.op == "load"}
+        asked = {node.attr for node in guard.when.args if node.op == "load"}
         mine = [out for out in masks.outs if out.var.name in asked]
         if len(mine) < len(masks.outs):
             others = tuple(out for out in masks.outs if out.var.name not in asked)
@@ -211,28 +216,30 @@ class _Cutter:
             return
         # The other parts, and what they need, are computed only if the cheap parts hold somewhere.
         first = [
-            combined("and", split[node.attr][0], graph) if node.attr in split else node for node in guard.when
+            combined("and", split[node.attr][0], graph) if node.attr in split else node
+            for node in guard.when.args
         ]
         with self.inner() as inner:
             self.ask(lazy, guard)
         nothing = constant(graph, FLAG)
         names = {out.var.name for out in mine}
         # A mask may be what a slot held before: nothing, where masks are skipped.
-        kept = tuple((var, nothing if value.attr in names else value) for var, value in self.kept(guard))
+        olds = {name: nothing if old.attr in names else old for name, old in self.kept(guard).items()}
         question = self.answer(first)
-        self.emit(Compute((question,), place, "words"))
-        keeps = (*((out.var, nothing) for out in mine), *kept)
-        self.emit(Guard((load(graph, question.var),), tuple(inner), keeps, guard.place))
+        self.emit(Compute((question,), place, over="words"))
+        outs = [(out.var, nothing) for out in mine] + [(guard.vars[name], old) for name, old in olds.items()]
+        self.guard(load(graph, question.var), tuple(inner), outs, guard.place)
 
     def ask(self, masks: list[Out], guard: Guard) -> None:
         """Store masks, test whether they hold anywhere, and emit the guard."""
         values = {out.var.name: out.value for out in masks}
-        asked = [values.get(node.attr, node) if node.op == "load" else node for node in guard.when]
+        asked = [values.get(node.attr, node) if node.op == "load" else node for node in guard.when.args]
         self.ensure(self.needs_of(asked), guard.place)
         words, question = self.computed(masks), self.answer(asked)
-        self.emit(Compute((*words, question), guard.place, "words"))
-        body = self.block(guard.body, guard.made())
-        self.emit(Guard((load(self.graph, question.var),), body, self.kept(guard), guard.place))
+        self.emit(Compute((*words, question), guard.place, over="words"))
+        body, olds = self.block(guard.body, guard.vars), self.kept(guard)
+        outs = [(var, olds[name]) for name, var in guard.vars.items()]
+        self.guard(load(self.graph, question.var), body, outs, guard.place)
 
     def answer(self, flags: Iterable[Node]) -> Out:
         """A new variable: whether one of some flags holds in any cell."""
@@ -282,16 +289,16 @@ class _Cutter:
             return
         whole = [Out(var, self.lazily(*split[value])) for value, var in vars.items()]
         if not self.needs_of(out.value for out in whole):
-            self.emit(Compute(self.computed(whole), place, "words", when=masks.when))
+            self.emit(Compute(self.computed(whole), place, when=masks.when, over="words"))
             self.known |= vars
             return
         candidates = [
             Out(self.namer.var(FLAG) if value in costly else var, combined("and", split[value][0], graph))
             for value, var in vars.items()
         ]
-        self.emit(Compute(self.computed(candidates), place, "words", when=masks.when))
+        self.emit(Compute(self.computed(candidates), place, when=masks.when, over="words"))
         asked = [load(graph, out.var) for out in candidates]
-        asked += [self.renamed(node) for node in guard.when if node.attr not in masks.made()]
+        asked += [self.renamed(node) for node in guard.when.args if node.attr not in masks.vars]
         with self.inner() as inner:
             needs = {frozenset(conjuncts(need)): need for need in self.needs_of(vars)}
             for value, candidate in zip(vars, candidates, strict=True):
@@ -302,8 +309,9 @@ class _Cutter:
                     self.split_masks[value] = self.under(load(graph, candidate.var), rest)
             # A mask that the next ones need is stored before them, under its own name.
             self.ensure(costly, place, costly)
-        keeps = tuple((var, constant(graph, FLAG)) for var in costly.values())
-        self.emit(Guard(tuple(dict.fromkeys(asked)), tuple(inner), keeps, guard.place))
+        when = graph.node("some", ANSWER, tuple(dict.fromkeys(asked)))
+        outs = [(var, constant(graph, FLAG)) for var in costly.values()]
+        self.guard(when, tuple(inner), outs, guard.place)
         self.known |= vars
 
     def computed(self, outs: Iterable[Out]) -> tuple[Out, ...]:
@@ -323,9 +331,9 @@ class _Cutter:
 
     def then(self, guard: Guard) -> None:
         """The body of a guard: planes that only move do so in place; the rest stays in a guard."""
-        when = tuple(self.renamed(node) for node in guard.when)
+        when = self.graph.node("some", ANSWER, tuple(self.renamed(node) for node in guard.when.args))
         outs = [out for one in guard.body if isinstance(one, Compute) for out in one.outs]
-        olds = {var.name: old for var, old in self.kept(guard)}
+        olds = self.kept(guard)
         carried = self.carried(outs, olds)
         others = tuple(out for out in outs if out.value not in carried)
         first = any(node in carried for out in others for node in walk(out.value))
@@ -335,8 +343,7 @@ class _Cutter:
         inner += [Compute(others, guard.place)] if others else []
         if inner:
             body = self.block(tuple(inner), {out.var.name for out in others})
-            keeps = tuple((out.var, olds[out.var.name]) for out in others)
-            self.emit(Guard(when, body, keeps, guard.place))
+            self.guard(when, body, [(out.var, olds[out.var.name]) for out in others], guard.place)
         if not first:
             self.move(carried, guard.place)
 
@@ -347,7 +354,7 @@ class _Cutter:
             node = out.value
             if is_movement(node) and node.args[0] is olds[out.var.name] and self.have(node.args[1]):
                 old, movers, rest = node.args
-                left = Carried(out.var, old, rest).leftover(movers)
+                left = leftover(old, rest, movers)
                 simple = left == "same" if node.op == "swap" else left and abs(node.attr[0]) <= 1
                 first = next(iter(carried), node)
                 if simple and (node.op, node.attr, movers) == (first.op, first.attr, first.args[1]):
@@ -365,8 +372,8 @@ class _Cutter:
             if rest is not old:
                 gone = self.graph.node("not", FLAG, (mask,)) if rest.op == "and" else mask
                 leaves = self.graph.node(rest.op, FLAG, (old, gone))
-            planes.append(Carried(var, old, leaves))
-        self.emit(Move(node.op, node.attr, mask, tuple(planes), place))
+            planes.append(Out(var, leaves, old))
+        self.emit(Move(tuple(planes), place, region=mask, op=node.op, offset=node.attr))
         self.known |= carried
 
     # What must be stored
@@ -513,14 +520,14 @@ class _Cutter:
             self.loop(outs(nodes), place, "cells")
         moves = [node for node in flags if self.costs.by_rows and is_movement(node)]
         self.loop(outs(node for node in flags if node not in moves), place, "words", when)
-        together: dict[tuple[str, Offset, Node], list[Carried]] = {}
+        together: dict[tuple[str, Offset, Node], list[Out]] = {}
         for out in outs(moves):
             content, movers, rest = map(self.variable, out.value.args)
             key = (out.value.op, out.value.attr, movers)
-            together.setdefault(key, []).append(Carried(out.var, content, rest))
+            together.setdefault(key, []).append(Out(out.var, rest, content))
             self.known[out.value] = out.var
         for (op, offset, movers), planes in together.items():
-            self.emit(Move(op, offset, movers, tuple(planes), place))
+            self.emit(Move(tuple(planes), place, region=movers, op=op, offset=offset))
 
     def loop(
         self,
@@ -532,7 +539,7 @@ class _Cutter:
         """A loop: floats first, then comparisons, each after the one under which it is computed."""
         if outs:
             outs = sorted(outs, key=lambda out: (out.var.type != REAL, out.value.op == "led"))
-            self.emit(Compute(self.computed(outs), place, over, when=when))
+            self.emit(Compute(self.computed(outs), place, when=when, over=over))
             for out in outs:
                 self.known.setdefault(out.value, out.var)
 

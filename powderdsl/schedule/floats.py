@@ -38,7 +38,7 @@ def late(schedule: Schedule) -> Schedule:
         return known.get(node.attr) if node.op == "load" else None
 
     for statement in flat(schedule.body):
-        new = rewritten(statement.values(), schedule.graph, rule)
+        new = rewritten(statement.values, schedule.graph, rule)
         if isinstance(statement, Compute):
             known |= {out.var.name: new(out.value) for out in statement.outs if out.var.type == REAL}
     schedule = map_values(schedule, rule)
@@ -119,7 +119,7 @@ def led(schedule: Schedule) -> Schedule:
     Draws as floats are costly, so their comparisons follow the condition of a choice, too: `c ? (draw < x ? 1 : 2) : 3`
     → `c ? (led(c, draw < x) ? 1 : 2) : 3`.
     """
-    roots = schedule.values()
+    roots = schedule.values
     comparisons = {node: number for number, node in enumerate(filter(is_comparison, ordered(roots)))}
     choices, conjunctions = on_all_paths(roots, _choices), on_all_paths(roots, _conjunctions)
     leaders: dict[Node, Node] = {}

@@ -68,7 +68,7 @@ def _where_read(schedule: Schedule) -> Schedule:
 
     asking: dict[str, set[str]] = {}
     """By field: the flags that hold wherever it is read."""
-    for node, masks in on_all_paths(schedule.values(), below).items():
+    for node, masks in on_all_paths(schedule.values, below).items():
         if field := field_of(node):
             names, where = {str(mask.attr) for mask in masks}, node.attr if node.op == "shift" else HERE
             flags = {shifted[name][0] for name in names if name in shifted and shifted[name][1] == where}
@@ -84,7 +84,7 @@ def _where_read(schedule: Schedule) -> Schedule:
                 args = graph.node("load", FLAG, (), flags[0]), out.value, constant(graph, REAL)
                 out = replace(out, value=graph.node("select", REAL, args))
             outs.append(out)
-        there.update(loop.made())
+        there.update(loop.vars)
         return [replace(loop, outs=tuple(outs))]
 
     return map_each(schedule, Compute, change)
@@ -109,8 +109,9 @@ def ask_regions(schedule: Schedule) -> Schedule:
             return [loop]
         region = rewritten([loop.region], graph, anywhere)(loop.region)
         question = Out(namer.var(ANSWER), graph.node("any", ANSWER, (region,)))
-        guard = Guard((load(graph, question.var),), (loop,), tuple(loop.unchanged()), loop.place)
-        return [Compute((question,), loop.place, "words"), guard]
+        outs = tuple(Out(var, loop.olds[name], loop.olds[name]) for name, var in loop.vars.items())
+        guard = Guard(outs, loop.place, when=load(graph, question.var), body=(loop,))
+        return [Compute((question,), loop.place, over="words"), guard]
 
     return map_each(schedule, Compute, change)
 
@@ -120,7 +121,7 @@ def _narrowed(loop: Compute, graph: Graph, slots: Mapping[str, tuple[str]]) -> C
 
     Only a slot's own old value has been clamped to the bounds of that slot.
     """
-    if not loop.of_cells:
+    if loop.over == "words":
         return loop
     kept = [unchanged(out.value, slots.get(out.var.name, ())) for out in loop.outs]
     rest = [old for old, _ in filter(None, kept)]
@@ -215,13 +216,13 @@ def join(schedule: Schedule) -> Schedule:
     `loop cells: a = …`, `loop cells: b = a[0,1|0] + …` → one loop over the rows of a world, in which `b` follows `a`
     one row behind. Where a loop only continues the choices before it, it becomes one with them.
     """
-    reads = Counter(loaded(schedule.values()))
+    reads = Counter(loaded(schedule.values))
 
     def change(block: Block) -> Block:
         result: list[Statement] = []
         run: list[Compute] = []
         for statement in (*block, None):
-            loop = statement if isinstance(statement, Compute) and statement.of_cells else None
+            loop = statement if isinstance(statement, Compute) and statement.over != "words" else None
             if run and (loop is None or _asks_masks_of(loop, run) or keeps(loop) or keeps(run[-1])):
                 result += [_joined(loops, reads) for loops in _components(run)]
                 run = []
@@ -244,7 +245,7 @@ def keeps(loop: Compute) -> bool:
 def _asks_masks_of(loop: Compute, run: Sequence[Compute]) -> bool:
     """Whether choices are made by flags of a run, which must be there in all rows before."""
     flags = {out.var.name for one in run for out in one.outs if out.var.type == FLAG}
-    return loop.over == "choices" and not flags.isdisjoint(loaded(loop.values()))
+    return loop.over == "choices" and not flags.isdisjoint(loop.reads)
 
 
 def _continued(first: Compute, second: Compute, reads: Counter[str], graph: Graph) -> Compute | None:
@@ -260,14 +261,14 @@ def _continued(first: Compute, second: Compute, reads: Counter[str], graph: Grap
     nodes = ordered(second.results)
     simple = all(node.type == REAL and node.op in CONTINUING for node in nodes)
     known = {_base(value) for value in made.values()} | made.keys()
-    inside = Counter(loaded(second.values()))
+    inside = Counter(loaded(second.values))
     names = {*loaded([*second.results, second.region])}
     if not simple or sum(bool(node.args) for node in nodes) > FEW or not known >= names:
         return None
     if any(reads[name] != inside[name] for name in made):
         return None
     new = rewritten(nodes, graph, lambda node: made.get(node.attr) if node.op == "load" else None)
-    outs = tuple(Out(out.var, new(out.value), None, out.otherwise) for out in second.outs)
+    outs = tuple(Out(out.var, new(out.value), out.otherwise) for out in second.outs)
     return replace(first, outs=outs)
 
 
@@ -284,8 +285,8 @@ CONTINUING = ("load", "const", "param", "add", "sub", "mul", "neg", "abs")
 
 def _components(run: Sequence[Compute]) -> list[list[Compute]]:
     """The loops of a run, apart where none reads what another one of them computes."""
-    made = made_in(run)
-    return connected(run, lambda loop: made.intersection((*made_in([loop]), *loaded(loop.values()))))
+    made = made_in(run).keys()
+    return connected(run, lambda loop: made & (loop.reads | loop.vars.keys()))
 
 
 def _joined(run: Sequence[Compute], reads: Counter[str]) -> Sweeps:
@@ -293,14 +294,14 @@ def _joined(run: Sequence[Compute], reads: Counter[str]) -> Sweeps:
     parts, lags = _places(run)
     inside = [Counter[str]() for _ in run]
     for loop, part in zip(run, parts, strict=True):
-        inside[part].update(loaded(loop.values()))
+        inside[part].update(loaded(loop.values))
     passing = (
         out.var.name
         for loop, part in zip(run, parts, strict=True)
         for out in loop.outs
         if out.var.type == REAL and reads[out.var.name] == inside[part][out.var.name]
     )
-    return Sweeps(tuple(run), tuple(parts), tuple(lags), tuple(passing))
+    return Sweeps(frees=tuple(passing), body=tuple(run), parts=tuple(parts), lags=tuple(lags))
 
 
 def _places(run: Sequence[Compute]) -> tuple[list[int], list[int]]:

@@ -11,7 +11,6 @@ from powderdsl.schedule.join import keeps
 from powderdsl.schedule.types import (
     ANSWER,
     Block,
-    Carried,
     Compute,
     Guard,
     Move,
@@ -29,13 +28,11 @@ from powderdsl.schedule.types import (
     flat,
     in_order,
     is_zero,
-    live_before,
     load,
     loaded,
     map_blocks,
     map_each,
     planes_at_neighbors,
-    read_by,
     read_elsewhere,
     reads_of,
     rewritten,
@@ -54,10 +51,10 @@ def release(schedule: Schedule) -> Schedule:
         """The statements with releases. `live`: the variables that are read after them."""
         lives = [live]
         for statement in reversed(body):
-            lives.append(live_before(statement, lives[-1]))
+            lives.append(lives[-1].difference(statement.vars) | statement.reads)
         result: list[Statement] = []
         for statement, after in zip(body, lives[-2::-1], strict=True):
-            used = read_by((statement,)) | {var.name for var in statement.defined() if var.type != ANSWER}
+            used = statement.reads | {name for name, var in statement.vars.items() if var.type != ANSWER}
             if isinstance(statement, Guard):
                 # Outer variables are released after the guard, whether its body runs or not.
                 statement = replace(statement, body=block(statement.body, after | used))
@@ -65,13 +62,13 @@ def release(schedule: Schedule) -> Schedule:
                 statement = _in_place(statement, after)
             elif isinstance(statement, Compute) and statement.region is not None:
                 statement = _updated(statement, after)
-            elif isinstance(statement, Sweeps) and keeps(statement.loops[0]):
-                statement = replace(statement, loops=(_updated(statement.loops[0], after),))
+            elif isinstance(statement, Sweeps) and keeps(statement.body[0]):
+                statement = replace(statement, body=(_updated(statement.body[0], after),))
             elif isinstance(statement, Sweeps):
                 statement = _overtaken(_put_off(statement, after, namer, graph), after)
             result.append(statement)
-            if gone := used - after - set(statement.ended()):
-                result.append(Release(tuple(in_order(gone))))
+            if gone := used - after - statement.ended:
+                result.append(Release(frees=tuple(in_order(gone))))
         return tuple(result)
 
     return replace(schedule, body=block(schedule.body, set(loaded(schedule.results))))
@@ -79,21 +76,21 @@ def release(schedule: Schedule) -> Schedule:
 
 def _in_place(move: Move, after: set[str]) -> Move:
     """A movement that overwrites what ends with it: the old plane, or the one whose flags stay where none arrives."""
-    reads = Counter(loaded([move.movers]))
-    for plane in move.planes:
-        reads.update(set(loaded([plane.old, plane.leaves])))
-    planes = []
-    for plane in move.planes:
-        stays = plane.leaves if plane.leaves.op in ("load", "const") else plane.old
+    reads = Counter(loaded([move.region]))
+    for out in move.outs:
+        reads.update(set(loaded([out.value, move.olds[out.var.name]])))
+    outs = []
+    for out in move.outs:
+        stays = out.value if out.value.op in ("load", "const") else move.olds[out.var.name]
         free = stays.op == "load" and stays.attr not in after and reads[stays.attr] == 1
-        planes.append(replace(plane, into=stays.attr if free else None))
-    return replace(move, planes=tuple(planes))
+        outs.append(replace(out, into=stays.attr if free else None))
+    return replace(move, outs=tuple(outs))
 
 
 def _updated(loop: Compute, after: set[str]) -> Compute:
     """A loop that changes some words or rows in place, where nothing reads the old ones later or elsewhere."""
-    needed = after | {read.name for read in reads_of(loop.values()) if read.far and not read.live}
-    olds = Counter(old.attr for _, old in loop.unchanged() if old.op == "load")
+    needed = after | {read.name for read in reads_of(loop.values) if read.far and not read.live}
+    olds = Counter(old.attr for old in loop.olds.values() if old.op == "load")
     ended = {name for name, count in olds.items() if count == 1} - needed
     outs = (
         replace(out, into=out.otherwise.attr) if out.otherwise and out.otherwise.attr in ended else out
@@ -107,8 +104,8 @@ def _put_off(sweeps: Sweeps, after: set[str], namer: Namer, graph: Graph) -> Swe
 
     `loop choices: b = m ? f(a[-1,0]) : a` → `b'` in its place, and `loop cells, 2 behind: b = b' into a`.
     """
-    loop = sweeps.loops[0]
-    lasting = [out for out in loop.outs if out.var.name not in sweeps.passing]
+    loop = sweeps.body[0]
+    lasting = [out for out in loop.outs if out.var.name not in sweeps.frees]
     free = [lag for lag, reader in _last_reads(sweeps, after).values() if reader == 0]
     choices = loop.over == "choices" and loop.region is not None and not any(sweeps.parts)
     if not choices or not lasting or len(free) < len(lasting):
@@ -116,25 +113,25 @@ def _put_off(sweeps: Sweeps, after: set[str], namer: Namer, graph: Graph) -> Swe
     waiting = {out.var.name: namer.var(REAL) for out in lasting}
     olds = {name: load(graph, var) for name, var in waiting.items()}
     loops = []
-    for one in sweeps.loops:
-        new = rewritten(one.values(), graph, lambda node: olds.get(node.attr) if node.op == "load" else None)
+    for one in sweeps.body:
+        new = rewritten(one.values, graph, lambda node: olds.get(node.attr) if node.op == "load" else None)
         loops.append(one.with_values(new))
     outs = tuple(replace(out, var=waiting.get(out.var.name, out.var)) for out in loop.outs)
     zero = constant(graph, REAL)
     region = combined("or", [graph.node("live", FLAG, (old,), (0, 0)) for old in olds.values()], graph)
-    stored = tuple(Out(out.var, olds[out.var.name], None, zero) for out in lasting)
+    stored = tuple(Out(out.var, olds[out.var.name], zero) for out in lasting)
     return Sweeps(
-        (replace(loops[0], outs=outs), *loops[1:], Compute(stored, loop.place, "cells", region)),
-        (*sweeps.parts, 0),
-        (*sweeps.lags, max(free)),
-        (*sweeps.passing, *(var.name for var in waiting.values())),
+        frees=(*sweeps.frees, *(var.name for var in waiting.values())),
+        body=(replace(loops[0], outs=outs), *loops[1:], Compute(stored, loop.place, region, over="cells")),
+        parts=(*sweeps.parts, 0),
+        lags=(*sweeps.lags, max(free)),
     )
 
 
 def _last_reads(sweeps: Sweeps, after: set[str]) -> dict[str, tuple[int, int]]:
     """By field that may be written over: the least lag with which that can be done to a row, and its last reader."""
     reads: dict[str, tuple[int, int]] = {}
-    kept = after | sweeps.made()
+    kept = after.union(sweeps.vars)
     for number, (loop, part, lag) in enumerate(sweeps.placed()):
         for read in field_reads(loop):
             if part > 0 or (read.live and read.dy):
@@ -153,12 +150,12 @@ def _overtaken(sweeps: Sweeps, after: set[str]) -> Sweeps:
         ]
         outs = []
         for out in loop.outs:
-            lasts = out.var.type == REAL and out.var.name not in sweeps.passing
+            lasts = out.var.type == REAL and out.var.name not in sweeps.frees
             into = free.pop(0) if lasts and free else None
             reads.pop(into or "", None)
             outs.append(replace(out, into=into))
         loops.append(replace(loop, outs=tuple(outs)))
-    return replace(sweeps, loops=tuple(loops))
+    return replace(sweeps, body=tuple(loops))
 
 
 def swaps(schedule: Schedule) -> Schedule:
@@ -168,7 +165,7 @@ def swaps(schedule: Schedule) -> Schedule:
     slot stay within its bounds wherever they are. What becomes zero afterwards does so in a loop over rows where it does.
     """
     offsets = {
-        str(statement.movers.attr): statement.offset
+        str(statement.region.attr): statement.offset
         for statement in flat(schedule.body)
         if isinstance(statement, Move) and statement.op == "swap"
     }
@@ -182,7 +179,7 @@ def swaps(schedule: Schedule) -> Schedule:
     namer, graph = Namer(schedule), schedule.graph
 
     def change(loop: Compute) -> list[Statement]:
-        found = [_swap(out.value, offsets, shifted) for out in loop.outs if loop.of_cells]
+        found = [_swap(out.value, offsets, shifted) for out in loop.outs if loop.over != "words"]
         first = found[0] if found else None
         if first is None:
             return [loop]
@@ -198,14 +195,14 @@ def swaps(schedule: Schedule) -> Schedule:
             moved = namer.var(REAL) if fresh else out.var
             if slot is not None:
                 settled[moved.name] = settled[out.var.name] = slot
-            planes.append(Carried(moved, old, old))
+            planes.append(Out(moved, old, old))
             value = load(graph, moved)
             for mask in fresh:
                 value = graph.node("select", REAL, (mask, constant(graph, REAL), value))
-            outs.append(Out(out.var, value, None, load(graph, moved)))
-        move = Move("swap", offset, movers, tuple(planes), loop.place)
+            outs.append(Out(out.var, value, load(graph, moved)))
+        move = Move(tuple(planes), loop.place, region=movers, op="swap", offset=offset)
         region = combined("or", fresh, graph)
-        return [move, Compute(tuple(outs), loop.place, "cells", region)] if fresh else [move]
+        return [move, Compute(tuple(outs), loop.place, region, over="cells")] if fresh else [move]
 
     return without_unread(map_each(schedule, Compute, change))
 
@@ -263,21 +260,25 @@ def buffers(schedule: Schedule, homes: Mapping[str, int], pool: Pool, *, in_plac
     numbers = _Plan(schedule, homes, pool, in_place).assigned()
     graph, namer = schedule.graph, Namer(schedule)
 
-    def moves(var: Var, old: Node) -> bool:
+    def moves(name: str, old: Node) -> bool:
         """Whether the value that a variable has where nothing happens lies in another buffer."""
-        return old.op == "load" and numbers[old.attr] != numbers[var.name]
+        return old.op == "load" and numbers[old.attr] != numbers[name]
 
     def change(body: Block) -> Block:
         """The statements with the copies that the assignment requires."""
         result: list[Statement] = []
         for statement in body:
             if isinstance(statement, Guard):
-                pairs = [keep for keep in statement.keeps if keep[1].op != "load" or moves(*keep)]
+                pairs = [
+                    (statement.vars[name], old)
+                    for name, old in statement.olds.items()
+                    if old.op != "load" or moves(name, old)
+                ]
                 statement = replace(statement, otherwise=tuple(copies(pairs, graph)))
             elif isinstance(statement, Compute):
-                across = {numbers[read.name] for read in reads_of(statement.values()) if read.far}
-                held = any(numbers.get(var.name) in across for var in statement.defined())
-                moved = any(moves(*pair) for pair in statement.unchanged())
+                across = {numbers[name] for name in read_elsewhere(statement.values)}
+                held = any(numbers.get(name) in across for name in statement.vars)
+                moved = any(moves(*pair) for pair in statement.olds.items())
                 statement = replace(statement, held=held, region=None if moved else statement.region)
             result.append(statement)
         return tuple(result)
@@ -318,13 +319,13 @@ class _Plan:
         defined: dict[str, int] = {}
         for position, statement in enumerate(self.order):
             if isinstance(statement, Compute):
-                self.read(position, *loaded(statement.values()))
-                defined |= {var.name: position for var in statement.defined()}
-            self.read(position, *statement.made())
-            for var, old in statement.unchanged():
-                self.ends[var.name] = position
+                self.read(position, *statement.reads)
+                defined |= dict.fromkeys(statement.vars, position)
+            self.read(position, *statement.vars)
+            for name, old in statement.olds.items():
+                self.ends[name] = position
                 if old.op == "load":
-                    self.follows[var.name] = old.attr
+                    self.follows[name] = old.attr
         changed = {slot for slot, _ in schedule.leaves}
         self.read(FOREVER, *(var.name for slot, var in schedule.finds if slot not in changed))
         for slot, node in schedule.leaves:
@@ -344,7 +345,7 @@ class _Plan:
             busy = {key: name for key, name in busy.items() if self.last.get(name, -1) >= position}
             if not isinstance(statement, Compute):
                 continue
-            for var in (var for var in statement.defined() if var.type != ANSWER):
+            for var in (var for var in statement.vars.values() if var.type != ANSWER):
                 number = self.taken_over(var, statement, position, busy)
                 if number is None:
                     number = self.free(var, busy)
@@ -358,8 +359,7 @@ class _Plan:
 
     def taken_over(self, var: Var, loop: Compute, position: int, busy: Mapping[Buffer, str]) -> Buffer | None:
         """The buffer to reuse: that of the variable it replaces, or its slot's, if nothing reads it after this loop."""
-        near = {read.name for read in reads_of(loop.values())}
-        far = read_elsewhere(loop.values())
+        near, far = loop.reads, read_elsewhere(loop.values)
         home = busy.get((var.type.name, self.wanted.get(var.name, -1)))
         for old in filter(None, (self.follows.get(var.name), home)):
             if self.last.get(old, -1) > position or busy.get(self.buffer[old]) != old:
@@ -382,8 +382,7 @@ class _Plan:
 
 def _in_order(body: Sequence[Statement]) -> Iterator[Statement]:
     for statement in body:
-        for block in statement.blocks():
-            yield from _in_order(block)
+        yield from _in_order(statement.body)
         yield statement
 
 
@@ -391,12 +390,12 @@ def copies(pairs: Sequence[tuple[Var, Node]], graph: Graph) -> Iterator[Compute]
     """Loops that assign values to variables; each reads everything before it writes anything."""
     flags = tuple(Out(var, value) for var, value in pairs if var.type == FLAG)
     if flags:
-        yield Compute(flags, "", "words")
+        yield Compute(flags, over="words")
     floats = [(var, value) for var, value in pairs if var.type == REAL]
     if floats:
         lives = (graph.node("live", FLAG, (old,), (0, 0)) for _, old in floats if old.op == "load")
-        outs = tuple(Out(var, value, None, constant(graph, REAL)) for var, value in floats)
-        yield Compute(outs, "", "cells", combined("or", lives, graph))
+        outs = tuple(Out(var, value, constant(graph, REAL)) for var, value in floats)
+        yield Compute(outs, region=combined("or", lives, graph), over="cells")
 
 
 Access = tuple[bool, bool]
@@ -440,9 +439,9 @@ def barriers(schedule: Schedule, pending: Pending) -> Schedule:
                 }
             elif isinstance(statement, Compute):
                 words = statement.over == "words"
-                accesses = reads_of(statement.values())
+                accesses = reads_of(statement.values)
                 reads = [(numbers[read.name], (words and not read.far, False)) for read in accesses]
-                stored = [var for var in statement.defined() if var.type != ANSWER]
+                stored = [var for var in statement.vars.values() if var.type != ANSWER]
                 writes = [(numbers[var.name], (words, True)) for var in stored]
                 if pending.add(reads if statement.held else [*reads, *writes]):
                     result.append(Sync())

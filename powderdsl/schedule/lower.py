@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from powderdsl.ir.ops import Graph, Node, PassGraph, SubstepGraph, Type, nodes_of
-from powderdsl.schedule.types import Block, Compute, Guard, Namer, Out, Schedule, Statement, Var, load
+from powderdsl.schedule.types import ANSWER, Block, Compute, Guard, Namer, Out, Schedule, Statement, Var, load
 
 
 def lower(pass_: PassGraph) -> Schedule:
@@ -53,10 +53,10 @@ class _Lowering:
             self.body += self.compute(guards, step.place)
             guarded = {node: old for node, old in guarded.items() if self.missing(node)}  # it may be a mask
         if guarded:
-            when = tuple(map(self.value, guards))
+            when = self.graph.node("some", ANSWER, tuple(map(self.value, guards)))
             body = self.compute(guarded, step.place)
-            keeps = tuple((self.stored[id(node)], old) for node, old in guarded.items())
-            self.body.append(Guard(when, body, keeps, step.place))
+            outs = tuple(Out(self.stored[id(node)], old, old) for node, old in guarded.items())
+            self.body.append(Guard(outs, step.place, when=when, body=body))
         self.current |= dict(step.writes)
 
     def missing(self, node: Node) -> bool:

@@ -57,11 +57,11 @@ def presence(schedule: Schedule) -> Schedule:
                 statement = replace(statement, body=(Forget(), *statement.body))
             body.append(statement)
         elif isinstance(statement, Compute) and isinstance(after, Guard):
-            asked = statement.made() == {mask.attr for mask in after.when}
+            asked = statement.vars.keys() == {mask.attr for mask in after.when.args}
             when = _asked(statement.results, bits, times, schedule.graph) if asked else None
             body.append(replace(statement, when=when))
         else:
-            body += [statement] if statement.made().isdisjoint(bits) else [statement, Forget()]
+            body += [statement] if bits.keys().isdisjoint(statement.vars) else [statement, Forget()]
     if any(node.op != "load" for node in leaves):
         body.append(Forget())
     return replace(schedule, body=tuple(body), when=_pass_asks(schedule, bits))
@@ -76,9 +76,9 @@ def _element_bits(schedule: Schedule) -> dict[str, int]:
         if slot.startswith(_ELEMENT):
             bits[name] = int(slot.removeprefix(_ELEMENT))
     pairs = [
-        (var.name, str(old.attr))
+        (name, str(old.attr))
         for statement in flat(schedule.body)
-        for var, old in statement.unchanged()
+        for name, old in statement.olds.items()
         if old.op == "load"
     ]
     for new, old in (*pairs, *reversed(pairs)):  # forward from the inputs, backward from the outputs
@@ -125,7 +125,7 @@ def _pass_asks(schedule: Schedule, bits: dict[str, int]) -> Node | None:
     """
     loops = [statement for statement in schedule.body if isinstance(statement, Compute)]
     values = {out.var.name: out.value for loop in loops for out in loop.outs}
-    guards = {name: one for one in schedule.body if isinstance(one, Guard) for name in one.made()}
+    guards = {name: one for one in schedule.body if isinstance(one, Guard) for name in one.vars}
     slots = {var.name: slot for slot, var in schedule.finds}
     masks: list[Node] = []
     for slot, node in schedule.leaves:
@@ -137,7 +137,7 @@ def _pass_asks(schedule: Schedule, bits: dict[str, int]) -> Node | None:
             masks += choices
         while node.op == "load" and node.attr in guards:
             guard = guards[node.attr]
-            masks += guard.when
+            masks += guard.when.args
             node = guard.olds[node.attr]
         if node.op != "load" or slots.get(node.attr) != slot:
             return None
@@ -164,7 +164,7 @@ def _asked(masks: list[Node], bits: dict[str, int], times: dict[str, Time], grap
 
 def asked_ids(schedule: Schedule) -> int:
     """All ids whose presence a schedule tests."""
-    nodes = ordered(filter(None, [*schedule.values(), schedule.when]))
+    nodes = ordered(filter(None, [*schedule.values, schedule.when]))
     return reduce(or_, (node.attr for node in nodes if node.op == "present"), 0)
 
 

@@ -75,7 +75,7 @@ class Rows:
 def rows_of(sweeps: Sweeps, reaches: Mapping[str, int]) -> Rows:
     """The plan of loops that run together."""
     rings, saved, waiting = _waiting(sweeps)
-    made = sweeps.made()
+    made = sweeps.vars
     loops = []
     turned = 0
     for loop, part, lag in sweeps.placed():
@@ -85,17 +85,17 @@ def rows_of(sweeps: Sweeps, reaches: Mapping[str, int]) -> Rows:
         marked = [] if chains else [name for name in planes if name not in made]
         loops.append(RowLoop(loop, part, lag, tuple(marked), tuple(map(tuple, chains)), turned))
         turned += -(-len(loops[-1].masks) // TURNED) * TURNED
-    first = sweeps.loops[0]
+    first = sweeps.body[0]
     places = {out.into: out.var.name for out in first.outs if out.into is not None} if keeps(first) else {}
     return Rows(tuple(loops), rings, saved, waiting, turned, places, reaches)
 
 
 def _waiting(sweeps: Sweeps) -> tuple[dict[str, Ring], dict[str, tuple[int, int]], int]:
     """The rings of passing fields, the rows that are saved of others, and the number of rows that wait in all."""
-    lags = {name: lag for loop, _, lag in sweeps.placed() for name in loop.made()}
-    depths = dict.fromkeys(sweeps.passing, 1)
-    bare: dict[str, int | None] = dict.fromkeys(sweeps.passing, 0)
-    below = {out.into: 0 for loop in sweeps.loops for out in loop.outs if out.into is not None}
+    lags = {name: lag for loop, _, lag in sweeps.placed() for name in loop.vars}
+    depths = dict.fromkeys(sweeps.frees, 1)
+    bare: dict[str, int | None] = dict.fromkeys(sweeps.frees, 0)
+    below = {out.into: 0 for loop in sweeps.body for out in loop.outs if out.into is not None}
     for loop, _, lag in sweeps.placed():
         for read in field_reads(loop):
             if (name := read.name) in depths:
@@ -132,11 +132,11 @@ def reaches_of(schedule: Schedule) -> dict[str, int]:
     reaches = {str(node.attr): ANY_PASS for node in schedule.results if node.op == "load"}
     copies: list[tuple[str, Node]] = []  # a field whose rows may be those of another one
     for statement in flat(schedule.body):
-        for node in ordered(statement.values()):
+        for node in ordered(statement.values):
             if node.op == "shift" and node.type == REAL and node.attr[2]:
                 name = str(node.args[0].attr)
                 reaches[name] = max(reaches.get(name, 0), abs(node.attr[1]))
-        copies += [(var.name, value) for var, value in statement.unchanged()]
+        copies += statement.olds.items()
     for _ in copies:
         before = dict(reaches)
         for name, old in copies:

@@ -55,17 +55,16 @@ class _Names:
 def _block(body: Sequence[Statement], indent: str, names: _Names) -> Iterator[str]:
     place = ""
     for statement in body:
-        written = getattr(statement, "place", "")
-        if written and written != place:
-            place = written
+        if statement.place not in ("", place):
+            place = statement.place
             yield f"{indent}# {place}"
         yield from _statement(statement, indent, names)
 
 
 def _statement(statement: Statement, indent: str, names: _Names) -> Iterator[str]:
-    values = _Values(statement.values(), names)
+    values, outs = _Values(statement.values, names), statement.outs
     match statement:
-        case Compute(outs, _, over, region, when):
+        case Compute(over=over, region=region, when=when):
             if over:
                 where = f" over {values.text(region)}" if region is not None else ""
                 where += f" when {values.text(when)}" if when is not None else ""
@@ -78,27 +77,28 @@ def _statement(statement: Statement, indent: str, names: _Names) -> Iterator[str
                 into = f" into {names.of(out.into)}" if out.into else ""
                 rest = f" else {values.text(out.otherwise)}" if out.otherwise is not None else ""
                 yield f"{indent}{names.of(out.var.name)} = {value}{rest}{into}"
-        case Sweeps(loops, parts):
+        case Sweeps(loops=loops, parts=parts):
             for loop, part, lag in statement.placed():
                 if len(loops) > 1:
                     behind = f", {lag} behind" if lag else ""
                     yield f"{indent}row by row{f', part {part}' if parts[-1] else ''}{behind}"
                 yield from _statement(loop, indent + ("  " if len(loops) > 1 else ""), names)
-        case Move(op, (dy, dx), movers, planes):
+        case Move(region=movers, op=op, offset=(dy, dx), olds=olds):
             yield f"{indent}{op} by {values.text(movers)} [{dy:+d},{dx:+d}]"
-            for plane in planes:
-                leaves = "" if plane.leaves is plane.old else f" leaving {values.text(plane.leaves)}"
-                into = f" into {names.of(plane.into)}" if plane.into else ""
-                yield f"{indent}  {names.of(plane.new.name)} = {values.text(plane.old)}{leaves}{into}"
-        case Guard(when, inner, keeps):
-            asked = " | ".join(map(values.text, when))
+            for out in outs:
+                old = olds[out.var.name]
+                leaves = "" if out.value is old else f" leaving {values.text(out.value)}"
+                into = f" into {names.of(out.into)}" if out.into else ""
+                yield f"{indent}  {names.of(out.var.name)} = {values.text(old)}{leaves}{into}"
+        case Guard(when=when, body=inner):
+            asked = " | ".join(map(values.text, when.args or (when,)))
             yield from (f"{indent}{line}" for line in values.taken())
             yield f"{indent}if any {asked}"
             yield from _block(inner, indent + "  ", names)
-            if keeps:
-                olds = (f"{names.of(var.name)} = {values.text(value)}" for var, value in keeps)
-                yield f"{indent}else {', '.join(olds)}"
-        case Release(released):
+            if outs:
+                kept = (f"{names.of(out.var.name)} = {values.text(out.value)}" for out in outs)
+                yield f"{indent}else {', '.join(kept)}"
+        case Release(frees=released):
             yield f"{indent}release {', '.join(map(names.of, released))}"
         case Forget():
             yield f"{indent}forget elements"

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Any, Literal, Self, TypeVar
 
@@ -36,13 +37,13 @@ class Var:
 class Out:
     """A variable and its value. `into` names the variable whose memory it reuses (set by `buffers` and `release`).
 
-    `otherwise` is its value outside the statement's `region`: a constant or a load.
+    `otherwise` is its value where the statement does nothing, such as outside its `region`: a constant or a load.
     """
 
     var: Var
     value: Node
-    into: str | None = None
     otherwise: Node | None = None
+    into: str | None = None
 
 
 Block = tuple["Statement", ...]
@@ -50,235 +51,162 @@ Block = tuple["Statement", ...]
 
 @dataclass(frozen=True)
 class Statement:
-    """A statement says once what it reads, makes and contains; all walks over schedules follow from that."""
+    """A statement says in the same fields what it makes, reads, contains and frees; all walks over schedules follow.
 
-    def values(self) -> Iterable[Node]:
-        """The values that it reads, without those of nested statements."""
-        return ()
-
-    def blocks(self) -> tuple[Block, ...]:
-        """The statements that it contains."""
-        return ()
-
-    def with_values(self, new: Callable[[Node], Node]) -> Self:
-        """The statement with each of these values replaced by another."""
-        return self
-
-    def with_blocks(self, new: Callable[[Block], Block]) -> Self:
-        """The statement with each of these blocks replaced by another."""
-        return self
-
-    def unchanged(self) -> Iterable[tuple[Var, Node]]:
-        """Variables with the value that they have where the statement does nothing."""
-        return ()
-
-    def defined(self) -> Iterable[Var]:
-        """The variables that it defines for statements after it."""
-        return [var for var, _ in self.unchanged()]
-
-    def made(self) -> set[str]:
-        """The names of these variables."""
-        return {var.name for var in self.defined()}
-
-    def ended(self) -> Iterable[str]:
-        """The variables whose memory it frees, or takes for those that it defines."""
-        return ()
-
-
-@dataclass(frozen=True)
-class Compute(Statement):
-    """Computes values of cells; all of them read the variables as they were before. `place`: ``rules/acme.yaml:12``.
-
-    `over` is the kind of loop that `cut` chose: over words of flags, over cells for floats, or over choices that are
-    applied to floats one after another. Words or rows in which `region` holds nowhere are skipped.
+    Words or rows in which `region` holds nowhere are skipped.
     """
 
-    outs: tuple[Out, ...]
+    outs: tuple[Out, ...] = ()
+    """The variables that it defines for statements after it."""
     place: str = ""
-    over: Literal["", "words", "cells", "choices"] = ""
+    """``rules/acme.yaml:12``."""
     region: Node | None = None
     when: Node | None = None
-    """An answer: if it is false, every variable is its `otherwise` (a constant) everywhere."""
-    held: bool = False
-    """Whether all values are computed before any is stored, since it overwrites what it reads at neighbors (`buffers`)."""
+    """An answer: if it is false, every variable is its `otherwise` everywhere."""
+    body: Block = ()
+    otherwise: Block = ()
+    """Statements that give variables their values if the body is skipped (set by `buffers`)."""
+    frees: tuple[str, ...] = ()
+    """Variables whose memory it frees."""
 
     @property
-    def of_cells(self) -> bool:
-        """Whether it is a loop over cells, not over words."""
-        return self.over in ("cells", "choices")
+    def loops(self) -> Sequence[Statement]:
+        """The statements that have its variables: itself, unless it only places others."""
+        return (self,)
+
+    @cached_property
+    def vars(self) -> dict[str, Var]:
+        """The variables that it defines, by name."""
+        return {out.var.name: out.var for loop in self.loops for out in loop.outs}
+
+    @cached_property
+    def olds(self) -> dict[str, Node]:
+        """The values that variables have where the statement does nothing."""
+        return {out.var.name: out.otherwise for out in self.outs if out.otherwise is not None}
+
+    @property
+    def ended(self) -> set[str]:
+        """The variables whose memory it frees, or takes for those that it defines."""
+        return {*self.frees, *[out.into for loop in self.loops for out in loop.outs if out.into is not None]}
 
     @property
     def results(self) -> list[Node]:
         """The values of its variables."""
         return [out.value for out in self.outs]
 
-    def values(self) -> Iterable[Node]:
-        rest = (*(out.otherwise for out in self.outs), self.region, self.when)
-        return (*self.results, *filter(None, rest))
+    @cached_property
+    def values(self) -> list[Node]:
+        """The values that it reads, without those of nested statements."""
+        return [*self.results, *self.olds.values(), *filter(None, (self.region, self.when))]
+
+    @cached_property
+    def reads(self) -> set[str]:
+        """The variables that it reads, or statements in it, without those that these define."""
+        names = {str(node.attr) for node in ordered(self.values) if node.op == "load"}
+        return names | read_by(self.body) | read_by(self.otherwise)
 
     def with_values(self, new: Callable[[Node], Node]) -> Self:
-        outs = tuple(
+        """The statement with each of its values replaced by another."""
+        outs = [
             replace(out, value=new(out.value), otherwise=out.otherwise and new(out.otherwise))
             for out in self.outs
-        )
+        ]
         return replace(
-            self, outs=outs, region=self.region and new(self.region), when=self.when and new(self.when)
+            self, outs=tuple(outs), region=self.region and new(self.region), when=self.when and new(self.when)
         )
 
-    def defined(self) -> Iterable[Var]:
-        return [out.var for out in self.outs]
 
-    def unchanged(self) -> Iterable[tuple[Var, Node]]:
-        return [(out.var, out.otherwise) for out in self.outs if out.otherwise is not None]
+@dataclass(frozen=True, kw_only=True)
+class Compute(Statement):
+    """Computes values of cells; all of them read the variables as they were before.
 
-    def ended(self) -> Iterable[str]:
-        return [out.into for out in self.outs if out.into is not None]
+    `over` is the kind of loop that `cut` chose: over words of flags, over cells for floats, or over choices that are
+    applied to floats one after another.
+    """
+
+    over: Literal["", "words", "cells", "choices"] = ""
+    held: bool = False
+    """Whether all values are computed before any is stored, since it overwrites what it reads at neighbors (`buffers`)."""
 
 
 Leftover = Literal["same", "nothing", "everything"]
 
 
-@dataclass(frozen=True)
-class Carried:
-    """A plane in a movement: its new value, its old value, and what a cell holds that its mover left and none entered.
+def leftover(old: Node, leaves: Node, movers: Node) -> Leftover | None:
+    """The flags that movers leave behind in the cells of a plane; None for any others."""
+    if leaves is old:
+        return "same"
+    if leaves.op not in ("and", "or") or old not in leaves.args:
+        return None
+    (other,) = (arg for arg in leaves.args if arg is not old)
+    if leaves.op == "or":
+        return "everything" if other is movers else None
+    return "nothing" if other.op == "not" and other.args[0] is movers else None
 
-    `leaves` is a value over loads; if it is `old` itself, the cell keeps its flag.
+
+@dataclass(frozen=True, kw_only=True)
+class Move(Statement):
+    """Planes that move together: `swap` or `arrive` of the IR by an offset. The flags of the region are the movers.
+
+    A variable's `otherwise` is the plane before, its `value` what a cell holds that its mover left and none entered: a
+    value over loads, or the plane itself if cells keep their flags.
     """
 
-    new: Var
-    old: Node
-    leaves: Node
-    into: str | None = None
-    """The variable whose memory the new one reuses, since nothing reads it later: the old one, or what is left (`release`)."""
-
-    def leftover(self, movers: Node) -> Leftover | None:
-        """The flags that movers leave behind in their cells; None for any others."""
-        if self.leaves is self.old:
-            return "same"
-        if self.leaves.op not in ("and", "or") or self.old not in self.leaves.args:
-            return None
-        (other,) = (arg for arg in self.leaves.args if arg is not self.old)
-        if self.leaves.op == "or":
-            return "everything" if other is movers else None
-        return "nothing" if other.op == "not" and other.args[0] is movers else None
-
-
-@dataclass(frozen=True)
-class Move(Statement):
-    """Planes that move together: `swap` or `arrive` of the IR with the same movers and offset."""
-
+    region: Node
     op: str
     offset: tuple[int, int]
-    movers: Node
-    planes: tuple[Carried, ...]
-    place: str = ""
 
-    def values(self) -> Iterator[Node]:
-        yield self.movers
-        for plane in self.planes:
-            yield from (plane.old, plane.leaves)
-
-    def with_values(self, new: Callable[[Node], Node]) -> Self:
-        planes = (replace(plane, old=new(plane.old), leaves=new(plane.leaves)) for plane in self.planes)
-        return replace(self, movers=new(self.movers), planes=tuple(planes))
-
-    def unchanged(self) -> Iterable[tuple[Var, Node]]:
-        return [(plane.new, plane.old) for plane in self.planes]
-
-    def ended(self) -> Iterable[str]:
-        return [plane.into for plane in self.planes if plane.into is not None]
-
-    def leftovers(self) -> dict[Leftover, list[Carried]] | None:
+    def leftovers(self) -> dict[Leftover, list[Out]] | None:
         """The planes by the flags that movers leave behind; None if these are any others in some plane."""
-        groups: dict[Leftover, list[Carried]] = {}
-        for plane in self.planes:
-            leftover = plane.leftover(self.movers)
-            if leftover is None:
+        groups: dict[Leftover, list[Out]] = {}
+        for out in self.outs:
+            left = leftover(self.olds[out.var.name], out.value, self.region)
+            if left is None:
                 return None
-            groups.setdefault(leftover, []).append(plane)
+            groups.setdefault(left, []).append(out)
         return groups
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Guard(Statement):
-    """Statements that run only if one of the flags `when` holds in some cell.
+    """Statements that run only `when` one of some flags holds in some cell.
 
-    `keeps` lists the variables of the body that are read after it, each with its value if the body is skipped.
+    Its variables are those of the body that are read after it, with the values that they have if the body is skipped.
     """
 
-    when: tuple[Node, ...]
-    body: Block
-    keeps: tuple[tuple[Var, Node], ...]
-    place: str = ""
-    otherwise: Block = ()
-    """Statements that give `keeps` their values if the body is skipped and they share no buffers (set by `buffers`)."""
-
-    @property
-    def olds(self) -> dict[str, Node]:
-        """The values that variables have if the body is skipped, by name."""
-        return {var.name: value for var, value in self.keeps}
-
-    def values(self) -> Iterable[Node]:
-        return (*self.when, *self.olds.values())
-
-    def blocks(self) -> tuple[Block, ...]:
-        return self.body, self.otherwise
-
-    def with_values(self, new: Callable[[Node], Node]) -> Self:
-        keeps = tuple((var, new(value)) for var, value in self.keeps)
-        return replace(self, when=tuple(map(new, self.when)), keeps=keeps)
-
-    def with_blocks(self, new: Callable[[Block], Block]) -> Self:
-        return replace(self, body=new(self.body), otherwise=new(self.otherwise))
-
-    def unchanged(self) -> Iterable[tuple[Var, Node]]:
-        return self.keeps
+    when: Node
 
 
-@dataclass(frozen=True)
 class Release(Statement):
     """Frees the buffers of variables that nothing reads later."""
 
-    names: tuple[str, ...]
 
-    def ended(self) -> Iterable[str]:
-        return self.names
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Sweeps(Statement):
     """Consecutive loops over cells that run together, world by world and row by row, so that data stay in the cache.
 
     Each loop runs `lags` rows behind the first of its part: then the rows that it reads of earlier loops are there. A
-    loop that reads an earlier one around the edge is in a later part, which begins when all rows are done.
-    `passing` lists fields that only loops of one part read: they need memory for a few rows. Stages change it as a whole.
+    loop that reads an earlier one around the edge is in a later part, which begins when all rows are done. It frees
+    fields that only loops of one part read: they need memory for a few rows. Stages change it as a whole.
     """
 
-    loops: tuple[Compute, ...]
+    body: tuple[Compute, ...]
     parts: tuple[int, ...]
     lags: tuple[int, ...]
-    passing: tuple[str, ...]
 
-    def blocks(self) -> tuple[Block, ...]:
-        return (self.loops,)
+    @property
+    def loops(self) -> tuple[Compute, ...]:
+        return self.body
 
     def placed(self) -> Iterator[tuple[Compute, int, int]]:
         """Each loop with its part and lag."""
-        return zip(self.loops, self.parts, self.lags, strict=True)
-
-    def defined(self) -> Iterable[Var]:
-        return [var for loop in self.loops for var in loop.defined()]
-
-    def ended(self) -> Iterable[str]:
-        return (*self.passing, *(name for loop in self.loops for name in loop.ended()))
+        return zip(self.body, self.parts, self.lags, strict=True)
 
 
-@dataclass(frozen=True)
 class Forget(Statement):
     """Discards what is known about which elements occur (`presence`)."""
 
 
-@dataclass(frozen=True)
 class Sync(Statement):
     """A barrier: all threads have finished the statements before it."""
 
@@ -303,10 +231,10 @@ class Schedule:
         """The values that the pass leaves in slots."""
         return [node for _, node in self.leaves]
 
+    @property
     def values(self) -> list[Node]:
         """All values: those of statements, then the results."""
-        nodes = [node for statement in flat(self.body) for node in statement.values()]
-        return nodes + self.results
+        return [node for statement in flat(self.body) for node in statement.values] + self.results
 
 
 # Values
@@ -406,26 +334,26 @@ def flat(body: Iterable[Statement]) -> Iterator[Statement]:
     """All statements, including nested ones, which come after those that contain them."""
     for statement in body:
         yield statement
-        for block in statement.blocks():
-            yield from flat(block)
+        yield from flat(statement.body)
+        yield from flat(statement.otherwise)
 
 
 def in_order(names: Iterable[str]) -> list[str]:
     """Names of variables sorted by number, so that no order of a set reaches a schedule."""
-    return sorted(sorted(names), key=lambda name: int(name[1:]))
+    return sorted(names, key=lambda name: (int(name[1:]), name))
 
 
 def variables(schedule: Schedule) -> dict[str, Var]:
     """All variables by name."""
-    made = [var for statement in flat(schedule.body) for var in statement.defined()]
-    return {var.name: var for var in (*dict(schedule.finds).values(), *made)}
+    found = {var.name: var for _, var in schedule.finds}
+    return found | made_in(schedule.body)
 
 
 def asked_masks(body: Block) -> Iterator[tuple[int, list[Out]]]:
     """Guards with masks in the statement before them: the position of that statement, and these masks."""
     for i, (masks, guard) in enumerate(pairwise(body)):
         if isinstance(masks, Compute) and isinstance(guard, Guard):
-            asked = {node.attr for node in guard.when if node.op == "load"}
+            asked = {node.attr for node in guard.when.args if node.op == "load"}
             yield i, [out for out in masks.outs if out.var.name in asked]
 
 
@@ -433,7 +361,11 @@ def map_blocks(schedule: Schedule, change: Callable[[Block], Block]) -> Schedule
     """The schedule with every block of statements changed, inner blocks first."""
 
     def block(body: Block) -> Block:
-        return change(tuple(statement.with_blocks(block) for statement in body))
+        inner = [
+            replace(part, body=block(part.body), otherwise=block(part.otherwise)) if part.body else part
+            for part in body
+        ]
+        return change(tuple(inner))
 
     return replace(schedule, body=block(schedule.body))
 
@@ -452,12 +384,12 @@ def map_each(schedule: Schedule, kind: type[Kind], change: Callable[[Kind], Iter
 
 def map_values(schedule: Schedule, rule: Rule) -> Schedule:
     """The schedule with every value rewritten by a rule, see `rewritten`."""
-    return with_values(schedule, rewritten(schedule.values(), schedule.graph, rule))
+    return with_values(schedule, rewritten(schedule.values, schedule.graph, rule))
 
 
 def with_values(schedule: Schedule, new: Callable[[Node], Node]) -> Schedule:
     """The schedule with every value replaced by another."""
-    changed = map_blocks(schedule, lambda body: tuple(statement.with_values(new) for statement in body))
+    changed = map_each(schedule, Statement, lambda statement: [statement.with_values(new)])
     return replace(changed, leaves=tuple((slot, new(node)) for slot, node in schedule.leaves))
 
 
@@ -491,7 +423,7 @@ def reads_of(values: Iterable[Node]) -> Iterator[Read]:
 
 def field_reads(loop: Compute) -> Iterator[Read]:
     """The fields that a loop or its region reads."""
-    return (read for read in reads_of(loop.values()) if read.type == REAL)
+    return (read for read in reads_of(loop.values) if read.type == REAL)
 
 
 def read_elsewhere(values: Iterable[Node]) -> set[str]:
@@ -510,19 +442,14 @@ def planes_at_neighbors(schedule: Schedule) -> dict[str, tuple[str, tuple[int, i
     }
 
 
-def made_in(body: Iterable[Statement]) -> set[str]:
-    """The variables that statements define, including nested ones."""
-    return {var.name for statement in flat(body) for var in statement.defined()}
+def made_in(body: Iterable[Statement]) -> dict[str, Var]:
+    """The variables that statements define, including nested ones, by name."""
+    return {name: var for statement in flat(body) for name, var in statement.vars.items()}
 
 
 def read_by(body: Block) -> set[str]:
     """The variables that statements read, without those that they define."""
-    return set(loaded(node for statement in flat(body) for node in statement.values())) - made_in(body)
-
-
-def live_before(statement: Statement, after: set[str]) -> set[str]:
-    """The variables that are read from before a statement on, given those that are read after it."""
-    return (after - statement.made()) | read_by((statement,))
+    return set[str]().union(*[statement.reads for statement in body]) - made_in(body).keys()
 
 
 def without_unread(schedule: Schedule) -> Schedule:
@@ -532,19 +459,11 @@ def without_unread(schedule: Schedule) -> Schedule:
         """The statements that are needed if some variables are read after them, and what is read before them."""
         result: list[Statement] = []
         for statement in reversed(body):
-            needed = True
-            if isinstance(statement, Compute):
-                statement = replace(statement, outs=tuple(o for o in statement.outs if o.var.name in live))
-                needed = bool(statement.outs)
-            elif isinstance(statement, Guard):
-                keeps = tuple(keep for keep in statement.keeps if keep[0].name in live)
-                statement = replace(statement, keeps=keeps)
-                inner, _ = block(statement.body, live | statement.made())
-                statement = replace(statement, body=inner)
-                needed = bool(keeps) or any(isinstance(part, Forget) for part in inner)
-            if needed:
-                result.append(statement)
-                live = live_before(statement, live)
+            outs = tuple([out for out in statement.outs if out.var.name in live])
+            inner, _ = block(statement.body, live)
+            if outs or any(isinstance(part, Forget) for part in (statement, *inner)):
+                result.append(replace(statement, outs=outs, body=inner))
+                live = live.difference(statement.vars) | result[-1].reads
         return tuple(reversed(result)), live
 
     body, live = block(schedule.body, set(loaded(schedule.results)))

@@ -47,52 +47,45 @@ class _Checker:
     def block(self, body: Sequence[Statement], live: set[str]) -> set[str]:
         """The variables that exist after a block."""
         for statement in body:
-            for node in statement.values():
+            for node in statement.values:
                 self.value(node, live)
-            ends = [self.block(block, live) for block in statement.blocks()]
-            defined = statement.made()
+            for out in statement.outs:
+                types = {node.type for node in (out.value, out.otherwise) if node is not None}
+                demand(types == {out.var.type}, f"{out.var.name} is a {out.var.type}, but gets others")
+            end, skipped = self.block(statement.body, live), self.block(statement.otherwise, live)
             if isinstance(statement, Guard):
-                end, skipped = ends
-                demand(
-                    all(node.type in (FLAG, ANSWER) for node in statement.when),
-                    "a guard asks what is no flag",
-                )
-                for var, value in statement.keeps:
-                    demand(var.name in end, f"{var.name} is kept, but not made")
-                    demand(var.type == value.type, f"{var.name} is a {var.type}, else a {value.type}")
-                made = skipped - live - defined
+                demand(statement.when.type == ANSWER, "a guard asks for no answer")
+                kept = statement.vars.keys()
+                demand(kept <= end, f"{in_order(kept - end)} are kept, but not made")
+                made = skipped - live - kept
                 demand(not made, f"{in_order(made)} are made only where a body is skipped")
-                live = (live & end) | defined  # the body defines them; outside they exist from its end
+                live = live & end | kept  # the body defines them; outside they exist from its end
                 continue
             if isinstance(statement, Sweeps):
                 _check_order(statement)
-                live = ends[0] - set(statement.passing)
+                live = end.difference(statement.frees)
                 continue
-            ended = set(statement.ended())
+            ended = statement.ended
             demand(ended <= live, f"{in_order(ended - live)} are released or overwritten, but not there")
             if isinstance(statement, Compute):
                 demand(
                     all(part.op in ("load", "live") for part in alternatives(statement.region)),
                     "a region is made of stored flags and live fields",
                 )
-                far = read_elsewhere(statement.values()) if statement.over == "words" else set()
+                far = read_elsewhere(statement.values) if statement.over == "words" else set()
                 demand(not ended & far, f"{in_order(ended & far)} are overwritten, but read at neighbors")
-                for out in statement.outs:
-                    demand(out.var.type == out.value.type, f"{out.var.name} gets a {out.value.type}")
             elif isinstance(statement, Move):
-                types = {
-                    node.type for plane in statement.planes for node in (plane.new, plane.old, plane.leaves)
-                }
-                demand(len(types) == 1, "flags and floats move apart, and values keep their type")
-                same = all(plane.old is plane.leaves for plane in statement.planes)
+                types = {var.type for var in statement.vars.values()}
+                demand(len(types) == 1, "flags and floats move apart")
+                same = all(out.value is out.otherwise for out in statement.outs)
                 demand(types == {FLAG} or (statement.op == "swap" and same), "floats are exchanged")
                 demand(statement.op in ("swap", "arrive"), f"a movement by {statement.op}")
-                demand(statement.movers.type == FLAG, "movers are flags")
+                demand(statement.region.type == FLAG, "movers are flags")
             live = live - ended
-            for var in statement.defined():
-                demand(self.vars.setdefault(var.name, var) is var, f"two variables are called {var.name}")
-                demand(var.name not in live, f"{var.name} is assigned twice")
-                live.add(var.name)
+            for name, var in statement.vars.items():
+                demand(self.vars.setdefault(name, var) is var, f"two variables are called {name}")
+                demand(name not in live, f"{name} is assigned twice")
+                live.add(name)
         return live
 
     def value(self, root: Node, live: set[str]) -> None:
@@ -119,19 +112,19 @@ def _check_order(sweeps: Sweeps) -> None:
                 demand(not around, f"{read.name} is read around the edge")
                 demand(lag >= behind + read.dy, f"{read.name} is read before it is there")
             else:
-                demand(read.name not in sweeps.passing, f"{read.name} is gone when it is read")
+                demand(read.name not in sweeps.frees, f"{read.name} is gone when it is read")
         if loop.over == "choices":
-            early = [name for name in loaded(loop.values()) if name in made and made[name][2] == FLAG]
+            early = [name for name in loaded(loop.values) if name in made and made[name][2] == FLAG]
             demand(not early, f"choices are made by {early}, which are not there in all rows")
         for out in loop.outs:  # a row is written over after all rows around it have been computed
             late = any(name == out.into and lag <= least for name, least in seen)
             demand(not late, f"{out.into} is written over before it is read")
         seen += [(read.name, lag - read.dy) for read in field_reads(loop)]
-        made |= {var.name: (part, lag, var.type) for var in loop.defined()}
+        made |= {name: (part, lag, var.type) for name, var in loop.vars.items()}
 
 
-SCHEDULE_OPS = frozenset({"load", "below_param", "any", "when", "led", "live", "present"})
+SCHEDULE_OPS = frozenset({"load", "below_param", "any", "some", "when", "led", "live", "present"})
 """Operations that only schedules have: `load` → what a variable holds; `below_param` → a draw below a parameter; `any`
-(flag) → whether it holds in some cell; `when` (flag, flag) → both, the second computed only in words where the first
+(flag) → whether it holds in some cell; `some` (flags) → whether one of them does; `when` (flag, flag) → both, the second computed only in words where the first
 holds somewhere; `led` (comparison, comparison) → the same in cells; `live` (floats), attribute (rows, reach) → whether
 the field may be other than zero so many rows down, at most so many columns to either side."""

@@ -56,11 +56,11 @@ def early(schedule: Schedule) -> Schedule:
     `m = a & b & c; if any m: a' = …; n = a' & ~b & c` → `s = b & c, t = ~b & c; m = a & s; …; n = a' & t`.
     """
     graph, namer = schedule.graph, Namer(schedule)
-    known = {var.name: i for i, statement in enumerate(schedule.body) for var in statement.defined()}
+    known = {name: i for i, statement in enumerate(schedule.body) for name in statement.vars}
     users: dict[Node, int] = {}
     """The first statement that computes each value."""
     for i, statement in reversed([*enumerate(schedule.body)]):
-        users |= dict.fromkeys(ordered(statement.values()), i)
+        users |= dict.fromkeys(ordered(statement.values), i)
     groups: dict[int, list[_Mask]] = {}
     """Masks with the conjuncts that depend on the same statement last."""
     for i, masks in asked_masks(schedule.body):
@@ -86,7 +86,7 @@ def early(schedule: Schedule) -> Schedule:
     if not planes:
         return schedule
     new: dict[Node, Node] = {}
-    for node in ordered(schedule.values()):
+    for node in ordered(schedule.values):
         new[node] = graph.node(node.op, node.type, tuple(new[arg] for arg in node.args), node.attr)
         if node in planes:
             rest = [new[part] for part in conjuncts(node) if part not in planes[node]]
@@ -221,9 +221,10 @@ def updates(schedule: Schedule) -> Schedule:
 
 def _taken_out(guard: Guard, graph: Graph, *, near: bool = True) -> list[Statement]:
     """The loops that leave a guard, and what remains of it. `near`: also loops that read other planes at neighbors."""
-    if not all(node.op == "load" for node in guard.when) or guard.otherwise:
+    when = guard.when.args
+    if not all(node.op == "load" for node in when):
         return [guard]
-    masks = {str(node.attr) for node in guard.when}
+    masks = {str(node.attr) for node in when}
     inside, olds = made_in(guard.body), guard.olds
     body: list[Statement] = []
     taken: dict[bool, list[Out]] = {True: [], False: []}
@@ -235,21 +236,21 @@ def _taken_out(guard: Guard, graph: Graph, *, near: bool = True) -> list[Stateme
         rest = []
         for out in statement.outs:
             old, far = olds.get(out.var.name), bool(read_elsewhere([out.value]))
-            stays = old is None or (far and not near) or not inside.isdisjoint(loaded([out.value]))
+            stays = old is None or (far and not near) or any(name in inside for name in loaded([out.value]))
             if old is None or stays or not _is_update(out.value, masks, old, graph):
                 rest.append(out)
             else:
                 taken[far].append(replace(out, otherwise=old))
-        body += _partly(replace(statement, outs=tuple(rest)), guard.when, graph) if rest else []
+        body += _partly(replace(statement, outs=tuple(rest)), when, graph) if rest else []
     elsewhere = read_elsewhere(out.value for out in taken[True])
     if any(olds[out.var.name].attr in elsewhere for out in taken[True]):
         return _taken_out(guard, graph, near=False)  # in place, such a loop would read what it has changed
-    region = combined("or", guard.when, graph)
-    loops = [Compute(tuple(outs), guard.place, "words", region) for outs in taken.values() if outs]
+    region = combined("or", when, graph)
+    loops = [Compute(tuple(outs), guard.place, region, over="words") for outs in taken.values() if outs]
     names = made_in(loops)
-    keeps = tuple((var, value) for var, value in guard.keeps if var.name not in names)
-    left = [replace(guard, body=tuple(body), keeps=keeps)] if body else []
-    return [*left, *loops] if names.isdisjoint(read_by(tuple(body))) else [*loops, *left]
+    outs = tuple(out for out in guard.outs if out.var.name not in names)
+    left = [replace(guard, body=tuple(body), outs=outs)] if body else []
+    return [*left, *loops] if names.keys().isdisjoint(read_by(tuple(body))) else [*loops, *left]
 
 
 def _partly(loop: Compute, when: Sequence[Node], graph: Graph) -> list[Compute]:
@@ -313,20 +314,21 @@ def moved(move: Move, graph: Graph) -> Compute:
     """A movement as a loop over words."""
     dy, dx = move.offset
     outs = []
-    for plane in move.planes:
-        entering = _at_neighbor(plane.old, -dy, -dx, graph)
-        entered = _at_neighbor(move.movers, -dy, -dx, graph)
-        value = graph.node("select", FLAG, (entered, entering, plane.leaves))
+    for out in move.outs:
+        old = move.olds[out.var.name]
+        entering = _at_neighbor(old, -dy, -dx, graph)
+        entered = _at_neighbor(move.region, -dy, -dx, graph)
+        value = graph.node("select", FLAG, (entered, entering, out.value))
         if move.op == "swap":
-            value = graph.node("select", FLAG, (move.movers, _at_neighbor(plane.old, dy, dx, graph), value))
-        outs.append(Out(plane.new, value))
-    return Compute(tuple(outs), move.place, "words")
+            value = graph.node("select", FLAG, (move.region, _at_neighbor(old, dy, dx, graph), value))
+        outs.append(Out(out.var, value))
+    return Compute(tuple(outs), move.place, over="words")
 
 
 def targets(move: Move, graph: Graph) -> Compute:
     """A loop that computes the cells which movers enter."""
     dy, dx = move.offset
-    return Compute((Out(Var("targets", FLAG), _at_neighbor(move.movers, -dy, -dx, graph)),), "", "words")
+    return Compute((Out(Var("targets", FLAG), _at_neighbor(move.region, -dy, -dx, graph)),), over="words")
 
 
 def _at_neighbor(plane: Node, dy: int, dx: int, graph: Graph) -> Node:

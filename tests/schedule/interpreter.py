@@ -27,6 +27,7 @@ from powderdsl.schedule.types import (
     Sweeps,
     Var,
     flat,
+    made_in,
 )
 
 SNAP = np.float32(2.0**-20)
@@ -72,7 +73,7 @@ class _State:
     def block(self, body: Sequence[Statement]) -> None:
         for statement in body:
             match statement:
-                case Compute(outs):
+                case Compute(outs=outs):
                     found = self.values([out.value for out in outs])
                     found = [
                         self.inside(statement, out, value) for out, value in zip(outs, found, strict=True)
@@ -81,49 +82,43 @@ class _State:
                         if out.into is not None:
                             del self.held[out.into]
                         self.set(out.var, value)
-                case Move(op, (dy, dx), movers, planes):
-                    values = self.values([movers, *(n for p in planes for n in (p.old, p.leaves))])
-                    m, targets = values[0], _shift(values[0], -dy, -dx, True)
-                    for i, plane in enumerate(planes):
-                        old, leaves = values[1 + 2 * i], values[2 + 2 * i]
+                case Move(op=op, offset=(dy, dx), region=movers, outs=outs):
+                    (m,) = self.values([movers])
+                    targets = _shift(m, -dy, -dx, True)
+                    olds = self.values([*statement.olds.values()])
+                    for out, old, leaves in zip(outs, olds, self.values(statement.results), strict=True):
                         moved = np.where(targets, _shift(old, -dy, -dx, True), leaves)
                         if op == "swap":
                             moved = np.where(m, _shift(old, dy, dx, True), moved)
-                        if plane.into is not None:
-                            del self.held[plane.into]
-                        self.set(plane.new, moved)
-                case Guard(when, inner, keeps, _, otherwise):
+                        if out.into is not None:
+                            del self.held[out.into]
+                        self.set(out.var, moved)
+                case Guard(when=when, body=inner, otherwise=otherwise):
                     before = dict(self.held)
-                    if any(np.any(flag) for flag in self.values(when)):
+                    if np.any(self.values([when])):
                         self.block(inner)
-                        kept = {var.name: self.held[var.name] for var, _ in keeps}
+                        kept = {name: self.held[name] for name in statement.vars}
                     else:
-                        found = self.values([value for _, value in keeps])
-                        kept = {var.name: value for (var, _), value in zip(keeps, found, strict=True)}
+                        kept = dict(zip(statement.olds, self.values([*statement.olds.values()]), strict=True))
                         self.block(otherwise)
-                        for name in {var.name for one in otherwise for var in one.defined()}:
+                        for name in made_in(otherwise):
                             assert np.array_equal(self.held[name], kept[name]), name
                     # What the body released or overwrote is gone in either case.
                     gone = set(before) - set(self.held)
-                    gone |= {name for inside in flat(inner) for name in inside.ended()}
+                    gone |= {name for inside in flat(inner) for name in inside.ended}
                     if self.buffers:  # skipped or not, what shares a buffer with what the body makes is gone
-                        made = {
-                            self.buffers[v.name]
-                            for one in flat(inner)
-                            for v in one.defined()
-                            if v.name in self.buffers
-                        }
+                        made = {self.buffers[name] for name in made_in(inner) if name in self.buffers}
                         gone |= {name for name in before if self.buffers.get(name) in made}
                     self.held = {name: value for name, value in before.items() if name not in gone}
-                    for var, _ in keeps:
-                        self.set(var, kept[var.name])
-                case Sweeps(loops):
+                    for name, var in statement.vars.items():
+                        self.set(var, kept[name])
+                case Sweeps(body=loops, frees=passing):
                     self.block(loops)
-                    for name in statement.passing:
+                    for name in passing:
                         del self.held[name]
                 case Forget():
                     self.world = replace(self.world, known=False)
-                case Release(names):
+                case Release(frees=names):
                     for name in names:
                         del self.held[name]
 
@@ -246,8 +241,8 @@ def _node(node: Node, args: list[Array], world: World) -> Any:
             return any(attr >> int(number) & 1 for number in np.unique(ids))
         case "and" | "or" if node.type == ANSWER:
             return (args[0] and args[1]) if node.op == "and" else (args[0] or args[1])
-        case "any":
-            return bool(np.any(args[0]))
+        case "any" | "some":
+            return bool(np.any(args))
     if node.op in _SIMPLE:
         return _SIMPLE[node.op](*args)
     return np.vectorize(partial(OPS[node.op].value, attr))(*args)

@@ -27,7 +27,7 @@ def test_box_sums_follow_choices() -> None:
     assert last.parts == (0, 0, 0)
     assert last.lags == (0, 1, 2)
     written = [out.var.name for loop in last.loops for out in loop.outs]
-    assert last.passing == tuple(written[:4])
+    assert last.frees == tuple(written[:4])
     # Two rows behind, the result takes the place of what the choices read up to a row below and above.
     read = {read.name for read in field_reads(last.loops[0])}
     assert {out.into for out in last.loops[2].outs} == read

@@ -33,7 +33,7 @@ def test_fields_are_exchanged_where_planes_are(policy: str, place: str) -> None:
     run_stages(rules, CPU)
     ((_, fall),) = packed_passes(rules)
     statements = list(flat(plan(fall, CPU).body))
-    moves = [(one.op, one.offset, one.planes[0].new.type) for one in statements if isinstance(one, Move)]
+    moves = [(one.op, one.offset, one.outs[0].var.type) for one in statements if isinstance(one, Move)]
     fields = [(op, offset) for op, offset, type in moves if type == REAL]
     assert fields == [(op, offset) for op, offset, type in moves if type != REAL]
     assert len(fields) == 2

@@ -42,7 +42,7 @@ def sweeps_text(sweeps: Sweeps, layout: NativeLayout, reaches: Mapping[str, int]
     """The text of one loop over worlds, see EACH_WORLD in fields.hpp."""
     rows = rows_of(sweeps, reaches)
     loops = [_Loop(number, plan, rows, layout) for number, plan in enumerate(rows.loops)]
-    if keeps(sweeps.loops[0]):
+    if keeps(sweeps.body[0]):
         return _in_place(loops[0])
     layout.cover(turned=rows.turned, waiting=rows.waiting)
     pointers = " ".join(
@@ -67,7 +67,7 @@ def sweeps_text(sweeps: Sweeps, layout: NativeLayout, reaches: Mapping[str, int]
     lines += ["} }", *(loop.after() for loop in loops)]
     # In a function of its own, fewer values compete for registers.
     text = "\n".join(["[&]() __attribute__((noinline)) {", *lines, "}();"])
-    if any(loop.region is None for loop in sweeps.loops):
+    if any(loop.region is None for loop in sweeps.body):
         return f"{{\n{text}\n}}"
     lasting = [(out.var.name, out.otherwise, out.into) for out in rows.outs if out.var.name not in rows.rings]
     quiet = " ".join(f"{name} = keep({held(value)});" for name, value, _ in lasting if value is not None)
@@ -94,7 +94,7 @@ def _in_place(loop: _Loop) -> str:
 
 def _addresses(rows: Rows) -> str:
     """Copies of the addresses that loops need: a compiler knows that what loops store does not change them."""
-    values = [value for plan in rows.loops for value in plan.loop.values()]
+    values = [value for plan in rows.loops for value in plan.loop.values]
     loads = {str(node.attr): node.type for node in ordered(values) if node.op == "load"}
     types = {rows.places.get(name, name): type for name, type in loads.items()}
     types |= {out.var.name: out.var.type for out in rows.outs}
@@ -208,13 +208,13 @@ class _Loop(CellValues[str]):
 
     def quiet(self) -> Iterator[str]:
         """The values of a row outside the region."""
-        for var, value in self.plan.loop.unchanged():
-            if var.name in self.rows.rings:
-                yield f"{self.at(var.name, 0)} = nothing;"
-            elif var.type == REAL and value.op == "const":
-                yield f"v{var.name}.live[base + y] = 0;"
+        for name, value in self.plan.loop.olds.items():
+            if name in self.rows.rings:
+                yield f"{self.at(name, 0)} = nothing;"
+            elif value.type == REAL and value.op == "const":
+                yield f"v{name}.live[base + y] = 0;"
             elif value.op == "const":
-                word = f"lane_word(v{var.name}, row * words + w, lane)"
+                word = f"lane_word(v{name}, row * words + w, lane)"
                 rest = "c.valid(w)[lane]" if value.attr else "0"
                 yield f"for (int w = 0; w < words; w++) {word} = {rest};"
 

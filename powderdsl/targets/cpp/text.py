@@ -62,8 +62,8 @@ def kind(var: Var) -> str:
 def answer(node: Node) -> str:
     """A condition in C++."""
     match node.op:
-        case "any":
-            return f"!{node.args[0].attr}->zero"
+        case "any" | "some":
+            return " || ".join(f"!{plane.attr}->zero" for plane in node.args) or "false"
         case "present":
             return f"(c.present & {node.attr:#x}ull)"
         case "const":
@@ -106,7 +106,7 @@ class _Printer(Printer):
         yield sweeps_text(sweeps, self.layout, self.reaches)
 
     def release(self, release: Release) -> Iterator[str]:
-        yield " ".join(f"give(c, {name});" for name in release.names)
+        yield " ".join(f"give(c, {name});" for name in release.frees)
 
     def forget(self, _: Forget) -> Iterator[str]:
         yield "c.present = ~0ull;"
@@ -125,49 +125,47 @@ class _Printer(Printer):
         yield " ".join(names.values())
 
     def guard(self, guard: Guard) -> Iterator[str]:
-        asked = " || ".join(f"!{node.attr}->zero" for node in guard.when) or "false"
-        yield f"if ({asked}) {{"
+        yield f"if ({answer(guard.when)}) {{"
         yield from self.block(guard.body)
-        if guard.keeps:
+        if guard.outs:
             yield "} else {"
-            for var, value in guard.keeps:
-                yield f"{var.name} = keep({held(value)});"
+            for out in guard.outs:
+                yield f"{out.var.name} = keep({held(out.value)});"
         yield "}"
 
     def move(self, move: Move) -> Iterator[str]:
         """Planes that move, or fields that exchange values; as few as possible are copied."""
         dy, dx = move.offset
         self.layout.cover(around_rows=abs(dy))
-        movers, fields = str(move.movers.attr), move.planes[0].new.type == REAL
+        movers, fields = str(move.region.attr), move.outs[0].var.type == REAL
         groups = move.leftovers()
         # `arrive_planes` moves by one row.
         copies = not fields and (groups is None or (move.op == "arrive" and abs(dy) > 1))
         if copies and move.op == "swap":
             target = f"shifted(c, {movers}, {-dy}, {-dx})"
-            for plane in move.planes:
-                old, rest = plane.old.attr, held(plane.leaves)
-                call = f"swap_plane(c, {old}, {movers}, target, {rest}, {dy}, {dx})"
-                yield f"{{ Plane* target = {target}; {plane.new.name} = {call}; give(c, target); }}"
-                if plane.into:
-                    yield f"give(c, {plane.into});"
+            for out in move.outs:
+                name, rest = out.var.name, held(out.value)
+                call = f"swap_plane(c, {move.olds[name].attr}, {movers}, target, {rest}, {dy}, {dx})"
+                yield f"{{ Plane* target = {target}; {name} = {call}; give(c, target); }}"
+                if out.into:
+                    yield f"give(c, {out.into});"
             return
-        news = []
-        for plane in move.planes:
-            old = held(plane.leaves) if copies else plane.old.attr
-            yield f"{plane.new.name} = {plane.into or f'keep({old})'};"
-            news.append(f"&{plane.new.name}")
+        news = [f"&{name}" for name in move.vars]
+        for out in move.outs:
+            old = held(out.value) if copies else move.olds[out.var.name].attr
+            yield f"{out.var.name} = {out.into or f'keep({old})'};"
         if fields:
             yield on_all("Field** const", news, f"swap_fields<{len(news)}>(c, {movers}, {dy}, {dx}, all);")
             return
         self.layout.cover(moving=len(news))
         if copies:
-            olds = ", ".join(str(plane.old.attr) for plane in move.planes)
+            olds = ", ".join(str(old.attr) for old in move.olds.values())
             call = f"arrive_over(c, {movers}, {dy}, {dx}, olds, news, {len(news)});"
             yield f"{{ Plane* const olds[] = {{{olds}}}; Plane** const news[] = {{{', '.join(news)}}}; {call} }}"
         for leaves, planes in groups.items() if groups and not copies else ():
             function = "swap_planes" if move.op == "swap" else f"arrive_planes<{leaves.upper()}>"
             call = f"{function}(c, {movers}, {dy}, {dx}, all, {len(planes)});"
-            yield on_all("Plane** const", (f"&{plane.new.name}" for plane in planes), call)
+            yield on_all("Plane** const", (f"&{out.var.name}" for out in planes), call)
 
     def update(self, loop: Compute) -> Iterator[str]:
         """Planes that change only in words where a mask holds. Empty ones that can only lose flags need no copy."""

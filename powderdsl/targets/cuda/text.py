@@ -51,8 +51,7 @@ class _Printer(Printer):
         return self.words(loop) if loop.over == "words" else self.cells(loop)
 
     def guard(self, guard: Guard) -> Iterator[str]:
-        (when,) = guard.when
-        yield f"if ({when.attr}) {{"
+        yield f"if ({guard.when.attr}) {{"
         yield from self.block(guard.body)
         if guard.otherwise:
             yield "} else {"

@@ -69,7 +69,7 @@ class CellLoop(Loop):
     kind = "cells"
 
     def __init__(self, library: Library, loop: Compute):
-        olds = [old for _, old in loop.unchanged() if old.op == "load"]
+        olds = [old for old in loop.olds.values() if old.op == "load"]
         region = [] if loop.region is None else [loop.region]
         super().__init__(library, loop, loaded([*(out.value for out in loop.outs), *region, *olds]))
         self.columns = self.memory.at("columns") + 4 * self.memory.halo

@@ -90,11 +90,11 @@ def extent_of(schedules: Sequence[Schedule]) -> Extent:
     for statement in (statement for schedule in schedules for statement in flat(schedule.body)):
         if isinstance(statement, Move):
             around = max(around, abs(statement.offset[0]))
-            lines = max(lines, abs(statement.offset[0]) if statement.planes[0].new.type == REAL else 0)
+            lines = max(lines, abs(statement.offset[0]) if statement.outs[0].var.type == REAL else 0)
         elif isinstance(statement, Sweeps):
-            laid = (loop for loop in statement.loops if loop.over == "choices")
+            laid = (loop for loop in statement.body if loop.over == "choices")
             chains = max(chains, *(len(chains_of(loop)) for loop in laid), 0)
-        for node in ordered(statement.values()):
+        for node in ordered(statement.values):
             if node.op == "shift" and node.type != REAL:
                 around = max(around, abs(node.attr[0]))
             elif node.op in ("shift", "live"):

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from powderdsl.ir.ops import Offset
-from powderdsl.schedule.types import Carried, Leftover, Move
+from powderdsl.schedule.types import Leftover, Move, Out
 from powderdsl.targets.wasm.binary import I32, Callee, Local, Value, body, const, load, op
 from powderdsl.targets.wasm.library import HALOED, LIVE, SOME, WORD, ZERO, Library, choose, either, some, word
 
@@ -18,7 +18,7 @@ TOGETHER = 4
 """Planes that a loop over rows of one word changes, since each waits for what it reads."""
 
 
-def groups_in_place(move: Move) -> dict[Leftover, list[Carried]] | None:
+def groups_in_place(move: Move) -> dict[Leftover, list[Out]] | None:
     """The planes of a movement by what movers leave behind; None if it needs copies: swaps reach the next row only."""
     groups = move.leftovers()
     near = groups is not None and abs(move.offset[0]) <= 1 and groups.keys() == {"same"}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import reduce
 from operator import or_
@@ -111,8 +111,9 @@ class Pass(Printer):
     def answer(self, node: Node) -> Value:
         """A condition: i32, not zero if it holds."""
         match node.op:
-            case "any":
-                return self.of(node.args[0])[SOME]
+            case "any" | "some":
+                asked: list[Value] = [self.of(plane)[SOME] for plane in node.args]
+                return reduce(or_, asked or [ZERO])
             case "present":
                 return op("i64.ne", self.library.present & node.attr, 0)
             case "const":
@@ -127,35 +128,33 @@ class Pass(Printer):
             self.printed(statement)
 
     def release(self, release: Release) -> None:
-        self.give(release.names)
+        self.give(release.frees)
 
     def forget(self, _: Forget) -> None:
         self.library.present.set(-1)
 
     @contextmanager
-    def where(self, condition: Value, keeps: Iterable[tuple[Var, Node]]) -> Iterator[None]:
+    def where(self, condition: Value, olds: Mapping[Var, Node]) -> Iterator[None]:
         """Statements that run if a condition holds; if not, variables that they define get other values."""
-        values = list(keeps)
-        self.declare(var for var, _ in values)
+        self.declare(olds)
         with body.when(condition):
             yield
-            if values:
+            if olds:
                 body.otherwise()
-                for var, value in values:
+                for var, value in olds.items():
                     self.define(var, self.kept(value))
 
     def guard(self, guard: Guard) -> None:
-        asked = [self.of(node)[SOME] for node in guard.when]
-        with self.where(reduce(or_, asked) if asked else ZERO, guard.keeps):
+        with self.where(self.answer(guard.when), {out.var: out.value for out in guard.outs}):
             self.block(guard.body)
 
     def sweeps(self, sweeps: Sweeps) -> None:
-        for loop in sweeps.loops:
+        for loop in sweeps.body:
             self.cells(loop)
             for out in loop.outs:
                 if out.into is not None:
                     body.do(self.library.give(self.vars[out.into]))
-        self.give(sweeps.passing)
+        self.give(sweeps.frees)
 
     def cells(self, loop: Compute) -> None:
         """A loop over cells, if its region holds anywhere."""
@@ -167,7 +166,8 @@ class Pass(Printer):
         else:
             parts = alternatives(loop.region)
             held = (self.of(part.args[0] if part.op == "live" else part) for part in parts)
-            with self.where(reduce(or_, (one[SOME] for one in held), ZERO), loop.unchanged()):
+            olds = {loop.vars[name]: old for name, old in loop.olds.items()}
+            with self.where(reduce(or_, (one[SOME] for one in held), ZERO), olds):
                 self.run(CellLoop(self.library, loop))
 
     def words(self, loop: Compute) -> None:
@@ -176,7 +176,7 @@ class Pass(Printer):
         if loop.when is None:
             self.run(made)
             return
-        with self.where(self.answer(loop.when), [(out.var, self.nothing) for out in loop.outs]):
+        with self.where(self.answer(loop.when), {out.var: self.nothing for out in loop.outs}):
             self.run(made)
 
     def run(self, made: CellLoop | WordLoop) -> None:
@@ -236,23 +236,23 @@ class Pass(Printer):
                 tests = [(value.args[0], self.nothing)]
         with ExitStack() as inner:
             for plane, rest in tests:
-                inner.enter_context(self.where(self.of(plane)[SOME], [(out.var, rest)]))
-            self.run(WordLoop(self.library, Compute((out,), "", "words")))
+                inner.enter_context(self.where(self.of(plane)[SOME], {out.var: rest}))
+            self.run(WordLoop(self.library, Compute((out,), over="words")))
 
     def move(self, move: Move) -> None:
         """Planes that move, or fields that exchange values; those that nothing moves stay as they are."""
         library, graph = self.library, self.schedule.graph
-        movers, fields = self.of(move.movers), move.planes[0].new.type == REAL
+        movers, fields = self.of(move.region), move.outs[0].var.type == REAL
         groups = None if fields else groups_in_place(move)
         if groups is None and not fields:
             self.run(WordLoop(library, moved(move, graph)))
-            for plane in move.planes:
-                if plane.into is not None:
-                    body.do(library.give(self.vars[plane.into]))
+            for out in move.outs:
+                if out.into is not None:
+                    body.do(library.give(self.vars[out.into]))
             return
-        for plane in move.planes:
-            old = self.of(plane.old) if plane.into is not None else self.kept(plane.old)
-            held = self.define(plane.new, old)
+        for out in move.outs:
+            old = move.olds[out.var.name]
+            held = self.define(out.var, self.of(old) if out.into is not None else self.kept(old))
             if fields:
                 with body.when(movers[SOME] & held[SOME]):
                     held.set(library.own_field(held))
@@ -260,5 +260,5 @@ class Pass(Printer):
         if groups is not None:
             with body.when(movers[SOME]), body.scope():
                 entered = WordLoop(library, targets(move, graph)).made()
-                planes = {kind: [self.vars[one.new.name] for one in group] for kind, group in groups.items()}
+                planes = {kind: [self.vars[out.var.name] for out in group] for kind, group in groups.items()}
                 move_groups(library, move, movers, planes, entered)
