@@ -12,7 +12,7 @@ from itertools import chain
 
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Severity, Span
 from powderdsl.model.composition.added_packs import AddedPacks, Difference, report_contested
-from powderdsl.model.composition.compose import Palette, compose
+from powderdsl.model.composition.compose import Palette, compose, title
 from powderdsl.model.composition.layout import lay_out
 from powderdsl.model.composition.names import needs_of, report_misspelled, words_of
 from powderdsl.model.declarations import PackDecl, RulesetDecl
@@ -83,14 +83,7 @@ def check(
     report_contested(composition, reporter)
     report_misspelled(packs, ruleset, elsewhere, reporter)
 
-    elements = tuple(
-        replace(
-            element,
-            tags=frozenset(tag for tag, ids in composition.tags.items() if element.id in ids),
-            ramp=ramps.get(name),
-        )
-        for name, element in composition.elements.items()
-    )
+    elements = tuple(replace(element, ramp=ramps.get(name)) for name, element in composition.elements.items())
     passes = tuple(elaborated.passes)
     names = {element.id: name for name, element in composition.elements.items()}
     facts = Facts(symbols.ids, symbols.properties, symbols.fields, composition.side_multiple, names)
@@ -107,8 +100,8 @@ def check(
     reporter.raise_if_errors()
     undecided += report_needless(passes, symbols.fields, facts, reporter)
     found = Ruleset(
-        name=composition.name,
-        about=composition.about,
+        name=title(packs, ruleset),
+        about=ruleset.about if ruleset else (packs[0].about if len(packs) == 1 else ""),
         packs=tuple(pack.name.text for pack in packs),
         elements=elements,
         slots=composition.slots,

@@ -5,11 +5,10 @@ The fields of these records are the keys that rule files may have: messages and 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import MISSING
-from itertools import chain
 
-from powderdsl.diagnostics import Source
+from powderdsl.diagnostics import Source, Span
 from powderdsl.model.builtins import MAX_SIDE_MULTIPLE
 from powderdsl.model.schema import Entry, Form, Record, keyed
 from powderdsl.syntax.ast import Syntax
@@ -37,11 +36,28 @@ STEPS = Form(
 )
 
 
-class TagDecl(Entry, noun="a tag"):
+class Definition(Entry):
+    """What a file defines, or adds to what another one defines."""
+
+    pack: str = ""
+    """The pack or ruleset in whose file it stands."""
+
+    @property
+    def qualified(self) -> str:
+        """The name that it has whatever else is loaded."""
+        return f"{self.pack}.{self.name.text}"
+
+    @property
+    def span(self) -> Span:
+        """Where its name stands in the file."""
+        return self.name.span
+
+
+class TagDecl(Definition, noun="a tag"):
     about: str = keyed("what its elements have in common", "", short=True)
 
 
-class PropertyDecl(Entry, noun="a property", others="an element"):
+class PropertyDecl(Definition, noun="a property", others="an element"):
     type: Syntax | None = keyed("its kind", required=True, short=True)
     default: Syntax | None = keyed("the value of elements that do not say")
     about: str = keyed("what it is, in a sentence", "")
@@ -61,7 +77,7 @@ class TintDecl(Entry, noun="a tint"):
     )
 
 
-class FieldDecl(Entry, noun="a field", others="an element"):
+class FieldDecl(Definition, noun="a field", others="an element"):
     type: Syntax | None = keyed("its kind", required=True)
     at: str = keyed(
         "`element`: it travels with it; `place`: it stays",
@@ -82,7 +98,7 @@ class ScratchDecl(Entry, noun="a scratch field"):
     type: Syntax | None = keyed("its kind", short=True)
 
 
-class ParamDecl(Entry, noun="a parameter"):
+class ParamDecl(Definition, noun="a parameter"):
     type: Syntax | None = keyed("its kind", required=True)
     default: Syntax | None = keyed("its value unless the user says otherwise", required=True, short=True)
     about: str = keyed("what it does, in a sentence", "")
@@ -106,7 +122,7 @@ class RampDecl(Entry, noun="a color_by"):
     over: Syntax | None = keyed("the range, LOW..HIGH; all values of the field by default")
 
 
-class ElementDecl(Entry, noun="an element", others="a property or field"):
+class ElementDecl(Definition, noun="an element", others="a property or field"):
     id: int | None = keyed("the number it asks for, 0 to 255; a free one otherwise", bounds=(0, 255))
     id_scalar: Scalar | None = None
     color: str = keyed('its color, quoted: "#RRGGBB"', "#000000", required=True, form=COLOR)
@@ -120,7 +136,7 @@ class ElementDecl(Entry, noun="an element", others="a property or field"):
     values: tuple[Pair, ...] = ()
 
 
-class AlsoDecl(Entry, others="a property or field"):
+class AlsoDecl(Definition, others="a property or field"):
     """Tags, values, a color and a ramp that a pack adds to an element of another pack, or a ruleset to one of its packs'."""
 
     tags: Words = keyed("tags to add", (), short=True)
@@ -129,7 +145,7 @@ class AlsoDecl(Entry, others="a property or field"):
     values: tuple[Pair, ...] = ()
 
 
-class KernelDecl(Entry, noun="a kernel"):
+class KernelDecl(Definition, noun="a kernel"):
     rows: tuple[tuple[int, ...], ...] = keyed(
         "rows of integer weights, an odd number of each, at most 31", (), shape="words"
     )
@@ -143,12 +159,12 @@ class KernelDecl(Entry, noun="a kernel"):
         return self.edges == "wrap"
 
 
-class StreamDecl(Entry, noun="a stream"):
+class StreamDecl(Definition, noun="a stream"):
     bits: int = keyed("resolution of a draw: 16 or 32", 16, choices=("16", "32"))
     about: str = keyed("what it is for", "")
 
 
-class SetDecl(Entry, noun="a set"):
+class SetDecl(Definition, noun="a set"):
     members: Syntax = keyed("its elements", MISSING, short=True)
 
 
@@ -187,7 +203,7 @@ class Block(Record, noun="a block", prefixes=("for ", "repeat ")):
         return (*(value for _, value in self.lets), *([self.header] if self.header else []), *self.rules)
 
 
-class PassDecl(Block, Entry, noun="a pass"):
+class PassDecl(Block, Definition, noun="a pass"):
     about: str = keyed("what it does, in a sentence", "")
     after: Words = keyed("passes that come before it", ())
     before: Words = keyed("passes that come after it", ())
@@ -220,7 +236,8 @@ class TestDecl(Entry, noun="a test"):
     seed: int | None = keyed("the seed; several are tried without one", bounds=(0, 2**31 - 1))
 
 
-Definition = TagDecl | PropertyDecl | FieldDecl | StreamDecl | KernelDecl | SetDecl | ElementDecl | PassDecl
+SHARED = ("elements", "tags", "properties", "fields", "streams", "kernels", "sets")
+"""The sections of a pack whose names share a namespace, in the order in which they take names."""
 
 
 class PackDecl(Record, noun="a pack"):
@@ -257,9 +274,7 @@ class PackDecl(Record, noun="a pack"):
     @property
     def definitions(self) -> tuple[Definition, ...]:
         """All its definitions in the shared namespace; passes have a namespace of their own."""
-        tables: tuple[Sequence[Definition], ...]
-        tables = self.tags, self.properties, self.fields, self.streams, self.kernels, self.sets, self.elements
-        return tuple(chain.from_iterable(tables))
+        return tuple(decl for section in SHARED for decl in getattr(self, section))
 
     @property
     def entries(self) -> tuple[ElementDecl | AlsoDecl, ...]:

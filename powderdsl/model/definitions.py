@@ -12,11 +12,12 @@ from typing import Any
 from powderdsl.diagnostics import Label, Reporter, Span, suggest
 from powderdsl.model.composition.added_packs import report_replaced
 from powderdsl.model.composition.compose import Composition
-from powderdsl.model.composition.names import Named, report_unknown
+from powderdsl.model.composition.names import report_unknown
 from powderdsl.model.declarations import (
     ElementDecl,
     FieldDecl,
     KernelDecl,
+    PropertyDecl,
     RampDecl,
     TypedDecl,
 )
@@ -66,65 +67,65 @@ def define_symbols(typer: Typer) -> list[tuple[str, int, Span]]:
         Where elements' own values of properties stand: property, id, place.
     """
     symbols, composition = typer.symbols, typer.symbols.composition
-    for name, kernel in composition.kernels.items():
-        if kernel.decl.shape is not None:
-            symbols.constants[name] = _shaped(kernel, kernel.decl.shape, typer)
+    names, elements = composition.names, composition.elements
+    for name, kernel in names.declared(KernelDecl).items():
+        if kernel.shape is not None:
+            symbols.constants[name] = _shaped(name, kernel, kernel.shape, typer)
     for name, param in composition.params.items():
-        word = composition.names.of(param.pack, param.decl.name.text)
-        other = composition.names.definitions.get(word)
-        if other is not None and composition.names.knows(param.pack, word):
+        word = names.of(param.pack, param.name.text)
+        if word in names.versions and names.knows(param.pack, word):
             # A rule would read the other one without a sign.
             typer.reporter.error(
                 "PD308", f"the parameter `{word}` hides another `{word}`", param.span, "the same word",
-                secondary=[Label(other.span, "this one")], helps=["rename the parameter"],
+                secondary=[Label(names.versions[word][-1].span, "this one")], helps=["rename the parameter"],
             )  # fmt: skip
         with suppress(Poisoned):
-            kind, default = _kind("parameter", param.decl, typer), param.decl.default
-            if default is not None:
-                value = typer.constant(default, kind, Scope(param.pack, {}))
-                symbols.params[name] = Param(name, kind, value, param.decl.about, param.span)
+            kind = _kind("parameter", param, typer)
+            if param.default is not None:
+                value = typer.constant(param.default, kind, Scope(param.pack, {}))
+                symbols.params[name] = Param(name, kind, value, param.about, param.span)
     _set_by_rulesets(composition, typer)
-    for name, prop in composition.properties.items():
+    properties = names.declared(PropertyDecl)
+    for name, prop in properties.items():
         with suppress(Poisoned):
-            kind = _kind("property", prop.decl, typer)
-            symbols.properties[name] = Property(name, kind, (), frozenset(), prop.pack, prop.span, prop.word)
-    for name, field in composition.fields.items():
+            kind, word = _kind("property", prop, typer), prop.name.text
+            symbols.properties[name] = Property(
+                name, kind, (), frozenset(), prop.pack, prop.span, word if word != name else ""
+            )
+    for name, field in names.declared(FieldDecl).items():
         with suppress(Poisoned):
-            symbols.fields[name] = _field(field, typer)
+            symbols.fields[name] = _field(name, field, typer)
     given = _element_values(typer)
-    for name, prop in composition.properties.items():
-        known = symbols.properties.get(name)
-        if known is None:
-            continue
-        default, usual = prop.decl.default, default_of(known.kind)
-        values = [_value(known, default, prop.pack, typer) if default else usual] * composition.slots
-        for element in composition.elements.values():
+    for name, known in symbols.properties.items():
+        prop = properties[name]
+        usual = _value(known, prop.default, prop.pack, typer) if prop.default else default_of(known.kind)
+        values = [usual] * composition.slots
+        for element in elements.values():
             if (name, element.name) in given:
                 values[element.id] = _value(known, *given[name, element.name], typer)
         symbols.properties[name] = replace(known, values=tuple(values))
-    for name, named in composition.sets.items():
+    for name, decl in typer.sets.items():
         try:
             if name not in symbols.constants:
-                typer.resolve_set(name, named.decl.members.span)
+                typer.resolve_set(name, decl.members.span)
         except Poisoned:
             symbols.constants.setdefault(name, Broken())
         except Unresolved:
             symbols.constants.setdefault(name, SetOf(()))
     typer.used.clear()
-    elements = composition.elements
     return [
         (name, elements[of].id, syntax.span) for (name, of), (syntax, _) in given.items() if of in elements
     ]
 
 
-def _shaped(named: Named[KernelDecl], shape: Syntax, typer: Typer) -> Operand:
+def _shaped(name: str, decl: KernelDecl, shape: Syntax, typer: Typer) -> Operand:
     """A kernel that is declared by a shape and its radius."""
     try:
-        found = typer.evaluate(shape, Scope(named.pack, {}))
-        if not isinstance(found, Kernel):
+        kernel = typer.evaluate(shape, Scope(decl.pack, {}))
+        if not isinstance(kernel, Kernel):
             fix = "such as `box(5)`, or rows of weights"
-            raise typer.wrong(found, "a shape with its radius", shape.span, fix)
-        return replace(found, name=named.name, wrap=named.decl.wrap)
+            raise typer.wrong(kernel, "a shape with its radius", shape.span, fix)
+        return replace(kernel, name=name, wrap=decl.wrap)
     except (Poisoned, Unresolved):
         return Broken()
 
@@ -179,8 +180,8 @@ def _set_by_rulesets(composition: Composition, typer: Typer) -> None:
 # Fields and properties
 
 
-def _field(named: Named[FieldDecl], typer: Typer) -> Field:
-    decl, scope = named.decl, Scope(named.pack, {})
+def _field(name: str, decl: FieldDecl, typer: Typer) -> Field:
+    scope, word = Scope(decl.pack, {}), decl.name.text
     kind = _kind("field", decl, typer)
     default = default_of(kind, typer.symbols.first_id)
     if decl.default:
@@ -199,8 +200,8 @@ def _field(named: Named[FieldDecl], typer: Typer) -> Field:
         most = typer.constant(decl.tint.most, CHANCE, scope) if decl.tint.most else 1
         tint = Tint(decl.tint.color, decl.tint.full, float(most))  # type: ignore[arg-type]  # a chance is a number
     return Field(
-        named.name, kind, clamped(default, kind), decl.at, decl.resets is not None, of, named.pack, named.span,
-        word=named.word, tint=tint,
+        name, kind, clamped(default, kind), decl.at, decl.resets is not None, of, decl.pack, decl.span,
+        word=word if word != name else "", tint=tint,
     )  # fmt: skip
 
 
@@ -211,31 +212,31 @@ Given = Mapping[tuple[str, str], tuple[Syntax, str]]
 def _element_values(typer: Typer) -> Given:
     """The properties' values of single elements; fields get theirs. Reports keys that name nothing."""
     symbols, composition = typer.symbols, typer.symbols.composition
+    properties = composition.names.declared(PropertyDecl)
+    declared: dict[str, PropertyDecl | FieldDecl] = {**properties, **composition.names.declared(FieldDecl)}
     given: dict[tuple[str, str], tuple[Syntax, str]] = {}
     own: dict[str, dict[int, Value]] = {}
     for pack, name, word, key, syntax in composition.given_values():
         element = composition.elements.get(word)
         field = symbols.fields.get(name)
-        if name in composition.properties:
+        if name in properties:
             given[name, word] = (syntax, pack)
-        elif name not in composition.fields:
+        elif name not in declared:
             if not key.is_optional:
-                keys = [own for own in keys_of(ElementDecl) if own != "override"]
-                names = (*composition.properties, *composition.fields, *keys)
-                report_unknown("property", key, names, typer.reporter, "PD108")
+                keys = (own for own in keys_of(ElementDecl) if own != "override")
+                report_unknown("property", key, (*declared, *keys), typer.reporter, "PD108")
         elif field and element and _may_have(field, element.id, word, key, typer):
             with suppress(Poisoned):
                 value = typer.constant(syntax, field.kind, Scope(pack, {}))
                 own.setdefault(name, {})[element.id] = clamped(value, field.kind)
-    declared: list[Named[Any]] = [*composition.properties.values(), *composition.fields.values()]
-    for known in declared:
-        for key, _ in known.decl.values:
-            if composition.element(key.word, known.pack) is not None or key.is_optional:
+    for name, decl in declared.items():
+        for key, _ in decl.values:
+            if key.is_optional or composition.element(key.word, decl.pack) is not None:
                 continue
             # It should be an element's name, but may also be a misspelled key.
-            close = get_close_matches(key.text.lower(), sorted(keys_of(type(known.decl))), n=1, cutoff=0.75)
+            close = get_close_matches(key.text.lower(), sorted(keys_of(type(decl))), n=1, cutoff=0.75)
             if close:
-                label = f"not a key of the {known.decl.NOUN.removeprefix('a ')} `{known.name}`"
+                label = f"not a key of the {decl.NOUN.removeprefix('a ')} `{name}`"
                 helps = [f"did you mean `{close[0]}`?"]
                 typer.reporter.error("PD108", f"unknown key `{key.text}`", key.span, label, helps=helps)
             else:
@@ -291,21 +292,23 @@ def _value(prop: Property, syntax: Syntax, pack: str, typer: Typer) -> Value | s
 def element_ramps(typer: Typer) -> dict[str, ColorRamp]:
     """The ramps by global names of elements. Of several for one element the last holds. Reports what is wrong."""
     composition, symbols = typer.symbols.composition, typer.symbols
+    properties = composition.names.declared(PropertyDecl)
+    fields = composition.names.declared(FieldDecl)
     places: dict[str, tuple[str, Span]] = {}
     ramps: dict[str, ColorRamp] = {}
-    for pack, name, entry in composition.entries():
+    for name, entry in composition.entries:
         if entry.ramp is None:
             continue
-        word, element = entry.ramp.field, composition.elements.get(name)
+        pack, word, element = entry.pack, entry.ramp.field, composition.elements.get(name)
         field_name = composition.names.of(pack, word.word)
         field = symbols.fields.get(field_name)
         with suppress(Poisoned):
-            if field_name in composition.properties:
+            if field_name in properties:
                 fix = "a property is the same in all cells of an element: choose its `color` accordingly, or declare a field"
                 raise typer.fail(
                     "PD401", f"`{word.word}` is a property", word.span, "a color follows a field", fix
                 )
-            if field_name not in composition.fields and not word.is_optional:
+            if field_name not in fields and not word.is_optional:
                 report_unknown("field", word, symbols.fields, typer.reporter)
             if field is None or element is None:
                 continue

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 from powderdsl.diagnostics import Span, suggest
 from powderdsl.model.builtins import DIRECTION_SETS, DIRECTIONS
-from powderdsl.model.composition.names import Named
 from powderdsl.model.declarations import Block, PassDecl, ScratchDecl
 from powderdsl.model.expressions.operators import (
     FALSE,
@@ -91,12 +91,10 @@ class Elaborator:
         self._rules = self._tried = 0
         self._blocks = 0
 
-    def run(self, passes: tuple[Named[PassDecl], ...]) -> Elaborated:
-        for named in passes:
-            try:
-                self.result.passes.append(self._pass(named))
-            except Poisoned:
-                continue
+    def run(self, passes: Mapping[str, PassDecl]) -> Elaborated:
+        for name, decl in passes.items():
+            with suppress(Poisoned):
+                self.result.passes.append(self._pass(name, decl))
         for span, name in self.result.inactive.items():
             if span not in self.result.active:
                 helps = [f"it becomes active with a pack that defines `{name}`"]
@@ -104,9 +102,8 @@ class Elaborator:
                 self.typer.reporter.report("PD506", message, span, "left out", helps=helps)
         return self.result
 
-    def _pass(self, named: Named[PassDecl]) -> Pass:
-        decl = named.decl
-        self._name, self._pack, self._word = named.name, named.pack, decl.name.text
+    def _pass(self, name: str, decl: PassDecl) -> Pass:
+        self._name, self._pack, self._word = name, decl.pack, decl.name.text
         rules = [rule for block in decl.walk() for rule in block.rules]
         self._numbers = {id(rule): number for number, rule in enumerate(rules)}
         self._empty_lets: set[str] = set()
@@ -114,13 +111,13 @@ class Elaborator:
         self._pending: list[Let] = []
         self._moments: list[Moment] = []
         self._scratch: list[Field] = []
-        scope = Scope(named.pack, {})
+        scope = Scope(decl.pack, {})
         for item in decl.scratch:
             scope = scope.bind(**{item.name.text: self._scratch_field(item, scope)})
         self._block(decl, scope, "", None, None)
         if self._pending:
             self._moments.append(Moment(tuple(self._pending), (), "prove", ""))
-        return Pass(self._name, named.pack, tuple(self._scratch), tuple(self._moments), decl.name.span)
+        return Pass(name, decl.pack, tuple(self._scratch), tuple(self._moments), decl.span)
 
     def _scratch_field(self, decl: ScratchDecl, scope: Scope) -> Operand:
         name, span = f"{self._name}.{decl.name.text}", decl.name.span

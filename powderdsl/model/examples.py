@@ -12,7 +12,7 @@ from math import lcm
 from powderdsl.diagnostics import Label, Reporter, Span, suggest
 from powderdsl.model.builtins import DIRECTIONS, OCTANTS
 from powderdsl.model.composition.names import report_unknown, words_of
-from powderdsl.model.declarations import TestDecl
+from powderdsl.model.declarations import ElementDecl, TestDecl
 from powderdsl.model.expressions.operators import Poisoned, Scope, Unresolved
 from powderdsl.model.expressions.symbols import Symbols, clamped_number
 from powderdsl.model.expressions.typer import Typer
@@ -147,11 +147,10 @@ class _ExampleReader:
         size = f"`given` has {len(given)} row{'s' * (len(given) != 1)} of {len(given[0])}"
         if expect and decl.expect and (len(expect), len(expect[0])) != (len(given), len(given[0])):
             raise typer.fail("PD110", "`expect` has another size than `given`", decl.expect.span, size)
-        elements, names = self.composition.elements, self.composition.names
-        ids = {word: one.id for global_name, one in elements.items() for word in (one.qualified, global_name)}
-        for (where, word), meaning in names.meanings.items():
-            if where == self.pack and meaning in elements:
-                ids[word] = elements[meaning].id
+        elements, ids = self.composition.elements, {}
+        for known, element in elements.items():
+            for word in (known, element.qualified, element.word or known):
+                ids[word] = elements[self.composition.element(word, self.pack) or known].id
         ids |= {character: elements[meaning].id for character, meaning in self.legend.items()}
         fields = self._grids(decl.fields, ids, size, expected=False)
         expect_fields = self._grids(decl.expect_fields, ids, size, expected=True)
@@ -199,9 +198,9 @@ class _ExampleReader:
         alone = composition.glyphs_alone(composition.scope(self.pack))
         legend |= {glyph: name for name, glyph in alone.items()}
         # What the pack's own file says comes first, whatever other packs took before.
-        for name, named in composition.element_decls.items():
-            if named.pack == self.pack and named.decl.glyph:
-                legend[named.decl.glyph] = name
+        for name, decl in composition.names.declared(ElementDecl).items():
+            if decl.pack == self.pack and decl.glyph:
+                legend[decl.glyph] = name
         for key, value in self.decl.legend:
             found = composition.element(value.word, self.pack)
             if found is None:

@@ -11,6 +11,7 @@ from powderdsl.diagnostics import Label, Reporter, Source, Span
 from powderdsl.model.builtins import MAX_RADIUS
 from powderdsl.model.declarations import (
     Block,
+    Definition,
     ElementDecl,
     KernelDecl,
     PackDecl,
@@ -56,7 +57,12 @@ def read_file(source: Source, reporter: Reporter) -> PackDecl | RulesetDecl | No
 class _PackReader(Reader):
     """Reads the records of rule files: what follows from no declaration of a key stands here."""
 
+    owner = ""
+    """The pack or ruleset whose file this is."""
+
     def file(self, kind: type[R], tree: Mapping) -> R | None:
+        name = tree.get(kind.NOUN.removeprefix("a "))
+        self.owner = name.text if isinstance(name, Scalar) else ""
         record = self.record(kind, tree, kind.NOUN, source=tree.span.source)
         return record if record is not None and self.name(record.name, kind.NOUN) else None  # type: ignore[attr-defined]  # files have names
 
@@ -98,6 +104,8 @@ class _PackReader(Reader):
             record = self.block(PassDecl, node, f"the pass `{name.text}`", name=name)
         else:
             record = super().entry(kind, name, node)
+        if isinstance(record, Definition):
+            record = replace(record, pack=self.owner)
         if isinstance(record, ElementDecl) and isinstance(node, Mapping):
             number: Any = node.get("id")
             record = replace(record, id_scalar=number if record.id is not None else None)
@@ -108,7 +116,8 @@ class _PackReader(Reader):
     def streams(self, node: Node | None) -> Iterator[StreamDecl]:
         if node is None or isinstance(node, Mapping):
             return self.entries(StreamDecl, node)
-        return (StreamDecl(name=word) for word in self.words(node) if self.name(word, StreamDecl.NOUN))
+        words = (word for word in self.words(node) if self.name(word, StreamDecl.NOUN))
+        return (StreamDecl(name=word, pack=self.owner) for word in words)
 
     def kernel(self, key: Scalar, node: Node) -> KernelDecl | None:
         """Rows of weights, a shape with its radius, or a mapping with one of them and `edges`."""

@@ -259,10 +259,8 @@ class _TaskReader:
     def is_name(self, word: str) -> bool:
         """Whether a word means something in the task's own rules."""
         symbols = self.typer.symbols
-        named = symbols.composition.names.definitions.get(word)
-        return (named is None or named.pack in self.own) and bool(
-            self.ruleset.element(word) or symbols.constants.get(word)
-        )
+        pack = symbols.composition.names.pack(word)
+        return pack in (None, *self.own) and bool(self.ruleset.element(word) or symbols.constants.get(word))
 
     def knobs(self) -> tuple[Knob, ...]:
         found: dict[str, Knob] = {}

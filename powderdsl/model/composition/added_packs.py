@@ -67,7 +67,7 @@ def report_contested(composition: Composition, reporter: Reporter) -> None:
     """Report values that are replaced by others."""
     known: dict[tuple[str, str], tuple[str, Span, Syntax]] = {}
     for pack, name, element, key, syntax in composition.given_values():
-        if element in composition.elements and (name in composition.properties or name in composition.fields):
+        if element in composition.elements and name in composition.names.versions:
             if (name, element) in known:
                 before, place, value = known[name, element]
                 if _meaning(value) != _meaning(syntax):
@@ -173,7 +173,8 @@ class AddedPacks:
         composition = self.composition
         tags: list[Given] = []
         values: list[Given] = []
-        for pack, name, entry in composition.entries():
+        for name, entry in composition.entries:
+            pack = entry.pack
             if name != element or pack in scope or pack not in composition.names.needs:
                 continue
             for noun, given, scalars in (
@@ -184,6 +185,6 @@ class AddedPacks:
                     word = composition.names.of(pack, scalar.word)
                     if word.rpartition(".")[2] in words:
                         given.append(Given(pack, element, noun, word, scalar.span))
-        named = composition.element_decls[element]
-        brings = [] if named.pack in scope else [Given(named.pack, element, "", "", named.span)]
+        made = composition.elements[element]
+        brings = [] if made.pack in scope else [Given(made.pack, element, "", "", made.span)]
         return tags or values or brings

@@ -13,13 +13,10 @@ from difflib import get_close_matches
 from functools import cached_property
 from itertools import pairwise
 from math import lcm
-from typing import Any
 
 from powderdsl.diagnostics import Label, Reporter, Span
 from powderdsl.model.builtins import RESERVED
 from powderdsl.model.composition.names import (
-    NameBook,
-    Named,
     Names,
     needed_first,
     order_passes,
@@ -27,17 +24,16 @@ from powderdsl.model.composition.names import (
     with_stand_ins,
 )
 from powderdsl.model.declarations import (
+    SHARED,
     AlsoDecl,
     ElementDecl,
     FieldDecl,
-    KernelDecl,
     PackDecl,
     ParamDecl,
     PassDecl,
     PropertyDecl,
     RulesetDecl,
-    SetDecl,
-    StreamDecl,
+    TagDecl,
 )
 from powderdsl.model.types import Element
 from powderdsl.syntax.ast import Syntax
@@ -51,34 +47,31 @@ Palette = Sequence[str | None]
 """By id: an element's qualified name, or None."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Composition:
-    """Packs merged. Dictionaries are by name, in load order; kinds and values are still syntax."""
+    """Packs merged. Dictionaries are by global name, in load order; kinds and values are still syntax."""
 
-    name: str
-    about: str
-    packs: tuple[PackDecl, ...]
+    packs: Sequence[PackDecl]
     ruleset: RulesetDecl | None
-    elements: dict[str, Element]
-    element_decls: dict[str, Named[ElementDecl]]
-    slots: int
-    tags: dict[str, frozenset[int]]
-    properties: dict[str, Named[PropertyDecl]]
-    fields: dict[str, Named[FieldDecl]]
-    streams: dict[str, Named[StreamDecl]]
-    params: dict[str, Named[ParamDecl]]
-    kernels: dict[str, Named[KernelDecl]]
-    sets: dict[str, Named[SetDecl]]
-    passes: tuple[Named[PassDecl], ...]
     names: Names
+    passes: dict[str, PassDecl]
+    """In the order in which they run."""
+    params: dict[str, ParamDecl]
+    """By qualified name."""
+    elements: dict[str, Element]
+    """By ascending id."""
+    slots: int
     order: dict[int, int]
     """The place of each id where loops run over elements: as if no palette had been recorded."""
-    groups: tuple[tuple[str, ...], ...]
+    groups: list[list[PackDecl]]
     """The packs whose elements and channels are placed together; the first ones lie where they lie by themselves."""
-    side_multiple: int
-    """The least common multiple of what the packs ask of the sides of worlds."""
     reserved: tuple[int, ...]
     """Ids of elements of a ruleset's own packs that are left out."""
+
+    @cached_property
+    def side_multiple(self) -> int:
+        """The least common multiple of what the packs ask of the sides of worlds."""
+        return lcm(*(pack.side_multiple for pack in self.packs))
 
     @cached_property
     def lineage(self) -> tuple[RulesetDecl, ...]:
@@ -103,57 +96,47 @@ class Composition:
             home = next(filter(None, (one.lister(author) for one in self.lineage)), None)
             known, speaker = [author, *(home.members if home else ())], author
         for word in words:
-            named = self.names.definitions.get(self.names.of(speaker, word))
-            known += [named.pack] if named else []
+            pack = self.names.pack(self.names.of(speaker, word))
+            known += [pack] if pack else []
         reached = {need for pack in known for need in self.names.needs.get(pack, (pack,))}
         return tuple(pack.name.text for pack in self.packs if pack.name.text in reached)
 
-    def entries(self) -> Iterator[tuple[str, str, ElementDecl | AlsoDecl]]:
-        """The entries of all elements: the pack or ruleset, the element's global name (as written if absent), the entry.
+    @cached_property
+    def entries(self) -> list[tuple[str, ElementDecl | AlsoDecl]]:
+        """The entries of all elements, each with its element's global name (as written if absent).
 
         In rising precedence: the elements' own entries, then those under `also`, each pack after those that it needs. A
         ruleset comes after its packs, and packs that are added to it come last.
         """
-        for name, named in self.element_decls.items():
-            yield named.pack, name, named.decl
         members = {name for one in self.lineage for name in one.members}
-        own: list[tuple[str, AlsoDecl]] = []
-        added: list[tuple[str, AlsoDecl]] = []
-        for pack in needed_first(self.packs):
-            (own if pack.name.text in members else added).extend((pack.name.text, one) for one in pack.also)
-        own += [(one.name.text, _waiting(also, self.left_out)) for one in self.lineage for also in one.also]
-        for giver, also in (*own, *added):
-            yield giver, self.element(also.name.word, giver) or also.name.word, also
+        packs = needed_first(self.packs)
+        also = [decl for pack in packs if pack.name.text in members for decl in pack.also]
+        also += [_waiting(decl, self.left_out) for one in self.lineage for decl in one.also]
+        also += [decl for pack in packs if pack.name.text not in members for decl in pack.also]
+        own = self.names.declared(ElementDecl)
+        return [*own.items(), *((self.names.of(decl.pack, decl.name.word), decl) for decl in also)]
 
     def given_values(self) -> Iterator[tuple[str, str, str, Scalar, Syntax]]:
         """Every value of a single element, in rising precedence: those of entries, then those beside the property or field.
 
         Each is a pack, a property or field and an element by global name (one that is absent as written), key and value.
         """
-        for pack, element, entry in self.entries():
+        for element, entry in self.entries:
             for key, syntax in entry.values:
-                yield pack, self.names.of(pack, key.word), element, key, syntax
-        beside: dict[str, Named[Any]] = {**self.properties, **self.fields}
-        for name, typed in beside.items():
-            for key, syntax in typed.decl.values:
-                yield typed.pack, name, self.element(key.word, typed.pack) or key.word, key, syntax
+                yield entry.pack, self.names.of(entry.pack, key.word), element, key, syntax
+        for name, decl in {**self.names.declared(PropertyDecl), **self.names.declared(FieldDecl)}.items():
+            for key, syntax in decl.values:
+                yield decl.pack, name, self.names.of(decl.pack, key.word), key, syntax
 
     def glyphs_alone(self, packs: Sequence[str]) -> dict[str, str]:
         """The glyphs of elements, by global name, as they are where only some packs are loaded."""
-        found: dict[str, Named[ElementDecl]] = {}
-        for pack in self.packs:
-            for decl in pack.elements if pack.name.text in packs else ():
-                name = self.names.of(pack.name.text, decl.name.text)
-                if name in self.elements:  # what overrides it elsewhere has no say here
-                    found[name] = Named(pack.name.text, decl, name)
-        return _glyphs(list(found.values()))
+        alone = (decl for pack in self.packs if pack.name.text in packs for decl in pack.elements)
+        return _glyphs({self.names.of(decl.pack, decl.name.text): decl for decl in alone})
 
     def element(self, word: str, pack: str) -> str | None:
         """The global name of the element that a pack means by a plain or qualified name."""
         name = self.names.of(pack, word)
-        if name in self.elements:
-            return name
-        return next((one for one, element in self.elements.items() if element.qualified == word), None)
+        return name if name in self.elements else None
 
 
 def _waiting(also: AlsoDecl, names: frozenset[str]) -> AlsoDecl:
@@ -189,75 +172,41 @@ def compose(
     _check_needs(packs, reporter)
     reporter.raise_if_errors()  # every name of a missing pack would be reported too
     renames = ruleset.renames if ruleset else ()
-    book = NameBook(packs, renames, reporter, RESERVED | reserved_words() | {"elements"})
-    versions = book.versions("element", lambda pack: pack.elements)
-    if not versions:
+    names = Names(packs, SHARED, renames, reporter, RESERVED | reserved_words() | {"elements"})
+    params = {decl.qualified: decl for pack in packs for decl in pack.params}
+    for decl in params.values():
+        names.check_word(decl.name, ParamDecl.NOUN)
+    passes = Names(packs, ("passes",), renames, reporter)
+    _check_renamed(ruleset, names.renamed | passes.renamed, reporter)
+    declared = names.declared(ElementDecl)
+    if not declared:
         reporter.error(
             "PD109", "no element is defined", packs[0].name.span if packs else None, "a world needs elements",
             helps=["define `elements:`, or load `core` too"],
         )  # fmt: skip
     groups = _groups(packs, ruleset)
-    wishes = _wishes(groups, ruleset is not None, versions, reporter)
+    wishes = _wishes(groups, ruleset is not None, names, reporter)
     natural = _composed_ids(wishes)
     ids = natural if palette is None else _recorded_ids(wishes, palette)
     _report_ids(wishes, ids, reporter, recorded=palette is not None)
-    declared = [found[0] for found in versions.values()]
     elements = _elements(declared, ids, reporter)
-    tables: dict[str, dict[str, Named[Any]]] = {}
-    for table, kind in _KINDS.items():
-        found = [book.define(decl, kind, pack.name.text) for pack in packs for decl in getattr(pack, table)]
-        tables[table] = {named.name: named for named in found if named}
-    params: dict[str, Named[ParamDecl]] = {}
-    for pack in packs:
-        for decl in pack.params:
-            book.check_word(decl.name, "parameter")
-            name = f"{pack.name.text}.{decl.name.text}"
-            params[name] = Named(pack.name.text, decl, name)
-    pass_book = NameBook(packs, renames, reporter)
-    passes: dict[str, Named[PassDecl]] = {}
-    for name, (effective, *overridden) in pass_book.versions("pass", lambda pack: pack.passes).items():
-        decls = [*(one.decl for one in reversed(overridden)), effective.decl]
-        after = tuple(scalar for decl in decls for scalar in decl.after)
-        before = tuple(scalar for decl in decls for scalar in decl.before)
-        passes[name] = replace(effective, decl=replace(effective.decl, after=after, before=before))
-    _check_renamed(ruleset, book.renamed | pass_book.renamed, reporter)
     composition = Composition(
-        name=_title(packs, ruleset),
-        about=ruleset.about if ruleset else (packs[0].about if len(packs) == 1 else ""),
-        packs=tuple(packs),
+        packs=packs,
         ruleset=ruleset,
-        elements=elements,
-        element_decls={name: versions[name][0] for name in elements},
-        slots=max(_slots(ruleset, elements, palette, reporter), *(number + 1 for number in ids.values()), 1),
-        tags={},
-        properties=tables["properties"],
-        fields=tables["fields"],
-        streams=tables["streams"],
+        names=names,
+        passes=order_passes(passes, reporter),
         params=params,
-        kernels=tables["kernels"],
-        sets=tables["sets"],
-        passes=order_passes(passes, pass_book.finish(), reporter),
-        names=book.finish(),
-        order={number: natural.get(word, number) for word, number in ids.items()},
-        side_multiple=lcm(*(pack.side_multiple for pack in packs)),
-        groups=tuple(tuple(pack.name.text for pack in group) for group in groups),
+        elements=elements,
+        slots=max(_slots(ruleset, elements, palette, reporter), *(number + 1 for number in ids.values()), 1),
+        order={number: natural.get(name, number) for name, number in ids.items()},
+        groups=groups,
         reserved=tuple(ids[wish.name] for wish in wishes if wish.name in ids and not wish.is_loaded),
     )
-    return _with_entries(composition, tables["tags"], reporter)
+    _add_entries(composition, reporter)
+    return composition
 
 
-_KINDS = {
-    "tags": "tag",
-    "properties": "property",
-    "fields": "field",
-    "streams": "stream",
-    "kernels": "kernel",
-    "sets": "set",
-}
-"""Sections of packs, and a definition of each."""
-
-
-def _title(packs: Sequence[PackDecl], ruleset: RulesetDecl | None) -> str:
+def title(packs: Sequence[PackDecl], ruleset: RulesetDecl | None) -> str:
     """The title of what is loaded: a ruleset, packs left out of it, packs added: ``ruleset-pack+pack``."""
     loaded = [pack.name.text for pack in packs]
     if ruleset is None:
@@ -343,8 +292,6 @@ class Wish:
     """An element that wants an id. `name` is the global one; `own` says that a ruleset lists its pack."""
 
     name: str
-    qualified: str
-    pack: str
     decl: ElementDecl
     own: bool
     replaces: tuple[str, ...] = ()
@@ -366,33 +313,26 @@ def _groups(packs: Sequence[PackDecl], ruleset: RulesetDecl | None) -> list[list
     return [*([first] if first else []), *([pack] for pack in others)]
 
 
-def _wishes(
-    groups: Sequence[Sequence[PackDecl]],
-    own: bool,
-    versions: Mapping[str, list[Named[ElementDecl]]],
-    reporter: Reporter,
-) -> list[Wish]:
+def _wishes(groups: Sequence[Sequence[PackDecl]], own: bool, names: Names, reporter: Reporter) -> list[Wish]:
     """All elements in the order in which ids are decided. In each group, elements that ask for an id come first.
 
     `own` says that the first group is a ruleset's. Warns of an element that overrides another one and asks for another
     id than that has.
     """
-    by_decl = {id(found[-1].decl): found for found in versions.values()}
+    versions = {found[-1].qualified: (name, found) for name, found in names.versions.items()}
     wishes: list[Wish] = []
     for number, group in enumerate(groups):
         listed = not own or number == 0
         of_group = []
-        for pack, decl in ((one.name.text, decl) for one in group for decl in one.elements):
-            found = by_decl.get(id(decl))
-            qualified = f"{pack}.{decl.name.text}"
-            if found is not None:
-                names = [f"{one.pack}.{one.decl.name.text}" for one in found]
-                asking = [one.decl for one in found if one.decl.id is not None] or [found[0].decl]
+        for decl in (decl for pack in group for decl in pack.elements):
+            name, (effective, *others) = versions.get(decl.qualified, ("", (None,)))
+            if effective is not None:
+                asking = [one for one in (effective, *others) if one.id is not None] or [effective]
                 _check_same_id(asking, reporter)
-                asked = replace(found[0].decl, id=asking[0].id, id_scalar=asking[0].id_scalar)
-                of_group.append(Wish(found[0].name, names[0], found[0].pack, asked, listed, tuple(names[1:])))
+                asked = replace(effective, id=asking[0].id, id_scalar=asking[0].id_scalar)
+                of_group.append(Wish(name, asked, listed, tuple(one.qualified for one in others)))
             elif not decl.override:  # defined by a pack that is left out: the id stays reserved
-                of_group.append(Wish(f"-{qualified}", qualified, pack, decl, listed, is_loaded=False))
+                of_group.append(Wish(f"-{decl.qualified}", decl, listed, is_loaded=False))
         wishes += sorted(of_group, key=lambda wish: wish.decl.id is None)
     return wishes
 
@@ -440,7 +380,7 @@ def _recorded_ids(wishes: Iterable[Wish], palette: Palette) -> dict[str, int]:
     ids: dict[str, int] = {}
     later: list[Wish] = []
     for wish in wishes:
-        name = next((name for name in (wish.qualified, *wish.replaces) if name in known), None)
+        name = next((name for name in (wish.decl.qualified, *wish.replaces) if name in known), None)
         if name is None:
             later.append(wish)
         else:
@@ -471,7 +411,7 @@ def _report_ids(
         wanted, scalar = wish.decl.id, wish.decl.id_scalar
         if wanted is None or scalar is None:
             continue
-        first = by_number.setdefault((wish.pack, wanted), wish)
+        first = by_number.setdefault((wish.decl.pack, wanted), wish)
         if first is not wish:
             used = {other.decl.id for other in loaded} | {
                 number for number, holder in holders.items() if holder.is_loaded and holder is not wish
@@ -484,8 +424,8 @@ def _report_ids(
             )  # fmt: skip
         elif not recorded and ids.get(wish.name, wanted) != wanted:
             reporter.report(
-                "PD313", f"`{wish.qualified}` has id {ids[wish.name]} here, not {wanted}",
-                scalar.span, f"`{holders[wanted].qualified}` has id {wanted}",
+                "PD313", f"`{wish.decl.qualified}` has id {ids[wish.name]} here, not {wanted}",
+                scalar.span, f"`{holders[wanted].decl.qualified}` has id {wanted}",
                 notes=["saved worlds, datasets and checkpoints know elements by name, not by id"],
             )  # fmt: skip
 
@@ -494,73 +434,62 @@ def _report_ids(
 
 
 def _elements(
-    declared: Sequence[Named[ElementDecl]], ids: Mapping[str, int], reporter: Reporter
+    declared: Mapping[str, ElementDecl], ids: Mapping[str, int], reporter: Reporter
 ) -> dict[str, Element]:
     """The elements by ascending id. A glyph that another element has already is replaced by a free one."""
-    owners: dict[str, Named[ElementDecl]] = {}
-    for named in declared:
-        glyph = named.decl.glyph
-        first = owners.setdefault(glyph, named) if glyph else named
-        if first is not named and first.pack == named.pack:
+    owners: dict[str, ElementDecl] = {}
+    for decl in declared.values():
+        first = owners.setdefault(decl.glyph, decl) if decl.glyph else decl
+        if first is not decl and first.pack == decl.pack:
             reporter.error(
-                "PD302", f"elements `{first.decl.name.text}` and `{named.decl.name.text}` have the same glyph `{glyph}`",
-                named.span, "this one", secondary=[Label(first.span, "and this one")], helps=["give one of them another glyph"],
+                "PD302", f"elements `{first.name.text}` and `{decl.name.text}` have the same glyph `{decl.glyph}`",
+                decl.span, "this one", secondary=[Label(first.span, "and this one")], helps=["give one of them another glyph"],
             )  # fmt: skip
-    declared = [named for named in declared if named.name in ids]
-    glyphs = _glyphs(declared)
-    elements = [
-        Element(
-            named.name,
-            named.pack,
-            ids[named.name],
-            named.decl.color,
-            glyphs[named.name],
-            named.decl.about,
-            frozenset(),
-            named.span,
-            named.word,
+    glyphs = _glyphs({name: decl for name, decl in declared.items() if name in ids})
+    elements = {}
+    for name in sorted(glyphs, key=ids.__getitem__):
+        decl, glyph = declared[name], glyphs[name]
+        word = decl.name.text if decl.name.text != name else ""
+        elements[name] = Element(
+            name, decl.pack, ids[name], decl.color, glyph, decl.about, frozenset(), decl.span, word
         )
-        for named in declared
-    ]
-    return {element.name: element for element in sorted(elements, key=lambda element: element.id)}
+    return elements
 
 
-def _glyphs(elements: Sequence[Named[ElementDecl]]) -> dict[str, str]:
+def _glyphs(elements: Mapping[str, ElementDecl]) -> dict[str, str]:
     """A glyph for each global name: what files say comes first, then free letters in the order of the elements."""
-    owners: dict[str, Named[ElementDecl]] = {}
-    for named in elements:
-        if named.decl.glyph:
-            owners.setdefault(named.decl.glyph, named)
+    owners: dict[str, ElementDecl] = {}
+    for decl in elements.values():
+        if decl.glyph:
+            owners.setdefault(decl.glyph, decl)
     taken = set(owners)
     glyphs: dict[str, str] = {}
-    for named in elements:
-        word, glyph = named.decl.name.text, named.decl.glyph
-        if not glyph or owners[glyph] is not named:
+    for name, decl in elements.items():
+        word, glyph = decl.name.text, decl.glyph
+        if not glyph or owners[glyph] is not decl:
             signs = "@$&*+=<>"
             letters = [*word, *word.upper(), *"0123456789", *signs]
             allowed = (c for c in letters if c.isalnum() or c in signs)
             glyph = next((c for c in allowed if c not in taken), "?")
         taken.add(glyph)
-        glyphs[named.name] = glyph
+        glyphs[name] = glyph
     return glyphs
 
 
-def _with_entries(composition: Composition, tags: Iterable[str], reporter: Reporter) -> Composition:
-    """The composition with the tags and colors that entries give elements. Reports tags and elements that nothing defines."""
-    elements = dict(composition.elements)
-    members: dict[str, set[int]] = {tag: set() for tag in tags}
-    for pack, name, entry in composition.entries():
+def _add_entries(composition: Composition, reporter: Reporter) -> None:
+    """Give elements the tags and colors of entries. Reports tags and elements that nothing defines."""
+    elements, tags = composition.elements, composition.names.declared(TagDecl)
+    for name, entry in composition.entries:
         element = elements.get(name)
-        if isinstance(entry, AlsoDecl) and element and entry.color is not None:
-            elements[name] = replace(element, color=entry.color)
-        elif isinstance(entry, AlsoDecl) and not element and not entry.name.is_optional:
+        if isinstance(entry, AlsoDecl) and element is None and not entry.name.is_optional:
             report_unknown("element", entry.name, elements, reporter)
+        given = set()
         for scalar in entry.tags:
-            tag = composition.names.of(pack, scalar.word)
-            if tag in members:
-                members[tag] |= {element.id} if element else set()
+            tag = composition.names.of(entry.pack, scalar.word)
+            if tag in tags:
+                given.add(tag)
             elif not scalar.is_optional:
                 more = "; to make a tag, declare it under `tags:`"
-                report_unknown("tag", scalar, members, reporter, more=more)
-    ids_of = {tag: frozenset(ids) for tag, ids in members.items()}
-    return replace(composition, tags=ids_of, elements=elements)
+                report_unknown("tag", scalar, tags, reporter, more=more)
+        if element is not None:
+            elements[name] = replace(element, color=entry.color or element.color, tags=element.tags | given)

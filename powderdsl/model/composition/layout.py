@@ -38,7 +38,11 @@ def lay_out(
     """The channels of elements and those of what lasts from step to step, in turn, by group of packs."""
     for (pack, *_), block in zip(composition.groups, blocks, strict=True):
         elements = {element.id: element for element in composition.elements.values()}
-        added = [MatrixChannel(e.name, id=e.id) for e in elements.values() if e.pack == pack and e.id >= size]
+        added = [
+            MatrixChannel(e.name, id=e.id)
+            for e in elements.values()
+            if e.pack == pack.name.text and e.id >= size
+        ]
         if not parts:
             names = [elements[number].name if number in elements else "" for number in range(size)]
             added = [MatrixChannel(name, id=number) for number, name in enumerate(names)]
@@ -58,7 +62,7 @@ def own_slots(composition: Composition) -> int:
     """How many ids the first packs have room for."""
     if composition.ruleset is not None and composition.ruleset.placing.slots:
         return composition.ruleset.placing.slots
-    own = composition.groups[0]
+    own = [pack.name.text for pack in composition.groups[0]]
     ids = [element.id for element in composition.elements.values() if element.pack in own]
     return max([*ids, *composition.reserved], default=-1) + 1
 
@@ -66,7 +70,7 @@ def own_slots(composition: Composition) -> int:
 def _blocks(symbols: Symbols, passes: tuple[Pass, ...]) -> list[list[str]]:
     """Stored properties and fields, by group of packs."""
     groups = symbols.composition.groups
-    place = {pack: number for number, group in enumerate(groups) for pack in group}
+    place = {pack.name.text: number for number, group in enumerate(groups) for pack in group}
     blocks: list[list[str]] = [[] for _ in groups]
     first: dict[str, int] = {}
     for pass_, moment, _ in substeps(passes):
@@ -92,8 +96,7 @@ def _written(
         return None
     base, _, part = word.rpartition(".")
     name, component = (base, part) if part in COMPONENTS and base else (word, "")
-    pack, point, own = name.rpartition(".")
-    name = (composition.names.qualified(pack, own) if point else None) or name
+    name = composition.names.known.get(name, name)
     channels = [one for one in known.get(name, ()) if not component or one.part == component]
     if not channels and not scalar.is_optional and composition.left_out.isdisjoint(word.split(".")):
         helps = suggest(word.partition(".")[0], ["elements", *known], "channels")

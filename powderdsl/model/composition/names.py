@@ -8,76 +8,135 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from difflib import get_close_matches
 from itertools import pairwise
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 from powderdsl.diagnostics import Label, Reporter, Span, suggest
-from powderdsl.model.declarations import Definition, PackDecl, ParamDecl, PassDecl, RulesetDecl, TestDecl
+from powderdsl.model.declarations import SHARED, Definition, PackDecl, PassDecl, RulesetDecl, TestDecl
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.yaml_tree import Mapping as MappingNode
 from powderdsl.syntax.yaml_tree import Node, Scalar
 
-T = TypeVar("T", bound=Definition | ParamDecl)
+D = TypeVar("D", bound=Definition)
 
 MAX_PASSES = 200
 
 
-@dataclass(frozen=True)
-class Named(Generic[T]):
-    """A declaration with the pack it comes from, and its global name."""
-
-    pack: str
-    decl: T
-    name: str
-    kind: str = ""
-
-    @property
-    def span(self) -> Span:
-        """Where its name stands in the file."""
-        return self.decl.name.span
-
-    @property
-    def word(self) -> str:
-        """Its name in its own file if that differs from `name`, else empty."""
-        return self.decl.name.text if self.decl.name.text != self.name else ""
-
-
-@dataclass(frozen=True)
 class Names:
-    """Every global name of a composition, passes left out: a pass and an element may share a word.
+    """Every global name in some sections of packs. Clashes are reported.
 
     The first pack that defines a word keeps it as its global name. A pack that neither needs that one nor is needed by
     it may define the same word: its definition is known as ``pack.word``. So adding a pack renames nothing.
+
+    Args:
+        rename: other global names, by qualified name.
+        reserved: words that name nothing.
     """
 
-    definitions: Mapping[str, Named[Any]]
-    """By global name."""
-    meanings: Mapping[tuple[str, str], str]
-    """By pack and word: the global name that the word means there, where that is not the word itself."""
-    defined: Mapping[tuple[str, str], str]
-    """By pack and word: the global name of what the pack defines, elements that it overrides among them."""
-    needs: Mapping[str, frozenset[str]]
-    """A pack, and all packs that it needs, directly or not."""
+    def __init__(
+        self,
+        packs: Sequence[PackDecl],
+        sections: Sequence[str],
+        rename: Sequence[tuple[Scalar, Scalar]],
+        reporter: Reporter,
+        reserved: frozenset[str] = frozenset(),
+    ):
+        self.reporter = reporter
+        self.reserved = reserved
+        self.rename = {old.text: new for old, new in rename}
+        self.renamed: set[str] = set()
+        """The qualified names of `rename` that were met."""
+        self.needs = needs_of(packs)
+        """A pack, and all packs that it needs, directly or not."""
+        self.provides = {pack.name.text: pack.provides for pack in packs}
+        self.versions: dict[str, list[Any]] = {}
+        """By global name: the declaration that holds, then those that it overrides."""
+        self.known: dict[str, str] = {}
+        """Global names by qualified name, those of elements and passes that a pack overrides among them."""
+        for section in sections:
+            for pack in packs:
+                for decl in getattr(pack, section):
+                    self._define(decl)
 
     def of(self, pack: str, word: str) -> str:
         """The global name that a word, plain or qualified, means in a pack. Unknown words stay as they are."""
-        owner, point, own = word.partition(".")
-        return (self.defined.get((owner, own)) if point else self.meanings.get((pack, word))) or word
+        return self._first(self.needs.get(pack, ()), word) or self.known.get(word, word)
 
-    def qualified(self, pack: str, word: str) -> str | None:
-        """The global name of what a pack defines under a word."""
-        return self.defined.get((pack, word))
+    def _first(self, packs: Iterable[str], word: str) -> str | None:
+        for pack in packs:
+            if name := self.known.get(f"{pack}.{word}"):
+                return name
+        return None
+
+    def declared(self, kind: type[D]) -> dict[str, D]:
+        """The declarations of a kind by global name, in load order."""
+        return {name: decl for name, (decl, *_) in self.versions.items() if isinstance(decl, kind)}
+
+    def pack(self, name: str) -> str | None:
+        """The pack that defines a global name; None for an unknown one."""
+        return self.versions[name][-1].pack if name in self.versions else None
 
     def knows(self, pack: str, name: str) -> bool:
         """Whether a pack can be expected to know a global name: its own, or one of a pack that it needs."""
-        named = self.definitions.get(name)
-        return named is None or named.pack in self.needs.get(pack, (pack,))
+        return self.pack(name) in (None, *self.needs.get(pack, (pack,)))
 
+    def check_word(self, scalar: Scalar, noun: str) -> bool:
+        """Whether a word may name something; reports one that belongs to the language."""
+        if scalar.text in self.reserved:
+            self.reporter.error(
+                "PD311", f"`{scalar.text}` is a reserved word", scalar.span, f"cannot name {noun}",
+                helps=[f"write `{scalar.text}_`, or choose another name"],
+            )  # fmt: skip
+        return scalar.text not in self.reserved
 
-def a(noun: str) -> str:
-    """The noun with its article."""
-    return f"{'an' if noun[0] in 'aeiou' else 'a'} {noun}"
+    def _define(self, decl: Any) -> None:
+        scalar, word, needs = decl.name, decl.name.text, self.needs[decl.pack]
+        if getattr(decl, "override", False):
+            name = self._first((*needs, *self.needs), word)
+            if name is not None and type(self.versions[name][0]) is type(decl):
+                self.versions[name].insert(0, decl)
+                self._know(decl, name)
+                return
+            self.reporter.error(
+                "PD301", f"`{word}` overrides nothing", scalar.span, "no pack before this one defines it",
+                helps=["remove `override`, or load the other pack first"],
+            )  # fmt: skip
+        new = self.rename.get(decl.qualified)
+        if new is not None:
+            self.renamed.add(decl.qualified)
+        if not self.check_word(scalar, decl.NOUN) or not self.check_word(new or scalar, decl.NOUN):
+            return
+        near = [pack for pack in self.needs if pack in needs or decl.pack in self.needs[pack]]
+        other = self._first(near, word)
+        name = new.text if new is not None else word if word not in self.versions else decl.qualified
+        if other is not None or name in self.versions:
+            first = self.versions[name if other is None else other][-1]
+            override = f"; to replace {decl.NOUN} say `override: yes`" if hasattr(decl, "override") else ""
+            clash = scalar if other is not None or new is None else new
+            self.reporter.error(
+                "PD302", f"{'pass ' * isinstance(decl, PassDecl)}`{clash.text}` is defined twice", clash.span,
+                f"{decl.NOUN} of {decl.pack}", secondary=[Label(first.span, f"{first.NOUN} of {first.pack}")],
+                helps=[f"rename one of them{override}"],
+            )  # fmt: skip
+            return
+        if name == decl.qualified:
+            first, noun = self.versions[word][-1], decl.NOUN.partition(" ")[2]
+            self.reporter.report(
+                "PD312", f"the {noun} `{word}` of `{decl.pack}` is known as `{name}` here", scalar.span,
+                f"`{first.pack}` defines `{word}` too",
+                secondary=[Label(first.span, f"{first.NOUN} of {first.pack}")],
+                notes=[f"in the rules of `{decl.pack}`, `{word}` still means its own"],
+            )  # fmt: skip
+        self.versions[name] = [decl]
+        self._know(decl, name)
+
+    def _know(self, decl: Definition, name: str) -> None:
+        """Remember the global name of a definition, also for those who name a pack that its pack stands in for."""
+        self.known[decl.qualified] = name
+        for other in self.provides[decl.pack]:
+            self.known.setdefault(f"{other.text}.{decl.name.text}", name)
 
 
 def listed(words: Sequence[str]) -> str:
@@ -109,18 +168,17 @@ def report_unknown(
 # Packs and what they need
 
 
-def needs_of(packs: Sequence[PackDecl]) -> dict[str, frozenset[str]]:
-    """For each pack, itself and all packs that it needs, directly or not."""
-    direct = {decl.name.text: [need.text for need in decl.needs] for decl in packs}
-    closed: dict[str, frozenset[str]] = {}
-    for pack in direct:
-        reached = {pack}
-        waiting = [pack]
-        while waiting:
-            new = set(direct.get(waiting.pop(), ())) - reached
-            reached |= new
-            waiting += new
-        closed[pack] = frozenset(reached)
+def needs_of(packs: Sequence[PackDecl]) -> dict[str, tuple[str, ...]]:
+    """For each pack, itself, then all packs that it needs, directly or not, in load order."""
+    by_name = {pack.name.text: pack for pack in packs}
+    closed = {}
+    for pack in by_name:
+        reached = [pack]
+        for name in reached:  # grows on the way
+            for need in by_name[name].needs:
+                if need.text in by_name and need.text not in reached:
+                    reached.append(need.text)
+        closed[pack] = (pack, *(name for name in by_name if name in reached[1:]))
     return closed
 
 
@@ -158,162 +216,37 @@ def in_order(names: Iterable[str], after: Mapping[str, Collection[str]]) -> tupl
 def needed_first(packs: Sequence[PackDecl]) -> list[PackDecl]:
     """The packs in load order, but each after the packs that it needs. Packs that need each other keep their order."""
     by_name = {pack.name.text: pack for pack in packs}
-    ordered, _ = in_order(by_name, {name: needs - {name} for name, needs in needs_of(packs).items()})
-    return [by_name[name] for name in ordered]
-
-
-# Definitions
-
-
-class NameBook:
-    """Collects the definitions of packs, in load order, and reports clashes.
-
-    `rename` has other global names, by qualified name; `reserved` are words that name nothing.
-    """
-
-    def __init__(
-        self,
-        packs: Sequence[PackDecl],
-        rename: Sequence[tuple[Scalar, Scalar]],
-        reporter: Reporter,
-        reserved: frozenset[str] = frozenset(),
-    ):
-        self.reporter = reporter
-        self.packs = packs
-        self.needs = needs_of(packs)
-        self.reserved = reserved
-        self.rename = {old.text: new for old, new in rename}
-        self.renamed: set[str] = set()
-        """The qualified names of `rename` that were met."""
-        self._words: dict[str, list[Named[Any]]] = {}
-        """By the word in its own file."""
-        self._known: dict[str, Named[Any]] = {}
-        """By global name."""
-        self._overridden: dict[tuple[str, str], str] = {}
-        """By pack and word: the global name of the element or pass that the pack overrides."""
-
-    def check_word(self, scalar: Scalar, kind: str) -> bool:
-        """Whether a word may name something; reports one that belongs to the language."""
-        if scalar.text in self.reserved:
-            self.reporter.error(
-                "PD311", f"`{scalar.text}` is a reserved word", scalar.span, f"cannot name {a(kind)}",
-                helps=[f"write `{scalar.text}_`, or choose another name"],
-            )  # fmt: skip
-        return scalar.text not in self.reserved
-
-    def define(self, decl: T, kind: str, pack: str) -> Named[T] | None:
-        """A definition with its global name, or None after reporting that it clashes with one the pack knows."""
-        scalar, word = decl.name, decl.name.text
-        if not self.check_word(scalar, kind):
-            return None
-        written = self._words.setdefault(word, [])
-        for other in written:
-            if other.pack in self.needs[pack] or pack in self.needs[other.pack]:
-                self._report_twice(scalar, kind, pack, other)
-                return None
-        name, new = word, self.rename.get(f"{pack}.{word}")
-        if new is not None:
-            self.renamed.add(f"{pack}.{word}")
-            if not self.check_word(new, kind):
-                return None
-            name = new.text
-        elif word in self._known:
-            name, first = f"{pack}.{word}", self._known[word]
-            self.reporter.report(
-                "PD312", f"the {kind} `{word}` of `{pack}` is known as `{name}` here", scalar.span,
-                f"`{first.pack}` defines `{word}` too",
-                secondary=[Label(first.span, f"{a(first.kind)} of {first.pack}")],
-                notes=[f"in the rules of `{pack}`, `{word}` still means its own"],
-            )  # fmt: skip
-        if name in self._known:
-            self._report_twice(new or scalar, kind, pack, self._known[name])
-            return None
-        named = Named(pack, decl, name, kind)
-        written.append(named)
-        self._known[name] = named
-        return named
-
-    def versions(
-        self, kind: str, decls_of: Callable[[PackDecl], Sequence[Any]]
-    ) -> dict[str, list[Named[Any]]]:
-        """The declarations of each element or pass by global name: the effective one first, then those that it overrides.
-
-        What is overridden is of a pack before; what the pack knows comes first.
-        """
-        found: dict[str, list[Named[Any]]] = {}
-        for pack, decl in ((one.name.text, decl) for one in self.packs for decl in decls_of(one)):
-            name = decl.name
-            written = [one for one in self._words.get(name.text, ()) if one.kind == kind]
-            near = [one for one in written if one.pack in self.needs[pack]]
-            if decl.override and written:
-                known = (near or written)[0].name
-                self._overridden[pack, name.text] = known
-                found[known].insert(0, Named(pack, decl, known, kind))
-                continue
-            if decl.override:
-                self.reporter.error(
-                    "PD301", f"`{name.text}` overrides nothing", name.span, "no pack before this one defines it",
-                    helps=["remove `override`, or load the other pack first"],
-                )  # fmt: skip
-            if named := self.define(decl, kind, pack):
-                found[named.name] = [named]
-        return found
-
-    def finish(self) -> Names:
-        """The meaning of every word in every pack."""
-        meanings: dict[tuple[str, str], str] = {}
-        for word, written in self._words.items():
-            if all(one.name == word for one in written):
-                continue
-            for pack, needs in self.needs.items():
-                near = [one.name for one in written if one.pack in needs]
-                own = [one.name for one in written if one.pack == pack]
-                if near:
-                    meanings[pack, word] = (own or near)[0]
-        defined = {(one.pack, one.decl.name.text): name for name, one in self._known.items()}
-        defined |= self._overridden
-        provided = {pack.name.text: pack.provides for pack in self.packs}
-        stands_in = {
-            (other.text, word): name for (pack, word), name in defined.items() for other in provided[pack]
-        }
-        return Names(self._known, meanings, stands_in | defined, self.needs)
-
-    def _report_twice(self, scalar: Scalar, kind: str, pack: str, other: Named[Any]) -> None:
-        override = f"; to replace {a(kind)} say `override: yes`" if kind in ("element", "pass") else ""
-        self.reporter.error(
-            "PD302", f"{'pass ' if kind == 'pass' else ''}`{scalar.text}` is defined twice", scalar.span,
-            f"{a(kind)} of {pack}", secondary=[Label(other.span, f"{a(other.kind)} of {other.pack}")],
-            helps=[f"rename one of them{override}"],
-        )  # fmt: skip
+    after = {name: needs for name, (_, *needs) in needs_of(packs).items()}
+    return [by_name[name] for name in in_order(by_name, after)[0]]
 
 
 # The order of passes
 
 
-def order_passes(
-    passes: dict[str, Named[PassDecl]], names: Names, reporter: Reporter
-) -> tuple[Named[PassDecl], ...]:
-    """Sort passes by `after` and `before`, then by load order. `names` resolves names of passes."""
+def order_passes(names: Names, reporter: Reporter) -> dict[str, PassDecl]:
+    """The passes sorted by `after` and `before`, then by load order. What overrides a pass keeps the place of that one."""
+    passes = names.declared(PassDecl)
     if len(passes) > MAX_PASSES:
-        last = list(passes.values())[MAX_PASSES].decl.name.span
+        last = list(passes.values())[MAX_PASSES].span
         reporter.error(
             "PD508", f"{len(passes):,} passes", last, f"the limit is {MAX_PASSES}", helps=["load fewer packs"]
         )
-        return tuple(passes.values())
+        return passes
     earlier: dict[str, dict[str, Span]] = {name: {} for name in passes}
-    for name, named in passes.items():
-        for scalars, is_after in ((named.decl.after, True), (named.decl.before, False)):
-            for scalar in scalars:
-                other = names.of(named.pack, scalar.word)
-                if other in passes:
-                    first, second = (other, name) if is_after else (name, other)
-                    earlier[second][first] = scalar.span
-                elif not scalar.is_optional:
-                    report_unknown("pass", scalar, passes, reporter)
+    for name, versions in names.versions.items():
+        for decl in reversed(versions):
+            for scalars, is_after in ((decl.after, True), (decl.before, False)):
+                for scalar in scalars:
+                    other = names.of(versions[0].pack, scalar.word)
+                    if other in passes:
+                        first, second = (other, name) if is_after else (name, other)
+                        earlier[second][first] = scalar.span
+                    elif not scalar.is_optional:
+                        report_unknown("pass", scalar, passes, reporter)
     ordered, stuck = in_order(passes, earlier)
     if stuck:
         _report_cycle(stuck, earlier, reporter)
-    return tuple(passes[name] for name in ordered)
+    return {name: passes[name] for name in ordered}
 
 
 def _report_cycle(waiting: list[str], earlier: dict[str, dict[str, Span]], reporter: Reporter) -> None:
@@ -330,9 +263,6 @@ def _report_cycle(waiting: list[str], earlier: dict[str, dict[str, Span]], repor
 
 
 # Optional names that look like misspelled ones
-
-SECTIONS = ("tags", "properties", "fields", "streams", "kernels", "sets", "elements", "passes")
-"""Sections of a pack whose keys are names that other packs may ask for."""
 
 MAX_PLACES = 4
 """Places of one name that are shown besides the first."""
@@ -353,21 +283,19 @@ def report_misspelled(
     """
     known: set[str] = set()
     for pack in (*packs, *(ruleset.left_out if ruleset else ())):
-        known.update(one.name.text for one in (*pack.definitions, *pack.params, *pack.passes))
-        for one in pack.passes:
-            known.update(item.name.text for item in one.scratch)
-            known.update(name.text for block in one.walk() for name, _ in block.lets)
+        known.update(decl.name.text for decl in (*pack.definitions, *pack.params, *pack.passes))
+        for decl in pack.passes:
+            lets = (name for block in decl.walk() for name, _ in block.lets)
+            known.update(name.text for name in (*(item.name for item in decl.scratch), *lets))
     asked: dict[str, dict[Span, None]] = {}
     for word, span in _optional_names((*packs, ruleset)):
         if word not in known:
             asked.setdefault(word, {})[span] = None
     others = elsewhere() if asked else {}
     for word, places in asked.items():
-        names = () if word in others else (*sorted(known), *others)
-        near = {name: slips for name in names if (slips := _slips(word, name)) is not None}
-        if not near:
+        meant = None if word in others else _meant(word, (*sorted(known), *others))
+        if meant is None:
             continue
-        meant = min(near, key=near.__getitem__)
         first, *more = places
         reporter.report(
             "PD315", f"no loaded or shipped pack defines `{word}`", first,
@@ -379,12 +307,14 @@ def report_misspelled(
 
 def words_of_tree(tree: Node | None) -> Iterator[str]:
     """The names that a pack's file defines, from its structure alone."""
-    if isinstance(tree, MappingNode):
-        for key, section in tree.entries:
-            if key.text in SECTIONS and isinstance(section, MappingNode):
-                yield from (name.text for name, _ in section.entries)
-            elif key.text in SECTIONS and not isinstance(section, Scalar | MappingNode):
-                yield from (item.text for item in section.items if isinstance(item, Scalar))
+    for key, section in tree.entries if isinstance(tree, MappingNode) else ():
+        if key.text in (*SHARED, "passes") and not isinstance(section, Scalar):
+            pairs = (
+                section.entries
+                if isinstance(section, MappingNode)
+                else ((item, item) for item in section.items)
+            )
+            yield from (name.text for name, _ in pairs if isinstance(name, Scalar))
 
 
 def _optional_names(value: object) -> Iterator[tuple[str, Span]]:
@@ -413,24 +343,8 @@ def _optional_names(value: object) -> Iterator[tuple[str, Span]]:
         yield from _optional_names(part)
 
 
-def _slips(word: str, name: str) -> int | None:
-    """How many slips make a word of a name; None if they are more than its length makes likely.
-
-    A letter that is left out, added, wrong, or exchanged with the next one is a slip. Other words may differ by one
-    letter too, as `food` and `mood`, `ash` and `dash`. So short words, and the first letter, must be right.
-    """
-    shorter, longer = sorted((len(word), len(name)))
-    most = 2 if len(name) >= 8 else 1
-    if shorter < 3 or longer - shorter > most or (shorter == 3 and longer > 3):
-        return None
-    wrong = 1 if len(name) >= 5 and word[0] == name[0] else most + 1
-    rows = [list(range(len(name) + 1))]
-    for i, a in enumerate(word, 1):
-        row = [i]
-        for j, b in enumerate(name, 1):
-            best = min(rows[-1][j] + 1, row[-1] + 1, rows[-1][j - 1] + (wrong if a != b else 0))
-            if i > 1 and j > 1 and a == name[j - 2] and b == word[i - 2]:
-                best = min(best, rows[-2][j - 2] + 1)
-            row.append(best)
-        rows.append(row)
-    return rows[-1][-1] if 0 < rows[-1][-1] <= most else None
+def _meant(word: str, names: Sequence[str]) -> str | None:
+    """The name that a word misspells. Short words, and the first letter, are taken to be right: `ash` is not `dash`."""
+    longer = [name for name in names if name[0] == word[0] and min(len(name), len(word)) > 3]
+    turned = (name for name in longer if sorted(name) == sorted(word))
+    return next(iter(get_close_matches(word, longer, n=1, cutoff=0.8)), None) or next(turned, None)

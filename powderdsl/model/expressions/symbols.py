@@ -18,6 +18,7 @@ from powderdsl.model.builtins import (
     grid_kernel,
 )
 from powderdsl.model.composition.compose import Composition
+from powderdsl.model.declarations import KernelDecl, StreamDecl, TagDecl
 from powderdsl.model.expressions.operators import Items, Operand, Place, SetOf
 from powderdsl.model.operations import FUNCTIONS
 from powderdsl.model.state import SNAP
@@ -73,26 +74,24 @@ class Symbols:
     def is_declared(self, name: str, pack: str) -> bool:
         """Whether some pack declares the name, even if its declaration is wrong."""
         meant = self.composition.names.of(pack, name)
-        return meant in self.composition.names.definitions or f"{pack}.{name}" in self.composition.params
+        return meant in self.composition.names.versions or f"{pack}.{name}" in self.composition.params
 
 
 def base_symbols(composition: Composition) -> Symbols:
     """Symbols with what needs no evaluation: directions, kernels, elements, tags, streams."""
-    symbols = Symbols(composition)
+    symbols, names, elements = Symbols(composition), composition.names, composition.elements
     constants = symbols.constants
     constants |= {name: Place(offset) for name, offset in DIRECTIONS.items()}
-    constants |= {name: Items(tuple(Place(o) for o in offsets)) for name, offsets in DIRECTION_SETS.items()}
+    constants |= {name: Items(tuple(map(Place, offsets))) for name, offsets in DIRECTION_SETS.items()}
     constants |= KERNELS
-    constants |= {
-        name: grid_kernel(name, k.decl.rows, k.decl.wrap)
-        for name, k in composition.kernels.items()
-        if k.decl.shape is None
-    }
-    constants |= {name: SetOf((element.id,), name) for name, element in composition.elements.items()}
-    constants |= {name: SetOf(tuple(sorted(ids))) for name, ids in composition.tags.items()}
-    symbols.streams |= {
-        name: Stream(name, name_number(name), s.decl.bits) for name, s in composition.streams.items()
-    }
+    for name, kernel in names.declared(KernelDecl).items():
+        if kernel.shape is None:
+            constants[name] = grid_kernel(name, kernel.rows, kernel.wrap)
+    constants |= {name: SetOf((element.id,), name) for name, element in elements.items()}
+    for tag in names.declared(TagDecl):
+        constants[tag] = SetOf(tuple(element.id for element in elements.values() if tag in element.tags))
+    for name, stream in names.declared(StreamDecl).items():
+        symbols.streams[name] = Stream(name, name_number(name), stream.bits)
     return symbols
 
 

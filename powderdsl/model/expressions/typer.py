@@ -11,6 +11,7 @@ from math import prod
 
 from powderdsl.diagnostics import Label, Reporter, Span
 from powderdsl.model.builtins import COORDINATES, KERNEL_SHAPES, KERNELS, MAX_MAGNITUDE, MAX_OFFSET, OCTANTS
+from powderdsl.model.declarations import SetDecl
 from powderdsl.model.expressions.operators import (
     ELEMENT_HERE,
     FALSE,
@@ -122,6 +123,7 @@ class Typer:
 
     def __init__(self, symbols: Symbols, reporter: Reporter):
         self.symbols, self.reporter = symbols, reporter
+        self.sets = symbols.composition.names.declared(SetDecl)
         self._misused: set[tuple[Span, str]] = set()
         self.used: set[str] = set()
         self.absent: set[str] = set()
@@ -348,7 +350,7 @@ class Typer:
             return Expr("param", param.kind, value=param.name, span=span)
         name = symbols.composition.names.of(scope.pack, name)
         self.used.add(name)
-        if name in symbols.composition.sets and name not in symbols.constants:
+        if name in self.sets and name not in symbols.constants:
             return self.resolve_set(name, span)
         if name in symbols.constants:
             if symbols.constants[name] == SetOf(()):
@@ -380,11 +382,11 @@ class Typer:
             self._sets_too_deep = True
             message = f"more than {MAX_SET_DEPTH} sets that depend on each other"
             raise self.fail("PD508", message, span, "too many in a row", "list elements or tags")
-        named = self.symbols.composition.sets[name]
-        pack, syntax = named.pack, named.decl.members
+        decl = self.sets[name]
         self.resolving.append(name)
         try:
-            result = SetOf(self.set_of(self.evaluate(syntax, Scope(pack, {})), syntax.span).ids)
+            members = self.evaluate(decl.members, Scope(decl.pack, {}))
+            result = SetOf(self.set_of(members, decl.members.span).ids)
         finally:
             self.resolving.pop()
         self.symbols.constants[name] = result
@@ -473,7 +475,7 @@ class Typer:
         (pack,) = syntax.children
         if pack.kind not in ("name", "attribute"):
             return None
-        name = self.symbols.composition.names.qualified(pack.text, syntax.text)
+        name = self.symbols.composition.names.known.get(f"{pack.text}.{syntax.text}")
         if name is None or self._is_own_word(pack, scope):
             return None
         found = self.find(name, syntax.span, Scope("", {}, scope.orientation))
@@ -506,7 +508,7 @@ class Typer:
         span, names = syntax.span, self.symbols.composition.names
         plain = replace(syntax, kind="attribute", span=Span(span.source, span.start, span.end - 1))
         qualified = f"{before.text}.{syntax.text}"
-        if qualified in self.symbols.params or names.qualified(before.text, syntax.text) is not None:
+        if qualified in self.symbols.params or qualified in names.known:
             return plain
         if before.kind in ("name", "attribute"):
             found = self.find(before.text, before.span, scope)

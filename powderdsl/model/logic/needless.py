@@ -15,6 +15,7 @@ from powderdsl.diagnostics import Label, Reporter, Span
 from powderdsl.model.composition.added_packs import pack_words
 from powderdsl.model.composition.compose import Composition
 from powderdsl.model.composition.names import words_of
+from powderdsl.model.declarations import FieldDecl, KernelDecl, SetDecl
 from powderdsl.model.expressions.operators import ELEMENT_HERE, look, member, negation
 from powderdsl.model.logic.satisfy import (
     HERE,
@@ -363,15 +364,15 @@ def report_unused(composition: Composition, typer: Typer, produced: frozenset[in
     for qualified, param in composition.params.items():
         if qualified not in typer.used and qualified not in values:
             _unused("parameter", qualified, param.span, reporter)
-    for name, named_set in composition.sets.items():
+    for name, named_set in composition.names.declared(SetDecl).items():
         if name not in typer.used:
             _unused("set", name, named_set.span, reporter)
         elif not typer.set_of(typer.symbols.constants[name], named_set.span).ids:
             reporter.report(
-                "PD505", f"the set `{name}` is empty", named_set.decl.members.span, "no element of the loaded packs is in it",
+                "PD505", f"the set `{name}` is empty", named_set.members.span, "no element of the loaded packs is in it",
                 helps=["load a pack with such elements, or widen the set"],
             )  # fmt: skip
-    for name, kernel in composition.kernels.items():
+    for name, kernel in composition.names.declared(KernelDecl).items():
         if name not in typer.used:
             _unused("kernel", name, kernel.span, reporter)
     _report_unwritten(composition, reporter)
@@ -397,8 +398,8 @@ def _report_unwritten(composition: Composition, reporter: Reporter) -> None:
     for ruleset in composition.lineage:
         words |= {word for line in ruleset.invariants for word in words_of(line)}
         words |= {scalar.word.partition(".")[0] for scalar in ruleset.matrix}
-    for name, field in composition.fields.items():
-        if name not in words and field.decl.name.text not in words:
+    for name, field in names.declared(FieldDecl).items():
+        if name not in words and field.name.text not in words:
             _unused("field", name, field.span, reporter)
     for block in (block for pack in composition.packs for one in pack.passes for block in one.walk()):
         inner = [line for one in block.walk() if one is not block for line in one.lines]

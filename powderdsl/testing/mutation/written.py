@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -105,7 +105,7 @@ def _words(field: str, world: World, same: np.ndarray, filler: str) -> list[str]
     return ["        " + " ".join(words) for words in rows_]
 
 
-def _known(field: str, ruleset: Ruleset, needed: frozenset[str]) -> str:
+def _known(field: str, ruleset: Ruleset, needed: Collection[str]) -> str:
     """A field's name, with `?` if its pack may be absent."""
     declared = ruleset.property(field) or ruleset.field(field)
     assert declared is not None
