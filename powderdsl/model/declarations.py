@@ -41,6 +41,8 @@ class Definition(Entry):
 
     pack: str = ""
     """The pack or ruleset in whose file it stands."""
+    values: tuple[Pair, ...] = ()
+    """Values of single elements: of this one, by property or field, or of this property or field, by element."""
 
     @property
     def qualified(self) -> str:
@@ -61,8 +63,6 @@ class PropertyDecl(Definition, noun="a property", others="an element"):
     type: Syntax | None = keyed("its kind", required=True, short=True)
     default: Syntax | None = keyed("the value of elements that do not say")
     about: str = keyed("what it is, in a sentence", "")
-    values: tuple[Pair, ...] = ()
-    """The values of single elements."""
 
 
 class TintDecl(Entry, noun="a tint"):
@@ -90,8 +90,6 @@ class FieldDecl(Definition, noun="a field", others="an element"):
     resets: str | None = keyed("`step`: back to the default when a step starts", choices=("step",))
     tint: TintDecl | None = keyed("how it tints cells in pictures, if it is a vector")
     about: str = keyed("what it is, in a sentence", "")
-    values: tuple[Pair, ...] = ()
-    """The defaults of single elements."""
 
 
 class ScratchDecl(Entry, noun="a scratch field"):
@@ -133,7 +131,6 @@ class ElementDecl(Definition, noun="an element", others="a property or field"):
     about: str = keyed("what it is, in a sentence", "")
     tags: Words = keyed("the tags it carries", ())
     override: bool = keyed("yes: replaces an element of another pack", False)
-    values: tuple[Pair, ...] = ()
 
 
 class AlsoDecl(Definition, others="a property or field"):
@@ -142,7 +139,6 @@ class AlsoDecl(Definition, others="a property or field"):
     tags: Words = keyed("tags to add", (), short=True)
     color: str | None = keyed('another color, quoted: "#RRGGBB"', form=COLOR)
     ramp: RampDecl | None = keyed("how its color follows a field", name="color_by")
-    values: tuple[Pair, ...] = ()
 
 
 class KernelDecl(Definition, noun="a kernel"):

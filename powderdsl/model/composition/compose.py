@@ -124,7 +124,8 @@ class Composition:
         for element, entry in self.entries:
             for key, syntax in entry.values:
                 yield entry.pack, self.names.of(entry.pack, key.word), element, key, syntax
-        for name, decl in {**self.names.declared(PropertyDecl), **self.names.declared(FieldDecl)}.items():
+        typed = [*self.names.declared(PropertyDecl).items(), *self.names.declared(FieldDecl).items()]
+        for name, decl in typed:
             for key, syntax in decl.values:
                 yield decl.pack, name, self.names.of(decl.pack, key.word), key, syntax
 
