@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from powderdsl.analysis.changes import HERE, Asked, RuleLine, rule_line
+from powderdsl.analysis.changes import Asked, RuleLine, rule_line
 from powderdsl.model.expressions.operators import (
     FALSE,
     TRUE,
@@ -18,8 +18,20 @@ from powderdsl.model.expressions.operators import (
     member,
     negation,
 )
-from powderdsl.model.logic.satisfy import Facts
-from powderdsl.model.types import ELEMENT, Assign, Expr, Let, Move, Rule, Ruleset, Transform, integer
+from powderdsl.model.logic.satisfy import Facts, Lets
+from powderdsl.model.operations import OPERATIONS
+from powderdsl.model.types import (
+    ELEMENT,
+    HERE,
+    Expr,
+    Move,
+    Rule,
+    Ruleset,
+    Transform,
+    integer,
+    substeps,
+    writes_of,
+)
 
 _ZERO = Expr("const", integer(0, 0), value=0)
 
@@ -45,21 +57,21 @@ def find_wants(ruleset: Ruleset, facts: Facts) -> dict[RuleLine, Wants]:
     named = named_by_fields(ruleset)
     found: dict[RuleLine, Wants] = {}
     for pass_ in ruleset.passes:
-        lets: list[Let] = []
+        lets: Lets = {}
         for moment in pass_.moments:
             asked = Asked.of(moment, facts)
             for rule in moment.rules:
                 if asked.may(rule):
-                    wants = _wants(rule, asked, lets, named)
+                    wants = _wants(rule, asked, lets | asked.lets, named)
                     line = rule_line(rule, pass_)
                     found[line] = _either(found[line], wants) if line in found else wants
-            lets += moment.lets
+            lets |= asked.lets
     return found
 
 
-def _wants(rule: Rule, asked: Asked, lets: list[Let], named: Ids) -> Wants:
-    """The needs of one rule. `lets` were fixed earlier in the pass."""
-    nodes = list(_nodes_of(rule, {**{let.name: let.value for let in lets}, **asked.lets}))
+def _wants(rule: Rule, asked: Asked, lets: Lets, named: Ids) -> Wants:
+    """The needs of one rule. `lets` are those of its substep and of earlier ones of the pass."""
+    nodes = list(_nodes_of(rule, lets))
     reads_names = any(node.op in ("field", "let") and node.kind == ELEMENT for node in nodes)
     sets = [frozenset(node.value) for node in nodes if node.op == "member"]
     candidates = [frozenset({number}) for number in asked.facts.ids]
@@ -90,19 +102,16 @@ def _by_size(ids: Ids) -> tuple[int, list[int]]:
 
 def named_by_fields(ruleset: Ruleset) -> Ids:
     """The ids that a field or a value under `let` may name although no cell ever held them."""
-    found: set[int] = set()
     fields = [*ruleset.fields, *(item for pass_ in ruleset.passes for item in pass_.scratch)]
-    found |= {int(value) for item in fields if item.kind == ELEMENT for value in item.defaults}
-    for _, moment in ruleset.substeps():
-        values = [let.value for let in moment.lets]
-        for rule in moment.rules:
-            values += [one.value for one in ([rule] if isinstance(rule, Assign) else rule.effects)]
+    found = {int(value) for item in fields if item.kind == ELEMENT for value in item.defaults}
+    for _, moment in substeps(ruleset.passes):
+        values = [*moment.values.values(), *(w.value for rule in moment.rules for w in writes_of(rule))]
         nodes = [node for value in values if value.kind == ELEMENT for node in value.walk()]
         found |= {int(node.value) for node in nodes if node.op == "const" and node.kind == ELEMENT}
     return frozenset(found)
 
 
-def _nodes_of(rule: Rule, lets: dict[str, Expr]) -> Iterator[Expr]:
+def _nodes_of(rule: Rule, lets: Lets) -> Iterator[Expr]:
     """Every part of a rule's condition and target, and of the values under `let` that they read."""
     parts = [*filter(None, [rule.mask, rule.target if isinstance(rule, Transform) else None])]
     seen: set[str] = set()
@@ -120,22 +129,22 @@ class Lacking:
     Rival rules are ignored, so more is considered possible.
     """
 
-    def __init__(self, asked: Asked, gone: Ids, earlier: list[Let]):
+    def __init__(self, asked: Asked, gone: Ids, lets: Lets):
         self.gone = gone
         self.ids = frozenset(asked.facts.ids) - gone
         self.facts = replace(asked.facts, ids=tuple(sorted(self.ids)))
-        self.constants: dict[str, Expr] = {}
-        lets: dict[str, Expr] = {}
-        for let in (*earlier, *asked.moment.lets):
-            lets[let.name] = self.rewrite(let.value)
-            if lets[let.name].op == "const":
-                self.constants[let.name] = lets[let.name]
-        now = {let.name: lets[let.name] for let in asked.moment.lets}
+        self.constants: Lets = {}
+        now: Lets = {}
+        for name, value in lets.items():
+            there = self.rewrite(value)
+            if there.op == "const":
+                self.constants[name] = there
+            if name in asked.lets:
+                now[name] = there
         self.asked = Asked(replace(asked.moment, rules=()), self.facts, now)
 
     def may(self, rule: Rule) -> bool:
         """Whether the rule may happen there."""
-        assert rule.mask is not None
         return bool(self.ids) and self.asked.may(replace(rule, mask=self.rewrite(rule.mask)))
 
     def may_make(self, rule: Rule) -> bool:
@@ -149,36 +158,36 @@ class Lacking:
 
     def rewrite(self, expr: Expr) -> Expr:
         """The expression as it is in this world: what asks for these elements is false, a count of them is 0."""
-        if expr.op == "let":
-            return self.constants.get(str(expr.value), expr)
-        limited = self.facts.fields.get(str(expr.value)) if expr.op == "field" else None
-        if limited and limited.of is not None and not limited.of & self.ids:
-            return Expr("const", expr.kind, value=limited.default)
-        args = tuple(self.rewrite(arg) for arg in expr.args)
-        same = all(new is old for new, old in zip(args, expr.args, strict=True))
-        return self._folded(expr if same else replace(expr, args=args))
-
-    def _folded(self, expr: Expr) -> Expr:
-        args = expr.args
+        args = [self.rewrite(arg) for arg in expr.args]
         match expr.op:
-            case "member" if (args[0].args[0] if args[0].op == "look" else args[0]).op in (
-                "element",
-                "field",
-            ):
+            case "let":
+                return self.constants.get(str(expr.value), expr)
+            case "field":
+                limited = self.facts.fields.get(str(expr.value))
+                if limited and limited.of is not None and not limited.of & self.ids:
+                    return Expr("const", expr.kind, value=limited.default)
+            case "member" if _bare(args[0]).op in ("element", "field"):
                 if not expr.value & self.ids:
                     return FALSE
-                return TRUE if expr.value >= self.ids else expr
+                if expr.value >= self.ids:
+                    return TRUE
             case "not":
                 return negation(args[0])
             case "and":
-                return conjunction(list(args))
+                return conjunction(args)
             case "or":
-                return disjunction(list(args))
+                return disjunction(args)
             case "look":
                 return look(args[0], expr.value)
             case "count" if args[0] == FALSE:
                 return _ZERO
             case "eq" | "lt" | "le" if all(arg.op == "const" and arg.kind.name == "int" for arg in args):
-                a, b = (arg.value for arg in args)
-                return TRUE if {"eq": a == b, "lt": a < b, "le": a <= b}[expr.op] else FALSE
-        return expr
+                evaluate = OPERATIONS[expr.op].evaluate
+                assert evaluate is not None
+                return TRUE if evaluate(*(arg.value for arg in args)) else FALSE
+        return replace(expr, args=tuple(args))
+
+
+def _bare(expr: Expr) -> Expr:
+    """The value that an expression looks at."""
+    return expr.args[0] if expr.op == "look" else expr

@@ -59,31 +59,21 @@ def _listed(names: Iterable[str]) -> str:
 
 
 def _element(ledger: Ledger, name: str) -> Iterator[str]:
-    yield f"{name}: its number {TRENDS[trend(ledger, name)]}"
-    rows = []
-    for entry in ledger.rules:
-        made = [before for before, after in entry.changes if after == name]
-        lost = [after for before, after in entry.changes if before == name]
-        rows += [("made from", made, entry)] if made else []
-        rows += [("becomes", lost, entry)] if lost else []
-    for verb in ("made from", "becomes"):
-        yield from (f"  {verb} {_listed(names)}: {_place(e.rule)}" for word, names, e in rows if word == verb)
+    words = {"constant": "is constant", "not decided": "may rise and fall"}
+    number = _number(ledger, name)
+    yield f"{name}: its number {words.get(number, number)}"
+    for verb, there, here in (("made from", 0, 1), ("becomes", 1, 0)):
+        for entry in ledger.rules:
+            names = [pair[there] for pair in entry.changes if pair[here] == name]
+            if names:
+                yield f"  {verb} {_listed(names)}: {_place(entry.rule)}"
     moved = [_place(entry.rule) for entry in ledger.rules if name in entry.moves]
     if moved:
         yield f"  moved: {_listed(moved)}"
 
 
-TRENDS = {
-    "constant": "is constant",
-    "never falls": "never falls",
-    "never rises": "never rises",
-    "not decided": "may rise and fall",
-}
-"""The trends of an element's number of cells, for JSON, and in words."""
-
-
-def trend(ledger: Ledger, name: str) -> str:
-    """One of TRENDS."""
+def _number(ledger: Ledger, name: str) -> str:
+    """The trend of an element's number of cells."""
     return next((trend for trend in AGAINST if ledger.keeps([name], trend)), "not decided")
 
 
@@ -154,7 +144,7 @@ def _element_data(ledger: Ledger, name: str, numbers: dict[RuleLine, int]) -> di
     changes = {pair: [numbers[line] for line in lines] for pair, lines in ledger.changes.items()}
     return {
         "name": name,
-        "number": trend(ledger, name),
+        "number": _number(ledger, name),
         "unchanged": bool(ledger.unchanged(name)),
         "never_appears": bool(ledger.never_appears(name)),
         "made_from": {before: lines for (before, after), lines in changes.items() if after == name},

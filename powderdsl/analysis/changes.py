@@ -6,16 +6,28 @@ Everything found here is an upper bound. What a rule is not said to do, it canno
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Set
 from dataclasses import dataclass, field
 
-from powderdsl.diagnostics import Span
 from powderdsl.model.expressions.operators import ELEMENT_HERE, member, negation
 from powderdsl.model.logic.satisfy import Facts, satisfiable
 from powderdsl.model.text import one_line
-from powderdsl.model.types import Assign, Expr, Moment, Move, Offset, Pass, Rule, Ruleset, Swap, Transform
-
-HERE: Offset = (0, 0)
+from powderdsl.model.types import (
+    HERE,
+    Assign,
+    Expr,
+    Moment,
+    Move,
+    Offset,
+    Pass,
+    Rule,
+    Ruleset,
+    Swap,
+    Transform,
+    footprint,
+    substeps,
+    writes_of,
+)
 
 MAX_QUESTION = 20_000
 """Nodes evaluated for one question, after which the answer is that it may be."""
@@ -24,7 +36,8 @@ MAX_PAIRS = 1024
 """Pairs of elements that are asked about one at a time where a rule computes what a cell becomes."""
 
 Condition = tuple[Expr, Offset]
-Pairs = set[tuple[int, int]]
+Pairs = Set[tuple[int, int]]
+Ids = Set[int]
 
 
 @dataclass(frozen=True, order=True)
@@ -47,8 +60,8 @@ class Found:
 
     line: RuleLine
     fires: bool = False
-    pairs: Pairs = field(default_factory=set)
-    moves: set[int] = field(default_factory=set)
+    pairs: Pairs = frozenset()
+    moves: Ids = frozenset()
     writes: list[Assign] = field(default_factory=list)
 
 
@@ -62,16 +75,24 @@ class Asked:
 
     @classmethod
     def of(cls, moment: Moment, facts: Facts) -> Asked:
-        return cls(moment, facts, {let.name: let.value for let in moment.lets})
+        return cls(moment, facts, moment.values)
 
     def may(self, rule: Rule, *more: Condition) -> bool:
         """Whether the rule may happen while these conditions hold too. False is a proof."""
-        assert rule.mask is not None
         first = ((rule.mask, HERE), *more)
         if not satisfiable(self.facts, first, self.lets):
             return False
         rivals = self.rivals(rule)
         return not rivals or satisfiable(self.facts, (*first, *rivals), self.lets)
+
+    def elements(self, rule: Rule, at: Offset, apart: Offset | None = None, known: Ids = frozenset()) -> Ids:
+        """The ids that may be at a place where the rule happens, but not at the place `apart`; `known` are not asked."""
+        found = set()
+        for number in self.facts.ids:
+            more = [] if apart is None else [is_not(number, apart)]
+            if number not in known and self.may(rule, is_(number, at), *more):
+                found.add(number)
+        return found
 
     def rivals(self, rule: Rule) -> list[Condition]:
         """The conditions that must not hold for the rule to happen, by the substep's conflict policy.
@@ -86,7 +107,6 @@ class Asked:
         cells = footprint(rule)
         if isinstance(rule, Swap) or (isinstance(rule, Move) and rule.leaving is not None):
             # pairs of one rule that share a cell: none of them happens
-            assert rule.mask is not None
             dy, dx = rule.offset
             found += [(negation(rule.mask), rule.offset), (negation(rule.mask), (-dy, -dx))]
         for other in self.moment.rules:
@@ -100,11 +120,6 @@ class Asked:
                 for y, x in cells:
                     found += [(negation(other.mask), (y - dy, x - dx)) for dy, dx in footprint(other)]
         return found
-
-
-def footprint(rule: Rule) -> tuple[Offset, ...]:
-    """The cells that a rule claims, seen from the cell where its condition holds."""
-    return (HERE, rule.offset) if isinstance(rule, (Swap, Move)) else (HERE,)
 
 
 def is_(number: int, at: Offset = HERE) -> Condition:
@@ -125,17 +140,48 @@ def facts_of(ruleset: Ruleset) -> Facts:
     )
 
 
-def find_changes(ruleset: Ruleset, facts: Facts) -> list[Found]:
-    """Effects of each line, in the order in which the lines first run."""
+def find_changes(ruleset: Ruleset, facts: Facts, *, together: bool = True) -> list[Found]:
+    """Effects of each line, in the order in which the lines first run; `together`: also of several at once."""
     found: dict[RuleLine, Found] = {}
-    for pass_, moment in ruleset.substeps():
+    for pass_, moment in substeps(ruleset.passes):
         asked = Asked.of(moment, facts)
         for rule in moment.rules:
             line = rule_line(rule, pass_)
-            _look_at(rule, asked, found.setdefault(line, Found(line)))
-        for rule, pairs in (*_chains(asked), *_overwritten(asked)):
+            effects = found.setdefault(line, Found(line))
+            if asked.may(rule):
+                effects.fires = True
+                effects.writes += writes_of(rule)
+                _look_at(rule, asked, effects)
+        rules, pairs = _together(asked) if together else ([], set())
+        for rule in rules:
             found[rule_line(rule, pass_)].pairs |= pairs
     return list(found.values())
+
+
+def line_effects(ruleset: Ruleset) -> list[Found]:
+    """Effects of each line by itself."""
+    return find_changes(ruleset, facts_of(ruleset), together=False)
+
+
+def reactions(ruleset: Ruleset) -> Iterator[tuple[RuleLine, list[int], list[int]]]:
+    """The lines that turn elements into others by themselves, with the ids before and after, ascending."""
+    for effects in line_effects(ruleset):
+        if effects.pairs:
+            before, after = zip(*effects.pairs, strict=True)
+            yield effects.line, sorted(set(before)), sorted(set(after))
+
+
+def moved_ids(ruleset: Ruleset) -> frozenset[int]:
+    """The elements that some rule may move or push aside."""
+    return frozenset(number for effects in line_effects(ruleset) for number in effects.moves)
+
+
+def unchanging_ids(ruleset: Ruleset) -> frozenset[int]:
+    """The elements that no rule moves or turns into anything: they stay in place permanently."""
+    ids = {element.id for element in ruleset.elements}
+    for effects in line_effects(ruleset):
+        ids -= effects.moves | {before for before, _ in effects.pairs}
+    return frozenset(ids)
 
 
 def rule_line(rule: Rule, pass_: Pass) -> RuleLine:
@@ -144,47 +190,27 @@ def rule_line(rule: Rule, pass_: Pass) -> RuleLine:
 
 
 def _look_at(rule: Rule, asked: Asked, found: Found) -> None:
-    """Add to `found` what one rule of a substep may do."""
-    if not asked.may(rule):
-        return
-    found.fires = True
-    match rule:
-        case Assign():
-            found.writes.append(rule)
-            return
-        case Transform():
-            found.pairs |= set(becomes(rule, asked, found.pairs))
-        case Swap() | Move(leaving=None):
-            found.moves |= _pushed(rule, asked, found.moves)
-            found.moves |= {
-                a for a in _left(asked, found.moves) if asked.may(rule, is_(a), is_not(a, rule.offset))
-            }
-            if isinstance(rule, Move):  # of a row one is lost, and one is there twice
-                targets = overwritten(rule, asked)
-                found.pairs |= {(x, y) for x in targets for y in targets if x != y}
-        case Move(leaving=Expr(value=left)):
-            found.moves |= _pushed(rule, asked, found.moves)
-            found.moves |= {a for a in _left(asked, found.moves) if a != left and asked.may(rule, is_(a))}
-            found.pairs |= {(x, left) for x in overwritten(rule, asked) if x != left}
-    found.writes += rule.effects
+    """Add to `found` what a rule that may happen moves and turns into something else."""
+    if isinstance(rule, Transform):
+        found.pairs |= set(_becomes(rule, asked, found.pairs))
+    elif isinstance(rule, (Swap, Move)):
+        left = rule.leaving if isinstance(rule, Move) else None
+        found.moves |= asked.elements(rule, rule.offset, HERE, found.moves)
+        if left is None:
+            found.moves |= asked.elements(rule, HERE, rule.offset, found.moves)
+        else:
+            found.moves |= asked.elements(rule, HERE, known=found.moves | {left.value})
+        if isinstance(rule, Move):
+            # what it moves to is lost; of a row that leaves nothing behind, one is lost, and one is there twice
+            lost = asked.elements(rule, rule.offset)
+            found.pairs |= _pairs(lost, lost if left is None else {left.value})
 
 
-def _left(asked: Asked, known: set[int]) -> Iterable[int]:
-    """Elements that are still to be asked about."""
-    return [number for number in asked.facts.ids if number not in known]
+def _pairs(before: Ids, after: Ids) -> Pairs:
+    return {(a, b) for a in before for b in after if a != b}
 
 
-def _pushed(rule: Swap | Move, asked: Asked, known: set[int]) -> set[int]:
-    """Elements that may be at the place where another element goes."""
-    return {a for a in _left(asked, known) if asked.may(rule, is_(a, rule.offset), is_not(a))}
-
-
-def overwritten(rule: Move, asked: Asked) -> list[int]:
-    """Elements at the place where something moves to, which are lost if they do not move away themselves."""
-    return [number for number in asked.facts.ids if asked.may(rule, is_(number, rule.offset))]
-
-
-def becomes(rule: Transform, asked: Asked, known: Pairs) -> Iterator[tuple[int, int]]:
+def _becomes(rule: Transform, asked: Asked, known: Pairs = frozenset()) -> Iterator[tuple[int, int]]:
     """The pairs (before, after) of a transform that are not known yet."""
     ids = asked.facts.ids
     if rule.target.op == "const":
@@ -193,128 +219,38 @@ def becomes(rule: Transform, asked: Asked, known: Pairs) -> Iterator[tuple[int, 
             if before != after and (before, after) not in known and asked.may(rule, is_(before)):
                 yield before, after
         return
-    firsts = [number for number in ids if asked.may(rule, is_(number))]
+    firsts = asked.elements(rule, HERE)
     lasts = [number for number in ids if asked.may(rule, (member(rule.target, (number,)), HERE))]
     few = len(firsts) * len(lasts) <= MAX_PAIRS
-    for before in firsts:
-        for after in lasts:
-            if before == after or (before, after) in known:
-                continue
-            if not few or asked.may(rule, is_(before), (member(rule.target, (after,)), HERE)):
-                yield before, after
+    for before, after in sorted(_pairs(firsts, {*lasts}) - known):
+        if not few or asked.may(rule, is_(before), (member(rule.target, (after,)), HERE)):
+            yield before, after
 
 
-def _chains(asked: Asked) -> Iterator[tuple[Move, Pairs]]:
-    """Effects of moves of different kinds together, where one goes to the place that another leaves.
+def _together(asked: Asked) -> tuple[list[Rule], Pairs]:
+    """Rules of a substep whose effects mix, and what they may do then to elements.
 
-    Of such a row the first leaves its element behind and the last overwrites one: these need not be of one rule.
+    Under ``overwrite`` several rules may claim one cell: anything of theirs may be lost or stay. Moves of different
+    kinds form rows, where one goes to the place that another leaves: the first of a row leaves its element behind, and
+    the last overwrites one.
     """
-    moves = [rule for rule in asked.moment.rules if isinstance(rule, Move)]
+    policy, rules = asked.moment.policy, asked.moment.rules
+    moves = [rule for rule in rules if isinstance(rule, Move)]
     kinds = {rule.offset if rule.leaving is None else rule.leaving.value for rule in moves}
-    if asked.moment.policy != "prove" or len(kinds) < 2:
-        return
-    live = [rule for rule in moves if asked.may(rule)]
-    lost = {number for rule in live for number in overwritten(rule, asked)}
-    left = {int(rule.leaving.value) for rule in live if rule.leaving is not None}
-    left |= {number for rule in live if rule.leaving is None for number in overwritten(rule, asked)}
-    pairs = {(before, after) for before in lost for after in left if before != after}
+    mixed: list[Rule] = [*moves] if policy == "prove" and len(kinds) > 1 else []
+    if policy == "overwrite":
+        mixed = [rule for rule in rules if not isinstance(rule, Assign)]
+    live = [rule for rule in mixed if asked.may(rule)]
+    lost: Ids = set()
+    made: Ids = set()
     for rule in live:
-        yield rule, pairs
-
-
-def _overwritten(asked: Asked) -> list[tuple[Rule, Pairs]]:
-    """Effects of rules that overwrite each other: in a cell that several claim anything of theirs may be lost or stay."""
-    if asked.moment.policy != "overwrite":
-        return []
-    live = [rule for rule in asked.moment.rules if not isinstance(rule, Assign) and asked.may(rule)]
-    there = {
-        number
-        for rule in live
-        for at in footprint(rule)
-        for number in asked.facts.ids
-        if asked.may(rule, is_(number, at))
-    }
-    made = {after for rule in live if isinstance(rule, Transform) for _, after in becomes(rule, asked, set())}
-    made |= {int(rule.leaving.value) for rule in live if isinstance(rule, Move) and rule.leaving is not None}
-    pairs = {(before, after) for before in there for after in there | made if before != after}
-    return [(rule, pairs) for rule in live]
-
-
-# Effects without budgets and policies
-
-
-@dataclass(frozen=True)
-class Reaction:
-    """A rule that may turn elements into others. `before` and `after` are ids, ascending.
-
-    The rules that one line was unrolled into are one reaction.
-    """
-
-    before: tuple[int, ...]
-    after: tuple[int, ...]
-    pass_name: str
-    pack: str
-    span: Span
-
-
-def reactions(ruleset: Ruleset) -> tuple[Reaction, ...]:
-    """Every line that turns elements into others, in the order they run."""
-    facts = facts_of(ruleset)
-    found: dict[Span, Reaction] = {}
-    for pass_, moment in ruleset.substeps():
-        lets = {let.name: let.value for let in moment.lets}
-        for rule in moment.rules:
-            if isinstance(rule, Transform):
-                known = found.get(rule.span)
-                before = set(known.before if known else ()) | _before(rule, facts, lets)
-                after = set(known.after if known else ()) | _after(rule, facts, lets)
-                ids = tuple(sorted(before)), tuple(sorted(after))
-                found[rule.span] = Reaction(*ids, pass_.name, pass_.pack, rule.span)
-    return tuple(found.values())
-
-
-def _before(rule: Transform, facts: Facts, lets: dict[str, Expr]) -> set[int]:
-    """The elements that the rule may change; one that becomes itself is not changed."""
-    same = rule.target.value if rule.target.op == "const" else None
-    return {
-        number
-        for number in facts.ids
-        if number != same and satisfiable(facts, [is_(number), (rule.mask, HERE)], lets)
-    }
-
-
-def _after(rule: Transform, facts: Facts, lets: dict[str, Expr]) -> set[int]:
-    if rule.target.op == "const":
-        return {int(rule.target.value)}
-    return {
-        number
-        for number in facts.ids
-        if satisfiable(facts, [(rule.mask, HERE), (member(rule.target, (number,)), HERE)], lets)
-    }
-
-
-def moved_ids(ruleset: Ruleset) -> frozenset[int]:
-    """The elements that some rule may move or push aside."""
-    facts = facts_of(ruleset)
-    found: set[int] = set()
-    for _, moment in ruleset.substeps():
-        lets = {let.name: let.value for let in moment.lets}
-        for rule in moment.rules:
-            if isinstance(rule, (Swap, Move)):
-                found |= {
-                    number
-                    for number in facts.ids
-                    if number not in found
-                    and any(
-                        satisfiable(facts, [is_(number, at), (rule.mask, HERE)], lets)
-                        for at in footprint(rule)
-                    )
-                }
-    return frozenset(found)
-
-
-def unchanging_ids(ruleset: Ruleset) -> frozenset[int]:
-    """The elements that no rule moves or turns into anything: they stay in place permanently."""
-    changed = {number for reaction in reactions(ruleset) for number in reaction.before}
-    everything = frozenset(element.id for element in ruleset.elements)
-    return everything - moved_ids(ruleset) - changed
+        cells = footprint(rule) if policy == "overwrite" else footprint(rule)[1:]
+        there = {number for at in cells for number in asked.elements(rule, at)}
+        lost |= there
+        if isinstance(rule, Transform):
+            made |= {after for _, after in _becomes(rule, asked)}
+        elif isinstance(rule, Move) and rule.leaving is not None:
+            made |= {rule.leaving.value}
+        if policy == "overwrite" or (isinstance(rule, Move) and rule.leaving is None):
+            made |= there
+    return live, _pairs(lost, made)

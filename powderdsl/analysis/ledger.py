@@ -7,9 +7,11 @@ contrary, for several rules may make up for each other.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
+from math import inf
 from operator import gt, lt, ne
 from typing import Any
 
@@ -18,7 +20,7 @@ from powderdsl.analysis.changes import MAX_QUESTION, Found, RuleLine, facts_of, 
 from powderdsl.analysis.overlaps import Overlap, find_overlaps
 from powderdsl.model.logic.satisfy import Budget
 from powderdsl.model.text import element_name, show_value
-from powderdsl.model.types import Assign, Kind, Ruleset
+from powderdsl.model.types import Assign, Field, Property, Ruleset
 
 Bounds = tuple[float, float]
 
@@ -91,8 +93,8 @@ class FieldEntry:
     bounds: Bounds | None
     fresh_bounds: Bounds | None
     writers: tuple[RuleLine, ...]
-    reaches: tuple[tuple[RuleLine, float | None, float | None], ...]
-    """For each line that writes an integer: how low and how high it can bring it. None: it never lowers or raises."""
+    reaches: tuple[tuple[RuleLine, Bounds], ...]
+    """For each line that writes an integer: how low it can bring it, ∞ if it never lowers it, and how high, or -∞."""
 
 
 @dataclass(frozen=True)
@@ -160,16 +162,14 @@ class Ledger:
 
     def _closed_sums(self, pairs: Iterable[tuple[str, str]]) -> tuple[tuple[str, ...], ...]:
         """Each element with everything that it reaches along some pairs, without the constant sums."""
-        reached: dict[tuple[str, ...], None] = {}
-        for start in self.elements:
-            found, fresh = {start}, [start]
-            while fresh:
-                name = fresh.pop()
-                more = [after for before, after in pairs if before == name and after not in found]
-                found.update(more)
-                fresh += more
-            reached[self._in_order(found)] = None
-        return tuple(names for names in reached if names not in self.constant_sums)
+        reached = {name: {name} for name in self.elements}
+        for before, after in pairs:
+            reached[before].add(after)
+        for middle, start in product(self.elements, repeat=2):
+            if middle in reached[start]:
+                reached[start] |= reached[middle]
+        sums = dict.fromkeys(map(self._in_order, reached.values()))
+        return tuple(names for names in sums if names not in self.constant_sums)
 
     def _in_order(self, chosen: Iterable[str]) -> tuple[str, ...]:
         """Some elements in the order of their ids."""
@@ -233,19 +233,21 @@ class Ledger:
         """
         start = dict.fromkeys(start)
         self._known(start)
-        cells, known = set(start), {*start, *self.named}
+        cells = set(start)
         while True:
-            more = {
-                after
-                for entry in self.rules
-                if all(known.intersection(one) for one in entry.needs)
-                for before, after in entry.changes
-                if before in cells and (after in known or after not in entry.copies)
-            }
+            more = {after for _, _, after in self.possible(cells)}
             if more <= cells:
                 return self._in_order(cells)
             cells |= more
-            known |= more
+
+    def possible(self, cells: Set[str]) -> Iterator[tuple[RuleLine, str, str]]:
+        """The changes (before, after) that lines may bring about in worlds whose cells hold only these elements."""
+        known = {*cells, *self.named}
+        for entry in self.rules:
+            if all(known.intersection(names) for names in entry.needs):
+                for before, after in entry.changes:
+                    if before in cells and (after in known or after not in entry.copies):
+                        yield entry.rule, before, after
 
     def within(self, field: str, low: float, high: float) -> Verdict:
         """Whether a field's numbers stay within two bounds, in every cell. Both parts of a vector are numbers.
@@ -263,11 +265,7 @@ class Ledger:
             return NotProven(f"`{field}` holds {entry.kind}", entry.writers)
         if low <= entry.fresh_bounds[0] and entry.fresh_bounds[1] <= high:
             return Proven(f"no rule writes `{field}` beyond", f"`{field}` within {low:g}..{high:g}")
-        lines = [
-            line
-            for line, lowest, highest in entry.reaches
-            if (lowest is not None and lowest < low) or (highest is not None and highest > high)
-        ]
+        lines = [line for line, (least, most) in entry.reaches if least < low or most > high]
         if not lines:
             return NotProven(f"`{field}` starts outside {low:g}..{high:g}")
         return NotProven(f"`{field}` may be written beyond {low:g}..{high:g}", tuple(lines))
@@ -338,60 +336,48 @@ def _named(ids: Iterable[int], names: Mapping[int, str]) -> Iterator[str]:
 
 def find_fields(ruleset: Ruleset, found: Iterable[Found]) -> tuple[FieldEntry, ...]:
     """All of them: fields in load order, scratch fields by pass, then properties."""
-    writes: dict[str, list[tuple[RuleLine, Assign]]] = {}
-    for one in found:
-        for assign in one.writes:
-            writes.setdefault(assign.field, []).append((one.line, assign))
+    writes = [(effects.line, assign) for effects in found for assign in effects.writes]
     entries = []
     for item in (*ruleset.fields, *(item for pass_ in ruleset.passes for item in pass_.scratch)):
         default = show_value(ruleset, item.kind, item.default)
         for identity, value in item.own:
             default += f", {element_name(ruleset, identity)} as {show_value(ruleset, item.kind, value)}"
-        bounds = (min(item.defaults), max(item.defaults)) if item.kind.name == "int" else None
-        entries.append((item.name, item.kind, default, item.at == "element", bounds))
-    params = {param.name: param.kind for param in ruleset.params}
+        values = [(value, value) for value in item.defaults]
+        entries.append(_field_entry(item, default, item.at == "element", values, writes))
+    params = {param.name: (param.kind.lo, param.kind.hi) for param in ruleset.params}
     for prop in ruleset.properties:
         if prop.stored:
-            kinds = [params[v] if isinstance(v, str) else Kind("int", v, v) for v in prop.values]  # type: ignore[arg-type]  # only numbers are left
-            hull = (min(kind.lo for kind in kinds), max(kind.hi for kind in kinds))
-            bounds = hull if prop.kind.name == "int" else None
-            entries.append((prop.name, prop.kind, "its element has it", True, bounds))
-    return tuple(_field_entry(*entry, writes.get(entry[0], [])) for entry in entries)
+            values = [params[value] if isinstance(value, str) else (value, value) for value in prop.values]
+            entries.append(_field_entry(prop, "its element has it", True, values, writes))
+    return tuple(entries)
 
 
 def _field_entry(
-    name: str,
-    kind: Kind,
+    item: Field | Property,
     default: str,
     travels: bool,
-    fresh: Bounds | None,
-    writes: list[tuple[RuleLine, Assign]],
+    fresh: Sequence[tuple[Any, Any]],
+    writes: Iterable[tuple[RuleLine, Assign]],
 ) -> FieldEntry:
+    """The entry of a field or property; `fresh` are the bounds of the values that fresh cells have."""
+    kind = item.kind
     declared = (kind.lo, kind.hi) if kind.name in ("int", "real", "vec2") else None
-    reaches: dict[RuleLine, list[tuple[float | None, float | None]]] = {}
-    for line, assign in writes if kind.name == "int" else ():
-        reaches.setdefault(line, []).append(reach(assign, (kind.lo, kind.hi)))
-    lines = tuple((line, *_hull(parts)) for line, parts in reaches.items())
-    if fresh is not None:
-        low, high = _hull([fresh, *(parts[1:] for parts in lines)])
-        assert low is not None
-        assert high is not None
-        fresh = (low, high)
-    writers = tuple(dict.fromkeys(line for line, _ in writes))
-    return FieldEntry(name, str(kind), default, travels, declared, fresh, writers, lines)
+    lines: dict[RuleLine, list[Bounds]] = {}
+    for line, assign in writes:
+        if assign.field == item.name:
+            lines.setdefault(line, []).append(reach(assign, (kind.lo, kind.hi)))
+    reaches = tuple((line, _hull(bounds)) for line, bounds in lines.items() if kind.name == "int")
+    bounds = _hull([*fresh, *(bounds for _, bounds in reaches)]) if kind.name == "int" else None
+    return FieldEntry(item.name, str(kind), default, travels, declared, bounds, tuple(lines), reaches)
 
 
-def reach(assign: Assign, declared: Bounds) -> tuple[float | None, float | None]:
-    """How low and how high an assignment may bring an integer; None where it never lowers or never raises it."""
-    low, high = assign.value.kind.lo, assign.value.kind.hi
+def reach(assign: Assign, declared: Bounds) -> Bounds:
+    """How low and how high an assignment may bring an integer; ∞ if it never lowers it, -∞ if it never raises it."""
+    low, high = assign.change
     if assign.op == ":=":
         return min(max(low, declared[0]), declared[1]), min(max(high, declared[0]), declared[1])
-    if assign.op == "-=":
-        low, high = -high, -low
-    return (declared[0] if low < 0 else None), (declared[1] if high > 0 else None)
+    return (declared[0] if low < 0 else inf), (declared[1] if high > 0 else -inf)
 
 
-def _hull(parts: Sequence[tuple[float | None, float | None]]) -> tuple[float | None, float | None]:
-    lows = [low for low, _ in parts if low is not None]
-    highs = [high for _, high in parts if high is not None]
-    return min(lows, default=None), max(highs, default=None)
+def _hull(parts: Sequence[Bounds]) -> Bounds:
+    return min(low for low, _ in parts), max(high for _, high in parts)

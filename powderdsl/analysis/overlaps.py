@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
-from powderdsl.analysis.changes import HERE, Asked, RuleLine, footprint, is_not, rule_line
-from powderdsl.model.logic.satisfy import Facts, satisfiable
-from powderdsl.model.types import Assign, Expr, Move, Offset, Pass, Rule, Ruleset, Transform
+from powderdsl.analysis.changes import Asked, RuleLine, is_not, rule_line
+from powderdsl.model.logic.satisfy import Conditions, Facts, Lets, satisfiable
+from powderdsl.model.types import (
+    HERE,
+    Assign,
+    Expr,
+    Move,
+    Pass,
+    Rule,
+    Ruleset,
+    Transform,
+    footprint,
+    minus,
+    substeps,
+    writes_of,
+)
 
 T = TypeVar("T")
 
@@ -41,44 +54,46 @@ class Overlap:
     field: str = ""
 
 
+Candidate = tuple[Overlap, Iterable[Conditions], Lets]
+"""Two lines, and for each way in which they could meet the conditions of that, with the values under `let`."""
+
+
 def find_overlaps(ruleset: Ruleset, facts: Facts) -> tuple[Overlap, ...]:
     """Every two lines that could not be shown to keep apart, in the order in which they run."""
     found: dict[Overlap, None] = {}
-    for pass_, moment in ruleset.substeps():
-        asked = Asked.of(moment, facts)
-        live = [rule for rule in moment.rules if rule.mask is None or asked.may(rule)]
-        found |= dict.fromkeys(_claims(asked, pass_, found))
-        found |= dict.fromkeys(_writes(live, asked, pass_, found))
-    found |= dict.fromkeys(_in_turn(ruleset, facts, found))
+    for overlap, ways, lets in _candidates(ruleset, facts):
+        if overlap not in found and any(satisfiable(facts, way, lets) for way in ways):
+            found[overlap] = None
     return tuple(found)
 
 
-def _meet(first: Expr, second: Expr, at: Offset, asked: Asked) -> bool:
-    return satisfiable(asked.facts, [(first, HERE), (second, at)], asked.lets)
+def _candidates(ruleset: Ruleset, facts: Facts) -> Iterator[Candidate]:
+    for pass_, moment in substeps(ruleset.passes):
+        asked = Asked.of(moment, facts)
+        live = [rule for rule in moment.rules if asked.may(rule)]
+        if moment.policy != "prove":
+            yield from _claims(asked, pass_)
+        yield from _writes(live, asked, pass_)
+    yield from _in_turn(ruleset)
 
 
-def _claims(asked: Asked, pass_: Pass, known: dict[Overlap, None]) -> Iterator[Overlap]:
+def _claims(asked: Asked, pass_: Pass) -> Iterator[Candidate]:
     """Rules of one substep that may claim one cell, where a policy decides."""
-    if asked.moment.policy == "prove":
-        return
     # Rules that are always dropped meet others too: only the conditions count here.
     movers = [rule for rule in asked.moment.rules if not isinstance(rule, Assign)]
-    outcome = _BY_POLICY[asked.moment.policy]
     for i, second in enumerate(movers):
         for first in movers[: i + 1]:
-            one = first is second
-            if one and isinstance(first, Move) and first.leaving is None:
+            outcome, same = _BY_POLICY[asked.moment.policy], first is second
+            if same and outcome == "first wins":
+                outcome = "both dropped"
+            if (same and isinstance(first, Move) and first.leaving is None) or (
+                outcome == "first wins" and _alike(first, second)
+            ):
                 continue  # cells of one rule that share a place move in rows
-            what = "both dropped" if one and outcome != "overwritten" else outcome
-            overlap = Overlap(what, rule_line(first, pass_), rule_line(second, pass_))
-            same = what == "first wins" and _alike(first, second)
-            if overlap in known or same:
-                continue
-            shifts = dict.fromkeys(
-                (a[0] - b[0], a[1] - b[1]) for a in footprint(first) for b in footprint(second)
-            )
-            if any(_meet(first.mask, second.mask, at, asked) for at in shifts if not (one and at == HERE)):
-                yield overlap
+            overlap = Overlap(outcome, rule_line(first, pass_), rule_line(second, pass_))
+            shifts = {minus(a, b): None for a in footprint(first) for b in footprint(second)}
+            ways = (((first.mask, HERE), (second.mask, at)) for at in shifts if not (same and at == HERE))
+            yield overlap, ways, asked.lets
 
 
 def _alike(first: Rule, second: Rule) -> bool:
@@ -88,22 +103,21 @@ def _alike(first: Rule, second: Rule) -> bool:
     return first.target == second.target and first.effects == second.effects
 
 
-def _writes(rules: list[Rule], asked: Asked, pass_: Pass, known: dict[Overlap, None]) -> Iterator[Overlap]:
+def _writes(rules: list[Rule], asked: Asked, pass_: Pass) -> Iterator[Candidate]:
     """Writes of one field in one substep whose order makes a difference. Roundings of floats are left out."""
-    plain = [(rule, rule) for rule in rules if isinstance(rule, Assign)]
-    effects = [(effect, rule) for rule in rules if not isinstance(rule, Assign) for effect in rule.effects]
-    for writes in (plain, effects):
+    settled = asked.moment.policy in ("drop_both", "first_wins")
+    for kind in (True, False):
+        chosen = [rule for rule in rules if isinstance(rule, Assign) == kind]
+        writes = [(write, rule) for rule in chosen for write in writes_of(rule)]
         for (a, first), (b, second) in _pairs(writes):
             outcome = order_matters(a, b)
-            if not outcome or first.mask is None or second.mask is None:
+            if not outcome:
                 continue
-            apart = first is not second and asked.moment.policy in ("drop_both", "first_wins")
-            if apart and _own_cells(first, a) and _own_cells(second, b):
+            own = not kind and a.offset in footprint(first) and b.offset in footprint(second)
+            if settled and own and first is not second:
                 continue  # rules that happen never share a cell
             overlap = Overlap(outcome, rule_line(first, pass_), rule_line(second, pass_), a.field)
-            at = (a.offset[0] - b.offset[0], a.offset[1] - b.offset[1])
-            if overlap not in known and _meet(first.mask, second.mask, at, asked):
-                yield overlap
+            yield overlap, [((first.mask, HERE), (second.mask, minus(a.offset, b.offset)))], asked.lets
 
 
 def _pairs(items: Sequence[T]) -> Iterator[tuple[T, T]]:
@@ -113,48 +127,36 @@ def _pairs(items: Sequence[T]) -> Iterator[tuple[T, T]]:
             yield first, second
 
 
-def _own_cells(rule: Rule, effect: Assign) -> bool:
-    """Whether an effect stays in the cells that its rule claims."""
-    return not isinstance(rule, Assign) and effect.offset in footprint(rule)
-
-
 def order_matters(a: Assign, b: Assign) -> str:
     """The key of OUTCOMES if these two write one cell, or an empty text."""
     if a.field != b.field or (a.op == b.op == ":=" and a.value == b.value):
         return ""
     if ":=" in (a.op, b.op):
         return "last writes"
-    (low, high), (other_low, other_high) = (
-        (-one.value.kind.hi, -one.value.kind.lo) if one.op == "-=" else (one.value.kind.lo, one.value.kind.hi)
-        for one in (a, b)
-    )
+    (low, high), (other_low, other_high) = a.change, b.change
     opposite = (high > 0 and other_low < 0) or (low < 0 and other_high > 0)
     return "cut off" if a.value.kind.name == "int" and opposite else ""
 
 
-def _in_turn(ruleset: Ruleset, facts: Facts, known: dict[Overlap, None]) -> Iterator[Overlap]:
+def _in_turn(ruleset: Ruleset) -> Iterator[Candidate]:
     """Transforms of different substeps that could happen to one cell of one world, with different results."""
-    rules = [
-        (number, pass_, rule, lets, _renamed(rule.mask, number))
-        for number, (pass_, moment) in enumerate(ruleset.substeps())
-        for lets in [{f"{let.name}@{number}": _renamed(let.value, number) for let in moment.lets}]
-        for rule in moment.rules
-        if isinstance(rule, Transform)
-    ]
-    if len({rule.span for _, _, rule, _, _ in rules}) > MAX_LINES:
+    rules: list[tuple[int, RuleLine, Expr, Expr]] = []
+    lets: Lets = {}
+    for number, (pass_, moment) in enumerate(substeps(ruleset.passes)):
+        lets |= {f"{name}@{number}": _renamed(value, number) for name, value in moment.values.items()}
+        for rule in moment.rules:
+            if isinstance(rule, Transform):
+                rules.append((number, rule_line(rule, pass_), rule.target, _renamed(rule.mask, number)))
+    if len({line for _, line, _, _ in rules}) > MAX_LINES:
         return
-    seen = set(known)
-    for (other, other_pass, earlier, other_lets, other_mask), (number, pass_, rule, lets, mask) in _pairs(
-        rules
-    ):
-        if other == number or (earlier.target == rule.target and rule.target.op == "const"):
-            continue
-        overlap = Overlap("first in turn", rule_line(earlier, other_pass), rule_line(rule, pass_))
-        changing = [is_not(t.value) for t in (rule.target, earlier.target) if t.op == "const"]
-        conditions = [(other_mask, HERE), (mask, HERE), *changing]
-        if overlap not in seen and satisfiable(facts, conditions, {**other_lets, **lets}):
-            seen.add(overlap)
-            yield overlap
+    for (other, first, earlier, other_mask), (number, second, target, mask) in _pairs(rules):
+        if other != number and (earlier != target or target.op != "const"):
+            changing = [is_not(end.value) for end in (target, earlier) if end.op == "const"]
+            yield (
+                Overlap("first in turn", first, second),
+                [[(other_mask, HERE), (mask, HERE), *changing]],
+                lets,
+            )
 
 
 def _renamed(expr: Expr, number: int) -> Expr:

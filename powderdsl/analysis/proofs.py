@@ -38,17 +38,12 @@ def prove(claim: Claim, ruleset: Ruleset, ledger: Ledger, without: frozenset[int
 
 def _conserved(trend: str, counted: set[str], ledger: Ledger, without: list[str]) -> Verdict:
     """The ledger's verdict on a count in worlds without some elements: rules that need these cannot happen."""
-    cells = set(ledger.reach(name for name in ledger.elements if name not in without))
-    known = cells | set(ledger.named)
-    lines = []
-    for entry in ledger.rules:
-        if not all(known.intersection(names) for names in entry.needs):
-            continue
-        for before, after in entry.changes:
-            if before not in cells or (after in entry.copies and after not in known):
-                continue
-            if AGAINST[trend](after in counted, before in counted):
-                lines.append(entry.rule)
+    cells = frozenset(ledger.reach(name for name in ledger.elements if name not in without))
+    lines = [
+        line
+        for line, before, after in ledger.possible(cells)
+        if AGAINST[trend](after in counted, before in counted)
+    ]
     if lines:
         return NotProven("some rule may change the number", tuple(dict.fromkeys(lines)))
     return Proven("no rule that can happen in such worlds changes the number so")
@@ -102,7 +97,7 @@ def horizon(ruleset: Ruleset) -> int:
 
 def _moment(moment: Moment, seen: int, lets: Mapping[str, int]) -> int:
     claims = [rule for rule in moment.rules if not isinstance(rule, Assign)]
-    masks = {id(rule): _sight(rule.mask, seen, lets) for rule in moment.rules if rule.mask is not None}
+    masks = {id(rule): _sight(rule.mask, seen, lets) for rule in moment.rules}
     reaches = [_length(rule.offset) for rule in claims if not isinstance(rule, Transform)]
     if moment.policy in ("drop_both", "first_wins") and claims:
         # A rule must know where the others claim cells; earlier rules decide one after the other.

@@ -30,6 +30,7 @@ from powderdsl.model.logic.satisfy import Budget, satisfiable
 from powderdsl.model.operations import OPERATIONS
 from powderdsl.model.state import scratch_slots, slots
 from powderdsl.model.types import (
+    HERE,
     Assign,
     Expr,
     Kind,
@@ -388,12 +389,7 @@ def live_passes(ruleset: Ruleset) -> tuple[Pass, ...]:
     facts = replace(facts_of(ruleset), budget=Budget(LIVE_BUDGET))
 
     def live(moment: Moment) -> Moment:
-        lets = {let.name: let.value for let in moment.lets}
-        rules = [
-            rule
-            for rule in moment.rules
-            if rule.mask is None or satisfiable(facts, [(rule.mask, (0, 0))], lets)
-        ]
+        rules = [rule for rule in moment.rules if satisfiable(facts, [(rule.mask, HERE)], moment.values)]
         return replace(moment, rules=tuple(rules))
 
     return tuple([replace(pass_, moments=tuple(map(live, pass_.moments))) for pass_ in ruleset.passes])
@@ -470,7 +466,7 @@ class _PassLowering:
         for let in moment.lets:
             self.lets[let.name] = lower_expression(let.value, self.inputs())
         at = self.inputs()
-        masks = {id(rule): node(rule.mask, at) for rule in moment.rules if rule.mask is not None}
+        masks = {id(rule): node(rule.mask, at) for rule in moment.rules}
         movers: list[Mover] = [rule for rule in moment.rules if not isinstance(rule, Assign)]
         if moment.policy in ("drop_both", "first_wins"):
             self._apply_policy(moment.policy, movers, masks)

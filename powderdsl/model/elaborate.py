@@ -12,6 +12,7 @@ from powderdsl.model.declarations import Block, PassDecl, ScratchDecl
 from powderdsl.model.expressions.operators import (
     FALSE,
     IDENTITY,
+    TRUE,
     Absent,
     Broken,
     Matrix,
@@ -312,9 +313,9 @@ class Elaborator:
 
     def _effects(self, syntax: Syntax, scope: Scope) -> tuple[Assign, ...]:
         clause = syntax.child("then")
-        return tuple([self._update(update, scope, None) for update in clause.children]) if clause else ()
+        return tuple([self._update(update, scope, TRUE) for update in clause.children]) if clause else ()
 
-    def _update(self, syntax: Syntax, scope: Scope, mask: Expr | None) -> Assign:
+    def _update(self, syntax: Syntax, scope: Scope, mask: Expr) -> Assign:
         target, value = syntax.children
         name, kind, offset = self._target(target, scope)
         operand = self.typer.evaluate(value, scope)

@@ -411,7 +411,7 @@ def run_moment(moment: Moment, at: Context, table: Mapping[str, Slot]) -> State:
 
 def masks_of(moment: Moment, at: Context) -> dict[int, Array]:
     """Where each rule of a substep happens, bool [B, H, W] by `id`. `at.lets` has the substep's lets."""
-    masks = {id(rule): evaluate(rule.mask, at) for rule in moment.rules if rule.mask is not None}
+    masks = {id(rule): evaluate(rule.mask, at) for rule in moment.rules}
     if moment.policy in ("drop_both", "first_wins"):
         claims = [rule for rule in moment.rules if not isinstance(rule, Assign)]
         _settle_claims(moment.policy, claims, masks)

@@ -274,8 +274,8 @@ class _Printer:
                 return self.assignment(rule) + self.condition("where", rule.mask)
         return text + "".join(f", then {self.assignment(effect)}" for effect in rule.effects)
 
-    def condition(self, word: str, mask: Expr | None) -> str:
-        return "" if mask is None or mask == TRUE else f" {word} {self.expr(mask)}"
+    def condition(self, word: str, mask: Expr) -> str:
+        return "" if mask == TRUE else f" {word} {self.expr(mask)}"
 
     def assignment(self, write: Assign) -> str:
         place = "" if write.offset == (0, 0) else f"{show_offset(write.offset)}."

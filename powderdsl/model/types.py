@@ -7,9 +7,10 @@ values directly, and `ir/lower.py` lowers them; neither looks at syntax again.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from powderdsl.diagnostics import Span
@@ -20,6 +21,17 @@ if TYPE_CHECKING:
 
 Offset = tuple[int, int]
 """(rows down, columns right)."""
+
+HERE: Offset = (0, 0)
+
+
+def plus(a: Offset, b: Offset) -> Offset:
+    return (a[0] + b[0], a[1] + b[1])
+
+
+def minus(a: Offset, b: Offset) -> Offset:
+    return (a[0] - b[0], a[1] - b[1])
+
 
 Value = int | float | Fraction | tuple[float, float]
 
@@ -207,9 +219,15 @@ class Assign:
     offset: Offset
     op: str
     value: Expr
-    mask: Expr | None
-    """None for an effect: it happens where its rule happens."""
+    mask: Expr
+    """Always true for an effect: it happens where its rule happens."""
     span: Span = dataclasses.field(compare=False, repr=False)
+
+    @property
+    def change(self) -> tuple[float, float]:
+        """The bounds of what it sets or adds."""
+        kind = self.value.kind
+        return (-kind.hi, -kind.lo) if self.op == "-=" else (kind.lo, kind.hi)
 
 
 @dataclass(frozen=True)
@@ -249,6 +267,16 @@ class Move:
 Rule = Transform | Swap | Move | Assign
 
 
+def writes_of(rule: Rule) -> tuple[Assign, ...]:
+    """The assignments that a rule is or has."""
+    return (rule,) if isinstance(rule, Assign) else rule.effects
+
+
+def footprint(rule: Rule) -> tuple[Offset, ...]:
+    """The cells that a rule claims, seen from the cell where its condition holds."""
+    return (HERE, rule.offset) if isinstance(rule, (Swap, Move)) else (HERE,)
+
+
 @dataclass(frozen=True)
 class Let:
     """A value fixed where it stands."""
@@ -273,6 +301,11 @@ class Moment:
     label: str
     """The loop variables of this copy, for messages: ``side = left``."""
 
+    @cached_property
+    def values(self) -> dict[str, Expr]:
+        """The values of its lets by name."""
+        return {let.name: let.value for let in self.lets}
+
 
 @dataclass(frozen=True)
 class Pass:
@@ -283,6 +316,13 @@ class Pass:
     scratch: tuple[Field, ...]
     moments: tuple[Moment, ...]
     span: Span = field(compare=False, repr=False)
+
+
+def substeps(passes: Iterable[Pass]) -> Iterator[tuple[Pass, Moment]]:
+    """Every substep with its pass, in the order in which they run."""
+    for pass_ in passes:
+        for moment in pass_.moments:
+            yield pass_, moment
 
 
 Cell = tuple[tuple[float, float], ...] | None
@@ -469,12 +509,6 @@ class Ruleset:
 
     def field(self, name: str) -> Field | None:
         return next((f for f in self.fields if f.name == name), None)
-
-    def substeps(self) -> Iterator[tuple[Pass, Moment]]:
-        """Every substep with its pass, in the order in which they run."""
-        for pass_ in self.passes:
-            for moment in pass_.moments:
-                yield pass_, moment
 
     def with_params(self, values: dict[str, Value]) -> Ruleset:
         """The same ruleset with other defaults; the values are checked by `definitions.set_params`."""

@@ -21,7 +21,7 @@ from powderdsl.diagnostics import Label, Span, suggest
 from powderdsl.diagnostics.printable import printable
 from powderdsl.diagnostics.render import source_lines
 from powderdsl.model import reference
-from powderdsl.model.expressions.operators import look
+from powderdsl.model.expressions.operators import TRUE, look
 from powderdsl.model.state import Slot, scratch_slots, slot_name
 from powderdsl.model.text import element_name, one_line, place_of, show_expr, show_offset, show_value
 from powderdsl.model.types import (
@@ -120,7 +120,6 @@ class Substep:
 
     def parts(self, rule: Rule, cell: Cell) -> tuple[Part, ...]:
         """A rule's condition in one cell, split at its `and`s. Flags fixed by `let` are split too, as they were fixed."""
-        assert rule.mask is not None
         return tuple(self._split(rule.mask, self.at, None, cell))
 
     def _split(self, expr: Expr, at: reference.Context, let: str | None, cell: Cell) -> Iterator[Part]:
@@ -729,7 +728,7 @@ def _marked_rule(rule: Rule, number: int) -> Rule:
     return replace(rule, effects=(*rule.effects, *marks))
 
 
-def _mark(number: int, place: Offset, rule: Rule, mask: Expr | None = None) -> Assign:
+def _mark(number: int, place: Offset, rule: Rule, mask: Expr = TRUE) -> Assign:
     """The assignment of a rule's number to a cell that it writes."""
     value = Expr("const", integer(number, number), value=number)
     return Assign(SLOT, place, ":=", value, mask, rule.span)

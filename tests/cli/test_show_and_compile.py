@@ -78,9 +78,9 @@ def test_reactions_know_what_becomes_what():
     rules = package.load("powderworld")
     pairs = {
         (before, after)
-        for one in reactions(rules)
-        for before in names(rules, one.before)
-        for after in names(rules, one.after)
+        for _, ids, made in reactions(rules)
+        for before in names(rules, ids)
+        for after in names(rules, made)
     }
     assert ("ice", "water") in pairs
     assert ("lava", "stone") in pairs

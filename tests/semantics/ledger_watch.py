@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from powderdsl.analysis.changes import RuleLine, footprint, rule_line
+from powderdsl.analysis.changes import RuleLine, rule_line
 from powderdsl.analysis.ledger import Ledger, RuleEntry
 from powderdsl.analysis.overlaps import order_matters
 from powderdsl.model import reference
-from powderdsl.model.types import ELEMENT, Assign, Moment, Move, Pass, Ruleset, Swap, Transform
+from powderdsl.model.types import ELEMENT, Assign, Moment, Move, Pass, Ruleset, Swap, Transform, footprint
 
 Array = np.ndarray[Any, Any]
 
@@ -76,9 +76,7 @@ class Watch:
         """Where the rules of a substep want to happen, and where they do."""
         for let in moment.lets:
             at.lets[let.name] = reference.evaluate(let.value, at)
-        wanted = {
-            id(rule): reference.evaluate(rule.mask, at) for rule in moment.rules if rule.mask is not None
-        }
+        wanted = {id(rule): reference.evaluate(rule.mask, at) for rule in moment.rules}
         masks = dict(wanted)
         if moment.policy in ("drop_both", "first_wins"):
             claims = [rule for rule in moment.rules if not isinstance(rule, Assign)]

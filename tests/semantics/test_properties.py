@@ -219,7 +219,7 @@ def reach(ruleset: Ruleset) -> tuple[int, int]:
             writes = [rule] if isinstance(rule, Assign) else list(effects)
             own = np.zeros(2, int) if isinstance(rule, Assign) else np.abs(getattr(rule, "offset", (0, 0)))
             claims += 2 * own if moment.policy != "prove" else 0
-            mask = np.zeros(2, int) if rule.mask is None else _seen(rule.mask)
+            mask = _seen(rule.mask)
             seen.append(mask + own)
             seen += [np.maximum(_seen(write.value), mask) + np.abs(write.offset) + own for write in writes]
             if hasattr(rule, "target"):
@@ -340,7 +340,7 @@ def test_what_is_shown_to_be_impossible_never_happens(monkeypatch: pytest.Monkey
         lets = dict(at.lets)
         for let in moment.lets:
             at.lets[let.name] = reference.evaluate(let.value, at)
-        masks = [(rule, reference.evaluate(rule.mask, at)) for rule in moment.rules if rule.mask is not None]
+        masks = [(rule, reference.evaluate(rule.mask, at)) for rule in moment.rules]
         for rule, mask in masks:
             if rule.span in silent:
                 counts["silent"] += 1

@@ -27,7 +27,7 @@ splits:
   test: {knobs: {many: 5}}
 """
 RECORDED = {
-    "task": "45bb04584a5c6f10",
+    "task": "96392df252f36572",
     "goal": "b5ca4d0c7989337c",
     "splits": "ed992e1d0651b1c6",
     "agent": "e387b8aca9904ca3",

@@ -95,9 +95,9 @@ def _tables(ruleset: Ruleset, styled: bool) -> Iterator[tuple[str, list[list[str
         rows.append([*head, *values, " ".join(sorted(element.tags))])
     yield f"Elements ({len(ruleset.elements)} of {ruleset.slots} ids)", rows
     rows = [["from", "to", "pass", "rule", "where"]]
-    for one in reactions(ruleset):
-        before, after = show_set(ruleset, one.before), show_set(ruleset, one.after)
-        rows.append([before, after, one.pass_name, one_line(one.span), place_of(one.span)])
+    for line, before, after in reactions(ruleset):
+        ids = show_set(ruleset, before), show_set(ruleset, after)
+        rows.append([*ids, line.pass_name, line.text, str(line)])
     yield "Reactions", rows
     rows = [["", "pass", "pack", "moments", "rules", "where"]]
     for number, pass_ in enumerate(ruleset.passes, 1):
@@ -163,12 +163,14 @@ def _data(ruleset: Ruleset) -> dict[str, Any]:
         "fields": [_described(field, "name", "at", "pack", kind=str(field.kind)) for field in ruleset.fields],
         "reactions": [
             {
-                "from": [element_name(ruleset, number) for number in reaction.before],
-                "to": [element_name(ruleset, number) for number in reaction.after],
-                "pass": reaction.pass_name,
-                **_described(reaction, "pack", rule=one_line(reaction.span)),
+                "from": [element_name(ruleset, number) for number in before],
+                "to": [element_name(ruleset, number) for number in after],
+                "pass": line.pass_name,
+                "pack": line.pack,
+                "rule": line.text,
+                "where": str(line),
             }
-            for reaction in reactions(ruleset)
+            for line, before, after in reactions(ruleset)
         ],
         "passes": [
             _described(

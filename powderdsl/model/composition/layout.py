@@ -10,8 +10,7 @@ from __future__ import annotations
 from powderdsl.diagnostics import Reporter, suggest
 from powderdsl.model.composition.compose import Composition
 from powderdsl.model.expressions.symbols import Symbols
-from powderdsl.model.logic.satisfy import substeps, writes_of
-from powderdsl.model.types import MatrixChannel, Pass
+from powderdsl.model.types import MatrixChannel, Pass, substeps, writes_of
 from powderdsl.syntax.yaml_tree import Scalar
 
 COMPONENTS = ("row", "column")
@@ -73,7 +72,7 @@ def _blocks(symbols: Symbols, passes: tuple[Pass, ...]) -> list[list[str]]:
     place = {pack.name.text: number for number, group in enumerate(groups) for pack in group}
     blocks: list[list[str]] = [[] for _ in groups]
     first: dict[str, int] = {}
-    for pass_, moment, _ in substeps(passes):
+    for pass_, moment in substeps(passes):
         for write in (write for rule in moment.rules for write in writes_of(rule)):
             first[write.field] = min(place[pass_.pack], first.get(write.field, place[pass_.pack]))
     for name, prop in symbols.properties.items():

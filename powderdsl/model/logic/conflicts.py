@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import islice
 from math import lcm
 from typing import TYPE_CHECKING
@@ -24,8 +24,8 @@ from powderdsl.model.expressions.operators import (
 )
 from powderdsl.model.logic.satisfy import (
     BUDGET,
-    HERE,
     MAX_QUESTION,
+    Answers,
     Budget,
     Conditions,
     Facts,
@@ -34,11 +34,23 @@ from powderdsl.model.logic.satisfy import (
     decide,
     example,
     satisfiable,
-    some,
-    substeps,
 )
 from powderdsl.model.operations import OPERATIONS
-from powderdsl.model.types import FLAG, Assign, Expr, Moment, Move, Offset, Pass, Rule, Swap, Transform
+from powderdsl.model.types import (
+    FLAG,
+    HERE,
+    Assign,
+    Expr,
+    Moment,
+    Move,
+    Offset,
+    Pass,
+    Rule,
+    Swap,
+    Transform,
+    footprint,
+    minus,
+)
 
 if TYPE_CHECKING:
     from powderdsl.model.elaborate import Elaborated
@@ -131,25 +143,6 @@ class _Found:
     places: list[tuple[int, int]]
 
 
-@dataclass
-class _Fate:
-    """What is known of the copies of a rule; None if that takes too much work to decide.
-
-    Args:
-        fires: whether one of them may happen.
-        useful: whether one of them may change something.
-        silent: conditions and values of the copies that never happen.
-    """
-
-    fires: bool | None = False
-    useful: bool | None = False
-    silent: list[tuple[Expr, Lets]] = field(default_factory=list)
-
-    @property
-    def is_decided(self) -> bool:
-        return self.fires is not None and not (self.fires and self.useful is None)
-
-
 def check_logic(
     passes: tuple[Pass, ...],
     facts: Facts,
@@ -165,25 +158,26 @@ def check_logic(
         The passes, with how conflicts are resolved, and the rules of which it takes too much work to decide whether
         they fire or do anything.
     """
-    fates: dict[Span, _Fate] = {}
+    fires: Answers[Span] = Answers()
+    useful: Answers[Span] = Answers()
+    silent: dict[Span, list[tuple[Expr, Lets]]] = {}
     conflicts: dict[Conflict, _Found] = {}
     work: list[tuple[int, int, Pass]] = []
     left = ALL_SUBSTEPS * BUDGET
     for at, pass_ in enumerate(passes):
         earlier: Lets = {}
-        for number, (_, moment, own) in enumerate(substeps([pass_])):
-            lets = earlier | own
+        for number, moment in enumerate(pass_.moments):
+            lets = earlier | moment.values
             earlier = lasting(lets)
             live = []
             for rule in moment.rules:
-                fires = rule.mask is None or decide(facts, [(rule.mask, HERE)], lets)
-                changes = _changes(rule, facts, lets) if fires else fires is False or None
-                fate = fates.setdefault(rule.span, _Fate())
-                fate.fires, fate.useful = some((fate.fires, fires)), some((fate.useful, changes))
-                if fires is not False:
+                happens = decide(facts, [(rule.mask, HERE)], lets)
+                fires.add(rule.span, happens)
+                useful.add(rule.span, happens and _changes(rule, facts, lets))
+                if happens is False:
+                    silent.setdefault(rule.span, []).append((rule.mask, lets))
+                else:
                     live.append(rule)
-                elif rule.mask is not None:
-                    fate.silent.append((rule.mask, lets))
             if moment.policy == "prove":
                 given = min(BUDGET, left)
                 asked = replace(facts, budget=Budget(given))
@@ -197,25 +191,25 @@ def check_logic(
         return passes, []
     passes = _report_conflicts(conflicts, passes, facts, added, reporter)
     relaxed = facts.relaxed()
-    for span, fate in fates.items():
-        if fate.is_decided:
-            _report_fate(span, fate, relaxed, elaborated, reporter)
-    return passes, [span for span, fate in fates.items() if not fate.is_decided]
-
-
-def _report_fate(span: Span, fate: _Fate, relaxed: Facts, elaborated: Elaborated, reporter: Reporter) -> None:
-    """Report a rule that never fires, and why, or that changes nothing."""
-    if fate.fires:
-        if not fate.useful:
+    for span in useful.where(False):
+        if fires[span]:
             label = "the cell already holds that element"
             fix = "remove it, or name another element after `->`"
             reporter.report("PD509", "this rule changes nothing", span, label, helps=[fix])
-        return
+        else:
+            _report_silent(span, silent[span], relaxed, elaborated, reporter)
+    return passes, useful.where(None)
+
+
+def _report_silent(
+    span: Span, copies: list[tuple[Expr, Lets]], relaxed: Facts, elaborated: Elaborated, reporter: Reporter
+) -> None:
+    """Report a rule that never fires, and why."""
     if span in elaborated.inactive:
         reason = f"`{elaborated.inactive[span]}` is not loaded"
     elif span in elaborated.empty:
         reason = f"no element is in `{elaborated.empty[span]}`"
-    elif any(decide(relaxed, [(mask, HERE)], lets) for mask, lets in fate.silent):
+    elif any(decide(relaxed, [(mask, HERE)], lets) for mask, lets in copies):
         reason = "no loaded element has the properties it asks for"
     else:
         fix = "look for conditions that exclude each other, or that the properties of no element meet"
@@ -304,7 +298,7 @@ def _check_substep(
     """The conflicts of one substep, with an example: of rules that move or transform, of assignments, of effects."""
     movers = [rule for rule in rules if not isinstance(rule, Assign)]
     yield from _meetings([(rule, rule.mask) for rule in movers], facts, lets)
-    sets = [(one, one.mask) for one in rules if isinstance(one, Assign) and one.op == ":=" and one.mask]
+    sets = [(rule, rule.mask) for rule in rules if isinstance(rule, Assign) and rule.op == ":="]
     yield from _meetings(sets, facts, lets)
     effects = [(one, rule.mask) for rule in movers for one in rule.effects if one.op == ":="]
     yield from _meetings(effects, facts, lets)
@@ -356,7 +350,7 @@ def _claims(first: Rule, second: Rule) -> Iterator[Offset]:
         assert isinstance(first, Assign)
         assert isinstance(second, Assign)
         if first.field == second.field and first.value != second.value:
-            yield (first.offset[0] - second.offset[0], first.offset[1] - second.offset[1])
+            yield minus(first.offset, second.offset)
         return
     if isinstance(first, Transform) and isinstance(second, Transform):
         if first is not second and first.target != second.target:
@@ -366,19 +360,12 @@ def _claims(first: Rule, second: Rule) -> Iterator[Offset]:
         # A move into a place that is being left is fine: what stands there goes first.
         if first is not second:
             yield HERE
-            yield (first.offset[0] - second.offset[0], first.offset[1] - second.offset[1])
+            yield minus(first.offset, second.offset)
         return
-    seen = set()
-    for a in _footprint(first):
-        for b in _footprint(second):
-            shift = (a[0] - b[0], a[1] - b[1])
-            if shift not in seen and not (first is second and shift == HERE):
-                seen.add(shift)
-                yield shift
-
-
-def _footprint(rule: Rule) -> tuple[Offset, ...]:
-    return (HERE, rule.offset) if isinstance(rule, (Swap, Move)) else (HERE,)
+    shifts = {minus(a, b): None for a in footprint(first) for b in footprint(second)}
+    if first is second:
+        del shifts[HERE]
+    yield from shifts
 
 
 _EXCLUDE = "make their conditions exclude each other, or put one under `then:`"

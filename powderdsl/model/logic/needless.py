@@ -17,20 +17,12 @@ from powderdsl.model.composition.compose import Composition
 from powderdsl.model.composition.names import words_of
 from powderdsl.model.declarations import FieldDecl, KernelDecl, SetDecl
 from powderdsl.model.expressions.operators import ELEMENT_HERE, look, member, negation
-from powderdsl.model.logic.satisfy import (
-    HERE,
-    Budget,
-    Facts,
-    Lets,
-    decide,
-    satisfiable,
-    some,
-    substeps,
-    writes_of,
-)
-from powderdsl.model.operations import OPERATIONS
+from powderdsl.model.logic.satisfy import Answers, Budget, Facts, Lets, decide, satisfiable, some
+from powderdsl.model.operations import COMPARISONS, OPERATIONS, Bounds
 from powderdsl.model.text import place_of
 from powderdsl.model.types import (
+    CHANCE,
+    HERE,
     Assign,
     Expr,
     Field,
@@ -38,11 +30,12 @@ from powderdsl.model.types import (
     Move,
     Offset,
     Pass,
-    Property,
     Rule,
     Ruleset,
-    Swap,
     Transform,
+    plus,
+    substeps,
+    writes_of,
 )
 from powderdsl.syntax.ast import Syntax
 
@@ -90,19 +83,20 @@ def _inside_any(span: Span, others: Sequence[Span]) -> bool:
 
 def _report_decided(passes: tuple[Pass, ...], silent: Sequence[Span], reporter: Reporter) -> None:
     """Report comparisons of integers whose ranges alone decide them."""
-    outcomes: dict[Span, set[bool | None]] = {}
-    for _, moment, lets in substeps(passes):
-        for node in (node for part in (*lets.values(), *_parts(moment.rules)) for node in part.walk()):
-            if node.op in ("eq", "lt", "le") and node.span is not None:
-                bounds = None
-                if all(arg.kind.name == "int" for arg in node.args) and any(
-                    arg.op != "const" for arg in node.args
-                ):
-                    bounds = OPERATIONS[node.op].between(*((arg.kind.lo, arg.kind.hi) for arg in node.args))
-                outcome = bool(bounds[0]) if bounds and bounds[0] == bounds[1] else None
-                outcomes.setdefault(node.span, set()).add(outcome)
-    for span, found in outcomes.items():
-        if found in ({True}, {False}) and not _inside_any(span, silent):
+    outcomes: dict[Span, set[Bounds | None]] = {}
+    for _, moment in substeps(passes):
+        for part in (*moment.values.values(), *_parts(moment.rules)):
+            for node in part.walk():
+                if node.op in COMPARISONS.values() and node.span is not None:
+                    kinds = [arg.kind for arg in node.args]
+                    outcome = None
+                    if {kind.name for kind in kinds} == {"int"} and {arg.op for arg in node.args} != {
+                        "const"
+                    }:
+                        outcome = OPERATIONS[node.op].between(*((kind.lo, kind.hi) for kind in kinds))
+                    outcomes.setdefault(node.span, set()).add(outcome)
+    for span, bounds in outcomes.items():
+        if bounds in ({(True, True)}, {(False, False)}) and not _inside_any(span, silent):
             reporter.report(
                 "PD513", "this comparison decides nothing", span, "its result is the same in every world",
                 helps=["look at the bounds of both sides", "remove it, if it is meant so"],
@@ -112,8 +106,7 @@ def _report_decided(passes: tuple[Pass, ...], silent: Sequence[Span], reporter: 
 def _parts(rules: Iterable[Rule]) -> Iterator[Expr]:
     """The expressions of some rules."""
     for rule in rules:
-        if rule.mask is not None:
-            yield rule.mask
+        yield rule.mask
         if isinstance(rule, Transform):
             yield rule.target
         for write in writes_of(rule):
@@ -137,44 +130,36 @@ def report_repeated(children: Sequence[Syntax], reporter: Reporter) -> None:
 def _report_overruled(
     passes: tuple[Pass, ...], facts: Facts, silent: Sequence[Span], reporter: Reporter
 ) -> list[Span]:
-    matters: dict[Span, bool | None] = {}
+    matters: Answers[Span] = Answers()
     winners: dict[Span, Rule] = {}
-    for _, moment, lets in substeps(passes):
+    for _, moment in substeps(passes):
         for place, rule in enumerate(moment.rules):
-            known = matters.get(rule.span, False)
-            if not known:
+            if not matters.get(rule.span):
                 rivals = _rivals(rule, place, moment)
-                matters[rule.span] = some((known, _matters(rule, rivals, moment, facts, lets)))
+                matters.add(rule.span, _matters(rule, rivals, moment, facts))
                 if rivals:
                     winners.setdefault(rule.span, rivals[0])
-    undecided = []
-    for span, effect in matters.items():
-        if effect or _inside_any(span, silent):
-            continue
-        if effect is None:
-            undecided.append(span)
-            continue
-        winner = winners[span]
-        words = "writes over it, always" if isinstance(winner, Assign) else "always comes before it"
-        reporter.report(
-            "PD514", "this rule is always overruled", span, "it has no effect",
-            secondary=[Label(winner.span, words)],
-            helps=["make their conditions exclude each other", "or remove one of them"],
-        )  # fmt: skip
-    return undecided
+    for span in matters.where(False):
+        if not _inside_any(span, silent):
+            winner = winners[span]
+            words = "writes over it, always" if isinstance(winner, Assign) else "always comes before it"
+            reporter.report(
+                "PD514", "this rule is always overruled", span, "it has no effect",
+                secondary=[Label(winner.span, words)],
+                helps=["make their conditions exclude each other", "or remove one of them"],
+            )  # fmt: skip
+    return [span for span in matters.where(None) if not _inside_any(span, silent)]
 
 
-def _matters(rule: Rule, rivals: Sequence[Rule], moment: Moment, facts: Facts, lets: Lets) -> bool | None:
+def _matters(rule: Rule, rivals: Sequence[Rule], moment: Moment, facts: Facts) -> bool | None:
     """Whether a rule that may happen is not always overruled by its rivals; None if that takes too much work."""
     facts.budget.left -= len(moment.rules) // GLANCES
-    if rule.mask is None:
-        return True
     if facts.budget.is_exhausted:
         return None
-    if not rivals or decide(facts, [(rule.mask, HERE)], lets) is False:
+    here = rule.mask, HERE
+    if not rivals or decide(facts, [here], moment.values) is False:
         return True
-    others = [(negation(other.mask), HERE) for other in rivals if other.mask]
-    return decide(facts, [(rule.mask, HERE), *others], lets)
+    return decide(facts, [here, *((negation(other.mask), HERE) for other in rivals)], moment.values)
 
 
 def _rivals(rule: Rule, place: int, moment: Moment) -> list[Rule]:
@@ -186,7 +171,7 @@ def _rivals(rule: Rule, place: int, moment: Moment) -> list[Rule]:
             continue
         if isinstance(rule, Assign) and isinstance(other, Assign):
             same = (other.field, other.offset) == (rule.field, rule.offset)
-            if same and not earlier and other.op == ":=" and other.mask is not None:
+            if same and not earlier and other.op == ":=":
                 rivals.append(other)
         elif isinstance(rule, Transform) and isinstance(other, Transform):
             same = other.target == rule.target and other.effects == rule.effects
@@ -212,11 +197,11 @@ def report_undrawn(
     quick = _quick(facts)
     undecided = []
     shown = {channel.source for channel in ruleset.matrix}
-    chances = {p.name: p for p in ruleset.properties if p.kind.name == "chance" and p.name not in shown}
     for name, number, span in given:
-        if name not in chances or chances[name].values[number] == 0:
+        prop = facts.properties[name]
+        if prop.kind != CHANCE or name in shown or prop.values[number] == 0:
             continue
-        drawn = some(_drawn(chances[name], number, ruleset, quick))
+        drawn = some(_drawn(name, number, ruleset, quick))
         if drawn is None:
             undecided.append(span)
         elif not drawn:
@@ -228,19 +213,15 @@ def report_undrawn(
     return undecided
 
 
-def _drawn(prop: Property, number: int, ruleset: Ruleset, facts: Facts) -> Iterator[bool | None]:
+def _drawn(name: str, number: int, ruleset: Ruleset, facts: Facts) -> Iterator[bool | None]:
     """For each rule that reads the property: may it happen where this element stands?"""
     for pass_ in ruleset.passes:
         everywhere = {let.name: let.value for moment in pass_.moments for let in moment.lets}
-        for _, moment, lets in substeps([pass_]):
+        for moment in pass_.moments:
             for rule in moment.rules:
-                places = _reads(prop.name, _parts([rule]), lets, everywhere)
-                if places and (None in places or rule.mask is None):
-                    yield True
-                for at in places:
-                    if at is not None and rule.mask is not None:
-                        here = (member(ELEMENT_HERE, (number,)), at)
-                        yield decide(facts, [(rule.mask, HERE), here], lets)
+                for at in _reads(name, _parts([rule]), moment.values, everywhere):
+                    here = [(member(ELEMENT_HERE, (number,)), at)] if at is not None else []
+                    yield not here or decide(facts, [(rule.mask, HERE), *here], moment.values)
 
 
 def _reads(name: str, parts: Iterable[Expr], lets: Lets, everywhere: Lets) -> dict[Offset | None, None]:
@@ -260,7 +241,7 @@ def _reads(name: str, parts: Iterable[Expr], lets: Lets, everywhere: Lets) -> di
                 args = (everywhere[str(expr.value)],) if (expr.value, at) not in opened else ()
                 opened.add((expr.value, at))
             case "look":
-                at = at and (at[0] + expr.value[0], at[1] + expr.value[1])
+                at = at and plus(at, expr.value)
             case "count" | "sum":
                 at = None
         waiting += [(arg, at) for arg in args]
@@ -274,60 +255,51 @@ def _report_lost_writes(
     passes: tuple[Pass, ...], fields: dict[str, Field], facts: Facts, silent: list[Span], reporter: Reporter
 ) -> list[Span]:
     """Warn of assignments and effects that are lost wherever their rule happens, in all its copies."""
-    limited = {name: field for name, field in fields.items() if field.of is not None}
-    arrives: dict[tuple[Span, str], bool | None] = {}
-    for _, moment, lets in substeps(passes) if limited else ():
+    arrives: Answers[tuple[Span, str]] = Answers()
+    for _, moment in substeps(passes):
         for rule in moment.rules:
             for write in writes_of(rule):
-                key = write.span, write.field
-                known = arrives.get(key, False)
-                if write.field in limited and not known and rule.span not in silent:
-                    ids = tuple(sorted(limited[write.field].of or ()))
-                    arrives[key] = some((known, _arrives(write, rule, ids, moment, facts, lets)))
-    for (span, name), answer in arrives.items():
-        if answer is False:
-            reporter.report(
-                "PD516", f"this write to `{name}` is always lost", span, f"no cell that it reaches has a `{name}`",
-                secondary=[Label(limited[name].span, "`of:` says which elements have it")],
-                helps=["widen `of:`, or write to a cell that holds one of its elements"],
-            )  # fmt: skip
-    return [span for (span, _), answer in arrives.items() if answer is None]
+                key, field = (write.span, write.field), fields.get(write.field)
+                if field and field.of is not None and rule.span not in silent and not arrives.get(key):
+                    arrives.add(key, _arrives(write, rule, tuple(sorted(field.of)), moment, facts))
+    for span, name in arrives.where(False):
+        reporter.report(
+            "PD516", f"this write to `{name}` is always lost", span, f"no cell that it reaches has a `{name}`",
+            secondary=[Label(fields[name].span, "`of:` says which elements have it")],
+            helps=["widen `of:`, or write to a cell that holds one of its elements"],
+        )  # fmt: skip
+    return [span for span, _ in arrives.where(None)]
 
 
-def _arrives(
-    write: Assign, rule: Rule, ids: tuple[int, ...], moment: Moment, facts: Facts, lets: Lets
-) -> bool | None:
+def _arrives(write: Assign, rule: Rule, ids: tuple[int, ...], moment: Moment, facts: Facts) -> bool | None:
     """Whether the cell may hold one of these elements when the write lands; None if that is too hard.
 
     Assignments come before all that moves, effects after it.
     """
-    if rule.mask is None:
-        return True
-    certain = _brings(rule).get(write.offset)
-    if isinstance(rule, Move) and write.offset == HERE:
-        certain = None  # another move may fill the place that is left
+    brought = _brings(rule).get(write.offset)
     stays = rule.mask, look(ELEMENT_HERE, write.offset)
     if isinstance(rule, Assign):
         landing = [stays]
-    elif certain is not None:
-        landing = [(rule.mask, certain)]
-    else:
-        landing = [(one.mask, what) for one in moment.rules if one.mask for what in _brings(one).values()]
-        landing += [stays] if write.offset not in _brings(rule) else []
-    return some(decide(facts, [(mask, HERE), (member(what, ids), HERE)], lets) for mask, what in landing)
+    elif brought is not None and not (isinstance(rule, Move) and write.offset == HERE):
+        landing = [(rule.mask, brought)]
+    else:  # other rules may bring something there, also to the place that a move leaves
+        landing = [(one.mask, what) for one in moment.rules for what in _brings(one).values()]
+        landing += [stays] if brought is None else []
+    return some(
+        decide(facts, [(mask, HERE), (member(what, ids), HERE)], moment.values) for mask, what in landing
+    )
 
 
 def _brings(rule: Rule) -> dict[Offset, Expr]:
     """The elements that a rule brings, by the offset of the cell that gets them."""
     match rule:
+        case Assign():
+            return {}
         case Transform():
             return {HERE: rule.target}
-        case Swap():
-            return {HERE: look(ELEMENT_HERE, rule.offset), rule.offset: ELEMENT_HERE}
-        case Move():
-            left = look(ELEMENT_HERE, rule.offset) if rule.leaving is None else rule.leaving
+        case Move(leaving=Expr() as left):
             return {HERE: left, rule.offset: ELEMENT_HERE}
-    return {}
+    return {HERE: look(ELEMENT_HERE, rule.offset), rule.offset: ELEMENT_HERE}
 
 
 # What could not be decided
@@ -419,50 +391,39 @@ def overridden_ids(passes: tuple[Pass, ...], names: Sequence[str], facts: Facts)
     A value of its own may fulfill the condition of another such rule, so this continues until nothing is added.
     """
     found: dict[str, frozenset[int]] = {}
-    more: dict[str, set[int]] = {name: set() for name in names}
+    more: dict[str, frozenset[int]] = {name: frozenset() for name in names}
     while more != found:
-        found = {name: frozenset(ids) for name, ids in more.items()}
+        found = more.copy()
         stored = {name: replace(facts.properties[name], stored=ids) for name, ids in found.items()}
         now = replace(facts, properties={**facts.properties, **stored})
-        for _, moment, lets in substeps(passes):
+        for _, moment in substeps(passes):
             for write in (write for rule in moment.rules for write in writes_of(rule) if write.field in more):
-                reached = more[write.field]
-                if write.mask is None or write.offset != HERE:
-                    reached.update(facts.ids)
-                    continue
                 for number in facts.ids:
-                    here = (member(ELEMENT_HERE, (number,)), HERE)
-                    if number not in reached and satisfiable(now, [here, (write.mask, HERE)], lets):
-                        reached.add(number)
+                    question = (member(ELEMENT_HERE, (number,)), write.offset), (write.mask, HERE)
+                    if number not in more[write.field] and satisfiable(now, question, moment.values):
+                        more[write.field] |= {number}
     return found
 
 
 def without_dead_overrides(passes: tuple[Pass, ...], dead: frozenset[str]) -> tuple[Pass, ...]:
     """The passes without assignments to properties that no cell can come to override: there is no place for them."""
-    if not dead:
-        return passes
-    return tuple(
-        replace(
-            pass_,
-            moments=tuple(
-                replace(
-                    moment,
-                    rules=tuple(r for r in moment.rules if not (isinstance(r, Assign) and r.field in dead)),
-                )
-                for moment in pass_.moments
-            ),
-        )
-        for pass_ in passes
+
+    def alive(moment: Moment) -> Moment:
+        rules = [r for r in moment.rules if not (isinstance(r, Assign) and r.field in dead)]
+        return replace(moment, rules=tuple(rules))
+
+    return (
+        tuple(replace(pass_, moments=tuple(map(alive, pass_.moments))) for pass_ in passes)
+        if dead
+        else passes
     )
 
 
 def produced_ids(passes: tuple[Pass, ...], facts: Facts) -> frozenset[int]:
     """The ids that some rule may bring about."""
     found: set[int] = set()
-    for _, moment, _ in substeps(passes):
-        for rule in moment.rules:
-            made = rule.target if isinstance(rule, Transform) else None
-            target = rule.leaving if isinstance(rule, Move) else made
-            if target is not None:
+    for _, moment in substeps(passes):
+        for target in (made for rule in moment.rules for made in _brings(rule).values()):
+            if target.op not in ("element", "look"):
                 found |= {target.value} if target.op == "const" else set(facts.ids)
     return frozenset(found)

@@ -8,17 +8,15 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any, NamedTuple, TypeVar
 
 from powderdsl.model.operations import OPERATIONS, Bounds
-from powderdsl.model.types import FLAG, Assign, Expr, Field, Moment, Offset, Pass, Property, Rule
+from powderdsl.model.types import FLAG, HERE, Expr, Field, Offset, Property, plus
 
-HERE: Offset = (0, 0)
-
-Key = tuple[str, object, Offset]
+Variable = tuple[str, object, Offset]
 """A variable: what it is, the name or expression, and the place."""
 Lets = dict[str, Expr]
 """Values of a substep by name."""
@@ -106,7 +104,21 @@ def some(answers: Iterable[bool | None]) -> bool | None:
     return None if undecided else False
 
 
-def alone(facts: Facts, condition: Expr, lets: Lets) -> dict[Key, frozenset[object]]:
+Key = TypeVar("Key", bound=Hashable)
+
+
+class Answers(dict[Key, bool | None]):
+    """Whether the answer is yes for one of the copies that each rule has; None if none is, and one is not known."""
+
+    def add(self, rule: Key, answer: bool | None) -> None:
+        self[rule] = some((self.get(rule, False), answer))
+
+    def where(self, answer: bool | None) -> list[Key]:
+        """The rules with this answer."""
+        return [rule for rule, known in self.items() if known is answer]
+
+
+def alone(facts: Facts, condition: Expr, lets: Lets) -> dict[Variable, frozenset[object]]:
     """What a condition leaves of variables that parts of it decide alone: an element, a field, a count at a place."""
     return _ask(facts, [(condition, HERE)], lets, _Search.alone) or {}
 
@@ -148,7 +160,7 @@ def _contradict(conditions: Conditions) -> bool:
         elif expr.op == "not":
             waiting.append((expr.args[0], at, not holds))
         elif expr.op == "look":
-            waiting.append((expr.args[0], _plus(at, expr.value), holds))
+            waiting.append((expr.args[0], plus(at, expr.value), holds))
         elif expr.op == ("and" if holds else "or"):
             waiting += [(arg, at, holds) for arg in expr.args]
     return False
@@ -180,7 +192,7 @@ class _Search:
         self._conditions: list[tuple[Expr, Offset]] = []
         for condition, at in conditions:
             self._split(self._resolve(condition)[0], at)
-        self._numbers: dict[Key, int] = {}
+        self._numbers: dict[Variable, int] = {}
         self._domains: dict[int, list[Any]] = {}
         self._cuts: dict[object, set[float]] = {}
         """Constants that the draws of each stream are compared with: between two of them all draws are alike."""
@@ -212,7 +224,7 @@ class _Search:
             for arg in condition.args:
                 self._split(arg, at)
         elif condition.op == "look":
-            self._split(condition.args[0], _plus(at, condition.value))
+            self._split(condition.args[0], plus(at, condition.value))
         else:
             self._conditions.append((condition, at))
 
@@ -225,7 +237,7 @@ class _Search:
         keys = dict.fromkeys(key for term, _ in joint for key in term.keys)
         return self._assign(sorted(keys, key=lambda key: len(self._domains[key])), 0, joint)
 
-    def alone(self) -> dict[Key, frozenset[object]] | None:
+    def alone(self) -> dict[Variable, frozenset[object]] | None:
         """The values that conditions on one variable leave of it, draws left out; None if one leaves nothing."""
         if self._narrow() is None:
             return None
@@ -320,7 +332,7 @@ class _Search:
             case "const":
                 return _Term("const", node)
             case "look":
-                return self._term(node.args[0], _plus(at, node.value))
+                return self._term(node.args[0], plus(at, node.value))
             case "element":
                 return self._variable(node, "element", None, at)
             case "draw":
@@ -448,10 +460,6 @@ def _evaluated(node: Expr, args: list[Any]) -> Any:
     return evaluate(*args) if node.value is None else evaluate(*args, node.value)
 
 
-def _plus(at: Offset, offset: Offset) -> Offset:
-    return (at[0] + offset[0], at[1] + offset[1])
-
-
 _FLOATS = ("real", "vec2", "chance")
 
 
@@ -467,15 +475,3 @@ def _is_opaque(node: Expr) -> bool:
     if OPERATIONS[op].evaluate is None:
         raise _Unknown
     return False
-
-
-def substeps(passes: Iterable[Pass]) -> Iterator[tuple[Pass, Moment, Lets]]:
-    """The substeps of some passes with the values that `let` fixes in each."""
-    for pass_ in passes:
-        for moment in pass_.moments:
-            yield pass_, moment, {let.name: let.value for let in moment.lets}
-
-
-def writes_of(rule: Rule) -> tuple[Assign, ...]:
-    """The assignments that a rule is or has."""
-    return (rule,) if isinstance(rule, Assign) else rule.effects

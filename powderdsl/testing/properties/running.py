@@ -188,7 +188,7 @@ def _marked_pass(pass_: Pass, names: Mapping[Span, str]) -> Pass:
             if isinstance(rule, Assign):
                 rules += [rule, Assign(name, (0, 0), ":=", TRUE, rule.mask, rule.span)]
             else:
-                effect = Assign(name, (0, 0), ":=", TRUE, None, rule.span)
+                effect = Assign(name, (0, 0), ":=", TRUE, TRUE, rule.span)
                 rules.append(replace(rule, effects=(*rule.effects, effect)))
         moments.append(replace(moment, rules=tuple(rules)))
     return replace(pass_, moments=tuple(moments))
