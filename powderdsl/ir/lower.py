@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial, reduce
+from itertools import starmap
 from math import ceil, floor, pi
 
 from powderdsl.analysis.changes import facts_of
@@ -28,17 +29,19 @@ from powderdsl.ir.ops import (
 from powderdsl.ir.single import single
 from powderdsl.model.logic.satisfy import Budget, satisfiable
 from powderdsl.model.operations import OPERATIONS
-from powderdsl.model.state import scratch_slots, slots
+from powderdsl.model.state import Slot, scratch_slots, slots
 from powderdsl.model.types import (
     HERE,
     Assign,
     Expr,
+    Kernel,
     Kind,
     Moment,
     Move,
     Offset,
     Pass,
     Property,
+    Rule,
     Ruleset,
     Swap,
     Transform,
@@ -64,17 +67,17 @@ ROUNDER = 12582912.0
 
 @dataclass
 class Inputs:
-    """What expressions read: the current node of each slot, and lets."""
+    """What expressions read: the current node of each slot, and under ``let NAME`` of each value that `let` has fixed."""
 
     ruleset: Ruleset
     build: Builder
     state: dict[str, Node]
-    lets: dict[str, Parts]
     threshold: Threshold | None = None
     """Chances are the number of draws below them if this is given, else floats."""
 
-    def with_threshold(self, threshold: Threshold | None) -> Inputs:
-        return Inputs(self.ruleset, self.build, self.state, self.lets, threshold)
+    def stream(self, name: str) -> tuple[str, int]:
+        """A stream and the bits of its draws."""
+        return name, next(stream.bits for stream in self.ruleset.streams if stream.name == name)
 
     def constant(self, value: Value | str, kind: Kind) -> Node:
         """A constant of a kind; a text names a parameter."""
@@ -117,14 +120,56 @@ class Inputs:
 def lower_expression(expr: Expr, at: Inputs) -> Parts:
     """The nodes of a checked expression.
 
-    What has no code in `_LOWER` is an operation of the IR, as its row says, of numbers or of both parts of vectors.
+    What has no case is an operation of the IR, as its row says, of numbers or of both parts of vectors.
     """
-    if expr.op in _LOWER:
-        value = _LOWER[expr.op](expr, at)
-        return (value,) if isinstance(value, Node) else value
-    name = OPERATIONS[expr.op].lowers or expr.op
+    build, value = at.build, expr.value
+    match expr.op:
+        case "const" | "param":
+            return (at.constant(value, expr.kind),)
+        case "element":
+            return (at.state["element"],)
+        case "property":
+            prop = at.ruleset.property(value)
+            assert prop is not None
+            return (at.state[value] if prop.stored else at.property_of(prop, at.state["element"]),)
+        case "field" | "let":
+            name = value if expr.op == "field" else f"let {value}"
+            return tuple([at.state[part] for part in part_names(name, expr.kind)])
+        case "draw":
+            return (build.derive("draw", attr=at.stream(value)),)
+        case "coordinate":
+            return (build.make("coordinate", ir_type(expr.kind), attr=value),)
+        case "lt" if any(arg.kind.name == "draw" for arg in expr.args):
+            return (_lt_draw(expr, at),)
+        case "to_real":
+            at = replace(at, threshold=None)
     args = [lower_expression(arg, at) for arg in expr.args]
-    return _each(partial(at.build.derive, name, attr=expr.value), *args)
+    match expr.op, args:
+        case "look", (parts,):
+            return tuple([build.shift(part, value) for part in parts])
+        case "eq", ((a,), (b,)) if a.type == FLAG:
+            return (build.not_(build.derive("xor", a, b)),)
+        case "to_real", ((a,),):
+            return (build.to_real(a),)
+        case "count", ((flag,),):
+            return (build.derive("count", flag, attr=(value.weights, value.wrap)),)
+        case "sum", (parts,):
+            return tuple([_sum(build, value, part) for part in parts])
+        case "octant", ((y, x),):
+            return (_octant(build, y, x),)
+        case "opposite" | "clockwise", ((direction,),):
+            eighths = build.integer(4 if expr.op == "opposite" else 2)
+            return (build.derive("mod", build.derive("add", direction, eighths), attr=8),)
+        case "sin" | "cos", ((x,),):
+            return (_wave(build, x, expr.op == "cos"),)
+        case "length", ((y, x),):
+            return (_length(build, y, x),)
+        case ("row_part", ((part, _),)) | ("column_part", ((_, part),)):
+            return (part,)
+        case "vector", ((y,), (x,)):
+            return y, x
+    name = OPERATIONS[expr.op].lowers or expr.op
+    return _each(partial(build.derive, name, attr=value), *args)
 
 
 def node(expr: Expr, at: Inputs) -> Node:
@@ -145,23 +190,6 @@ def _real(build: Builder, value: float | Fraction) -> Node:
     return build.real(single(float(value)))
 
 
-def _property(expr: Expr, at: Inputs) -> Node:
-    prop = at.ruleset.property(str(expr.value))
-    assert prop is not None
-    return at.state[prop.name] if prop.stored else at.property_of(prop, at.state["element"])
-
-
-def _look(expr: Expr, at: Inputs) -> Parts:
-    return _each(lambda part: at.build.shift(part, expr.value), lower_expression(expr.args[0], at))
-
-
-def _eq(expr: Expr, at: Inputs) -> Node:
-    a, b = (node(arg, at) for arg in expr.args)
-    if a.type == FLAG:
-        return at.build.not_(at.build.derive("xor", a, b))
-    return at.build.derive("eq", a, b)
-
-
 # Draws
 
 
@@ -172,92 +200,75 @@ def draws_below(chance: Fraction | float, threshold: Threshold) -> int:
     return min(max(count, 0), 1 << threshold.bits)
 
 
-def _stream(name: str, at: Inputs) -> tuple[str, int]:
-    """A stream and the bits of its draws."""
-    return name, next(stream.bits for stream in at.ruleset.streams if stream.name == name)
-
-
-def _split_draw(expr: Expr, at: Inputs) -> tuple[tuple[str, int], Offset, Node | None]:
+def _split_draw(expr: Expr, at: Inputs) -> tuple[tuple[str, int], Offset, Node]:
     """A draw as its stream, the offset at which it is read, and the integer that is added to it."""
     build = at.build
     if expr.op == "draw":
-        return _stream(expr.value, at), (0, 0), None
+        return at.stream(expr.value), (0, 0), build.integer(0)
     if expr.op == "look":
         stream, (dy, dx), extra = _split_draw(expr.args[0], at)
         oy, ox = expr.value
-        return stream, (dy + oy, dx + ox), build.shift(extra, (oy, ox)) if extra else None
+        return stream, (dy + oy, dx + ox), build.shift(extra, (oy, ox))
     draw, number = sorted(expr.args, key=lambda arg: arg.kind.name != "draw")
     stream, offset, extra = _split_draw(draw, at)
     other = node(number, at)
-    other = build.derive("neg", other) if expr.op == "sub" else other
-    return stream, offset, build.derive("add", extra, other) if extra else other
+    return (
+        stream,
+        offset,
+        build.derive("add", extra, build.derive("neg", other) if expr.op == "sub" else other),
+    )
 
 
-def _lt(expr: Expr, at: Inputs) -> Node:
-    left, right = expr.args
+def _lt_draw(expr: Expr, at: Inputs) -> Node:
+    """draw + extra < other, or other < draw + extra, which is the opposite of draw + extra <= other."""
     build = at.build
-    if "draw" not in (left.kind.name, right.kind.name):
-        return build.derive("lt", node(left, at), node(right, at))
-    # draw + extra < other, or other < draw + extra, which is the opposite of draw + extra <= other
-    flipped = right.kind.name == "draw"
-    draw, other = (right, left) if flipped else (left, right)
+    draw, other = sorted(expr.args, key=lambda arg: arg.kind.name != "draw")
+    flipped = draw is not expr.args[0]
     stream, offset, extra = _split_draw(draw, at)
     threshold = Threshold(stream[1], strict=not flipped)
+    base, limit = build.integer(0), build.integer(0)
     if other.kind.name == "int":
-        limit = node(other, at)
-        result = build.derive("lt", extra or build.integer(0), limit)
-        return build.not_(result) if flipped else result
-    base = floor(other.value) if other.op == "const" else 0
-    if other.op == "const":
-        limit = build.integer(draws_below(other.value - base, threshold))
+        base = node(other, at)
+    elif other.op == "const":
+        base = build.integer(floor(other.value))
+        limit = build.integer(draws_below(other.value - floor(other.value), threshold))
     else:
-        limit = node(other, at.with_threshold(threshold))
+        limit = node(other, replace(at, threshold=threshold))
     there = build.shift(limit, (-offset[0], -offset[1]))
     part = build.shift(build.derive("below", there, attr=stream), offset)
-    if extra is None:
-        result = part if base == 0 else build.flag(base > 0)
-    else:
-        bound = build.integer(base)
-        less = build.derive("lt", extra, bound)
-        result = build.or_(less, build.and_(build.derive("eq", extra, bound), part))
+    less, same = build.derive("lt", extra, base), build.derive("eq", extra, base)
+    result = build.or_(less, build.and_(same, part))
     return build.not_(result) if flipped else result
 
 
 # Neighborhoods and vectors
 
 
-def _sum(expr: Expr, at: Inputs) -> Parts:
+def _sum(build: Builder, kernel: Kernel, value: Node) -> Node:
     """The weighted sum, each row from the left, then the rows from the top. Equal rows are summed once and shifted."""
-    build, kernel = at.build, expr.value
 
-    def weighted(value: Node, dx: int, weight: int) -> Node:
+    def weighted(dx: int, weight: int) -> Node:
         term = build.shift(value, (0, dx), kernel.wrap)
         return term if weight == 1 else build.derive("mul", term, build.const(weight, value.type))
 
-    def total(value: Node) -> Node:
-        if not kernel.weights:
-            return build.const(0, value.type)
-        rows = (
-            build.shift(reduce(add, (weighted(value, *cell) for cell in cells)), (dy, 0), kernel.wrap)
-            for dy, cells in kernel_rows(kernel.weights).items()
-        )
-        return reduce(add, rows)
-
+    if not kernel.weights:
+        return build.const(0, value.type)
     add = partial(build.derive, "add")
-    return _each(total, lower_expression(expr.args[0], at))
+    rows = kernel_rows(kernel.weights).items()
+    return reduce(
+        add, (build.shift(reduce(add, starmap(weighted, row)), (dy, 0), kernel.wrap) for dy, row in rows)
+    )
 
 
-def _length(expr: Expr, at: Inputs) -> Node:
-    derive = at.build.derive
-    y, x = lower_expression(expr.args[0], at)
-    return derive("sqrt", derive("add", derive("mul", y, y), derive("mul", x, x)))
+def _length(build: Builder, y: Node, x: Node) -> Node:
+    add, mul = (partial(build.derive, op) for op in ("add", "mul"))
+    return build.derive("sqrt", add(mul(y, y), mul(x, x)))
 
 
-def _octant(expr: Expr, at: Inputs) -> Node:
+def _octant(build: Builder, y: Node, x: Node) -> Node:
     """The octant, by comparing x with the borders of the octants at this length."""
-    build, derive = at.build, at.build.derive
-    y, x = lower_expression(expr.args[0], at)
-    reach = derive("add", _length(expr, at), _real(build, 0.001))
+    derive = build.derive
+    reach = derive("add", _length(build, y, x), _real(build, 0.001))
     near, far = (derive("mul", _real(build, border), reach) for border in (NEAR, FAR))
     up = derive("lt", y, build.real(0.0))
     result = build.integer(4)
@@ -268,15 +279,8 @@ def _octant(expr: Expr, at: Inputs) -> Node:
     return result
 
 
-def _turned(eighths: int) -> Callable[[Expr, Inputs], Node]:
-    return lambda expr, at: at.build.derive(
-        "mod", at.build.derive("add", node(expr.args[0], at), at.build.integer(eighths)), attr=8
-    )
-
-
-def _wave(expr: Expr, at: Inputs) -> Node:
+def _wave(build: Builder, x: Node, cosine: bool) -> Node:
     """A sine or cosine: π/2 is taken off in three parts, then follows a series. See `model.reference` for each step."""
-    build, x = at.build, node(expr.args[0], at)
     real = partial(_real, build)
     add, sub, mul, lt = (partial(build.derive, op) for op in ("add", "sub", "mul", "lt"))
 
@@ -300,41 +304,14 @@ def _wave(expr: Expr, at: Inputs) -> Node:
     rising = add(rest, add(small, mul(rest, mul(z, series(SINE)))))
     level = sub(real(1.0), add(mul(real(0.5), z), sub(mul(rest, small), mul(mul(z, z), series(COSINE)))))
     odd = build.or_(between(0.5, 1.5), lt(real(2.5), turn))
-    is_cosine = expr.op == "cos"
-    down = between(0.5, 2.5) if is_cosine else lt(real(1.5), turn)
-    value = build.select(odd, rising, level) if is_cosine else build.select(odd, level, rising)
+    down = between(0.5, 2.5) if cosine else lt(real(1.5), turn)
+    value = build.select(odd, rising, level) if cosine else build.select(odd, level, rising)
     return build.select(down, build.derive("neg", value), value)
 
 
-_LOWER: dict[str, Callable[[Expr, Inputs], Node | Parts]] = {
-    **dict.fromkeys(("const", "param"), lambda e, at: at.constant(e.value, e.kind)),
-    "element": lambda e, at: at.state["element"],
-    "property": _property,
-    "field": lambda e, at: tuple([at.state[name] for name in part_names(e.value, e.kind)]),
-    "let": lambda e, at: at.lets[e.value],
-    "draw": lambda e, at: at.build.derive("draw", attr=_stream(e.value, at)),
-    "coordinate": lambda e, at: at.build.make("coordinate", ir_type(e.kind), attr=e.value),
-    "look": _look,
-    "eq": _eq,
-    "lt": _lt,
-    "to_real": lambda e, at: at.build.to_real(node(e.args[0], at.with_threshold(None))),
-    "count": lambda e, at: at.build.derive(
-        "count", node(e.args[0], at), attr=(e.value.weights, e.value.wrap)
-    ),
-    "sum": _sum,
-    "octant": _octant,
-    "opposite": _turned(4),
-    "clockwise": _turned(2),
-    **dict.fromkeys(("sin", "cos"), _wave),
-    "length": _length,
-    "row_part": lambda e, at: lower_expression(e.args[0], at)[0],
-    "column_part": lambda e, at: lower_expression(e.args[0], at)[1],
-    "vector": lambda e, at: (node(e.args[0], at), node(e.args[1], at)),
-}
-"""Operations of the model that are more than one of the IR."""
-
-
 Mover = Transform | Swap | Move
+Claim = tuple[Rule, Node]
+"""A rule and the cells in which it happens."""
 
 LIVE_BUDGET = 100_000
 """Nodes evaluated to find rules that no world lets happen, a tenth of a second. After that every rule stays."""
@@ -353,15 +330,19 @@ def ir_type(kind: Kind, ids: int = 256) -> Type:
     return types.get(kind.name) or integer(int(kind.lo), int(kind.hi))
 
 
+def slot_parts(slot: Slot, ruleset: Ruleset) -> tuple[SlotType, ...]:
+    """The IR slots of a state array: see `part_names`."""
+    type, names = ir_type(slot.kind, ruleset.slots), part_names(slot.name, slot.kind)
+    if len(names) == 1:
+        return (SlotType(slot.name, type, slot.default, slot.resets, slot.name),)
+    return tuple([
+        SlotType(name, type, slot.default[i], slot.resets, slot.name, i) for i, name in enumerate(names)
+    ])  # fmt: skip
+
+
 def lower_ruleset(ruleset: Ruleset) -> Program:
     """All passes of a ruleset, one graph each."""
-    slot_types = []
-    for slot in slots(ruleset):
-        names = part_names(slot.name, slot.kind)
-        for i, name in enumerate(names):
-            default = slot.default[i] if isinstance(slot.default, tuple) else slot.default
-            type, component = ir_type(slot.kind, ruleset.slots), i if len(names) > 1 else None
-            slot_types.append(SlotType(name, type, default, slot.resets, slot.name, component))
+    slot_types = [part for slot in slots(ruleset) for part in slot_parts(slot, ruleset)]
     # The range of a slot that starts each step at its default grows from pass to pass.
     ranges = {
         s.name: integer(int(s.default), int(s.default))
@@ -407,82 +388,80 @@ def lower_substep(ruleset: Ruleset, pass_: Pass, number: int, graph: Graph) -> d
     that this substep fixes are among the results.
     """
     lowering = _PassLowering(ruleset, pass_, graph)
-    for moment in pass_.moments[:number]:
-        for let in moment.lets:
-            type = ir_type(let.value.kind, ruleset.slots)
-            names = [f"let {name}" for name in part_names(let.name, let.value.kind)]
-            lowering.lets[let.name] = tuple([lowering.build.input(name, type) for name in names])
+    for let in (let for moment in pass_.moments[:number] for let in moment.lets):
+        type = ir_type(let.value.kind, ruleset.slots)
+        for name in part_names(f"let {let.name}", let.value.kind):
+            lowering.state[name] = lowering.build.input(name, type)
     before = dict(lowering.state)
-    moment = pass_.moments[number]
-    lowering.substep(moment)
-    changed = {name: node for name, node in lowering.state.items() if before[name] is not node}
-    for let in moment.lets:
-        names = [f"let {name}" for name in part_names(let.name, let.value.kind)]
-        changed |= zip(names, lowering.lets[let.name], strict=True)
-    return changed
+    lowering.substep(pass_.moments[number])
+    return {name: node for name, node in lowering.state.items() if before.get(name) is not node}
 
 
 class _PassLowering:
-    """Lowers one pass: keeps the current node of every slot, and the values of lets."""
+    """Lowers one pass: keeps the current node of every slot and let."""
 
     def __init__(self, ruleset: Ruleset, pass_: Pass, graph: Graph, ranges: Mapping[str, Type] | None = None):
         self.ruleset, self.pass_ = ruleset, pass_
         self.build = Builder(graph)
-        self.slots = {slot.name: slot for slot in slots(ruleset)} | scratch_slots(pass_)
+        self.scratch = scratch_slots(pass_)
+        self.slots = {slot.name: slot for slot in slots(ruleset)} | self.scratch
         """The state's arrays, and scratch fields."""
+        self.parts = [(slot, part) for slot in self.slots.values() for part in slot_parts(slot, ruleset)]
+        self.travelling = [part.name for slot, part in self.parts if slot.travels]
         self.state: dict[str, Node] = {}
-        for slot in self.slots.values():
-            type = ir_type(slot.kind, ruleset.slots)
-            for name in part_names(slot.name, slot.kind):
-                self.state[name] = self.build.input(name, (ranges or {}).get(name, type))
-        self.lets: dict[str, Parts] = {}
+        for _, part in self.parts:
+            self.state[part.name] = self.build.input(part.name, (ranges or {}).get(part.name, part.type))
 
     def lower(self) -> PassGraph:
         build, before = self.build, dict(self.state)
-        for slot in scratch_slots(self.pass_).values():
-            # The number nearest to zero: the same in both components of a vector.
-            default = slot.default[0] if isinstance(slot.default, tuple) else slot.default
-            for name in part_names(slot.name, slot.kind):
-                self.state[name] = build.const(default, before[name].type)
-        substeps = tuple([self.substep(moment) for moment in self.pass_.moments])
+        for slot, part in self.parts:
+            if slot.name in self.scratch:
+                self.state[part.name] = build.const(part.default, part.type)
+        substeps = tuple(map(self.substep, self.pass_.moments))
         outputs = []
-        for slot in slots(self.ruleset):
-            for name in part_names(slot.name, slot.kind):
-                last = self.state[name]
-                if last is not before[name]:
-                    limits = (float(slot.kind.lo), float(slot.kind.hi))
-                    outputs.append(
-                        (name, build.derive("settle", last, attr=limits) if slot.is_real else last)
-                    )
+        for slot, part in self.parts:
+            last = self.state[part.name]
+            if slot.name not in self.scratch and last is not before[part.name]:
+                limits = (float(slot.kind.lo), float(slot.kind.hi))
+                outputs.append(
+                    (part.name, build.derive("settle", last, attr=limits) if slot.is_real else last)
+                )
         return PassGraph(self.pass_.name, self.pass_.pack, substeps, tuple(outputs))
 
     def inputs(self) -> Inputs:
-        return Inputs(self.ruleset, self.build, dict(self.state), self.lets)
+        return Inputs(self.ruleset, self.build, dict(self.state))
 
     def substep(self, moment: Moment) -> SubstepGraph:
-        build = self.build
         place = next((f"{r.span.source.name}:{r.span.line}" for r in moment.rules), "")
-        build.place = place
+        self.build.place = place
         for let in moment.lets:
-            self.lets[let.name] = lower_expression(let.value, self.inputs())
+            names = part_names(f"let {let.name}", let.value.kind)
+            self.state |= zip(names, lower_expression(let.value, self.inputs()), strict=True)
         at = self.inputs()
-        masks = {id(rule): node(rule.mask, at) for rule in moment.rules}
-        movers: list[Mover] = [rule for rule in moment.rules if not isinstance(rule, Assign)]
+        claims: list[Claim] = [(rule, node(rule.mask, at)) for rule in moment.rules]
         if moment.policy in ("drop_both", "first_wins"):
-            self._apply_policy(moment.policy, movers, masks)
-        writes = [(rule, masks[id(rule)]) for rule in moment.rules if isinstance(rule, Assign)]
-        effects = [(effect, masks[id(rule)]) for rule in movers for effect in rule.effects]
-        values = {id(write): lower_expression(write.value, at) for write, _ in (*writes, *effects)}
+            claims = self._apart(claims, moment.policy)
+        movers = [(rule, mask) for rule, mask in claims if not isinstance(rule, Assign)]
+        writes = [
+            (rule, mask, lower_expression(rule.value, at))
+            for rule, mask in claims
+            if isinstance(rule, Assign)
+        ]
+        effects = [
+            (effect, mask, lower_expression(effect.value, at))
+            for rule, mask in movers
+            for effect in rule.effects
+        ]
         before = dict(self.state)
-        for write, mask in writes:
-            self._assign(write, values[id(write)], mask)
-        self._move(movers, masks, at, moment.policy)
-        for write, mask in effects:
-            self._assign(write, values[id(write)], mask)
+        for write in writes:
+            self._assign(*write)
+        self._move(movers, at, moment.policy)
+        for effect in effects:
+            self._assign(*effect)
         changed = tuple((name, new) for name, new in self.state.items() if before[name] is not new)
-        return SubstepGraph(moment.label, place, changed, tuple(masks.values()))
+        return SubstepGraph(moment.label, place, changed, tuple(mask for _, mask in claims))
 
-    def _assign(self, write: Assign, value: Parts, mask: Node) -> None:
+    def _assign(self, write: Assign, mask: Node, value: Parts) -> None:
         """`field op value` at an offset from each cell of the mask, read from the target's side."""
         build = self.build
         slot = self.slots[write.field]
@@ -499,88 +478,77 @@ class _PassLowering:
                 new = build.clamp(new, int(slot.kind.lo), int(slot.kind.hi))
             self.state[name] = build.select(mask, new, old)
 
-    def _move(self, movers: list[Mover], masks: dict[int, Node], at: Inputs, policy: str) -> None:
+    def _move(self, movers: Sequence[tuple[Mover, Node]], at: Inputs, policy: str) -> None:
         """Transforms and what moves leave behind first, then arrivals, all from the world before.
 
         Without a policy that keeps them apart, a cell may take part in several exchanges. They are then not swaps, of
         which each cell belongs to one at most: movers take what their targets held, and what they held arrives there.
         """
-        build = self.build
-        before = dict(self.state)
-        travelling = [
-            name for slot in self.slots.values() if slot.travels for name in part_names(slot.name, slot.kind)
-        ]
-        for rule in movers:
+        build, state = self.build, self.state
+        before = dict(state)
+        for rule, mask in movers:
             if isinstance(rule, Swap):
                 continue
-            target = rule.target if isinstance(rule, Transform) else rule.leaving
-            left = (
-                {name: build.shift(before[name], rule.offset) for name in travelling}
-                if target is None and isinstance(rule, Move)
-                else self._fresh(node(target, at))  # type: ignore[arg-type]  # only moves may have none
-            )
+            element = rule.target if isinstance(rule, Transform) else rule.leaving
+            if element is not None:
+                left = self._fresh(node(element, at), at)
+            else:
+                left = {name: build.shift(before[name], rule.offset) for name in self.travelling}  # type: ignore[union-attr]  # only moves have none
             for name, value in left.items():
-                self.state[name] = build.select(masks[id(rule)], value, self.state[name])
-        for rule in movers:
+                state[name] = build.select(mask, value, state[name])
+        for rule, mask in movers:
             if isinstance(rule, Transform):
                 continue
             swaps = isinstance(rule, Swap)
             op = "swap" if swaps and policy != "overwrite" else "arrive"
-            for name in travelling:
-                mask, rest = masks[id(rule)], self.state[name]
-                moved = build.derive(op, before[name], mask, rest, attr=rule.offset)
+            for name in self.travelling:
+                state[name] = build.derive(op, before[name], mask, state[name], attr=rule.offset)
                 if swaps and op == "arrive":
-                    moved = build.select(mask, build.shift(before[name], rule.offset), moved)
-                self.state[name] = moved
+                    state[name] = build.select(mask, build.shift(before[name], rule.offset), state[name])
 
-    def _fresh(self, element: Node) -> dict[str, Node]:
+    def _fresh(self, element: Node, at: Inputs) -> dict[str, Node]:
         """What a new cell of an element holds."""
-        build = self.build
-        at = self.inputs()
-        found = {"element": element}
-        for slot in self.slots.values():
+        build, fresh = self.build, {"element": element}
+        for slot, part in self.parts:
             if not slot.travels or slot.name == "element":
                 continue
             prop = self.ruleset.property(slot.name)
             if prop is not None:
-                found[slot.name] = at.property_of(prop, element)
+                fresh[slot.name] = at.property_of(prop, element)
                 continue
-            defaults = slot.default if isinstance(slot.default, tuple) else (slot.default,)
-            type = ir_type(slot.kind, self.ruleset.slots)
-            for part, (name, default) in enumerate(
-                zip(part_names(slot.name, slot.kind), defaults, strict=True)
-            ):
-                values = [build.const(default, type)] * self.ruleset.slots
-                for identity, own in slot.own:
-                    values[identity] = build.const(own[part] if isinstance(own, tuple) else own, type)
-                found[name] = at.by_element(element, values)
-        return found
+            values = [build.const(part.default, part.type)] * self.ruleset.slots
+            for identity, own in slot.own:
+                values[identity] = build.const(
+                    own if part.component is None else own[part.component], part.type
+                )
+            fresh[part.name] = at.by_element(element, values)
+        return fresh
 
-    def _apply_policy(self, policy: str, movers: list[Mover], masks: dict[int, Node]) -> None:
-        """Narrow the masks so that no two rules claim one cell."""
+    def _apart(self, claims: Sequence[Claim], policy: str) -> list[Claim]:
+        """Narrow the masks of movers so that no two claim one cell."""
         build = self.build
-        wanted = {id(rule): masks[id(rule)] for rule in movers}
 
-        def reach(rule: Mover, cells: Node, way: int) -> Node:
+        def reach(rule: Rule, cells: Node, way: int) -> Node:
             """The cells and their targets, or under -1 these cells and those from where they are targets."""
-            if isinstance(rule, Transform):
-                return cells
-            return build.or_(cells, build.shift(cells, (way * rule.offset[0], way * rule.offset[1])))
+            if isinstance(rule, Swap | Move):
+                return build.or_(cells, build.shift(cells, (way * rule.offset[0], way * rule.offset[1])))
+            return cells
 
+        narrowed: list[Claim] = []
         taken = build.flag(False)
-        for rule in movers:
-            mask = wanted[id(rule)]
+        for rule, mask in claims:
+            if isinstance(rule, Assign):
+                narrowed.append((rule, mask))
+                continue
             if isinstance(rule, Swap) or (isinstance(rule, Move) and rule.leaving is not None):
                 dy, dx = rule.offset
                 chained = build.or_(build.shift(mask, (dy, dx)), build.shift(mask, (-dy, -dx)))
                 mask = build.and_(mask, build.not_(chained))
-            if policy == "drop_both":
-                for other in movers:
-                    if other is not rule:
-                        mask = build.and_(
-                            mask, build.not_(reach(rule, reach(other, wanted[id(other)], -1), 1))
-                        )
-            else:
+            if policy == "first_wins":
                 mask = build.and_(mask, build.not_(reach(rule, taken, 1)))
                 taken = build.or_(taken, reach(rule, mask, -1))
-            masks[id(rule)] = mask
+            for other, wanted in claims if policy == "drop_both" else ():
+                if other is not rule and not isinstance(other, Assign):
+                    mask = build.and_(mask, build.not_(reach(rule, reach(other, wanted, -1), 1)))
+            narrowed.append((rule, mask))
+        return narrowed

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from powderdsl.ir.bits import NotBits, lower_bits
 from powderdsl.ir.lower import Inputs, ir_type, lower_expression, part_names
-from powderdsl.ir.ops import FLAG, Builder, Node, PassGraph, Program, SlotType, Type, component_of
+from powderdsl.ir.ops import FLAG, Builder, PassGraph, Program, SlotType, Type, component_of
 from powderdsl.ir.stages import run_passes
 from powderdsl.model.state import slots
 from powderdsl.model.types import Expr, Ruleset
@@ -204,11 +204,11 @@ def _lowered(ruleset: Ruleset, measures: Sequence[tuple[int, Measure]]) -> Progr
     build = Builder()
     types, regions = _types(ruleset), _lets([measure for _, measure in measures])
     state = {name: build.input(name, type) for name, type in types.items()}
-    lets: dict[str, tuple[Node, ...]] = {name: (build.input(name, FLAG),) for name in regions}
+    state |= {f"let {name}": build.input(name, FLAG) for name in regions}
     outputs = []
     for number, measure in measures:
         assert measure.value is not None
-        (node,) = lower_expression(measure.value, Inputs(ruleset, build, state, lets))
+        (node,) = lower_expression(measure.value, Inputs(ruleset, build, state))
         outputs.append((f"measure {number}", node))
     every = {**types, **dict.fromkeys(regions, FLAG), **{name: node.type for name, node in outputs}}
     rows = [SlotType(name, type, 0, False) for name, type in every.items()]
