@@ -41,23 +41,33 @@ class World:
     """A batch of worlds of one ruleset, as arrays of the simulator's kind: torch tensors, or arrays without torch.
 
     `state` has one array a slot; `seed`, `index` and `step` (int64 [B]) decide the random numbers: the same three
-    give the same future, alone or in any batch.
+    give the same future, alone or in any batch. The step is `since` steps after `start`.
+
+    Raises:
+        ValueError: a seed, index or start that does not fit.
     """
 
     sim: Simulator
     state: Mapping[str, Array]
     seed: Array
     index: Array
-    step: Array
+    start: Array
+    since: int = 0
 
-    if not TYPE_CHECKING:
+    def __post_init__(self) -> None:
+        batch, device = shape_of(self.state)[0], getattr(self.seed, "device", None)
+        for name in ("seed", "index", "start"):
+            array = getattr(self, name)
+            fits = tuple(array.shape) == (batch,) and array.dtype == self.sim.kind.xp.int64
+            if not fits or getattr(array, "device", None) != device:
+                raise ValueError(
+                    f"a world's {name} must be int64 [{batch}], found {array.dtype} {list(array.shape)}"
+                )
 
-        def __getattr__(self, name: str) -> Array:
-            """The step of a world that a simulator has made, counted when it is first read."""
-            clock = self.__dict__.get("_clock")
-            if name != "step" or clock is None:
-                raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-            return self.__dict__.setdefault("step", clock.start + clock.since)
+    @property
+    def step(self) -> Array:
+        """How many steps each world has made: int64 [B]."""
+        return self.start + self.since
 
     @property
     def ids(self) -> Array:
@@ -118,17 +128,21 @@ class World:
         """
         return self.sim.observer.planes(self.state, out)
 
-    def with_state(self, state: Mapping[str, Array]) -> World:
-        """These worlds in another state, at the same step with the same random futures."""
+    def with_state(self, state: Mapping[str, Array], **changes: Any) -> World:
+        """These worlds in another state, at the same step with the same random futures, unless `changes` say others.
+
+        Faster than `dataclasses.replace`, and not checked.
+        """
         world = object.__new__(World)
-        world.__dict__.update(self.__dict__, state=state)
+        world.__dict__.update(self.__dict__, state=state, **changes)
         return world
 
     def select(self, worlds: int | slice | Sequence[int] | Array) -> World:
         """Some worlds of the batch, with their random futures unchanged."""
         keys = [worlds] if isinstance(worlds, int) else worlds
         chosen = {name: value[keys] for name, value in self.state.items()}
-        return replace(self, state=chosen, seed=self.seed[keys], index=self.index[keys], step=self.step[keys])
+        clock = {name: getattr(self, name)[keys] for name in ("seed", "index", "start")}
+        return self.with_state(chosen, **clock)
 
 
 class Simulator:
@@ -384,25 +398,17 @@ class Simulator:
             KeyError: unknown streams, passes or parameters. ValueError: wrong shapes or values.
         """
         self.check(world)
-        steps = _whole_count(steps)
-        draws: Mapping[str, Array] = _NOTHING
-        chosen = None
-        clock = _clock_of(world)
-        batch = clock.seed.shape[0]
-        if params is None:
-            values = self._defaults(batch)
-        else:
-            values = self._parameters(given_mapping("params", params), batch)
-        if random is not None:
-            draws = self._draws(given_mapping("random", random), world)
-        if passes is not None:
-            chosen = self._chosen(passes)
+        steps, batch = _whole_count(steps), world.seed.shape[0]
+        values = self._defaults(batch) if params is None else self._parameters(params, batch)
+        draws = self._draws(random, world) if random is not None else {}
+        chosen = self._chosen(passes) if passes is not None else None
+        clock = Clock(world.seed, world.index, world.start, world.since)
         state = self._program.run(Job(world.state, clock, steps, values, draws, chosen, reuse))
         # Made without the calls that a frozen dataclass takes.
         after = object.__new__(World)
         known = after.__dict__
-        known["sim"], known["state"], known["seed"], known["index"] = self, state, clock.seed, clock.world
-        known["_clock"] = Clock(clock.seed, clock.world, clock.start, clock.since + steps)
+        known.update(world.__dict__)
+        known["sim"], known["state"], known["since"] = self, state, world.since + steps
         return after
 
     def _chosen(self, passes: Sequence[str]) -> frozenset[str]:
@@ -428,7 +434,7 @@ class Simulator:
         """Given draws as integers k below 2^bits, which stand for (k + ½) / 2^bits: int64 [B, H, W]."""
         bits = {stream.name: stream.bits for stream in self.ruleset.streams}
         draws, xp = {}, self.kind.xp
-        for name, value in random.items():
+        for name, value in given_mapping("random", random).items():
             if name not in bits:
                 raise unknown_name("stream", name, bits)
             given = self._shaped(value, f"random[{name!r}]", world.shape)
@@ -448,7 +454,7 @@ class Simulator:
 
     def _parameters(self, given: Mapping[str, Any], batch: int) -> Mapping[str, Array]:
         values, known = self._defaults(batch), {param.name: param for param in self.ruleset.params}
-        for name, value in given.items():
+        for name, value in given_mapping("params", given).items():
             if name not in known:
                 raise unknown_name("parameter", name, known)
             values = {**values, name: checked_parameter(self.kind, value, known[name], batch)}
@@ -459,12 +465,11 @@ class Simulator:
 
         Native code counts processor time on one thread.
         """
-        clock, params = PassClock(self.device), self._defaults(len(world))
-        self._program.run(
-            Job(world.state, _clock_of(world), _whole_count(steps), params, {}, None, timing=clock)
-        )
-        known = [name for name in self.passes if name in clock.seconds]
-        return {name: clock.seconds[name] for name in self.passes} if known else {}
+        timing, params = PassClock(self.device), self._defaults(len(world))
+        clock = Clock(world.seed, world.index, world.start, world.since)
+        self._program.run(Job(world.state, clock, _whole_count(steps), params, {}, None, timing=timing))
+        known = [name for name in self.passes if name in timing.seconds]
+        return {name: timing.seconds[name] for name in self.passes} if known else {}
 
 
 def compile(
@@ -494,30 +499,6 @@ def compile(
     if not isinstance(model, Ruleset):
         raise TypeError(f"ruleset must be a Ruleset or a name, found {type(model).__name__}")
     return Simulator(model, backend, device, threads, tensors=tensors, memo=memo)
-
-
-_NOTHING: Mapping[str, Array] = {}
-
-
-def _clock_of(world: World) -> Clock:
-    """What decides the random numbers of a world's next step. Raises ValueError for arrays that do not fit.
-
-    `step` is computed lazily. Once somebody has read it, it counts: they may have modified it in place.
-    """
-    known = world.__dict__
-    clock: Clock | None = known.get("_clock")
-    if clock is not None and "step" not in known:
-        return clock
-    kind, batch = world.sim.kind, shape_of(world.state)[0]
-    device = getattr(world.seed, "device", None)
-    for name in ("seed", "index", "step"):
-        array = getattr(world, name)
-        fits = tuple(array.shape) == (batch,) and array.dtype == kind.xp.int64
-        if not fits or getattr(array, "device", None) != device:
-            raise ValueError(
-                f"a world's {name} must be int64 [{batch}], found {array.dtype} {list(array.shape)}"
-            )
-    return Clock(world.seed, world.index, kind.copied(world.step))
 
 
 def _whole_count(value: Any) -> int:

@@ -248,7 +248,7 @@ class TaskProgram:
         }
         ahead = self.simulator.step(world.select(places), steps, params=own)
         state = {name: value.index_copy(0, places, ahead.state[name]) for name, value in world.state.items()}
-        return replace(world, state=state, step=world.step.index_copy(0, places, ahead.step))
+        return world.with_state(state, start=world.step.index_copy(0, places, ahead.step), since=0)
 
 
 def _copy(tensor: Tensor, device: torch.device | str = "cpu") -> Tensor:

@@ -259,7 +259,7 @@ class Session:
                 fields[slot_name(rules, name)] = values.reshape(whole)
         seed, index, step = (int(number) for number in data["clock"])
         world = sim.replace(sim.world(ids, seed=seed), **fields)
-        return replace(world, index=np.full_like(world.index, index), step=np.full_like(world.step, step))
+        return replace(world, index=np.full_like(world.index, index), start=np.full_like(world.start, step))
 
 
 def _is_ruleset(text: str) -> bool:

@@ -104,7 +104,7 @@ def _loaded(archive: Archive, sim: Simulator, source: Path) -> World:
         fields[slot.name] = _translated(palette, value, sim, source) if slot.kind == ELEMENT else value
     try:
         world = sim.replace(sim.world(_translated(palette, ids, sim, source)), **fields)
-        return World(sim, world.state, **clock)
+        return World(sim, world.state, *clock.values())
     except (ValueError, TypeError) as error:
         raise _bad(source, str(error)) from None
 

@@ -34,8 +34,8 @@ def put_worlds(world: World, places: Tensor, part: World, *, reuse: bool) -> Wor
         state = {
             name: put_rows(value, places, part.state[name], reuse) for name, value in world.state.items()
         }
-    clock = (put_rows(getattr(world, name), places, getattr(part, name), reuse) for name in CLOCK)
-    return World(world.sim, state, *clock)
+    seed, index, step = (put_rows(getattr(world, name), places, getattr(part, name), reuse) for name in CLOCK)
+    return World(world.sim, state, seed, index, step)
 
 
 def put_rows(rows: Tensor, places: Tensor, part: Tensor, reuse: bool) -> Tensor:

@@ -121,7 +121,7 @@ class Start:
     def world(self, simulator: Simulator) -> World:
         """The same worlds for any simulator of the ruleset."""
         world = simulator.world(self.ids, self.seed, index=self.index)
-        world = replace(world, step=simulator.kind.from_numpy(self.step.copy()))
+        world = replace(world, start=simulator.kind.from_numpy(self.step.copy()))
         return simulator.replace(world, **self.fields) if self.fields else world
 
     def __str__(self) -> str:

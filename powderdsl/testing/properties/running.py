@@ -80,7 +80,7 @@ def run_sample(
     dtypes = {slot.name: slot.dtype for slot in sim.slots}
     given = {name: sim.kind.from_numpy(values.astype(dtypes[name])) for name, values in start.items()}
     clock = sim.kind.from_numpy(sample.step.copy())
-    world = replace(world, state={**world.state, **given}, step=clock)
+    world = replace(world, state={**world.state, **given}, start=clock)
     found = [start]
     for _ in range(steps):
         world = sim.step(world, random=random, params=dict(sample.params) or None)
