@@ -93,6 +93,14 @@ def property_values(ruleset: Ruleset, name: str) -> list[float]:
     return values + [0.0] * (256 - len(values))
 
 
+def fresh_values(ruleset: Ruleset, slot: Slot) -> list[Any]:
+    """What new cells of elements hold in a slot, by id: 256 numbers, or pairs."""
+    if ruleset.property(slot.name) is None:
+        return [slot.fresh(identity) for identity in range(256)]
+    values = property_values(ruleset, slot.name)
+    return values if slot.is_real else [*map(int, values)]
+
+
 def scratch_slots(pass_: Pass) -> dict[str, Slot]:
     """The slots of a pass's scratch fields by name. They live in the pass and are not stored."""
     return {

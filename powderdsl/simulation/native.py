@@ -208,12 +208,10 @@ class AutoProgram:
         make: Callable[[], Runnable],
     ):
         self._name, self._first, self._large, self._make = name, first, large, make
-        self._thread: threading.Thread | None = None
-        self._began = 0.0
-        self._took: float | None = None
         self._native: Runnable | None = None
         self._problem = ""
-        self._beginning = threading.Lock()
+        self._thread: threading.Thread | None = None
+        self._starting = threading.Lock()
         self._spent = 0.0
         self._pace: tuple[int, float] | None = None  # cells of a batch, seconds a step on the first backend
         self._steps = {"first": 0, "native": 0}
@@ -230,45 +228,39 @@ class AutoProgram:
     @property
     def notes(self) -> tuple[str, ...]:
         """Sentences about which backend ran, and why."""
-        thread, steps, first = self._thread, self._steps, self._name
-        seconds = time.perf_counter() - self._began if self._took is None else self._took
+        thread, first = self._thread, f"{self._name} for {self._steps['first']} steps"
         if self._native is not None and thread is None:
             return ("native: it was compiled before",)
         if self._native is not None:
-            ready = f"while native was made ready ({seconds:.0f} s), then native for {steps['native']}"
-            return (f"{first} for {steps['first']} steps {ready}",)
+            return (f"{first} while native was made ready, then native for {self._steps['native']}",)
         if self._problem:
-            return f"{first}: {self._problem}", f"native code is faster: {INSTALL}"
+            return f"{self._name}: {self._problem}", f"native code is faster: {INSTALL}"
         if thread is not None and thread.is_alive():
-            return (f"{first} for {steps['first']} steps; native is being made ready ({seconds:.0f} s)",)
-        return (f"{first}: native is compiled from {WORTH:g} s of work, or by --backend native",)
+            return (f"{first}; native is being made ready",)
+        return (f"{self._name}: native is compiled from {WORTH:g} s of work, or by --backend native",)
 
     def run(self, job: Job) -> Mapping[str, Array]:
         """The state `job.steps` later."""
         if job.timing is not None:
             return (self._native or self._first()).run(job)
-        clock, part, done, cells = job.clock, job, 0, prod(shape_of(job.state))
-        while True:
-            native = self._native
-            if native is not None:
-                self._steps["native"] += part.steps
-                return native.run(part)
-            count = self._slice(cells, job.steps - done)
+        cells = prod(shape_of(job.state))
+        while self._native is None:
+            count, clock = self._slice(cells, job.steps), job.clock
             began = time.perf_counter()
             try:
-                state = self._first().run(part._replace(steps=count))
+                state = self._first().run(job._replace(steps=count))
             except MemoryError:  # of WebAssembly: native code is waited for
                 self._begin()
                 if self._thread is not None:
                     self._thread.join()
-                self._steps["native"] += part.steps
-                return (self._native or self._large()).run(part)
-            done += count
-            later = clock._replace(since=clock.since + done)
-            part = part._replace(state=state, clock=later, steps=job.steps - done)
-            self._account(cells, count, job.steps - done, time.perf_counter() - began)
-            if done == job.steps:
+                break
+            left = job.steps - count
+            self._account(cells, count, left, time.perf_counter() - began)
+            if not left:
                 return state
+            job = job._replace(state=state, clock=clock._replace(since=clock.since + count), steps=left)
+        self._steps["native"] += job.steps
+        return (self._native or self._large()).run(job)
 
     def _slice(self, cells: int, left: int) -> int:
         """The number of steps to run on the first backend before the next check: one until their speed is known."""
@@ -292,22 +284,17 @@ class AutoProgram:
             self._begin()
 
     def _begin(self) -> None:
-        """Start to compile, unless a build has started. Concurrent callers do not wait."""
+        """Start to compile, unless a build has started."""
         if self._problem:
             _tell_of_compilers(self._problem)
             return
-        if not self._beginning.acquire(blocking=False):
-            return
-        try:
-            # A fork has its parent's memory, but not its threads: there the thread is lost.
-            lost = self._thread is not None and self._took is None and not self._thread.is_alive()
-            if self._native is None and (self._thread is None or lost):
-                self._began = time.perf_counter()
+        with self._starting:
+            # A fork has its parent's memory, but not its threads: there the thread has ended and left nothing.
+            known = self._native is not None or bool(self._problem)
+            if not known and (self._thread is None or not self._thread.is_alive()):
                 context = copy_context()
                 self._thread = threading.Thread(target=context.run, args=(self._compile,), daemon=True)
                 self._thread.start()
-        finally:
-            self._beginning.release()
 
     def _compile(self) -> None:
         try:
@@ -316,7 +303,6 @@ class AutoProgram:
             self._problem = str(error)
         except Exception as error:  # what runs continues; `--backend native` shows what is wrong
             self._problem = f"{type(error).__name__}: {error}"
-        self._took = time.perf_counter() - self._began
 
 
 @cache

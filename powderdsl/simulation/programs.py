@@ -94,7 +94,7 @@ def make_program(
     | arrays  | backend   | whole steps            | chosen passes | given draws |
     |---------|-----------|------------------------|---------------|-------------|
     | any     | reference | oracle                 | oracle        | oracle      |
-    | plain   | wasm      | wasm                   | wasm          | oracle      |
+    | plain   | wasm      | wasm                   | oracle        | oracle      |
     | tensors | wasm      | wasm                   | torch         | torch       |
     | tensors | native    | native                 | torch         | torch       |
     | tensors | cuda      | cuda                   | torch         | torch       |
@@ -120,7 +120,9 @@ def make_program(
     if backend == "wasm" and problem:
         raise unavailable("wasm", problem, _CPU if plain else _WASMTIME)
     if plain:
-        return BackendProgram("wasm", _Modules(ruleset, lower(ruleset, memo), kind, memo or Memo()))
+        return BackendProgram(
+            "wasm", _plain_program(ruleset, kind, memo), lambda: ReferenceProgram(ruleset, kind)
+        )
     from powderdsl.targets.torch.program import TorchProgram, packed_program
 
     # These are made when first needed: native code that was compiled before needs none of them.
@@ -144,6 +146,16 @@ def make_program(
     return BackendProgram("torch", cells())
 
 
+@collection_paused()
+def _plain_program(ruleset: Ruleset, kind: ArrayKind, memo: Memo | None) -> Runnable:
+    """WebAssembly without torch: the oracle runs the passes that it cannot."""
+    return mixed_program(
+        parts(lower(ruleset, memo), memo),
+        lambda program, planes: WasmProgram(program, planes, kind, memo),
+        lambda program: ReferenceProgram(ruleset, kind, program),
+    )
+
+
 @cache
 def _wasm_problem() -> str:
     """Why no WebAssembly runs in this process; empty if it does."""
@@ -165,7 +177,6 @@ class BackendProgram:
 
     def __init__(self, name: str, whole: Runnable, rest: Callable[[], Runnable] | None = None):
         self._name, self.whole, self._rest = name, whole, rest
-        self._others = 0
 
     @property
     def running(self) -> str:
@@ -175,16 +186,12 @@ class BackendProgram:
     @property
     def notes(self) -> tuple[str, ...]:
         """Sentences about which backend ran, and why."""
-        notes = tuple(getattr(self.whole, "notes", ()))
-        if self._others:
-            notes += (f"torch for {self._others} steps with given draws or chosen passes",)
-        return notes
+        return tuple(getattr(self.whole, "notes", ()))
 
     def run(self, job: Job) -> Mapping[str, Array]:
         """The state `job.steps` later."""
         if self._rest is None or (job.passes is None and not job.draws):
             return self.whole.run(job)
-        self._others += job.steps
         return self._rest().run(job)
 
 
@@ -218,29 +225,3 @@ class ReferenceProgram:
                 self._ruleset, arrays, at, numbers, passes=passes, draws=given, tick=job.tick
             )
         return {name: self._kind.from_numpy(value.copy()) for name, value in arrays.items()}
-
-
-class _Modules:
-    """WebAssembly without torch: modules of whole steps and of chosen passes; the oracle for what they cannot run."""
-
-    def __init__(self, ruleset: Ruleset, program: Program, kind: ArrayKind, memo: Memo):
-        self._ruleset, self._program, self._kind, self._memo = ruleset, program, kind, memo
-        self._made: dict[frozenset[str] | None, Runnable] = {}
-
-    def run(self, job: Job) -> Mapping[str, Array]:
-        """The state `job.steps` later."""
-        if job.draws:
-            return ReferenceProgram(self._ruleset, self._kind).run(job)
-        chosen = job.passes
-        if chosen not in self._made:
-            self._made[chosen] = self._make(chosen)
-        return self._made[chosen].run(job if chosen is None else job._replace(passes=None))
-
-    @collection_paused()
-    def _make(self, chosen: frozenset[str] | None) -> Runnable:
-        passes = tuple(pass_ for pass_ in self._program.passes if chosen is None or pass_.name in chosen)
-        return mixed_program(
-            parts(replace(self._program, passes=passes), self._memo),
-            lambda program, planes: WasmProgram(program, planes, self._kind, self._memo),
-            lambda program: ReferenceProgram(self._ruleset, self._kind, program),
-        )

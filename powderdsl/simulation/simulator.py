@@ -12,7 +12,15 @@ from operator import index
 from typing import TYPE_CHECKING, Any
 
 from powderdsl.compiler import load
-from powderdsl.model.state import Slot, check_sides, property_dtype, property_values, slot_name, slots
+from powderdsl.model.state import (
+    Slot,
+    check_sides,
+    fresh_values,
+    property_dtype,
+    property_values,
+    slot_name,
+    slots,
+)
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.programs import array_kind, make_program
 from powderdsl.simulation.state_checks import (
@@ -20,7 +28,6 @@ from powderdsl.simulation.state_checks import (
     checked_parameter,
     checked_values,
     given_mapping,
-    looked_up,
     unknown_name,
     unknown_slot,
 )
@@ -217,6 +224,10 @@ class Simulator:
             self._tables[name] = self.kind.put(property_values(self.ruleset, name), "float64")
         return self._tables[name]
 
+    def fresh_values(self, slot: Slot) -> Array:
+        """What new cells of elements hold in a slot, by id: of its dtype, [256] or [256, 2]."""
+        return self.kind.put(fresh_values(self.ruleset, slot), slot.dtype)
+
     # Making worlds
 
     def world(self, ids: Any, seed: Any = 0, *, index: Any = None) -> World:
@@ -257,10 +268,8 @@ class Simulator:
         """A slot's values in new cells of these elements."""
         if slot.name == "element":
             return self.kind.copied(ids)
-        if self.ruleset.property(slot.name) is not None:
-            return looked_up(self.kind, self.table(slot.name), ids, slot.dtype)
-        values = self.kind.put([slot.fresh(i) for i in range(256)], slot.dtype)
-        return looked_up(self.kind, values, ids, slot.dtype)
+        values = self.kind.entries(self.fresh_values(slot), ids)
+        return self.kind.contiguous(self.kind.xp.moveaxis(values, -1, 1)) if slot.planes == 2 else values
 
     def _renewed(self, state: Mapping[str, Array], ids: Array, cells: Array) -> dict[str, Array]:
         """A state with fresh cells of the elements `ids`, uint8 [B, H, W], where `cells` is set."""
@@ -313,21 +322,19 @@ class Simulator:
             element = xp.asarray(ids, dtype=xp.uint8)
             state = self._renewed(state, element, element != state["element"])
         for name, value in fields.items():
-            slot = self.slot_by_name.get(name)
-            if slot is None:
-                if self.ruleset.property(name) is None:
-                    world.read(name)
-                wanted = self._shaped(value, name, world.shape)
-                current = self.kind.entries(self.table(name), state["element"])
-                if not bool((xp.asarray(wanted, dtype=xp.float64) == current).all()):
-                    raise ValueError(
-                        f"`{name}` follows from the element here: no rule of {self.ruleset.name} changes it"
-                    )
-                continue
+            slot = self._changing(name)
             array = self._shaped(value, name, world.shape, slot.planes == 2)
-            usual = None if self.ruleset.property(name) is None else self.table(name)
-            state[name] = checked_values(self.kind, array, state["element"], slot, usual, self.ruleset)
+            ids = state["element"]
+            state[name] = checked_values(self.kind, array, ids, self._fresh(slot, ids), slot, self.ruleset)
         return replace(world, state=state)
+
+    def _changing(self, name: str) -> Slot:
+        """The slot of a field or property that cells can have values of. Raises KeyError, ValueError."""
+        if name in self.slot_by_name:
+            return self.slot_by_name[name]
+        if self.ruleset.property(name) is None:
+            raise unknown_slot(self.ruleset, name)
+        raise ValueError(f"`{name}` follows from the element: no rule of {self.ruleset.name} changes it")
 
     def _shaped(self, value: Any, name: str, shape: tuple[int, ...], vector: bool = False) -> Array:
         array = self.kind.given(value, name)
@@ -363,10 +370,7 @@ class Simulator:
             element_ids = xp.full_like(world.ids, painted.id)
             world = replace(world, state=self._renewed(world.state, element_ids, mask))
         for name, value in fields.items():
-            if name not in self.slot_by_name:
-                world.read(name)
-                raise ValueError(f"`{name}` follows from the element: it cannot be painted")
-            slot = self.slot_by_name[name]
+            slot = self._changing(name)
             new = self._shaped(value, name, world.shape, slot.planes == 2)
             both = (xp.asarray(values, dtype=xp.float64) for values in (new, world.state[name]))
             world = self.replace(world, **{name: self._where(slot, mask, *both)})

@@ -11,7 +11,7 @@ from powderdsl.ir.segments import carry
 from powderdsl.model.state import (
     Slot,
     fits,
-    property_values,
+    fresh_values,
     qualified_slots,
     size_problem,
     slots,
@@ -74,10 +74,7 @@ def standalone_module(ruleset: Ruleset, size: tuple[int, int], memo: Memo | None
 
 def _stored(slot: Slot, ruleset: Ruleset, parts: tuple[Piece, ...]) -> Stored:
     prop = ruleset.property(slot.name)
-    if prop is not None:
-        usual: Sequence[Any] = property_values(ruleset, slot.name)
-    else:
-        usual = [slot.fresh(identity) for identity in range(256)]
+    usual = fresh_values(ruleset, slot)
     number = float if slot.dtype == "float32" else int
     by_component = zip(*usual, strict=True) if slot.planes == 2 else [usual]
     low, high = stored_range(slot.kind)

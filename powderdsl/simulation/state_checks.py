@@ -39,12 +39,8 @@ def check_ids(kind: ArrayKind, ids: Array, name: str, ruleset: Ruleset) -> None:
     xp, known = kind.xp, _flags_by_id(kind, (element.id for element in ruleset.elements))
     flat = ids.reshape(-1)
     for start in range(0, len(flat), CHUNK):
-        values = flat[start : start + CHUNK]
-        if values.dtype == xp.uint8:
-            good = kind.entries(known, values)
-        else:
-            values = xp.asarray(values, dtype=xp.int64)
-            good = (values >= 0) & (values < 256) & known[xp.clip(values, 0, 255)]
+        values = xp.asarray(flat[start : start + CHUNK], dtype=xp.int64)
+        good = (values >= 0) & (values < 256) & known[xp.clip(values, 0, 255)]
         if not bool(good.all()):
             at = good.tolist().index(False)
             index, place = start + at, list[int]()
@@ -60,17 +56,6 @@ def _flags_by_id(kind: ArrayKind, ids: Iterable[int]) -> Array:
     return kind.put([number in some for number in range(256)])
 
 
-def looked_up(kind: ArrayKind, table: Array, ids: Array, dtype: str) -> Array:
-    """The entry of a table [256] or [256, 2] for each of the ids [B, H, W]: of `dtype`, [B, H, W] or [B, 2, H, W]."""
-    vectors = table.ndim == 2
-    shape = tuple(ids.shape)
-    out = kind.zeros(dtype, (shape[0], 2, *shape[1:]) if vectors else shape)
-    for rows in _rows(shape):
-        entries = kind.entries(table, ids[:, rows])
-        out[..., rows, :] = kind.xp.moveaxis(entries, -1, 1) if vectors else entries
-    return out
-
-
 def _rows(shape: tuple[int, ...]) -> Iterator[slice]:
     """The rows of worlds [B, H, W] or [B, 2, H, W] in parts."""
     step = max(1, CHUNK // max(1, shape[0] * shape[-1]))
@@ -78,13 +63,13 @@ def _rows(shape: tuple[int, ...]) -> Iterator[slice]:
 
 
 def checked_values(
-    kind: ArrayKind, array: Array, ids: Array, slot: Slot, usual: Array | None, ruleset: Ruleset
+    kind: ArrayKind, array: Array, ids: Array, fresh: Array, slot: Slot, ruleset: Ruleset
 ) -> Array:
     """Values [B, H, W] or [B, 2, H, W] as a slot holds them, in memory of their own.
 
     Args:
         ids: the elements of the cells, of which some may not have the field or property.
-        usual: a property's value in these cells, [256] by id; None for the default of a field.
+        fresh: what new cells of these elements hold.
 
     Raises:
         TypeError, ValueError: values that the slot cannot hold, or not in these cells.
@@ -102,13 +87,9 @@ def checked_values(
         out[..., rows, :] = values
         if limited is None:
             continue
-        if usual is None:
-            default = kind.put(slot.default, slot.dtype)
-            default = default[:, None, None] if slot.planes == 2 else default
-        else:
-            default = kind.xp.asarray(kind.entries(usual, ids[:, rows]), dtype=kind.xp.int64)
         without = ~kind.entries(_flags_by_id(kind, limited), ids[:, rows])
-        if bool(((values != default) & (without[:, None] if slot.planes == 2 else without)).any()):
+        differs = values != fresh[..., rows, :]
+        if bool((differs & (without[:, None] if slot.planes == 2 else without)).any()):
             names = ", ".join(element.name for element in ruleset.elements if element.id in limited)
             raise ValueError(f"{slot.name} can only differ from its default in cells of: {names}")
     return out
@@ -126,7 +107,7 @@ def _integers(kind: ArrayKind, array: Array, slot: Slot, ruleset: Ruleset) -> Ar
         raise TypeError(f"{slot.name} takes integers, found {array.dtype}")
     values = xp.asarray(array, dtype=xp.int64)
     if slot.kind.name == "element":
-        check_ids(kind, array if array.dtype == xp.uint8 else values, slot.name, ruleset)
+        check_ids(kind, values, slot.name, ruleset)
     lo, hi = stored_range(slot.kind)
     least, most = int(values.min()), int(values.max())
     if least < lo or most > hi:

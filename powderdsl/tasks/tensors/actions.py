@@ -66,17 +66,8 @@ class Blocks:
         for first, end in (axis.T[:, :, None] for axis in edges):
             width = torch.arange(int((end - first).max()), device=sim.device)
             self._lines.append(torch.minimum(first + width, end - 1))
-        known = torch.tensor([[element.id for element in sim.ruleset.elements]], device=sim.device)
-        state = sim.world(known[None]).state
-        self.fresh: dict[str, Tensor] = {}
+        self.fresh = {slot.name: sim.fresh_values(slot) for slot in sim.slots if slot.travels}
         """What a new cell holds, by id: [256] or, of vectors, [256, 2]."""
-        for slot in sim.slots:
-            if slot.travels:
-                fresh = state[slot.name][0]
-                value = fresh[:, 0].T if slot.planes == 2 else fresh[0]
-                table = value[:1].repeat(256, *[1] * (value.ndim - 1))
-                table[known[0]] = value
-                self.fresh[slot.name] = table
         self._arrays = {name: table.cpu().numpy() for name, table in self.fresh.items()}
         self._edges = [axis.cpu().numpy() for axis in edges]
 
