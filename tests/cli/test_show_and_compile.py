@@ -28,7 +28,7 @@ def _repository(monkeypatch):
 def test_show_lists_elements_reactions_passes_and_parameters():
     lines = powderdsl("show", "powderworld").stdout.splitlines()
     tables = [line for line in lines if line and not line.startswith(" ")]
-    assert [line.split()[0] for line in tables[2:]] == ["Elements", "Reactions", "Passes,", "Parameters"]
+    assert [line.split()[0] for line in tables[3:]] == ["Elements", "Reactions", "Passes,", "Parameters"]
     rules = package.load("powderworld")
     for element in rules.elements:
         row = next(line for line in lines if line.split()[:2] == [str(element.id), element.name])

@@ -232,15 +232,15 @@ def test_pictures_of_commands(stove: Path) -> None:
 
 def test_show_prints_ramps(stove: Path) -> None:
     text = run_command("show", "core+stove.yaml").stdout
-    assert "#303030; #303030 -> #FF3000 by heat 0..9" in text
+    assert "#303030  #303030 -> #FF3000 by heat 0..9" in text
     import json
 
     data = {
         one["name"]: one
         for one in json.loads(run_command("show", "core+stove.yaml", "--json").stdout)["elements"]
     }
-    assert data["stove"]["color_by"] == {"field": "heat", "from": "#303030", "to": "#FF3000", "over": [0, 9]}
-    assert data["wall"]["color_by"] is None
+    assert data["stove"]["color_by"] == "#303030 -> #FF3000 by heat 0..9"
+    assert data["wall"]["color_by"] == ""
     assert (
         "#303030 #303030 -> #FF3000 by heat 0..9"
         in run_command("compile", "core+stove.yaml", "--emit", "model").stdout

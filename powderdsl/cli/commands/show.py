@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import sys
 from collections.abc import Iterator
 from itertools import cycle
@@ -17,8 +18,8 @@ from powderdsl.cli.exits import BadInput
 from powderdsl.cli.output import color_wanted, print_json
 from powderdsl.diagnostics import Span
 from powderdsl.diagnostics.printable import printable, write_styled
-from powderdsl.model.text import element_name, one_line, place_of, show_set, show_value
-from powderdsl.model.types import ColorRamp, Element, Pass, Property, Ruleset, Value
+from powderdsl.model.text import one_line, place_of, show_set, show_value
+from powderdsl.model.types import Element, Pass, Property, Ruleset
 from powderdsl.system.reports import Painted, table
 from powderdsl.tasks.shipped import is_task
 
@@ -52,21 +53,56 @@ def command(
 
         task = load_task(rules, knobs=knobs, params=settings)
         check_split(task, split)
-        if as_json:
-            print_json(_task_data(task))
-        else:
-            click.echo("\n".join(_task_text(task)))
+        _show(*_of_task(task), as_json)
         if out is not None:
             _write_sheet(task, split, seeds, out)
             click.echo(f"wrote {out}: seeds 0 to {seeds - 1} of {split}", err=as_json)
         return
     if out is not None or knobs:
         raise BadInput("--out and --knob go with a task")
-    ruleset = opt.load_rules(rules, settings)
+    _show(*_of_rules(opt.load_rules(rules, settings)), as_json)
+
+
+Tables = dict[str, list[dict[str, Any]]]
+"""Rows by column, by name of their table."""
+
+TITLES = {
+    "passes": "Passes, in order",
+    "params": "Parameters (--set NAME=VALUE)",
+    "knobs": "Knobs (--knob NAME=N)",
+}
+"""Titles of tables that say more than their names."""
+
+
+def _show(head: dict[str, Any], tables: Tables, as_json: bool) -> None:
+    """Print what something consists of; on a terminal with swatches of colors."""
     if as_json:
-        print_json(_data(ruleset))
-    else:
-        write_styled(sys.stdout, "\n".join(_text(ruleset, color_wanted(sys.stdout))) + "\n")
+        print_json({**head, **tables})
+        return
+    styled = color_wanted(sys.stdout)
+    about = f": {head['about']}" if head["about"] else ""
+    lines = [printable(f"{head['name']}{about}")]
+    lines += [f"{name}: {_text(value)}" for name, value in head.items() if name not in ("name", "about")]
+    for name, parts in tables.items():
+        rows = [[_text(cell, styled) for cell in part.values()] for part in parts]
+        lines += ["", TITLES.get(name, name.capitalize()), *table([[*parts[0]], *rows] if parts else [])]
+    write_styled(sys.stdout, "\n".join(lines) + "\n")
+
+
+def _text(value: Any, styled: bool = False) -> str:
+    """A cell as text; names are separated by spaces."""
+    text = " ".join(value) if isinstance(value, list) else str(value)
+    if not (styled and COLOR.search(text)):
+        return text
+    return Painted(COLOR.sub(_swatch, printable(text)))
+
+
+COLOR = re.compile("#([0-9A-Fa-f]{6})")
+
+
+def _swatch(color: re.Match[str]) -> str:
+    red, green, blue = bytes.fromhex(color[1])
+    return f"\x1b[48;2;{red};{green};{blue}m    \x1b[0m {color[0]}"
 
 
 def rule_spans(pass_: Pass) -> tuple[Span, ...]:
@@ -74,58 +110,58 @@ def rule_spans(pass_: Pass) -> tuple[Span, ...]:
     return tuple(dict.fromkeys(rule.span for moment in pass_.moments for rule in moment.rules))
 
 
-# Tables
+def _of_rules(ruleset: Ruleset) -> tuple[dict[str, Any], Tables]:
+    head = {"name": ruleset.name, "about": ruleset.about, "packs": [*ruleset.packs], "slots": ruleset.slots}
+    elements = [
+        {
+            **_described(element, "id", "name", "pack", "glyph", "color"),
+            "color_by": _ramp_text(element),
+            **{prop.name: _property_text(ruleset, prop, element) for prop in ruleset.properties},
+            "tags": sorted(element.tags),
+        }
+        for element in ruleset.elements
+    ]
+    changes = [
+        {
+            "from": show_set(ruleset, before),
+            "to": show_set(ruleset, after),
+            "pass": line.pass_name,
+            "rule": line.text,
+            "where": str(line),
+        }
+        for line, before, after in reactions(ruleset)
+    ]
+    passes = [
+        {
+            **_described(pass_, "name", "pack"),
+            "moments": len(pass_.moments),
+            "rules": len(rule_spans(pass_)),
+            "where": place_of(pass_.span),
+        }
+        for pass_ in ruleset.passes
+    ]
+    params = [
+        {
+            "name": param.name,
+            "value": show_value(ruleset, param.kind, param.default),
+            "kind": str(param.kind),
+            "about": param.about,
+            "where": place_of(param.span),
+        }
+        for param in ruleset.params
+    ]
+    return head, {"elements": elements, "reactions": changes, "passes": passes, "params": params}
 
 
-def _text(ruleset: Ruleset, styled: bool) -> Iterator[str]:
-    yield printable(f"{ruleset.name}{': ' if ruleset.about else ''}{ruleset.about}")
-    yield f"packs: {' '.join(ruleset.packs)}"
-    for title, rows in _tables(ruleset, styled):
-        yield ""
-        yield title
-        yield from table(rows)
+def _described(part: Any, *names: str) -> dict[str, Any]:
+    """Some attributes of a part."""
+    return {name: getattr(part, name) for name in names}
 
 
-def _tables(ruleset: Ruleset, styled: bool) -> Iterator[tuple[str, list[list[str]]]]:
-    """The title and the rows of each table."""
-    rows = [["id", "element", "pack", "glyph", "color", *(p.name for p in ruleset.properties), "tags"]]
-    for element in ruleset.elements:
-        head = [str(element.id), element.name, element.pack, element.glyph, _color(element, styled)]
-        values = [_property_text(ruleset, prop, element) for prop in ruleset.properties]
-        rows.append([*head, *values, " ".join(sorted(element.tags))])
-    yield f"Elements ({len(ruleset.elements)} of {ruleset.slots} ids)", rows
-    rows = [["from", "to", "pass", "rule", "where"]]
-    for line, before, after in reactions(ruleset):
-        ids = show_set(ruleset, before), show_set(ruleset, after)
-        rows.append([*ids, line.pass_name, line.text, str(line)])
-    yield "Reactions", rows
-    rows = [["", "pass", "pack", "moments", "rules", "where"]]
-    for number, pass_ in enumerate(ruleset.passes, 1):
-        counts = [str(len(pass_.moments)), str(len(rule_spans(pass_)))]
-        rows.append([str(number), pass_.name, pass_.pack, *counts, place_of(pass_.span)])
-    yield "Passes, in order", rows
-    rows = [["name", "value", "kind", "about", "where"]]
-    for param in ruleset.params:
-        value = show_value(ruleset, param.kind, param.default)
-        rows.append([param.name, value, str(param.kind), param.about, place_of(param.span)])
-    yield "Parameters (--set NAME=VALUE)", rows
-
-
-def _swatch(color: str, styled: bool) -> str:
-    if not styled:
-        return color
-    red, green, blue = bytes.fromhex(color[1:])
-    return Painted(f"\x1b[48;2;{red};{green};{blue}m    \x1b[0m {color}")
-
-
-def _color(element: Element, styled: bool) -> str:
-    """Its color, and both ends of its ramp with what this follows."""
-    text, ramp = _swatch(element.color, styled), element.ramp
-    if ramp is None:
-        return text
-    start, end = _swatch(ramp.start, styled), _swatch(ramp.end, styled)
-    text = f"{text}; {start} -> {end} by {ramp.field} {ramp.lo}..{ramp.hi}"
-    return Painted(text) if styled else text
+def _ramp_text(element: Element) -> str:
+    """The field that its color follows, and both ends."""
+    ramp = element.ramp
+    return f"{ramp.start} -> {ramp.end} by {ramp.field} {ramp.lo}..{ramp.hi}" if ramp else ""
 
 
 def _property_text(ruleset: Ruleset, prop: Property, element: Element) -> str:
@@ -134,87 +170,25 @@ def _property_text(ruleset: Ruleset, prop: Property, element: Element) -> str:
     return f"{text}*" if element.id in prop.stored else text
 
 
-# JSON
-
-
-def _plain(value: Value | str) -> Any:
-    """A constant for JSON: chances as numbers in 0..1."""
-    if isinstance(value, (str, int)):
-        return value
-    return [float(part) for part in value] if isinstance(value, tuple) else float(value)
-
-
-def _data(ruleset: Ruleset) -> dict[str, Any]:
-    return {
-        "name": ruleset.name,
-        "about": ruleset.about,
-        "packs": ruleset.packs,
-        "slots": ruleset.slots,
-        "elements": [
-            _described(
-                element,
-                *("id", "name", "pack", "glyph", "color", "about", "tags"),
-                color_by=_ramp_data(element.ramp),
-                properties={prop.name: _plain(prop.values[element.id]) for prop in ruleset.properties},
-            )
-            for element in ruleset.elements
-        ],
-        "properties": [_described(prop, "name", "pack", kind=str(prop.kind)) for prop in ruleset.properties],
-        "fields": [_described(field, "name", "at", "pack", kind=str(field.kind)) for field in ruleset.fields],
-        "reactions": [
-            {
-                "from": [element_name(ruleset, number) for number in before],
-                "to": [element_name(ruleset, number) for number in after],
-                "pass": line.pass_name,
-                "pack": line.pack,
-                "rule": line.text,
-                "where": str(line),
-            }
-            for line, before, after in reactions(ruleset)
-        ],
-        "passes": [
-            _described(
-                pass_,
-                *("name", "pack"),
-                moments=len(pass_.moments),
-                rules=[{"rule": one_line(span), "where": place_of(span)} for span in rule_spans(pass_)],
-            )
-            for pass_ in ruleset.passes
-        ],
-        "params": [
-            _described(param, "name", "about", kind=str(param.kind), value=_plain(param.default))
-            for param in ruleset.params
-        ],
-    }
-
-
-def _described(part: Any, *names: str, **more: Any) -> dict[str, Any]:
-    """Some attributes of a part of the model, and its place."""
-    return {**{name: getattr(part, name) for name in names}, **more, "where": place_of(part.span)}
-
-
-def _ramp_data(ramp: ColorRamp | None) -> dict[str, Any] | None:
-    if ramp is None:
-        return None
-    return {"field": ramp.field, "from": ramp.start, "to": ramp.end, "over": (ramp.lo, ramp.hi)}
-
-
 # Tasks
 
 
-def _task_text(task: Task) -> Iterator[str]:
-    yield f"{task.name}{': ' if task.about else ''}{task.about}"
-    yield f"rules: {task.ruleset.name}"
-    yield f"worlds: {task.size[0]}×{task.size[1]} cells"
-    yield f"agent: {'; '.join(_agent_text(task))}"
-    rows = [["split", "worlds", "about"]]
-    for split in task.splits:
-        worlds = "one a seed" if len(split.variants) == 1 else f"{len(split.variants)} stands"
-        rows.append([split.name, worlds, split.about])
-    yield from ("", "Splits", *table(rows))
-    rows = [["name", "value", "range", "about"]]
-    rows += [[knob.name, str(knob.value), f"{knob.lo}..{knob.hi}", knob.about] for knob in task.knobs]
-    yield from ("", "Knobs (--knob NAME=N)", *table(rows))
+def _of_task(task: Task) -> tuple[dict[str, Any], Tables]:
+    head = {
+        **_described(task, "name", "about"),
+        "rules": task.ruleset.name,
+        "size": f"{task.size[0]}×{task.size[1]} cells",
+        "agent": "; ".join(_agent_text(task)),
+    }
+    splits = [
+        {**_described(split, "name", "about"), "stands": [stand.name for stand in split.variants]}
+        for split in task.splits
+    ]
+    knobs = [
+        {"name": knob.name, "value": knob.value, "range": f"{knob.lo}..{knob.hi}", "about": knob.about}
+        for knob in task.knobs
+    ]
+    return head, {"splits": splits, "knobs": knobs}
 
 
 def _agent_text(task: Task) -> Iterator[str]:
@@ -233,24 +207,6 @@ def _agent_text(task: Task) -> Iterator[str]:
     if agent.free_steps:
         yield f"then {agent.free_steps} steps"
     yield f"a brush of {brush[0]}×{brush[1]} cells at {bins[0]}×{bins[1]} places"
-
-
-def _task_data(task: Task) -> dict[str, Any]:
-    return {
-        "name": task.name,
-        "about": task.about,
-        "rules": task.ruleset.name,
-        "size": task.size,
-        "agent": task.agent,
-        "splits": [
-            {"name": split.name, "about": split.about, "stands": [stand.name for stand in split.variants]}
-            for split in task.splits
-        ],
-        "knobs": [
-            {"name": knob.name, "value": knob.value, "range": [knob.lo, knob.hi], "about": knob.about}
-            for knob in task.knobs
-        ],
-    }
 
 
 def _write_sheet(task: Task, split: str, seeds: int, out: Path) -> None:

@@ -1,11 +1,11 @@
 """Check a study before its first command runs: each command with every value of the study.
 
-Commands say why they refuse their words, but not where the study has these. A word is to blame for a mistake if the
-mistake is gone without the word.
+Commands say why they refuse their words, but not where the study has these: the word is to blame that a mistake names.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fnmatch import fnmatchcase
@@ -91,26 +91,28 @@ class _StudyCheck:
 
         Words with mistakes are left out, which shows what is wrong with others.
         """
-        rest = step
-        for name, word in step.words:
-            if (step.name, name, point.filled(word)) in self.refused:
-                rest = without(rest, word)
+        rest, told = self.unrefused(step, point), set[str]()
         while rest.on == step.on:
             result, mistakes = self.attempt(rest, point, run)
             if not mistakes:
                 return result if rest == step else None
             self.wrong.add(step.name)
-            others = [self.attempt(without(rest, word), point, run)[1] for _, word in rest.words]
-            words = [*zip(rest.words, others, strict=True)]
-            blamed = [_blamed(mistake, words, point) for mistake in mistakes]
-            for mistake, (name, wrong) in zip(mistakes, blamed, strict=True):
-                self.report(mistake, step, point, name, wrong)
-                if wrong is not None:
-                    self.refused.add((step.name, name, point.filled(wrong)))
-                    rest = without(rest, wrong)
-            if ("", None) in blamed:
-                return None
+            for mistake in mistakes:
+                name, word = _blamed(mistake, rest, point)
+                self.report(mistake, step, point, name, word)
+                if word is None or mistake.message in told:
+                    return None
+                told.add(mistake.message)
+                self.refused.add((step.name, name, point.filled(word)))
+            rest = self.unrefused(rest, point)
         return None
+
+    def unrefused(self, step: StudyStep, point: Point) -> StudyStep:
+        """A step without words that are to blame for mistakes."""
+        words = [
+            pair for pair in step.words if (step.name, pair[0], point.filled(pair[1])) not in self.refused
+        ]
+        return replace(step, words=tuple(words))
 
     def attempt(self, step: StudyStep, point: Point, run: Any) -> tuple[Any, Sequence[Diagnostic]]:
         """The result of a step, and the mistakes in its words."""
@@ -119,6 +121,15 @@ class _StudyCheck:
         except CompileError as error:
             # Where a value is out of range, mistakes in the file that uses it are consequences.
             own = [mistake for mistake in error.diagnostics if mistake.primary.span is None]
+            if step.on is not None and own and own[0].code == "PD620":
+                steps = [
+                    other.name
+                    for other in self.study.steps
+                    if MAKES.get(other.command) == WORKS_ON[step.command]
+                ]
+                name = point.filled(step.on)
+                message = f"no step before this one and no run `{name}`"
+                own = [Diagnostic("PD806", message, Label(None), helps=suggest(name, steps, "steps"))]
             return None, own or error.diagnostics
         except (click.ClickException, ValueError, TypeError) as error:
             message = error.format_message() if isinstance(error, click.ClickException) else str(error)
@@ -128,18 +139,12 @@ class _StudyCheck:
         self, mistake: Diagnostic, step: StudyStep, point: Point, name: str, word: Scalar | None
     ) -> None:
         """Report a mistake where the value of a word is written, and where it is used."""
+        if mistake.primary.span is not None and (word is None or step.means.get(name) in READ):
+            self.reporter.add(mistake)  # in the file that the word names
+            return
         if word is None:
             self.reporter.add(replace(mistake, primary=Label(step.key.span)))
             return
-        if mistake.primary.span is not None and step.means.get(name) in READ:
-            self.reporter.add(mistake)  # in the file that the word names
-            return
-        if mistake.code == "PD620":
-            steps = [one.name for one in self.study.steps if MAKES.get(one.command) == WORKS_ON[step.command]]
-            message = f"no step before this one and no run `{word.text}`"
-            mistake = replace(
-                mistake, code="PD806", message=message, helps=suggest(word.text, steps, "steps")
-            )
         names = Template(word.text).get_identifiers()
         span = point.spans.get(names[0]) if len(names) == 1 else None
         used = () if span is None else (Label(word.span, f"as `{point.filled(word)}`"),)
@@ -242,13 +247,7 @@ def _evaluation(values: Mapping[str, Any], run: TrainConfig | None) -> Sequence[
     splits = values["splits"] or [split.name for split in task.splits]
     for split in splits:
         check_split(task, split)
-    return agent_keys(
-        splits,
-        chosen_policies(values["policies"], task, trained=run is not None),
-        trained_on="train" if run is None else run.split,
-        success=task.goal.success is not None,
-        intervals=values["episodes"] > 1,
-    )
+    return agent_keys(splits, chosen_policies(values["policies"], task, trained=run is not None))
 
 
 def _task(name: str, knobs: Mapping[str, int], params: Mapping[str, Any], packs: Sequence[str]) -> Task:
@@ -271,47 +270,32 @@ def _rules_of(task: str) -> str:
     return "+".join(_task(task, {}, {}, ()).rules)
 
 
-def _blamed(
-    mistake: Diagnostic, words: Sequence[tuple[tuple[str, Scalar], Sequence[Diagnostic]]], point: Point
-) -> tuple[str, Scalar | None]:
-    """The option and the word without which a mistake is gone; no word if there are several such options.
-
-    `words` are options and their words, with the mistakes that are there without each. What the step works on comes last:
-    nothing else is known without it.
-    """
-    suspects: list[tuple[tuple[bool, bool, int], str, Scalar]] = []
-    for (name, word), others in words:
-        is_there = (mistake.code, mistake.message) in [(other.code, other.message) for other in others]
-        is_named = point.filled(word) in mistake.message or (name != "on" and name in mistake.message)
-        if not is_there and (is_named or name != "on" or mistake.code != "PD806"):
-            suspects.append(((not is_named, name == "on", len(others)), name, word))
-    least = min((rank for rank, _, _ in suspects), default=None)
-    best = [(name, word) for rank, name, word in suspects if rank == least]
-    return best[-1] if len({name for name, _ in best}) == 1 else ("", None)
+def _blamed(mistake: Diagnostic, step: StudyStep, point: Point) -> tuple[str, Scalar | None]:
+    """The option and the word that a mistake names; no word where it names several options alike, or none."""
+    named = {*re.findall(r"(?:[`'(]|--|found )([\w.%:/-]+)", mistake.message)}
+    variables = {name[2:]: option.name for option in called(step.command).params for name in option.opts}
+    suspects: list[tuple[int, str, Scalar]] = []
+    for name, word in step.words:
+        text = point.filled(word)
+        told = {name, variables.get(name), text, *re.split("[-,=+]", text)}
+        suspects.append((len(told & named), name, word))
+    most = max(score for score, _, _ in [*suspects, (1, "", step.key)])
+    best = {name: word for score, name, word in suspects if score == most}
+    return next(iter(best.items())) if len(best) == 1 else ("", None)
 
 
-def without(step: StudyStep, word: Scalar) -> StudyStep:
-    """A step without one of its words."""
-    return replace(step, words=tuple(pair for pair in step.words if pair[1] is not word))
-
-
-def agent_keys(
-    splits: Sequence[str], policies: Sequence[str], *, trained_on: str, success: bool, intervals: bool
-) -> list[str]:
-    """The keys of numbers that `evaluate` writes. A test compares them with real ones."""
-    means = ("mean", "interval") if intervals else ("mean",)
-    normalized = ["normalized"] if {"expert", "nothing"} <= {*policies} else []
-    keys = ["seed", *(["step"] if "trained" in policies else [])]
+def agent_keys(splits: Sequence[str], policies: Sequence[str]) -> list[str]:
+    """The keys of numbers that `evaluate` may write. A test compares them with real ones."""
+    normalized = ["normalized/"] if {"expert", "nothing"} <= {*policies} else []
+    keys = ["seed", "step"]
     for split in splits:
+        keys += [f"unchanged/{split}", f"seen/{split}/worlds"]
         for policy in policies:
-            above = [f"above/{other}" for other in BASELINES if other != policy and other in policies]
-            scales = [f"{scale}/{mean}" for scale in (*above, *normalized) for mean in means]
-            numbers = ["episodes", "length", *means, *(["success"] if success else []), *scales]
+            above = [f"above/{other}/" for other in BASELINES if other != policy and other in policies]
+            means = [f"{scale}{name}" for scale in ("", *above, *normalized) for name in ("mean", "interval")]
+            numbers = [*means, "episodes", "length", "success"]
             keys += [f"splits/{split}/{policy}/{number}" for number in numbers]
-        if split != trained_on:
-            keys += [f"seen/{split}/without/{policy}/{mean}" for policy in policies for mean in means]
-            keys += [f"seen/{split}/worlds"]
-        keys += [f"unchanged/{split}"] if len(policies) > 1 else []
+            keys += [f"seen/{split}/without/{policy}/{number}" for number in means[:2]]
     return keys
 
 
