@@ -15,7 +15,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from itertools import product
@@ -203,35 +203,31 @@ def read_program(path: Path) -> Program:
 
     The file is run as `python` would run it, so it has to be trusted. Raises ValueError if that is not possible.
     """
-    load = _located(path, runpy.run_path)(str(path), run_name=f"beside_{path.stem}").get("load")
+    with _located(path):
+        load = runpy.run_path(str(path), run_name=f"beside_{path.stem}").get("load")
     if not callable(load):
         raise ValueError(f"{path}: does not define `load(state)`, which returns `run(steps)`")
 
     def start(state: State) -> Run:
-        run = _located(path, load)(state)
+        with _located(path):
+            run = load(state)
         if not callable(run):
             raise ValueError(f"{path}: `load(state)` does not return a function `run(steps)`")
-        return _located(path, run)
+        return _located(path)(run)
 
     return Program(path.stem, start)
 
 
-def _located(path: Path, function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function whose exceptions name the line of the file that led to them."""
-
-    def call(*values: Any, **named: Any) -> Any:
-        try:
-            return function(*values, **named)
-        except Exception as error:
-            frames = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
-            words = str(error)
-            if isinstance(error, SyntaxError):  # its text repeats file and line
-                frames, words = [(error.filename or "", error.lineno)], error.msg
-            lines = [line for file, line in frames if Path(file).resolve() == path.resolve()]
-            place = f"{path}:{lines[-1]}" if lines else str(path)
-            raise ValueError(f"{place}: {type(error).__name__}: {words}") from error
-
-    return call
+@contextmanager
+def _located(path: Path) -> Iterator[None]:
+    """Name the line of a file that led to an exception; also a decorator."""
+    try:
+        yield
+    except Exception as error:
+        frames = traceback.extract_tb(error.__traceback__)
+        lines = [frame.lineno for frame in frames if Path(frame.filename).resolve() == path.resolve()]
+        place = f"{path}:{lines[-1]}" if lines else str(path)
+        raise ValueError(f"{place}: {type(error).__name__}: {error}") from error
 
 
 # Measuring
@@ -483,24 +479,25 @@ def report_text(report: Report) -> str:
 
 def _cell_table(report: Report) -> str:
     """One line per cell, and a column for each program beside the backends."""
-    columns: dict[str, Callable[[CellFigures], str]] = {
-        "backend": lambda figures: figures.cell.backend,
-        "batch": lambda figures: f"{figures.cell.batch:,}",
-        "size": lambda figures: "{}×{}".format(*figures.cell.size),
-        "threads": lambda figures: str(figures.cell.threads),
-        "world-steps/s": lambda figures: number(median(figures.rates)),
-        "slowest..fastest": lambda figures: f"{number(figures.rates[0])}..{number(figures.rates[-1])}",
-        "µs/world-step": lambda figures: number(figures.world_step_microseconds),
-        "CPUs": lambda figures: f"{figures.processor_microseconds / figures.world_step_microseconds:.2f}",
-        "to first step": lambda figures: f"{figures.compile_seconds + figures.first_step_seconds:.2f} s",
-    }
+    titles = ["backend", "batch", "size", "threads", "world-steps/s", "slowest..fastest", "µs/world-step"]
     programs = [program.name for program in report.plan.programs]
-    rows = [[*columns, *(f"÷ {name}" for name in programs)]]
+    rows = [[*titles, "CPUs", "to first step", *(f"÷ {name}" for name in programs)]]
     for figures in report.cells:
+        cell, rates, spent = figures.cell, figures.rates, figures.world_step_microseconds
         ratios = [report.ratio(figures, name) for name in programs]
         rows.append(
-            [show(figures) for show in columns.values()]
-            + ["?" if ratio is None else number(ratio) for ratio in ratios]
+            [
+                cell.backend,
+                f"{cell.batch:,}",
+                f"{cell.size[0]}×{cell.size[1]}",
+                str(cell.threads),
+                number(median(rates)),
+                f"{number(rates[0])}..{number(rates[-1])}",
+                number(spent),
+                f"{figures.processor_microseconds / spent:.2f}",
+                f"{figures.compile_seconds + figures.first_step_seconds:.2f} s",
+                *("?" if ratio is None else number(ratio) for ratio in ratios),
+            ]
         )
     return "\n".join(table(rows, indent=""))
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from filelock import FileLock, Timeout
 
@@ -160,11 +160,15 @@ def read_metrics(folder: Path) -> Iterator[dict[str, Any]]:
                     yield line
 
 
-class Estimate(NamedTuple):
+@dataclass(frozen=True)
+class Estimate:
     """A mean, and half of its 95 % interval; None for a single value."""
 
     mean: float
     interval: float | None
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter((self.mean, self.interval))
 
 
 def mean_and_interval(values: Sequence[float]) -> Estimate:

@@ -171,7 +171,7 @@ def from_json(values: Mapping[str, Any]) -> TrainConfig:
 
 def check_config(config: TrainConfig, known: Sequence[Diagnostic] = ()) -> TrainConfig:
     """The same settings. Raises CompileError (PD640) with everything that is wrong in them, after what is `known`."""
-    wrong = [*known, *(_wrong(*mistake) for mistake in mistakes(config))]
+    wrong = [*known, *map(_wrong, mistakes(config))]
     if not wrong:
         wrong = [_wrong(sentence) for sentence in _contradictions(config)]
     if wrong:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -90,22 +90,11 @@ class Evaluation:
 
     def as_json(self) -> dict[str, Any]:
         """For JSON: scores by split and policy."""
+        data = asdict(self)
         splits: dict[str, dict[str, Any]] = {}
-        for score in self.scores:
-            numbers = {name: value for name, value in vars(score).items() if name not in ("split", "policy")}
-            numbers["above"] = {other: estimate._asdict() for other, estimate in score.above.items()}
-            if score.normalized is not None:
-                numbers["normalized"] = score.normalized._asdict()
-            splits.setdefault(score.split, {})[score.policy] = numbers
-        seen = {
-            split: {
-                "worlds": one.worlds,
-                "without": {policy: estimate._asdict() for policy, estimate in one.without.items()},
-            }
-            for split, one in self.seen.items()
-        }
-        about = {name: value for name, value in vars(self).items() if name != "scores"}
-        return {**about, "seen": seen, "splits": splits}
+        for score in data.pop("scores"):
+            splits.setdefault(score.pop("split"), {})[score.pop("policy")] = score
+        return {**data, "splits": splits}
 
 
 def play(
@@ -168,7 +157,6 @@ def evaluate(
     seed: int = 0,
     backend: str | None = None,
     device: str | None = None,
-    said: Callable[[Score], None] | None = None,
     packs: Sequence[str] = (),
 ) -> Evaluation:
     """Play policies on splits; for a run, write ``evaluation.json`` into its folder.
@@ -182,18 +170,13 @@ def evaluate(
         policies: some of POLICIES. Unless given, all that the task and the run have, but not an expert that searches,
             which takes as long as its many plans.
         deterministic: the trained policy takes the likeliest action, instead of drawing one.
-        backend, device: those of the run unless given. said: called with each score as it is known.
+        backend, device: those of the run unless given.
         packs: names or files of packs that are added to the rules of a run's task.
 
     Raises:
         CompileError: PD620 for a run that is not there, PD801 for a split. ValueError: another argument is wrong.
     """
-    if isinstance(run_or_task, Task):
-        run, config, task = None, TrainConfig(run_or_task.name), run_or_task
-    else:
-        run = run_or_task if isinstance(run_or_task, RunFolder) else find_run(run_or_task, "ppo")
-        config = config_of(run)
-        task = task_of(run, packs)
+    run, config, task = subject(run_or_task, packs)
     names = [one.name for one in task.splits] if splits is None else list(dict.fromkeys(splits))
     for name in names:
         check_split(task, name)
@@ -205,10 +188,11 @@ def evaluate(
     players = {one: player(one, first, run, deterministic=deterministic) for one in chosen}
     trained = players.get("trained")
     step = trained.step if isinstance(trained, TrainedPolicy) else None
+    own = TaskProgram(task, config.split, first.simulator)
+    training = {*_starts(own, torch.arange(min(TRAINING_STARTS, config.worlds)))}
     scores: list[Score] = []
     unchanged: dict[str, int] = {}
     seen: dict[str, Seen] = {}
-    training = None
     for name in names:
         program = first if name == first.split else TaskProgram(task, name, first.simulator)
         count = config.worlds if run is not None and name == config.split else episodes
@@ -220,22 +204,26 @@ def evaluate(
             returns = torch.stack([one.returns for one in played.values()])
             unchanged[name] = int((returns == returns[0]).all(0).sum())
         if name != config.split:
-            if training is None:
-                own = TaskProgram(task, config.split, first.simulator)
-                training = frozenset(_starts(own, torch.arange(min(TRAINING_STARTS, config.worlds))))
             new = torch.tensor([start not in training for start in _starts(program, worlds)])
             without = {
                 one: mean_and_interval(of.returns[new].tolist()) for one, of in played.items() if new.any()
             }
             seen[name] = Seen(int((~new).sum()), without)
-        for policy in chosen:
-            scores.append(_score(name, policy, played, task))
-            if said is not None:
-                said(scores[-1])
+        scores += [_score(name, policy, played, task) for policy in chosen]
     found = Evaluation(task.name, step, deterministic, seed, tuple(scores), unchanged, seen)
     if run is not None:
         write_json(run.path / EVALUATION, found.as_json())
     return found
+
+
+def subject(
+    run_or_task: RunFolder | Task | str | Path, packs: Sequence[str] = ()
+) -> tuple[RunFolder | None, TrainConfig, Task]:
+    """A run, its settings, and its task with some packs added; a task has no run. Raises CompileError."""
+    if isinstance(run_or_task, Task):
+        return None, TrainConfig(run_or_task.name), run_or_task
+    run = run_or_task if isinstance(run_or_task, RunFolder) else find_run(run_or_task, "ppo")
+    return run, config_of(run), task_of(run, packs)
 
 
 def player(
@@ -288,16 +276,9 @@ def _score(split: str, policy: str, all_played: Mapping[str, Played], task: Task
         normalized = _ratio(played.returns - nothing, all_played["expert"].returns - nothing)
     success = float(played.success.double().mean()) if task.goal.success is not None else None
     length = float(played.lengths.double().mean())
-    return Score(
-        split,
-        policy,
-        len(played.returns),
-        *mean_and_interval(played.returns.tolist()),
-        success,
-        length,
-        above,
-        normalized,
-    )
+    returns = mean_and_interval(played.returns.tolist())
+    episodes = len(played.returns)
+    return Score(split, policy, episodes, returns.mean, returns.interval, success, length, above, normalized)
 
 
 def _ratio(values: Tensor, scale: Tensor) -> Estimate | None:

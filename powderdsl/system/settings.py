@@ -7,8 +7,9 @@ of these, ``tuple[T, ...]``, ``Mapping[str, T]``, ``T | None``, or any of these 
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from functools import cache
 from operator import index
@@ -73,19 +74,19 @@ def check_count(name: str, value: Any, most: int, *, least: int = 1) -> None:
         raise ValueError(f"{name} must be an integer from {least:,} to {most:,}, found {value!r}")
 
 
-def mistakes(config: Any) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Yield a sentence and suggestions for each setting whose value it does not take."""
-    hints = get_type_hints(type(config))
-    for item in fields(config):
-        value, limits = getattr(config, item.name), item.metadata.get("limits")
-        if limits is not None and (wanted := _mismatch(hints[item.name], value, limits)):
-            yield f"`{item.name}` is {value!r}: it takes {wanted}", suggest(str(value), limits.choices)
+def mistakes(config: Any) -> list[str]:
+    """A sentence for each setting whose value it does not take."""
+    problems: list[str] = []
+    for name, (hint, _) in _fields_of(type(config)).items():  # type: ignore[arg-type]  # types are hashable
+        if get_origin(hint) is Annotated:
+            _read(hint, getattr(config, name), name, problems)
+    return problems
 
 
 def check_settings(config: Any) -> None:
     """Raise ValueError with all `mistakes`."""
-    if wrong := "; ".join(sentence for sentence, _ in mistakes(config)):
-        raise ValueError(wrong)
+    if wrong := mistakes(config):
+        raise ValueError("; ".join(wrong))
 
 
 def read_record(kind: type[Record], data: Any, problems: list[str], path: str = "") -> Record | None:
@@ -143,7 +144,8 @@ def _read(kind: Any, value: Any, path: str, problems: list[str]) -> Any:
         return read_record(kind, value, problems, path)  # type: ignore[arg-type]  # it is a type, not an instance
     if kind is int and hasattr(value, "__index__") and not isinstance(value, bool):
         value = index(value)  # also of NumPy's integers
-    if wanted := _mismatch(kind, value, limits):
+    fits, wanted = _compared(kind, value, limits)
+    if not fits:
         problems.append(f"`{path}` must be {wanted}, found {value!r:.80}")
         return None
     if names := getattr(kind, "_fields", ()):
@@ -151,40 +153,36 @@ def _read(kind: Any, value: Any, path: str, problems: list[str]) -> Any:
         parts = zip(names, value, strict=True)
         return kind(*(_read(hints[name], part, f"{path}.{name}", problems) for name, part in parts))
     if get_origin(kind) is tuple:
-        item = get_args(kind)[0]
-        return tuple(_read(item, part, f"{path}[{at}]", problems) for at, part in enumerate(value))
+        return tuple(
+            _read(get_args(kind)[0], part, f"{path}[{at}]", problems) for at, part in enumerate(value)
+        )
     if get_origin(kind) is Mapping:
-        item = get_args(kind)[1]
-        return {key: _read(item, part, f"{path}.{key}", problems) for key, part in value.items()}
+        return {key: _read(get_args(kind)[1], part, f"{path}.{key}", problems) for key, part in value.items()}
     return value
 
 
-def _mismatch(kind: Any, value: Any, limits: Limits) -> str:
-    """What a value should be, if it is something else. The values in lists and mappings are not looked at."""
-    low, high = limits.length
-    if names := getattr(kind, "_fields", ()):
-        fits = isinstance(value, list | tuple) and len(value) == len(names)
-        wanted = f"[{', '.join(names)}]"
-    elif get_origin(kind) is tuple:
-        fits = isinstance(value, list | tuple) and low <= len(value) <= high
-        wanted = f"a list of {low:,} to {high:,} values"
-    elif get_origin(kind) is Mapping:
+def _compared(kind: Any, value: Any, limits: Limits) -> tuple[bool, str]:
+    """Whether a value is one of a type, and what such values are. Those in lists and mappings are not looked at."""
+    names = getattr(kind, "_fields", ())
+    low, high = (len(names), len(names)) if names else limits.length
+    if names or get_origin(kind) is tuple:
+        wanted = f"[{', '.join(names)}]" if names else f"a list of {low:,} to {high:,} values"
+        return isinstance(value, list | tuple) and low <= len(value) <= high, wanted
+    if get_origin(kind) is Mapping:
         fits = isinstance(value, Mapping) and low <= len(value) <= high
-        fits = fits and all(re.fullmatch(limits.keys, str(key)) for key in value)
         wanted = f"a mapping of {low:,} to {high:,} values, with keys that match {limits.keys}"
-    elif kind is bool:
-        fits, wanted = isinstance(value, bool), "true or false"
-    elif kind is str and limits.choices:
-        fits, wanted = value in limits.choices, " or ".join(f"`{word}`" for word in limits.choices)
-    elif kind is str:
-        fits = isinstance(value, str) and re.fullmatch(limits.pattern, value) is not None
-        wanted = limits.form
-    else:
-        fits = isinstance(value, int if kind is int else int | float) and not isinstance(value, bool)
-        fits = fits and (limits.low is None or limits.low <= value)
-        fits = fits and (limits.high is None or value <= limits.high)
-        written = "," if kind is int else "g"
-        wanted = "an integer" if kind is int else "a number"
-        wanted += "" if limits.low is None else f" from {limits.low:{written}}"
-        wanted += "" if limits.high is None else f" to {limits.high:{written}}"
-    return "" if fits else wanted
+        return fits and all(re.fullmatch(limits.keys, str(key)) for key in value), wanted
+    if kind is bool:
+        return isinstance(value, bool), "true or false"
+    if limits.choices:
+        return value in limits.choices, " or ".join(f"`{word}`" for word in limits.choices)
+    if kind is str:
+        return isinstance(value, str) and re.fullmatch(limits.pattern, value) is not None, limits.form
+    least = -math.inf if limits.low is None else limits.low
+    most = math.inf if limits.high is None else limits.high
+    fits = isinstance(value, int if kind is int else int | float) and not isinstance(value, bool)
+    written = "," if kind is int else "g"
+    wanted = "an integer" if kind is int else "a number"
+    wanted += f" from {least:{written}}" if least > -math.inf else ""
+    wanted += f" to {most:{written}}" if most < math.inf else ""
+    return fits and least <= value <= most, wanted

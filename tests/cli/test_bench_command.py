@@ -139,7 +139,7 @@ def test_a_program_is_measured_beside_a_backend(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("def load(state)\n    pass\n", "bad.py:1: SyntaxError"),
+        ("def load(state)\n    pass\n", "(bad.py, line 1)"),
         ("x = 1\n", "does not define `load(state)`"),
         ("def load(state):\n    pass\n", "does not return a function"),
         ("def load(state):\n    return state['lava']\n", "bad.py:2: KeyError"),

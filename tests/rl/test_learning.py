@@ -69,9 +69,9 @@ def test_a_policy_takes_the_expert_from_a_dataset(tmp_path: Path) -> None:
     ).scores
     assert [one.policy for one in (trained, expert, nothing)] == ["trained", "expert", "nothing"]
     assert trained.normalized is not None
-    assert trained.normalized[0] > 0.8
+    assert trained.normalized.mean > 0.8
     assert at_random.normalized is not None
-    assert at_random.normalized[0] < 0.4
+    assert at_random.normalized.mean < 0.4
     (cloned,) = [
         line for line in (run.path / "metrics.jsonl").read_text().splitlines() if "clone/loss" in line
     ]

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from powderdsl.diagnostics import CompileError, Reporter, Severity, Source
+from powderdsl.experiments.runs import Estimate
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.rl.evaluation import evaluate
 from powderdsl.tasks.episodes import TaskProgram, compile_task
@@ -140,9 +141,9 @@ def test_an_expert_changes_no_fingerprint() -> None:
 def test_shipped_experts_beat_doing_nothing(name: str, least: float) -> None:
     found = evaluate(load_task(name), splits=["test"], policies=["expert", "nothing"], episodes=32)
     expert, nothing = found.scores
-    assert expert.above["nothing"][0] > least
-    assert expert.normalized == (1.0, 0.0)
-    assert nothing.normalized == (0.0, 0.0)
+    assert expert.above["nothing"].mean > least
+    assert expert.normalized == Estimate(1.0, 0.0)
+    assert nothing.normalized == Estimate(0.0, 0.0)
 
 
 def test_scores_on_the_experts_scale() -> None:
@@ -171,7 +172,7 @@ def test_test_worlds_that_are_training_worlds_are_told_apart() -> None:
     assert 3 < seen.worlds < 25
     everywhere = next(one for one in found.scores if one.split == "test")
     empty = 62 * 62 / 1000
-    whole = seen.worlds * empty + (64 - seen.worlds) * seen.without["nothing"][0]
+    whole = seen.worlds * empty + (64 - seen.worlds) * seen.without["nothing"].mean
     assert everywhere.mean == pytest.approx(whole / 64)
     assert found.as_json()["seen"]["test"]["worlds"] == seen.worlds
 

@@ -22,20 +22,20 @@ class Config:
 
 @pytest.mark.parametrize("wrong", [0, 10, 2.0, True, "3", None, float("nan"), 10**400])
 def test_numbers_out_of_bounds(wrong: object) -> None:
-    ((found, _),) = mistakes(Config(rounds=wrong))  # type: ignore[arg-type]
-    assert found == f"`rounds` is {wrong!r}: it takes an integer from 1 to 9"
+    (found,) = mistakes(Config(rounds=wrong))  # type: ignore[arg-type]
+    assert found == f"`rounds` must be an integer from 1 to 9, found {wrong!r:.80}"
 
 
 @pytest.mark.parametrize("wrong", [-0.1, float("nan"), float("inf"), False, "1", 10**400])
 def test_reals_out_of_bounds(wrong: object) -> None:
-    ((found, _),) = mistakes(Config(decay=wrong))  # type: ignore[arg-type]
-    assert found == f"`decay` is {wrong!r}: it takes a number from 0 to 1"
+    (found,) = mistakes(Config(decay=wrong))  # type: ignore[arg-type]
+    assert found == f"`decay` must be a number from 0 to 1, found {wrong!r:.80}"
 
 
 def test_all_mistakes_are_said_at_once() -> None:
     check_settings(Config(9, 1, 10**30))
     with pytest.raises(
-        ValueError, match=r"`rounds` is 0: .*; `most_cells` is 1: it takes an integer from 2$"
+        ValueError, match=r"`rounds` must be .*; `most_cells` must be an integer from 2, found 1$"
     ):
         check_settings(Config(0, 1.0, 1))
 

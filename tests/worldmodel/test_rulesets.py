@@ -139,7 +139,7 @@ def test_unknown_properties_and_bad_numbers_are_refused() -> None:
     for wrong in ({"chances": 0.5}, {"leave_out": 1.0}, {"chances": float("nan")}):
         with pytest.raises(ValueError, match=r"chances|leave_out"):
             Variety(**wrong)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="`rulesets` is 1025: it takes an integer from 0 to 1,024"):
+    with pytest.raises(ValueError, match="`rulesets` must be an integer from 0 to 1,024, found 1025"):
         DataConfig(rulesets=1025)
 
 

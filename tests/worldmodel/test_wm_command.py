@@ -117,7 +117,7 @@ def test_preset_and_options_make_the_configuration(tmp_path: Path, dunes: str) -
         (("train", "--rules", "core+snad"), "PD304"),
         (("train", "--elements", "99"), "the knob `kinds` must lie in 0..4"),
         (("train", "--knob", "lines=2"), "no knob `lines`"),
-        (("train", "--iterations", "0"), "`iterations` is 0: it takes an integer from 1"),
+        (("train", "--iterations", "0"), "`iterations` must be an integer from 1"),
         (("train", "--chances", "3"), "--rulesets says how many"),
         (("train", "--first-ruleset", "3"), "--rulesets says how many"),
         (("train", "--rulesets", "2", "--swap", "densty"), "did you mean `density`?"),

@@ -12,7 +12,6 @@ from powderdsl.cli.exits import user_values
 from powderdsl.cli.options import find_played
 from powderdsl.cli.output import print_json
 from powderdsl.system.reports import table
-from powderdsl.tasks.task import Task
 
 if TYPE_CHECKING:
     from powderdsl.rl.evaluation import Evaluation, Score
@@ -57,7 +56,7 @@ def command(
     from powderdsl.rl.evaluation import evaluate
 
     with user_values():
-        found = evaluate(played, packs=() if isinstance(played, Task) else packs, **asked)
+        found = evaluate(played, packs=packs, **asked)
     if out is not None:
         write_json(out, found.as_json(), follow=True)
     if as_json:

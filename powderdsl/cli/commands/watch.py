@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -10,7 +11,6 @@ from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput, user_values
 from powderdsl.cli.options import check_writable, find_played
 from powderdsl.cli.pictures import MAX_SIDE
-from powderdsl.rl.config import TrainConfig
 from powderdsl.tasks.task import Task
 
 
@@ -39,46 +39,39 @@ def command(
     policy: str | None,
     deterministic: bool,
     seed: int,
-    knobs: dict[str, int],
-    settings: dict[str, str],
-    packs: tuple[str, ...],
     out: Path | None,
     fps: int,
     scale: int,
     backend: str | None,
+    **changes: Any,
 ) -> None:
     """Play worlds of a RUN's task with its agent, side by side, and write the film.
 
     Regions are outlined, and so is where the agent acts; below each world stand its return so far and the action. For a
     TASK, actions are random, or nobody acts.
     """
-    played = find_played(run, knobs, settings, packs)
-    if isinstance(played, Task):
-        if policy == "trained":
-            raise BadInput("a task has no trained policy: name a run, or choose --policy random")
-        task, config, folder = played, TrainConfig(run), Path()
-    else:
-        from powderdsl.rl.policies import config_of, task_of
-
-        task, config, folder = task_of(played, packs), config_of(played), played.path
+    played = find_played(run, **changes)
     policy = policy or ("random" if isinstance(played, Task) else "trained")
+    if isinstance(played, Task) and policy == "trained":
+        raise BadInput("a task has no trained policy: name a run, or choose --policy random")
+    from powderdsl.rl.evaluation import film, player, subject
+
+    own, config, task = subject(played, changes["packs"])
     names = [one.name for one in task.splits]
     split = split or ("test" if "test" in names else names[0])
     if out is None:
-        out = folder / "watch.gif"
+        out = own.path / "watch.gif" if own else Path("watch.gif")
         check_writable(out)
     if max(task.size) * scale * min(worlds, 4) > MAX_SIDE:
         raise BadInput("such a picture is too large: choose a smaller --scale, or fewer --worlds")
     import torch
 
-    from powderdsl.rl.evaluation import film, player
     from powderdsl.simulation.media import write_gif, write_mp4
     from powderdsl.tasks.episodes import compile_task
 
     program = compile_task(task, split=split, backend=backend or config.backend)
-    run_folder = None if isinstance(played, Task) else played
     with user_values():
-        acts = player(policy, program, run_folder, deterministic=deterministic)
+        acts = player(policy, program, own, deterministic=deterministic)
     observation = config.observation if policy == "trained" else "ids"
     numbers = torch.arange(worlds)
     episodes, pictures = film(program, acts, numbers, observation=observation, seed=seed, factor=scale)
