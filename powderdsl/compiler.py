@@ -65,7 +65,7 @@ def shipped_rules() -> list[str]:
 
 
 @cache
-def _shipped_words() -> dict[str, str]:
+def shipped_words() -> dict[str, str]:
     """The words that the shipped packs define, each with its pack."""
     found: dict[str, str] = {}
     for source in _shipped_sources():
@@ -129,7 +129,7 @@ def load_with_diagnostics(
     reporter = Reporter()
     packs, ruleset = read(names, reporter)
     reporter.raise_if_errors()
-    model = check(packs, ruleset, reporter, palette, _shipped_words)
+    model = check(packs, ruleset, reporter, palette, shipped_words)
     if params:
         model = set_params(model, params, reporter)
     reporter.raise_if_errors()

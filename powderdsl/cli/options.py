@@ -89,17 +89,6 @@ NAMES = Parsed("NAME,NAME", _names)
 """`one,another`."""
 
 
-def _settings(ctx: click.Context, param: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
-    """`pack.param=VALUE` options as a mapping; names and values are checked later, with the model."""
-    found = {}
-    for value in values:
-        name, equals, text = value.partition("=")
-        if not equals or not name.strip() or not text.strip():
-            raise click.BadParameter(f"`{value}`: write pack.param=VALUE", ctx, param)
-        found[name.strip()] = text.strip()
-    return found
-
-
 def option(name: str, kind: Any, about: str, default: Any = None, *, to: str = "", **more: Any) -> Option:
     """An option of a command.
 
@@ -149,19 +138,24 @@ def output(name: str, metavar: str, about: str, *suffixes: str, **more: Any) -> 
     return option(name, OutputFile(suffixes), about, metavar=metavar, **more)
 
 
+def pairs(name: str, metavar: str, about: str, to: str, value: str = ".+", read: type = str) -> Option:
+    """An option that may be repeated: values by name. `value` is a pattern of them, `read` what makes them of text."""
+
+    def mapping(ctx: click.Context, param: click.Parameter, words: tuple[str, ...]) -> dict[str, Any]:
+        values = {}
+        for word in words:
+            match = re.fullmatch(rf"\s*([^\s=]+)\s*=\s*({value})", word.rstrip())
+            if match is None:
+                raise click.BadParameter(f"`{word}`: write {metavar}", ctx, param)
+            values[match[1]] = read(match[2])
+        return values
+
+    return option(name, metavar, about, to=to, multiple=True, callback=mapping)
+
+
 def knobs(about: str) -> Option:
     """Values for knobs of a task, as a mapping."""
-    return option("--knob", "NAME=N", about, to="knobs", multiple=True, callback=_knob_values)
-
-
-def _knob_values(ctx: click.Context, param: click.Parameter, knobs: tuple[str, ...]) -> dict[str, int]:
-    values = {}
-    for knob in knobs:
-        match = re.fullmatch(r"([A-Za-z_]\w*)=(-?[0-9]{1,6})", knob.strip())
-        if match is None:
-            raise click.BadParameter(f"`{knob}`: write --knob NAME=N", ctx, param)
-        values[match[1]] = int(match[2])
-    return values
+    return pairs("--knob", "NAME=N", about, "knobs", "-?[0-9]{1,6}", int)
 
 
 def several(*options: Option) -> Option:
@@ -202,14 +196,13 @@ def _setting(one: Field[Any]) -> Option:
 rules = click.argument("rules", metavar="RULES")
 """RULES: what `powderdsl.load` takes."""
 
-parameters = click.option(
+parameters = pairs(
     "--set",
+    "PACK.PARAM=VALUE",
+    "Another value for a parameter of the rules, such as 5%. May be repeated.",
     "settings",
-    multiple=True,
-    metavar="PACK.PARAM=VALUE",
-    callback=_settings,
-    help="Another value for a parameter of the rules, such as 5%. May be repeated.",
 )
+"""Names and values are checked later, with the model."""
 world = click.option(
     "--world", metavar="FILE|NAME", help="A .npz, .png, .txt or .yaml file, or the name of a scene."
 )

@@ -21,7 +21,6 @@ from powderdsl.datasets.manifest import (
     Manifest,
     Recipe,
     damaged,
-    differences,
     many_damaged,
     read_manifest,
     recipe_of,
@@ -29,6 +28,7 @@ from powderdsl.datasets.manifest import (
 from powderdsl.datasets.shards import DTYPES, Shard, knows_ids, open_shard, read_episodes, row_shape
 from powderdsl.diagnostics import CompileError, Diagnostic
 from powderdsl.envs.tensor_env import TensorEnv
+from powderdsl.experiments.runs import differences
 from powderdsl.system.random import MASK, base_keys, mix
 from powderdsl.system.settings import check_count
 from powderdsl.system.writing import failure
@@ -140,9 +140,10 @@ class Dataset:
 
     def require_equal(self, other: Recipe, names: tuple[str, ...], whose: object) -> None:
         """Raise CompileError (PD631) where some values of the recipe differ from those of another."""
-        found = [one for one in differences(self.recipe, other) if one.split(":")[0].split(".")[0] in names]
-        if found:
-            raise failure("PD631", f"{self.folder} does not fit {whose}", notes=tuple(found[:20]))
+        own, others = ({name: getattr(recipe, name) for name in names} for recipe in (self.recipe, other))
+        notes = differences(own, others)
+        if notes:
+            raise failure("PD631", f"{self.folder} does not fit {whose}", notes=notes)
 
     def check(self) -> None:
         """Read every byte of every shard.

@@ -6,7 +6,7 @@ import json
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from math import prod
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from powderdsl.diagnostics import CompileError, Diagnostic, Label
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.system.reading import check_links, parse_json, read_bytes
-from powderdsl.system.settings import Limits, check_count, read_record
+from powderdsl.system.settings import Limits, check_settings, read_record
 from powderdsl.system.writing import failure, write_text
 from powderdsl.tasks.task import BLOW, NO_CHANGE, Task
 
@@ -40,7 +40,7 @@ MAX_SIDE = 1 << 20
 
 
 Digest = Annotated[str, Limits(pattern=r"[0-9a-f]{64}", form="64 hexadecimal digits")]
-Seed = Annotated[int, Limits(0, (1 << 62) - 1)]
+Seed = Annotated[int, Limits(0, (1 << 61) - 1)]
 Episodes = Annotated[int, Limits(1, MAX_EPISODES)]
 Names = Annotated[tuple[str, ...], Limits(length=(1, 1000))]
 Palette = Annotated[Mapping[str, str], Limits(keys=r"[0-9]|[1-9][0-9]|1[0-9]{2}|2[0-4][0-9]|25[0-5]")]
@@ -150,7 +150,7 @@ def read_manifest(folder: Path) -> Manifest:
         raise damaged(f"{path} is not a manifest", f'it lacks "format": "{FORMAT}"')
     version = data.pop("version", None)
     if version != VERSION:
-        raise damaged(f"{path} has the version {_short(version)}", f"this powderdsl reads {VERSION}")
+        raise damaged(f"{path} has the version {version!r:.80}", f"this powderdsl reads {VERSION}")
     manifest = _checked(path, data)
     return replace(manifest, shards=tuple(sorted(manifest.shards, key=lambda shard: shard.number)))
 
@@ -211,19 +211,6 @@ def many_damaged(path: Path, problems: list[str]) -> CompileError:
     )
 
 
-def differences(old: Recipe, new: Recipe) -> list[str]:
-    """The differences of two recipes, with both values."""
-    found = []
-    for item in fields(Recipe):
-        a, b = getattr(old, item.name), getattr(new, item.name)
-        if isinstance(a, Mapping):
-            keys = [key for key in {**a, **b} if a.get(key) != b.get(key)]
-            found += [f"{item.name}.{key}: {_short(a.get(key))}, not {_short(b.get(key))}" for key in keys]
-        elif a != b:
-            found.append(f"{item.name}: {_short(a)}, not {_short(b)}")
-    return found
-
-
 def choice_names(task: Task) -> tuple[str, ...]:
     """What the values of an action's third number are."""
     names = {element.id: element.qualified for element in task.ruleset.elements}
@@ -253,7 +240,7 @@ def recipe_of(
     """What is recorded of an environment's task, split, rules and observations. `shard` as in `record`.
 
     Raises:
-        ValueError: a shard may become too large.
+        ValueError: a value out of range, or a shard may become too large.
     """
     task, ruleset = env.task, env.task.ruleset
     recipe = Recipe(
@@ -280,31 +267,20 @@ def recipe_of(
         actions=env.max_episode_steps,
         last_action="terminates" if env.last_action_terminates else "truncates",
     )
-    return replace(recipe, shard=_shard_size(recipe, shard))
-
-
-def _shard_size(recipe: Recipe, given: int | None) -> int:
-    """The number of episodes per shard. Raises ValueError if they may not fit into one."""
     each = episode_bytes(recipe)
-    if given is None:
-        size = USUAL_SHARD
-        while size > 1 and size * each > USUAL_SHARD_BYTES:
-            size //= 2
-        size = max(size, -(-recipe.episodes // MAX_SHARDS))
-    else:
-        check_count("shard", given, MAX_EPISODES)
-        size = given
-    if size * each > MAX_SHARD_BYTES:
-        raise ValueError(
-            f"a shard of {size} episodes may take {size * each:,} bytes, more than {MAX_SHARD_BYTES:,}: "
+    if shard is None:
+        shard = max(1, min(USUAL_SHARD, USUAL_SHARD_BYTES // each), -(-episodes // MAX_SHARDS))
+    recipe = replace(recipe, shard=shard)
+    check_settings(recipe)
+    problems = _misfits(recipe, ())
+    if shard * each > MAX_SHARD_BYTES:
+        problems.append(
+            f"a shard of {shard} episodes may take {shard * each:,} bytes, more than {MAX_SHARD_BYTES:,}: "
             "record fewer episodes a shard, or shorter ones with max_episode_steps"
         )
-    if -(-recipe.episodes // size) > MAX_SHARDS:
-        raise ValueError(
-            f"{recipe.episodes:,} episodes in shards of {size} are more than {MAX_SHARDS:,} shards: "
-            f"record at least {-(-recipe.episodes // MAX_SHARDS)} episodes a shard"
-        )
-    return size
+    if problems:
+        raise ValueError("; ".join(problems))
+    return recipe
 
 
 def episode_bytes(recipe: Recipe) -> int:
@@ -334,8 +310,3 @@ def _misfits(recipe: Recipe, shards: Sequence[ShardRow]) -> list[str]:
             found.append(f"`shards[{place}]`: {unpacked:,} bytes, more than {MAX_SHARD_BYTES:,}")
         numbers.add(row.number)
     return found
-
-
-def _short(value: Any) -> str:
-    text = repr(list(value) if isinstance(value, tuple) else value)
-    return text if len(text) <= 80 else f"{text[:77]}…"

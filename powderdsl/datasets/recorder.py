@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -12,17 +12,13 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from powderdsl.datasets.dataset import Dataset
 from powderdsl.datasets.manifest import (
     FILE,
-    KINDS,
-    MAX_EPISODES,
     Manifest,
     Recipe,
     check_place,
-    differences,
     episode_bytes,
     read_manifest,
     recipe_of,
@@ -32,7 +28,7 @@ from powderdsl.datasets.shards import DTYPES, is_whole, row_shape, write_shard
 from powderdsl.envs.acting import FrameStack, Policy, action_keys, random_policy
 from powderdsl.envs.observations import Observation, observation_of
 from powderdsl.envs.tensor_env import TensorEnv
-from powderdsl.experiments.runs import held
+from powderdsl.experiments.runs import differences, held
 from powderdsl.system.settings import check_count
 from powderdsl.system.writing import failure, not_writable
 from powderdsl.tasks.episodes import TaskProgram
@@ -100,11 +96,7 @@ def record(
             it has another dataset; PD613: it cannot be written; PD622: another process records there. ValueError: another
             argument that is wrong.
     """
-    check_count("episodes", episodes, MAX_EPISODES)
     check_count("envs", envs, 1 << 20)
-    check_count("seed", seed, (1 << 61) - 1, least=0)
-    if observation not in KINDS:
-        raise ValueError(f"observation is one of {', '.join(KINDS)}; found {observation!r}")
     if isinstance(policy, str) and policy not in SCRIPTED:
         raise ValueError(f"policy is a function, or one of {', '.join(SCRIPTED)}; found {policy!r}")
     name = policy if isinstance(policy, str) else policy_name
@@ -119,7 +111,7 @@ def record(
     act = SCRIPTED[policy](env.program) if isinstance(policy, str) else policy
     place = Path(folder)
     with held_place(place):
-        recording = _Recording(env, act, sight, place, begun(place, recipe))
+        recording = _Recording(env.program, act, sight, place, begun(place, recipe))
         recording.play(envs, progress or (lambda done, total: None))
     return Dataset.open(place)
 
@@ -145,10 +137,10 @@ def begun(folder: Path, recipe: Recipe) -> Manifest:
         manifest = Manifest(recipe, datetime.now(UTC).isoformat(timespec="seconds"), ())
     else:
         manifest = read_manifest(folder)
-        differ = differences(manifest.recipe, recipe)
-        if differ:
+        notes = differences(asdict(manifest.recipe), asdict(recipe))
+        if notes:
             helps = ("take another folder, or the values that it was begun with",)
-            raise failure("PD631", f"{folder} has another dataset", notes=tuple(differ[:20]), helps=helps)
+            raise failure("PD631", f"{folder} has another dataset", notes=notes, helps=helps)
         manifest = replace(
             manifest, recipe=recipe, shards=tuple(row for row in manifest.shards if is_whole(folder, row))
         )
@@ -171,116 +163,88 @@ def add_shard(
 
 
 class _Recording:
-    """Plays the episodes of all missing shards, in order, and writes each shard when its last episode ends.
-
-    `env` has a number of slots. A slot whose episode is over takes the next one, so that all are busy until the end.
-    """
+    """Plays the episodes of all missing shards, in order, and writes each shard when its last episode has ended."""
 
     def __init__(
         self,
-        one: TensorEnv,
+        program: TaskProgram,
         policy: Policy | ExpertPlayer,
         sight: Observation,
         folder: Path,
         manifest: Manifest,
     ):
         self.recipe, self.manifest, self.folder = manifest.recipe, manifest, folder
-        self.one, self.policy, self.sight = one, policy, sight
-        recorded = {row.number for row in manifest.shards}
-        shards = [number for number in range(self.recipe.shards) if number not in recorded]
-        self.unfinished = {number: len(self.recipe.episodes_of(number)) for number in shards}
-        self.numbers = (episode for number in shards for episode in self.recipe.episodes_of(number))
-        self.finished: dict[int, dict[str, Array]] = {}
+        self.program, self.policy, self.sight = program, policy, sight
 
     def play(self, envs: int, progress: Progress) -> None:
-        """Play with at most `envs` slots until all shards are written."""
-        recipe, left = self.recipe, sum(self.unfinished.values())
-        done = recipe.episodes - left
-        progress(done, recipe.episodes)
-        if not left:
-            return
-        most = max(1, min(envs, PLAYING_BYTES // episode_bytes(recipe)))
-        slots = -(-left // -(-left // most))  # the fewest that need no more rounds
-        self.env = TensorEnv(
-            self.one.program,
-            slots,
+        """Play at most `envs` episodes at once until all shards are written."""
+        recipe, recorded = self.recipe, {row.number for row in self.manifest.shards}
+        shards = [number for number in range(recipe.shards) if number not in recorded]
+        numbers = np.array([episode for number in shards for episode in recipe.episodes_of(number)], np.int64)
+        many = max(1, min(envs, PLAYING_BYTES // episode_bytes(recipe)))
+        progress(recipe.episodes - len(numbers), recipe.episodes)
+        episodes: list[dict[str, Array]] = []
+        for first in range(0, len(numbers), many):
+            done = recipe.episodes - len(numbers) + first
+            episodes += self.played(numbers[first : first + many], done, progress)
+            while shards and len(episodes) >= len(recipe.episodes_of(shards[0])):
+                count = len(recipe.episodes_of(shards[0]))
+                parts = {name: [episode[name] for episode in episodes[:count]] for name in DTYPES}
+                self.manifest = add_shard(self.folder, self.manifest, shards.pop(0), parts)
+                episodes = episodes[count:]
+
+    def played(self, numbers: Array, done: int, progress: Progress) -> list[dict[str, Array]]:
+        """The arrays of some episodes, played at once. Those that are over run on, and no longer count."""
+        recipe, count = self.recipe, len(numbers)
+        env = TensorEnv(
+            self.program,
+            count,
             observation=recipe.observation,
             worlds=recipe.worlds,
-            autoreset_mode="disabled",
+            autoreset_mode="next_step",
             last_action=recipe.last_action,
             max_episode_steps=recipe.actions,
         )
-        self.episode = np.array([next(self.numbers) for _ in range(slots)], np.int64)
-        self.stack = FrameStack(getattr(self.policy, "frames", 1))
-        self.playing, self.taken = np.ones(slots, bool), np.zeros(slots, np.int64)
-        self.tape = {
-            name: np.empty((slots, recipe.actions + 1, *row_shape(recipe, name)), dtype)
+        tape = {
+            name: np.empty((count, recipe.actions + 1, *row_shape(recipe, name)), dtype)
             for name, dtype in DTYPES.items()
             if name not in ("length", "world")
         }
-        observed, _ = self.env.reset(seed=0, options={"worlds": _worlds(recipe, self.episode)})
-        self.tape["observation"][:, 0] = observed.cpu().numpy()
-        while self.playing.any():
-            observed, ended = self.act(observed)
-            done += int((ended & self.playing).sum())
-            under_way = self.taken[self.playing & ~ended].sum()
-            progress(done + float(under_way) / recipe.actions, recipe.episodes)
-            if ended.any():
-                observed = self.end(ended, observed)
-
-    def act(self, observed: Tensor) -> tuple[Tensor, NDArray[np.bool_]]:
-        """Take and record an action in every slot. Returns the next observations, and which episodes ended."""
-        env, tape, every = self.env, self.tape, np.arange(len(self.taken))
-        episode, taken = (torch.from_numpy(one.copy()).to(env.device) for one in (self.episode, self.taken))
-        assert env.episodes is not None
-        if isinstance(self.policy, ExpertPlayer):
-            actions = self.policy(env.episodes)
-        else:
-            own = self.sight.kind == self.recipe.observation
-            shown = observed if own else self.sight.of(env.episodes.world)
-            with torch.no_grad():
-                shown = self.stack.push(shown, taken == 0)
-                actions = torch.as_tensor(self.policy(shown, action_keys(self.recipe.seed, episode, taken)))
-        observed, reward, terminated, truncated, info = env.step(actions)
-        given = {"action": actions, "reward": reward, "terminated": terminated, "truncated": truncated}
-        for name, value in {**given, "success": info["success"]}.items():
-            tape[name][every, self.taken] = value.cpu().numpy()
-        self.taken += 1
-        tape["observation"][every, self.taken] = observed.cpu().numpy()
-        return observed, (terminated | truncated).cpu().numpy()
-
-    def end(self, ended: NDArray[np.bool_], observed: Tensor) -> Tensor:
-        """Keep the episodes that ended and begin the next ones. Returns the observations after that."""
-        for slot in np.flatnonzero(ended & self.playing).tolist():
-            episode, length = int(self.episode[slot]), int(self.taken[slot])
-            self.finished[episode] = {
-                name: rows[slot, : length + (name == "observation")].copy()
-                for name, rows in self.tape.items()
-            }
-            shard = episode // self.recipe.shard
-            self.unfinished[shard] -= 1
-            if not self.unfinished[shard]:
-                self.write(shard)
-            following = next(self.numbers, None)
-            # A slot without a next episode plays its last one again, for nothing.
-            self.playing[slot] = following is not None
-            self.episode[slot] = episode if following is None else following
-        self.taken[ended] = 0
-        if self.playing.any():
-            worlds = _worlds(self.recipe, self.episode)
-            options = {"worlds": worlds, "reset_mask": torch.from_numpy(ended.copy())}
-            observed, _ = self.env.reset(options=options)
-            self.tape["observation"][ended, 0] = observed.cpu().numpy()[ended]
-        return observed
-
-    def write(self, number: int) -> None:
-        """Write a shard of finished episodes, and the manifest with it. The episodes leave memory."""
-        numbers = self.recipe.episodes_of(number)
-        episodes = [self.finished.pop(episode) for episode in numbers]
-        parts = {name: [one[name] for one in episodes] for name in episodes[0]}
-        parts["length"] = [np.array([len(one) for one in parts["action"]])]
-        parts["world"] = [_worlds(self.recipe, np.array(numbers, np.int64))]
-        self.manifest = add_shard(self.folder, self.manifest, number, parts)
+        worlds, length = _worlds(recipe, numbers), np.zeros(count, np.int64)
+        stack, episodes = (
+            FrameStack(getattr(self.policy, "frames", 1)),
+            torch.from_numpy(numbers).to(env.device),
+        )
+        observed, _ = env.reset(seed=0, options={"worlds": worlds})
+        tape["observation"][:, 0] = observed.cpu().numpy()
+        for step in range(recipe.actions):
+            assert env.episodes is not None
+            if isinstance(self.policy, ExpertPlayer):
+                actions = self.policy(env.episodes)
+            else:
+                own = self.sight.kind == recipe.observation
+                shown = stack.push(observed if own else self.sight.of(env.episodes.world))
+                with torch.no_grad():
+                    actions = torch.as_tensor(self.policy(shown, action_keys(recipe.seed, episodes, step)))
+            observed, reward, terminated, truncated, info = env.step(actions)
+            given = {"action": actions, "reward": reward, "terminated": terminated, "truncated": truncated}
+            for name, value in {**given, "success": info["success"]}.items():
+                tape[name][:, step] = value.cpu().numpy()
+            tape["observation"][:, step + 1] = observed.cpu().numpy()
+            length[(terminated | truncated).cpu().numpy() & (length == 0)] = step + 1
+            going = int((length == 0).sum())
+            progress(done + count - going + going * (step + 1) / recipe.actions, recipe.episodes)
+            if not going:
+                break
+        ends = [
+            {"length": np.array([taken]), "world": np.array([world])}
+            for taken, world in zip(length, worlds, strict=True)
+        ]
+        return [
+            {name: rows[slot, : length[slot] + (name == "observation")].copy() for name, rows in tape.items()}
+            | end
+            for slot, end in enumerate(ends)
+        ]
 
 
 def _worlds(recipe: Recipe, episode: Array) -> Array:

@@ -265,17 +265,10 @@ def open_run(
     folder, plain = Path(path), json.loads(json.dumps(config))
     if (folder / ABOUT).exists():
         run = read_run(folder)
-        there, here = _flat(run.config), _flat(plain)
-        notes = [
-            f"`{name}` is {there.get(name, 'not set')} there, {here.get(name, 'not set')} here"
-            for name in sorted({*there, *here})
-            if there.get(name) != here.get(name)
-        ]
-        if run.kind != kind:
-            notes = [f"it is of the kind `{run.kind}`, not `{kind}`"]
+        notes = differences({"kind": run.kind}, {"kind": kind}) or differences(run.config, plain)
         if notes:
             helps = ("choose another folder with `--run`, or continue with that run's own settings",)
-            raise failure("PD621", f"{folder} holds another run", notes=tuple(notes), helps=helps)
+            raise failure("PD621", f"{folder} holds another run", notes=notes, helps=helps)
         return run
     new_folder(folder)
     versions = {"python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}"}
@@ -378,12 +371,26 @@ def write_json(path: Path, value: Any, *, follow: bool = False) -> Path:
     return path
 
 
+def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> tuple[str, ...]:
+    """The settings that differ, by dotted names, each with both values. Thirty at most."""
+    there, here = _flat(there), _flat(here)
+    names = [name for name in sorted({*there, *here}) if there.get(name) != here.get(name)]
+    return tuple(
+        f"`{name}` is {there.get(name, 'not set'):.80} there, {here.get(name, 'not set'):.80} here"
+        for name in names[:30]
+    )
+
+
 def _flat(config: Mapping[str, Any], within: str = "") -> dict[str, str]:
     """Each setting by its dotted name, as JSON."""
     settings: dict[str, str] = {}
     for name, value in config.items():
         is_group = isinstance(value, Mapping) and value
-        settings |= _flat(value, f"{within}{name}.") if is_group else {within + name: json.dumps(value)}
+        settings |= (
+            _flat(value, f"{within}{name}.")
+            if is_group
+            else {within + name: json.dumps(value, ensure_ascii=False)}
+        )
     return settings
 
 

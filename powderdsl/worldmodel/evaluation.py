@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from powderdsl.experiments.runs import does_not_fit
+from powderdsl.experiments.runs import differences, does_not_fit
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.draw import contact_sheet, palette, rgb, scale
 from powderdsl.worldmodel.config import HERE, DataConfig, Machine
@@ -123,12 +123,10 @@ def evaluate_recording(trained: Trained, recording: Recording, *, machine: Machi
     if known is None:
         raise does_not_fit(trained.run.path, "it learned from worlds, without actions")
     check_slots(trained.run.path, trained.palette, recording.rules)
-    why = [
-        f"`{name}` is {getattr(known, name)} there, {getattr(here, name)} in {recording.dataset.folder}"
-        for name in ("channels", "steps", "speed")
-        if getattr(known, name) != getattr(here, name)
-    ]
-    if why:
+    seen, shown = (
+        {name: getattr(one, name) for name in ("channels", "steps", "speed")} for one in (known, here)
+    )
+    if why := differences(seen, shown):
         raise does_not_fit(trained.run.path, *why)
     slots, predictors = len(trained.palette), dict[str, Network]({MODEL: trained.network})
     if known.actions:

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from powderdsl.datasets.manifest import changed_params, choice_names
+from powderdsl.experiments.runs import differences
 from powderdsl.model.fingerprint import fingerprint
 from powderdsl.system.writing import failure
 from powderdsl.tasks.shipped import load_task, shipped_tasks
@@ -148,22 +149,15 @@ def open_recording(folder: str | Path, task: str | None = None) -> Recording:
     found = load_task(name, knobs=recipe.knobs, params=params, palette=palette)
     notes = _differences(recipe, found)
     if notes:
-        raise failure("PD631", f"{folder} does not fit the task {found.name}", notes=tuple(notes))
+        raise failure("PD631", f"{folder} does not fit the task {found.name}", notes=notes)
     return Recording(dataset, name, found, palette)
 
 
-def _differences(recipe: Recipe, task: Task) -> list[str]:
+def _differences(recipe: Recipe, task: Task) -> tuple[str, ...]:
     """Why a recipe is not one of a task."""
-    compared = {
-        "size": (recipe.shape[1:], task.size),
-        "actions": (recipe.action_nvec, task.agent.action_nvec),
-        "choices": (recipe.choices, choice_names(task)),
-    }
-    found = [
-        f"{key}: {list(there)}, not {list(here)}"
-        for key, (there, here) in compared.items()
-        if list(there) != list(here)
-    ]
-    if not found and recipe.task_fingerprint and recipe.task_fingerprint != fingerprint(task):
-        found.append("the task, its knobs or its rules have changed since, or it had more packs")
-    return found
+    there = {"size": recipe.shape[1:], "actions": recipe.action_nvec, "choices": recipe.choices}
+    here = {"size": task.size, "actions": task.agent.action_nvec, "choices": choice_names(task)}
+    if found := differences(there, here):
+        return found
+    same = recipe.task_fingerprint == fingerprint(task)
+    return () if same else ("the task, its knobs or its rules have changed since, or it had more packs",)

@@ -59,9 +59,9 @@ def test_a_dataset_is_recorded_and_verified(task: Path, tmp_path: Path) -> None:
     refused = powderdsl(*command, *more)
     assert refused.exit_code == 2
     for line in (
-        "policy: 'nothing', not 'random'",
-        "observation: 'compact', not 'ids'",
-        "compress: True, not False",
+        '`policy` is "nothing" there, "random" here',
+        '`observation` is "compact" there, "ids" here',
+        "`compress` is true there, false here",
     ):
         assert line in refused.stderr
     (out / "shard-000001.npz").write_bytes(b"no shard")
@@ -90,7 +90,7 @@ def test_a_folder_with_other_files_is_refused(task: Path, tmp_path: Path) -> Non
         (("--verify", "gone"), "PD630"),
         (("small", "--verify", "gone"), "--verify takes a folder"),
         (("--seed", "-1"), "is not an integer"),
-        (("--knob", "disks"), "write --knob NAME=N"),
+        (("--knob", "disks"), "write NAME=N"),
         (("sand-pushing", "--out", "d", "--episodes", "1", "--policy", "runs/clever"), "PD620"),
         (("--observation", "matrix"), "matrix"),
         (("sand-pushing", "--out", "a/b", "--episodes", "1"), "PD613"),

@@ -180,7 +180,7 @@ def test_data_of_another_meaning_is_refused(recorded: Dataset, small: TaskProgra
         recorded.require(TensorEnv("ice-bridge", 1, observation="compact", backend="torch"))
     (found,) = caught.value.diagnostics
     assert found.code == "PD631"
-    names = {note.split(":")[0].split(".")[0] for note in found.notes}
+    names = {note.split("`")[1].split(".")[0] for note in found.notes}
     assert {"observation", "channels", "shape", "palette", "action_nvec", "choices"} <= names
     melting = compile_task(
         replace(

@@ -184,7 +184,7 @@ def test_another_recipe_is_refused(small: TaskProgram, recorded: Dataset) -> Non
         record(small, "random", recorded.folder, episodes=21, seed=4, shard=8, observation="compact")
     (found,) = caught.value.diagnostics
     assert found.code == "PD631"
-    assert {note.split(":")[0] for note in found.notes} == {
+    assert {note.split("`")[1] for note in found.notes} == {
         "seed",
         "episodes",
         "observation",
@@ -216,13 +216,13 @@ def test_folders_of_others_are_left_alone(small: TaskProgram, tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
-        ({"episodes": 0}, "episodes must be an integer from 1"),
-        ({"episodes": True}, "episodes must be an integer"),
-        ({"seed": -1}, "seed must be an integer from 0"),
+        ({"episodes": 0}, "`episodes` must be an integer from 1"),
+        ({"episodes": True}, "`episodes` must be an integer"),
+        ({"seed": -1}, "`seed` must be an integer from 0"),
         ({"envs": 0}, "envs must be"),
-        ({"shard": 0}, "shard must be"),
+        ({"shard": 0}, "`shard` must be"),
         ({"shard": 1 << 30}, "a shard of 1073741824 episodes may take"),
-        ({"observation": "matrix"}, "observation is one of ids, compact"),
+        ({"observation": "matrix"}, "`observation` must be `ids` or `compact`"),
         ({"policy": "clever"}, "one of expert, random, nothing"),
         ({"policy": lambda observed, keys: None}, "needs a policy_name"),
         (
@@ -244,7 +244,7 @@ def test_bad_arguments_are_refused(
 def test_more_shards_than_a_dataset_may_have_are_refused_before_anything_is_written(
     small: TaskProgram, tmp_path: Path
 ) -> None:
-    with pytest.raises(ValueError, match="record at least 2 episodes a shard"):
+    with pytest.raises(ValueError, match="65,537 shards, more than 65,536"):
         record(small, "random", tmp_path / "data", episodes=MAX_SHARDS + 1, shard=1)
     assert not (tmp_path / "data").exists()
     assert recipe_of(TensorEnv(small, 1), episodes=600 * MAX_SHARDS).shards <= MAX_SHARDS

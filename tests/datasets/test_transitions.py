@@ -137,7 +137,7 @@ def test_folders_of_other_meaning_are_refused(recorded: Dataset, tmp_path: Path)
         Transitions([recorded, other])
     (found,) = caught.value.diagnostics
     assert found.code == "PD631"
-    assert any(note.startswith("choices") for note in found.notes)
+    assert any(note.startswith("`choices`") for note in found.notes)
     with pytest.raises(ValueError, match="at least one"):
         Transitions([])
 

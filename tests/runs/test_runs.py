@@ -95,7 +95,7 @@ def test_the_same_settings_come_back_and_others_are_refused(tmp_path: Path) -> N
     )
     with pytest.raises(CompileError) as error:
         open_run(folder, "other", {"seed": 1})
-    assert "of the kind `toy`" in notes(error)
+    assert '`kind` is "toy" there, "other" here' in notes(error)
 
 
 def test_other_peoples_files_are_left_alone(tmp_path: Path) -> None:
