@@ -18,7 +18,7 @@ from powderdsl.cli.exits import BadInput
 from powderdsl.cli.output import color_wanted, print_json
 from powderdsl.diagnostics import Span
 from powderdsl.diagnostics.printable import printable, write_styled
-from powderdsl.model.text import one_line, place_of, show_set, show_value
+from powderdsl.model.text import place_of, show_set, show_value
 from powderdsl.model.types import Element, Pass, Property, Ruleset
 from powderdsl.system.reports import Painted, table
 from powderdsl.tasks.shipped import is_task
