@@ -121,8 +121,9 @@ class RampDecl(Entry, noun="a color_by"):
 
 
 class ElementDecl(Definition, noun="an element", others="a property or field"):
-    id: int | None = keyed("the number it asks for, 0 to 255; a free one otherwise", bounds=(0, 255))
-    id_scalar: Scalar | None = None
+    id: Scalar | None = keyed(
+        "the number it asks for, 0 to 255; a free one otherwise", bounds=(0, 255), shape="number"
+    )
     color: str = keyed('its color, quoted: "#RRGGBB"', "#000000", required=True, form=COLOR)
     ramp: RampDecl | None = keyed("how its color follows a field", name="color_by")
     glyph: str = keyed(
@@ -131,6 +132,11 @@ class ElementDecl(Definition, noun="an element", others="a property or field"):
     about: str = keyed("what it is, in a sentence", "")
     tags: Words = keyed("the tags it carries", ())
     override: bool = keyed("yes: replaces an element of another pack", False)
+
+    @property
+    def number(self) -> int | None:
+        """The id that it asks for."""
+        return int(self.id.text) if self.id else None
 
 
 class AlsoDecl(Definition, others="a property or field"):

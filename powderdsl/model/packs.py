@@ -106,9 +106,6 @@ class _PackReader(Reader):
             record = super().entry(kind, name, node)
         if isinstance(record, Definition):
             record = replace(record, pack=self.owner)
-        if isinstance(record, ElementDecl) and isinstance(node, Mapping):
-            number: Any = node.get("id")
-            record = replace(record, id_scalar=number if record.id is not None else None)
         return record
 
     # Definitions

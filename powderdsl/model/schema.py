@@ -277,7 +277,8 @@ class Reader:
             word = self.choice(key.text, node, row.choices)
             return int(word) if word and row.shape == "number" else word
         if row.shape == "number":
-            return self.number(key.text, node, *row.bounds)
+            number = self.number(key.text, node, *row.bounds)
+            return node if row.type is Scalar and number is not None else number
         if row.type is Syntax:
             return self.line(node)
         return " ".join(node.text.split()) if row.type is str else node

@@ -63,8 +63,8 @@ class Composition:
     slots: int
     order: dict[int, int]
     """The place of each id where loops run over elements: as if no palette had been recorded."""
-    groups: list[list[PackDecl]]
-    """The packs whose elements and channels are placed together; the first ones lie where they lie by themselves."""
+    group: dict[str, int]
+    """By pack: the number of the group in which its elements and channels lie; the first group lies as if alone."""
     reserved: tuple[int, ...]
     """Ids of elements of a ruleset's own packs that are left out."""
 
@@ -186,10 +186,11 @@ def compose(
             helps=["define `elements:`, or load `core` too"],
         )  # fmt: skip
     groups = _groups(packs, ruleset)
-    wishes = _wishes(groups, ruleset is not None, names, reporter)
-    natural = _composed_ids(wishes)
-    ids = natural if palette is None else _recorded_ids(wishes, palette)
-    _report_ids(wishes, ids, reporter, recorded=palette is not None)
+    wishes = [_wishes(group, names, reporter) for group in groups]
+    natural = _composed_ids(wishes, ruleset is not None)
+    asking = [decl for group in wishes for decl in group]
+    ids = natural if palette is None else _recorded_ids(asking, names, palette)
+    _report_ids(asking, ids, names, reporter, recorded=palette is not None)
     elements = _elements(declared, ids, reporter)
     composition = Composition(
         packs=packs,
@@ -200,8 +201,8 @@ def compose(
         elements=elements,
         slots=max(_slots(ruleset, elements, palette, reporter), *(number + 1 for number in ids.values()), 1),
         order={number: natural.get(name, number) for name, number in ids.items()},
-        groups=groups,
-        reserved=tuple(ids[wish.name] for wish in wishes if wish.name in ids and not wish.is_loaded),
+        group={pack.name.text: number for number, group in enumerate(groups) for pack in group},
+        reserved=tuple(number for name, number in ids.items() if name not in names.known),
     )
     _add_entries(composition, reporter)
     return composition
@@ -288,19 +289,6 @@ def _check_needs(packs: Sequence[PackDecl], reporter: Reporter) -> None:
 # Ids
 
 
-@dataclass(frozen=True)
-class Wish:
-    """An element that wants an id. `name` is the global one; `own` says that a ruleset lists its pack."""
-
-    name: str
-    decl: ElementDecl
-    own: bool
-    replaces: tuple[str, ...] = ()
-    """Qualified names of the elements that it overrides, the latest first: it takes over their id."""
-    is_loaded: bool = True
-    """False for elements of packs that a ruleset leaves out: their ids stay reserved."""
-
-
 def _groups(packs: Sequence[PackDecl], ruleset: RulesetDecl | None) -> list[list[PackDecl]]:
     """The packs whose elements and channels are placed together, one group after the other.
 
@@ -314,119 +302,102 @@ def _groups(packs: Sequence[PackDecl], ruleset: RulesetDecl | None) -> list[list
     return [*([first] if first else []), *([pack] for pack in others)]
 
 
-def _wishes(groups: Sequence[Sequence[PackDecl]], own: bool, names: Names, reporter: Reporter) -> list[Wish]:
-    """All elements in the order in which ids are decided. In each group, elements that ask for an id come first.
+def _wishes(group: Sequence[PackDecl], names: Names, reporter: Reporter) -> list[ElementDecl]:
+    """The elements of some packs in the order in which ids are decided: elements that ask for an id come first.
 
-    `own` says that the first group is a ruleset's. Warns of an element that overrides another one and asks for another
-    id than that has.
+    An element that overrides another one asks for the same id unless it says another one, with a warning. Elements of
+    packs that are left out keep their ids reserved.
     """
-    versions = {found[-1].qualified: (name, found) for name, found in names.versions.items()}
-    wishes: list[Wish] = []
-    for number, group in enumerate(groups):
-        listed = not own or number == 0
-        of_group = []
-        for decl in (decl for pack in group for decl in pack.elements):
-            name, (effective, *others) = versions.get(decl.qualified, ("", (None,)))
-            if effective is not None:
-                asking = [one for one in (effective, *others) if one.id is not None] or [effective]
-                _check_same_id(asking, reporter)
-                asked = replace(effective, id=asking[0].id, id_scalar=asking[0].id_scalar)
-                of_group.append(Wish(name, asked, listed, tuple(one.qualified for one in others)))
-            elif not decl.override:  # defined by a pack that is left out: the id stays reserved
-                of_group.append(Wish(f"-{decl.qualified}", decl, listed, is_loaded=False))
-        wishes += sorted(of_group, key=lambda wish: wish.decl.id is None)
-    return wishes
+    versions = {found[-1].qualified: found for found in names.versions.values()}
+    wishes: list[ElementDecl] = []
+    for decl in (decl for pack in group for decl in pack.elements):
+        found = versions.get(decl.qualified, [] if decl.override else [decl])
+        asking = [one for one in found if one.id] or found[:1]
+        for new, old in pairwise(asking):
+            if new.number != old.number:
+                reporter.report(
+                    "PD318", f"`{new.name.text}` gets the id {new.number} instead of {old.number}", new.id.span,
+                    "its channel moves too", secondary=[Label(old.id.span, "the id of the element that it replaces")],
+                    helps=["leave out `id`: an element that overrides another keeps its id"],
+                )  # fmt: skip
+        wishes += [replace(found[0], id=one.id) for one in asking[:1]]
+    return sorted(wishes, key=lambda decl: decl.id is None)
 
 
-def _check_same_id(asking: Sequence[ElementDecl], reporter: Reporter) -> None:
-    """Warn of declarations of one element, the latest first, that ask for another id than the one before."""
-    for decl, old in pairwise(asking):
-        if decl.id_scalar and old.id_scalar and decl.id != old.id:
-            reporter.report(
-                "PD318", f"`{decl.name.text}` gets the id {decl.id} instead of {old.id}", decl.id_scalar.span,
-                "its channel moves too", secondary=[Label(old.id_scalar.span, "the id of the element that it replaces")],
-                helps=["leave out `id`: an element that overrides another keeps its id"],
-            )  # fmt: skip
-
-
-def _composed_ids(wishes: Iterable[Wish]) -> dict[str, int]:
-    """Ids by global name. Earlier wishes are decided first, so further packs change nothing.
+def _composed_ids(groups: Sequence[Sequence[ElementDecl]], of_ruleset: bool) -> dict[str, int]:
+    """Ids by qualified name. Earlier wishes are decided first, so further packs change nothing.
 
     An element has the id that its file gives, unless that is taken. All others have the lowest free id above those of
-    the ruleset's packs, or, without a ruleset, above all ids so far.
+    the ruleset's packs, the first group, or, without a ruleset, above all ids so far.
     """
     ids: dict[str, int] = {}
-    taken: set[int] = set()
+    free = list(range(MAX_ELEMENTS))
     highest = -1
-    for wish in wishes:
-        number = wish.decl.id
-        if number is None or number in taken:
-            free = [n for n in range(MAX_ELEMENTS) if n not in taken]
-            if not free:
-                break
-            number = next((n for n in free if n > highest), free[0])
-        ids[wish.name] = number
-        taken.add(number)
-        if wish.own:
-            highest = max(highest, number)
+    for place, group in enumerate(groups):
+        for decl in group if free else ():
+            wanted = decl.number if decl.number in free else None
+            number = next((n for n in free if n > highest), free[0]) if wanted is None else wanted
+            ids[decl.qualified] = number
+            free.remove(number)
+            if place == 0 or not of_ruleset:
+                highest = max(highest, number)
     return ids
 
 
-def _recorded_ids(wishes: Iterable[Wish], palette: Palette) -> dict[str, int]:
-    """Ids by global name, where a palette has them; others get its free ids, then those behind its end.
+def _recorded_ids(wishes: Iterable[ElementDecl], names: Names, palette: Palette) -> dict[str, int]:
+    """Ids by qualified name, where a palette has them; others get its free ids, then those behind its end.
 
-    An element that asks for a free id of the palette gets it.
+    An element has the id of the one that it overrides. An element that asks for a free id of the palette gets it.
     """
     known = {name: number for number, name in enumerate(palette) if name is not None}
     ids: dict[str, int] = {}
-    later: list[Wish] = []
-    for wish in wishes:
-        name = next((name for name in (wish.decl.qualified, *wish.replaces) if name in known), None)
-        if name is None:
-            later.append(wish)
+    later: list[ElementDecl] = []
+    for decl in wishes:
+        versions = names.versions.get(names.known.get(decl.qualified, ""), [decl])
+        recorded = [known[one.qualified] for one in versions if one.qualified in known]
+        if recorded:
+            ids[decl.qualified] = recorded[0]
         else:
-            ids[wish.name] = known[name]
+            later.append(decl)
     free = [n for n in range(len(palette)) if palette[n] is None and n not in ids.values()]
-    for wish in later:
-        if (wanted := wish.decl.id) is not None and wanted in free:
-            ids[wish.name] = wanted
-            free.remove(wanted)
-    waiting = [wish.name for wish in later if wish.name not in ids]
+    for decl in later:
+        if decl.number in free:
+            ids[decl.qualified] = decl.number
+            free.remove(decl.number)
+    waiting = [decl.qualified for decl in later if decl.qualified not in ids]
     return ids | dict(zip(waiting, (*free, *range(len(palette), MAX_ELEMENTS)), strict=False))
 
 
 def _report_ids(
-    wishes: Sequence[Wish], ids: Mapping[str, int], reporter: Reporter, *, recorded: bool
+    wishes: Sequence[ElementDecl], ids: Mapping[str, int], names: Names, reporter: Reporter, *, recorded: bool
 ) -> None:
     """Report elements without an id, two elements of one pack with the same id, and ids that differ from the file."""
-    loaded = [wish for wish in wishes if wish.is_loaded]
-    lacking = [wish for wish in loaded if wish.name not in ids]
+    loaded = [decl for decl in wishes if decl.qualified in names.known]
+    lacking = [decl for decl in loaded if decl.qualified not in ids]
     if lacking:
         reporter.error(
-            "PD508", f"{len(loaded)} elements", lacking[0].decl.name.span, f"the limit is {MAX_ELEMENTS}",
-            helps=["load fewer packs"],
+            "PD508", f"{len(loaded)} elements", lacking[0].span, f"the limit is {MAX_ELEMENTS}", helps=["load fewer packs"]
         )  # fmt: skip
-    holders = {ids[wish.name]: wish for wish in wishes if wish.name in ids}
-    by_number: dict[tuple[str, int], Wish] = {}
-    for wish in loaded:
-        wanted, scalar = wish.decl.id, wish.decl.id_scalar
-        if wanted is None or scalar is None:
+    holders = {number: name for name, number in ids.items()}
+    by_number: dict[tuple[str, int], ElementDecl] = {}
+    for decl in loaded:
+        if decl.id is None or decl.number is None:
             continue
-        first = by_number.setdefault((wish.decl.pack, wanted), wish)
-        if first is not wish:
-            used = {other.decl.id for other in loaded} | {
-                number for number, holder in holders.items() if holder.is_loaded and holder is not wish
-            }
+        name, wanted = decl.qualified, decl.number
+        first = by_number.setdefault((decl.pack, wanted), decl)
+        if first is not decl:
+            others = [other for other in loaded if other is not decl]
+            used = {number for other in others for number in (other.number, ids.get(other.qualified))}
             free = next((n for n in range(MAX_ELEMENTS) if n not in used), None)
             reporter.error(
-                "PD303", f"elements `{first.decl.name.text}` and `{wish.decl.name.text}` have the same id {wanted}",
-                scalar.span, "already taken", secondary=[Label(first.decl.name.span, "by this one")],
+                "PD303", f"elements `{first.name.text}` and `{decl.name.text}` have the same id {wanted}",
+                decl.id.span, "already taken", secondary=[Label(first.span, "by this one")],
                 helps=[] if free is None else [f"id {free} is free; an element without `id:` gets a free one"],
             )  # fmt: skip
-        elif not recorded and ids.get(wish.name, wanted) != wanted:
+        elif not recorded and ids.get(name, wanted) != wanted:
             reporter.report(
-                "PD313", f"`{wish.decl.qualified}` has id {ids[wish.name]} here, not {wanted}",
-                scalar.span, f"`{holders[wanted].decl.qualified}` has id {wanted}",
+                "PD313", f"`{name}` has id {ids[name]} here, not {wanted}",
+                decl.id.span, f"`{holders[wanted]}` has id {wanted}",
                 notes=["saved worlds, datasets and checkpoints know elements by name, not by id"],
             )  # fmt: skip
 
@@ -446,13 +417,12 @@ def _elements(
                 "PD302", f"elements `{first.name.text}` and `{decl.name.text}` have the same glyph `{decl.glyph}`",
                 decl.span, "this one", secondary=[Label(first.span, "and this one")], helps=["give one of them another glyph"],
             )  # fmt: skip
-    glyphs = _glyphs({name: decl for name, decl in declared.items() if name in ids})
+    glyphs = _glyphs(declared)
     elements = {}
-    for name in sorted(glyphs, key=ids.__getitem__):
-        decl, glyph = declared[name], glyphs[name]
-        word = decl.name.text if decl.name.text != name else ""
+    for name, decl in sorted(declared.items(), key=lambda item: ids.get(item[1].qualified, MAX_ELEMENTS)):
+        number, word = ids.get(decl.qualified, MAX_ELEMENTS), decl.name.text if decl.name.text != name else ""
         elements[name] = Element(
-            name, decl.pack, ids[name], decl.color, glyph, decl.about, frozenset(), decl.span, word
+            name, decl.pack, number, decl.color, glyphs[name], decl.about, frozenset(), decl.span, word
         )
     return elements
 

@@ -31,22 +31,20 @@ def lay_out(
     for name, field in symbols.fields.items():
         if field.kind.name == "vec2":
             known[name] = [MatrixChannel(f"{name}.{part}", name, part=part) for part in COMPONENTS]
-    size = own_slots(composition)
+    size, elements = own_slots(composition), composition.elements.values()
+    names = {element.id: element.name for element in elements}
     blocks = _blocks(symbols, passes)
     parts: list[list[MatrixChannel]] = []
     """The channels of elements and those of what lasts from step to step, in turn, by group of packs."""
-    for (pack, *_), block in zip(composition.groups, blocks, strict=True):
-        elements = {element.id: element for element in composition.elements.values()}
-        added = [
-            MatrixChannel(e.name, id=e.id)
-            for e in elements.values()
-            if e.pack == pack.name.text and e.id >= size
-        ]
-        if not parts:
-            names = [elements[number].name if number in elements else "" for number in range(size)]
-            added = [MatrixChannel(name, id=number) for number, name in enumerate(names)]
+    for number, block in enumerate(blocks):
+        ids = (
+            [e.id for e in elements if e.id >= size and composition.group[e.pack] == number]
+            if parts
+            else range(size)
+        )
+        parts.append([MatrixChannel(names.get(identity, ""), id=identity) for identity in ids])
         lasting = [name for name in block if name not in symbols.fields or not symbols.fields[name].resets]
-        parts += [added, [channel for name in lasting for channel in known[name]]]
+        parts.append([channel for name in lasting for channel in known[name]])
     written = composition.ruleset.placing.matrix if composition.ruleset else ()
     if written:
         own = [_written(scalar, known, composition, reporter) for scalar in written]
@@ -61,16 +59,14 @@ def own_slots(composition: Composition) -> int:
     """How many ids the first packs have room for."""
     if composition.ruleset is not None and composition.ruleset.placing.slots:
         return composition.ruleset.placing.slots
-    own = [pack.name.text for pack in composition.groups[0]]
-    ids = [element.id for element in composition.elements.values() if element.pack in own]
+    ids = [element.id for element in composition.elements.values() if composition.group[element.pack] == 0]
     return max([*ids, *composition.reserved], default=-1) + 1
 
 
 def _blocks(symbols: Symbols, passes: tuple[Pass, ...]) -> list[list[str]]:
     """Stored properties and fields, by group of packs."""
-    groups = symbols.composition.groups
-    place = {pack.name.text: number for number, group in enumerate(groups) for pack in group}
-    blocks: list[list[str]] = [[] for _ in groups]
+    place = symbols.composition.group
+    blocks: list[list[str]] = [[] for _ in range(max(place.values()) + 1)]
     first: dict[str, int] = {}
     for pass_, moment in substeps(passes):
         for write in (write for rule in moment.rules for write in writes_of(rule)):
