@@ -100,9 +100,9 @@ def check(
     reporter.raise_if_errors()
     undecided += report_needless(passes, symbols.fields, facts, reporter)
     found = Ruleset(
-        name=title(packs, ruleset),
+        name=title(composition.packs, ruleset),
         about=ruleset.about if ruleset else (packs[0].about if len(packs) == 1 else ""),
-        packs=tuple(pack.name.text for pack in packs),
+        packs=tuple(composition.packs),
         elements=elements,
         slots=composition.slots,
         properties=tuple(symbols.properties.values()),
@@ -156,7 +156,7 @@ def restricted(ruleset: Ruleset, packs: Collection[str]) -> Ruleset | None:
 def without(ruleset: Ruleset, pack: str) -> Ruleset | None:
     """The model without one pack and the packs that need it; None if the rest is not a ruleset."""
     assert ruleset.declared is not None
-    needs = needs_of(ruleset.declared.packs)
+    needs = needs_of({decl.name.text: decl for decl in ruleset.declared.packs})
     return restricted(ruleset, [name for name in needs if pack not in needs[name]])
 
 
@@ -195,7 +195,7 @@ def with_outgrown(ruleset: Ruleset, remarks: tuple[Diagnostic, ...]) -> tuple[Di
         return remarks
     composition = compose(ruleset.declared.packs, ruleset.declared.ruleset, Reporter())
     notes: dict[Diagnostic, Diagnostic] = {}
-    authors: list[PackDecl | RulesetDecl] = [*composition.packs, *composition.lineage]
+    authors: list[PackDecl | RulesetDecl] = [*composition.packs.values(), *composition.lineage]
     for author in authors:
         own = {
             one: one.primary.span

@@ -161,11 +161,11 @@ def _kind(noun: str, decl: TypedDecl, typer: Typer) -> Kind:
 
 def _set_by_rulesets(composition: Composition, typer: Typer) -> None:
     """Give parameters the values of rulesets, bases first; values for packs that are left out are skipped."""
-    params, loaded = typer.symbols.params, {pack.name.text for pack in composition.packs}
+    params = typer.symbols.params
     for ruleset in composition.lineage:
         for key, syntax in ruleset.params:
             pack, known = key.text.partition(".")[0], params.get(key.text)
-            if pack not in loaded and any(pack in one.members for one in ruleset.lineage):
+            if pack not in composition.packs and any(pack in one.members for one in ruleset.lineage):
                 continue
             if known is None:
                 helps = suggest(key.text, params, "parameters")

@@ -121,10 +121,10 @@ ANYTHING = "?"
 def check_examples(typer: Typer) -> tuple[Example, ...]:
     """The tests of all packs, checked: characters known, rows equally long."""
     examples = []
-    for pack in typer.symbols.composition.packs:
+    for name, pack in typer.symbols.composition.packs.items():
         for decl in pack.tests:
             with suppress(Poisoned, Unresolved):
-                examples.append(_ExampleReader(typer, pack.name.text, decl).example())
+                examples.append(_ExampleReader(typer, name, decl).example())
     return tuple(examples)
 
 
@@ -223,7 +223,7 @@ class _ExampleReader:
         if not any(side % multiple for side in sides):
             return
         known = self.composition.names.needs[self.pack]
-        least = lcm(*(pack.side_multiple for pack in self.composition.packs if pack.name.text in known))
+        least = lcm(*(self.composition.packs[pack].side_multiple for pack in known))
         if any(side % least for side in sides):
             label = f"`side_multiple` asks for multiples of {multiple}"
             raise self.typer.fail("PD110", f"a world of {sides[0]}×{sides[1]} cells", drawing.span, label)

@@ -57,7 +57,7 @@ def check_invariants(
         typer_of: what checks expressions against the names of some packs alone; None if they make no ruleset.
     """
     written: list[tuple[str, Syntax, RulesetDecl | None]]
-    written = [(pack.name.text, line, None) for pack in composition.packs for line in pack.invariants]
+    written = [(name, line, None) for name, pack in composition.packs.items() for line in pack.invariants]
     gone = composition.left_out
     for ruleset in composition.lineage:
         written += [(ruleset.name.text, with_optional(line, gone), ruleset) for line in ruleset.invariants]
@@ -76,7 +76,7 @@ def check_invariants(
                 "PD506", f"this invariant is inactive: `{missing.name}` is not loaded", line.span, "left out",
                 helps=[f"it becomes active with a pack that defines `{missing.name}`"],
             )  # fmt: skip
-        added = [one.name.text for one in composition.packs if one.name.text not in scope]
+        added = [name for name in composition.packs if name not in scope]
         for remark in typer.reporter.diagnostics:
             if remark.code == "PD511" and added and _can_hold(typer_of(scope), line, pack):
                 names = ", ".join(f"`{name}`" for name in added)

@@ -117,7 +117,7 @@ class RulesetSource:
         """The packs that are left out, drawn one at a time; packs that others need stay."""
         if not self.variety.leave_out:
             return ()
-        needed = {name.text for pack in with_stand_ins(self.packs) for name in pack.needs}
+        needed = {name.text for pack in with_stand_ins(self.packs).values() for name in pack.needs}
         loose = [pack.name.text for pack in self.packs if pack.name.text not in needed]
         return tuple(name for name in loose if next(draws) < self.variety.leave_out)
 

@@ -145,7 +145,7 @@ class AddedPacks:
         Args:
             place: where the conflict is reported. ids: elements with which the rules meet.
         """
-        packs = {decl.name.text: decl for decl in self.composition.packs}
+        packs = self.composition.packs
         words = frozenset(pack_words(packs[pack]))
         scope = self.composition.scope(pack, words)
         if len(scope) == len(packs):

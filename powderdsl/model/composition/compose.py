@@ -7,7 +7,7 @@ later.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import cached_property
@@ -51,7 +51,7 @@ Palette = Sequence[str | None]
 class Composition:
     """Packs merged. Dictionaries are by global name, in load order; kinds and values are still syntax."""
 
-    packs: Sequence[PackDecl]
+    packs: dict[str, PackDecl]
     ruleset: RulesetDecl | None
     names: Names
     passes: dict[str, PassDecl]
@@ -71,7 +71,7 @@ class Composition:
     @cached_property
     def side_multiple(self) -> int:
         """The least common multiple of what the packs ask of the sides of worlds."""
-        return lcm(*(pack.side_multiple for pack in self.packs))
+        return lcm(*(pack.side_multiple for pack in self.packs.values()))
 
     @cached_property
     def lineage(self) -> tuple[RulesetDecl, ...]:
@@ -99,7 +99,7 @@ class Composition:
             pack = self.names.pack(self.names.of(speaker, word))
             known += [pack] if pack else []
         reached = {need for pack in known for need in self.names.needs.get(pack, (pack,))}
-        return tuple(pack.name.text for pack in self.packs if pack.name.text in reached)
+        return tuple(pack for pack in self.packs if pack in reached)
 
     @cached_property
     def entries(self) -> list[tuple[str, ElementDecl | AlsoDecl]]:
@@ -110,9 +110,9 @@ class Composition:
         """
         members = {name for one in self.lineage for name in one.members}
         packs = needed_first(self.packs)
-        also = [decl for pack in packs if pack.name.text in members for decl in pack.also]
+        also = [decl for pack in packs if pack in members for decl in self.packs[pack].also]
         also += [_waiting(decl, self.left_out) for one in self.lineage for decl in one.also]
-        also += [decl for pack in packs if pack.name.text not in members for decl in pack.also]
+        also += [decl for pack in packs if pack not in members for decl in self.packs[pack].also]
         own = self.names.declared(ElementDecl)
         return [*own.items(), *((self.names.of(decl.pack, decl.name.word), decl) for decl in also)]
 
@@ -131,7 +131,7 @@ class Composition:
 
     def glyphs_alone(self, packs: Sequence[str]) -> dict[str, str]:
         """The glyphs of elements, by global name, as they are where only some packs are loaded."""
-        alone = (decl for pack in self.packs if pack.name.text in packs for decl in pack.elements)
+        alone = (decl for name, pack in self.packs.items() if name in packs for decl in pack.elements)
         return _glyphs({self.names.of(decl.pack, decl.name.text): decl for decl in alone})
 
     def element(self, word: str, pack: str) -> str | None:
@@ -169,15 +169,15 @@ def compose(
 
     `palette` has ids that were recorded earlier.
     """
-    packs = with_stand_ins(packs)
-    _check_needs(packs, reporter)
+    loaded = with_stand_ins(packs)
+    _check_needs(loaded, reporter)
     reporter.raise_if_errors()  # every name of a missing pack would be reported too
     renames = ruleset.renames if ruleset else ()
-    names = Names(packs, SHARED, renames, reporter, RESERVED | reserved_words() | {"elements"})
+    names = Names(loaded, SHARED, renames, reporter, RESERVED | reserved_words() | {"elements"})
     params = {decl.qualified: decl for pack in packs for decl in pack.params}
     for decl in params.values():
         names.check_word(decl.name, ParamDecl.NOUN)
-    passes = Names(packs, ("passes",), renames, reporter)
+    passes = Names(loaded, ("passes",), renames, reporter)
     _check_renamed(ruleset, names.renamed | passes.renamed, reporter)
     declared = names.declared(ElementDecl)
     if not declared:
@@ -185,7 +185,7 @@ def compose(
             "PD109", "no element is defined", packs[0].name.span if packs else None, "a world needs elements",
             helps=["define `elements:`, or load `core` too"],
         )  # fmt: skip
-    groups = _groups(packs, ruleset)
+    groups = _groups(loaded, ruleset)
     wishes = [_wishes(group, names, reporter) for group in groups]
     natural = _composed_ids(wishes, ruleset is not None)
     asking = [decl for group in wishes for decl in group]
@@ -193,7 +193,7 @@ def compose(
     _report_ids(asking, ids, names, reporter, recorded=palette is not None)
     elements = _elements(declared, ids, reporter)
     composition = Composition(
-        packs=packs,
+        packs=loaded,
         ruleset=ruleset,
         names=names,
         passes=order_passes(passes, reporter),
@@ -208,9 +208,8 @@ def compose(
     return composition
 
 
-def title(packs: Sequence[PackDecl], ruleset: RulesetDecl | None) -> str:
+def title(loaded: Collection[str], ruleset: RulesetDecl | None) -> str:
     """The title of what is loaded: a ruleset, packs left out of it, packs added: ``ruleset-pack+pack``."""
-    loaded = [pack.name.text for pack in packs]
     if ruleset is None:
         return "+".join(loaded)
     named = [ruleset]
@@ -250,15 +249,14 @@ def _check_renamed(ruleset: RulesetDecl | None, renamed: set[str], reporter: Rep
             )  # fmt: skip
 
 
-def _check_needs(packs: Sequence[PackDecl], reporter: Reporter) -> None:
+def _check_needs(loaded: Mapping[str, PackDecl], reporter: Reporter) -> None:
     """Report packs that cannot be loaded together, and packs that are needed and not loaded."""
-    loaded = {pack.name.text: pack for pack in packs}
     stands_in: dict[str, PackDecl] = {}
     missing: dict[str, dict[str, Span]] = {}
-    for pack in packs:
+    for name, pack in loaded.items():
         for need in pack.needs:
             if need.text not in loaded:
-                missing.setdefault(need.text, {})[pack.name.text] = need.span
+                missing.setdefault(need.text, {})[name] = need.span
         for other in (*pack.conflicts, *pack.provides):
             rival = loaded.get(other.text)
             if other in pack.provides:
@@ -266,7 +264,7 @@ def _check_needs(packs: Sequence[PackDecl], reporter: Reporter) -> None:
                 stands_in.setdefault(other.text, pack)
             if rival is not None:
                 reporter.error(
-                    "PD306", f"packs `{pack.name.text}` and `{rival.name.text}` cannot be loaded together",
+                    "PD306", f"packs `{name}` and `{rival.name.text}` cannot be loaded together",
                     other.span, "declared here", secondary=[Label(rival.name.span, "loaded too")],
                     helps=["leave one of them out"],
                 )  # fmt: skip
@@ -289,17 +287,17 @@ def _check_needs(packs: Sequence[PackDecl], reporter: Reporter) -> None:
 # Ids
 
 
-def _groups(packs: Sequence[PackDecl], ruleset: RulesetDecl | None) -> list[list[PackDecl]]:
+def _groups(packs: Mapping[str, PackDecl], ruleset: RulesetDecl | None) -> list[list[PackDecl]]:
     """The packs whose elements and channels are placed together, one group after the other.
 
     A ruleset's own packs come first, packs that it leaves out included, because their positions stay reserved. Each
     further pack follows by itself, after the packs that it needs: the order in which packs are named matters little.
     """
     own = ruleset.placed if ruleset else ()
-    by_name = {pack.name.text: pack for pack in (*(ruleset.left_out if ruleset else ()), *packs)}
+    by_name = {pack.name.text: pack for pack in (*(ruleset.left_out if ruleset else ()), *packs.values())}
     first = [by_name[name] for name in own if name in by_name]
-    others = needed_first([pack for pack in packs if pack.name.text not in own])
-    return [*([first] if first else []), *([pack] for pack in others)]
+    others = ([packs[name]] for name in needed_first(packs) if name not in own)
+    return [*([first] if first else []), *others]
 
 
 def _wishes(group: Sequence[PackDecl], names: Names, reporter: Reporter) -> list[ElementDecl]:

@@ -37,7 +37,7 @@ class Names:
 
     def __init__(
         self,
-        packs: Sequence[PackDecl],
+        packs: Mapping[str, PackDecl],
         sections: Sequence[str],
         rename: Sequence[tuple[Scalar, Scalar]],
         reporter: Reporter,
@@ -50,13 +50,13 @@ class Names:
         """The qualified names of `rename` that were met."""
         self.needs = needs_of(packs)
         """A pack, and all packs that it needs, directly or not."""
-        self.provides = {pack.name.text: pack.provides for pack in packs}
+        self.packs = packs
         self.versions: dict[str, list[Any]] = {}
         """By global name: the declaration that holds, then those that it overrides."""
         self.known: dict[str, str] = {}
         """Global names by qualified name, those of elements and passes that a pack overrides among them."""
         for section in sections:
-            for pack in packs:
+            for pack in packs.values():
                 for decl in getattr(pack, section):
                     self._define(decl)
 
@@ -135,7 +135,7 @@ class Names:
     def _know(self, decl: Definition, name: str) -> None:
         """Remember the global name of a definition, also for those who name a pack that its pack stands in for."""
         self.known[decl.qualified] = name
-        for other in self.provides[decl.pack]:
+        for other in self.packs[decl.pack].provides:
             self.known.setdefault(f"{other.text}.{decl.name.text}", name)
 
 
@@ -168,32 +168,26 @@ def report_unknown(
 # Packs and what they need
 
 
-def needs_of(packs: Sequence[PackDecl]) -> dict[str, tuple[str, ...]]:
+def needs_of(packs: Mapping[str, PackDecl]) -> dict[str, tuple[str, ...]]:
     """For each pack, itself, then all packs that it needs, directly or not, in load order."""
-    by_name = {pack.name.text: pack for pack in packs}
     closed = {}
-    for pack in by_name:
+    for pack in packs:
         reached = [pack]
         for name in reached:  # grows on the way
-            for need in by_name[name].needs:
-                if need.text in by_name and need.text not in reached:
-                    reached.append(need.text)
-        closed[pack] = (pack, *(name for name in by_name if name in reached[1:]))
+            reached += [need.text for need in packs[name].needs if need.text in packs.keys() - reached]
+        closed[pack] = (pack, *(name for name in packs if name in reached[1:]))
     return closed
 
 
-def with_stand_ins(packs: Sequence[PackDecl]) -> list[PackDecl]:
-    """Replace `needs` that are not loaded by the loaded packs that provide them."""
-    loaded = {pack.name.text for pack in packs}
-    provider = {
-        other.text: pack.name.text for pack in packs for other in pack.provides if other.text not in loaded
-    }
-    if not provider:
-        return list(packs)
-    return [
-        replace(pack, needs=tuple(replace(one, text=provider.get(one.text, one.text)) for one in pack.needs))
-        for pack in packs
-    ]
+def with_stand_ins(packs: Iterable[PackDecl]) -> dict[str, PackDecl]:
+    """Packs by name. They need the packs that provide what is not loaded instead of that."""
+    loaded = {pack.name.text: pack for pack in packs}
+    provider = {other.text: name for name, pack in loaded.items() for other in pack.provides}
+    provider |= dict(zip(loaded, loaded, strict=True))
+    for name, pack in loaded.items():
+        needs = [replace(need, text=provider.get(need.text, need.text)) for need in pack.needs]
+        loaded[name] = replace(pack, needs=tuple(needs))
+    return loaded
 
 
 def in_order(names: Iterable[str], after: Mapping[str, Collection[str]]) -> tuple[list[str], list[str]]:
@@ -213,11 +207,9 @@ def in_order(names: Iterable[str], after: Mapping[str, Collection[str]]) -> tupl
     return ordered, stuck
 
 
-def needed_first(packs: Sequence[PackDecl]) -> list[PackDecl]:
+def needed_first(packs: Mapping[str, PackDecl]) -> list[str]:
     """The packs in load order, but each after the packs that it needs. Packs that need each other keep their order."""
-    by_name = {pack.name.text: pack for pack in packs}
-    after = {name: needs for name, (_, *needs) in needs_of(packs).items()}
-    return [by_name[name] for name in in_order(by_name, after)[0]]
+    return in_order(packs, {name: needs for name, (_, *needs) in needs_of(packs).items()})[0]
 
 
 # The order of passes

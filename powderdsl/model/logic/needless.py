@@ -366,14 +366,16 @@ def _report_unwritten(composition: Composition, reporter: Reporter) -> None:
     them for others.
     """
     names = composition.names
-    words = {names.of(pack.name.text, word) for pack in composition.packs for word in pack_words(pack)}
+    words = {names.of(name, word) for name, pack in composition.packs.items() for word in pack_words(pack)}
     for ruleset in composition.lineage:
         words |= {word for line in ruleset.invariants for word in words_of(line)}
         words |= {scalar.word.partition(".")[0] for scalar in ruleset.matrix}
     for name, field in names.declared(FieldDecl).items():
         if name not in words and field.name.text not in words:
             _unused("field", name, field.span, reporter)
-    for block in (block for pack in composition.packs for one in pack.passes for block in one.walk()):
+    for block in (
+        block for pack in composition.packs.values() for one in pack.passes for block in one.walk()
+    ):
         inner = [line for one in block.walk() if one is not block for line in one.lines]
         later = {word for line in (*block.lines[len(block.lets) :], *inner) for word in words_of(line)}
         for scalar, value in reversed(block.lets):

@@ -68,7 +68,7 @@ def written_test(
         items = ", ".join(f"{glyph}: {element}" for glyph, element in quoted)
         lines.append(f"    legend: {{{items}}}")
     lines += ["    given: |", *_drawn(before, glyphs)]
-    needed = needs_of(packs)[mutant.pack]
+    needed = needs_of({decl.name.text: decl for decl in packs})[mutant.pack]
     start = run_sample(sim, found.sample, 0)[1]
     usual = sim.world(found.sample.ids)
     for field in found.sample.fields:
@@ -131,7 +131,7 @@ def _legend(
     Characters that packs choose themselves are known wherever these are loaded; all others depend on what else is
     loaded. Elements of packs that this one does not need may be absent: the test then waits.
     """
-    needed = needs_of(packs)[pack]
+    needed = needs_of({decl.name.text: decl for decl in packs})[pack]
     chosen = {f"{one.name.text}.{decl.name.text}": decl.glyph for one in packs for decl in one.elements}
     glyphs: dict[int, str] = {}
     legend = []
