@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Iterable, Iterator
+from dataclasses import fields
 from fractions import Fraction
 
 from powderdsl.diagnostics import Span
 from powderdsl.model.builtins import DIRECTIONS, OCTANTS
-from powderdsl.model.declarations import Block, PackDecl, PassDecl
+from powderdsl.model.declarations import PackDecl
 from powderdsl.model.expressions.operators import TRUE
 from powderdsl.model.operations import COMPARISONS, OPERATIONS
+from powderdsl.model.schema import Record
 from powderdsl.model.types import (
     Assign,
     Element,
@@ -29,6 +31,7 @@ from powderdsl.model.types import (
     Value,
 )
 from powderdsl.syntax.ast import Syntax
+from powderdsl.syntax.yaml_tree import Scalar
 
 _ATOM = 9
 """How tightly a word binds, or what ends in a parenthesis."""
@@ -48,51 +51,39 @@ def print_model(ruleset: Ruleset, passes: Iterable[str] | None = None) -> str:
 
 def print_tree(packs: Iterable[PackDecl], pass_name: str | None = None) -> str:
     """Packs as parsed, or only a pass of them: each line as written, with its place, above its syntax tree."""
-    return "\n".join(line for pack in packs for line in _pack_lines(pack, pass_name))
+    lines: list[str] = []
+    for pack in packs:
+        if pass_name is not None:
+            passes = tuple(decl for decl in pack.passes if decl.name.text == pass_name)
+            pack = PackDecl(name=pack.name, source=pack.source, passes=passes)
+        if pass_name is None or pack.passes:
+            lines += _tree_lines("pack", pack, "")
+    return "\n".join(lines)
 
 
-def _pack_lines(pack: PackDecl, pass_name: str | None) -> Iterator[str]:
-    chosen = [decl for decl in pack.passes if pass_name in (None, decl.name.text)]
-    if chosen or pass_name is None:
-        yield f"pack {pack.name.text}  # {place_of(pack.name.span)}"
-    for named_set in pack.sets if pass_name is None else ():
-        yield from _syntax_lines(f"set {named_set.name.text}", named_set.members, "  ")
-    for decl in chosen:
-        yield from _pass_lines(decl)
-
-
-def _pass_lines(decl: PassDecl) -> Iterator[str]:
-    yield f"  pass {decl.name.text}  # {place_of(decl.name.span)}"
-    for item in decl.scratch:
-        if item.type is not None:
-            yield from _syntax_lines(f"scratch {item.name.text}", item.type, "    ")
-    yield from _block_lines(decl, "    ")
-
-
-def _block_lines(block: Block, indent: str) -> Iterator[str]:
-    for name, syntax in block.lets:
-        yield from _syntax_lines(f"let {name.text}", syntax, indent)
-    inner = indent
-    if block.header is not None:
-        yield from _syntax_lines("loop", block.header, indent)
-        inner += "  "
-    for key, value in (("symmetry", block.symmetry), ("conflicts", block.conflicts)):
-        if value:
-            yield f"{inner}{key} {value}"
-    for syntax in block.rules:
-        yield from _syntax_lines("rule", syntax, inner)
-    for child in block.blocks:
-        yield f"{inner}block"
-        yield from _block_lines(child, inner + "  ")
-    for child in block.then:
-        yield f"{indent}then"
-        yield from _block_lines(child, indent + "  ")
-
-
-def _syntax_lines(what: str, syntax: Syntax, indent: str) -> Iterator[str]:
-    """A heading with the line as written, below it the tree."""
-    yield f"{indent}{what}: {one_line(syntax.span)}  # {place_of(syntax.span)}"
-    yield syntax.dump(indent + "  ")
+def _tree_lines(key: str, value: object, indent: str) -> Iterator[str]:
+    """What stands below a key, as far as it says anything."""
+    match value:
+        case Syntax():
+            yield f"{indent}{key}: {one_line(value.span)}  # {place_of(value.span)}"
+            yield value.dump(indent + "  ")
+        case Record():
+            name = getattr(value, "name", None)
+            yield f"{indent}{key}" + (f" {name.text}  # {place_of(name.span)}" if name else "")
+            for item in fields(value):  # type: ignore[arg-type]  # records are dataclasses
+                part, row = getattr(value, item.name), item.metadata.get("key")
+                if item.name not in ("name", "pack", "source") and part != item.default:
+                    yield from _tree_lines(row.name or item.name if row else item.name, part, indent + "  ")
+        case (Scalar() as name, Syntax() as line):
+            yield from _tree_lines(f"{key} {name.text}", line, indent)
+        case (Record() | Syntax() | tuple(), *_):
+            for part in value:
+                yield from _tree_lines(key, part, indent)
+        case Scalar() | (Scalar(), *_):
+            words = value if isinstance(value, tuple) else (value,)
+            yield f"{indent}{key} {' '.join(one_line(word.content) for word in words)}"
+        case _:
+            yield f"{indent}{key} {value}"
 
 
 def place_of(span: Span) -> str:

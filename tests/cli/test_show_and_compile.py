@@ -187,7 +187,7 @@ def test_kernels_that_are_not_there(arguments):
 
 def test_trees_show_rules_as_parsed():
     result = powderdsl("compile", "core+water", "--emit", "tree", "--pass", "melt")
-    heading = "rule: ice -> water if count(thaws) > 1 and interact < melt  # rules/water.yaml:"
+    heading = "do: ice -> water if count(thaws) > 1 and interact < melt  # rules/water.yaml:"
     assert heading in result.stdout
     assert "      transform\n        name ice\n        name water\n        condition\n" in result.stdout
 

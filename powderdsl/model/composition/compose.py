@@ -332,9 +332,12 @@ def _composed_ids(groups: Sequence[Sequence[ElementDecl]], of_ruleset: bool) -> 
     free = list(range(MAX_ELEMENTS))
     highest = -1
     for place, group in enumerate(groups):
-        for decl in group if free else ():
-            wanted = decl.number if decl.number in free else None
-            number = next((n for n in free if n > highest), free[0]) if wanted is None else wanted
+        for decl in group:
+            if not free:
+                return ids
+            number = decl.number
+            if number not in free:
+                number = next((n for n in free if n > highest), free[0])
             ids[decl.qualified] = number
             free.remove(number)
             if place == 0 or not of_ruleset:
