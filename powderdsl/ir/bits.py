@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import operator
 from collections import defaultdict
-from collections.abc import Callable, Hashable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import cache, lru_cache, partial, reduce
 from itertools import permutations
 from typing import Any, NamedTuple
@@ -99,12 +99,8 @@ def simpler(build: Builder, op: str, args: tuple[Node, ...], attr: Hashable = No
     return None
 
 
-@dataclass(frozen=True)
-class Bits:
-    """The bit planes of an integer, lowest first, and whether the highest is a sign (two's complement)."""
-
-    planes: tuple[Node, ...]
-    signed: bool = False
+Bits = tuple[Node, ...]
+"""The bit planes of an integer in two's complement, lowest first; the last is the sign, constant where there is none."""
 
 
 class Gates(Builder):
@@ -147,46 +143,39 @@ class Gates(Builder):
 
     def constant(self, value: int) -> Bits:
         type = integer(value, value)
-        return Bits(tuple([self.flag(bool(value >> i & 1)) for i in range(type.bits)]), type.signed)
+        return self.fit([self.flag(bool(value >> i & 1)) for i in range(type.bits)], type)
 
-    def sign(self, a: Bits) -> Node:
-        """The plane that all those beyond the highest one equal."""
-        return a.planes[-1] if a.signed else self.no
-
-    def bit(self, a: Bits, index: int) -> Node:
-        return a.planes[index] if index < len(a.planes) else self.sign(a)
-
-    def fit(self, a: Bits, type: Type) -> Bits:
-        """The same number in the planes of a range that holds it."""
-        return Bits(tuple([self.bit(a, i) for i in range(type.bits)]), type.signed)
+    def fit(self, planes: Sequence[Node], type: Type) -> Bits:
+        """The same number in the planes of a range that holds it. They may lack the sign of one that has none."""
+        fitted = [planes[min(i, len(planes) - 1)] for i in range(type.bits)]
+        return (*fitted,) if type.signed else (*fitted, self.no)
 
     def full_adder(self, a: Node, b: Node, c: Node) -> tuple[Node, Node]:
         """Sum and carry of three bits."""
         half = self.derive("xor", a, b)
         return self.derive("xor", half, c), self.or_(self.and_(a, b), self.and_(half, c))
 
+    def pairs(self, a: Bits, b: Bits, count: int = 0) -> Iterator[tuple[Node, Node]]:
+        """The lowest bits of two numbers side by side, as many as the longer one has if no count is given."""
+        for i in range(count or max(len(a), len(b))):
+            yield a[min(i, len(a) - 1)], b[min(i, len(b) - 1)]
+
     def add(self, a: Bits, b: Bits, type: Type, carry: Node | None = None) -> Bits:
         """a + b (+ carry)."""
         carry = carry or self.no
         planes = []
-        for i in range(type.bits):
-            total, carry = self.full_adder(self.bit(a, i), self.bit(b, i), carry)
+        for x, y in self.pairs(a, b, type.bits):
+            total, carry = self.full_adder(x, y, carry)
             planes.append(total)
-        return Bits(tuple(planes), type.signed)
+        return self.fit(planes, type)
 
     def sub(self, a: Bits, b: Bits, type: Type) -> Bits:
         """a - b, which is a + (-b - 1) + 1."""
-        planes = b.planes if b.signed else (*b.planes, self.no)
-        return self.add(a, Bits(tuple(map(self.not_, planes)), True), type, self.yes)
+        return self.add(a, tuple(map(self.not_, b)), type, self.yes)
 
     def neg(self, a: Bits, type: Type) -> Bits:
         """-a, where `type` is the range of a."""
         return self.sub(self.constant(0), a, integer(-type.hi, -type.lo))
-
-    def pairs(self, a: Bits, b: Bits) -> list[tuple[Node, Node]]:
-        """The bits of two numbers side by side, lowest first."""
-        count = max(len(a.planes), len(b.planes)) + (a.signed != b.signed)
-        return [(self.bit(a, i), self.bit(b, i)) for i in range(count)]
 
     def eq(self, a: Bits, b: Bits) -> Node:
         same = [self.not_(self.derive("xor", x, y)) for x, y in self.pairs(a, b)]
@@ -194,39 +183,36 @@ class Gates(Builder):
 
     def lt(self, a: Bits, b: Bits) -> Node:
         """a < b: from the lowest bit, the highest difference decides."""
-        *pairs, (x, y) = self.pairs(a, b)
-        highest = (y, x) if a.signed or b.signed else (x, y)  # the sign counts the other way
+        *pairs, signs = self.pairs(a, b)
         result = self.no
-        for x, y in (*pairs, highest):
+        for x, y in (*pairs, signs[::-1]):  # the sign counts the other way
             result = self.select(self.derive("xor", x, y), y, result)
         return result
 
     def choose(self, condition: Node, yes: Bits, no: Bits, type: Type) -> Bits:
         """One number where a condition holds, the other elsewhere."""
-        pairs = zip(self.fit(yes, type).planes, self.fit(no, type).planes, strict=True)
-        return Bits(tuple([self.select(condition, a, b) for a, b in pairs]), type.signed)
+        return self.fit([self.select(condition, *pair) for pair in self.pairs(yes, no, type.bits)], type)
 
     def divide(self, a: Bits, b: Bits, most: int) -> tuple[Bits, Bits]:
         """a / b rounded down, and the remainder, where 0 < b ≤ most; where b is 0 they mean nothing.
 
         Long division from the highest bit: twice the remainder so far plus the bit, less b if it fits.
         """
-        bits = list(reversed(a.planes))
-        rest, quotient = self.constant(0), []
-        if a.signed:  # the sign bit counts as minus one: minus one time b, and b - 1 left
-            quotient.append(bits[0])
+        *bits, sign = a
+        rest, quotient = self.constant(0), [sign]
+        if sign is not self.no:  # it counts as minus one: minus one time b, and b - 1 left
             less = self.sub(b, self.constant(1), integer(-1, most - 1))
-            rest = self.choose(bits.pop(0), less, rest, integer(0, most - 1))
-        for bit in bits:
-            doubled = Bits((bit, *rest.planes))
+            rest = self.choose(sign, less, rest, integer(0, most - 1))
+        for bit in reversed(bits):
+            doubled = (bit, *rest)
             smaller = self.lt(doubled, b)
             reduced = self.sub(doubled, b, integer(-most, 2 * most - 1))
             rest = self.choose(smaller, doubled, reduced, integer(0, most - 1))
             quotient.append(self.not_(smaller))
-        return Bits(tuple(reversed(quotient)), a.signed), rest
+        return tuple(reversed(quotient)), rest
 
-    def total(self, terms: Iterable[tuple[Node, int]], count: int) -> tuple[Node, ...]:
-        """The sum of flags of some weights, as `count` planes: a carry-save tree."""
+    def total(self, terms: Iterable[tuple[Node, int]], count: int) -> Bits:
+        """The sum of flags of some weights, as `count` planes and no sign: a carry-save tree."""
         columns: defaultdict[int, list[Node]] = defaultdict(list)
         for flag, weight in terms:
             for i in range(weight.bit_length()):
@@ -241,7 +227,7 @@ class Gates(Builder):
                 column.append(total)
                 columns[i + 1].append(carry)
             planes.append(column[0] if column else self.no)
-        return tuple(planes)
+        return (*planes, self.no)
 
     def truth_table(self, inputs: Sequence[Node], matters: int, values: int) -> Node:
         """Any function of a few planes: bit n of `values` is its value for the number n, if it `matters`."""
@@ -348,8 +334,8 @@ def lower_pass(program: Program, pass_: PassGraph) -> PassGraph:
         value = values[node]
         if isinstance(value, Node):
             return [(name, value)]
-        planes = gates.fit(value, slots[name]).planes if name in slots else value.planes
-        return [(plane_name(name, i), plane) for i, plane in enumerate(planes)]
+        type = slots.get(name, node.type)
+        return [(plane_name(name, i), plane) for i, plane in enumerate(gates.fit(value, type)[: type.bits])]
 
     lowered = pass_.map(write, values.__getitem__)
     outputs = tuple([(name, node) for name, node in lowered.outputs if not node.is_input(name)])
@@ -363,10 +349,10 @@ class _Lowering(Gates):
         super().__init__()
         self.slots = slots
         self.values: dict[Node, Any] = {}
-        """The flag, float or integer (`Bits`) that each node has become."""
+        """The flag or float that each node has become, or the planes of its integer."""
 
     def lower(self, node: Node, args: Sequence[Any]) -> Node | Bits:
-        whole = node.type.name == "int" or Bits in map(type, args)
+        whole = node.type.name == "int" or tuple in map(type, args)
         if whole and node.op not in _INTEGERS:
             raise NotBits(f"{node.op} of integers")
         row = (_INTEGERS if whole else _OTHERS).get(node.op)
@@ -383,7 +369,7 @@ class _Lowering(Gates):
         self, a: Bits, type: Type, test: Callable[[int], bool | int], below: int | None = None
     ) -> Node:
         """A flag that depends on a small integer only; what it is from `below` on does not matter."""
-        count = len(a.planes)
+        count = type.bits
         if count > MAX_TABLE_BITS:
             raise NotBits(f"a table over {count} planes")
         matters = values = 0
@@ -391,7 +377,7 @@ class _Lowering(Gates):
             place = number & ((1 << count) - 1)
             matters |= 1 << place
             values |= bool(test(number)) << place
-        return self.truth_table(a.planes, matters, values)
+        return self.truth_table(a[:count], matters, values)
 
     def number_of(
         self, a: Bits, node: Node, function: Callable[[int], int], below: int | None = None
@@ -402,34 +388,32 @@ class _Lowering(Gates):
             self.flag_of(a, of, partial(lambda i, number: function(number) >> i & 1, i), below)
             for i in range(node.type.bits)
         ]
-        return Bits(tuple(planes), node.type.signed)
+        return self.fit(planes, node.type)
 
 
 def _input(gates: _Lowering, node: Node) -> Bits:
     type = gates.slots[str(node.attr)]
     planes = [gates.input(plane_name(node.attr, i), FLAG) for i in range(type.bits)]
-    return gates.fit(Bits(tuple(planes), type.signed), node.type)
+    return gates.fit(gates.fit(planes, type), node.type)
 
 
 def _by_bit(gates: _Lowering, node: Node) -> Bits:
     planes = [gates.make(node.op, FLAG, attr=(*node.attr, i)) for i in range(node.type.bits)]
-    return Bits(tuple(planes), node.type.signed)
+    return gates.fit(planes, node.type)
 
 
 def _shift(gates: _Lowering, node: Node, value: Bits) -> Bits:
     dy, dx, wraps = node.attr
-    value = gates.fit(value, node.type)
-    return Bits(tuple([gates.shift(plane, (dy, dx), wraps) for plane in value.planes]), value.signed)
+    return tuple([gates.shift(plane, (dy, dx), wraps) for plane in gates.fit(value, node.type)])
 
 
 def _move(gates: _Lowering, node: Node, content: Bits, movers: Node, rest: Bits) -> Bits:
     """Swaps stay swaps, one for each bit plane: targets exchange planes in place."""
-    pairs = zip(gates.fit(content, node.type).planes, gates.fit(rest, node.type).planes, strict=True)
     planes = [
         a if a is b and a.op == "const" else gates.derive(node.op, a, movers, b, attr=node.attr)
-        for a, b in pairs
+        for a, b in gates.pairs(content, rest, node.type.bits)
     ]
-    return Bits(tuple(planes), node.type.signed)
+    return gates.fit(planes, node.type)
 
 
 def _move_floats(gates: _Lowering, node: Node, content: Node, movers: Node, rest: Node) -> Node:
@@ -455,7 +439,7 @@ def _below(gates: _Lowering, node: Node, limit: Bits) -> Node:
         if count <= 0 or count >= 1 << bits:
             return gates.flag(count > 0)
         return gates.derive("chance", attr=(stream, bits, count))
-    planes = gates.fit(limit, integer(0, 1 << bits)).planes
+    *planes, _ = gates.fit(limit, integer(0, 1 << bits))
     return gates.derive("below_planes", *reversed(planes), attr=(stream, bits))
 
 
@@ -475,7 +459,7 @@ def _compare(gates: _Lowering, node: Node, a: Bits, b: Bits) -> Node:
             if len(some) == 1 and test(0) not in some:
                 joined = _any_neighbor(gates, side)
                 return joined if True in some else gates.not_(joined)
-        if len(bits.planes) <= 5:
+        if side.type.bits <= 5:
             return gates.flag_of(bits, side.type, test)
     if node.op == "eq":
         return gates.eq(a, b)
@@ -495,7 +479,7 @@ def _any_neighbor(gates: _Lowering, count: Node) -> Node:
 def _count(gates: _Lowering, node: Node, flag: Node) -> Bits:
     """A kernel as adders: each pattern of a row once, then the rows; negative weights are added inverted."""
     weights, wraps = node.attr
-    sums: dict[object, list[tuple[Node, ...]]] = {}
+    sums: dict[object, list[Bits]] = {}
     terms: tuple[list[tuple[Node, int]], ...] = ([], [])
     for dy, pattern in kernel_rows(weights).items():
         if pattern not in sums:
@@ -508,33 +492,33 @@ def _count(gates: _Lowering, node: Node, flag: Node) -> Bits:
         for side, planes in zip(terms, sums[pattern], strict=True):
             side += [(gates.shift(plane, (dy, 0), wraps), 1 << i) for i, plane in enumerate(planes)]
     lo, hi = node.type.lo, node.type.hi
-    plus = Bits(gates.total(terms[0], max(hi.bit_length(), 1)))
+    plus = gates.total(terms[0], max(hi.bit_length(), 1))
     if lo >= 0:
         return gates.fit(plus, node.type)
-    return gates.sub(plus, Bits(gates.total(terms[1], max((-lo).bit_length(), 1))), node.type)
+    return gates.sub(plus, gates.total(terms[1], max((-lo).bit_length(), 1)), node.type)
 
 
 def _multiply(gates: _Lowering, node: Node, a: Bits, b: Bits) -> Bits:
     """Shifted additions; a negative factor counts its sign bit as minus."""
     bound = 1 << integer(min(node.type.lo, 0), node.type.hi).bits
     result = gates.constant(0)
-    for i, bit in enumerate(b.planes):
-        term = Bits((*[gates.no] * i, *[gates.and_(bit, plane) for plane in a.planes]), a.signed)
-        combine = gates.sub if b.signed and i == len(b.planes) - 1 else gates.add
-        result = combine(result, term, integer(-bound, bound - 1))
+    for i, bit in enumerate(b):
+        if bit is not gates.no:
+            term = (*[gates.no] * i, *[gates.and_(bit, plane) for plane in a])
+            combine = gates.sub if i == len(b) - 1 else gates.add
+            result = combine(result, term, integer(-bound, bound - 1))
     return gates.fit(result, node.type)
 
 
 def _quotient(gates: _Lowering, node: Node, value: Bits, divisor: Bits) -> Bits:
     of, by = (arg.type for arg in node.args)
     if by.lo == by.hi and by.lo > 0 and by.lo & (by.lo - 1) == 0:  # rounded down, as a shift is
-        shifted = value.planes[by.lo.bit_length() - 1 :] or (gates.sign(value),)
-        return gates.fit(Bits(shifted, value.signed), node.type)
-    if by.lo == by.hi and by.lo and len(value.planes) <= MAX_TABLE_BITS // 2:
+        return gates.fit(value[by.lo.bit_length() - 1 :] or value[-1:], node.type)
+    if by.lo == by.hi and by.lo and of.bits <= MAX_TABLE_BITS // 2:
         return gates.number_of(value, node, lambda number: number // by.lo)
     most = max(abs(by.lo), abs(by.hi))
-    if divisor.signed:  # a div -b = -a div b
-        negative = divisor.planes[-1]
+    if by.signed:  # a div -b = -a div b
+        negative = divisor[-1]
         reach = max(abs(of.lo), abs(of.hi))
         value = gates.choose(negative, gates.neg(value, of), value, integer(-reach, reach))
         divisor = gates.choose(negative, gates.neg(divisor, by), divisor, integer(0, most))
@@ -546,9 +530,8 @@ def _quotient(gates: _Lowering, node: Node, value: Bits, divisor: Bits) -> Bits:
 def _mod(gates: _Lowering, node: Node, value: Bits) -> Bits:
     modulus = node.attr
     if modulus & (modulus - 1) == 0:  # its lowest bits; of a modulus of 1 none
-        bits = [gates.bit(value, i) for i in range(modulus.bit_length() - 1)]
-        return Bits(tuple(bits) or (gates.no,))
-    if len(value.planes) > MAX_TABLE_BITS // 2:
+        return gates.fit(value[: modulus.bit_length() - 1] or (gates.no,), node.type)
+    if node.args[0].type.bits > MAX_TABLE_BITS // 2:
         _, rest = gates.divide(value, gates.constant(modulus), modulus)
         return gates.fit(rest, node.type)
     return gates.number_of(value, node, lambda number: number % modulus)
@@ -561,8 +544,8 @@ def _to_real(gates: _Lowering, node: Node, value: Bits) -> Node:
         raise NotBits("an integer too large for float32")
     weights: dict[Node, float] = {}  # equal planes count together
     always = 0.0
-    for i, plane in enumerate(value.planes):
-        weight = -float(1 << i) if value.signed and i == len(value.planes) - 1 else float(1 << i)
+    for i, plane in enumerate(value):
+        weight = float(1 << i) if i < len(value) - 1 else -float(1 << i)
         if plane.op == "const":
             always += weight if plane.attr else 0.0
         else:
@@ -595,7 +578,7 @@ _INTEGERS: dict[str, Callable[..., Node | Bits]] = {
     "quotient": _quotient,
     "mod": _mod,
     "neg": lambda gates, node, a: gates.neg(a, node.args[0].type),
-    "abs": lambda gates, node, a: gates.choose(gates.sign(a), gates.neg(a, node.args[0].type), a, node.type),
+    "abs": lambda gates, node, a: gates.choose(a[-1], gates.neg(a, node.args[0].type), a, node.type),
     "min": lambda gates, node, a, b: gates.choose(gates.lt(a, b), a, b, node.type),
     "max": lambda gates, node, a, b: gates.choose(gates.lt(a, b), b, a, node.type),
     "to_real": _to_real,

@@ -7,7 +7,7 @@ from itertools import product
 import pytest
 
 from powderdsl.ir.bits import Bits, Gates
-from powderdsl.ir.ops import FLAG, Builder, Node, integer
+from powderdsl.ir.ops import FLAG, Node, integer
 
 RANGES = [(0, 1), (0, 5), (-3, 3), (-8, 7), (-2, 9), (3, 12)]
 
@@ -40,19 +40,17 @@ def evaluate(node: Node, args: list[bool], inputs: dict[str, bool]) -> bool:
 
 def number_of(bits: Bits, inputs: dict[str, bool]) -> int:
     known: dict[int, bool] = {}
-    total = sum(value_of(plane, inputs, known) << i for i, plane in enumerate(bits.planes))
-    if bits.signed and value_of(bits.planes[-1], inputs, known):
-        total -= 1 << len(bits.planes)
-    return total
+    total = sum(value_of(plane, inputs, known) << i for i, plane in enumerate(bits))
+    return total - (value_of(bits[-1], inputs, known) << len(bits))
 
 
-def variable(name: str, lo: int, hi: int, build: Builder) -> Bits:
+def variable(name: str, lo: int, hi: int, gates: Gates) -> Bits:
     type = integer(lo, hi)
-    return Bits(tuple(build.input(f"{name}{i}", FLAG) for i in range(type.bits)), type.signed)
+    return gates.fit([gates.input(f"{name}{i}", FLAG) for i in range(type.bits)], type)
 
 
 def assignment(name: str, value: int, bits: Bits) -> dict[str, bool]:
-    return {f"{name}{i}": bool(value >> i & 1) for i in range(len(bits.planes))}
+    return {f"{name}{i}": bool(value >> i & 1) for i in range(len(bits))}
 
 
 @pytest.mark.parametrize("first", RANGES)
@@ -87,7 +85,7 @@ def test_truth_tables(bounds: tuple[int, int]) -> None:
     lo, hi = bounds
     gates = Gates()
     a = variable("a", lo, hi, gates)
-    count = len(a.planes)
+    count = len(a)
     every = 1 << (hi - lo + 1)
     for members in range(0, every, max(1, every // 97)):
         matters = values = 0
@@ -95,7 +93,7 @@ def test_truth_tables(bounds: tuple[int, int]) -> None:
             place = number & ((1 << count) - 1)
             matters |= 1 << place
             values |= (members >> (number - lo) & 1) << place
-        node = gates.truth_table(a.planes, matters, values)
+        node = gates.truth_table(a, matters, values)
         for number in range(lo, hi + 1):
             assert value_of(node, assignment("a", number, a)) == bool(members >> (number - lo) & 1)
 
@@ -107,7 +105,7 @@ def test_sums_of_flags(size: int) -> None:
     planes = gates.total([(flag, 1) for flag in flags], size.bit_length())
     for values in product((False, True), repeat=size):
         inputs = {f"f{i}": v for i, v in enumerate(values)}
-        assert number_of(Bits(planes), inputs) == sum(values)
+        assert number_of(planes, inputs) == sum(values)
 
 
 def test_gates_fold() -> None:
