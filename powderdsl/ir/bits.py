@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import operator
 from collections import defaultdict
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cache, lru_cache, partial, reduce
+from functools import cache, lru_cache, reduce
 from itertools import permutations
 from typing import Any, NamedTuple
 
@@ -18,7 +18,7 @@ from powderdsl.ir.ops import (
     FLAG,
     OPS,
     REAL,
-    Builder,
+    Graph,
     Node,
     Offset,
     PassGraph,
@@ -54,7 +54,7 @@ def _opposite(a: Node, b: Node) -> bool:
     return (a.op == "not" and a.args[0] is b) or (b.op == "not" and b.args[0] is a)
 
 
-def simpler(build: Builder, op: str, args: tuple[Node, ...], attr: Hashable = None) -> Node | None:
+def simpler(build: Graph, op: str, args: tuple[Node, ...], attr: Hashable = None) -> Node | None:
     """Constants evaluated, except floats, and the algebra of flags: what an operation is without itself, if anything."""
     row = OPS[op]
     constants = [arg.attr for arg in args if arg.op == "const" and arg.type != REAL]
@@ -95,7 +95,7 @@ def simpler(build: Builder, op: str, args: tuple[Node, ...], attr: Hashable = No
                 if _opposite(yes, no):
                     return build.derive("xor", build.not_(condition), yes)
             if condition.op == "not":  # select(not c, a, b) = select(c, b, a)
-                return Builder.derive(build, op, condition.args[0], no, yes)
+                return Graph.derive(build, op, condition.args[0], no, yes)
     return None
 
 
@@ -103,13 +103,19 @@ Bits = tuple[Node, ...]
 """The bit planes of an integer in two's complement, lowest first; the last is the sign, constant where there is none."""
 
 
-class Gates(Builder):
-    """Boolean circuits on bit planes: gates that fold as they are built, adders, comparators, truth tables."""
+class Gates(Graph):
+    """Boolean circuits on bit planes: gates that fold as they are built, adders, comparators, truth tables.
 
-    def __init__(self) -> None:
+    `slots` are the types of what the nodes find that are lowered to gates.
+    """
+
+    def __init__(self, slots: Mapping[str, Type] | None = None) -> None:
         super().__init__()
         self.no = self.flag(False)
         self.yes = self.flag(True)
+        self.slots = slots or {}
+        self.values: dict[Node, Any] = {}
+        """The flag or float that each lowered node has become, or the planes of its integer."""
 
     def derive(self, op: str, *args: Node, attr: Hashable = None) -> Node:
         known = simpler(self, op, args, attr) if args and args[-1].type == FLAG else None
@@ -229,6 +235,33 @@ class Gates(Builder):
             planes.append(column[0] if column else self.no)
         return (*planes, self.no)
 
+    def lower(self, node: Node) -> Node | Bits:
+        """A node of a pass on bit planes. Raises NotBits."""
+        args = tuple([self.values[arg] for arg in node.args])
+        whole = node.type.name == "int" or tuple in map(type, args)
+        if whole and node.op not in _INTEGERS:
+            raise NotBits(f"{node.op} of integers")
+        row = (_INTEGERS if whole else _OTHERS).get(node.op)
+        value: Node | Bits = row(self, node, *args) if row else self.rebuild(node, args)
+        if self.size > MAX_GATES:
+            raise NotBits(f"more than {MAX_GATES:,} gates")
+        return value
+
+    def looked_up(self, a: Bits, of: Type, function: Callable[[int], int | None], type: Type) -> Bits:
+        """What a function gives for a small integer of a range; where that is None it does not matter."""
+        if of.bits > MAX_TABLE_BITS:
+            raise NotBits(f"a table over {of.bits} planes")
+        values = {number & ((1 << of.bits) - 1): function(number) for number in range(of.lo, of.hi + 1)}
+        planes = []
+        for i in range(type.bits):
+            matters = holds = 0
+            for place, value in values.items():
+                if value is not None:
+                    matters |= 1 << place
+                    holds |= (value >> i & 1) << place
+            planes.append(self.truth_table(a[: of.bits], matters, holds))
+        return self.fit(planes, type)
+
     def truth_table(self, inputs: Sequence[Node], matters: int, values: int) -> Node:
         """Any function of a few planes: bit n of `values` is its value for the number n, if it `matters`."""
         used = []
@@ -317,14 +350,12 @@ def lower_bits(program: Program) -> Program:
 def lower_pass(program: Program, pass_: PassGraph) -> PassGraph:
     """One pass of a program on bit planes. Raises NotBits."""
     slots = {slot.name: slot.type for slot in program.slots}
-    gates = _Lowering(slots)
+    gates = Gates(slots)
     values = gates.values
     for node in nodes_of(pass_):
         gates.place = node.places[0] if node.places else ""
         try:
-            values[node] = gates.lower(node, [values[arg] for arg in node.args])
-            if gates.graph.size > MAX_GATES:
-                raise NotBits(f"more than {MAX_GATES:,} gates")
+            values[node] = gates.lower(node)
         except NotBits as error:
             error.place = error.place or gates.place
             raise
@@ -342,72 +373,23 @@ def lower_pass(program: Program, pass_: PassGraph) -> PassGraph:
     return replace(lowered, outputs=outputs)
 
 
-class _Lowering(Gates):
-    """Gates for the nodes of a pass. `slots` are the types of what it finds."""
-
-    def __init__(self, slots: dict[str, Type]):
-        super().__init__()
-        self.slots = slots
-        self.values: dict[Node, Any] = {}
-        """The flag or float that each node has become, or the planes of its integer."""
-
-    def lower(self, node: Node, args: Sequence[Any]) -> Node | Bits:
-        whole = node.type.name == "int" or tuple in map(type, args)
-        if whole and node.op not in _INTEGERS:
-            raise NotBits(f"{node.op} of integers")
-        row = (_INTEGERS if whole else _OTHERS).get(node.op)
-        if row is not None:
-            value: Node | Bits = row(self, node, *args)
-            return value
-        return (
-            self.derive(node.op, *args, attr=node.attr)
-            if args
-            else self.make(node.op, node.type, attr=node.attr)
-        )
-
-    def flag_of(
-        self, a: Bits, type: Type, test: Callable[[int], bool | int], below: int | None = None
-    ) -> Node:
-        """A flag that depends on a small integer only; what it is from `below` on does not matter."""
-        count = type.bits
-        if count > MAX_TABLE_BITS:
-            raise NotBits(f"a table over {count} planes")
-        matters = values = 0
-        for number in range(type.lo, min(type.hi + 1, below or type.hi + 1)):
-            place = number & ((1 << count) - 1)
-            matters |= 1 << place
-            values |= bool(test(number)) << place
-        return self.truth_table(a[:count], matters, values)
-
-    def number_of(
-        self, a: Bits, node: Node, function: Callable[[int], int], below: int | None = None
-    ) -> Bits:
-        """The integer of a node that depends on a small integer only, bit by bit."""
-        of = node.args[0].type
-        planes = [
-            self.flag_of(a, of, partial(lambda i, number: function(number) >> i & 1, i), below)
-            for i in range(node.type.bits)
-        ]
-        return self.fit(planes, node.type)
-
-
-def _input(gates: _Lowering, node: Node) -> Bits:
+def _input(gates: Gates, node: Node) -> Bits:
     type = gates.slots[str(node.attr)]
     planes = [gates.input(plane_name(node.attr, i), FLAG) for i in range(type.bits)]
     return gates.fit(gates.fit(planes, type), node.type)
 
 
-def _by_bit(gates: _Lowering, node: Node) -> Bits:
-    planes = [gates.make(node.op, FLAG, attr=(*node.attr, i)) for i in range(node.type.bits)]
+def _by_bit(gates: Gates, node: Node) -> Bits:
+    planes = [gates.node(node.op, FLAG, attr=(*node.attr, i)) for i in range(node.type.bits)]
     return gates.fit(planes, node.type)
 
 
-def _shift(gates: _Lowering, node: Node, value: Bits) -> Bits:
+def _shift(gates: Gates, node: Node, value: Bits) -> Bits:
     dy, dx, wraps = node.attr
     return tuple([gates.shift(plane, (dy, dx), wraps) for plane in gates.fit(value, node.type)])
 
 
-def _move(gates: _Lowering, node: Node, content: Bits, movers: Node, rest: Bits) -> Bits:
+def _move(gates: Gates, node: Node, content: Bits, movers: Node, rest: Bits) -> Bits:
     """Swaps stay swaps, one for each bit plane: targets exchange planes in place."""
     planes = [
         a if a is b and a.op == "const" else gates.derive(node.op, a, movers, b, attr=node.attr)
@@ -416,7 +398,7 @@ def _move(gates: _Lowering, node: Node, content: Bits, movers: Node, rest: Bits)
     return gates.fit(planes, node.type)
 
 
-def _move_floats(gates: _Lowering, node: Node, content: Node, movers: Node, rest: Node) -> Node:
+def _move_floats(gates: Gates, node: Node, content: Node, movers: Node, rest: Node) -> Node:
     """Floats are moved cell by cell anyway: choices between what neighbors hold."""
     if content.type == FLAG:
         return gates.derive(node.op, content, movers, rest, attr=node.attr)
@@ -426,7 +408,7 @@ def _move_floats(gates: _Lowering, node: Node, content: Node, movers: Node, rest
     return gates.select(movers, gates.shift(content, (dy, dx)), moved) if node.op == "swap" else moved
 
 
-def _below(gates: _Lowering, node: Node, limit: Bits) -> Node:
+def _below(gates: Gates, node: Node, limit: Bits) -> Node:
     """A draw below a limit. A constant limit is an attribute; another is given plane by plane, highest first."""
     stream, bits = node.attr
     (source,) = node.args
@@ -443,7 +425,7 @@ def _below(gates: _Lowering, node: Node, limit: Bits) -> Node:
     return gates.derive("below_planes", *reversed(planes), attr=(stream, bits))
 
 
-def _compare(gates: _Lowering, node: Node, a: Bits, b: Bits) -> Node:
+def _compare(gates: Gates, node: Node, a: Bits, b: Bits) -> Node:
     left, right = node.args
     holds = getattr(operator, node.op)
     for side, bits, other in ((left, a, right), (right, b, left)):
@@ -460,13 +442,13 @@ def _compare(gates: _Lowering, node: Node, a: Bits, b: Bits) -> Node:
                 joined = _any_neighbor(gates, side)
                 return joined if True in some else gates.not_(joined)
         if side.type.bits <= 5:
-            return gates.flag_of(bits, side.type, test)
+            return gates.looked_up(bits, side.type, test, FLAG)[0]
     if node.op == "eq":
         return gates.eq(a, b)
     return gates.lt(a, b) if node.op == "lt" else gates.not_(gates.lt(b, a))
 
 
-def _any_neighbor(gates: _Lowering, count: Node) -> Node:
+def _any_neighbor(gates: Gates, count: Node) -> Node:
     weights, wraps = count.attr
     flag = gates.values[count.args[0]]
     rows = [
@@ -476,7 +458,7 @@ def _any_neighbor(gates: _Lowering, count: Node) -> Node:
     return gates.any(rows)
 
 
-def _count(gates: _Lowering, node: Node, flag: Node) -> Bits:
+def _count(gates: Gates, node: Node, flag: Node) -> Bits:
     """A kernel as adders: each pattern of a row once, then the rows; negative weights are added inverted."""
     weights, wraps = node.attr
     sums: dict[object, list[Bits]] = {}
@@ -498,7 +480,7 @@ def _count(gates: _Lowering, node: Node, flag: Node) -> Bits:
     return gates.sub(plus, gates.total(terms[1], max((-lo).bit_length(), 1)), node.type)
 
 
-def _multiply(gates: _Lowering, node: Node, a: Bits, b: Bits) -> Bits:
+def _multiply(gates: Gates, node: Node, a: Bits, b: Bits) -> Bits:
     """Shifted additions; a negative factor counts its sign bit as minus."""
     bound = 1 << integer(min(node.type.lo, 0), node.type.hi).bits
     result = gates.constant(0)
@@ -510,12 +492,12 @@ def _multiply(gates: _Lowering, node: Node, a: Bits, b: Bits) -> Bits:
     return gates.fit(result, node.type)
 
 
-def _quotient(gates: _Lowering, node: Node, value: Bits, divisor: Bits) -> Bits:
+def _quotient(gates: Gates, node: Node, value: Bits, divisor: Bits) -> Bits:
     of, by = (arg.type for arg in node.args)
     if by.lo == by.hi and by.lo > 0 and by.lo & (by.lo - 1) == 0:  # rounded down, as a shift is
         return gates.fit(value[by.lo.bit_length() - 1 :] or value[-1:], node.type)
     if by.lo == by.hi and by.lo and of.bits <= MAX_TABLE_BITS // 2:
-        return gates.number_of(value, node, lambda number: number // by.lo)
+        return gates.looked_up(value, of, lambda number: number // by.lo, node.type)
     most = max(abs(by.lo), abs(by.hi))
     if by.signed:  # a div -b = -a div b
         negative = divisor[-1]
@@ -527,17 +509,17 @@ def _quotient(gates: _Lowering, node: Node, value: Bits, divisor: Bits) -> Bits:
     return gates.choose(none, gates.constant(0), quotient, node.type)
 
 
-def _mod(gates: _Lowering, node: Node, value: Bits) -> Bits:
+def _mod(gates: Gates, node: Node, value: Bits) -> Bits:
     modulus = node.attr
     if modulus & (modulus - 1) == 0:  # its lowest bits; of a modulus of 1 none
         return gates.fit(value[: modulus.bit_length() - 1] or (gates.no,), node.type)
     if node.args[0].type.bits > MAX_TABLE_BITS // 2:
         _, rest = gates.divide(value, gates.constant(modulus), modulus)
         return gates.fit(rest, node.type)
-    return gates.number_of(value, node, lambda number: number % modulus)
+    return gates.looked_up(value, node.args[0].type, lambda number: number % modulus, node.type)
 
 
-def _to_real(gates: _Lowering, node: Node, value: Bits) -> Node:
+def _to_real(gates: Gates, node: Node, value: Bits) -> Node:
     """A number from its planes: exact, since integers stay below 2^24."""
     of = node.args[0].type
     if max(abs(of.lo), abs(of.hi)) >= 1 << 24:
@@ -567,8 +549,10 @@ _INTEGERS: dict[str, Callable[..., Node | Bits]] = {
     "below": _below,
     "shift": _shift,
     "count": _count,
-    "in_set": lambda gates, node, a: gates.flag_of(a, node.args[0].type, node.attr.__contains__),
-    "table": lambda gates, node, a: gates.number_of(a, node, node.attr.__getitem__, len(node.attr)),
+    "in_set": lambda gates, node, a: gates.looked_up(a, node.args[0].type, node.attr.__contains__, FLAG)[0],
+    "table": lambda gates, node, a: gates.looked_up(
+        a, node.args[0].type, dict(enumerate(node.attr)).get, node.type
+    ),
     "eq": _compare,
     "lt": _compare,
     "le": _compare,

@@ -13,7 +13,6 @@ from powderdsl.analysis.changes import facts_of
 from powderdsl.ir.ops import (
     FLAG,
     REAL,
-    Builder,
     Graph,
     Node,
     PassGraph,
@@ -70,7 +69,7 @@ class Inputs:
     """What expressions read: the current node of each slot, and under ``let NAME`` of each value that `let` has fixed."""
 
     ruleset: Ruleset
-    build: Builder
+    build: Graph
     state: dict[str, Node]
     threshold: Threshold | None = None
     """Chances are the number of draws below them if this is given, else floats."""
@@ -85,8 +84,8 @@ class Inputs:
         if isinstance(value, str):
             param = next(p for p in self.ruleset.params if p.name == value)
             if kind.name == "chance" and threshold is not None:
-                return build.make("param", integer(0, 1 << threshold.bits), attr=(value, threshold))
-            return build.make("param", ir_type(param.kind), attr=(value, None))
+                return build.node("param", integer(0, 1 << threshold.bits), attr=(value, threshold))
+            return build.node("param", ir_type(param.kind), attr=(value, None))
         assert not isinstance(value, tuple)
         match kind.name:
             case "flag":
@@ -138,7 +137,7 @@ def lower_expression(expr: Expr, at: Inputs) -> Parts:
         case "draw":
             return (build.derive("draw", attr=at.stream(value)),)
         case "coordinate":
-            return (build.make("coordinate", ir_type(expr.kind), attr=value),)
+            return (build.node("coordinate", ir_type(expr.kind), attr=value),)
         case "lt" if any(arg.kind.name == "draw" for arg in expr.args):
             return (_lt_draw(expr, at),)
         case "to_real":
@@ -149,8 +148,8 @@ def lower_expression(expr: Expr, at: Inputs) -> Parts:
             return tuple([build.shift(part, value) for part in parts])
         case "eq", ((a,), (b,)) if a.type == FLAG:
             return (build.not_(build.derive("xor", a, b)),)
-        case "to_real", ((a,),):
-            return (build.to_real(a),)
+        case "to_real", (parts,) if parts[0].type == REAL:
+            return parts
         case "count", ((flag,),):
             return (build.derive("count", flag, attr=(value.weights, value.wrap)),)
         case "sum", (parts,):
@@ -185,7 +184,7 @@ def _each(function: Callable[..., Node], *values: Parts) -> Parts:
     return tuple([function(*[value[part % len(value)] for value in values]) for part in (0, 1)])
 
 
-def _real(build: Builder, value: float | Fraction) -> Node:
+def _real(build: Graph, value: float | Fraction) -> Node:
     """A constant as the float32 it is rounded to, going through float64 as the reference does."""
     return build.real(single(float(value)))
 
@@ -244,7 +243,7 @@ def _lt_draw(expr: Expr, at: Inputs) -> Node:
 # Neighborhoods and vectors
 
 
-def _sum(build: Builder, kernel: Kernel, value: Node) -> Node:
+def _sum(build: Graph, kernel: Kernel, value: Node) -> Node:
     """The weighted sum, each row from the left, then the rows from the top. Equal rows are summed once and shifted."""
 
     def weighted(dx: int, weight: int) -> Node:
@@ -260,12 +259,12 @@ def _sum(build: Builder, kernel: Kernel, value: Node) -> Node:
     )
 
 
-def _length(build: Builder, y: Node, x: Node) -> Node:
+def _length(build: Graph, y: Node, x: Node) -> Node:
     add, mul = (partial(build.derive, op) for op in ("add", "mul"))
     return build.derive("sqrt", add(mul(y, y), mul(x, x)))
 
 
-def _octant(build: Builder, y: Node, x: Node) -> Node:
+def _octant(build: Graph, y: Node, x: Node) -> Node:
     """The octant, by comparing x with the borders of the octants at this length."""
     derive = build.derive
     reach = derive("add", _length(build, y, x), _real(build, 0.001))
@@ -279,7 +278,7 @@ def _octant(build: Builder, y: Node, x: Node) -> Node:
     return result
 
 
-def _wave(build: Builder, x: Node, cosine: bool) -> Node:
+def _wave(build: Graph, x: Node, cosine: bool) -> Node:
     """A sine or cosine: π/2 is taken off in three parts, then follows a series. See `model.reference` for each step."""
     real = partial(_real, build)
     add, sub, mul, lt = (partial(build.derive, op) for op in ("add", "sub", "mul", "lt"))
@@ -402,7 +401,7 @@ class _PassLowering:
 
     def __init__(self, ruleset: Ruleset, pass_: Pass, graph: Graph, ranges: Mapping[str, Type] | None = None):
         self.ruleset, self.pass_ = ruleset, pass_
-        self.build = Builder(graph)
+        self.build = graph
         self.scratch = scratch_slots(pass_)
         self.slots = {slot.name: slot for slot in slots(ruleset)} | self.scratch
         """The state's arrays, and scratch fields."""

@@ -208,6 +208,8 @@ class Graph:
 
     def __init__(self) -> None:
         self._nodes: dict[Hashable, Node] = {}
+        self.place = ""
+        """Where the rule was written that nodes are made for."""
 
     def copy(self) -> Graph:
         """A graph with the same nodes, to which others can be added."""
@@ -220,49 +222,32 @@ class Graph:
         """The number of nodes."""
         return len(self._nodes)
 
-    def node(
-        self,
-        op: str,
-        type: Type,
-        args: tuple[Node, ...] = (),
-        attr: Hashable = None,
-        places: tuple[str, ...] = (),
-    ) -> Node:
+    def node(self, op: str, type: Type, args: tuple[Node, ...] = (), attr: Hashable = None) -> Node:
         if op in COMMUTATIVE and args[0].type != REAL and args[0].index > args[1].index:
             args = (args[1], args[0])
         # A const's type keeps 1 and 1.0 and True apart; -0.0 never arises as a constant.
         key = (op, type.name, args, attr)
         node = self._nodes.get(key)
         if node is None:
+            places = (self.place,) if self.place else ()
             node = self._nodes[key] = Node(op, type, args, attr, len(self._nodes), places)
         return node
 
-
-class Builder:
-    """Makes well-typed nodes in one graph. `place` is where the rule being lowered was written."""
-
-    def __init__(self, graph: Graph | None = None):
-        self.graph = graph or Graph()
-        self.place = ""
-
-    def make(self, op: str, type: Type, *args: Node, attr: Hashable = None) -> Node:
-        return self.graph.node(op, type, args, attr, (self.place,) if self.place else ())
-
     def derive(self, op: str, *args: Node, attr: Hashable = None) -> Node:
         """An operation whose type follows from its arguments."""
-        return self.make(op, OPS[op].type_of(attr, args), *args, attr=attr)
+        return self.node(op, OPS[op].type_of(attr, args), args, attr)
 
     def input(self, slot: str, type: Type) -> Node:
-        return self.make("input", type, attr=slot)
+        return self.node("input", type, attr=slot)
 
     def flag(self, value: bool) -> Node:
-        return self.make("const", FLAG, attr=bool(value))
+        return self.node("const", FLAG, attr=bool(value))
 
     def integer(self, value: int) -> Node:
-        return self.make("const", integer(value, value), attr=int(value))
+        return self.node("const", integer(value, value), attr=int(value))
 
     def real(self, value: float) -> Node:
-        return self.make("const", REAL, attr=float(value))
+        return self.node("const", REAL, attr=float(value))
 
     def const(self, value: int | float, type: Type) -> Node:
         if type == FLAG:
@@ -288,9 +273,6 @@ class Builder:
     def in_set(self, value: Node, members: frozenset[int]) -> Node:
         return self.derive("in_set", value, attr=members)
 
-    def to_real(self, a: Node) -> Node:
-        return a if a.type == REAL else self.derive("to_real", a)
-
     def clamp(self, a: Node, lo: int, hi: int) -> Node:
         """Integers clamped to bounds, where their range asks for it."""
         if a.type.lo < lo:
@@ -310,8 +292,9 @@ class Builder:
 
     def rebuild(self, node: Node, args: tuple[Node, ...]) -> Node:
         """The same operation on other arguments."""
-        type = OPS[node.op].type_of(node.attr, args) if args else node.type
-        return self.make(node.op, type, *args, attr=node.attr)
+        if args:
+            return self.derive(node.op, *args, attr=node.attr)
+        return self.node(node.op, node.type, attr=node.attr)
 
 
 @dataclass(frozen=True)

@@ -13,16 +13,16 @@ from math import frexp
 from typing import NamedTuple
 
 from powderdsl.ir.bits import is_const, simpler
-from powderdsl.ir.ops import OPS, REAL, Builder, Node, PassGraph, Program, Type, nodes_of, verify
+from powderdsl.ir.ops import OPS, REAL, Graph, Node, PassGraph, Program, Type, nodes_of, verify
 from powderdsl.ir.single import single, square_root, stepped
 
-Rewrite = Callable[[Node, Builder], Node | None]
+Rewrite = Callable[[Node, Graph], Node | None]
 """From a node to its replacement, or None for no change."""
 
 
 def rewrite_pass(pass_: PassGraph, rules: Sequence[Rewrite]) -> PassGraph:
     """The pass rebuilt bottom-up in a fresh graph, every node rewritten until no rule applies; earlier ones are preferred."""
-    build = Builder()
+    build = Graph()
     done: dict[Node, Node] = {}
     """Nodes of the new graph by those of the old one."""
     final: dict[Node, Node] = {}
@@ -50,7 +50,7 @@ def rewrite_pass(pass_: PassGraph, rules: Sequence[Rewrite]) -> PassGraph:
     return pass_.map(lambda slot, node: [(slot, done[node])], done.__getitem__)
 
 
-def fold(node: Node, build: Builder) -> Node | None:
+def fold(node: Node, build: Graph) -> Node | None:
     """Constant folding, the algebra of flags, and what ranges decide."""
     known = simpler(build, node.op, node.args, node.attr)
     if known is not None:
@@ -120,7 +120,7 @@ def _last_square(limit: float) -> float:
 MAX_VALUES = 16
 
 
-def resolve(node: Node, build: Builder) -> Node | None:
+def resolve(node: Node, build: Graph) -> Node | None:
     """Questions about properties become questions about elements: densities vanish, sets of ids remain."""
     holds: Callable[..., bool] = partial(OPS[node.op].value, None)
     match node.op, node.args, node.attr:
@@ -153,7 +153,7 @@ def _is_table(node: Node) -> bool:
     return node.op == "table" or (small and stored.is_input("element"))
 
 
-def _where(node: Node, holds: Callable[[int], bool], build: Builder) -> Node:
+def _where(node: Node, holds: Callable[[int], bool], build: Graph) -> Node:
     """table(x) < c = x in {i : table[i] < c}. An element is the table of its own ids."""
     x, values = (node.args[0], node.attr) if node.op == "table" else (node, range(node.type.hi + 1))
     return build.in_set(x, frozenset(i for i, value in enumerate(values) if holds(value)))
@@ -168,7 +168,7 @@ def specialise(pass_: PassGraph) -> PassGraph:
     return rewrite_pass(pass_, [partial(_specialise, {})])
 
 
-def _specialise(tables: Tables, node: Node, build: Builder) -> Node | None:
+def _specialise(tables: Tables, node: Node, build: Graph) -> Node | None:
     if node.op != "and" or not _tables(node, tables):
         return None
     parts = _conjuncts(node)
@@ -204,7 +204,7 @@ def _conjuncts(node: Node) -> list[Node]:
     return [part for arg in node.args for part in _conjuncts(arg)] if node.op == "and" else [node]
 
 
-def share(node: Node, build: Builder) -> Node | None:
+def share(node: Node, build: Graph) -> Node | None:
     """Shifts move outwards over what is computed cell by cell: one read a neighbor and value, shared by all rules.
 
     What is combined then stands on one side, and a flag is a fraction of a number: the question is asked once.

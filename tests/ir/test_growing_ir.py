@@ -31,7 +31,7 @@ ROWS = {
 
 RUN = """\
 import torch
-from powderdsl.ir.ops import REAL, Builder, PassGraph, Program, SlotType, SubstepGraph, integer
+from powderdsl.ir.ops import REAL, Graph, PassGraph, Program, SlotType, SubstepGraph, integer
 from powderdsl.ir.segments import carry, segments
 from powderdsl.ir.stages import run_passes
 from powderdsl.targets.cpp.source import native_source
@@ -41,7 +41,7 @@ from powderdsl.targets.tensor_kind import Tensors
 from powderdsl.targets.torch.program import TorchProgram
 from powderdsl.targets.wasm.program import WasmProgram
 
-build = Builder()
+build = Graph()
 types = {"element": integer(0, 3), "n": integer(-9, 12), "x": REAL}
 slots = tuple(SlotType(name, type, 0, False) for name, type in types.items())
 element, n, x = (build.input(name, type) for name, type in types.items())

@@ -14,7 +14,7 @@ from powderdsl.ir.ops import (
     FLAG,
     OPS,
     REAL,
-    Builder,
+    Graph,
     InvalidIR,
     Node,
     PassGraph,
@@ -127,7 +127,7 @@ def a_program(*outputs: tuple[str, Node]) -> Program:
     return Program("broken", slots, (("q", "chance"),), (("s", 7, 16),), (a_pass(*outputs),))
 
 
-BUILD = Builder()
+BUILD = Graph()
 F, N, R = BUILD.input("f", FLAG), BUILD.input("n", integer(0, 3)), BUILD.input("r", REAL)
 
 
@@ -144,8 +144,8 @@ F, N, R = BUILD.input("f", FLAG), BUILD.input("n", integer(0, 3)), BUILD.input("
         (("f", N), "gets a 0..3"),
         (("g", F), "unknown slot g"),
         (("f", BUILD.input("h", FLAG)), "unknown slot h"),
-        (("f", BUILD.make("below", FLAG, N, attr=("t", 16))), "unknown stream"),
-        (("r", BUILD.make("param", REAL, attr=("z", "value"))), "unknown parameter"),
+        (("f", BUILD.node("below", FLAG, (N,), ("t", 16))), "unknown stream"),
+        (("r", BUILD.node("param", REAL, attr=("z", "value"))), "unknown parameter"),
         (("f", Node("and", FLAG, (Node("not", FLAG, (F,), None, 906), Node("not", FLAG, (F,), None, 907)), None, 908)), "interned"),
     ],
 )  # fmt: skip

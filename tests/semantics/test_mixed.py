@@ -7,7 +7,7 @@ import pytest
 import powderdsl
 from powderdsl.compiler import lower
 from powderdsl.ir import bits
-from powderdsl.ir.ops import FLAG, Builder, PassGraph, Program, SlotType, integer
+from powderdsl.ir.ops import FLAG, Graph, PassGraph, Program, SlotType, integer
 from powderdsl.ir.segments import Carried, carry, segments
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.programs import BackendProgram
@@ -109,7 +109,7 @@ def test_any_passes_on_cells(name: str, torch) -> None:  # type: ignore[no-untyp
 
 def test_what_planes_refuse_and_rules_cannot_say() -> None:
     """Sets of large numbers, and numbers that float32 rounds: rule files have neither, the IR could."""
-    build = Builder()
+    build = Graph()
     build.place = "made.yaml:7"
     number = build.input("number", integer(0, 1 << 25))
     slots = (SlotType("number", number.type, 0, False), SlotType("found", FLAG, 0, False))

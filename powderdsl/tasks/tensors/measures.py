@@ -12,7 +12,7 @@ from torch import Tensor
 
 from powderdsl.ir.bits import NotBits, lower_bits
 from powderdsl.ir.lower import Inputs, ir_type, lower_expression, part_names
-from powderdsl.ir.ops import FLAG, Builder, PassGraph, Program, SlotType, Type, component_of
+from powderdsl.ir.ops import FLAG, Graph, PassGraph, Program, SlotType, Type, component_of
 from powderdsl.ir.stages import run_passes
 from powderdsl.model.state import slots
 from powderdsl.model.types import Expr, Ruleset
@@ -201,7 +201,7 @@ def _lets(measures: Sequence[Measure]) -> list[str]:
 
 def _lowered(ruleset: Ruleset, measures: Sequence[tuple[int, Measure]]) -> Program:
     """The cell expressions of numbered measures as a program of one pass, with an output each: ``measure 3``."""
-    build = Builder()
+    build = Graph()
     types, regions = _types(ruleset), _lets([measure for _, measure in measures])
     state = {name: build.input(name, type) for name, type in types.items()}
     state |= {f"let {name}": build.input(name, FLAG) for name in regions}
