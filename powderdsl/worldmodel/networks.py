@@ -8,20 +8,19 @@ from __future__ import annotations
 
 import math
 import os
+import pkgutil
 import sys
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import reduce
-from importlib import import_module
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from powderdsl.diagnostics import CompileError, suggest
+from powderdsl.diagnostics import suggest
 from powderdsl.experiments.runs import Checkpoint, fitting
 from powderdsl.system.writing import failure
 from powderdsl.worldmodel.config import TrainConfig
@@ -180,12 +179,11 @@ class CustomNetwork:
         Raises:
             CompileError: PD625 if it is not a module, or making it fails.
         """
-        with torch.random.fork_rng(devices=[]), self._told("cannot be made"):
+        with torch.random.fork_rng(devices=[]), _told(self.name, "cannot be made"):
             torch.manual_seed(seed)
             network = self.make(encoder.channels, encoder.slots)
-        if not isinstance(network, nn.Module):
-            found = type(network).__name__
-            raise _invalid(self.name, f"must give a torch.nn.Module, found {found}", helps=(CONTRACT,))
+            if not isinstance(network, nn.Module):
+                raise TypeError(f"it must give a torch.nn.Module, found {type(network).__name__}")
         return Encoded(encoder, network)
 
     def check(self, encoder: ActionChannels, size: tuple[int, int], seed: int) -> None:
@@ -197,30 +195,24 @@ class CustomNetwork:
         network = self.build(encoder, seed)
         state = (encoder.observed + 3,) if encoder.observed else ()
         inputs = torch.zeros(2, *state, *size, dtype=torch.uint8)
-        with torch.random.fork_rng(devices=[]), self._told("fails on a batch"):
-            logits = network(inputs)
-        given, expected = f"for channels {[2, encoder.channels, *size]}", [2, encoder.slots, *size]
-        is_tensor = isinstance(logits, Tensor)
-        if not is_tensor or list(logits.shape) != expected or not logits.is_floating_point():
-            result = f"{list(logits.shape)} of {logits.dtype}" if is_tensor else type(logits).__name__
-            raise _invalid(
-                self.name, f"must give logits {expected}, found {result}", given, helps=(CONTRACT,)
+        expected = [2, encoder.slots, *size]
+        with torch.random.fork_rng(devices=[]), _told(self.name, "cannot be trained"):
+            logits: Any = network(inputs)
+            found = (
+                f"{list(logits.shape)} of {logits.dtype}"
+                if isinstance(logits, Tensor)
+                else type(logits).__name__
             )
-        weights = [one for one in network.parameters() if one.requires_grad]
-        if logits.requires_grad and weights:
-            with self._told("has no gradient"):
+            if not (found.startswith(str(expected)) and logits.is_floating_point()):
+                given = [2, encoder.channels, *size]
+                raise ValueError(f"it must give logits {expected}, found {found}, for channels {given}")
+            weights = [weight for weight in network.parameters() if weight.requires_grad]
+            if logits.requires_grad and weights:
                 F.cross_entropy(logits.float(), torch.zeros(2, *size, dtype=torch.int64)).backward()
-        if all(one.grad is None for one in weights):
-            helps = ("its logits must depend on parameters that require a gradient",)
-            raise _invalid(self.name, "cannot be trained: no gradient reaches a parameter", helps=helps)
-
-    @contextmanager
-    def _told(self, what: str) -> Iterator[None]:
-        """Report exceptions of the user's code, with the line that raised them."""
-        try:
-            yield
-        except Exception as error:
-            raise _invalid(self.name, what, *_words(error), helps=(CONTRACT,)) from None
+            if all(weight.grad is None for weight in weights):
+                raise ValueError(
+                    "no gradient reaches a parameter: logits must depend on some that require one"
+                )
 
 
 def custom_network(name: str) -> CustomNetwork:
@@ -229,27 +221,14 @@ def custom_network(name: str) -> CustomNetwork:
     Raises:
         CompileError: PD625 if the name has another form, or there is no such module or class in it.
     """
-    if not is_network_name(name):
-        raise _invalid(name, "is not a name of a network", helps=("write MODULE:CLASS, such as nets:Deep",))
-    module_name, _, path = name.partition(":")
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # behind all others: nothing that is installed is replaced
-    try:
-        module = import_module(module_name)
-    except Exception as error:
-        lacking = error.name if isinstance(error, ModuleNotFoundError) else None
-        if lacking and f"{module_name}.".startswith(f"{lacking}."):
-            fix = "run the command in the module's folder"
-            raise _invalid(name, "cannot be imported", _words(error)[0], helps=(fix,)) from None
-        raise _invalid(name, "cannot be imported", *_words(error)) from None
-    try:
-        make = reduce(getattr, path.split("."), module)
-    except AttributeError:
-        known = [one for one, value in vars(module).items() if callable(value) and not one.startswith("_")]
-        helps = suggest(path, known, f"`{module_name}` has")
-        raise _invalid(name, f"does not exist: `{module_name}` has no `{path}`", helps=helps) from None
-    if not callable(make):
-        raise _invalid(name, f"is not a class but {type(make).__name__}", helps=(CONTRACT,))
+    with _told(name, "cannot be imported"):
+        if not is_network_name(name):
+            raise ValueError("write MODULE:CLASS, such as nets:Deep")
+        make = pkgutil.resolve_name(name)
+        if not callable(make):
+            raise TypeError(f"it is not a class but {type(make).__name__}")
     return CustomNetwork(name, make)
 
 
@@ -258,18 +237,22 @@ def is_network_name(text: str) -> bool:
     return text.count(":") == 1 and all(part.isidentifier() for part in text.replace(":", ".").split("."))
 
 
-def _words(error: Exception) -> tuple[str, str]:
-    """What an exception says, and the line of the code that raised it."""
-    said = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}".removesuffix(": ")
-    if isinstance(error, SyntaxError):
-        return said, f"at {error.filename}:{error.lineno}"
-    frames = [one for one in traceback.extract_tb(error.__traceback__) if not one.filename.startswith("<")]
-    return said, f"at {frames[-1].filename}:{frames[-1].lineno}"
-
-
-def _invalid(name: str, what: str, *notes: str, helps: tuple[str, ...] = ()) -> CompileError:
-    """PD625: a network that cannot be used."""
-    return failure("PD625", f"the network `{name}` {what}", notes=notes, helps=helps)
+@contextmanager
+def _told(name: str, what: str) -> Iterator[None]:
+    """Report exceptions as PD625, with the line of the user's code that raised them."""
+    try:
+        yield
+    except Exception as error:
+        frames = traceback.extract_tb(error.__traceback__)
+        ours = ("<", __file__, os.path.dirname(os.__file__))
+        lines = [(frame.filename, frame.lineno) for frame in frames if not frame.filename.startswith(ours)]
+        lines += [(error.filename or "", error.lineno)] if isinstance(error, SyntaxError) else []
+        notes = [f"{type(error).__name__}: {' '.join(str(error).split())[:300]}".removesuffix(": ")]
+        notes += [f"at {file}:{line}" for file, line in lines[-1:]]
+        helps = (CONTRACT,)
+        if isinstance(error, AttributeError):
+            helps = suggest(error.name, [word for word in dir(error.obj) if not word.startswith("_")])
+        raise failure("PD625", f"the network `{name}` {what}", notes=tuple(notes), helps=helps) from None
 
 
 # Networks of runs
