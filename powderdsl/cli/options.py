@@ -41,15 +41,6 @@ class Parsed(click.ParamType):
             self.fail(f"`{value}` {error}", param, ctx)
 
 
-def _integer(low: int, high: int) -> Parsed:
-    def make(text: str) -> int:
-        if not re.fullmatch(r"[0-9]{1,20}", text) or not low <= int(text) <= high:
-            raise ValueError(f"is not an integer from {low} to {high}")
-        return int(text)
-
-    return Parsed("N", make)
-
-
 def _count(text: str) -> int:
     text = text.replace("_", "")
     if not re.fullmatch(r"[0-9]{1,18}|[0-9]{1,6}(\.[0-9]{1,6})?[eE]\+?[0-9]{1,2}", text):
@@ -101,7 +92,7 @@ def option(name: str, kind: Any, about: str, default: Any = None, *, to: str = "
         case str():
             more["metavar"] = kind
         case (int() as low, int() as high):
-            more["type"] = _integer(low, high)
+            more |= {"type": click.IntRange(low, high), "metavar": "N"}
         case [*words]:
             more["type"] = click.Choice(words)
         case _ if kind is bool:

@@ -21,7 +21,6 @@ from powderdsl.datasets.manifest import (
     Manifest,
     Recipe,
     damaged,
-    many_damaged,
     read_manifest,
     recipe_of,
 )
@@ -100,17 +99,6 @@ class Dataset:
         if missing:
             reason = f"{missing} of {manifest.recipe.shards} shards are missing"
             raise damaged(f"{place} is not complete", reason, "the command that began it completes it")
-        problems = []
-        for row in manifest.shards:
-            try:
-                size = (place / row.file).stat().st_size
-            except OSError as error:
-                problems.append(f"{row.file}: {error.strerror}")
-            else:
-                if size != row.bytes:
-                    problems.append(f"{row.file}: {size:,} bytes instead of {row.bytes:,}")
-        if problems:
-            raise many_damaged(place, problems)
         return cls(place, manifest, memory)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -169,14 +157,12 @@ class Dataset:
         """One episode. Raises IndexError."""
         if not 0 <= number < len(self):
             raise IndexError(f"no episode {number}: there are {len(self)}")
-        shard = self._shard(number // self.recipe.shard)
-        place = number % self.recipe.shard
-        first, length = int(shard.starts[place]), int(shard.arrays["length"][place])
-        rows = np.arange(first, first + length)
-        values = {name: _tensor(shard.arrays[name][rows]) for name in Batch._fields if name in shard.arrays}
-        values["observation"] = _tensor(
-            shard.arrays["observation"][np.arange(first + place, first + place + length + 1)]
-        )
+        shard, place = self._shard(number // self.recipe.shard), number % self.recipe.shard
+        length = int(shard.arrays["length"][place])
+        rows = self.gather(np.array([number]), np.array([0]), length)
+        values = {name: torch.from_numpy(part[0]) for name, part in zip(Batch._fields, rows, strict=True)}
+        last = values.pop("next_observation")[-1:]
+        values["observation"] = torch.cat([values["observation"], last])
         return Episode(number, int(shard.arrays["world"][place]), **values)
 
     def transitions(
@@ -358,10 +344,6 @@ def drawn(seed: int, number: int, count: int, below: int) -> Array:
     key = mix((keys[:, 0] + (number >> 32)) & MASK)
     halves = mix((key[:, None] + mix(torch.arange(1, count + 1))) & MASK)
     return np.asarray((((halves[0] << 31) | (halves[1] >> 1)) % below).numpy())
-
-
-def _tensor(rows: Array) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(rows))
 
 
 def _integers(numbers: Any) -> Array:

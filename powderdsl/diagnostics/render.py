@@ -78,14 +78,6 @@ def render_text(diagnostic: Diagnostic, *, color: bool = False) -> str:
     return "\n".join(lines)
 
 
-def render_short(diagnostic: Diagnostic) -> str:
-    """`file:line:column: error[CODE]: message (help)` on one line."""
-    span = diagnostic.primary.span
-    place = f"{span.place}: " if span else ""
-    helps = f" ({'; '.join(diagnostic.helps)})" if diagnostic.helps else ""
-    return printable(f"{place}{diagnostic.severity.value}[{diagnostic.code}]: {diagnostic.message}{helps}")
-
-
 def diagnostic_data(diagnostic: Diagnostic, *, utf16: bool = False) -> dict[str, Any]:
     """A diagnostic as plain data. `utf16` counts columns in UTF-16 units, as browser editors do."""
 

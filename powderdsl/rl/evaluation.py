@@ -133,15 +133,17 @@ def play(
             actions = policy(episodes)
         elif policy is not None:
             actions = policy(stack.push(sight.of(episodes.world)), keys)
+        seen = None
+        if recorder is not None:
+            seen, recorder.actions = recorder.see, actions
         # Episodes that are over run on, and no longer count.
-        seen = None if recorder is None else recorder.see
         episodes, reward, success, over = program.act(episodes, actions, reuse=seen is None, seen=seen)
         returns += torch.where(going, reward.double(), 0.0)
         lengths += going
         succeeded |= success & going
         going = going & ~over
         if recorder is not None:
-            recorder.act(actions, returns, ~going)
+            recorder.acted(returns, ~going)
         if not bool(going.any()):
             break
     return Played(returns.cpu(), lengths.cpu(), succeeded.cpu())
@@ -340,7 +342,8 @@ class Film:
         self.task, self.factor = task, factor
         self.regions: dict[str, NDArray[np.bool_]] = {}
         self.scenes: list[FilmScene] = []
-        self._pending: list[tuple[Any, Any]] = []
+        self.actions: Tensor | None = None
+        """Those that lead to the scenes that follow."""
         self._returns = torch.zeros(count, dtype=torch.float64)
         self._over = torch.zeros(count, dtype=torch.bool)
         self._fields = shown_fields(task.ruleset)
@@ -350,19 +353,17 @@ class Film:
         """The worlds at their start."""
         self.regions = {name: value.cpu().numpy() for name, value in episodes.regions.items()}
         self.see(episodes.world)
-        self.act(None, self._returns, self._over)
 
     def see(self, world: World) -> None:
         """The worlds after an action, or a step."""
         fields = {name: world[name].cpu().numpy().copy() for name in self._fields}
-        self._pending.append((world.ids.cpu().numpy().copy(), fields))
+        ids = world.ids.cpu().numpy().copy()
+        self.scenes.append(FilmScene(ids, fields, self.actions, self._returns, self._over))
 
-    def act(self, actions: Tensor | None, returns: Tensor, over: Tensor) -> None:
-        """Assign the worlds seen since the last call to these actions; the last of them shows the new returns."""
-        *earlier, last = self._pending
-        self.scenes += [FilmScene(*seen, actions, self._returns, self._over) for seen in earlier]
-        self._pending, self._returns, self._over = [], returns.cpu().clone(), over.cpu().clone()
-        self.scenes.append(FilmScene(*last, actions, self._returns, self._over))
+    def acted(self, returns: Tensor, over: Tensor) -> None:
+        """What the last scene shows besides, and those that follow."""
+        self._returns, self._over = returns.cpu().clone(), over.cpu().clone()
+        self.scenes[-1] = self.scenes[-1]._replace(returns=self._returns, over=self._over)
 
     def pictures(self) -> Iterator[NDArray[np.uint8]]:
         """A picture of each scene, all worlds side by side."""

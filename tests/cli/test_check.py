@@ -59,14 +59,6 @@ def test_notes_are_shown_on_request(pack):
     assert quiet.exit_code == loud.exit_code == 0
 
 
-def test_the_short_format_has_one_line_each(pack):
-    result = powderdsl("check", pack("vanish: 20%", "vanish: 120%"), "--short")
-    assert result.exit_code == 2
-    first, *_, last = result.stdout.splitlines()
-    assert first.startswith("grit.yaml:4:18: error[PD40")
-    assert last == "core+grit.yaml: 1 error"
-
-
 def test_json_is_one_list(pack):
     result = powderdsl("check", pack("vanish: 20%", "vanish: 120%"), "nope", "--json")
     assert result.exit_code == 2

@@ -16,7 +16,7 @@ def test_tasks_are_checked_beside_rules(tmp_path):
     bad.write_text(
         "# A task\ntask: bad\nrules: core\nsize: [8, 8]\nfill: emty\nagent: {may: any, actions: 0}\n"
     )
-    result = run("check", "sand-pushing", str(bad), "core", "--short")
+    result = run("check", "sand-pushing", str(bad), "core")
     assert result.exit_code == 2
     assert "PD604" in result.output
     assert "PD402" in result.output

@@ -117,7 +117,7 @@ ROWS: list[tuple[Callable[[Any], Any], str]] = [
     (lambda rows: rows[0].update(transitions=10**9), "cannot have 1000000000 transitions"),
     (lambda rows: rows[0].update(transitions=7), "cannot have 7 transitions"),
     (lambda rows: rows[0].update(bytes=10**15), "`shards[0].bytes` must be an integer"),
-    (lambda rows: rows[0].update(bytes=5), "instead of 5"),
+    (lambda rows: rows[0].update(bytes=5), "its size or its SHA-256"),
     (lambda rows: rows[0].update(sha256="0" * 64), "SHA-256"),
     (lambda rows: rows.pop(), "1 of 3 shards are missing"),
     (lambda rows: rows.extend([[]] * 30), "`shards[3]` must be a mapping"),
@@ -170,9 +170,12 @@ def test_shards_that_are_gone_or_cut_are_told_at_once(folder: Path) -> None:
     whole = (folder / "shard-000001.npz").read_bytes()
     (folder / "shard-000001.npz").write_bytes(whole[:-100])
     with pytest.raises(CompileError) as caught:
-        Dataset.open(folder)
-    notes = [note for one in caught.value.diagnostics for note in one.notes]
-    assert [note.split(":")[0] for note in notes] == ["shard-000000.npz", "shard-000001.npz"]
+        Dataset.open(folder).check()
+    messages = [one.message for one in caught.value.diagnostics]
+    assert [message.split("/")[-1].split()[0] for message in messages] == [
+        "shard-000000.npz",
+        "shard-000001.npz",
+    ]
 
 
 @pytest.mark.parametrize("place", [0, 40, 3000, -2000, -30])

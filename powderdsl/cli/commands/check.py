@@ -17,7 +17,7 @@ from powderdsl.cli.exits import BAD_INPUT, FAILED, OK
 from powderdsl.cli.output import counted, print_json, write_diagnostics
 from powderdsl.compiler import load_with_diagnostics, lower
 from powderdsl.diagnostics import CompileError, Diagnostic, Severity
-from powderdsl.diagnostics.render import diagnostic_data, render_short
+from powderdsl.diagnostics.render import diagnostic_data
 from powderdsl.model.types import Ruleset
 from powderdsl.system.reports import table
 from powderdsl.tasks.shipped import is_task
@@ -49,7 +49,6 @@ class Checked:
 @click.command("check")
 @click.argument("rules", nargs=-1, required=True, metavar="RULES...")
 @opt.option("--json", bool, "One JSON list instead of text.", to="as_json")
-@opt.option("--short", bool, "One line for each mistake, without carets.")
 @opt.option("--notes", bool, "Also list notes, such as inactive rules.")
 @opt.option("--warnings-as-errors", bool, "Exit with 1 if there are warnings.")
 @opt.option("--quick", bool, "Check only the rules themselves; do not try invariants.")
@@ -58,7 +57,6 @@ class Checked:
 def command(
     rules: tuple[str, ...],
     as_json: bool,
-    short: bool,
     notes: bool,
     warnings_as_errors: bool,
     quick: bool,
@@ -73,13 +71,12 @@ def command(
     Exit code: 0 without errors, 1 with warnings under --warnings-as-errors, 2 with errors.
     """
     results = [_check(name, quick, cost, ledger) for name in rules]
-    text = not as_json and not short
     # Compositions share packs: a dictionary has each diagnostic once.
     shown = dict.fromkeys(
         diagnostic
         for result in results
         for diagnostic in result.diagnostics
-        if notes or diagnostic.severity is not Severity.NOTE or (not text and diagnostic.code in ALWAYS_SHOWN)
+        if notes or diagnostic.severity is not Severity.NOTE or (as_json and diagnostic.code in ALWAYS_SHOWN)
     )
     if as_json:
         data: Any = [diagnostic_data(diagnostic) for diagnostic in shown]
@@ -90,23 +87,21 @@ def command(
         if ledger:
             data["ledger"] = {result.name: ledger_data(result.ledger) for result in results if result.ledger}
         print_json(data)
-    elif short:
-        click.echo("".join(f"{render_short(diagnostic)}\n" for diagnostic in shown), nl=False)
     elif shown:
         write_diagnostics(shown, sys.stdout)
         click.echo()
     if not as_json:
-        click.echo("\n".join(line for result in results for line in _lines(result, notes, text)))
+        click.echo("\n".join(line for result in results for line in _lines(result, notes)))
     if any(result.number(Severity.ERROR) for result in results):
         return BAD_INPUT
     warned = any(result.number(Severity.WARNING) for result in results)
     return FAILED if warned and warnings_as_errors else OK
 
 
-def _lines(result: Checked, notes: bool, text: bool) -> Iterator[str]:
+def _lines(result: Checked, notes: bool) -> Iterator[str]:
     """The summary of one RULES, its cost and its ledger."""
     yield _summary(result, notes)
-    for diagnostic in result.diagnostics if text and not notes else ():
+    for diagnostic in () if notes else result.diagnostics:
         if diagnostic.code in ALWAYS_SHOWN:
             yield f"  {diagnostic.message}"
     if result.cost is not None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -14,7 +13,6 @@ from powderdsl.compiler import lower, read
 from powderdsl.diagnostics import Reporter, suggest
 from powderdsl.model.text import print_model, print_tree
 from powderdsl.model.types import Ruleset
-from powderdsl.system.writing import write_text
 
 if TYPE_CHECKING:
     from powderdsl.ir.ops import Program
@@ -36,7 +34,6 @@ STAGES = ("tree", "model", "ir", "planes", "schedule", "kernels")
 @opt.backend("auto", "Whose schedule or kernels are printed.")
 @opt.option("--after", "STAGE", "Print the schedule after this stage of the planner.  [default: the last]")
 @opt.option("--pass", "NAME", "Print only this pass of the rules.", to="pass_name")
-@opt.output("-o", "FILE", "Write to this file instead of stdout.", to="--out")
 @opt.parameters
 def command(
     rules: str,
@@ -44,7 +41,6 @@ def command(
     backend: str,
     after: str | None,
     pass_name: str | None,
-    out: Path | None,
     settings: dict[str, str],
 ) -> None:
     """Print the output of a compiler stage."""
@@ -54,11 +50,7 @@ def command(
         text = _tree(rules, pass_name)
     else:
         text = _checked(opt.load_rules(rules, settings), stage, backend, after, pass_name)
-    text = text if text.endswith("\n") else f"{text}\n"
-    if out is None:
-        click.echo(text, nl=False)
-    else:
-        write_text(out, text, follow=True)
+    click.echo(text, nl=not text.endswith("\n"))
 
 
 def _checked(ruleset: Ruleset, stage: str, backend: str, after: str | None, pass_name: str | None) -> str:
