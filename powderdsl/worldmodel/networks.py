@@ -249,9 +249,9 @@ def _told(name: str, what: str) -> Iterator[None]:
         lines += [(error.filename or "", error.lineno)] if isinstance(error, SyntaxError) else []
         notes = [f"{type(error).__name__}: {' '.join(str(error).split())[:300]}".removesuffix(": ")]
         notes += [f"at {file}:{line}" for file, line in lines[-1:]]
-        helps = (CONTRACT,)
+        helps: tuple[str, ...] = (CONTRACT,)
         if isinstance(error, AttributeError):
-            helps = suggest(error.name, [word for word in dir(error.obj) if not word.startswith("_")])
+            helps = suggest(str(error.name), [word for word in dir(error.obj) if not word.startswith("_")])
         raise failure("PD625", f"the network `{name}` {what}", notes=tuple(notes), helps=helps) from None
 
 

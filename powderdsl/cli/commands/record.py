@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -14,7 +14,8 @@ from powderdsl.datasets.manifest import check_place
 from powderdsl.tasks.shipped import check_split, load_task
 from powderdsl.tasks.task import Task
 
-SCRIPTED = ("expert", "random", "nothing")
+if TYPE_CHECKING:
+    from powderdsl.datasets.dataset import Dataset
 
 
 @click.command("record", cls=opt.ManyWords)
@@ -67,45 +68,72 @@ def command(
         powderdsl record --verify data
         powderdsl record --out data --to-minari me/data-v0
     """
-    if verify is not None:
-        if task is not None or out is not None or episodes is not None:
-            raise BadInput("--verify takes a folder, and no TASK, --out or --episodes")
-        return _verify(verify)
-    if to_minari is not None or from_minari is not None:
-        return _exchanged(task, out, episodes, to_minari, from_minari, how)
-    knobs, settings, packs = (how.pop(name) for name in ("knobs", "settings", "packs"))
-    if task is None or out is None or episodes is None:
-        required = {"TASK": task, "--out": out, "--episodes": episodes}
-        raise BadInput(f"missing {', '.join(name for name, value in required.items() if value is None)}")
-    with user_values():
-        check_place(out)
-        palette = None
-        if policy not in SCRIPTED:
-            from powderdsl.experiments.runs import find_run, recorded_palette
-
-            palette = recorded_palette(find_run(policy, "ppo"))
-        loaded = load_task(task, knobs=knobs, params=settings, packs=packs, palette=palette)
-        check_split(loaded, how["split"])
+    modes = {"--verify": verify, "--to-minari": to_minari, "--from-minari": from_minari}
+    mode, *others = [name for name, value in modes.items() if value is not None] or [""]
+    needs, takes = NEEDS[mode]
+    asked = {"TASK": task, "--out": out, "--episodes": episodes}
+    given = [*others, *(name for name, value in asked.items() if value is not None)]
+    if extra := [name for name in given if name not in takes]:
+        raise BadInput(f"{mode} does not go with {', '.join(extra)}")
+    if missing := [name for name in needs if name not in given]:
+        raise BadInput(f"missing {', '.join(missing)}")
     require_gymnasium()
-    from powderdsl.datasets.recorder import record
+    from powderdsl.datasets.dataset import Dataset
 
-    with user_values(), progress(loaded.name, episodes, lines=True, resumes=out) as show:
-        acting = {"policy": policy} if policy in SCRIPTED else _trained(policy, loaded, how)
-        dataset = record(
-            loaded,
+    knobs, settings, packs = (how.pop(name) for name in ("knobs", "settings", "packs"))
+    changes = {"knobs": knobs, "params": settings, "packs": packs}
+    with user_values():
+        if mode == "":
+            dataset = _recorded(str(task), Path(out or ""), episodes or 0, policy, changes, how)
+        elif from_minari is not None:
+            dataset = _imported(from_minari, Path(out or ""), task, changes, how)
+        else:
+            dataset = Dataset.open(verify or out or "")
+        if verify is not None:
+            dataset.check()
+        if to_minari is not None:
+            from powderdsl.datasets.minari import to_minari as write_minari
+
+            write_minari(dataset, to_minari)
+    recipe, size = dataset.recipe, sum(row.bytes for row in dataset.manifest.shards)
+    click.echo(
+        f"{to_minari or verify or out}: {counted(len(dataset), 'episode')} of {recipe.task} "
+        f"({recipe.split}, {recipe.policy}), {dataset.steps:,} transitions, "
+        f"{counted(recipe.shards, 'shard')}, {size / 1e6:,.1f} MB{', all as recorded' if verify else ''}",
+        err=True,
+    )
+    return OK
+
+
+NEEDS = {
+    "": (("TASK", "--out", "--episodes"), ("TASK", "--out", "--episodes")),
+    "--verify": ((), ()),
+    "--to-minari": (("--out",), ("--out",)),
+    "--from-minari": (("--out",), ("TASK", "--out")),
+}
+"""What each of the command's modes needs, and what it takes."""
+
+
+def _recorded(
+    name: str, out: Path, episodes: int, policy: str, changes: dict[str, Any], how: dict[str, Any]
+) -> Dataset:
+    from powderdsl.datasets.recorder import SCRIPTED, record
+    from powderdsl.experiments.runs import find_run, recorded_palette
+
+    check_place(out)
+    palette = None if policy in SCRIPTED else recorded_palette(find_run(policy, "ppo"))
+    task = load_task(name, **changes, palette=palette)
+    check_split(task, how["split"])
+    with progress(task.name, episodes, lines=True, resumes=out) as show:
+        acting = {"policy": policy} if policy in SCRIPTED else _trained(policy, task, how)
+        return record(
+            task,
             folder=out,
             episodes=episodes,
             progress=lambda done, total: show(done, "episodes"),
             **acting,
             **how,
         )
-    size = sum(row.bytes for row in dataset.manifest.shards)
-    click.echo(
-        f"{out}: {counted(len(dataset), 'episode')}, {dataset.steps:,} transitions, "
-        f"{counted(dataset.recipe.shards, 'shard')}, {size / 1e6:,.1f} MB",
-        err=True,
-    )
-    return OK
 
 
 def _trained(path: str, task: Task, how: dict[str, Any]) -> dict[str, Any]:
@@ -132,50 +160,12 @@ def require_gymnasium() -> None:
     require("gymnasium", "recording", "pip install 'powderdsl[rl]'")
 
 
-def _verify(folder: Path) -> int:
-    require_gymnasium()
-    from powderdsl.datasets.dataset import Dataset
+def _imported(
+    name: str, out: Path, task: str | None, changes: dict[str, Any], how: dict[str, Any]
+) -> Dataset:
+    from powderdsl.datasets.minari import from_minari
 
-    dataset = Dataset.open(folder)
-    dataset.check()
-    recipe = dataset.recipe
-    click.echo(
-        f"{folder}: {counted(len(dataset), 'episode')} of {recipe.task} ({recipe.split}, {recipe.policy}), "
-        f"{dataset.steps:,} transitions, {counted(recipe.shards, 'shard')}: all as recorded"
-    )
-    return OK
-
-
-def _exchanged(
-    task: str | None,
-    out: Path | None,
-    episodes: int | None,
-    to_minari: str | None,
-    from_minari: str | None,
-    how: dict[str, Any],
-) -> int:
-    """Write a dataset as a Minari dataset, or read one."""
-    if out is None or episodes is not None or None not in (to_minari, from_minari):
-        raise BadInput("--to-minari and --from-minari take --out and no --episodes; give one of them")
-    if to_minari is not None and task is not None:
-        raise BadInput("--to-minari takes no TASK: it writes what --out holds")
-    require_gymnasium()
-    from powderdsl.datasets import minari
-    from powderdsl.datasets.dataset import Dataset
-
-    minari.require_minari()
-    with user_values():
-        if to_minari is not None:
-            dataset = Dataset.open(out)
-            minari.to_minari(dataset, to_minari)
-        elif task is None:
-            dataset = minari.from_minari(str(from_minari), out)
-        else:
-            loaded = load_task(task, knobs=how["knobs"], params=how["settings"], packs=how["packs"])
-            names = ("split", "observation", "worlds", "shard", "compress", "backend", "device")
-            dataset = minari.from_minari(
-                str(from_minari), out, task=loaded, **{name: how[name] for name in names}
-            )
-    counts = f"{counted(len(dataset), 'episode')}, {dataset.steps:,} transitions"
-    click.echo(f"{to_minari or out}: {counts}", err=True)
-    return OK
+    if task is None:
+        return from_minari(name, out)
+    names = ("split", "observation", "worlds", "shard", "compress", "backend", "device")
+    return from_minari(name, out, task=load_task(task, **changes), **{name: how[name] for name in names})

@@ -260,29 +260,25 @@ def curves_of(runs: Sequence[RunFolder], metric: str) -> list[Line]:
 
     A label names the settings in which the groups differ. Runs without the metric are left out.
     """
-    groups: dict[str, list[RunFolder]] = {}
+    groups: dict[tuple[tuple[str, str], ...], dict[str, dict[int, float]]] = {}
     for run in runs:
-        settings = {name: value for name, value in run.config.items() if name != "seed"}
-        groups.setdefault(json.dumps(settings, sort_keys=True), []).append(run)
-    configs = [json.loads(key) for key in groups]
-    names = sorted({name for config in configs for name in config if not name.endswith(DERIVED)})
-    differ = [name for name in names if len({json.dumps(config.get(name)) for config in configs}) > 1]
+        settings = {name: json.dumps(value) for name, value in run.config.items() if value is not None}
+        seed = settings.pop("seed", "")
+        lines = [line for line in read_metrics(run.path) if isinstance(line.get(metric), int | float)]
+        if lines:
+            by_step = {line["step"]: line[metric] for line in lines}
+            groups.setdefault(tuple(sorted(settings.items())), {})[seed] = by_step
+    shared = set.intersection(*map(set, groups)) if groups else set()
     curves = []
-    for config, members in zip(configs, groups.values(), strict=True):
-        by_seed: dict[str, dict[int, float]] = {}
-        for run in members:
-            lines = [line for line in read_metrics(run.path) if isinstance(line.get(metric), int | float)]
-            by_seed[str(run.config.get("seed"))] = {line["step"]: line[metric] for line in lines}
-        numbers = [by_step for by_step in by_seed.values() if by_step]
-        if numbers:
-            steps = sorted(set.intersection(*map(set, numbers)))
-            # Settings at their defaults are not recorded; files are shown by their names.
-            values = {name: config[name] for name in differ if config.get(name) is not None}
-            label = ", ".join(
-                f"{name} {Path(value).name if isinstance(value, str) and '/' in value else value}"
-                for name, value in values.items()
-            )
-            curves.append(Line(label, steps, [[by_step[step] for by_step in numbers] for step in steps]))
+    for group, by_seed in groups.items():
+        differ = [
+            (name, value.rpartition("/")[2].strip('"'))  # files are shown by their names
+            for name, value in group
+            if (name, value) not in shared and not name.endswith(DERIVED)
+        ]
+        steps = sorted(set.intersection(*map(set, by_seed.values())))
+        samples = [[by_step[step] for by_step in by_seed.values()] for step in steps]
+        curves.append(Line(", ".join(map(" ".join, differ)), steps, samples))
     return curves
 
 
