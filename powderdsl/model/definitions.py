@@ -222,9 +222,8 @@ def _element_values(typer: Typer) -> Given:
         if name in properties:
             given[name, word] = (syntax, pack)
         elif name not in declared:
-            if not key.is_optional:
-                keys = (own for own in keys_of(ElementDecl) if own != "override")
-                report_unknown("property", key, (*declared, *keys), typer.reporter, "PD108")
+            keys = (own for own in keys_of(ElementDecl) if own != "override")
+            report_unknown("property", key, (*declared, *keys), typer.reporter, "PD108")
         elif field and element and _may_have(field, element.id, word, key, typer):
             with suppress(Poisoned):
                 value = typer.constant(syntax, field.kind, Scope(pack, {}))
@@ -308,7 +307,7 @@ def element_ramps(typer: Typer) -> dict[str, ColorRamp]:
                 raise typer.fail(
                     "PD401", f"`{word.word}` is a property", word.span, "a color follows a field", fix
                 )
-            if field_name not in fields and not word.is_optional:
+            if field_name not in fields:
                 report_unknown("field", word, symbols.fields, typer.reporter)
             if field is None or element is None:
                 continue

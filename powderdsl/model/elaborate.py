@@ -335,14 +335,19 @@ class Elaborator:
 
     def _target(self, syntax: Syntax, scope: Scope) -> tuple[str, Kind, Offset]:
         """The field that is assigned, its kind, and where."""
-        operand, offset = self._assigned(syntax, scope)
+        operand, offset = self.typer.evaluate(syntax, scope), (0, 0)
         if isinstance(operand, Absent):
             raise Unresolved(operand.name)
+        if isinstance(operand, Expr) and operand.op == "look":
+            operand, offset = operand.args[0], operand.value
         if not isinstance(operand, Expr) or operand.op not in ("field", "property"):
-            symbols, scratch = self.typer.symbols, (one.name.rpartition(".")[2] for one in self._scratch)
+            symbols, scratch = self.typer.symbols, (field.name.rpartition(".")[2] for field in self._scratch)
             helps = suggest(syntax.text, (*symbols.fields, *symbols.properties, *scratch), "fields")
             if isinstance(operand, (SetOf, Place)):
                 helps = ("one element becomes another with `->`: `SET -> ELEMENT if …`",)
+            if isinstance(operand, Expr) and operand.op.endswith("_part"):
+                whole = syntax.children[0].span.text
+                helps = (f"assign the whole vector: `{whole} := vector(…, …)`",)
             message = f"`{syntax.span.text.removesuffix('?')}` cannot be assigned"
             raise self.typer.fail("PD407", message, syntax.span, "not a field or property", *helps)
         name = str(operand.value)
@@ -352,30 +357,6 @@ class Elaborator:
                 raise self.typer.fail("PD407", message, syntax.span, label, "declare it as an integer")
             self.result.overridden.add(name)
         return name, operand.kind, offset
-
-    def _assigned(self, syntax: Syntax, scope: Scope) -> tuple[Operand, Offset]:
-        """The operand left of an assignment, and the offset of the neighbor that it belongs to."""
-        if syntax.kind == "optional_attribute":
-            syntax = self.typer.certain(syntax, scope)
-        if syntax.kind != "attribute":
-            return self.typer.evaluate(syntax, scope), (0, 0)
-        own = self.typer.of_pack(syntax, scope)
-        if isinstance(own, Expr) and own.op == "look":
-            return own.args[0], own.value
-        if own is not None:
-            return own, (0, 0)
-        before = syntax.children[0]
-        owner = self.typer.evaluate(before, scope)
-        if isinstance(owner, SetOf):
-            fix = f"write `{syntax.text} := … where {before.span.text}`"
-            raise self.typer.wrong(owner, "a neighbor before the dot", before.span, fix)
-        if isinstance(owner, Expr) and owner.kind.name == "vec2":
-            fix = f"assign the whole vector: `{before.span.text} := vector(…, …)`"
-            message = "a part of a vector cannot be assigned"
-            raise self.typer.fail("PD407", message, syntax.span, "only a part", fix)
-        offset = self.typer.offset(self.typer.place(owner, before.span).offset, syntax.span)
-        word = Span(syntax.span.source, syntax.span.end - len(syntax.text), syntax.span.end)
-        return self.typer.lookup(syntax.text, word, scope, after_dot=True), offset
 
     def _push(self, syntax: Syntax, scope: Scope) -> list[Rule]:
         target, amount, source = syntax.children[:3]

@@ -453,14 +453,14 @@ def _add_entries(composition: Composition, reporter: Reporter) -> None:
     elements, tags = composition.elements, composition.names.declared(TagDecl)
     for name, entry in composition.entries:
         element = elements.get(name)
-        if isinstance(entry, AlsoDecl) and element is None and not entry.name.is_optional:
+        if isinstance(entry, AlsoDecl) and element is None:
             report_unknown("element", entry.name, elements, reporter)
         given = set()
         for scalar in entry.tags:
             tag = composition.names.of(entry.pack, scalar.word)
             if tag in tags:
                 given.add(tag)
-            elif not scalar.is_optional:
+            else:
                 more = "; to make a tag, declare it under `tags:`"
                 report_unknown("tag", scalar, tags, reporter, more=more)
         if element is not None:

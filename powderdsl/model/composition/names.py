@@ -157,7 +157,9 @@ def words_of(syntax: Syntax) -> Iterator[str]:
 def report_unknown(
     kind: str, scalar: Scalar, known: Iterable[str], reporter: Reporter, code: str = "PD301", more: str = ""
 ) -> None:
-    """Report a name that no loaded pack defines. `more` is what else may help."""
+    """Report a name that no loaded pack defines, unless it may be absent. `more` is what else may help."""
+    if scalar.is_optional:
+        return
     kinds = {"pass": "passes", "property": "properties"}.get(kind, f"{kind}s")
     helps = [*suggest(scalar.word, known, kinds), f"if its pack may be absent, write `{scalar.word}?`{more}"]
     reporter.error(
@@ -233,7 +235,7 @@ def order_passes(names: Names, reporter: Reporter) -> dict[str, PassDecl]:
                     if other in passes:
                         first, second = (other, name) if is_after else (name, other)
                         earlier[second][first] = scalar.span
-                    elif not scalar.is_optional:
+                    else:
                         report_unknown("pass", scalar, passes, reporter)
     ordered, stuck = in_order(passes, earlier)
     if stuck:
