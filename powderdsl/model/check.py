@@ -12,14 +12,14 @@ from itertools import chain
 
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Severity, Span
 from powderdsl.model.composition.added_packs import AddedPacks, Difference, report_contested
-from powderdsl.model.composition.compose import Palette, compose, title
+from powderdsl.model.composition.compose import Composition, Palette, compose, title
 from powderdsl.model.composition.layout import lay_out
 from powderdsl.model.composition.names import needs_of, report_misspelled, words_of
 from powderdsl.model.declarations import PackDecl, RulesetDecl
 from powderdsl.model.definitions import define_symbols, element_ramps
 from powderdsl.model.elaborate import Elaborated, Elaborator
 from powderdsl.model.examples import check_assigned, check_examples
-from powderdsl.model.expressions.symbols import Symbols, base_symbols
+from powderdsl.model.expressions.symbols import add_constants
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.invariants import check_invariants
 from powderdsl.model.logic.conflicts import check_logic
@@ -52,7 +52,8 @@ def resolve_names(
     """
     composition = compose(packs, ruleset, reporter, palette)
     reporter.raise_if_errors()  # with clashing names or missing packs, rules would only be misread
-    typer = Typer(base_symbols(composition), reporter)
+    add_constants(composition)
+    typer = Typer(composition, reporter)
     return typer, define_symbols(typer)
 
 
@@ -73,7 +74,7 @@ def check(
         alone: no pack counts as added to others: rules that meet are errors.
     """
     typer, given = resolve_names(packs, ruleset, reporter, palette)
-    symbols, composition = typer.symbols, typer.symbols.composition
+    composition = typer.symbols
     elaborated = Elaborator(typer).run(composition.passes)
     examples = check_examples(typer)
     invariants = check_invariants(composition, typer, partial(_typer_of, packs))
@@ -85,30 +86,30 @@ def check(
 
     elements = tuple(replace(element, ramp=ramps.get(name)) for name, element in composition.elements.items())
     passes = tuple(elaborated.passes)
-    names = {element.id: name for name, element in composition.elements.items()}
-    facts = Facts(symbols.ids, symbols.properties, symbols.fields, composition.side_multiple, names)
+    names, properties, fields = composition.names_by_id, composition.properties, composition.fields
+    facts = Facts(composition.ids, properties, fields, composition.side_multiple, names)
     stored = overridden_ids(passes, sorted(elaborated.overridden), facts)
     for name, ids in stored.items():
-        symbols.properties[name] = replace(symbols.properties[name], stored=ids)
-    check_assigned(examples, symbols, reporter)
+        properties[name] = replace(properties[name], stored=ids)
+    check_assigned(examples, composition, reporter)
     added = None
     if not alone:
         added = AddedPacks(composition, partial(_check_some, Declared(tuple(packs), None), alone=True))
     passes, undecided = check_logic(passes, facts, elaborated, reporter, added)
     report_unused(composition, typer, produced_ids(passes, facts))
-    order, matrix = lay_out(symbols, passes, reporter)
+    order, matrix = lay_out(composition, passes, reporter)
     reporter.raise_if_errors()
-    undecided += report_needless(passes, symbols.fields, facts, reporter)
+    undecided += report_needless(passes, composition.fields, facts, reporter)
     found = Ruleset(
         name=title(composition.packs, ruleset),
         about=ruleset.about if ruleset else (packs[0].about if len(packs) == 1 else ""),
         packs=tuple(composition.packs),
         elements=elements,
         slots=composition.slots,
-        properties=tuple(symbols.properties.values()),
-        fields=tuple(symbols.fields.values()),
-        streams=_streams(symbols, elaborated, reporter),
-        params=tuple(symbols.params.values()),
+        properties=tuple(composition.properties.values()),
+        fields=tuple(composition.fields.values()),
+        streams=_streams(composition, elaborated, reporter),
+        params=tuple(composition.params.values()),
         passes=without_dead_overrides(passes, frozenset(name for name, ids in stored.items() if not ids)),
         matrix=matrix,
         side_multiple=composition.side_multiple,
@@ -130,7 +131,7 @@ def _typer_of(packs: Sequence[PackDecl], names: tuple[str, ...]) -> Typer | None
         return None
 
 
-def _streams(symbols: Symbols, elaborated: Elaborated, reporter: Reporter) -> tuple[Stream, ...]:
+def _streams(symbols: Composition, elaborated: Elaborated, reporter: Reporter) -> tuple[Stream, ...]:
     streams = [*symbols.streams.values(), *elaborated.streams.values()]
     by_ident: dict[int, str] = {}
     for stream in streams:

@@ -11,7 +11,6 @@ from typing import Any
 
 from powderdsl.diagnostics import Label, Reporter, Span, suggest
 from powderdsl.model.composition.added_packs import report_replaced
-from powderdsl.model.composition.compose import Composition
 from powderdsl.model.composition.names import report_unknown
 from powderdsl.model.declarations import (
     ElementDecl,
@@ -66,12 +65,12 @@ def define_symbols(typer: Typer) -> list[tuple[str, int, Span]]:
     Returns:
         Where elements' own values of properties stand: property, id, place.
     """
-    symbols, composition = typer.symbols, typer.symbols.composition
-    names, elements = composition.names, composition.elements
+    symbols = typer.symbols
+    names, elements = symbols.names, symbols.elements
     for name, kernel in names.declared(KernelDecl).items():
         if kernel.shape is not None:
             symbols.constants[name] = _shaped(name, kernel, kernel.shape, typer)
-    for name, param in composition.params.items():
+    for name, param in symbols.param_decls.items():
         word = names.of(param.pack, param.name.text)
         if word in names.versions and names.knows(param.pack, word):
             # A rule would read the other one without a sign.
@@ -84,7 +83,7 @@ def define_symbols(typer: Typer) -> list[tuple[str, int, Span]]:
             if param.default is not None:
                 value = typer.constant(param.default, kind, Scope(param.pack, {}))
                 symbols.params[name] = Param(name, kind, value, param.about, param.span)
-    _set_by_rulesets(composition, typer)
+    _set_by_rulesets(typer)
     properties = names.declared(PropertyDecl)
     for name, prop in properties.items():
         with suppress(Poisoned):
@@ -99,7 +98,7 @@ def define_symbols(typer: Typer) -> list[tuple[str, int, Span]]:
     for name, known in symbols.properties.items():
         prop = properties[name]
         usual = _value(known, prop.default, prop.pack, typer) if prop.default else default_of(known.kind)
-        values = [usual] * composition.slots
+        values = [usual] * symbols.slots
         for element in elements.values():
             if (name, element.name) in given:
                 values[element.id] = _value(known, *given[name, element.name], typer)
@@ -159,13 +158,13 @@ def _kind(noun: str, decl: TypedDecl, typer: Typer) -> Kind:
     )  # fmt: skip
 
 
-def _set_by_rulesets(composition: Composition, typer: Typer) -> None:
+def _set_by_rulesets(typer: Typer) -> None:
     """Give parameters the values of rulesets, bases first; values for packs that are left out are skipped."""
     params = typer.symbols.params
-    for ruleset in composition.lineage:
+    for ruleset in typer.symbols.lineage:
         for key, syntax in ruleset.params:
             pack, known = key.text.partition(".")[0], params.get(key.text)
-            if pack not in composition.packs and any(pack in one.members for one in ruleset.lineage):
+            if pack not in typer.symbols.packs and any(pack in one.members for one in ruleset.lineage):
                 continue
             if known is None:
                 helps = suggest(key.text, params, "parameters")
@@ -211,13 +210,13 @@ Given = Mapping[tuple[str, str], tuple[Syntax, str]]
 
 def _element_values(typer: Typer) -> Given:
     """The properties' values of single elements; fields get theirs. Reports keys that name nothing."""
-    symbols, composition = typer.symbols, typer.symbols.composition
-    properties = composition.names.declared(PropertyDecl)
-    declared: dict[str, PropertyDecl | FieldDecl] = {**properties, **composition.names.declared(FieldDecl)}
+    symbols = typer.symbols
+    properties = symbols.names.declared(PropertyDecl)
+    declared: dict[str, PropertyDecl | FieldDecl] = {**properties, **symbols.names.declared(FieldDecl)}
     given: dict[tuple[str, str], tuple[Syntax, str]] = {}
     own: dict[str, dict[int, Value]] = {}
-    for pack, name, word, key, syntax in composition.given_values():
-        element = composition.elements.get(word)
+    for pack, name, word, key, syntax in symbols.given_values():
+        element = symbols.elements.get(word)
         field = symbols.fields.get(name)
         if name in properties:
             given[name, word] = (syntax, pack)
@@ -230,7 +229,7 @@ def _element_values(typer: Typer) -> Given:
                 own.setdefault(name, {})[element.id] = clamped(value, field.kind)
     for name, decl in declared.items():
         for key, _ in decl.values:
-            if key.is_optional or composition.element(key.word, decl.pack) is not None:
+            if key.is_optional or symbols.element(key.word, decl.pack) is not None:
                 continue
             # It should be an element's name, but may also be a misspelled key.
             close = get_close_matches(key.text.lower(), sorted(keys_of(type(decl))), n=1, cutoff=0.75)
@@ -239,7 +238,7 @@ def _element_values(typer: Typer) -> Given:
                 helps = [f"did you mean `{close[0]}`?"]
                 typer.reporter.error("PD108", f"unknown key `{key.text}`", key.span, label, helps=helps)
             else:
-                report_unknown("element", key, composition.elements, typer.reporter)
+                report_unknown("element", key, symbols.elements, typer.reporter)
     for name, values in own.items():
         field = symbols.fields[name]
         changed = tuple((number, value) for number, value in sorted(values.items()) if value != field.default)
@@ -290,16 +289,16 @@ def _value(prop: Property, syntax: Syntax, pack: str, typer: Typer) -> Value | s
 
 def element_ramps(typer: Typer) -> dict[str, ColorRamp]:
     """The ramps by global names of elements. Of several for one element the last holds. Reports what is wrong."""
-    composition, symbols = typer.symbols.composition, typer.symbols
-    properties = composition.names.declared(PropertyDecl)
-    fields = composition.names.declared(FieldDecl)
+    symbols = typer.symbols
+    properties = symbols.names.declared(PropertyDecl)
+    fields = symbols.names.declared(FieldDecl)
     places: dict[str, tuple[str, Span]] = {}
     ramps: dict[str, ColorRamp] = {}
-    for name, entry in composition.entries:
+    for name, entry in symbols.entries:
         if entry.ramp is None:
             continue
-        pack, word, element = entry.pack, entry.ramp.field, composition.elements.get(name)
-        field_name = composition.names.of(pack, word.word)
+        pack, word, element = entry.pack, entry.ramp.field, symbols.elements.get(name)
+        field_name = symbols.names.of(pack, word.word)
         field = symbols.fields.get(field_name)
         with suppress(Poisoned):
             if field_name in properties:
@@ -313,7 +312,7 @@ def element_ramps(typer: Typer) -> dict[str, ColorRamp]:
                 continue
             ramp, here = _ramp(field, element, entry.ramp, typer), (pack, entry.ramp.name.span)
             if name in ramps and ramps[name] != ramp:
-                report_replaced("color_by", name, places[name], here, composition, typer.reporter)
+                report_replaced("color_by", name, places[name], here, symbols, typer.reporter)
             places[name], ramps[name] = here, ramp
     return ramps
 

@@ -11,10 +11,11 @@ from math import lcm
 
 from powderdsl.diagnostics import Label, Reporter, Span, suggest
 from powderdsl.model.builtins import DIRECTIONS, OCTANTS
+from powderdsl.model.composition.compose import Composition
 from powderdsl.model.composition.names import report_unknown, words_of
 from powderdsl.model.declarations import ElementDecl, TestDecl
 from powderdsl.model.expressions.operators import Poisoned, Scope, Unresolved
-from powderdsl.model.expressions.symbols import Symbols, clamped_number
+from powderdsl.model.expressions.symbols import clamped_number
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.schema import comment_after
 from powderdsl.model.types import CHANCE, Cell, Example, FieldGrid, Kernel, Kind, Often
@@ -121,7 +122,7 @@ ANYTHING = "?"
 def check_examples(typer: Typer) -> tuple[Example, ...]:
     """The tests of all packs, checked: characters known, rows equally long."""
     examples = []
-    for name, pack in typer.symbols.composition.packs.items():
+    for name, pack in typer.symbols.packs.items():
         for decl in pack.tests:
             with suppress(Poisoned, Unresolved):
                 examples.append(_ExampleReader(typer, name, decl).example())
@@ -133,7 +134,7 @@ class _ExampleReader:
 
     def __init__(self, typer: Typer, pack: str, decl: TestDecl):
         self.typer, self.pack, self.decl = typer, pack, decl
-        self.composition = typer.symbols.composition
+        self.composition = typer.symbols
         self.legend = self._legend()
         self.given: tuple[str, ...] = ()
 
@@ -342,9 +343,9 @@ class _ExampleReader:
         raise Poisoned
 
 
-def check_assigned(examples: Sequence[Example], symbols: Symbols, reporter: Reporter) -> None:
+def check_assigned(examples: Sequence[Example], symbols: Composition, reporter: Reporter) -> None:
     """Refuse drawn properties that follow from the element: only what rules assign can differ."""
-    elements = symbols.composition.elements
+    elements = symbols.elements
     for example in examples:
         legend = dict(example.legend)
         for grid in (*example.fields, *example.expect_fields):

@@ -259,7 +259,7 @@ class _TaskReader:
     def is_name(self, word: str) -> bool:
         """Whether a word means something in the task's own rules."""
         symbols = self.typer.symbols
-        pack = symbols.composition.names.pack(word)
+        pack = symbols.names.pack(word)
         return pack in (None, *self.own) and bool(self.ruleset.element(word) or symbols.constants.get(word))
 
     def knobs(self) -> tuple[Knob, ...]:

@@ -150,7 +150,9 @@ class GoalChecker:
         names = [*ACTION_WORDS, *FUNCTIONS, *self.knobs]
         text = syntax.span.text
         if syntax.kind == "name" and self.typer.find(syntax.text, syntax.span, self.scope) is None:
-            helps = suggest(syntax.text, [*names, *self.typer.symbols.names()])
+            symbols = self.typer.symbols
+            known = (*names, *symbols.constants, *symbols.properties, *symbols.fields, *symbols.streams)
+            helps = suggest(syntax.text, known)
             message = f"unknown name `{syntax.text}`"
             return self.typer.fail("PD301", message, syntax.span, "not defined", *helps)
         return self.typer.fail(

@@ -155,7 +155,7 @@ class AddedPacks:
         alone = self._conflicts[scope]
         if alone is None or place in alone:
             return ()
-        names = {element.id: name for name, element in self.composition.elements.items()}
+        names = self.composition.names_by_id
         elements = [names[number] for number in dict.fromkeys(ids) if number in names]
         return tuple(given for name in elements for given in self._given(name, scope, words))
 

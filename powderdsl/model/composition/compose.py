@@ -8,11 +8,12 @@ later.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from functools import cached_property
 from itertools import pairwise
 from math import lcm
+from typing import TYPE_CHECKING
 
 from powderdsl.diagnostics import Label, Reporter, Span
 from powderdsl.model.builtins import RESERVED
@@ -35,10 +36,13 @@ from powderdsl.model.declarations import (
     RulesetDecl,
     TagDecl,
 )
-from powderdsl.model.types import Element
+from powderdsl.model.types import Element, Field, Param, Property, Stream
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.parse import reserved_words
 from powderdsl.syntax.yaml_tree import Scalar
+
+if TYPE_CHECKING:
+    from powderdsl.model.expressions.operators import Operand
 
 MAX_ELEMENTS = 256
 """Ids fit into a byte."""
@@ -49,14 +53,14 @@ Palette = Sequence[str | None]
 
 @dataclass
 class Composition:
-    """Packs merged. Dictionaries are by global name, in load order; kinds and values are still syntax."""
+    """Packs merged: all that is known everywhere. Dictionaries are by global name, in load order."""
 
     packs: dict[str, PackDecl]
     ruleset: RulesetDecl | None
     names: Names
     passes: dict[str, PassDecl]
     """In the order in which they run."""
-    params: dict[str, ParamDecl]
+    param_decls: dict[str, ParamDecl]
     """By qualified name."""
     elements: dict[str, Element]
     """By ascending id."""
@@ -67,6 +71,30 @@ class Composition:
     """By pack: the number of the group in which its elements and channels lie; the first group lies as if alone."""
     reserved: tuple[int, ...]
     """Ids of elements of a ruleset's own packs that are left out."""
+    properties: dict[str, Property] = field(default_factory=dict)
+    """This and what follows is added by `check.resolve_names`."""
+    fields: dict[str, Field] = field(default_factory=dict)
+    streams: dict[str, Stream] = field(default_factory=dict)
+    params: dict[str, Param] = field(default_factory=dict)
+    constants: dict[str, Operand] = field(default_factory=dict)
+    """Elements, tags, sets, kernels, directions."""
+
+    @property
+    def ids(self) -> tuple[int, ...]:
+        return tuple(self.names_by_id)
+
+    @cached_property
+    def names_by_id(self) -> dict[int, str]:
+        return {element.id: name for name, element in self.elements.items()}
+
+    @property
+    def first_id(self) -> int:
+        """The element that fields of elements hold unless their file says otherwise."""
+        return min(self.ids, key=self.order.__getitem__)
+
+    def is_declared(self, name: str, pack: str) -> bool:
+        """Whether some pack declares the name, even if its declaration is wrong."""
+        return self.names.of(pack, name) in self.names.versions or f"{pack}.{name}" in self.param_decls
 
     @cached_property
     def side_multiple(self) -> int:
@@ -197,7 +225,7 @@ def compose(
         ruleset=ruleset,
         names=names,
         passes=order_passes(passes, reporter),
-        params=params,
+        param_decls=params,
         elements=elements,
         slots=max(_slots(ruleset, elements, palette, reporter), *(number + 1 for number in ids.values()), 1),
         order={number: natural.get(name, number) for name, number in ids.items()},

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from powderdsl.diagnostics import Reporter, suggest
 from powderdsl.model.composition.compose import Composition
-from powderdsl.model.expressions.symbols import Symbols
 from powderdsl.model.types import MatrixChannel, Pass, substeps, writes_of
 from powderdsl.syntax.yaml_tree import Scalar
 
@@ -20,31 +19,27 @@ Channels = dict[str, list[MatrixChannel]]
 
 
 def lay_out(
-    symbols: Symbols, passes: tuple[Pass, ...], reporter: Reporter
+    composition: Composition, passes: tuple[Pass, ...], reporter: Reporter
 ) -> tuple[tuple[str, ...], tuple[MatrixChannel, ...]]:
     """The names of all that a cell holds besides its element, in order, and the channels of `World.matrix()`.
 
     Reports names in a ruleset's `matrix:` that no loaded pack has.
     """
-    composition = symbols.composition
-    known: Channels = {name: [MatrixChannel(name, name)] for name in (*symbols.properties, *symbols.fields)}
-    for name, field in symbols.fields.items():
+    fields, names, size = composition.fields, composition.names_by_id, own_slots(composition)
+    known: Channels = {name: [MatrixChannel(name, name)] for name in (*composition.properties, *fields)}
+    for name, field in fields.items():
         if field.kind.name == "vec2":
             known[name] = [MatrixChannel(f"{name}.{part}", name, part=part) for part in COMPONENTS]
-    size, elements = own_slots(composition), composition.elements.values()
-    names = {element.id: element.name for element in elements}
-    blocks = _blocks(symbols, passes)
-    parts: list[list[MatrixChannel]] = []
+    blocks = _blocks(composition, passes)
+    parts: list[list[MatrixChannel]] = [[] for _ in range(2 * len(blocks))]
     """The channels of elements and those of what lasts from step to step, in turn, by group of packs."""
-    for number, block in enumerate(blocks):
-        ids = (
-            [e.id for e in elements if e.id >= size and composition.group[e.pack] == number]
-            if parts
-            else range(size)
-        )
-        parts.append([MatrixChannel(names.get(identity, ""), id=identity) for identity in ids])
-        lasting = [name for name in block if name not in symbols.fields or not symbols.fields[name].resets]
-        parts.append([channel for name in lasting for channel in known[name]])
+    for number in sorted({*range(size), *names}):
+        group = composition.group[composition.elements[names[number]].pack] if number >= size else 0
+        parts[2 * group].append(MatrixChannel(names.get(number, ""), id=number))
+    for group, block in enumerate(blocks):
+        for name in block:
+            if name not in fields or not fields[name].resets:
+                parts[2 * group + 1] += known[name]
     written = composition.ruleset.placing.matrix if composition.ruleset else ()
     if written:
         own = [_written(scalar, known, composition, reporter) for scalar in written]
@@ -63,18 +58,18 @@ def own_slots(composition: Composition) -> int:
     return max([*ids, *composition.reserved], default=-1) + 1
 
 
-def _blocks(symbols: Symbols, passes: tuple[Pass, ...]) -> list[list[str]]:
+def _blocks(composition: Composition, passes: tuple[Pass, ...]) -> list[list[str]]:
     """Stored properties and fields, by group of packs."""
-    place = symbols.composition.group
+    place = composition.group
     blocks: list[list[str]] = [[] for _ in range(max(place.values()) + 1)]
     first: dict[str, int] = {}
     for pass_, moment in substeps(passes):
         for write in (write for rule in moment.rules for write in writes_of(rule)):
             first[write.field] = min(place[pass_.pack], first.get(write.field, place[pass_.pack]))
-    for name, prop in symbols.properties.items():
+    for name, prop in composition.properties.items():
         if prop.stored:
             blocks[max(first.get(name, 0), place[prop.pack])].append(name)
-    for name, field in symbols.fields.items():
+    for name, field in composition.fields.items():
         blocks[place[field.pack]].append(name)
     return blocks
 

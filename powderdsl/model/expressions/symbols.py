@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
@@ -19,7 +18,7 @@ from powderdsl.model.builtins import (
 )
 from powderdsl.model.composition.compose import Composition
 from powderdsl.model.declarations import KernelDecl, StreamDecl, TagDecl
-from powderdsl.model.expressions.operators import Items, Operand, Place, SetOf
+from powderdsl.model.expressions.operators import Items, Place, SetOf
 from powderdsl.model.operations import FUNCTIONS
 from powderdsl.model.state import SNAP
 from powderdsl.model.types import (
@@ -28,9 +27,7 @@ from powderdsl.model.types import (
     ELEMENT,
     FLAG,
     Expr,
-    Field,
     Kind,
-    Param,
     Property,
     Stream,
     Value,
@@ -43,44 +40,9 @@ if TYPE_CHECKING:
     from powderdsl.model.expressions.typer import Typer
 
 
-@dataclass
-class Symbols:
-    """Names known everywhere. Filled in order by `check.resolve_names`; not changed afterwards."""
-
-    composition: Composition
-    properties: dict[str, Property] = field(default_factory=dict)
-    fields: dict[str, Field] = field(default_factory=dict)
-    streams: dict[str, Stream] = field(default_factory=dict)
-    params: dict[str, Param] = field(default_factory=dict)
-    constants: dict[str, Operand] = field(default_factory=dict)
-    """Elements, tags, sets, kernels, directions."""
-
-    @property
-    def ids(self) -> tuple[int, ...]:
-        return tuple(element.id for element in self.composition.elements.values())
-
-    @property
-    def first_id(self) -> int:
-        """The element that fields of elements hold unless their file says otherwise."""
-        return min(self.ids, key=self.composition.order.__getitem__)
-
-    def names(self, *, after_dot: bool = False) -> list[str]:
-        """All words that an expression can use, for suggestions; with `after_dot`, the words that can follow a neighbor."""
-        if after_dot:
-            return [*self.properties, *self.fields, *self.streams, *DIRECTIONS]
-        params = (name.split(".")[1] for name in self.params)
-        return [*self.constants, *self.properties, *self.fields, *self.streams, *params]
-
-    def is_declared(self, name: str, pack: str) -> bool:
-        """Whether some pack declares the name, even if its declaration is wrong."""
-        meant = self.composition.names.of(pack, name)
-        return meant in self.composition.names.versions or f"{pack}.{name}" in self.composition.params
-
-
-def base_symbols(composition: Composition) -> Symbols:
-    """Symbols with what needs no evaluation: directions, kernels, elements, tags, streams."""
-    symbols, names, elements = Symbols(composition), composition.names, composition.elements
-    constants = symbols.constants
+def add_constants(composition: Composition) -> None:
+    """Define what needs no evaluation: directions, kernels, elements, tags, streams."""
+    constants, names, elements = composition.constants, composition.names, composition.elements
     constants |= {name: Place(offset) for name, offset in DIRECTIONS.items()}
     constants |= {name: Items(tuple(map(Place, offsets))) for name, offsets in DIRECTION_SETS.items()}
     constants |= KERNELS
@@ -91,8 +53,7 @@ def base_symbols(composition: Composition) -> Symbols:
     for tag in names.declared(TagDecl):
         constants[tag] = SetOf(tuple(element.id for element in elements.values() if tag in element.tags))
     for name, stream in names.declared(StreamDecl).items():
-        symbols.streams[name] = Stream(name, name_number(name), stream.bits)
-    return symbols
+        composition.streams[name] = Stream(name, name_number(name), stream.bits)
 
 
 # Literals: no float is involved, `2%` is 1/50
@@ -230,7 +191,7 @@ MAX_PLACES = 4
 class UnknownNames:
     """Names that were looked up and not found: each is reported once, with all its places."""
 
-    def __init__(self, symbols: Symbols, reporter: Reporter):
+    def __init__(self, symbols: Composition, reporter: Reporter):
         self.symbols = symbols
         self.reporter = reporter
         self._places: dict[tuple[str, bool], dict[Span, tuple[str, ...]]] = {}
@@ -260,8 +221,9 @@ class UnknownNames:
             return (f"write `{elsewhere[0]}`: a parameter of another pack is named with its pack",)
         if not after_dot and name.lower() in ELSEWHERE:
             return (ELSEWHERE[name.lower()],)
-        known = self.symbols.names(after_dot=after_dot)
-        close = suggest(name, known if after_dot else [*known, *known_here, *FUNCTIONS])
+        symbols, params = self.symbols, (name.split(".")[1] for name in self.symbols.params)
+        others = DIRECTIONS if after_dot else (*symbols.constants, *params, *known_here, *FUNCTIONS)
+        close = suggest(name, (*symbols.properties, *symbols.fields, *symbols.streams, *others))
         if close and close[0].startswith("did"):
             return close
         return (f"load the pack that defines it, or write `{name}?` if that may be absent",)

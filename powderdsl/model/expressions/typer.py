@@ -11,6 +11,7 @@ from math import prod
 
 from powderdsl.diagnostics import Label, Reporter, Span
 from powderdsl.model.builtins import COORDINATES, KERNEL_SHAPES, KERNELS, MAX_MAGNITUDE, MAX_OFFSET, OCTANTS
+from powderdsl.model.composition.compose import Composition
 from powderdsl.model.declarations import SetDecl
 from powderdsl.model.expressions.operators import (
     ELEMENT_HERE,
@@ -46,7 +47,7 @@ from powderdsl.model.expressions.operators import (
     quotient,
     turned,
 )
-from powderdsl.model.expressions.symbols import Symbols, UnknownNames, number_value, read_bounds, read_number
+from powderdsl.model.expressions.symbols import UnknownNames, number_value, read_bounds, read_number
 from powderdsl.model.logic.needless import report_repeated
 from powderdsl.model.operations import FUNCTIONS
 from powderdsl.model.types import (
@@ -121,9 +122,9 @@ def describe(operand: Operand) -> str:
 class Typer:
     """Checks expressions against the symbols of a composition."""
 
-    def __init__(self, symbols: Symbols, reporter: Reporter):
+    def __init__(self, symbols: Composition, reporter: Reporter):
         self.symbols, self.reporter = symbols, reporter
-        self.sets = symbols.composition.names.declared(SetDecl)
+        self.sets = symbols.names.declared(SetDecl)
         self._misused: set[tuple[Span, str]] = set()
         self.used: set[str] = set()
         self.absent: set[str] = set()
@@ -348,7 +349,7 @@ class Typer:
         if param is not None:  # a name that hides no other that its pack knows
             self.used.add(param.name)
             return Expr("param", param.kind, value=param.name, span=span)
-        name = symbols.composition.names.of(scope.pack, name)
+        name = symbols.names.of(scope.pack, name)
         self.used.add(name)
         if name in self.sets and name not in symbols.constants:
             return self.resolve_set(name, span)
@@ -366,7 +367,7 @@ class Typer:
         if name in scope.locals:
             return True
         found = self.find(name, span, Scope(scope.pack, {}))
-        names = self.symbols.composition.names
+        names = self.symbols.names
         return found is not None and names.knows(scope.pack, names.of(scope.pack, name))
 
     def resolve_set(self, name: str, span: Span) -> Operand:
@@ -475,7 +476,7 @@ class Typer:
         (pack,) = syntax.children
         if pack.kind not in ("name", "attribute"):
             return None
-        name = self.symbols.composition.names.known.get(f"{pack.text}.{syntax.text}")
+        name = self.symbols.names.known.get(f"{pack.text}.{syntax.text}")
         if name is None or self._is_own_word(pack, scope):
             return None
         found = self.find(name, syntax.span, Scope("", {}, scope.orientation))
@@ -505,7 +506,7 @@ class Typer:
     def certain(self, syntax: Syntax, scope: Scope) -> Syntax:
         """An attribute without its question mark. Raises Unresolved if nothing that is loaded has its name."""
         (before,) = syntax.children
-        span, names = syntax.span, self.symbols.composition.names
+        span, names = syntax.span, self.symbols.names
         plain = replace(syntax, kind="attribute", span=Span(span.source, span.start, span.end - 1))
         qualified = f"{before.text}.{syntax.text}"
         if qualified in self.symbols.params or qualified in names.known:
@@ -612,10 +613,8 @@ class Typer:
                     raise self._too_long(rounds, syntax.span, "64")
                 return [Number(Fraction(i)) for i in range(operand.lo, operand.hi + 1)]
             case SetOf():
-                composition = self.symbols.composition
-                names = {element.id: name for name, element in composition.elements.items()}
-                ids = sorted(operand.ids, key=composition.order.__getitem__)
-                return [SetOf((i,), names[i]) for i in ids]
+                ids = sorted(operand.ids, key=self.symbols.order.__getitem__)
+                return [SetOf((i,), self.symbols.names_by_id[i]) for i in ids]
             case Items():
                 return list(operand.items)
             case Absent():

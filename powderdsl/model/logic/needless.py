@@ -333,7 +333,7 @@ def report_unused(composition: Composition, typer: Typer, produced: frozenset[in
     """Report definitions that no rule uses (warnings), and what the loaded packs lack (notes)."""
     reporter = typer.reporter
     values = [str(value) for prop in typer.symbols.properties.values() for value in prop.values]
-    for qualified, param in composition.params.items():
+    for qualified, param in composition.param_decls.items():
         if qualified not in typer.used and qualified not in values:
             _unused("parameter", qualified, param.span, reporter)
     for name, named_set in composition.names.declared(SetDecl).items():
