@@ -82,7 +82,7 @@ def check(
     typer.unknown.report()
     reporter.raise_if_errors()
     report_contested(composition, reporter)
-    report_misspelled(packs, ruleset, elsewhere, reporter)
+    report_misspelled(packs, composition.ruleset, elsewhere, reporter)
 
     elements = tuple(replace(element, ramp=ramps.get(name)) for name, element in composition.elements.items())
     passes = tuple(elaborated.passes)
@@ -101,7 +101,7 @@ def check(
     reporter.raise_if_errors()
     undecided += report_needless(passes, composition.fields, facts, reporter)
     found = Ruleset(
-        name=title(composition.packs, ruleset),
+        name=title(composition.packs, composition.ruleset),
         about=ruleset.about if ruleset else (packs[0].about if len(packs) == 1 else ""),
         packs=tuple(composition.packs),
         elements=elements,
@@ -196,7 +196,7 @@ def with_outgrown(ruleset: Ruleset, remarks: tuple[Diagnostic, ...]) -> tuple[Di
         return remarks
     composition = compose(ruleset.declared.packs, ruleset.declared.ruleset, Reporter())
     notes: dict[Diagnostic, Diagnostic] = {}
-    authors: list[PackDecl | RulesetDecl] = [*composition.packs.values(), *composition.lineage]
+    authors: list[PackDecl | RulesetDecl] = [*composition.packs.values(), *composition.ruleset.lineage]
     for author in authors:
         own = {
             one: one.primary.span

@@ -161,7 +161,7 @@ def _kind(noun: str, decl: TypedDecl, typer: Typer) -> Kind:
 def _set_by_rulesets(typer: Typer) -> None:
     """Give parameters the values of rulesets, bases first; values for packs that are left out are skipped."""
     params = typer.symbols.params
-    for ruleset in typer.symbols.lineage:
+    for ruleset in typer.symbols.ruleset.lineage:
         for key, syntax in ruleset.params:
             pack, known = key.text.partition(".")[0], params.get(key.text)
             if pack not in typer.symbols.packs and any(pack in one.members for one in ruleset.lineage):

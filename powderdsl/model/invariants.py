@@ -59,7 +59,7 @@ def check_invariants(
     written: list[tuple[str, Syntax, RulesetDecl | None]]
     written = [(name, line, None) for name, pack in composition.packs.items() for line in pack.invariants]
     gone = composition.left_out
-    for ruleset in composition.lineage:
+    for ruleset in composition.ruleset.lineage:
         written += [(ruleset.name.text, with_optional(line, gone), ruleset) for line in ruleset.invariants]
     found = []
     reporter = typer.reporter

@@ -15,7 +15,7 @@ from itertools import pairwise
 from math import lcm
 from typing import TYPE_CHECKING
 
-from powderdsl.diagnostics import Label, Reporter, Span
+from powderdsl.diagnostics import Label, Reporter, Source, Span
 from powderdsl.model.builtins import RESERVED
 from powderdsl.model.composition.names import (
     Names,
@@ -47,6 +47,10 @@ if TYPE_CHECKING:
 MAX_ELEMENTS = 256
 """Ids fit into a byte."""
 
+NO_SOURCE = Source("", "")
+NO_PLACE = Span(NO_SOURCE, 0, 0)
+NO_RULESET = RulesetDecl(name=Scalar("", NO_PLACE, NO_PLACE, "plain"), source=NO_SOURCE)
+
 Palette = Sequence[str | None]
 """By id: an element's qualified name, or None."""
 
@@ -56,7 +60,8 @@ class Composition:
     """Packs merged: all that is known everywhere. Dictionaries are by global name, in load order."""
 
     packs: dict[str, PackDecl]
-    ruleset: RulesetDecl | None
+    ruleset: RulesetDecl
+    """`NO_RULESET` for packs without one."""
     names: Names
     passes: dict[str, PassDecl]
     """In the order in which they run."""
@@ -102,15 +107,9 @@ class Composition:
         return lcm(*(pack.side_multiple for pack in self.packs.values()))
 
     @cached_property
-    def lineage(self) -> tuple[RulesetDecl, ...]:
-        """The rulesets that are loaded, what inherits after what it extends."""
-        return self.ruleset.lineage if self.ruleset else ()
-
-    @cached_property
     def left_out(self) -> frozenset[str]:
         """Names of packs that a ruleset leaves out: its own lines may use them as if they ended in `?`."""
-        packs = self.ruleset.left_out if self.ruleset else ()
-        return frozenset(decl.name.text for pack in packs for decl in pack.definitions)
+        return frozenset(decl.name.text for pack in self.ruleset.left_out for decl in pack.definitions)
 
     def scope(self, author: str | RulesetDecl, words: Iterable[str] = ()) -> tuple[str, ...]:
         """The packs that the author of a pack or ruleset knew, in load order. All others were added.
@@ -121,7 +120,7 @@ class Composition:
         if isinstance(author, RulesetDecl):
             known, speaker = [*author.members], ""
         else:
-            home = next(filter(None, (one.lister(author) for one in self.lineage)), None)
+            home = next(filter(None, (one.lister(author) for one in self.ruleset.lineage)), None)
             known, speaker = [author, *(home.members if home else ())], author
         for word in words:
             pack = self.names.pack(self.names.of(speaker, word))
@@ -136,10 +135,10 @@ class Composition:
         In rising precedence: the elements' own entries, then those under `also`, each pack after those that it needs. A
         ruleset comes after its packs, and packs that are added to it come last.
         """
-        members = {name for one in self.lineage for name in one.members}
+        members = {name for one in self.ruleset.lineage for name in one.members}
         packs = needed_first(self.packs)
         also = [decl for pack in packs if pack in members for decl in self.packs[pack].also]
-        also += [_waiting(decl, self.left_out) for one in self.lineage for decl in one.also]
+        also += [_waiting(decl, self.left_out) for one in self.ruleset.lineage for decl in one.also]
         also += [decl for pack in packs if pack not in members for decl in self.packs[pack].also]
         own = self.names.declared(ElementDecl)
         return [*own.items(), *((self.names.of(decl.pack, decl.name.word), decl) for decl in also)]
@@ -197,10 +196,11 @@ def compose(
 
     `palette` has ids that were recorded earlier.
     """
+    ruleset = ruleset or NO_RULESET
     loaded = with_stand_ins(packs)
     _check_needs(loaded, reporter)
     reporter.raise_if_errors()  # every name of a missing pack would be reported too
-    renames = ruleset.renames if ruleset else ()
+    renames = ruleset.renames
     names = Names(loaded, SHARED, renames, reporter, RESERVED | reserved_words() | {"elements"})
     params = {decl.qualified: decl for pack in packs for decl in pack.params}
     for decl in params.values():
@@ -215,7 +215,7 @@ def compose(
         )  # fmt: skip
     groups = _groups(loaded, ruleset)
     wishes = [_wishes(group, names, reporter) for group in groups]
-    natural = _composed_ids(wishes, ruleset is not None)
+    natural = _composed_ids(wishes, ruleset is not NO_RULESET)
     asking = [decl for group in wishes for decl in group]
     ids = natural if palette is None else _recorded_ids(asking, names, palette)
     _report_ids(asking, ids, names, reporter, recorded=palette is not None)
@@ -236,10 +236,8 @@ def compose(
     return composition
 
 
-def title(loaded: Collection[str], ruleset: RulesetDecl | None) -> str:
+def title(loaded: Collection[str], ruleset: RulesetDecl) -> str:
     """The title of what is loaded: a ruleset, packs left out of it, packs added: ``ruleset-pack+pack``."""
-    if ruleset is None:
-        return "+".join(loaded)
     named = [ruleset]
     for one in reversed(ruleset.beside):  # a ruleset that a later one extends has no title of its own
         if all(one.source.name not in {base.source.name for base in known.lineage} for known in named):
@@ -247,18 +245,18 @@ def title(loaded: Collection[str], ruleset: RulesetDecl | None) -> str:
     members = list(dict.fromkeys(name for one in named for name in one.members))
     gone = [f"-{name}" for name in members if name not in loaded]
     added = [f"+{name}" for name in loaded if name not in members]
-    return "".join(["+".join(one.name.text for one in named), *gone, *added])
+    return "".join(["+".join(one.name.text for one in named), *gone, *added]).removeprefix("+")
 
 
 def _slots(
-    ruleset: RulesetDecl | None, elements: Mapping[str, Element], palette: Palette | None, reporter: Reporter
+    ruleset: RulesetDecl, elements: Mapping[str, Element], palette: Palette | None, reporter: Reporter
 ) -> int:
     """How many ids a ruleset or a palette asks for. Reports an id of the ruleset's own packs beyond its slots."""
-    wanted = (ruleset.placing.slots if ruleset else None) or 0
+    wanted = ruleset.placing.slots or 0
     # The packs of the ruleset that declares `slots` must fit; packs loaded on top of them add slots.
-    own = ruleset.placed if ruleset and wanted else ()
+    own = ruleset.placed if wanted else ()
     top = max((e for e in elements.values() if e.pack in own), key=lambda element: element.id, default=None)
-    if top and ruleset and palette is None and top.id >= wanted:
+    if top and palette is None and top.id >= wanted:
         reporter.error(
             "PD402", f"element `{top.name}` has id {top.id}, but the ruleset has {wanted} slots", top.span,
             helps=[f"say `slots: {top.id + 1}` in {ruleset.placing.source.name}"],
@@ -266,10 +264,10 @@ def _slots(
     return max(wanted, len(palette or ()))
 
 
-def _check_renamed(ruleset: RulesetDecl | None, renamed: set[str], reporter: Reporter) -> None:
+def _check_renamed(ruleset: RulesetDecl, renamed: set[str], reporter: Reporter) -> None:
     """Report names under `rename:` that no pack defines. Those of packs that are left out may wait."""
-    waiting = {pack.name.text for pack in ruleset.left_out} if ruleset else ()
-    for old, _ in ruleset.renames if ruleset else ():
+    waiting = {pack.name.text for pack in ruleset.left_out}
+    for old, _ in ruleset.renames:
         if old.text not in renamed and old.text.partition(".")[0] not in waiting:
             reporter.error(
                 "PD310", f"nothing is called `{old.text}`", old.span, "no loaded pack defines this",
@@ -315,17 +313,16 @@ def _check_needs(loaded: Mapping[str, PackDecl], reporter: Reporter) -> None:
 # Ids
 
 
-def _groups(packs: Mapping[str, PackDecl], ruleset: RulesetDecl | None) -> list[list[PackDecl]]:
+def _groups(packs: Mapping[str, PackDecl], ruleset: RulesetDecl) -> list[list[PackDecl]]:
     """The packs whose elements and channels are placed together, one group after the other.
 
     A ruleset's own packs come first, packs that it leaves out included, because their positions stay reserved. Each
     further pack follows by itself, after the packs that it needs: the order in which packs are named matters little.
     """
-    own = ruleset.placed if ruleset else ()
-    by_name = {pack.name.text: pack for pack in (*(ruleset.left_out if ruleset else ()), *packs.values())}
-    first = [by_name[name] for name in own if name in by_name]
-    others = ([packs[name]] for name in needed_first(packs) if name not in own)
-    return [*([first] if first else []), *others]
+    own, reserved = ruleset.placed, {pack.name.text: pack for pack in ruleset.left_out}
+    groups = [[packs.get(name) or reserved[name] for name in own if name in packs or name in reserved]]
+    groups += [[packs[name]] for name in needed_first(packs) if name not in own]
+    return [*filter(None, groups)]
 
 
 def _wishes(group: Sequence[PackDecl], names: Names, reporter: Reporter) -> list[ElementDecl]:

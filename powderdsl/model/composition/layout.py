@@ -40,7 +40,7 @@ def lay_out(
         for name in block:
             if name not in fields or not fields[name].resets:
                 parts[2 * group + 1] += known[name]
-    written = composition.ruleset.placing.matrix if composition.ruleset else ()
+    written = composition.ruleset.placing.matrix
     if written:
         own = [_written(scalar, known, composition, reporter) for scalar in written]
         shown = [parts[0] if channels is None else channels for channels in own]
@@ -52,7 +52,7 @@ def lay_out(
 
 def own_slots(composition: Composition) -> int:
     """How many ids the first packs have room for."""
-    if composition.ruleset is not None and composition.ruleset.placing.slots:
+    if composition.ruleset.placing.slots:
         return composition.ruleset.placing.slots
     ids = [element.id for element in composition.elements.values() if composition.group[element.pack] == 0]
     return max([*ids, *composition.reserved], default=-1) + 1

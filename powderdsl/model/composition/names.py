@@ -266,7 +266,7 @@ _OPTIONAL = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\?")
 
 def report_misspelled(
     packs: Sequence[PackDecl],
-    ruleset: RulesetDecl | None,
+    ruleset: RulesetDecl,
     elsewhere: Callable[[], Mapping[str, str]],
     reporter: Reporter,
 ) -> None:
@@ -276,7 +276,7 @@ def report_misspelled(
         elsewhere: words that packs define which are not loaded, and these packs. Asked only if it matters.
     """
     known: set[str] = set()
-    for pack in (*packs, *(ruleset.left_out if ruleset else ())):
+    for pack in (*packs, *ruleset.left_out):
         known.update(decl.name.text for decl in (*pack.definitions, *pack.params, *pack.passes))
         for decl in pack.passes:
             lets = (name for block in decl.walk() for name, _ in block.lets)

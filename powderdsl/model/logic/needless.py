@@ -367,7 +367,7 @@ def _report_unwritten(composition: Composition, reporter: Reporter) -> None:
     """
     names = composition.names
     words = {names.of(name, word) for name, pack in composition.packs.items() for word in pack_words(pack)}
-    for ruleset in composition.lineage:
+    for ruleset in composition.ruleset.lineage:
         words |= {word for line in ruleset.invariants for word in words_of(line)}
         words |= {scalar.word.partition(".")[0] for scalar in ruleset.matrix}
     for name, field in names.declared(FieldDecl).items():
