@@ -194,17 +194,16 @@ def split_names(name: str | Path) -> tuple[list[str], list[str]]:
     A file that exists is a path, whatever characters it has: of the parts between ``+``, the longest run that names a
     file is one path. After ``.yaml`` a ``-`` leaves out too.
     """
-    text = str(name)
-    if isinstance(name, Path) or _is_there(text):
-        return [text], []
+    if isinstance(name, Path):
+        return [str(name)], []
     plus: list[str] = []
     minus: list[str] = []
-    parts = text.split("+")
+    parts = name.split("+")
     while parts:
         count = min(len(parts), MAX_PLUSES + 1)
         head, rest = _without("+".join(parts[:count]))
-        while count > 1 and (not _is_there(head) or any("+" in word for word in rest)):
-            count -= 1  # names of packs have no `+`
+        while count > 1 and (not _is_there(head) or "+" in "".join(rest)):  # names of packs have no `+`
+            count -= 1
             head, rest = _without("+".join(parts[:count]))
         parts = parts[count:]
         plus.append(head)

@@ -319,31 +319,23 @@ def element_ramps(typer: Typer) -> dict[str, ColorRamp]:
 
 def _ramp(field: Field, element: Element, decl: RampDecl, typer: Typer) -> ColorRamp:
     """The ramp of an element. Raises Poisoned after reporting that cells cannot show the field, or not this range."""
-    kind = field.kind
-    declared = (Label(field.span, "declared here"),)
+    kind, declared = field.kind, [Label(field.span, "declared here")]
     if kind.name not in ORDERED:
         fix = "a color follows numbers and flags: LOW..HIGH, real(LOW..HIGH), flag"
         if kind.name == "vec2":
             fix = f"declare a field for its length, `real(0..{kind.hi:g})`, and assign it in a pass"
-        typer.reporter.error(
-            "PD401", f"a color cannot follow a field of kind {kind}", decl.field.span, "its values have no order",
-            secondary=declared, helps=[fix],
-        )  # fmt: skip
-        raise Poisoned
+        message, label = f"a color cannot follow a field of kind {kind}", "its values have no order"
+        raise typer.fail("PD401", message, decl.field.span, label, fix, secondary=declared)
     if field.of is not None and element.id not in field.of:
-        typer.reporter.error(
-            "PD407", f"`{element.name}` has no `{field.name}`", decl.field.span, f"`of:` leaves `{element.name}` out",
-            secondary=declared, helps=[f"add `{element.name}` to `of:`, or remove `color_by`"],
-        )  # fmt: skip
-        raise Poisoned
+        message, label = f"`{element.name}` has no `{field.name}`", f"`of:` leaves `{element.name}` out"
+        fix = f"add `{element.name}` to `of:`, or remove `color_by`"
+        raise typer.fail("PD407", message, decl.field.span, label, fix, secondary=declared)
     least, most = (0, 1) if kind.name == "flag" else (int(kind.lo), int(kind.hi))
     lo, hi = read_bounds(decl.over, typer) if decl.over is not None else (least, most)
     if not least <= lo <= hi <= most and decl.over is not None:
-        typer.reporter.error(
-            "PD402", f"`{field.name}` does not reach all of {lo}..{hi}", decl.over.span, f"its values are {least}..{most}",
-            secondary=declared, helps=[f"write a range within `{least}..{most}`, or leave out `over` for all of it"],
-        )  # fmt: skip
-        raise Poisoned
+        message, label = f"`{field.name}` does not reach all of {lo}..{hi}", f"its values are {least}..{most}"
+        fix = f"write a range within `{least}..{most}`, or leave out `over` for all of it"
+        raise typer.fail("PD402", message, decl.over.span, label, fix, secondary=declared)
     if lo == hi:
         place, fix = decl.field.span, f"widen the kind of `{field.name}`, or remove `color_by`"
         if decl.over is not None:

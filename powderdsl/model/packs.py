@@ -26,8 +26,10 @@ from powderdsl.model.schema import E, R, Reader, first_line, keys_of, read_tree
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.yaml_tree import Mapping, Node, Scalar, Sequence
 
-MAX_WEIGHTS = 2 * MAX_RADIUS + 1
-"""In a row or a column of a kernel."""
+SIDES = range(1, 2 * MAX_RADIUS + 2, 2)
+"""Numbers of rows and columns of kernels: the cell's own weight is in the middle."""
+
+WEIGHT = re.compile("-?[0-9]{1,3}")
 
 
 def read_file(source: Source, reporter: Reporter) -> PackDecl | RulesetDecl | None:
@@ -118,48 +120,42 @@ class _PackReader(Reader):
 
     def kernel(self, key: Scalar, node: Node) -> KernelDecl | None:
         """Rows of weights, a shape with its radius, or a mapping with one of them and `edges`."""
-        if isinstance(node, Scalar) and not node.text[:1].isdigit():
-            shape = self.line(node)
-            return KernelDecl(name=key, shape=shape) if shape else None
-        edges = None
-        if isinstance(node, Mapping):
-            entries = self.mapping(KernelDecl, node, f"the kernel `{key.text}`")
-            values = self.values(KernelDecl, entries)
-            edges = values.get("edges")
-            if len({"shape", "rows"} & entries.keys()) != 1:
-                both = "rows" in entries
-                self.reporter.error(
-                    "PD109", f"the kernel `{key.text}` has {'rows and a shape' if both else 'no rows'}",
-                    entries["shape"][0].span if both else key.span, "one of them" if both else "`rows` is missing",
-                    helps=["`rows`: rows of integer weights; or `shape`: a shape and its radius, such as `disc(3)`"],
-                )  # fmt: skip
-                return None
-            if "shape" in entries:
-                return KernelDecl(name=key, **values) if "shape" in values else None
-            node = entries["rows"][1]
-        rows = self.kernel_rows(key, node)
-        return KernelDecl(name=key, rows=rows, edges=edges) if rows else None
+        if not isinstance(node, Mapping):
+            is_shape = isinstance(node, Scalar) and not node.text[:1].isdigit()
+            node = Mapping(((replace(key, text="shape" if is_shape else "rows"), node),), node.span)
+        entries = self.mapping(KernelDecl, node, f"the kernel `{key.text}`")
+        if len({"shape", "rows"} & entries.keys()) != 1:
+            both = "rows" in entries
+            self.reporter.error(
+                "PD109", f"the kernel `{key.text}` has {'rows and a shape' if both else 'no rows'}",
+                entries["shape"][0].span if both else key.span, "one of them" if both else "`rows` is missing",
+                helps=["`rows`: rows of integer weights; or `shape`: a shape and its radius, such as `disc(3)`"],
+            )  # fmt: skip
+            return None
+        values = self.values(KernelDecl, entries)
+        if "rows" in entries:
+            values["rows"] = self.kernel_rows(key, entries["rows"][1], values["rows"])
+        return KernelDecl(name=key, **values) if values.get("rows") or "shape" in values else None
 
-    def kernel_rows(self, key: Scalar, node: Node) -> tuple[tuple[int, ...], ...] | None:
-        """Rows of weights with a cell in the middle; reports what they lack."""
-        words = self.words(node)
+    def kernel_rows(self, key: Scalar, node: Node, words: tuple[Scalar, ...]) -> tuple[tuple[int, ...], ...]:
+        """Rows of weights with a cell in the middle; none after reporting what they lack."""
+        rows = [word.text.split() for word in words]
+        wrong = [
+            word.span
+            for word, row in zip(words, rows, strict=True)
+            if len(row) not in SIDES or len(row) != len(rows[0]) or not all(map(WEIGHT.fullmatch, row))
+        ]
         if not words:
             self.shape(node, "rows of weights", 'write ["1 1 1", "1 0 1", "1 1 1"]')
-            return None
-        rows = [word.text.split() for word in words]
-        faults = (
-            (word.span, _row_fault(row, len(rows[0]), key.text))
-            for word, row in zip(words, rows, strict=True)
-        )
-        wrong = [(span, fault) for span, fault in faults if fault]
-        if not wrong and (len(rows) > MAX_WEIGHTS or len(rows) % 2 == 0):
-            fault = "has no middle" if len(rows) <= MAX_WEIGHTS else "is too high"
-            label = f"{len(rows)} rows" + (" are an even number" if len(rows) % 2 == 0 else "")
-            fix = f"write an odd number of rows, at most {MAX_WEIGHTS}, the cell's own in the middle"
-            wrong = [(key.span, (f"kernel `{key.text}` {fault}", label, fix))]
-        for span, (message, label, fix) in wrong[:1]:
-            self.reporter.error("PD110", message, span, label, helps=[fix])
-        return None if wrong else tuple(tuple(int(weight) for weight in row) for row in rows)
+        elif wrong or len(rows) not in SIDES:
+            self.reporter.error(
+                "PD110", f"the kernel `{key.text}` is not made of rows of weights", [*wrong, key.span][0],
+                f"{len(rows)} rows, the first of {len(rows[0])} weights",
+                helps=[f"write rows of integers, equally many in each: an odd number of both, at most {SIDES[-1]}"],
+            )  # fmt: skip
+        else:
+            return tuple(tuple(map(int, row)) for row in rows)
+        return ()
 
     # Passes
 
@@ -239,21 +235,3 @@ class _PackReader(Reader):
                     "PD110", "`often` says what becomes of cells", key.span, "not of the form `A -> B`",
                     helps=["write what holds in a cell before and after: `egg -> hen: 2%`"],
                 )  # fmt: skip
-
-
-def _row_fault(row: list[str], width: int, kernel: str) -> tuple[str, str, str] | None:
-    """The fault of a row of weights as a message, a label and a fix. `width` is the length of the first row."""
-    count = len(row)
-    if not row or not all(re.fullmatch(r"-?[0-9]{1,3}", weight) for weight in row):
-        fix = 'write "1 0 1", numbers up to 999 with blanks between them'
-        return "a kernel row that is not integers", "not a row of weights", fix
-    if count > MAX_WEIGHTS:
-        label = f"{count} weights: a kernel reaches {MAX_RADIUS} cells to each side"
-        return "a kernel that is too wide", label, f"write at most {MAX_WEIGHTS}"
-    if count % 2 == 0:
-        fix = "write an odd number of weights, the cell's own in the middle"
-        return f"kernel `{kernel}` has no middle", f"{count} weights are an even number", fix
-    if count != width:
-        label = f"{count} weights, the first row has {width}"
-        return "the rows of a kernel are equally long", label, f"write {width} weights here too"
-    return None

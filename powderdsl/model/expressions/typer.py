@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from itertools import pairwise, product
@@ -177,26 +177,33 @@ class Typer:
 
     # Operands of the kind that their place needs, or reports why not
 
-    def fail(self, code: str, message: str, span: Span, label: str = "", *helps: str) -> Poisoned:
+    def fail(
+        self,
+        code: str,
+        message: str,
+        span: Span,
+        label: str = "",
+        *helps: str,
+        secondary: Sequence[Label] = (),
+    ) -> Poisoned:
         """Report an error; the exception to raise after it."""
-        self.reporter.error(code, message, span, label, helps=helps)
+        self.reporter.error(code, message, span, label, secondary=secondary, helps=helps)
         return Poisoned()
 
     def wrong(self, operand: Operand, wanted: str, span: Span, *helps: str) -> Poisoned:
         """Report an operand of the wrong kind; the exception to raise after it."""
         if isinstance(operand, Broken):
             return Poisoned()
-        secondary = []
+        secondary: tuple[Label, ...] = ()
         if isinstance(operand, Expr) and operand.op == "let" and operand.span not in (None, span):
             assert operand.span is not None
             if (operand.span, wanted) in self._misused:
                 return Poisoned()  # one value of the wrong kind is one mistake, however often it is used
             self._misused.add((operand.span, wanted))
-            secondary = [Label(operand.span, "its value, set here")]
+            secondary = (Label(operand.span, "its value, set here"),)
         found = describe(operand)
         message, label = f"expected {wanted}, found {found}", f"this is {found}"
-        self.reporter.error("PD401", message, span, label, secondary=secondary, helps=helps)
-        return Poisoned()
+        return self.fail("PD401", message, span, label, *helps, secondary=secondary)
 
     def flag(self, operand: Operand, span: Span) -> Expr:
         match operand:
