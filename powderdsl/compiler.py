@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any
 from powderdsl.diagnostics import CompileError, Label, Reporter, Severity, Source, Span, suggest
 from powderdsl.model.check import check, with_outgrown
 from powderdsl.model.composition.compose import Palette, compose
-from powderdsl.model.composition.layout import own_slots
 from powderdsl.model.composition.names import words_of_tree
 from powderdsl.model.declarations import PackDecl, RulesetDecl
 from powderdsl.model.definitions import set_params
@@ -151,7 +150,7 @@ def whole_palette(*names: str | Path) -> tuple[str | None, ...]:
     reporter.raise_if_errors()
     composition = compose(packs, ruleset, reporter)
     reporter.raise_if_errors()
-    own = own_slots(composition) if ruleset else composition.slots
+    own = composition.own_slots if ruleset else composition.slots
     by_id = {element.id: element.qualified for element in composition.elements.values()}
     return tuple(by_id.get(number) for number in range(own)) + tuple(
         name for number, name in by_id.items() if number >= own
@@ -180,11 +179,11 @@ def read(names: Sequence[str | Path], reporter: Reporter) -> tuple[list[PackDecl
     *beside, last = rulesets
     for one in last.lineage:
         for scalar in one.without:  # the ids of their elements stay reserved
-            lister = one.base.lister(scalar.text) if one.base else None
+            lister = one.base.members.get(scalar.text) if one.base else None
             if lister is not None and scalar.text not in last.members:
                 reader.read(scalar.text, lister)
     members = dict.fromkeys(name for one in last.lineage for name in one.members)
-    reserved = tuple(packs[name] for name in members if name not in loaded and name in packs)
+    reserved = {name: packs[name] for name in members if name not in loaded and name in packs}
     return list(loaded.values()), replace(last, beside=tuple(beside), left_out=reserved)
 
 
@@ -302,8 +301,8 @@ class _Reader:
             if ruleset is None or any(one.source.name == ruleset.source.name for one in self.rulesets):
                 return
             self.rulesets.append(ruleset)
-            for member in ruleset.members:
-                self.read(member, ruleset.lister(member))
+            for member, lister in ruleset.members.items():
+                self.read(member, lister)
 
     def with_base(self, decl: RulesetDecl, path: tuple[RulesetDecl, ...]) -> RulesetDecl | None:
         """The ruleset with the one that it extends; `path` leads from the first one to this one."""

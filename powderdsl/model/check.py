@@ -87,7 +87,7 @@ def check(
     elements = tuple(replace(element, ramp=ramps.get(name)) for name, element in composition.elements.items())
     passes = tuple(elaborated.passes)
     names, properties, fields = composition.names_by_id, composition.properties, composition.fields
-    facts = Facts(composition.ids, properties, fields, composition.side_multiple, names)
+    facts = Facts(tuple(names), properties, fields, composition.side_multiple, names)
     stored = overridden_ids(passes, sorted(elaborated.overridden), facts)
     for name, ids in stored.items():
         properties[name] = replace(properties[name], stored=ids)

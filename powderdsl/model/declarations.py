@@ -5,8 +5,8 @@ The fields of these records are the keys that rule files may have: messages and 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import MISSING
+from collections.abc import Iterator, Mapping
+from dataclasses import MISSING, field
 
 from powderdsl.diagnostics import Source, Span
 from powderdsl.model.builtins import MAX_SIDE_MULTIPLE
@@ -314,35 +314,30 @@ class RulesetDecl(Record, noun="a ruleset"):
     invariants: tuple[Syntax, ...] = keyed(
         "what is true of every world, a statement a line", (), shape="invariants"
     )
-    left_out: tuple[PackDecl, ...] = ()
+    left_out: Mapping[str, PackDecl] = field(default_factory=dict)
     """Packs of its own that are not loaded: the ids of their elements stay reserved."""
     base: RulesetDecl | None = None
     beside: tuple[RulesetDecl, ...] = ()
 
     @property
-    def members(self) -> tuple[str, ...]:
-        """Names of its packs: the packs of its base that it keeps, then its own."""
-        gone = {scalar.text for scalar in self.without}
-        kept = [name for name in self.base.members if name not in gone] if self.base else []
-        return tuple(dict.fromkeys([*kept, *(scalar.text for scalar in self.packs)]))
-
-    def lister(self, pack: str) -> RulesetDecl | None:
-        """The ruleset in whose file one of its packs is listed: this one, or one that it extends."""
-        inherited = self.base is not None and pack in self.base.members
-        if inherited and pack not in {scalar.text for scalar in self.without}:
-            assert self.base is not None
-            return self.base.lister(pack)
-        return self if pack in {scalar.text for scalar in self.packs} else None
+    def members(self) -> dict[str, RulesetDecl]:
+        """Its packs: those of its base that it keeps, then its own; each with the ruleset in whose file it is listed."""
+        members = self.base.members if self.base else {}
+        for scalar in self.without:
+            members.pop(scalar.text, None)
+        for scalar in self.packs:
+            members.setdefault(scalar.text, self)
+        return members
 
     @property
     def lineage(self) -> tuple[RulesetDecl, ...]:
         """This ruleset, all that it extends and all beside it, each once, bases first."""
-        found: dict[str, RulesetDecl] = {}
-        for one in (*self.beside, self.base):
-            if one is not None:
-                found |= {inherited.source.name: inherited for inherited in one.lineage}
-        found.pop(self.source.name, None)
-        return (*found.values(), self)
+        lineage: dict[str, RulesetDecl] = {}
+        for start in filter(None, (*self.beside, self.base)):
+            for one in start.lineage:
+                lineage[one.source.name] = one
+        lineage.pop(self.source.name, None)
+        return (*lineage.values(), self)
 
     @property
     def placing(self) -> RulesetDecl:
@@ -350,13 +345,19 @@ class RulesetDecl(Record, noun="a ruleset"):
         return self if self.slots or self.matrix or self.base is None else self.base.placing
 
     @property
-    def placed(self) -> tuple[str, ...]:
+    def placed(self) -> list[str]:
         """The packs of that ruleset, except packs that others of the same name replace."""
         sources = {one.source.name for one in self.placing.lineage}
-        listers = {name: self.lister(name) for name in self.placing.members}
-        return tuple(name for name, one in listers.items() if one is None or one.source.name in sources)
+        members = self.members
+        return [
+            name for name in self.placing.members if members.get(name, self.placing).source.name in sources
+        ]
 
     @property
-    def renames(self) -> tuple[tuple[Scalar, Scalar], ...]:
-        """Its own renames after the inherited ones; the last one for a name counts."""
-        return tuple(pair for one in self.lineage for pair in one.rename)
+    def renames(self) -> dict[str, tuple[Scalar, Scalar]]:
+        """Its own renames and the inherited ones, by qualified name."""
+        renames = {}
+        for one in self.lineage:
+            for old, new in one.rename:
+                renames[old.text] = old, new
+        return renames

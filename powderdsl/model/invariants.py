@@ -96,7 +96,7 @@ def _claim(typer: Typer, line: Syntax, pack: str) -> tuple[Claim, frozenset[int]
     if line.kind == "without":
         line, what = line.children
         without = frozenset(typer.set_of(typer.evaluate(what, scope), what.span).ids)
-        if without == frozenset(typer.symbols.ids):
+        if without == typer.symbols.names_by_id.keys():
             label = "no world is without all of these"
             raise typer.fail("PD511", "this invariant cannot hold", what.span, label)
         typer.absent.clear()  # a world is without elements of packs that are not loaded
@@ -181,7 +181,7 @@ class _Statement:
             )
             if not ids:
                 self.says_nothing(call.span, "no element is counted", is_empty=True)
-            elif ids == frozenset(typer.symbols.ids):
+            elif ids == typer.symbols.names_by_id.keys():
                 self.says_nothing(call.span, "all cells are counted")
             return Total(member(ELEMENT_HERE, tuple(sorted(ids)), call.span), trend, ids)
         if call.text == "sum" and len(operands) == 1:

@@ -11,8 +11,9 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from functools import cached_property
-from itertools import pairwise
+from itertools import chain, pairwise
 from math import lcm
+from operator import attrgetter
 from typing import TYPE_CHECKING
 
 from powderdsl.diagnostics import Label, Reporter, Source, Span
@@ -74,8 +75,8 @@ class Composition:
     """The place of each id where loops run over elements: as if no palette had been recorded."""
     group: dict[str, int]
     """By pack: the number of the group in which its elements and channels lie; the first group lies as if alone."""
-    reserved: tuple[int, ...]
-    """Ids of elements of a ruleset's own packs that are left out."""
+    own_slots: int
+    """How many ids the first group has room for, packs that are left out included."""
     properties: dict[str, Property] = field(default_factory=dict)
     """This and what follows is added by `check.resolve_names`."""
     fields: dict[str, Field] = field(default_factory=dict)
@@ -84,10 +85,6 @@ class Composition:
     constants: dict[str, Operand] = field(default_factory=dict)
     """Elements, tags, sets, kernels, directions."""
 
-    @property
-    def ids(self) -> tuple[int, ...]:
-        return tuple(self.names_by_id)
-
     @cached_property
     def names_by_id(self) -> dict[int, str]:
         return {element.id: name for name, element in self.elements.items()}
@@ -95,7 +92,7 @@ class Composition:
     @property
     def first_id(self) -> int:
         """The element that fields of elements hold unless their file says otherwise."""
-        return min(self.ids, key=self.order.__getitem__)
+        return min(self.names_by_id, key=self.order.__getitem__)
 
     def is_declared(self, name: str, pack: str) -> bool:
         """Whether some pack declares the name, even if its declaration is wrong."""
@@ -109,7 +106,9 @@ class Composition:
     @cached_property
     def left_out(self) -> frozenset[str]:
         """Names of packs that a ruleset leaves out: its own lines may use them as if they ended in `?`."""
-        return frozenset(decl.name.text for pack in self.ruleset.left_out for decl in pack.definitions)
+        return frozenset(
+            decl.name.text for pack in self.ruleset.left_out.values() for decl in pack.definitions
+        )
 
     def scope(self, author: str | RulesetDecl, words: Iterable[str] = ()) -> tuple[str, ...]:
         """The packs that the author of a pack or ruleset knew, in load order. All others were added.
@@ -120,12 +119,15 @@ class Composition:
         if isinstance(author, RulesetDecl):
             known, speaker = [*author.members], ""
         else:
-            home = next(filter(None, (one.lister(author) for one in self.ruleset.lineage)), None)
-            known, speaker = [author, *(home.members if home else ())], author
+            known, speaker = [author], author
+            for one in self.ruleset.lineage:
+                if author in one.members:
+                    known += one.members[author].members
+                    break
         for word in words:
             pack = self.names.pack(self.names.of(speaker, word))
             known += [pack] if pack else []
-        reached = {need for pack in known for need in self.names.needs.get(pack, (pack,))}
+        reached = set[str]().union(*(self.names.needs.get(pack, (pack,)) for pack in known))
         return tuple(pack for pack in self.packs if pack in reached)
 
     @cached_property
@@ -135,13 +137,17 @@ class Composition:
         In rising precedence: the elements' own entries, then those under `also`, each pack after those that it needs. A
         ruleset comes after its packs, and packs that are added to it come last.
         """
-        members = {name for one in self.ruleset.lineage for name in one.members}
-        packs = needed_first(self.packs)
-        also = [decl for pack in packs if pack in members for decl in self.packs[pack].also]
-        also += [_waiting(decl, self.left_out) for one in self.ruleset.lineage for decl in one.also]
-        also += [decl for pack in packs if pack not in members for decl in self.packs[pack].also]
-        own = self.names.declared(ElementDecl)
-        return [*own.items(), *((self.names.of(decl.pack, decl.name.word), decl) for decl in also)]
+        own: list[AlsoDecl] = []
+        added: list[AlsoDecl] = []
+        for pack in needed_first(self.packs):
+            is_own = any(pack in one.members for one in self.ruleset.lineage)
+            (own if is_own else added).extend(self.packs[pack].also)
+        for one in self.ruleset.lineage:
+            own += [_waiting(decl, self.left_out) for decl in one.also]
+        entries: list[tuple[str, ElementDecl | AlsoDecl]] = [*self.names.declared(ElementDecl).items()]
+        for decl in (*own, *added):
+            entries.append((self.names.of(decl.pack, decl.name.word), decl))
+        return entries
 
     def given_values(self) -> Iterator[tuple[str, str, str, Scalar, Syntax]]:
         """Every value of a single element, in rising precedence: those of entries, then those beside the property or field.
@@ -158,8 +164,11 @@ class Composition:
 
     def glyphs_alone(self, packs: Sequence[str]) -> dict[str, str]:
         """The glyphs of elements, by global name, as they are where only some packs are loaded."""
-        alone = (decl for name, pack in self.packs.items() if name in packs for decl in pack.elements)
-        return _glyphs({self.names.of(decl.pack, decl.name.text): decl for decl in alone})
+        alone = {}
+        for pack in packs:
+            for decl in self.packs[pack].elements:
+                alone[self.names.of(pack, decl.name.text)] = decl
+        return _glyphs(alone)
 
     def element(self, word: str, pack: str) -> str | None:
         """The global name of the element that a pack means by a plain or qualified name."""
@@ -200,13 +209,19 @@ def compose(
     loaded = with_stand_ins(packs)
     _check_needs(loaded, reporter)
     reporter.raise_if_errors()  # every name of a missing pack would be reported too
-    renames = ruleset.renames
-    names = Names(loaded, SHARED, renames, reporter, RESERVED | reserved_words() | {"elements"})
-    params = {decl.qualified: decl for pack in packs for decl in pack.params}
-    for decl in params.values():
-        names.check_word(decl.name, ParamDecl.NOUN)
-    passes = Names(loaded, ("passes",), renames, reporter)
-    _check_renamed(ruleset, names.renamed | passes.renamed, reporter)
+    names = Names(loaded, SHARED, ruleset.renames, reporter, RESERVED | reserved_words() | {"elements"})
+    params = {}
+    for pack in loaded.values():
+        for param in pack.params:
+            names.check_word(param.name, ParamDecl.NOUN)
+            params[param.qualified] = param
+    passes = Names(loaded, ("passes",), ruleset.renames, reporter)
+    for name, (old, _) in ruleset.renames.items():
+        if name not in names.renamed | passes.renamed and name.partition(".")[0] not in ruleset.left_out:
+            reporter.error(
+                "PD310", f"nothing is called `{name}`", old.span, "no loaded pack defines this",
+                helps=["write the pack's name, a point, and the name that it defines: `pack.word`"],
+            )  # fmt: skip
     declared = names.declared(ElementDecl)
     if not declared:
         reporter.error(
@@ -216,10 +231,20 @@ def compose(
     groups = _groups(loaded, ruleset)
     wishes = [_wishes(group, names, reporter) for group in groups]
     natural = _composed_ids(wishes, ruleset is not NO_RULESET)
-    asking = [decl for group in wishes for decl in group]
+    asking = [*chain.from_iterable(wishes)]
     ids = natural if palette is None else _recorded_ids(asking, names, palette)
     _report_ids(asking, ids, names, reporter, recorded=palette is not None)
     elements = _elements(declared, ids, reporter)
+    wanted = ruleset.placing.slots or 0
+    own = max((ids.get(decl.qualified, -1) for decl in wishes[0]), default=-1) + 1 if wishes else 0
+    # The packs of the ruleset that declares `slots` must fit; packs loaded on top of them add slots.
+    beyond = [e for e in elements.values() if 0 < wanted <= e.id and e.pack in ruleset.placed]
+    if palette is None and beyond:
+        top = beyond[-1]
+        reporter.error(
+            "PD402", f"element `{top.name}` has id {top.id}, but the ruleset has {wanted} slots", top.span,
+            helps=[f"say `slots: {top.id + 1}` in {ruleset.placing.source.name}"],
+        )  # fmt: skip
     composition = Composition(
         packs=loaded,
         ruleset=ruleset,
@@ -227,10 +252,10 @@ def compose(
         passes=order_passes(passes, reporter),
         param_decls=params,
         elements=elements,
-        slots=max(_slots(ruleset, elements, palette, reporter), *(number + 1 for number in ids.values()), 1),
+        slots=max(wanted, len(palette or ()), 1 + max(ids.values(), default=0)),
         order={number: natural.get(name, number) for name, number in ids.items()},
         group={pack.name.text: number for number, group in enumerate(groups) for pack in group},
-        reserved=tuple(number for name, number in ids.items() if name not in names.known),
+        own_slots=wanted or own,
     )
     _add_entries(composition, reporter)
     return composition
@@ -246,33 +271,6 @@ def title(loaded: Collection[str], ruleset: RulesetDecl) -> str:
     gone = [f"-{name}" for name in members if name not in loaded]
     added = [f"+{name}" for name in loaded if name not in members]
     return "".join(["+".join(one.name.text for one in named), *gone, *added]).removeprefix("+")
-
-
-def _slots(
-    ruleset: RulesetDecl, elements: Mapping[str, Element], palette: Palette | None, reporter: Reporter
-) -> int:
-    """How many ids a ruleset or a palette asks for. Reports an id of the ruleset's own packs beyond its slots."""
-    wanted = ruleset.placing.slots or 0
-    # The packs of the ruleset that declares `slots` must fit; packs loaded on top of them add slots.
-    own = ruleset.placed if wanted else ()
-    top = max((e for e in elements.values() if e.pack in own), key=lambda element: element.id, default=None)
-    if top and palette is None and top.id >= wanted:
-        reporter.error(
-            "PD402", f"element `{top.name}` has id {top.id}, but the ruleset has {wanted} slots", top.span,
-            helps=[f"say `slots: {top.id + 1}` in {ruleset.placing.source.name}"],
-        )  # fmt: skip
-    return max(wanted, len(palette or ()))
-
-
-def _check_renamed(ruleset: RulesetDecl, renamed: set[str], reporter: Reporter) -> None:
-    """Report names under `rename:` that no pack defines. Those of packs that are left out may wait."""
-    waiting = {pack.name.text for pack in ruleset.left_out}
-    for old, _ in ruleset.renames:
-        if old.text not in renamed and old.text.partition(".")[0] not in waiting:
-            reporter.error(
-                "PD310", f"nothing is called `{old.text}`", old.span, "no loaded pack defines this",
-                helps=["write the pack's name, a point, and the name that it defines: `pack.word`"],
-            )  # fmt: skip
 
 
 def _check_needs(loaded: Mapping[str, PackDecl], reporter: Reporter) -> None:
@@ -319,10 +317,14 @@ def _groups(packs: Mapping[str, PackDecl], ruleset: RulesetDecl) -> list[list[Pa
     A ruleset's own packs come first, packs that it leaves out included, because their positions stay reserved. Each
     further pack follows by itself, after the packs that it needs: the order in which packs are named matters little.
     """
-    own, reserved = ruleset.placed, {pack.name.text: pack for pack in ruleset.left_out}
-    groups = [[packs.get(name) or reserved[name] for name in own if name in packs or name in reserved]]
-    groups += [[packs[name]] for name in needed_first(packs) if name not in own]
-    return [*filter(None, groups)]
+    own = ruleset.placed
+    groups = [
+        [packs.get(name) or ruleset.left_out[name] for name in own if name in packs.keys() | ruleset.left_out]
+    ]
+    for name in needed_first(packs):
+        if name not in own:
+            groups.append([packs[name]])
+    return groups if groups[0] else groups[1:]
 
 
 def _wishes(group: Sequence[PackDecl], names: Names, reporter: Reporter) -> list[ElementDecl]:
@@ -331,11 +333,13 @@ def _wishes(group: Sequence[PackDecl], names: Names, reporter: Reporter) -> list
     An element that overrides another one asks for the same id unless it says another one, with a warning. Elements of
     packs that are left out keep their ids reserved.
     """
-    versions = {found[-1].qualified: found for found in names.versions.values()}
     wishes: list[ElementDecl] = []
-    for decl in (decl for pack in group for decl in pack.elements):
-        found = versions.get(decl.qualified, [] if decl.override else [decl])
-        asking = [one for one in found if one.id] or found[:1]
+    others: list[ElementDecl] = []
+    for decl in chain.from_iterable(pack.elements for pack in group):
+        versions = names.versions.get(names.known.get(decl.qualified, ""), [decl])
+        if versions[-1] is not decl or (decl.override and decl.qualified not in names.known):
+            continue
+        asking = [one for one in versions if one.id]
         for new, old in pairwise(asking):
             if new.number != old.number:
                 reporter.report(
@@ -343,8 +347,11 @@ def _wishes(group: Sequence[PackDecl], names: Names, reporter: Reporter) -> list
                     "its channel moves too", secondary=[Label(old.id.span, "the id of the element that it replaces")],
                     helps=["leave out `id`: an element that overrides another keeps its id"],
                 )  # fmt: skip
-        wishes += [replace(found[0], id=one.id) for one in asking[:1]]
-    return sorted(wishes, key=lambda decl: decl.id is None)
+        if asking:
+            wishes.append(replace(versions[0], id=asking[0].id))
+        else:
+            others.append(versions[0])
+    return wishes + others
 
 
 def _composed_ids(groups: Sequence[Sequence[ElementDecl]], of_ruleset: bool) -> dict[str, int]:
@@ -444,13 +451,15 @@ def _elements(
                 decl.span, "this one", secondary=[Label(first.span, "and this one")], helps=["give one of them another glyph"],
             )  # fmt: skip
     glyphs = _glyphs(declared)
-    elements = {}
-    for name, decl in sorted(declared.items(), key=lambda item: ids.get(item[1].qualified, MAX_ELEMENTS)):
+    elements = []
+    for name, decl in declared.items():
         number, word = ids.get(decl.qualified, MAX_ELEMENTS), decl.name.text if decl.name.text != name else ""
-        elements[name] = Element(
-            name, decl.pack, number, decl.color, glyphs[name], decl.about, frozenset(), decl.span, word
+        elements.append(
+            Element(
+                name, decl.pack, number, decl.color, glyphs[name], decl.about, frozenset(), decl.span, word
+            )
         )
-    return elements
+    return {element.name: element for element in sorted(elements, key=attrgetter("id"))}
 
 
 def _glyphs(elements: Mapping[str, ElementDecl]) -> dict[str, str]:

@@ -25,7 +25,7 @@ def lay_out(
 
     Reports names in a ruleset's `matrix:` that no loaded pack has.
     """
-    fields, names, size = composition.fields, composition.names_by_id, own_slots(composition)
+    fields, names, size = composition.fields, composition.names_by_id, composition.own_slots
     known: Channels = {name: [MatrixChannel(name, name)] for name in (*composition.properties, *fields)}
     for name, field in fields.items():
         if field.kind.name == "vec2":
@@ -48,14 +48,6 @@ def lay_out(
         parts = [*shown, *parts[2:]] if None in own else shown
     order = tuple(name for block in blocks for name in block)
     return order, tuple(channel for part in parts for channel in part)
-
-
-def own_slots(composition: Composition) -> int:
-    """How many ids the first packs have room for."""
-    if composition.ruleset.placing.slots:
-        return composition.ruleset.placing.slots
-    ids = [element.id for element in composition.elements.values() if composition.group[element.pack] == 0]
-    return max([*ids, *composition.reserved], default=-1) + 1
 
 
 def _blocks(composition: Composition, passes: tuple[Pass, ...]) -> list[list[str]]:

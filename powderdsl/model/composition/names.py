@@ -31,7 +31,7 @@ class Names:
     it may define the same word: its definition is known as ``pack.word``. So adding a pack renames nothing.
 
     Args:
-        rename: other global names, by qualified name.
+        rename: by qualified name: where it is written, and the other global name.
         reserved: words that name nothing.
     """
 
@@ -39,13 +39,13 @@ class Names:
         self,
         packs: Mapping[str, PackDecl],
         sections: Sequence[str],
-        rename: Sequence[tuple[Scalar, Scalar]],
+        rename: Mapping[str, tuple[Scalar, Scalar]],
         reporter: Reporter,
         reserved: frozenset[str] = frozenset(),
     ):
         self.reporter = reporter
         self.reserved = reserved
-        self.rename = {old.text: new for old, new in rename}
+        self.rename = rename
         self.renamed: set[str] = set()
         """The qualified names of `rename` that were met."""
         self.needs = needs_of(packs)
@@ -103,7 +103,7 @@ class Names:
                 "PD301", f"`{word}` overrides nothing", scalar.span, "no pack before this one defines it",
                 helps=["remove `override`, or load the other pack first"],
             )  # fmt: skip
-        new = self.rename.get(decl.qualified)
+        _, new = self.rename.get(decl.qualified, (None, None))
         if new is not None:
             self.renamed.add(decl.qualified)
         if not self.check_word(scalar, decl.NOUN) or not self.check_word(new or scalar, decl.NOUN):
@@ -176,7 +176,9 @@ def needs_of(packs: Mapping[str, PackDecl]) -> dict[str, tuple[str, ...]]:
     for pack in packs:
         reached = [pack]
         for name in reached:  # grows on the way
-            reached += [need.text for need in packs[name].needs if need.text in packs.keys() - reached]
+            for need in packs[name].needs:
+                if need.text in packs and need.text not in reached:
+                    reached.append(need.text)
         closed[pack] = (pack, *(name for name in packs if name in reached[1:]))
     return closed
 
@@ -184,8 +186,10 @@ def needs_of(packs: Mapping[str, PackDecl]) -> dict[str, tuple[str, ...]]:
 def with_stand_ins(packs: Iterable[PackDecl]) -> dict[str, PackDecl]:
     """Packs by name. They need the packs that provide what is not loaded instead of that."""
     loaded = {pack.name.text: pack for pack in packs}
-    provider = {other.text: name for name, pack in loaded.items() for other in pack.provides}
-    provider |= dict(zip(loaded, loaded, strict=True))
+    provider = dict(zip(loaded, loaded, strict=True))
+    for name, pack in loaded.items():
+        for other in pack.provides:
+            provider.setdefault(other.text, name)
     for name, pack in loaded.items():
         needs = [replace(need, text=provider.get(need.text, need.text)) for need in pack.needs]
         loaded[name] = replace(pack, needs=tuple(needs))
@@ -276,7 +280,7 @@ def report_misspelled(
         elsewhere: words that packs define which are not loaded, and these packs. Asked only if it matters.
     """
     known: set[str] = set()
-    for pack in (*packs, *ruleset.left_out):
+    for pack in (*packs, *ruleset.left_out.values()):
         known.update(decl.name.text for decl in (*pack.definitions, *pack.params, *pack.passes))
         for decl in pack.passes:
             lets = (name for block in decl.walk() for name, _ in block.lets)

@@ -536,7 +536,7 @@ class Typer:
 
     def any_but(self, syntax: Syntax, scope: Scope) -> Operand:
         left_out = self.set_of(self.evaluate(syntax.children[0], scope), syntax.children[0].span)
-        return SetOf(tuple(i for i in self.symbols.ids if i not in left_out.ids))
+        return SetOf(tuple(i for i in self.symbols.names_by_id if i not in left_out.ids))
 
     # Logic
 
@@ -669,7 +669,7 @@ HANDLERS: dict[str, Callable[[Typer, Syntax, Scope], Operand]] = {
     "no": lambda typer, at, scope: FALSE,
     "range": lambda typer, at, scope: Bounds(*read_bounds(at, typer)),
     "tuple": Typer.tuple_,
-    "any": lambda typer, at, scope: SetOf(typer.symbols.ids),
+    "any": lambda typer, at, scope: SetOf(tuple(typer.symbols.names_by_id)),
     "any_but": Typer.any_but,
     **dict.fromkeys(("or_", "and_"), Typer.logic),
     "not_": lambda typer, at, scope: negation(typer.condition(at.children[0], scope), at.span),
