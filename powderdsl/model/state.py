@@ -95,6 +95,8 @@ def property_values(ruleset: Ruleset, name: str) -> list[float]:
 
 def fresh_values(ruleset: Ruleset, slot: Slot) -> list[Any]:
     """What new cells of elements hold in a slot, by id: 256 numbers, or pairs."""
+    if slot.name == "element":
+        return [*range(256)]
     if ruleset.property(slot.name) is None:
         return [slot.fresh(identity) for identity in range(256)]
     values = property_values(ruleset, slot.name)

@@ -11,7 +11,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box, Discrete
 from gymnasium.utils import EzPickle
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -20,17 +19,7 @@ from numpy.typing import NDArray
 
 from powderdsl.envs.gym import array, objects
 from powderdsl.envs.tensor_env import check_cells, check_going, check_options, mode_of, reset_mask, seeds_of
-from powderdsl.ogbench.episodes import (
-    FIRST_ELEMENT,
-    FIRST_X,
-    FIRST_Y,
-    MODES,
-    RANDOMNESS,
-    Episodes,
-    LevelProgram,
-    keyed,
-    task_of,
-)
+from powderdsl.ogbench.episodes import FIRST, MODES, RANDOMNESS, Episodes, LevelProgram, keyed, task_of
 from powderdsl.ogbench.levels import GoalTask, Level, find_level
 from powderdsl.system.settings import check_settings, setting
 
@@ -81,10 +70,6 @@ class EnvOptions:
         as_ogbench = self.randomness == "ogbench"
         return _program(find_level(level), as_ogbench, self.backend, str(self.device), self.threads)
 
-    def episodes(self, program: LevelProgram, count: int) -> Episodes:
-        """Episodes of environments whose seeds are `seed`, `seed` + 1, …."""
-        return Episodes(program, np.arange(count) + self.seed, randomness=self.randomness, mode=self.mode)
-
     def picture(self, observation: Array) -> Array:
         """The world's part of an observation, by its nearest pixels: uint8 [height, width, 3]."""
         rows = np.arange(self.height) * observation.shape[0] // self.height
@@ -97,12 +82,34 @@ def _program(level: Level, as_ogbench: bool, backend: str, device: str, threads:
     return LevelProgram(level, backend=backend, device=device, threads=threads, as_ogbench=as_ogbench)
 
 
-def spaces_of(level: Level) -> tuple[Box, Discrete[Any]]:
-    """The spaces of one world's observations and actions."""
-    return Box(0, 255, (level.side, level.side, 6), np.uint8), Discrete(level.actions)
+class _Face:
+    """The base of environments that show `Episodes` to Gymnasium: their spaces and pictures."""
+
+    metadata: dict[str, Any]
+    episodes: Episodes
+    """The same episodes on tensors. Environment i has the seed `seed` + i."""
+
+    def _show(self, level: str | Path | Level | LevelProgram, count: int, options: EnvOptions) -> None:
+        program = options.program(level)
+        self._options, self.level, self.render_mode = options, program.level, options.render_mode
+        check_cells(count, (self.level.side, self.level.side))
+        seeds = np.arange(count) + options.seed
+        self.episodes = Episodes(program, seeds, randomness=options.randomness, mode=options.mode)
+        self._space = Box(0, 255, (self.level.side, self.level.side, 6), np.uint8)
+        self._actions = Discrete(self.level.actions)
+
+    def _task(self, options: Mapping[str, Any]) -> int | GoalTask | None:
+        """The task that options of `reset` name, if there are tasks."""
+        return task_of(self.level, options) if self.episodes.mode == "task" else None
+
+    def _observations(self) -> Array:
+        return array(self.episodes.observations())
+
+    def _pictures(self) -> tuple[Array, ...]:
+        return tuple(self._options.picture(world) for world in self._observations())
 
 
-class PowderworldEnv(gymnasium.Env[Array, Any], EzPickle):
+class PowderworldEnv(_Face, gymnasium.Env[Array, Any], EzPickle):
     """OGBench's Powderworld: an action chooses an element, the next x, the next y; then a step runs and a block is painted.
 
     Observations are uint8 [H, W, 6]: the world's picture and the action frame. ``info["goal"]`` of `reset` is the goal as
@@ -117,12 +124,8 @@ class PowderworldEnv(gymnasium.Env[Array, Any], EzPickle):
 
     def __init__(self, level: str | Path | Level | LevelProgram, **options: Any):
         EzPickle.__init__(self, level, **options)
-        self._options = EnvOptions(**options)
-        program = self._options.program(level)
-        self.episodes = self._options.episodes(program, 1)
-        """The same episode in a batch of one."""
-        self.level, self.render_mode = program.level, self._options.render_mode
-        self.observation_space, self.action_space = spaces_of(self.level)
+        self._show(level, 1, EnvOptions(**options))
+        self.observation_space, self.action_space = self._space, self._actions
         self.task_infos = [
             {"task_name": task.name, "action_seq": list(task.actions), "tol": task.tolerance}
             for task in self.level.tasks
@@ -154,38 +157,27 @@ class PowderworldEnv(gymnasium.Env[Array, Any], EzPickle):
         """
         given = dict(options or {})
         check_options(given, OPTIONS)
-        task = task_of(self.level, given) if self.episodes.mode == "task" else None
-        here = np.zeros(1, dtype=np.int64)
-        if seed is not None:
-            self.episodes.seed(here, np.array(seeds_of(seed, 1)))
-            super().reset(seed=int(seed))
-        self.episodes.begin(here, [task])
+        self.episodes.begin(np.zeros(1, dtype=np.int64), [self._task(given)], seeds_of(seed, 1))
+        super().reset(seed=None if seed is None else int(seed))
         if self.episodes.mode != "task":
-            return self._observation(), {}
+            return self._observations()[0], {}
         number = int(self.episodes.task_number[0])
         self.cur_task_id = number or None
         self.cur_task_info = self.task_infos[number - 1] if number else dict(given["task_info"])
         info = {"goal": array(self.episodes.goals()[0])}
         if given.get("render_goal"):
             info["goal_rendered"] = self._options.picture(info["goal"])
-        return self._observation(), info
+        return self._observations()[0], info
 
     def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """One of the three choices of an action. One that is not valid is replaced by a random valid one."""
-        if self.episodes.world is None:
-            raise ResetNeeded("reset the environment before its first step")
         success = bool(self.episodes.step(np.array([action], dtype=np.int64).reshape(1))[0])
         info = {"success": float(success)} if self.episodes.mode == "task" else {}
-        return self._observation(), float(success), success, False, info
-
-    def _observation(self) -> Array:
-        return array(self.episodes.observations()[0])
+        return self._observations()[0], float(success), success, False, info
 
     def render(self) -> Any:
         """The world's picture, uint8 [height, width, 3]."""
-        if self.episodes.world is None:
-            raise ResetNeeded("reset the environment before rendering it")
-        return self._options.picture(self._observation())
+        return self._pictures()[0]
 
     # For scripts that choose whole actions
 
@@ -193,7 +185,7 @@ class PowderworldEnv(gymnasium.Env[Array, Any], EzPickle):
         """A whole action, all equally likely: the element's name, x and y. From the seed, the episode and its step."""
         at = self.episodes
         key = (at.seeds, at.episode.clip(0), at.elapsed)
-        drawn = [float(keyed(key, f"{what} sample", 1)[0, 0]) for what in (FIRST_ELEMENT, FIRST_X, FIRST_Y)]
+        drawn = [float(keyed(key, f"{what} sample", 1)[0, 0]) for what in FIRST]
         element, x, y = (int(one * self.level.choices(stage)) for stage, one in enumerate(drawn))
         return self.level.elements[element], x, y
 
@@ -206,7 +198,7 @@ class PowderworldEnv(gymnasium.Env[Array, Any], EzPickle):
         return self.semantic_action_to_action(*self.sample_semantic_action())
 
 
-class PowderworldVectorEnv(VectorEnv[Any, Any, Any]):
+class PowderworldVectorEnv(_Face, VectorEnv[Any, Any, Any]):
     """Environment i plays the same episodes as a `PowderworldEnv` with the seed `seed` + i, whatever the others do.
 
     Args:
@@ -226,17 +218,11 @@ class PowderworldVectorEnv(VectorEnv[Any, Any, Any]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         **options: Any,
     ):
-        self._options = EnvOptions(**options)
-        program = self._options.program(level)
-        self.level = program.level
-        check_cells(num_envs, (self.level.side, self.level.side))
-        self.episodes = self._options.episodes(program, num_envs)
-        """The same episodes on tensors."""
+        self._show(level, num_envs, EnvOptions(**options))
         self.num_envs, self.autoreset_mode = num_envs, mode_of(autoreset_mode)
         self.max_episode_steps = max_episode_steps or self.level.steps
-        self.render_mode = self._options.render_mode
         self.metadata = PowderworldEnv.metadata | {"autoreset_mode": self.autoreset_mode}
-        self.single_observation_space, self.single_action_space = spaces_of(self.level)
+        self.single_observation_space, self.single_action_space = self._space, self._actions
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._over = np.zeros(num_envs, dtype=bool)
@@ -268,19 +254,17 @@ class PowderworldVectorEnv(VectorEnv[Any, Any, Any]):
         if isinstance(seed, int):
             super().reset(seed=seed)
         which = np.flatnonzero(mask)
-        seeded = np.array([at for at in which if seeds[at] is not None], dtype=np.int64)
-        self.episodes.seed(seeded, np.array([seeds[at] for at in seeded], dtype=np.int64))
-        self.episodes.begin(which, [tasks[at] for at in which])
+        self.episodes.begin(which, [tasks[at] for at in which], [seeds[at] for at in which])
         self._over[mask] = False
         return self._observations(), self._begun(mask)
 
     def _tasks(self, given: Mapping[str, Any]) -> list[int | GoalTask | None]:
         ids = np.asarray(given.get("task_id"))
-        if self.episodes.mode != "task" or ids.ndim != 1:
-            return [task_of(self.level, given) if self.episodes.mode == "task" else None] * self.num_envs
+        if ids.ndim != 1:
+            return [self._task(given)] * self.num_envs
         if len(ids) != self.num_envs:
             raise ValueError(f"task_id has {len(ids)} numbers for {self.num_envs} environments")
-        return [task_of(self.level, {**given, "task_id": one}) for one in ids.tolist()]
+        return [self._task({**given, "task_id": number}) for number in ids.tolist()]
 
     def step(self, actions: Any) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """One choice in every episode: integers [B]. Those that are not valid are replaced by random valid ones.
@@ -299,8 +283,6 @@ class PowderworldVectorEnv(VectorEnv[Any, Any, Any]):
             raise ValueError(
                 f"actions must be integers [{self.num_envs}], found {given.dtype} {list(given.shape)}"
             )
-        if self.episodes.world is None:
-            raise ResetNeeded("reset the environment before its first step")
         waiting = self._over.copy()
         if self.autoreset_mode is AutoresetMode.DISABLED:
             check_going(torch.from_numpy(waiting))
@@ -340,11 +322,6 @@ class PowderworldVectorEnv(VectorEnv[Any, Any, Any]):
             "_task_id": mask.copy(),
         }
 
-    def _observations(self) -> Array:
-        return array(self.episodes.observations())
-
     def render(self) -> tuple[Any, ...] | None:
         """Each world's picture, uint8 [height, width, 3]."""
-        if self.render_mode is None:
-            return None
-        return tuple(self._options.picture(world) for world in self._observations())
+        return None if self.render_mode is None else self._pictures()

@@ -6,11 +6,13 @@ Environments are faces of this.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from itertools import count
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -32,10 +34,9 @@ Numbers = NDArray[np.int64]
 class _WithoutSnap(Simulator):
     """On torch, keeping every magnitude of float fields."""
 
-    def __init__(self, ruleset: Ruleset, backend: str, device: str | torch.device, threads: int):
-        super().__init__(ruleset, backend, device, threads)
-        program = TorchProgram(lower(ruleset), self.device, snap=0.0)
-        self._program = BackendProgram("torch", program)
+    def __init__(self, ruleset: Ruleset, device: str | torch.device):
+        super().__init__(ruleset, "torch", device)
+        self._program = BackendProgram("torch", TorchProgram(lower(ruleset), self.device, snap=0.0))
 
 
 class LevelProgram:
@@ -61,7 +62,7 @@ class LevelProgram:
         if as_ogbench:
             ruleset = load(level.rounded)
             ruleset = replace(ruleset, streams=tuple(replace(one, bits=32) for one in ruleset.streams))
-            self.simulator: Simulator = _WithoutSnap(ruleset, "torch", device, threads)
+            self.simulator: Simulator = _WithoutSnap(ruleset, device)
         else:
             ruleset = load(level.rules)
             self.simulator = compile(ruleset, backend, str(device), threads)
@@ -141,14 +142,8 @@ MAX_GOALS = 1 << 13
 RANDOMNESS = ("counter", "ogbench")
 """``counter``: hashes of the seed, the episode, the step and what is drawn. ``ogbench``: a generator for each environment."""
 
-FIRST_TASK, FIRST_ELEMENT, FIRST_X, FIRST_Y, REPLACED = (
-    "ogbench task",
-    "ogbench element",
-    "ogbench x",
-    "ogbench y",
-    "ogbench invalid",
-)
-"""What is drawn."""
+FIRST = ("ogbench element", "ogbench x", "ogbench y")
+"""What is drawn at each stage of a first action."""
 
 
 def keyed(parts: Sequence[Any], what: str, count: int) -> NDArray[np.float64]:
@@ -184,9 +179,9 @@ class Draws:
         """Draws for one step of their worlds, [streams, n, H, W] in [0, 1); None: the simulator's own."""
         return None
 
-    def seed(self, which: Numbers, seeds: Numbers) -> None:
-        """Start the draws of environments again, from their seeds, int64 [n]."""
-        self._seeds[which] = seeds
+    def seed(self, which: int, seed: int) -> None:
+        """Start the draws of an environment again, from a seed."""
+        self._seeds[which] = seed
 
 
 class LegacyDraws(Draws):
@@ -198,9 +193,8 @@ class LegacyDraws(Draws):
         self._states = [np.random.RandomState(int(seed) & MASK) for seed in seeds]
         self._streams, self._side = streams, side
 
-    def seed(self, which: Numbers, seeds: Numbers) -> None:
-        for one, seed in zip(which, seeds, strict=True):
-            self._states[one] = np.random.RandomState(int(seed) & MASK)
+    def seed(self, which: int, seed: int) -> None:
+        self._states[which] = np.random.RandomState(seed & MASK)
 
     def integers(self, which: Numbers, what: str, episode: Numbers, time: Numbers, count: int) -> Numbers:
         return np.array([self._states[one].randint(count) for one in which], dtype=np.int64)
@@ -213,8 +207,7 @@ class LegacyDraws(Draws):
         return np.minimum(single, np.nextafter(1.0, 0.0))
 
 
-@dataclass(frozen=True, eq=False)
-class Goal:
+class Goal(NamedTuple):
     """A world to reach: ids uint8 [H, W] and picture uint8 [H, W, 3]."""
 
     ids: Tensor
@@ -240,83 +233,82 @@ class Episodes:
     ):
         self.program, self.level, self.mode = program, program.level, mode
         self.seeds = np.array(seeds, dtype=np.int64)
-        self.count = count = len(self.seeds)
+        self.count = batch = len(self.seeds)
         if randomness == "counter":
             randomness = Draws(self.seeds)
         elif isinstance(randomness, str):
             randomness = LegacyDraws(self.seeds, len(program.streams), self.level.side)
         self._draws = randomness
         side, device = self.level.side, program.device
-        self.episode = np.full(count, -1, dtype=np.int64)
+        self.episode = np.full(batch, -1, dtype=np.int64)
         """The number of each environment's episode."""
-        self.stage = np.zeros(count, dtype=np.int64)
+        self.stage = np.zeros(batch, dtype=np.int64)
         """What the next action chooses: 0 the element, 1 x, 2 y."""
-        self.elapsed = np.zeros(count, dtype=np.int64)
+        self.elapsed = np.zeros(batch, dtype=np.int64)
         """Environment steps of each episode."""
-        self.errors = np.zeros(count, dtype=np.int64)
+        self.errors = np.zeros(batch, dtype=np.int64)
         """Cells of the goal without a match in the world."""
-        self.tolerance = np.zeros(count, dtype=np.int64)
-        self.task_number = np.zeros(count, dtype=np.int64)
+        self.tolerance = np.zeros(batch, dtype=np.int64)
+        self.task_number = np.zeros(batch, dtype=np.int64)
         """The task of each episode, from 1; 0 if it was given from outside."""
-        self._chosen = np.zeros((count, 3), dtype=np.int64)
+        self._chosen = np.zeros((batch, 3), dtype=np.int64)
         self.world: World | None = None
-        self._shown = torch.zeros(count, side, side, 6, dtype=torch.uint8, device=device)
-        self.goal_ids = torch.zeros(count, side, side, dtype=torch.uint8, device=device)
-        self.goal_pictures = torch.zeros(count, side, side, 3, dtype=torch.uint8, device=device)
+        self._shown = torch.zeros(batch, side, side, 6, dtype=torch.uint8, device=device)
+        self.goal_ids = torch.zeros(batch, side, side, dtype=torch.uint8, device=device)
+        self.goal_pictures = torch.zeros(batch, side, side, 3, dtype=torch.uint8, device=device)
         self._goals: dict[tuple[int, GoalTask], Goal] = {}
         self._columns = torch.arange(side, device=device)
 
-    def seed(self, which: Numbers, seeds: Numbers) -> None:
-        """Give environments new seeds, int64 [n]; their next episode has the number 0."""
-        self.seeds[which], self.episode[which] = seeds, -1
-        self._draws.seed(which, seeds)
-
     # Beginning
 
-    def begin(self, which: Numbers, tasks: Sequence[int | GoalTask | None]) -> None:
+    def begin(
+        self,
+        which: Numbers,
+        tasks: Sequence[int | GoalTask | None],
+        seeds: Sequence[int | None] | None = None,
+    ) -> None:
         """Begin the next episodes of environments `which`, int64 [n]; the first call begins all.
 
         Args:
             tasks: for each the number of a task, from 1, a task, or None to draw one.
+            seeds: for each a new seed, of which this is episode 0, or None.
         """
+        for place, seed in zip(which, seeds or (), strict=seeds is not None):
+            if seed is not None:
+                self.seeds[place], self.episode[place] = seed, -1
+                self._draws.seed(place, seed)
         self.episode[which] += 1
         self.stage[which], self.elapsed[which] = 0, 0
         if self.mode == "task":
-            found = [self._task(int(one), task) for one, task in zip(which, tasks, strict=True)]
-            self._set_goals(which, found)
+            self._set_goals(
+                which, [self._task(place, task) for place, task in zip(which, tasks, strict=True)]
+            )
         fresh = self.program.start(self.seeds[which], self.episode[which])
         if self.mode == "task":
-            first = [
-                self._drawn(which, what, self.level.choices(stage))
-                for stage, what in enumerate((FIRST_ELEMENT, FIRST_X, FIRST_Y))
-            ]
+            first = [self._drawn(which, what, self.level.choices(stage)) for stage, what in enumerate(FIRST)]
             fresh = self.program.act(fresh, np.stack(first, 1), self._draws.planes(which))
         self._put(which, fresh)
         self._show_frames()
 
-    def _task(self, which: int, task: int | GoalTask | None) -> GoalTask:
-        if isinstance(task, GoalTask):
-            self.task_number[which] = 0
-            return task
+    def _task(self, place: int, task: int | GoalTask | None) -> GoalTask:
         if task is None:
-            task = 1 + int(self._drawn(np.array([which]), FIRST_TASK, len(self.level.tasks))[0])
-        self.task_number[which] = task
-        return self.level.tasks[task - 1]
+            task = 1 + int(self._drawn(np.array([place]), "ogbench task", len(self.level.tasks))[0])
+        self.task_number[place] = 0 if isinstance(task, GoalTask) else task
+        return task if isinstance(task, GoalTask) else self.level.tasks[task - 1]
 
     def _drawn(self, which: Numbers, what: str, count: int) -> Numbers:
         return self._draws.integers(which, what, self.episode[which], self.elapsed[which], count)
 
     def _set_goals(self, which: Numbers, tasks: Sequence[GoalTask]) -> None:
-        keys = [(int(seed), task) for seed, task in zip(self.seeds[which], tasks, strict=True)]
-        known = self._goals if self._draws.fixes_goals else {}
-        missing = [at for at, key in enumerate(keys) if key not in known]
+        fixed = self._draws.fixes_goals
+        if not fixed or len(self._goals) > MAX_GOALS:
+            self._goals.clear()
+        of = self.seeds[which] if fixed else which
+        keys = [(int(number), task) for number, task in zip(of, tasks, strict=True)]
+        missing = [at for at, key in enumerate(keys) if key not in self._goals]
         made = self.play_goals(which[missing], [tasks[at] for at in missing])
-        new = dict(zip(missing, made, strict=True))
-        goals = [new[at] if at in new else known[key] for at, key in enumerate(keys)]
-        if self._draws.fixes_goals:
-            if len(known) > MAX_GOALS:
-                known.clear()
-            known.update((keys[at], goal) for at, goal in new.items())
+        self._goals |= zip([keys[at] for at in missing], made, strict=True)
+        goals = [self._goals[key] for key in keys]
         places = torch.from_numpy(which).to(self.program.device)
         self.goal_ids[places] = torch.stack([goal.ids for goal in goals])
         self.goal_pictures[places] = torch.stack([goal.picture for goal in goals])
@@ -324,25 +316,24 @@ class Episodes:
 
     def play_goals(self, which: Numbers, tasks: Sequence[GoalTask]) -> list[Goal]:
         """The goals that tasks lead to, one for each of environments `which`, int64 [n]: their actions from the start."""
-        if not len(which):
+        goals: dict[int, Goal] = {}
+        if not tasks:
             return []
         lists = [self.level.numbers(task) for task in tasks]
-        order = sorted(range(len(lists)), key=lambda at: -len(lists[at]))  # the longest lists stay to the end
-        world = self.program.start(self.seeds[which][order], np.full(len(which), GOALS, dtype=np.int64))
-        found: dict[int, Goal] = {}
-        active = len(order)
-        for time in range(len(lists[order[0]]) + 1):
-            left = sum(len(one) > time for one in lists)
-            if left < active:
+        world = self.program.start(self.seeds[which], np.full(len(which), GOALS, dtype=np.int64))
+        active = list(range(len(lists)))
+        for time in count():
+            left = [row for row, at in enumerate(active) if len(lists[at]) > time]
+            if len(left) < len(active):
                 ids, pictures = world.ids, world.rgb()
-                for place in range(left, active):
-                    found[order[place]] = Goal(ids[place].clone(), pictures[place].clone())
+                ended = {*range(len(active))}.difference(left)
+                goals |= {active[row]: Goal(ids[row].clone(), pictures[row].clone()) for row in ended}
                 if not left:
                     break
-                world, active = world.select(slice(0, left)), left
-            painted = np.array([lists[at][time] for at in order[:active]], dtype=np.int64)
-            world = self.program.act(world, painted, self._draws.planes(which[order[:active]]))
-        return [found[at] for at in range(len(order))]
+                world, active = world.select(left), [active[row] for row in left]
+            painted = np.array([lists[at][time] for at in active], dtype=np.int64)
+            world = self.program.act(world, painted, self._draws.planes(which[active]))
+        return [goals[at] for at in range(len(lists))]
 
     # Stepping
 
@@ -355,9 +346,7 @@ class Episodes:
         Returns:
             success, bool [B]: whether the worlds match their goals now.
         """
-        which = np.arange(self.count) if active is None else np.flatnonzero(active)
-        if not len(which):
-            return self.success
+        part, which = self._world, np.arange(self.count) if active is None else np.flatnonzero(active)
         stages = self.stage[which]
         choices = np.where(stages == 0, self.level.choices(0), self.level.choices(1))
         given = actions[which]
@@ -367,13 +356,12 @@ class Episodes:
             for stage in range(3):
                 bad = np.flatnonzero(invalid & (stages == stage))
                 if len(bad):
-                    given[bad] = self._drawn(which[bad], REPLACED, self.level.choices(stage))
+                    given[bad] = self._drawn(which[bad], "ogbench invalid", self.level.choices(stage))
         self._chosen[which, stages] = given
         self.stage[which] = (stages + 1) % 3
         self.elapsed[which] += 1
         painting = which[stages == 2]
         if len(painting):
-            part = self._world
             if len(painting) < self.count:
                 part = part.select(torch.from_numpy(painting).to(self.program.device))
             planes = self._draws.planes(painting)
@@ -388,7 +376,8 @@ class Episodes:
 
     @property
     def _world(self) -> World:
-        assert self.world is not None
+        if self.world is None:
+            raise ResetNeeded("reset the environment before its first step, and before rendering it")
         return self.world
 
     def _put(self, which: Numbers, part: World) -> None:
@@ -420,7 +409,12 @@ class Episodes:
     # Showing
 
     def observations(self) -> Tensor:
-        """uint8 [B, H, W, 6]: the worlds' pictures, then the action frames. It is never overwritten."""
+        """uint8 [B, H, W, 6]: the worlds' pictures, then the action frames. It is never overwritten.
+
+        Raises:
+            ResetNeeded: before the first episode.
+        """
+        assert self._world
         return self._shown.clone()
 
     def goals(self) -> Tensor:

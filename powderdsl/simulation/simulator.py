@@ -266,8 +266,6 @@ class Simulator:
 
     def _fresh(self, slot: Slot, ids: Array) -> Array:
         """A slot's values in new cells of these elements."""
-        if slot.name == "element":
-            return self.kind.copied(ids)
         values = self.kind.entries(self.fresh_values(slot), ids)
         return self.kind.contiguous(self.kind.xp.moveaxis(values, -1, 1)) if slot.planes == 2 else values
 
