@@ -29,7 +29,7 @@ from powderdsl.diagnostics import CompileError, Diagnostic
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.experiments.runs import differences
 from powderdsl.system.random import MASK, base_keys, mix
-from powderdsl.system.settings import check_count
+from powderdsl.system.settings import check_choice, check_count
 from powderdsl.system.writing import failure
 
 Array = NDArray[Any]
@@ -370,8 +370,7 @@ def split(
     Raises:
         ValueError: a wrong argument, or a part would be empty.
     """
-    if by not in UNITS:
-        raise ValueError(f"by is one of {', '.join(UNITS)}; found {by!r}")
+    check_choice("by", by, UNITS)
     check_count("seed", seed, (1 << 62) - 1, least=0)
     if not fractions or not all(one > 0 for one in fractions) or not math.isclose(sum(fractions), 1):
         raise ValueError(f"fractions must be positive and sum to 1, found {list(fractions)}")

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from powderdsl.datasets.dataset import Dataset
+from powderdsl.system.settings import check_choice
 
 LAYOUTS = ("d4rl", "ogbench")
 
@@ -24,8 +25,7 @@ def flat(dataset: Dataset, layout: str = "d4rl") -> dict[str, NDArray[Any]]:
     Raises:
         ValueError: another layout.
     """
-    if layout not in LAYOUTS:
-        raise ValueError(f"layout is one of {', '.join(LAYOUTS)}; found {layout!r}")
+    check_choice("layout", layout, LAYOUTS)
     parts = [_episode(dataset, number, layout) for number in range(len(dataset))]
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 

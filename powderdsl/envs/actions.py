@@ -10,7 +10,7 @@ import torch
 from gymnasium.spaces import Discrete, MultiDiscrete
 from torch import Tensor
 
-from powderdsl.diagnostics import suggest
+from powderdsl.system.settings import check_choice
 from powderdsl.tasks.episodes import ACTION, check_numbers, integer_tensor
 from powderdsl.tasks.task import BLOW, NO_CHANGE, Agent
 
@@ -62,17 +62,14 @@ class ActionForm:
         Raises:
             TypeError: they are not integers. ValueError: a wrong shape, or a number out of range, with its index.
         """
-        device = self.table.device
         if self.kind == "discrete":
             values = integer_tensor("actions", actions)
             if values.ndim != 1:
                 raise ValueError(f"actions must have the shape [episodes], found {list(values.shape)}")
-            bad = ((values < 0) | (values >= self.nvec[0])).nonzero()
-            if len(bad):
-                place, most = int(bad[0]), self.nvec[0] - 1
-                raise ValueError(f"actions[{place}] is {int(values[place])}: it must lie in 0..{most}")
-            return self.table[values.to(device)]
-        numbers = check_numbers(actions, self.nvec, self.names).to(device)
+            actions = values[:, None]
+        numbers = check_numbers(actions, self.nvec, self.names).to(self.table.device)
+        if self.kind == "discrete":
+            return self.table[numbers[:, 0]]
         if len(self.columns) == len(ACTION):
             return numbers
         return self.table.expand(len(numbers), -1).clone().index_copy_(1, self.columns, numbers)
@@ -97,9 +94,7 @@ def action_form(kind: str, agent: Agent, device: torch.device) -> ActionForm:
     Raises:
         ValueError: an unknown kind, or more than MAX_ACTIONS discrete actions.
     """
-    if kind not in KINDS:
-        helps = suggest(str(kind), KINDS, "kinds") or ("kinds: " + ", ".join(KINDS),)
-        raise ValueError(f"no actions {kind!r}; {'; '.join(helps)}")
+    check_choice("actions", kind, KINDS)
     rows, columns = agent.bins
     full_nvec = agent.action_nvec
     read = (

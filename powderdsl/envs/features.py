@@ -22,30 +22,22 @@ class Expand(nn.Module):
         sources: the channel of the observation that each comes from. tables: [C, 256], what it is by the number there.
     """
 
-    def __init__(self, sources: tuple[int, ...], tables: Any):
+    def __init__(self, sources: tuple[int, ...], tables: Tensor):
         super().__init__()
-        whole = torch.as_tensor(tables, dtype=torch.float32)
-        single = (whole != 0).sum(1) == 1
-        # 1 where one element is, else 0.
-        of_one = single & (whole.amax(1) == 1) & (torch.tensor(sources) == 0)
-        flags = [*of_one.tolist(), False]
-        first = flags.index(True) if True in flags else 0
-        self.flags = slice(first, flags.index(False, first))  # in a row: then they are written at once
         self.channels = len(sources)
-        rest = [channel for channel in range(self.channels) if not first <= channel < self.flags.stop]
-        self.others = [(channel, sources[channel]) for channel in rest]
-        self.register_buffer("tables", whole)
-        self.register_buffer("elements", whole[self.flags].argmax(1).float()[:, None, None])
+        self.of_source = {
+            source: [channel for channel, other in enumerate(sources) if other == source]
+            for source in dict.fromkeys(sources)
+        }
+        self.register_buffer("tables", tables)
 
     def forward(self, observed: Tensor) -> Tensor:
         """Bytes, or the same numbers as floats: [B, C, H, W]."""
         batch, _, height, width = observed.shape
         out = torch.empty(batch, self.channels, height, width, device=observed.device)
-        out[:, self.flags] = observed[:, :1].float() == self.get_buffer("elements")
-        tables, numbers = self.get_buffer("tables"), observed.int()
-        for channel, source in self.others:
-            found = tables[channel].index_select(0, numbers[:, source].flatten())
-            out[:, channel] = found.view(batch, height, width)
+        for source, channels in self.of_source.items():
+            values = self.get_buffer("tables")[channels].index_select(1, observed[:, source].int().flatten())
+            out[:, channels] = values.view(-1, batch, height, width).movedim(0, 1)
         return out
 
 

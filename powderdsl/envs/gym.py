@@ -24,6 +24,7 @@ from torch import Tensor
 from powderdsl.envs import env_id
 from powderdsl.envs.tensor_env import Info, TensorEnv
 from powderdsl.simulation.draw import scale
+from powderdsl.system.settings import check_choice
 from powderdsl.tasks.episodes import TaskProgram
 from powderdsl.tasks.task import Task
 
@@ -65,8 +66,8 @@ class Face:
         how = {"render_mode": None, "render_scale": 8, "actions": "multidiscrete", **how}
         rest = {**how, **fixed}
         self.render_mode, self.render_scale = rest.pop("render_mode"), rest.pop("render_scale")
-        if self.render_mode not in (None, *RENDER_MODES):
-            raise ValueError(f"render_mode is one of {', '.join(RENDER_MODES)}; found {self.render_mode!r}")
+        if self.render_mode is not None:
+            check_choice("render_mode", self.render_mode, RENDER_MODES)
         self.tensors = TensorEnv(task, **rest)
         self.spec = EnvSpec(
             env_id(self.tensors.task.name),

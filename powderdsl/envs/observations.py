@@ -9,10 +9,10 @@ import torch
 from gymnasium.spaces import Box
 from torch import Tensor
 
-from powderdsl.diagnostics import suggest
 from powderdsl.model.state import property_values
 from powderdsl.simulation.observe import Observer
 from powderdsl.simulation.simulator import Simulator, World
+from powderdsl.system.settings import check_choice
 from powderdsl.worlds.raster import Size
 
 KINDS = ("ids", "compact", "matrix", "rgb")
@@ -46,16 +46,10 @@ class Observation:
 
 def channels_of(kind: str, observer: Observer) -> tuple[str, ...]:
     """The names of the channels of a kind of observation. Raises ValueError for an unknown kind."""
-    known = {
-        "ids": ("element",),
-        "compact": observer.compact_names,
-        "matrix": observer.matrix_names,
-        "rgb": ("red", "green", "blue"),
-    }
-    if kind not in known:
-        helps = suggest(str(kind), KINDS, "kinds") or ("kinds: " + ", ".join(KINDS),)
-        raise ValueError(f"no observation {kind!r}; {'; '.join(helps)}")
-    return known[kind]
+    check_choice("observation", kind, KINDS)
+    if kind in ("ids", "rgb"):
+        return ("element",) if kind == "ids" else ("red", "green", "blue")
+    return observer.compact_names if kind == "compact" else observer.matrix_names
 
 
 def observation_of(kind: str, simulator: Simulator, size: Size) -> Observation:

@@ -17,7 +17,7 @@ from powderdsl.envs.observations import observation_of
 from powderdsl.simulation.simulator import MAX_CELLS
 from powderdsl.simulation.state_checks import given_mapping
 from powderdsl.system.random import MASK, mix
-from powderdsl.system.settings import check_count
+from powderdsl.system.settings import check_choice, check_count
 from powderdsl.tasks.episodes import Episodes, TaskProgram, compile_task, integer_tensor, load_task
 from powderdsl.tasks.task import Task
 
@@ -91,8 +91,7 @@ class TensorEnv:
     ):
         check_count("worlds", worlds, MAX_SEED)
         check_count("max_episode_steps", 1 if max_episode_steps is None else max_episode_steps, MAX_SEED)
-        if last_action not in LAST_ACTIONS:
-            raise ValueError(f"last_action is one of {', '.join(LAST_ACTIONS)}; found {last_action!r}")
+        check_choice("last_action", last_action, LAST_ACTIONS)
         if isinstance(task, Task) and (knobs or params):
             raise ValueError("knobs and params are given to `load_task` where the task is loaded before")
         if isinstance(task, str | Path):
@@ -391,8 +390,7 @@ def check_cells(num_envs: int, size: tuple[int, int]) -> None:
 
 def mode_of(value: AutoresetMode | str) -> AutoresetMode:
     """A mode of Gymnasium's, or the one of a name, which may be written in any case."""
-    try:
-        return value if isinstance(value, AutoresetMode) else AutoresetMode[value.upper()]
-    except KeyError:
-        names = ", ".join(mode.name for mode in AutoresetMode)
-        raise ValueError(f"autoreset_mode is one of {names}; found {value!r}") from None
+    if isinstance(value, AutoresetMode):
+        return value
+    check_choice("autoreset_mode", value.upper(), [mode.name for mode in AutoresetMode])
+    return AutoresetMode[value.upper()]

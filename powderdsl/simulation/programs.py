@@ -7,7 +7,7 @@ from contextlib import nullcontext, suppress
 from dataclasses import replace
 from functools import cache
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from powderdsl.compiler import BACKENDS, lower, parts
 from powderdsl.diagnostics import CompileError
@@ -166,33 +166,19 @@ def _wasm_problem() -> str:
     return ""
 
 
-class BackendProgram:
-    """The programs of one backend.
+class BackendProgram(NamedTuple):
+    """The programs of one backend. `name` is what runs, unless `whole` has a `running` of its own, and `notes` on it."""
 
-    Args:
-        name: the backend's, if `whole` does not tell which one is running.
-        whole: the program of whole steps.
-        rest: gives the program for chosen passes and given draws, if that is another one.
-    """
-
-    def __init__(self, name: str, whole: Runnable, rest: Callable[[], Runnable] | None = None):
-        self._name, self.whole, self._rest = name, whole, rest
-
-    @property
-    def running(self) -> str:
-        """What the next step runs on."""
-        return str(getattr(self.whole, "running", self._name))
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Sentences about which backend ran, and why."""
-        return tuple(getattr(self.whole, "notes", ()))
+    name: str
+    whole: Runnable
+    rest: Callable[[], Runnable] | None = None
+    """Gives the program for chosen passes and given draws, if that is another one than that of whole steps."""
 
     def run(self, job: Job) -> Mapping[str, Array]:
         """The state `job.steps` later."""
-        if self._rest is None or (job.passes is None and not job.draws):
+        if self.rest is None or (job.passes is None and not job.draws):
             return self.whole.run(job)
-        return self._rest().run(job)
+        return self.rest().run(job)
 
 
 class ReferenceProgram:

@@ -182,12 +182,12 @@ class Simulator:
     @property
     def running(self) -> str:
         """The backend that the next step runs on: for ``auto`` on the CPU, ``wasm`` (or ``torch``) or ``native``."""
-        return self._program.running
+        return str(getattr(self._program.whole, "running", self._program.name))
 
     @property
     def notes(self) -> tuple[str, ...]:
         """For ``auto``: sentences about which backend ran, and why."""
-        return self._program.notes
+        return tuple(getattr(self._program.whole, "notes", ()))
 
     @cached_property
     def observer(self) -> Observer:

@@ -74,6 +74,12 @@ def check_count(name: str, value: Any, most: int, *, least: int = 1) -> None:
         raise ValueError(f"{name} must be an integer from {least:,} to {most:,}, found {value!r}")
 
 
+def check_choice(name: str, value: Any, choices: Sequence[str]) -> None:
+    """Raise ValueError if an argument is none of some texts."""
+    if value not in choices:
+        raise ValueError(f"{name} is one of {', '.join(choices)}; found {value!r}")
+
+
 def mistakes(config: Any) -> list[str]:
     """A sentence for each setting whose value it does not take."""
     problems: list[str] = []

@@ -187,7 +187,7 @@ def test_given_draws_and_chosen_passes_stay_with_torch() -> None:
     program.run(job(4, draws={"coin": torch.zeros(1, 2, 2)}))
     program.run(job(5, passes=frozenset({"fall"})))
     assert log == [("native", 0, 3), ("torch", 0, 4), ("torch", 0, 5)]
-    assert program.notes == ("native: it was compiled before",)
+    assert auto.notes == ("native: it was compiled before",)
 
 
 @pytest.mark.parametrize("problem", [NoCompiler("no C++ compiler: tried g++"), ValueError("oh")])
