@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from powderdsl.ir.ops import Node, Program, Threshold, nodes_of
@@ -120,3 +120,8 @@ def fixed_key(node: Node) -> tuple[int, int, int]:
 def literal(value: float) -> str:
     """A float32 constant, exactly."""
     return f"{value.hex()}f"
+
+
+def braced(items: Iterable[object]) -> str:
+    """A list in C++."""
+    return f"{{{', '.join(map(str, items))}}}"

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from functools import reduce
+from collections.abc import Iterator, Sequence
 from importlib.resources import files
-from operator import or_
 from typing import NamedTuple
 
 from powderdsl.ir.ops import SNAP, Program
@@ -13,7 +11,7 @@ from powderdsl.schedule.presence import asked_ids
 from powderdsl.schedule.stages import CPU, plan
 from powderdsl.system.memo import collection_paused
 from powderdsl.targets.cpp.text import pass_text
-from powderdsl.targets.layout import NativeLayout, literal, native_layout
+from powderdsl.targets.layout import NativeLayout, braced, literal, native_layout
 
 GENERATOR_VERSION = 11
 """Part of every cache key; increase it when generated code changes meaning."""
@@ -54,9 +52,13 @@ def native_source(program: Program, width: int = 0) -> NativeSource:
     Args:
         width: see `known_width`.
     """
-    layout = native_layout(program)
-    schedules = [plan(pass_, CPU) for pass_ in program.passes]
-    passes = [pass_text(schedule, i, layout) for i, schedule in enumerate(schedules)]
+    layout, asked = native_layout(program), 0
+    passes, calls = [], []
+    for number, pass_ in enumerate(program.passes):
+        schedule = plan(pass_, CPU)
+        asked |= asked_ids(schedule)
+        passes.append(pass_text(schedule, number, layout))
+        calls.append(f"  pass_{number}(c); TICK({number})")
     sizes = {
         "WIDTH": width,
         "STREAMS": len(layout.streams),
@@ -70,16 +72,11 @@ def native_source(program: Program, width: int = 0) -> NativeSource:
         "SNAP": literal(SNAP),
         "PASSES": len(passes),
     }
-    folder = files("powderdsl.targets.cpp")
-    before, after = (
-        "\n".join((folder / f"{part}.hpp").read_text(encoding="utf-8") for part in parts)
-        for parts in (LIBRARY, DRIVER)
-    )
+    before, after = "\n".join(map(_header, LIBRARY)), "\n".join(map(_header, DRIVER))
     units = 2 if sum(map(len, passes)) >= UNIT_SIZE else 1
-    asked = reduce(or_, map(asked_ids, schedules), 0)
     lines = [
         f"// {len(passes)} passes, generated; version {GENERATOR_VERSION}",
-        *(f"#define {name} {size}" for name, size in sizes.items()),
+        *map("#define {} {}".format, sizes, sizes.values()),
         before,
         *_in_units(passes, units, len(after)),
         f"{ONLY_IN}0",
@@ -87,7 +84,7 @@ def native_source(program: Program, width: int = 0) -> NativeSource:
         *_look(layout, asked),
         "static void run_passes(Context& c) {\n  START;",
         *(["  if (c.present == ~0ull) look(c);"] if asked else []),
-        *(f"  pass_{i}(c); TICK({i})" for i in range(len(passes))),
+        *calls,
         "}",
         after,
         "#endif\n",
@@ -95,62 +92,69 @@ def native_source(program: Program, width: int = 0) -> NativeSource:
     return NativeSource("\n".join(lines), layout, units)
 
 
+def _header(name: str) -> str:
+    return (files("powderdsl.targets.cpp") / f"{name}.hpp").read_text(encoding="utf-8")
+
+
+STRUCTS = """\
+struct ResetPlane { int slot; bool value; };
+struct ResetReal { int slot; float value; };
+struct FixedPlane { int kind, a, b; };
+struct StepPlane { u64 a; int b; };"""
+
+
 def _tables(program: Program, layout: NativeLayout) -> Iterator[str]:
     """The types of tables, and tables of slots that a step resets, of planes and of streams."""
-    yield "struct ResetPlane { int slot; bool value; };"
-    yield "struct ResetReal { int slot; float value; };"
-    yield "struct FixedPlane { int kind, a, b; };"
-    yield "struct StepPlane { u64 a; int b; };"
-    planes, reals = [], []
+    planes, reals, idents = [], [], []
     for slot in program.slots:
         if slot.resets and slot.name in layout.planes:
             planes.append((layout.planes[slot.name], int(slot.default)))
         elif slot.resets:
             reals.append((layout.reals[slot.name], literal(float(slot.default))))
-    tables: dict[tuple[str, str], Iterable[tuple[object, ...]]] = {
-        ("ResetPlane", "RESET_PLANES"): planes,
-        ("ResetReal", "RESET_REALS"): reals,
-        ("FixedPlane", "FIXED"): layout.fixed,
-        ("StepPlane", "STEP_TABLE"): layout.step_planes,
-    }
-    for (type, name), rows in tables.items():
-        items = ", ".join(["{" + ", ".join(map(str, row)) + "}" for row in rows])
-        yield f"static const std::vector<{type}> {name} = {{{items}}};"
-    idents = ", ".join(f"{ident}u" for _, ident, _ in program.streams)
-    yield f"static const std::vector<u32> STREAM_IDENT = {{{idents}}};"
+    for _, ident, _ in program.streams:
+        idents.append(f"{ident}u")
+    yield STRUCTS
+    yield f"static const std::vector<ResetPlane> RESET_PLANES = {braced(map(braced, planes))};"
+    yield f"static const std::vector<ResetReal> RESET_REALS = {braced(map(braced, reals))};"
+    yield f"static const std::vector<FixedPlane> FIXED = {braced(map(braced, layout.fixed))};"
+    yield f"static const std::vector<StepPlane> STEP_TABLE = {braced(map(braced, layout.step_planes))};"
+    yield f"static const std::vector<u32> STREAM_IDENT = {braced(idents)};"
 
 
 def _in_units(passes: Sequence[str], units: int, driver: int) -> Iterator[str]:
     """The passes, each in a unit, so that all units are about as long; the first has a driver of so many letters, too."""
     sizes = [driver, *[0] * (units - 1)]
-    chosen: dict[int, int] = {}
-    for number in sorted(range(len(passes)), key=lambda number: -len(passes[number])):
-        chosen[number] = sizes.index(min(sizes))
-        sizes[chosen[number]] += len(passes[number])
-    yield from (f"void pass_{number}(Context& c);" for number in range(len(passes)))
-    for number, text in enumerate(passes):
-        yield f"{ONLY_IN}{chosen[number]}\n{text}\n#endif"
+    chosen: dict[str, int] = {}
+    for text in sorted(passes, key=len, reverse=True):
+        chosen[text] = sizes.index(min(sizes))
+        sizes[chosen[text]] += len(text)
+    for number in range(len(passes)):
+        yield f"void pass_{number}(Context& c);"
+    for text in passes:
+        yield f"{ONLY_IN}{chosen[text]}\n{text}\n#endif"
 
 
 def _look(layout: NativeLayout, asked: int) -> Iterator[str]:
     """The function that finds which of the ids in `asked` are present, from products of their low and high bits."""
-    planes = [plane for name, plane in layout.planes.items() if name.startswith(ELEMENT)]
-    ids = [code for code in range(1 << len(planes)) if asked >> code & 1]
-    if not ids:
+    if not asked:
         yield "static void look(Context&) {}"
         return
-    low = len(planes) // 2
-    before, stores, present = [], [], []
-    for code in ids:
-        before.append(f"V id{code} = splat(0);")
-        stores.append(f"id{code} |= low{code & (1 << low) - 1} & high{code >> low};")
-        present.append(f"(any(id{code}) ? 1ull << {code} : 0)")
+    planes = [plane for name, plane in layout.planes.items() if name.startswith(ELEMENT)]
+    ids = [code for code in range(1 << len(planes)) if asked >> code & 1]
+    low, present = len(planes) // 2, []
     yield "static void look(Context& c) {"
-    yield from (f"const V* e{bit} = c.slot[{plane}]->data;" for bit, plane in enumerate(planes))
-    yield from (*before, "for (size_t i = 0; i < c.g.cells(); i++) {")
-    yield from (f"const V b{bit} = e{bit}[i];" for bit in range(len(planes)))
+    for bit, plane in enumerate(planes):
+        yield f"const V* e{bit} = c.slot[{plane}]->data;"
+    for code in ids:
+        yield f"V id{code} = splat(0);"
+    yield "for (size_t i = 0; i < c.g.cells(); i++) {"
+    for bit in range(len(planes)):
+        yield f"const V b{bit} = e{bit}[i];"
     for name, bits in (("low", range(low)), ("high", range(low, len(planes)))):
         for code in range(1 << len(bits)):
             factors = [f"{'' if code >> i & 1 else '~'}b{bit}" for i, bit in enumerate(bits)]
             yield f"const V {name}{code} = {' & '.join(factors) or '~splat(0)'};"
-    yield from (*stores, "}", f"c.present = {' | '.join(present)};", "}")
+    for code in ids:
+        yield f"id{code} |= low{code & (1 << low) - 1} & high{code >> low};"
+        present.append(f"(any(id{code}) ? 1ull << {code} : 0)")
+    yield f"}}\nc.present = {' | '.join(present)};\n}}"

@@ -48,22 +48,23 @@ def pass_text(schedule: Schedule, number: int, layout: NativeLayout) -> str:
         del rest[var.name]
         place = printer.slot(slot, var)
         if slot in changed:  # nothing else refers to it while the pass runs, so it may be overwritten
-            lines.append(f"{kind(var)}* {var.name} = {place}; {place} = nullptr;")
+            lines.append(f"{KINDS[var.type.name]}* {var.name} = {place}; {place} = nullptr;")
         else:
-            lines.append(f"{kind(var)}* {var.name} = keep({place});")
-    lines += [f"{kind(var)}* {var.name};" for var in rest.values()]
+            lines.append(f"{KINDS[var.type.name]}* {var.name} = keep({place});")
+    for var in rest.values():
+        lines.append(f"{KINDS[var.type.name]}* {var.name};")
     return "\n".join([*lines, *printer.block(schedule.body), *printer.leave(schedule), "}"])
 
 
-def kind(var: Var) -> str:
-    return "Field" if var.type == REAL else "Plane"
+KINDS = {"real": "Field", "flag": "Plane"}
+"""The type of a variable's memory."""
 
 
 def answer(node: Node) -> str:
     """A condition in C++."""
     match node.op:
         case "any" | "some":
-            return " || ".join(f"!{plane.attr}->zero" for plane in node.args) or "false"
+            return " || ".join(map("!{0.attr}->zero".format, node.args)) or "false"
         case "present":
             return f"(c.present & {node.attr:#x}ull)"
         case "const":
@@ -106,7 +107,7 @@ class _Printer(Printer):
         yield sweeps_text(sweeps, self.layout, self.reaches)
 
     def release(self, release: Release) -> Iterator[str]:
-        yield " ".join(f"give(c, {name});" for name in release.frees)
+        yield " ".join(map("give(c, {});".format, release.frees))
 
     def forget(self, _: Forget) -> Iterator[str]:
         yield "c.present = ~0ull;"
@@ -116,7 +117,7 @@ class _Printer(Printer):
         places, names = [], {}
         for i, (slot, node) in enumerate(schedule.leaves):
             var = Var(held(node), node.type)
-            yield f"{kind(var)}* s{i} = keep({var.name});"
+            yield f"{KINDS[var.type.name]}* s{i} = keep({var.name});"
             places.append(self.slot(slot, var))
             if node.op == "load":
                 names[var.name] = f"give(c, {var.name});"
@@ -176,8 +177,8 @@ class _Printer(Printer):
             if out.into:
                 values.places[old] = name
             yield f"{name} = {old if out.into else f'keep({old})'};"
-        masks = [str(node.attr) for node in alternatives(loop.region)]
-        yield f"if ({' || '.join(f'!{mask}->zero' for mask in masks)}) {{"
+        masks = alternatives(loop.region)
+        yield f"if ({' || '.join(map('!{0.attr}->zero'.format, masks))}) {{"
         before, stores, after = [], [], []
         for out in loop.outs:
             assert out.otherwise is not None
@@ -190,8 +191,10 @@ class _Printer(Printer):
                 before.append(f"V a{name} = splat(0); const bool e{name} = {name}->zero; own(c, {name});")
                 stores.append(f"{{ const V o = {value}; {words}[i] = o; a{name} |= o; }}")
                 after.append(f"{name}->zero = e{name} && !any(a{name});")
-        some = " | ".join(f"{values.plane(mask)}[i]" for mask in masks)
-        yield "\n".join([*before, values.ready(), values.pointers(), LOOP, f"if (!any({some})) continue;"])
+        some = " | ".join(map(values.node, masks))
+        yield "\n".join(
+            [*before, values.ready(), " ".join(values.pointers), LOOP, f"if (!any({some})) continue;"]
+        )
         yield "\n".join([*values.lines, *stores, "}", *after, "}"])
 
     def words(self, loop: Compute) -> Iterator[str]:
@@ -208,7 +211,7 @@ class _Printer(Printer):
         yield f"{skipped}{{"
         yield values.ready()
         yield " ".join(before)
-        yield "\n".join([values.pointers(), LOOP, *values.lines, *stores, "}"])
+        yield "\n".join([" ".join(values.pointers), LOOP, *values.lines, *stores, "}"])
         yield " ".join(after) + " }"
 
 
@@ -231,6 +234,8 @@ class _Words(WordText):
         """The planes that hold the old values of planes which are changed in place."""
         self.read: dict[str, str] = {}
         """The pointers to planes that the loop reads, which would be loaded again after every store, by what they point to."""
+        self.pointers: list[str] = []
+        """Statements before the loop that set these pointers."""
 
     def ready(self) -> str:
         """Statements before the loop that prepare the rows of other strips."""
@@ -241,11 +246,10 @@ class _Words(WordText):
         return self.pointer(f"{self.places.get(name, name)}->data")
 
     def pointer(self, words: str) -> str:
-        return self.read.setdefault(words, f"r{len(self.read)}")
-
-    def pointers(self) -> str:
-        """Statements before the loop that name what it points to."""
-        return " ".join(f"V* const {name} = {words};" for words, name in self.read.items())
+        if words not in self.read:
+            self.read[words] = f"r{len(self.read)}"
+            self.pointers.append(f"V* const {self.read[words]} = {words};")
+        return self.read[words]
 
     def lazy(self, node: Node) -> str:
         """A conjunction whose second part is computed only where the first holds somewhere in the word."""

@@ -454,6 +454,7 @@ class Module:
         self.pages, self.most = pages, most
         self._types: dict[bytes, int] = {}
         self._functions: dict[tuple[int, bytes], Callee] = {}
+        self._once: dict[str, Callee] = {}
         self._names: list[str] = []
         self._globals: list[tuple[str, int]] = []
         self._exports: list[bytes] = [_text("memory") + b"\x02\x00"]
@@ -469,6 +470,12 @@ class Module:
             if (result := write(*function.params)) is not None:
                 body.give(result)
         return self.add(function, name or write.__name__.strip("_"), export=export)
+
+    def once(self, name: str, write: Writer) -> Callee:
+        """A function that is added when it is first needed."""
+        if name not in self._once:
+            self._once[name] = self.define(write, name)
+        return self._once[name]
 
     def add(self, function: Function, name: str, *, export: bool = False) -> Callee:
         params = [bytes([TYPES[param.type]]) for param in function.params]

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
+from functools import partial, reduce
+from operator import or_
 
 from powderdsl.ir.ops import REAL, SNAP, Node
 from powderdsl.schedule.rows import chains_of, region_of
-from powderdsl.schedule.types import Compute, loaded
+from powderdsl.schedule.types import Compute, loaded, reads_of
 from powderdsl.targets.layout import param_key
 from powderdsl.targets.printing import CellValues
 from powderdsl.targets.wasm.binary import I32, Local, Value, body, const, floats, load, op, vector
@@ -69,9 +70,7 @@ class CellLoop(Loop):
     kind = "cells"
 
     def __init__(self, library: Library, loop: Compute):
-        olds = [old for old in loop.olds.values() if old.op == "load"]
-        region = [] if loop.region is None else [loop.region]
-        super().__init__(library, loop, loaded([*(out.value for out in loop.outs), *region, *olds]))
+        super().__init__(library, loop, loaded(loop.values))
         self.columns = self.memory.at("columns") + 4 * self.memory.halo
         self.starts: dict[tuple[str, int, bool], Local] = {}
 
@@ -86,7 +85,7 @@ class CellLoop(Loop):
                 with body.scope(), body.block() as skip:
                     self.skip = skip
                     self.starts = {}
-                    self.lay() if self.loop.over == "choices" else self.body()
+                    self.lay() if self.loop.over == "choices" else self.sweep()
                 line += 1
         for out, place, some_live in zip(self.loop.outs, self.outs, self.somewhere, strict=True):
             place[SOME] = some_live
@@ -97,16 +96,12 @@ class CellLoop(Loop):
 
     def find_starts(self) -> None:
         """Find where the lines begin that are read, before the loop over their cells."""
-        for node in self.nodes:
-            if node.type != REAL or node.op not in ("load", "shift"):
-                continue
-            dy, _, wraps = node.attr if node.op == "shift" else (0, 0, True)
-            name = str(node.args[0].attr if node.op == "shift" else node.attr)
-            key = (name, dy, wraps or not dy)
-            if key not in self.starts:
-                line = self.library.other_line(self.line, dy, wraps=key[2])
+        for read in reads_of(self.loop.results):
+            key = (read.name, read.dy, read.wraps or not read.dy)
+            if read.type == REAL and key not in self.starts:
+                line = self.library.other_line(self.line, read.dy, wraps=read.wraps)
                 line = line if isinstance(line, Local) else body.let(line)
-                self.starts[key] = body.let(self.library.line(self.held[name], line))
+                self.starts[key] = body.let(self.library.line(self.held[read.name], line))
 
     def live(self, field: Value, line: Value | None = None) -> Value:
         return (field + (self.line if line is None else line))[LIVE]
@@ -120,20 +115,28 @@ class CellLoop(Loop):
         """The word of a plane for this lane; `at`: bytes from its first word."""
         return (plane + at)[self.memory.half]
 
-    def row_flags(self, planes: Sequence[str]) -> Value:
+    def row_flags(self, planes: Iterable[str]) -> Value:
         """A test that planes hold a flag in this row of the lane."""
-        memory = self.memory
-        flags = const("i64", 0)
-        if memory.words <= 4:
-            for name in planes:
-                for w in range(memory.words):
-                    flags = flags | load("i64.load", self.held[name] + self.row, memory.base + 16 * w)
-            return op("i64.ne", flags, 0)
-        total = body.let(flags)
-        for name in planes:
-            with body.each(0, memory.row, 16) as at:
-                total |= self.flags(self.held[name], self.row + at)
-        return op("i64.ne", total, 0)
+        held = [self.held[name] for name in planes]
+        return op("i64.ne", self.library.row_flags(held, self.row, self.memory.half), 0)
+
+    def skip_unless(self, busy: Value, rests: Iterable[Node | None]) -> None:
+        """Skip a line that is not busy: what the loop writes is then the rest, or nothing."""
+        with body.when(op("i32.eqz", busy)):
+            for i, rest in enumerate(rests):
+                if rest is not None and rest.op == "load":
+                    self.copy(i, self.held[str(rest.attr)])
+                elif self.loop.outs[i].var.type == REAL:
+                    self.set_live(i, ZERO)
+                else:
+                    full = rest is not None and rest.attr
+                    if full:
+                        self.somewhere[i].set(1)
+                    for w in range(self.memory.words):
+                        columns = (1 << min(WORD, self.memory.width - WORD * w)) - 1
+                        word = load("i64.load", self.outs[i] + self.row, self.memory.base + 16 * w)
+                        word.set(columns if full else 0)
+            body.jump(self.skip)
 
     def copy(self, place: int, source: Local) -> None:
         """A line as it is in another field."""
@@ -144,9 +147,7 @@ class CellLoop(Loop):
             )
 
     def copy_cells(self, to: Value, source: Value) -> None:
-        library = self.library
-        copy = library.lazily("copy_line", lambda: library.module.define(self._copy_line))
-        body.do(copy(to, source))
+        body.do(self.library.module.once("copy_line", self._copy_line)(to, source))
 
     def _copy_line(self, to: I32, source: I32) -> None:
         begin = -4 * self.memory.halo
@@ -157,33 +158,16 @@ class CellLoop(Loop):
 
     def skipped(self) -> None:
         """Skip a line outside the region."""
-        loop = self.loop
-        if loop.region is None:
+        if self.loop.region is None:
             return
-        fields, planes = region_of(loop)
-        busy = ZERO
+        fields, planes = region_of(self.loop)
+        busy = self.row_flags(planes) if planes else ZERO
         for live in fields:
             line = self.library.other_line(self.line, live.attr[0], wraps=True)
             busy = busy | self.live(self.held[str(live.args[0].attr)], line)
-        if planes:
-            busy = busy | self.row_flags(planes)
-        with body.when(op("i32.eqz", busy)):
-            for i, out in enumerate(loop.outs):
-                assert out.otherwise is not None
-                if out.otherwise.op == "load":
-                    self.copy(i, self.held[str(out.otherwise.attr)])
-                elif out.var.type == REAL:
-                    self.set_live(i, ZERO)
-                else:
-                    if out.otherwise.attr:
-                        self.somewhere[i].set(1)
-                    for w in range(self.memory.words):
-                        columns = (1 << min(WORD, self.memory.width - WORD * w)) - 1
-                        word = load("i64.load", self.outs[i] + self.row, self.memory.base + 16 * w)
-                        word.set(columns if out.otherwise.attr else 0)
-            body.jump(self.skip)
+        self.skip_unless(busy, [out.otherwise for out in self.loop.outs])
 
-    def body(self) -> None:
+    def sweep(self) -> None:
         memory, library = self.memory, self.library
         self.skipped()
         self.find_starts()
@@ -244,17 +228,13 @@ class CellLoop(Loop):
         """
         library, memory, outs = self.library, self.memory, self.loop.outs
         chains = chains_of(self.loop)
-        bases = [self.held[str(chain[0].args[2].attr)] for chain in chains]
+        bases = [chain[0].args[2] for chain in chains]
         masks = [str(choice.args[0].attr) for choice in chains[0]]
         continued = [chain[-1] for chain in chains] != [out.value for out in outs]
-        any_flag = self.row_flags(list(dict.fromkeys(masks)))
+        busy = self.row_flags(dict.fromkeys(masks))
         if continued:
-            for base in bases:
-                any_flag = any_flag | self.live(base)
-        with body.when(op("i32.eqz", any_flag)):
-            for i in range(len(outs)):
-                self.set_live(i, ZERO) if continued else self.copy(i, bases[i])
-            body.jump(self.skip)
+            busy = reduce(or_, (self.live(self.held[str(base.attr)]) for base in bases), busy)
+        self.skip_unless(busy, [None] * len(outs) if continued else bases)
         self.find_starts()
         for i in range(len(outs)):
             self.set_live(i, const("i32", 1))
@@ -263,8 +243,8 @@ class CellLoop(Loop):
         if continued:
             first = memory.at("chains") + 4 * memory.halo
             running = [body.let(first + 4 * memory.stride * i) for i in range(len(chains))]
-        for chain, line in zip(chains, running, strict=True):
-            self.copy_cells(line, self.starts[str(chain[0].args[2].attr), 0, True])
+        for base, line in zip(bases, running, strict=True):
+            self.copy_cells(line, self.starts[str(base.attr), 0, True])
         with self.each_word() as (at, x, _):
             for level, mask in enumerate(masks):
                 with body.scope():

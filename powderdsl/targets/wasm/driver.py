@@ -6,12 +6,13 @@ end before `bottom` and `right`.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 
 from powderdsl.ir.ops import REAL, Program
-from powderdsl.system.random import START_0, START_1
+from powderdsl.system.random import MASK, START_0, START_1
 from powderdsl.targets.codec import Piece
 from powderdsl.targets.layout import Layout
 from powderdsl.targets.wasm.binary import (
@@ -35,11 +36,7 @@ from powderdsl.targets.wasm.library import (
     HEADER,
     LANES,
     LIVE,
-    NEXT_BATCH,
-    SIZE,
     SOME,
-    STILL,
-    SWAPPED,
     WORD,
     WORLDS,
     Library,
@@ -155,7 +152,7 @@ class Driver(Batches):
 
     def add(self, *, export: bool) -> dict[str, Callee]:
         """Add the functions, and give them by name. `export`: hosts see them, and the passes by number."""
-        self.define(self._setup, self._load_real, self._store_real)
+        self.define(self._setup, self._renew, self._load_real, self._store_real)
         self.define(
             self.allocate, self.release, self.copy, self.scratch, self.load, self.store, export=export
         )
@@ -182,41 +179,30 @@ class Driver(Batches):
                 body.trap()
         count = body.let((worlds + 1) >> library.strips.equals(0))
         count.set(either(library.strips, worlds, count))
-        size = body.let((worlds * per_world + count * memory.group + (HEADER + 4 * 15)) & ~15)
-        before, batch = body.let(0), body.let(library.batches)
-        with body.block() as chosen:
-            with body.block() as missing, body.loop() as again:
-                body.jump(missing, batch.equals(0))
-                with body.when(batch[SIZE].equals(size)):
-                    with body.when(before):
-                        before[NEXT_BATCH] = batch[NEXT_BATCH]
-                        body.otherwise()
-                        library.batches.set(batch[NEXT_BATCH])
-                    body.jump(chosen)
-                before.set(batch)
-                batch.set(batch[NEXT_BATCH])
-                body.jump(again)
-            batch.set(library.bump(size))
-        for member, value in ((WORLDS, worlds), (GROUPS, count), (SIZE, size)):
-            batch[member] = value
+        size = (worlds * per_world + count * memory.group + (HEADER + 4 * 15)) & ~15
+        batch = body.let(library.bump(size))
+        batch[WORLDS], batch[GROUPS] = worlds, count
+        body.do(self.calls["renew"](batch))
+        return batch
+
+    def _renew(self, batch: I32) -> None:
+        """Planes and fields without anything, for a batch that has none."""
+        library, memory = self.library, self.memory
         with self.each_group(batch) as group:
             for member, real in memory.slots:
                 group[member] = library.keep(library.calm if real else library.nothing)
             group[memory.present] = -1
-        return batch
 
     def release(self, batch: I32) -> None:
-        """Use the memory of a batch for others."""
+        """A batch becomes as a new one, so that its memory can be used for as many worlds."""
         with self.each_group(batch) as group:
             for member, _ in self.memory.slots:
                 body.do(self.library.give(group[member]))
-        batch[NEXT_BATCH] = self.library.batches
-        self.library.batches.set(batch)
+        body.do(self.calls["renew"](batch))
 
-    def copy(self, old: I32) -> Value:
-        """A new batch, which shares what is not changed later."""
+    def copy(self, old: I32, new: I32) -> None:
+        """A new batch gets what another one of as many worlds has, and shares what is not changed later."""
         library, present = self.library, self.memory.present
-        new = body.let(self.calls["allocate"](old[WORLDS], library.world_rows))
         body.do(op("memory.copy", new + HEADER, old + HEADER, self.part(old, 3) - old - HEADER))
         apart = body.let(new - old)
         with self.each_group(old) as group:
@@ -224,7 +210,6 @@ class Driver(Batches):
                 body.do(library.give((group + apart)[member]))
                 (group + apart)[member] = library.keep(group[member])
             (group + apart)[present] = group[present]
-        return new
 
     def scratch(self, size: I32) -> Value:
         """Memory for the host, until it asks for more."""
@@ -407,7 +392,12 @@ class Driver(Batches):
         clock = load("v128.load", 0, memory.at("clock"))
         worlds = [load("v128.load", 0, memory.at("worlds", i)) for i in range(2)]
         bases = [library.mixed(op("i32x4.add", world, clock)) for world in worlds]
-        apart = body.let(load("v128.load", 0, memory.at("apart")))
+        # The four hashes of a vector differ by this: a word of a lane has two, and strips continue each other.
+        strip = splat(either(library.strips, library.rows, 0) * (-(-memory.width // 32) * 32 * GOLDEN))
+        within = vector(struct.pack("<4I", *[0, 32 * GOLDEN & MASK] * 2))
+        apart = body.let(
+            op("i32x4.add", op("i32x4.mul", strip, vector(struct.pack("<4I", 0, 0, 1, 1))), within)
+        )
         for name, ident, _ in self.program.streams:
             with body.scope():
                 first, second = (library.mixed(op("i32x4.add", base, integers(ident))) for base in bases)
@@ -455,25 +445,18 @@ class Driver(Batches):
         return field
 
     def _look(self, names: Sequence[str], ids: Sequence[int]) -> None:
-        """Finds which of some ids are present, from products of their low and high bits, which have planes."""
+        """Finds which of some ids are present, from products of their bits, which have planes."""
         library, memory = self.library, self.memory
         planes = [body.let(library.group[memory.slot(name, None)]) for name in names]
         found = {code: body.let(0, "v128") for code in ids}
-        low = len(names) // 2
-
-        def products(bits: Sequence[Value]) -> list[Local]:
-            made = [body.let(-1, "v128")]
-            for bit in bits:
-                rest = [body.let(op("v128.andnot", one, bit)) for one in made]
-                made = [*rest, *(body.let(one & bit) for one in made)]
-            return made
-
         with body.each(0, library.cells, 16) as at, body.scope():
-            bits = [body.let((plane + at)[memory.flags]) for plane in planes]
-            low_products, high = products(bits[:low]), products(bits[low:])
+            products: list[Value] = [const("v128", -1)]
+            for plane in planes:
+                bit = body.let((plane + at)[memory.flags])
+                without = [body.let(op("v128.andnot", product, bit)) for product in products]
+                products = [*without, *(body.let(product & bit) for product in products)]
             for code in ids:
-                both = low_products[code & (1 << low) - 1] & high[code >> low]
-                found[code] |= both
+                found[code] |= products[code]
         total: Value = const("i64", 0)
         for code in ids:
             total = total | (counted(op("v128.any_true", found[code])) << code)
@@ -493,49 +476,18 @@ class Driver(Batches):
         library.plane_size.set(rows * memory.row + (memory.base + memory.extent.around * memory.row))
         library.live_size.set((lines + 16) & ~15)
         library.field_size.set(library.live_size + lines * (4 * memory.stride) + (HEADER + 64 & ~15))
-        turn = load("v128.load", memory.at("turn"))
-        with body.when(strips):
-            turn.set(vector(SWAPPED))
-            body.otherwise()
-            turn.set(vector(STILL))
-        # The four hashes of a vector differ by this: a word of a lane has two, and strips continue each other.
-        strip = body.let(either(strips, rows, 0) * (-(-memory.width // 32) * 32 * GOLDEN))
-        for number in range(4):
-            hashes = strip * (number // 2) + number % 2 * 32 * GOLDEN
-            word(0, memory.at("apart") + 4 * number).set(hashes)
-        for plane in (library.nothing, library.everything, library.inside):
-            plane.set(library.take())
+        library.nothing.set(library.take())
         library.nothing[HALOED] = 1
         for plane in (library.everything, library.inside):
-            with body.each(0, rows * memory.row, 8 * LANES) as at, body.scope():
-                last = (at % memory.row).equals(memory.row - 8 * LANES)
-                rest = const("v128", (1 << memory.width - WORD * (memory.words - 1)) - 1)
-                full = const("v128", (1 << min(WORD, memory.width)) - 1)
-                (plane + at)[memory.flags] = either(last, rest, full)
-        self._beyond(rows)
-        library.everything[SOME] = 1
+            plane.set(self._fixed(2, 0, 0))
         library.calm.set(library.take_field())
         library.zeros.set(library.bump(4 * memory.stride + 64 & ~15) + 4 * memory.halo)
-        word(memory.at("rows")).set(library.bump((rows << 2) + 31 & ~15))
-        columns = const("i32", memory.at("columns") + 4 * memory.halo)
-        with body.each(0, 4 * memory.width, 4) as at:
-            word(columns + at).set(-1)
+        library.row_list.set(library.bump((rows << 2) + 31 & ~15))
         for dy in range(-memory.extent.lines, memory.extent.lines + 1):
             for wraps in (True, False):
                 self._line_table(dy, wraps)
         for (kind, a, b), number in self.layout.fixed.items():
-            self._fixed(kind, a, b, memory.at("fixed", number))
-
-    def _beyond(self, rows: Value) -> None:
-        """In the halo, the rows of the other strip: the lower one lies below the upper one, and around it nothing."""
-        memory, plane = self.memory, self.library.inside
-        if not (size := memory.extent.around * memory.row):
-            return
-        with body.when(self.library.strips), body.each(0, size, 8 * LANES) as at, body.scope():
-            below = rows * memory.row + at
-            same = (plane + at % memory.row)[memory.half]
-            load("i64.load", plane + at, HEADER + 8).set(same)
-            (plane + below)[memory.half] = same
+            word(memory.at("fixed", number)).set(self._fixed(kind, a, b))
 
     def _line_table(self, dy: int, wraps: bool) -> None:
         library, lines = self.library, self.library.lines
@@ -552,20 +504,28 @@ class Driver(Batches):
                     other.set(either(op("i32.lt_s", other, 0), other + height, other))
                 word(table + (line << 2)).set(seen if wraps else either(other < height, seen, lines))
 
-    def _fixed(self, kind: int, a: int, b: int, place: int) -> None:
-        """A plane of a bit of coordinates (0: rows, 1: columns; modulus, bit), or of `inside` (rows, columns)."""
+    def _fixed(self, kind: int, a: int, b: int) -> Value:
+        """A plane of a bit of coordinates (0: rows, 1: columns; modulus, bit), or of `inside` (2: rows, columns).
+
+        Its halo has what the other strip has there, and around the world nothing is inside.
+        """
         library, memory = self.library, self.memory
-        with body.scope():
+        around = memory.extent.around
+
+        def fixed() -> Value:
             plane = body.let(library.take())
-            word(place).set(plane)
             plane[SOME] = 1
-            strips_rows = body.let(either(library.strips, library.rows, 0))
-            with body.each(0, LANES) as lane, body.each(0, library.rows) as y:
-                row = body.let(y + strips_rows * lane)
+            top = body.let(either(library.strips, library.rows, 0))
+            with body.each(0, LANES) as lane, body.each(0, library.rows + 2 * around) as y:
+                row = body.let(y + top * lane - around)
                 with body.each(0, memory.width) as x, body.scope():
                     if kind == 2:
                         flag = ((row + a) < library.world_rows) & ((x + b) < memory.width)
                     else:
                         flag = (((x if kind else row) % a) >> b) & 1
-                    half = body.let(plane + y * memory.row + ((x >> 6) << 4) + (lane << 3))[memory.half]
+                    at = body.let(plane + y * memory.row + ((x >> 6) << 4) + (lane << 3))
+                    half = load("i64.load", at, HEADER)
                     half |= counted(flag) << counted(x & 63)
+            return plane
+
+        return library.module.define(fixed)()

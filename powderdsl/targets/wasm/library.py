@@ -6,20 +6,21 @@ Addresses are bytes. Everything is aligned to 16 bytes. A group is two lanes of 
             hold the rows that follow on the torus if `haloed`. `some`: it may hold a flag; if not, all words are zero.
     field   refs, some, 2, next. A byte a line: whether it is `live`; other lines are zero and not to be read. Then the
             lines, of both lanes one after the other, with `reach` columns of the torus on both sides.
-    batch   worlds, groups, next, size. Seeds, indices and steps, i64 a world each. The bits of parameters, a byte a
+    batch   worlds, groups. Seeds, indices and steps, i64 a world each. The bits of parameters, a byte a
             world each. Their float32 values. The groups.
     group   the planes and fields of slots, i32 each; i64: the ids that are present, of those that passes ask for.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
+from functools import partial, reduce
+from operator import or_
 from typing import NamedTuple
 
-from powderdsl.ir.ops import REAL, ordered
+from powderdsl.ir.ops import REAL
 from powderdsl.schedule.rows import chains_of
-from powderdsl.schedule.types import Move, Schedule, Sweeps, flat
+from powderdsl.schedule.types import Move, Schedule, Sweeps, flat, reads_of
 from powderdsl.system.random import MASK
 from powderdsl.targets.layout import Layout
 from powderdsl.targets.wasm.binary import (
@@ -54,7 +55,7 @@ REFS_SOME = Member("i64.load", 0)
 LIVE = Member("i32.load8_u", HEADER)
 """Of a line: beyond a field as many bytes as its number."""
 
-WORLDS, GROUPS, NEXT_BATCH, SIZE = (Member("i32.load", at) for at in (0, 4, 8, 12))
+WORLDS, GROUPS = Member("i32.load", 0), Member("i32.load", 4)
 
 PAGE = 1 << 16
 GOLDEN, FIRST, SECOND = 0x9E3779B1, 0x7FEB352D, 0x846CA68B
@@ -63,6 +64,9 @@ MOST_BITS = 64
 
 AHEAD = 4
 """Bits of a draw that are made together, since the multiplications of one wait for each other."""
+
+UNROLLED = 4
+"""Words of a row up to which they are looked at without a loop."""
 
 STILL, SWAPPED = bytes(range(16)), bytes([*range(8, 16), *range(8)])
 """For `i8x16.swizzle`: the lanes as they are, and exchanged."""
@@ -94,12 +98,11 @@ def extent_of(schedules: Sequence[Schedule]) -> Extent:
         elif isinstance(statement, Sweeps):
             laid = (loop for loop in statement.body if loop.over == "choices")
             chains = max(chains, *(len(chains_of(loop)) for loop in laid), 0)
-        for node in ordered(statement.values):
-            if node.op == "shift" and node.type != REAL:
-                around = max(around, abs(node.attr[0]))
-            elif node.op in ("shift", "live"):
-                lines = max(lines, abs(node.attr[0]))
-                reach = max(reach, abs(node.attr[1]) if node.op == "shift" else 0)
+        for read in reads_of(statement.values):
+            if read.type != REAL:
+                around = max(around, abs(read.dy))
+            else:
+                lines, reach = max(lines, abs(read.dy)), max(reach, abs(read.dx))
     return Extent(around, lines, reach, chains)
 
 
@@ -134,8 +137,6 @@ class Memory:
         self.top = 64
         self._tables: dict[str, tuple[int, int]] = {}
         for name, size, count in (
-            ("turn", 16, 1),
-            ("apart", 16, 1),
             ("worlds", 16, 2),
             ("clock", 16, 1),
             ("keys", 32, len(layout.streams)),
@@ -147,7 +148,6 @@ class Memory:
             ("fixed", 4, len(layout.fixed)),
             ("lines", 4, 2 * (2 * extent.lines + 1)),
             ("moving", 4, len(layout.planes) + 1),
-            ("rows", 4, 1),
             ("change", self.row, 2),
             ("columns", 4 * self.stride, 1),
             ("chains", 4 * self.stride, extent.chains),
@@ -213,8 +213,8 @@ class Library:
         variable, define = module.variable, module.define
         self.top = variable("i32", memory.top)
         """Where memory that was never used begins."""
-        self.planes, self.fields, self.batches = variable("i32"), variable("i32"), variable("i32")
-        """The first plane, field and batch that is free."""
+        self.planes, self.fields = variable("i32"), variable("i32")
+        """The first plane and field that is free."""
         self.rows, self.lines, self.cells = variable("i32"), variable("i32"), variable("i32")
         """Rows of a lane; lines of both lanes; bytes of the rows of a plane."""
         self.strips, self.plane_size, self.field_size = variable("i32"), variable("i32"), variable("i32")
@@ -226,7 +226,10 @@ class Library:
         self.present = variable("i64")
         self.world_rows = variable("i32")
         """Rows of a world; 0 before the first batch."""
+        self.row_list = variable("i32")
+        """The rows that movers leave or enter."""
         self.scratch, self.scratch_end = variable("i32"), variable("i32")
+        module.data(memory.at("columns") + 4 * memory.halo, b"\xff" * (4 * memory.width))
         self.bump = define(self._bump)
         self.take = define(partial(self._take, self.planes, self.plane_size, 0), "take")
         self.take_field = define(partial(self._take, self.fields, self.field_size, FIELD), "take_field")
@@ -236,13 +239,6 @@ class Library:
         self.mix = define(self._mix)
         self.draw_below, self.draw_below_planes = define(self._draw_below), define(self._draw_below_planes)
         self.coin = define(self._coin)
-        self.made: dict[object, Callee] = {}
-        """Functions that are made when they are first needed, by what they do."""
-
-    def lazily(self, key: object, make: Callable[[], Callee]) -> Callee:
-        if key not in self.made:
-            self.made[key] = make()
-        return self.made[key]
 
     # Memory
 
@@ -322,7 +318,7 @@ class Library:
         plane[HALOED] = 1
         if not around:
             return
-        turn = load("v128.load", 0, memory.at("turn"))
+        turn = body.let(either(self.strips, vector(SWAPPED), vector(STILL)))
         with body.each(1, around + 1) as k:
             for target, source in (
                 (around - k, (rows * around - k) % rows),
@@ -332,6 +328,17 @@ class Library:
                 with body.each(0, memory.row, 16) as w:
                     seen = op("i8x16.swizzle", (came + w)[memory.flags], turn)
                     load("v128.load", to + w, HEADER).set(seen)
+
+    def row_flags(self, planes: Sequence[Value], row: Value, member: Member) -> Value:
+        """What planes hold in a row, together: `member` are words of both lanes, or of one."""
+        if self.memory.words <= UNROLLED:
+            places = [(plane + row, 16 * w) for plane in planes for w in range(self.memory.words)]
+            return reduce(or_, [load(member.load, at, member.offset + more) for at, more in places])
+        flags = body.let(0, "i64" if member == self.memory.half else "v128")
+        with body.each(row, row + self.memory.row, 16) as at:
+            for plane in planes:
+                flags |= (plane + at)[member]
+        return flags
 
     # Draws
 
@@ -430,7 +437,7 @@ class Library:
 
     def draw_float(self) -> Callee:
         """A draw of a cell as float32: number of the word, lane in bytes, column in the word, keys, bits."""
-        return self.lazily("draw_float", lambda: self.module.define(self._draw_float))
+        return self.module.once("draw_float", self._draw_float)
 
     def _draw_float(self, at: I32, lane: I32, column: I32, keys: I32, bits: I32) -> Value:
         number = body.let(self.first_number(at, keys))
@@ -457,8 +464,7 @@ class Library:
         """
         memory = self.memory
         if not memory.whole or abs(dx) >= WORD:
-            columns = self.lazily(("columns", wraps), lambda: self._columns(wraps=wraps))
-            return columns(row, x + dx)
+            return self._columns(wraps=wraps)(row, x + dx)
         last = const("i32", memory.row - 16)
         here = load("v128.load", row + at)
         if dx > 0:
@@ -500,7 +506,7 @@ class Library:
                 body.jump(again)
             return flags
 
-        return self.module.define(columns, "columns" if wraps else "columns_inside")
+        return self.module.once("columns" if wraps else "columns_inside", columns)
 
     def rotated(self, row: Value, dx: int, *, wraps: bool) -> Value:
         """The flags `dx` columns to the right, of rows of one word. Beyond the width they are garbage."""

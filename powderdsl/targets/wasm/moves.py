@@ -32,32 +32,22 @@ def rows_that_move(library: Library, downwards: bool) -> Callee:
     memory, cells = library.memory, library.cells
 
     def rows(movers: I32, targets: I32) -> Value:
-        end = body.let(word(0, memory.at("rows")))
+        end = body.let(library.row_list)
         at = body.let(cells - memory.row if downwards else ZERO)
         with body.each(0, cells, memory.row), body.scope():
-            flags = const("v128", 0)
-            if memory.words <= 4:
-                for w in range(memory.words):
-                    for plane in (movers, targets):
-                        flags = flags | load("v128.load", plane + at, memory.base + 16 * w)
-            else:
-                total = flags = body.let(flags)
-                with body.each(at, at + memory.row, 16) as one:
-                    for plane in (movers, targets):
-                        total |= (plane + one)[memory.flags]
+            flags = library.row_flags([movers, targets], at, memory.flags)
             word(end).set(at)
             end += some(flags) << 2
             at.set(at - memory.row if downwards else at + memory.row)
         return end
 
-    return library.lazily(("rows", downwards), lambda: library.module.define(rows, "rows_that_move"))
+    return library.module.once("rows_down" if downwards else "rows_up", rows)
 
 
 def mover(library: Library, kind: str, offset: Offset, leaves: Leftover) -> Callee:
     """Moves planes: those of movers and targets, the end of the list of rows, the end of the table of planes."""
     name = f"{kind}_{offset[0]}_{offset[1]}_{leaves}"
-    write = _Mover(library, kind, offset, leaves).write
-    return library.lazily(name, lambda: library.module.define(write, name))
+    return library.module.once(name, _Mover(library, kind, offset, leaves).write)
 
 
 class _Mover:
@@ -91,7 +81,7 @@ class _Mover:
         else:
             before = [body.let(edges[0])]
             self.here = body.let(memory.at("change"))
-        entry = body.let(word(0, memory.at("rows")))
+        entry = body.let(self.library.row_list)
         with body.each(entry, self.rows_end, 4) as listed, body.scope():
             at = body.let(word(listed))
             if memory.words == 1:
@@ -179,10 +169,7 @@ def exchanger(library: Library, offset: Offset) -> Callee:
         line = body.let(0)
         with body.each(0, 16, 8) as lane, body.each(lane, lane + library.cells, memory.row) as row:
             with body.scope(), body.block() as skip:
-                flags = body.let(0, "i64")
-                with body.each(row, row + memory.row, 16) as at:
-                    flags |= (movers + at)[memory.half]
-                body.jump(skip, op("i64.eqz", flags))
+                body.jump(skip, op("i64.eqz", library.row_flags([movers], row, memory.half)))
                 other = body.let(library.other_line(line, dy, wraps=True))
                 body.jump(skip, op("i32.eqz", (field + line)[LIVE] | (field + other)[LIVE]))
                 here, there = (body.let(library.line_start(field, number)) for number in (line, other))
@@ -200,8 +187,7 @@ def exchanger(library: Library, offset: Offset) -> Callee:
                 library.finish_line(there)
             line += 1
 
-    name = f"exchange_{dy}_{dx}"
-    return library.lazily(name, lambda: library.module.define(exchange, name))
+    return library.module.once(f"exchange_{dy}_{dx}", exchange)
 
 
 def _exchange_word(left: Local, x: Local, here: Local, there: Local, by: int, width: int) -> None:

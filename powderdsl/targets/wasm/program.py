@@ -6,6 +6,7 @@ Worlds stay packed between calls; arrays are made when they are read.
 from __future__ import annotations
 
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from math import prod
 from threading import RLock
@@ -79,9 +80,9 @@ class WasmProgram:
             instance = self.instance(*shape)
         if isinstance(state, WasmState) and state.instance is not instance:
             state = dict(state)
-        with instance as call:
+        with instance:
             if isinstance(state, WasmState):
-                batch, like = state.take() if job.reuse else call("copy", state.handle), state.like
+                batch, like = state.take() if job.reuse else instance.copy(state), state.like
             else:
                 batch, like = instance.pack(state)
             instance.run(batch, job, shape[0])
@@ -98,8 +99,10 @@ class Instance:
         self.program, self.kind, self.layout = program, program.kind, program.layout
         self.running = program.module(width)()
         self.call = self.running.call
-        self.gone: list[int] = []
-        """Batches that nobody uses any more."""
+        self.gone: list[tuple[int, int]] = []
+        """Batches that nobody uses any more, with their numbers of worlds."""
+        self._free: defaultdict[int, list[int]] = defaultdict(list)
+        """By number of worlds: batches to be used again."""
         self._lock = RLock()
         self._inputs: tuple[Mapping[str, Array], int, bytes] | None = None
         """The last parameters, the number of worlds, and what the module takes for them."""
@@ -107,7 +110,9 @@ class Instance:
     def __enter__(self) -> Callable[..., int]:
         self._lock.acquire()
         while self.gone:
-            self.call("release", self.gone.pop())
+            worlds, batch = self.gone.pop()
+            self.call("release", batch)
+            self._free[worlds].append(batch)
         return self.call
 
     def __exit__(self, *_: object) -> None:
@@ -125,10 +130,22 @@ class Instance:
                 (*numbers, at, plane) if component is None else (*numbers, at + component * plane, 2 * plane)
             )
 
+    def new(self, worlds: int, rows: int) -> int:
+        """A batch of zeros."""
+        free = self._free[worlds]
+        return free.pop() if free else self.call("allocate", worlds, rows)
+
+    def copy(self, state: WasmState) -> int:
+        """A batch with a state that is here already."""
+        worlds, rows, _ = shape_of(state)
+        batch = self.new(worlds, rows)
+        self.call("copy", state.handle, batch)
+        return batch
+
     def pack(self, state: Mapping[str, Array]) -> tuple[int, Like]:
-        """A new batch with the state."""
-        worlds, rows, _ = state["element"].shape
-        batch = self.call("allocate", worlds, rows)
+        """A batch with a state."""
+        worlds, rows, _ = shape_of(state)
+        batch = self.new(worlds, rows)
         like: dict[str, tuple[Any, tuple[int, ...]]] = {}
         for name, given in state.items():
             value = self.kind.contiguous(given)
@@ -189,11 +206,11 @@ class WasmState(OwnedBatch):
 
     def release(self, handle: int) -> None:
         # The collector may come in the middle of a call, of this or another thread: the next call releases it.
-        self.instance.gone.append(handle)
+        self.instance.gone.append((shape_of(self)[0], handle))
 
     def __copy__(self) -> WasmState:
-        with self.instance as call:
-            return WasmState(self.instance, call("copy", self.handle), self.like)
+        with self.instance:
+            return WasmState(self.instance, self.instance.copy(self), self.like)
 
     def unpack(self, name: str) -> Array:
         return self.instance.read(self.handle, name, self.like)

@@ -20,16 +20,18 @@ The section `powderdsl` of the module is JSON: the size, and elements, fields an
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain
+from typing import TypeVar
 
 from powderdsl.ir.ops import SNAP, Threshold
 from powderdsl.targets.codec import Piece
 from powderdsl.targets.wasm.binary import F64, I32, Callee, Local, Value, body, const, load, op
 from powderdsl.targets.wasm.driver import Batches, numbers_of
-from powderdsl.targets.wasm.library import HEADER, LIVE, PAGE, SOME, Library, aligned, counted, either, word
+from powderdsl.targets.wasm.library import HEADER, PAGE, Library, aligned, counted, either
+
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -86,10 +88,10 @@ class Standalone(Batches):
         self.count = face.rows * self.memory.width
         self.valid = self._data(bytes(i if i in face.ids else face.ids[0] for i in range(256)))
         self.cells_at = const("i32", self._place(self.count))
-        self.wide = self._place(4 * self.count)
-        """Cells of 4 bytes, while fresh values are spread."""
         self.parts = {slot.name: list(self._parts(slot)) for slot in face.fields}
         """The pieces of fields, where their cells lie for the host, and tables of fresh values."""
+        self.reads: dict[str, Callee] = {}
+        self.takes: dict[str, Callee] = {}
 
     def _parts(self, slot: Stored) -> Iterator[tuple[Piece, int, int]]:
         at = self._place(self.count * slot.size * len(slot.pieces))
@@ -110,13 +112,13 @@ class Standalone(Batches):
     def add(self) -> None:
         """Add all functions, and grow the memory by what they need."""
         module, define = self.library.module, self.library.module.define
-        self.define(self.begin, self.show, export=True)
-        self.define(self._fill)
-        self.knobs = [define(partial(self._knob, knob), "knob") for knob in self.face.knobs]
-        self.reads = [define(partial(self._read, slot), "read") for slot in self.face.fields]
-        self.takes = [define(partial(self._take_values, slot), "take_values") for slot in self.face.fields]
-        self.define(self.cells, self.step, self.field, self.take, self.paint, self.set, export=True)
-        self.define(self.parameter, self.clock, export=True)
+        self.define(self.begin, self.show, self.parameter, export=True)
+        for slot in self.face.fields:
+            self.reads[slot.name] = define(partial(self._read, slot), "read")
+            self.takes[slot.name] = define(partial(self._take_values, slot), "take_values")
+        self.define(
+            self.cells, self.step, self.clock, self.field, self.take, self.paint, self.set, export=True
+        )
         module.start(define(self._start))
         module.custom("powderdsl", self.face.about)
         module.pages = self.end // PAGE + 1
@@ -127,8 +129,8 @@ class Standalone(Batches):
     def _start(self) -> None:
         """Makes a world of the first element, with seed 0."""
         self.batch.set(self.calls["allocate"](1, self.face.rows))
-        for set_knob, knob in zip(self.knobs, self.face.knobs, strict=True):
-            body.do(set_knob(const("f64", knob.default)))
+        for number, knob in enumerate(self.face.knobs):
+            body.do(self.calls["parameter"](number, const("f64", knob.default)))
         body.do(op("memory.fill", self.cells_at, self.face.ids[0], self.count))
         body.do(self.calls["begin"](0))
 
@@ -137,13 +139,23 @@ class Standalone(Batches):
         with body.each(0, self.count) as i:
             cell = load("i32.load8_u", self.cells_at + i)
             cell.set(load("i32.load8_u", cell, self.valid))
-        body.do(self._load(self.face.element, self.cells_at, 1))
-        for piece, _, usual in chain.from_iterable(self.parts.values()):
-            with body.each(0, self.count) as i:
-                word(i << 2, self.wide).set(word(load("i32.load8_u", self.cells_at + i) << 2, usual))
-            body.do(self._load(piece, self.wide, 4))
+            self._freshen(i, cell, self.face.fields)
+        self._put(self.face.fields)
         for number, start in enumerate((counted(seed), *[const("i64", 0)] * 2)):
             load("i64.load", self.batch, HEADER + 8 * number).set(start)
+
+    def _freshen(self, cell: Value, element: Value, slots: Iterable[Stored]) -> None:
+        """Fields of a cell get the usual values of an element, for the host."""
+        for slot in slots:
+            for piece, at, usual in self.parts[slot.name]:
+                load(slot.load, cell * slot.size, at).set(_usual(piece, element, usual))
+
+    def _put(self, slots: Iterable[Stored]) -> None:
+        """The ids and fields that the host sees become those of the world."""
+        body.do(self._load(self.face.element, self.cells_at, 1))
+        for slot in slots:
+            for piece, at, _ in self.parts[slot.name]:
+                body.do(self._load(piece, at, slot.size))
 
     def _load(self, piece: Piece, address: Value | int, size: int) -> Value:
         return self.calls["load"](self.batch, *numbers_of(piece, self.layout, size), address, 0)
@@ -195,21 +207,19 @@ class Standalone(Batches):
                 if slot.holders is not None:
                     holders = self._data(bytes(i in slot.holders for i in range(256)))
                     with body.when(load("i32.load8_u", identity, holders).equals(0)):
-                        cell.set(load("f32.load" if piece.is_real else "i32.load", identity << 2, usual))
+                        cell.set(_usual(piece, identity, usual))
             body.do(self._load(piece, at, slot.size))
 
     def field(self, number: I32) -> int:
-        for i, slot in enumerate(self.face.fields):
-            with body.when(number.equals(i)):
-                body.do(self.reads[i]())
-                body.give(self.parts[slot.name][0][1])
+        for slot in _of_number(number, self.face.fields):
+            body.do(self.reads[slot.name]())
+            body.give(self.parts[slot.name][0][1])
         return 0
 
     def take(self, number: I32) -> None:
         body.do(self.calls["show"]())
-        for i, take in enumerate(self.takes):
-            with body.when(number.equals(i)):
-                body.do(take())
+        for slot in _of_number(number, self.face.fields):
+            body.do(self.takes[slot.name]())
 
     # Boxes
 
@@ -227,44 +237,15 @@ class Standalone(Batches):
             body.leave()
         with body.when(op("i32.ne", load("i32.load8_u", element, self.valid), element)):
             body.leave()
-        fresh: list[tuple[Piece, Value]] = [(self.face.element, element)]
-        for slot in self.face.fields:
-            if slot.of_element:
-                fresh += [(piece, word(element << 2, usual)) for piece, _, usual in self.parts[slot.name]]
-        for piece, value in fresh:
-            place, planes, *_ = numbers_of(piece, self.layout, 0)
-            body.do(self.calls["fill"](place, planes, top, bottom, left, right, value))
-
-    def _fill(self, slot: I32, planes: I32, top: I32, bottom: I32, left: I32, right: I32, value: I32) -> None:
-        """A box of equal cells: in planes from a slot on; without planes, in a field, by the bits of its value."""
-        library, memory = self.library, self.memory
-        group = body.let(self.part(self.batch, 3))
-        group[memory.present] = -1
-        with body.each(top, bottom) as y:
-            lane, row = body.let(y // library.rows), body.let(y % library.rows)
-            with body.each(slot, slot + planes, some=False) as number:
-                at = body.let(group + (number << 2))
-                plane = body.let(library.own(word(at)))
-                word(at).set(plane)
-                flag = body.let(counted((value >> (number - slot)) & 1))
-                plane[SOME] |= op("i32.wrap_i64", flag)
-                with body.each(left, right) as x:
-                    half = body.let(plane + row * memory.row + ((x >> 6) << 4) + (lane << 3))[memory.half]
-                    by = body.let(counted(x & 63))
-                    half.set(half & (const("i64", -1) ^ (1 << by)) | (flag << by))
-            with body.when(planes.equals(0)):
-                at = body.let(group + (slot << 2))
-                field = body.let(library.own_field(word(at)))
-                word(at).set(field)
-                line = body.let(lane * library.rows + row)
-                start, alive = body.let(library.line_start(field, line)), body.let(0)
-                with body.when((field + line)[LIVE].equals(0)):
-                    body.do(op("memory.fill", start, 0, 4 * memory.width))
-                with body.each(left, right) as x:
-                    word(start + (x << 2)).set(value)
-                with body.each(0, 4 * memory.width, 4) as x:
-                    alive |= word(start + x) << 1
-                self.close_line(field, line, start, alive)
+        body.do(self.calls["show"]())
+        fresh = [slot for slot in self.face.fields if slot.of_element]
+        for slot in fresh:
+            body.do(self.reads[slot.name]())
+        with body.each(top, bottom) as y, body.each(left, right) as x:
+            cell = body.let(y * self.memory.width + x)
+            load("i32.load8_u", self.cells_at + cell).set(element)
+            self._freshen(cell, element, fresh)
+        self._put(fresh)
 
     def set(
         self,
@@ -279,26 +260,29 @@ class Standalone(Batches):
         body.do(self.calls["show"]())
         self._cut(top, bottom, self.face.rows)
         self._cut(left, right, self.memory.width)
-        for i, slot in enumerate(self.face.fields):
-            with body.when(field.equals(i)), body.scope():
-                with body.when(component >= len(slot.pieces)):
-                    body.leave()
-                body.do(self.reads[i]())
-                convert = "f32.demote_f64" if slot.pieces[0].is_real else "i32.trunc_sat_f64_s"
-                stored = body.let(op(convert, _within(value, slot.low, slot.high)))
-                base = body.let(component * (self.count * slot.size))
-                with body.each(top, bottom) as y, body.each(left, right) as x:
-                    place = base + (y * self.memory.width + x) * slot.size
-                    load(slot.load, place, self.parts[slot.name][0][1]).set(stored)
-                body.do(self.takes[i]())
+        for slot in _of_number(field, self.face.fields):
+            with body.when(component >= len(slot.pieces)):
+                body.leave()
+            body.do(self.reads[slot.name]())
+            convert = "f32.demote_f64" if slot.pieces[0].is_real else "i32.trunc_sat_f64_s"
+            stored = body.let(op(convert, _within(value, slot.low, slot.high)))
+            base = body.let(component * (self.count * slot.size))
+            with body.each(top, bottom) as y, body.each(left, right) as x:
+                place = base + (y * self.memory.width + x) * slot.size
+                load(slot.load, place, self.parts[slot.name][0][1]).set(stored)
+            body.do(self.takes[slot.name]())
 
     # Parameters
 
-    def _knob(self, knob: Knob, value: F64) -> None:
-        """Sets a parameter: its value, cut to its range, as bits and floats."""
-        layout = self.layout
+    def parameter(self, number: I32, value: F64) -> None:
         with body.when(op("f64.ne", value, value)):
             body.leave()
+        for knob in _of_number(number, self.face.knobs):
+            self._set_knob(knob, value)
+
+    def _set_knob(self, knob: Knob, value: Local) -> None:
+        """A parameter's value, cut to its range, becomes bits and floats."""
+        layout = self.layout
         value.set(_within(value, knob.low, knob.high))
         if knob.whole:
             value.set(op("f64.floor", op("f64.add", value, 0.5)))
@@ -315,10 +299,17 @@ class Standalone(Batches):
             at = self.part(self.batch, 2) + 4 * layout.param_reals[knob.name]
             load("f32.load", at).set(op("f32.demote_f64", value))
 
-    def parameter(self, number: I32, value: F64) -> None:
-        for i, set_knob in enumerate(self.knobs):
-            with body.when(number.equals(i)):
-                body.do(set_knob(value))
+
+def _of_number(number: Value, items: Iterable[Item]) -> Iterator[Item]:
+    """Statements for each item, of which those run that are for the item of this number."""
+    for i, item in enumerate(items):
+        with body.when(number.equals(i)), body.scope():
+            yield item
+
+
+def _usual(piece: Piece, element: Value, table: int) -> Value:
+    """The value that fresh cells of an element have."""
+    return load("f32.load" if piece.is_real else "i32.load", element << 2, table)
 
 
 def _within(value: Value, low: float, high: float) -> Value:

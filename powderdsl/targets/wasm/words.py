@@ -10,7 +10,7 @@ from operator import or_
 
 from powderdsl.ir.ops import Node, ordered
 from powderdsl.schedule.costs import is_coin
-from powderdsl.schedule.types import Compute, alternatives, loaded
+from powderdsl.schedule.types import Compute, alternatives, loaded, reads_of
 from powderdsl.targets.layout import Layout, fixed_key, is_run, param_key
 from powderdsl.targets.printing import Values, drawn_where, limited_draw
 from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, body, const, load, op
@@ -68,8 +68,7 @@ class WordLoop(Loop):
         made = (plane_name(node, library.memory.layout) for node in ordered(values))
         names = (name for name in loaded(values) if name not in olds)
         super().__init__(library, loop, chain(names, filter(None, made), self.mask_names))
-        shifts = (node for node in self.nodes if node.op == "shift" and node.attr[0])
-        self.haloed = list(dict.fromkeys(str(node.args[0].attr) for node in shifts))
+        self.haloed = list(dict.fromkeys(read.name for read in reads_of(values) if read.dy))
         for out, place in zip(loop.outs, self.outs, strict=True):
             if out.into in olds:  # what is overwritten holds the old value
                 self.held[str(out.into)] = place
@@ -82,7 +81,7 @@ class WordLoop(Loop):
         if memory.words == 1:
             with body.each(0, stop, 16) as at:
                 self.at = at
-                self.body(any_flags)
+                self.word(any_flags)
         else:
             y = body.let(0)
             with body.each(0, stop, memory.row) as row:
@@ -90,7 +89,7 @@ class WordLoop(Loop):
                 self.y, self.row, self.x, self.within = y, row, x, within
                 with body.loop() as again:
                     self.at = body.let(row + within)
-                    self.body(any_flags)
+                    self.word(any_flags)
                     x += WORD
                     within += 16
                     body.jump(again, within < memory.row)
@@ -99,7 +98,7 @@ class WordLoop(Loop):
             before = place[SOME] if self.updates else ZERO
             place[SOME] = before | some(any_flag)
 
-    def body(self, any_flags: Sequence[Local]) -> None:
+    def word(self, any_flags: Sequence[Local]) -> None:
         flags = self.memory.flags
         values = WordValues(self)
         with body.scope(), body.block() as skip:
