@@ -9,19 +9,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from powderdsl.analysis.changes import Asked, RuleLine, rule_line
-from powderdsl.model.expressions.operators import (
-    FALSE,
-    TRUE,
-    conjunction,
-    disjunction,
-    look,
-    member,
-    negation,
-)
-from powderdsl.model.logic.satisfy import Facts, Lets
-from powderdsl.model.operations import OPERATIONS
+from powderdsl.model.expressions.operators import FALSE, member
+from powderdsl.model.logic.satisfy import Facts, Lets, satisfiable
 from powderdsl.model.types import (
     ELEMENT,
+    FLAG,
     HERE,
     Expr,
     Move,
@@ -131,63 +123,35 @@ class Lacking:
 
     def __init__(self, asked: Asked, gone: Ids, lets: Lets):
         self.gone = gone
-        self.ids = frozenset(asked.facts.ids) - gone
-        self.facts = replace(asked.facts, ids=tuple(sorted(self.ids)))
-        self.constants: Lets = {}
-        now: Lets = {}
+        facts = replace(asked.facts, ids=tuple(number for number in asked.facts.ids if number not in gone))
+        self.asked = Asked(replace(asked.moment, rules=()), facts, {})
         for name, value in lets.items():
             there = self.rewrite(value)
-            if there.op == "const":
-                self.constants[name] = there
             if name in asked.lets:
-                now[name] = there
-        self.asked = Asked(replace(asked.moment, rules=()), self.facts, now)
+                self.asked.lets[name] = there
+            elif value.kind == FLAG and not self._can(there):
+                self.asked.lets[name] = FALSE  # so it was when it was fixed
+
+    def _can(self, *conditions: Expr) -> bool:
+        """Whether a cell of this world may fulfill these conditions."""
+        facts = self.asked.facts
+        return bool(facts.ids) and satisfiable(facts, [(one, HERE) for one in conditions], self.asked.lets)
 
     def may(self, rule: Rule) -> bool:
         """Whether the rule may happen there."""
-        return bool(self.ids) and self.asked.may(replace(rule, mask=self.rewrite(rule.mask)))
+        return self._can(self.rewrite(rule.mask))
 
     def may_make(self, rule: Rule) -> bool:
         """Whether the rule may bring about an element that the world lacks."""
-        if not isinstance(rule, Transform):
-            left = rule.leaving if isinstance(rule, Move) else None
-            return left is not None and left.value in self.gone and self.may(rule)
-        made = member(self.rewrite(rule.target), tuple(self.gone))
-        there = replace(rule, mask=self.rewrite(rule.mask))
-        return bool(self.ids) and self.asked.may(there, (made, HERE))
+        if isinstance(rule, Transform):
+            made = member(self.rewrite(rule.target), tuple(self.gone))
+            return self._can(self.rewrite(rule.mask), made)
+        left = rule.leaving if isinstance(rule, Move) else None
+        return left is not None and left.value in self.gone and self.may(rule)
 
     def rewrite(self, expr: Expr) -> Expr:
-        """The expression as it is in this world: what asks for these elements is false, a count of them is 0."""
-        args = [self.rewrite(arg) for arg in expr.args]
-        match expr.op:
-            case "let":
-                return self.constants.get(str(expr.value), expr)
-            case "field":
-                limited = self.facts.fields.get(str(expr.value))
-                if limited and limited.of is not None and not limited.of & self.ids:
-                    return Expr("const", expr.kind, value=limited.default)
-            case "member" if _bare(args[0]).op in ("element", "field"):
-                if not expr.value & self.ids:
-                    return FALSE
-                if expr.value >= self.ids:
-                    return TRUE
-            case "not":
-                return negation(args[0])
-            case "and":
-                return conjunction(args)
-            case "or":
-                return disjunction(args)
-            case "look":
-                return look(args[0], expr.value)
-            case "count" if args[0] == FALSE:
-                return _ZERO
-            case "eq" | "lt" | "le" if all(arg.op == "const" and arg.kind.name == "int" for arg in args):
-                evaluate = OPERATIONS[expr.op].evaluate
-                assert evaluate is not None
-                return TRUE if evaluate(*(arg.value for arg in args)) else FALSE
-        return replace(expr, args=tuple(args))
-
-
-def _bare(expr: Expr) -> Expr:
-    """The value that an expression looks at."""
-    return expr.args[0] if expr.op == "look" else expr
+        """The expression as it is in this world: a count of what no cell fulfills is 0."""
+        args = tuple(self.rewrite(arg) for arg in expr.args)
+        if expr.op == "count" and not self._can(*args):
+            return _ZERO
+        return replace(expr, args=args)

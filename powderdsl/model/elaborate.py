@@ -16,7 +16,6 @@ from powderdsl.model.expressions.operators import (
     Absent,
     Broken,
     Matrix,
-    Number,
     Operand,
     Place,
     Poisoned,
@@ -24,6 +23,7 @@ from powderdsl.model.expressions.operators import (
     SetOf,
     Unresolved,
     conjunction,
+    kind_name,
     turned,
 )
 from powderdsl.model.expressions.symbols import default_of, read_kind
@@ -197,7 +197,7 @@ class Elaborator:
         self.typer.start_rule(syntax.span)
         try:
             operand = self.typer.evaluate(syntax, scope)
-            if isinstance(operand, (Number, Place)):
+            if isinstance(operand, Place) or kind_name(operand) == "number":
                 return operand
             value = self.typer.value(operand, syntax.span)
         except Poisoned:
@@ -206,7 +206,6 @@ class Elaborator:
             return Absent(missing.name)
         finally:
             self._empty_lets |= self.typer.empty
-        assert isinstance(value, Expr)
         if value.op == "draw":
             return value  # a stream's draws are fixed for the whole step
         if value.kind.name in ("draw", "chance"):
@@ -380,6 +379,6 @@ def _show(operand: Operand) -> str:
         case Place():
             names = [n for n, o in DIRECTIONS.items() if o == operand.offset]
             return names[0] if names else f"at{operand.offset}".replace(" ", "")
-        case Number():
+        case Expr():
             return str(operand.value)
     return str(getattr(operand, "name", operand))

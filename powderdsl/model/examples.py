@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from fractions import Fraction
-from itertools import chain
+from itertools import chain, product
 from math import lcm
 
 from powderdsl.diagnostics import Label, Reporter, Span, suggest
@@ -18,7 +18,7 @@ from powderdsl.model.expressions.operators import Poisoned, Scope, Unresolved
 from powderdsl.model.expressions.symbols import clamped_number
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.schema import comment_after
-from powderdsl.model.types import CHANCE, Cell, Example, FieldGrid, Kernel, Kind, Often
+from powderdsl.model.types import CHANCE, Cell, Example, FieldGrid, Kernel, Kind, Often, plus
 from powderdsl.syntax.yaml_tree import Scalar
 
 MAX_SIDE = 64
@@ -34,8 +34,15 @@ FORMS = {
 """For each kind: a noun for its words, and how they are written."""
 
 _FLAGS = {"yes": 1, "true": 1, "no": 0, "false": 0}
-_WHOLE = re.compile(r"-?[0-9]{1,7}")
-_NUMBER = re.compile(r"-?[0-9]{1,7}(\.[0-9]{1,20})?([eE][-+]?[0-9]{1,2})?")
+_OCTANTS = {
+    f"{first}.{second}".removesuffix(".here"): OCTANTS.index(plus(DIRECTIONS[first], DIRECTIONS[second]))
+    for first, second in product(DIRECTIONS, repeat=2)
+    if plus(DIRECTIONS[first], DIRECTIONS[second]) in OCTANTS
+}
+"""Directions by their words: `above.right`, rows first, and `right.above`."""
+
+_WHOLE = r"-?[0-9]{1,7}"
+_NUMBER = r"-?[0-9]{1,7}(\.[0-9]{1,20})?([eE][-+]?[0-9]{1,2})?"
 
 Bounds = tuple[float, float]
 """The lowest and the highest value that a word allows: twice the same, but for a range."""
@@ -59,30 +66,23 @@ def read_word(word: str, kind: Kind, ids: Mapping[str, int], *, ranges: bool = F
     Raises:
         WordProblem: it is not a value of this kind.
     """
-    parts = [word]
-    if kind.name == "vec2":
-        parts = (word[1:-1] if word.startswith("(") and word.endswith(")") else word).split(",")
+    table = {"flag": _FLAGS, "element": ids, "direction": _OCTANTS}.get(kind.name)
     values: list[Bounds] = []
-    for part in parts:
-        value: float | None = None
-        if kind.name == "flag":
-            value = _FLAGS.get(part)
-        elif kind.name == "element":
-            value = ids.get(part)
-        elif kind.name == "direction":
-            steps = [DIRECTIONS.get(step) for step in part.split(".")]
-            sums = sum(step[0] for step in steps if step), sum(step[1] for step in steps if step)
-            value = OCTANTS.index(sums) if None not in steps and sums in OCTANTS else None
-        else:
+    if table is not None:
+        parts = [word]
+        values += [(table[word],) * 2] if word in table else []
+    else:
+        parts = [word] if kind.name != "vec2" else word.removeprefix("(").removesuffix(")").split(",")
+        for part in parts:
             low, dots, high = part.partition("..") if ranges else (part, "", "")
-            ends = _number(low, kind), _number(high if dots else low, kind)
-            if ends[0] is not None and ends[1] is not None:
-                if ends[0] > ends[1]:
-                    label, fix = f"{low} is above {high}", f"write `{high}..{low}`"
-                    raise WordProblem("PD402", "a range that runs backwards", label, fix)
-                values.append((ends[0], ends[1]))
-        if value is not None:
-            values.append((value, value))
+            least = _number(low, kind)
+            most = _number(high, kind) if dots else least
+            if least is None or most is None:
+                break
+            if least > most:
+                label, fix = f"{low} is above {high}", f"write `{high}..{low}`"
+                raise WordProblem("PD402", "a range that runs backwards", label, fix)
+            values.append((least, most))
     if not len(values) == len(parts) == 1 + (kind.name == "vec2"):
         noun, form = FORMS[kind.name]
         elements = [name for name in ids if len(name) > 1]
@@ -92,24 +92,21 @@ def read_word(word: str, kind: Kind, ids: Mapping[str, int], *, ranges: bool = F
 
 
 def _number(word: str, kind: Kind) -> float | None:
+    """The number that a word is, if it is one."""
     whole = kind.name == "int"
-    if not (_WHOLE if whole else _NUMBER).fullmatch(word):
+    if not re.fullmatch(_WHOLE if whole else _NUMBER, word):
         return None
     value = Fraction(word)
     if not kind.lo <= value <= kind.hi:
-        label, fix = (
-            f"the range is {kind.lo:g}..{kind.hi:g}",
-            "write a number in this range, or widen it where it is declared",
-        )
+        label = f"the range is {kind.lo:g}..{kind.hi:g}"
+        fix = "write a number in this range, or widen it where it is declared"
         raise WordProblem("PD402", f"{word} lies outside {kind}", label, fix)
     return int(value) if whole else float(clamped_number(value, kind))
 
 
 def direction_word(octant: int) -> str:
     """A direction as drawings have it: `above.right`."""
-    rows, columns = OCTANTS[octant]
-    sides = {name: offset for name, offset in DIRECTIONS.items() if name != "here"}
-    return ".".join(name for name, offset in sides.items() if offset in ((rows, 0), (0, columns)))
+    return next(word for word, number in _OCTANTS.items() if number == octant and not word.startswith("here"))
 
 
 DEFAULT = "."
@@ -169,9 +166,8 @@ class _ExampleReader:
             before, after = (typer.condition(part, scope) for part in change.children)
             part = Fraction(typer.constant(chance, CHANCE, scope))  # type: ignore[arg-type]  # a chance is a fraction
             often.append(Often(before, after, part, change.span))
-        words = sorted(
-            {self.legend[char] for char in "".join([*given, *(expect or ())]) if char in self.legend}
-        )
+        drawn = set("".join((*given, *(expect or ()))))
+        words = sorted(meaning for character, meaning in self.legend.items() if character in drawn)
         words += [grid.name for grid in (*fields, *expect_fields)]
         for syntax in (*decl.always, *(change for change, _ in decl.often)):
             words += words_of(syntax)
@@ -264,13 +260,11 @@ class _ExampleReader:
         self, drawn: Sequence[tuple[Scalar, Scalar]], ids: Mapping[str, int], size: str, *, expected: bool
     ) -> tuple[FieldGrid, ...]:
         """The grids of `fields`, or of `expect_fields`."""
-        grids, failed = [], False
+        grids = []
         for key, scalar in drawn:
-            try:
+            with suppress(Poisoned):
                 grids.append(self._grid(key, scalar, ids, size, expected))
-            except Poisoned:
-                failed = True
-        if failed:
+        if len(grids) < len(drawn):
             raise Poisoned
         return tuple(grids)
 
@@ -281,13 +275,13 @@ class _ExampleReader:
         kind = self._kind(key, name)
         rows = [line.split() for line in scalar.text.splitlines() if line.strip()]
         words = list(chain.from_iterable(rows))
-        content, places = scalar.content, [scalar.span] * len(words)
-        spans = [
+        content = scalar.content
+        places = [
             Span(content.source, content.start + match.start(), content.start + match.end())
             for match in re.finditer(r"\S+", content.text)
         ]
-        if len(spans) == len(words):  # else YAML has changed the text while reading it
-            places = spans
+        if len(places) != len(words):  # YAML has changed the text while reading it
+            places = [scalar.span] * len(words)
         everywhere = len(words) == 1
         if not everywhere and list(map(len, rows)) != list(map(len, self.given)):
             raise self.typer.fail(
@@ -310,9 +304,8 @@ class _ExampleReader:
         if failed:
             raise Poisoned
         if everywhere:
-            cells = tuple((read[words[0]],) * len(row) for row in self.given)
-        else:
-            cells = tuple(tuple(read[word] for word in row) for row in rows)
+            rows = [words * len(row) for row in self.given]
+        cells = tuple(tuple(read[word] for word in row) for row in rows)
         field = self.typer.symbols.fields.get(name)
         if field is not None and field.of is not None and not everywhere and not expected:
             drawing = zip(chain.from_iterable(cells), "".join(self.given), places, strict=True)

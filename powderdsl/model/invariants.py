@@ -14,7 +14,6 @@ from powderdsl.model.expressions.operators import (
     FALSE,
     TRUE,
     Absent,
-    Number,
     Poisoned,
     Scope,
     SetOf,
@@ -187,11 +186,11 @@ class _Statement:
         if call.text == "sum" and len(operands) == 1:
             (operand, span), *_ = operands
             value = typer.value(operand, span)
-            if isinstance(value, Expr) and value.kind.name not in ("int", "flag"):
+            if value.kind.name == "number":
+                raise typer.wrong(value, "something that worlds have", span)
+            if value.kind.name not in ("int", "flag"):
                 fix = "floats are rounded: their sums are constant for no rule"
                 raise typer.wrong(value, "an integer", span, fix)
-            if isinstance(value, Number):
-                raise typer.wrong(value, "something that worlds have", span)
             return Total(value, trend, None)
         flags = [typer.flag(operand, span) for operand, span in operands]
         return Total(self.asked(disjunction(flags, call.span), call.span), trend, None)

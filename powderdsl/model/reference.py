@@ -6,7 +6,9 @@ are int64 here, floats float32 with one rounding an operation, draws float64.
 
 from __future__ import annotations
 
+import functools
 import math
+import operator
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -34,13 +36,12 @@ Array = np.ndarray[Any, Any]
 State = dict[str, Array]
 
 WIDE: dict[str, Any] = {
+    **dict.fromkeys(("int", "element", "direction"), np.int64),
     "flag": np.bool_,
-    "real": np.float32,
-    "vec2": np.float32,
-    "chance": np.float64,
-    "number": np.float64,
+    **dict.fromkeys(("real", "vec2"), np.float32),
+    **dict.fromkeys(("chance", "number"), np.float64),
 }
-"""The dtype in which values of a kind are computed; int64 for other kinds."""
+"""The dtype in which values of a kind are computed."""
 
 
 @dataclass(frozen=True)
@@ -107,11 +108,6 @@ def back(offset: Offset) -> Offset:
     return (-offset[0], -offset[1])
 
 
-def look_or_nothing(value: Array, offset: Offset) -> Array:
-    """Like `look`, but zero outside the grid."""
-    return np.where(inside(value.shape[-2:], offset), look(value, offset), np.zeros((), value.dtype))
-
-
 def inside(shape: tuple[int, ...], offset: Offset) -> Array:
     """bool [H, W]: whether the neighbor lies inside the grid."""
     height, width = shape
@@ -121,17 +117,14 @@ def inside(shape: tuple[int, ...], offset: Offset) -> Array:
 
 def neighborhood(value: Array, kernel: Kernel) -> Array:
     """The weighted sum over a kernel: each row from the left, then the rows from the top."""
-    see = look if kernel.wrap else look_or_nothing
     rows: dict[int, Array] = {}
     for dy, dx, weight in kernel.weights:
-        seen = see(value, (dy, dx))
+        seen = look(value, (dy, dx))
+        if not kernel.wrap:
+            seen = np.where(inside(value.shape[-2:], (dy, dx)), seen, np.zeros((), value.dtype))
         term = seen if weight == 1 else seen * value.dtype.type(weight)
         rows[dy] = rows[dy] + term if dy in rows else term
-    totals = list(rows.values())
-    result = totals[0] if totals else np.zeros_like(value)
-    for total in totals[1:]:
-        result = result + total
-    return result
+    return functools.reduce(operator.add, rows.values()) if rows else np.zeros_like(value)
 
 
 # Expressions
@@ -188,19 +181,6 @@ def evaluate(expr: Expr, at: Context) -> Array:
         return np.asarray(_OPS[expr.op](expr, at, *args))
 
 
-def _constant(expr: Expr, at: Context) -> Array:
-    return _as_kind(expr.kind.name, expr.value, at.shape)
-
-
-def _as_kind(kind: str, value: Any, shape: tuple[int, ...]) -> Array:
-    return np.broadcast_to(np.asarray(value, WIDE.get(kind, np.int64)), shape)
-
-
-def _parameter(expr: Expr, at: Context) -> Array:
-    value = at.params[str(expr.value)]
-    return np.broadcast_to(value[:, None, None], at.shape)
-
-
 def _property(expr: Expr, at: Context) -> Array:
     prop = at.ruleset.property(str(expr.value))
     assert prop is not None
@@ -214,7 +194,7 @@ def _of_elements(prop: Property, ids: Array, at: Context) -> Array:
     plain = (float(value) if isinstance(value, Fraction) else value for value in prop.values)
     numbers = [0 if isinstance(value, str) else value for value in plain]
     numbers += [0] * (256 - len(numbers))
-    result = np.asarray(numbers, WIDE.get(prop.kind.name, np.int64))[ids]
+    result = np.asarray(numbers, WIDE[prop.kind.name])[ids]
     for identity, value in enumerate(prop.values):
         if isinstance(value, str):
             result = np.where(ids == identity, at.params[value][:, None, None], result)
@@ -240,13 +220,9 @@ def _coordinate(expr: Expr, at: Context) -> Array:
     return np.broadcast_to(values[name] % modulus, at.shape)
 
 
-def _member(expr: Expr, at: Context, ids: Array) -> Array:
-    return np.isin(ids, sorted(expr.value))
-
-
 _OPS: dict[str, Any] = {
-    "const": _constant,
-    "param": _parameter,
+    "const": lambda e, at: np.broadcast_to(np.asarray(e.value, WIDE[e.kind.name]), at.shape),
+    "param": lambda e, at: np.broadcast_to(at.params[e.value][:, None, None], at.shape),
     "element": lambda e, at: at.state["element"],
     "property": _property,
     "field": lambda e, at: at.state[e.value],
@@ -255,7 +231,7 @@ _OPS: dict[str, Any] = {
     "coordinate": _coordinate,
     "inside": lambda e, at: np.broadcast_to(inside(at.shape[1:], e.value), at.shape),
     "look": lambda e, at, a: look(a, e.value),
-    "member": _member,
+    "member": lambda e, at, a: np.isin(a, sorted(e.value)),
     "not": lambda e, at, a: ~a,
     "and": lambda e, at, a, b: a & b,
     "or": lambda e, at, a, b: a | b,
@@ -508,13 +484,13 @@ def run_pass(pass_: Pass, at: Context, table: Mapping[str, Slot]) -> State:
 def _fresh(slot: Slot, shape: tuple[int, int, int]) -> Array:
     batch, height, width = shape
     whole = (batch, 2, height, width) if slot.planes == 2 else shape
-    return _default(slot, np.zeros(whole, WIDE.get(slot.kind.name, np.int64))).copy()
+    return _default(slot, np.zeros(whole, WIDE[slot.kind.name])).copy()
 
 
 def widened(ruleset: Ruleset, state: Mapping[str, Array]) -> State:
     """The slots of a state in the dtypes that steps compute in."""
     kinds = {slot.name: slot.kind.name for slot in slots(ruleset)}
-    return {name: value.astype(WIDE.get(kinds[name], np.int64)) for name, value in state.items()}
+    return {name: value.astype(WIDE[kinds[name]]) for name, value in state.items()}
 
 
 def parameters(ruleset: Ruleset, batch: int, given: Mapping[str, Any]) -> dict[str, Array]:
@@ -522,7 +498,7 @@ def parameters(ruleset: Ruleset, batch: int, given: Mapping[str, Any]) -> dict[s
     return {
         param.name: np.broadcast_to(
             np.asarray(given.get(param.name, float(param.default)), np.float64), (batch,)
-        ).astype(WIDE.get(param.kind.name, np.int64))
+        ).astype(WIDE[param.kind.name])
         for param in ruleset.params
     }
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from fractions import Fraction
 from functools import reduce
 from itertools import pairwise
 
 from powderdsl.diagnostics import Span, suggest
-from powderdsl.model.expressions.operators import Number, Operand, Poisoned, Scope, SetOf, Unresolved
+from powderdsl.model.expressions.operators import Operand, Poisoned, Scope, SetOf, Unresolved, number
 from powderdsl.model.expressions.symbols import read_number
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.operations import COMPARISONS
@@ -51,7 +50,7 @@ class GoalChecker:
     knobs: Mapping[str, int]
 
     def __post_init__(self) -> None:
-        names: dict[str, Operand] = {name: Number(Fraction(value)) for name, value in self.knobs.items()}
+        names: dict[str, Operand] = {name: number(value) for name, value in self.knobs.items()}
         names |= {name: Expr("let", FLAG, value=REGION_LET + name) for name in sorted(self.regions)}
         self.scope = Scope("", names)
 
@@ -216,7 +215,7 @@ class GoalChecker:
             found = self.typer.flag(operand, syntax.span)
         else:
             value = self.typer.value(operand, syntax.span)
-            if isinstance(value, Number) or value.kind.name not in ("int", "flag", "real"):
+            if value.kind.name not in ("int", "flag", "real"):
                 raise self.typer.wrong(value, "a number of each cell", syntax.span, "such as a field")
             found = value
         if any(part.op == "draw" for part in found.walk()):

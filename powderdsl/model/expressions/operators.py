@@ -62,13 +62,6 @@ class PlaceChoice:
 
 
 @dataclass(frozen=True)
-class Number:
-    """An exact constant."""
-
-    value: Fraction
-
-
-@dataclass(frozen=True)
 class Bounds:
     """`lo..hi`, both included."""
 
@@ -95,9 +88,7 @@ class Broken:
     """A name whose definition has been reported: using it is not a second mistake."""
 
 
-Operand = Expr | SetOf | Place | PlaceChoice | Number | Bounds | Items | Kernel | Absent | Broken
-Value = Expr | Number
-"""Operands that arithmetic and comparisons work on."""
+Operand = Expr | SetOf | Place | PlaceChoice | Bounds | Items | Kernel | Absent | Broken
 
 
 class Poisoned(Exception):
@@ -139,6 +130,11 @@ def turned(offset: Offset, matrix: Matrix) -> Offset:
 
 ELEMENT_HERE = Expr("element", ELEMENT)
 TRUE, FALSE = Expr("const", FLAG, value=1), Expr("const", FLAG, value=0)
+
+
+def number(value: float | Fraction) -> Expr:
+    """An exact constant, of no kind until something takes it."""
+    return Expr("const", NUMBER, value=Fraction(value))
 
 
 def look(value: Expr, offset: Offset, span: Span | None = None) -> Expr:
@@ -192,7 +188,7 @@ def _joined(op: str, values: list[Expr], span: Span | None) -> Expr:
     return result
 
 
-Placed = tuple[Value, Span]
+Placed = tuple[Expr, Span]
 """A value and where it stands."""
 
 MAX_MODULUS = 64
@@ -203,27 +199,35 @@ def kind_name(value: Operand | None) -> str:
     return value.kind.name if isinstance(value, Expr) else ""
 
 
-def is_integer(value: Value) -> bool:
+def is_integer(value: Expr) -> bool:
     """Whether a value is an integer, or a constant that is one."""
-    return value.value.denominator == 1 if isinstance(value, Number) else value.kind.name == "int"
+    return value.value.denominator == 1 if value.kind == NUMBER else value.kind.name == "int"
 
 
 def whole_constant(operand: Operand) -> int | None:
     """The integer that an operand is, if it is a constant one."""
-    return int(operand.value) if isinstance(operand, Number) and is_integer(operand) else None
+    if isinstance(operand, Expr) and operand.kind == NUMBER and is_integer(operand):
+        return int(operand.value)
+    return None
 
 
-def arithmetic(typer: Typer, op: str, values: Sequence[Placed], span: Span) -> Value:
-    """An operation on numbers: constants are folded, integers stay integers, all else becomes floats."""
+def arithmetic(typer: Typer, op: str, values: Sequence[Placed], span: Span) -> Expr:
+    """An operation on numbers: constants are folded, integers stay integers, all else becomes floats.
+
+    An integer added to a draw, or subtracted from it, shifts its range.
+    """
     row = OPERATIONS[op]
-    numbers = [value.value for value, _ in values if isinstance(value, Number)]
-    if row.evaluate is not None and len(numbers) == len(values):
-        return Number(Fraction(row.evaluate(*numbers)))
-    if all(is_integer(value) for value, _ in values):
-        args = tuple(typer.of_kind(value, INTEGER, place) for value, place in values)
+    kinds = [value.kind.name for value, _ in values]
+    if row.evaluate is not None and {*kinds} == {"number"}:
+        return number(row.evaluate(*(value.value for value, _ in values)))
+    shifts = sorted(kinds) in (["draw", "int"], ["draw", "number"]) and (
+        op == "add" or (op == "sub" and kinds[0] == "draw")
+    )
+    if shifts or all(is_integer(value) for value, _ in values):
+        args = tuple(v if v.kind.name == "draw" else typer.of_kind(v, INTEGER, place) for v, place in values)
         bounds = row.between(*((arg.kind.lo, arg.kind.hi) for arg in args))
         if bounds is not None:
-            return Expr(op, integer(*bounds), args, span=span)
+            return Expr(op, Kind("draw" if shifts else "int", *bounds), args, span=span)
     return Expr(op, REAL, tuple(typer.of_kind(value, REAL, place) for value, place in values), span=span)
 
 
@@ -246,9 +250,9 @@ def compare(typer: Typer, sign: str, left: Placed, right: Placed, span: Span) ->
     (a, _), (b, _) = left, right
     op = COMPARISONS[sign]
     evaluate = OPERATIONS[op].evaluate
-    if evaluate is not None and isinstance(a, Number) and isinstance(b, Number):
+    if evaluate is not None and a.kind == b.kind == NUMBER:
         return TRUE if evaluate(a.value, b.value) else FALSE
-    kinds = {kind_name(value) for value in (a, b)} - {""}
+    kinds = {value.kind.name for value in (a, b)} - {"number"}
     if "draw" in kinds:
         return _compare_draw(typer, op, left, right, span)
     if kinds & {"element", "direction", "flag", "vec2"}:
@@ -258,23 +262,23 @@ def compare(typer: Typer, sign: str, left: Placed, right: Placed, span: Span) ->
         # A bound such as 1.5 is rounded to the integer that means the same.
         if op == "eq" and not (is_integer(a) and is_integer(b)):
             return FALSE
-        if isinstance(a, Number) and not is_integer(a):
-            a = Number(Fraction(floor(a.value) + (op == "le")))
-        elif isinstance(b, Number) and not is_integer(b):
-            b = Number(Fraction(ceil(b.value) - (op == "le")))
+        if not is_integer(a):
+            a = number(floor(a.value) + (op == "le"))
+        elif not is_integer(b):
+            b = number(ceil(b.value) - (op == "le"))
     return Expr(op, FLAG, tuple(typer.of_kind(value, kind, span) for value in (a, b)), span=span)
 
 
 def _compare_discrete(typer: Typer, op: str, left: Placed, right: Placed, span: Span) -> Expr:
     for (value, _), (other, place) in ((left, right), (right, left)):
-        if isinstance(value, Expr) and value.kind in _COMPARABLE:
+        if value.kind in _COMPARABLE:
             words, fix = _COMPARABLE[value.kind]
-            if not isinstance(other, Expr) or other.kind != value.kind:
+            if other.kind != value.kind:
                 raise typer.wrong(other, f"{words} to compare with {words}", place, fix)
             if op != "eq":
                 message = f"{words} is not more or less than another"
                 raise typer.fail("PD401", message, span, "has no order", "use `==` or `!=`")
-            return Expr(op, FLAG, (left[0], right[0]), span=span)  # type: ignore[arg-type]  # both are Expr: see above
+            return Expr(op, FLAG, (left[0], right[0]), span=span)
     fix = "compare `length(…)`, or `.row` and `.column`"
     raise typer.fail("PD401", "vectors are not compared", span, "one side is a vector", fix)
 
@@ -283,12 +287,11 @@ def _compare_draw(typer: Typer, op: str, left: Placed, right: Placed, span: Span
     if op == "eq":
         message, fix = "a draw never equals anything exactly", "compare with `<` or `>`"
         raise typer.fail("PD401", message, span, "always false", fix)
-    first = kind_name(left[0]) == "draw"
+    first = left[0].kind.name == "draw"
     (draw, _), (other, place) = (left, right) if first else (right, left)
-    assert isinstance(draw, Expr)
-    if kind_name(other) == "draw":
+    if other.kind.name == "draw":
         raise typer.fail("PD401", "two draws are not compared", span, "one side must be a number")
-    if isinstance(other, Number):
+    if other.kind == NUMBER:
         if not draw.kind.lo <= other.value <= draw.kind.hi:
             if (draw.kind.lo, draw.kind.hi) == (0, 1):
                 shown = f"{float(other.value):g}"
@@ -296,7 +299,7 @@ def _compare_draw(typer: Typer, op: str, left: Placed, right: Placed, span: Span
                 message, label = f"a draw compared with {shown}", "draws lie between 0 and 1"
                 raise typer.fail("PD403", message, place, label, f"did you mean {fix}?")
             return TRUE if (other.value > draw.kind.hi) == first else FALSE
-        kind = CHANCE if 0 <= other.value <= 1 else Kind("number")
+        kind = CHANCE if 0 <= other.value <= 1 else NUMBER
         _check_resolution(typer, draw, other.value, place)
         other = Expr("const", kind, value=other.value, span=span)
     if other.kind.name == "real":
@@ -332,29 +335,23 @@ def holds(typer: Typer, left: Operand, right: Operand, syntax: Syntax) -> Expr:
     match left, right:
         case Place(), Place():
             return TRUE if left == right else FALSE
-        case Place(), Items() if all(isinstance(item, Place) for item in right.items):
-            return TRUE if left in right.items else FALSE
         case Place(), Expr() if right.kind == FLAG:
             return look(right, left.offset, span)
-        case Number(), Number():
+        case Expr(), Expr() if left.kind == right.kind == NUMBER:
             return TRUE if left == right else FALSE
         case SetOf(), SetOf() if left.name is not None:
             return TRUE if left.ids[0] in right.ids else FALSE
-        case (PlaceChoice(), Place() | PlaceChoice()) | (Place(), PlaceChoice()):
+        case (Expr() | Place() | PlaceChoice(), Place() | PlaceChoice()) | (_, Expr(kind=Kind("direction"))):
             one, other = typer.of_kind(left, DIRECTION, first), typer.of_kind(right, DIRECTION, second)
             return compare(typer, "==", (one, span), (other, span), span)
-        case Expr(), Place() | PlaceChoice():
-            return compare(typer, "==", (left, span), (typer.of_kind(right, DIRECTION, second), span), span)
-        case _, Expr() if right.kind == DIRECTION:
-            return compare(typer, "==", (typer.of_kind(left, DIRECTION, first), span), (right, span), span)
         case _, Bounds():
             value = (typer.value(left, first), span)
-            low, high = ((Number(Fraction(bound)), span) for bound in (right.lo, right.hi))
+            low, high = (number(right.lo), span), (number(right.hi), span)
             parts = [compare(typer, "<=", low, value, span), compare(typer, "<=", value, high, span)]
             return conjunction(parts, span)
         case _, Items() if any(_stands_alone(item) for item in right.items):
             return disjunction([_equals(typer, left, item, syntax) for item in right.items], span)
-        case _, Number():
+        case _, Expr() if right.kind == NUMBER:
             raise _not_a_set(typer, syntax)
         case _, Absent():
             return FALSE
@@ -368,12 +365,12 @@ def holds(typer: Typer, left: Operand, right: Operand, syntax: Syntax) -> Expr:
 
 def _stands_alone(item: Operand) -> bool:
     """Whether an item of a list is compared by itself: numbers and directions. The others join to a set of elements."""
-    return isinstance(item, (Number, Place)) or kind_name(item) == "direction"
+    return isinstance(item, Place) or kind_name(item) in ("number", "direction")
 
 
 def _equals(typer: Typer, left: Operand, item: Operand, syntax: Syntax) -> Expr:
     """Whether `left` is one item of a list: numbers are compared, places and elements named."""
-    if isinstance(item, Number) and not isinstance(left, Number):
+    if isinstance(item, Expr) and item.kind == NUMBER and kind_name(left) != "number":
         value = typer.value(left, syntax.children[0].span)
         return compare(typer, "==", (value, syntax.span), (item, syntax.span), syntax.span)
     return holds(typer, left, item, syntax)
@@ -392,77 +389,48 @@ def _not_a_set(typer: Typer, syntax: Syntax) -> Poisoned:
 # Arithmetic
 
 
-def binary(typer: Typer, syntax: Syntax, left: Value, right: Value) -> Value:
-    """`+ - * /` on numbers and vectors."""
+def calculation(typer: Typer, syntax: Syntax, scope: Scope) -> Expr:
+    """`+ - * / div` on numbers and vectors. `a div b` divides integers, rounded down; 0 where b is 0."""
+    return _calculated(typer, syntax, [typer.value_of(child, scope) for child in syntax.children])
+
+
+def _calculated(typer: Typer, syntax: Syntax, values: Sequence[Expr]) -> Expr:
     op, span = syntax.kind, syntax.span
-    kinds = [kind_name(value) for value in (left, right)]
-    for value, kind, child in zip((left, right), kinds, syntax.children, strict=True):
-        if kind in ("flag", "element", "direction"):
-            raise typer.wrong(value, "a number", child.span)
-    _check_divisor(typer, op, right, syntax)
-    if "vec2" in kinds:
-        return _on_vectors(typer, op, left, right, span)
-    # An integer added to a draw, or subtracted from it, shifts its range.
-    shifts = op == "add" or (op == "sub" and kinds[0] == "draw")
-    if shifts and sorted(kinds) in (["", "draw"], ["draw", "int"]):
-        args = tuple(
-            value if isinstance(value, Expr) else typer.of_kind(value, INTEGER, span)
-            for value in (left, right)
-        )
-        bounds = OPERATIONS[op].between(*((arg.kind.lo, arg.kind.hi) for arg in args))
-        assert bounds is not None
-        return Expr(op, Kind("draw", *bounds), args, span=span)
-    result = arithmetic(typer, op, [(left, span), (right, span)], span)
-    if isinstance(result, Number):
-        if abs(result.value) > 10**6 or result.value.denominator > 10**18:
-            raise typer.fail("PD402", "a constant out of reach", span, "numbers go up to 1,000,000")
-        return result
-    return typer.bounded(result, span)
-
-
-def _check_divisor(typer: Typer, op: str, divisor: Value, syntax: Syntax) -> None:
-    zero = divisor.value == 0 if isinstance(divisor, Number) else divisor.op == "const" and divisor.value == 0
-    if op in ("div", "quotient") and zero:
+    placed: list[Placed] = []
+    for value, child in zip(values, syntax.children, strict=True):
+        if value.kind in _COMPARABLE:
+            helps = ["an item of a list has a blank after its `-`"] if op == "neg" else []
+            raise typer.wrong(value, "a number", child.span, *helps)
+        if op == "quotient" and value.kind.name == "real":
+            raise typer.wrong(value, "an integer", child.span, "`div` divides integers; for floats say `/`")
+        if op == "quotient" and not is_integer(value):
+            value = typer.of_kind(value, INTEGER, child.span)
+        placed.append((value, child.span))
+    if op in ("div", "quotient") and values[1].op == "const" and values[1].value == 0:
         raise typer.fail("PD402", "division by zero", syntax.children[1].span, "this is 0")
+    if any(value.kind.name == "vec2" for value in values):
+        return _on_vectors(typer, op, placed, span)
+    result = arithmetic(typer, op, placed, span)
+    if result.kind != NUMBER:
+        return typer.bounded(result, span)
+    if abs(result.value) > 10**6 or result.value.denominator > 10**18:
+        raise typer.fail("PD402", "a constant out of reach", span, "numbers go up to 1,000,000")
+    return result
 
 
-def _on_vectors(typer: Typer, op: str, left: Value, right: Value, span: Span) -> Expr:
-    first, second = (kind_name(value) == "vec2" for value in (left, right))
-    if op in ("add", "sub") and not (first and second):
+def _on_vectors(typer: Typer, op: str, values: Sequence[Placed], span: Span) -> Expr:
+    vectors = [value.kind.name == "vec2" for value, _ in values]
+    if op in ("add", "sub") and not all(vectors):
         message, fix = "a vector adds up with vectors only", "write `vector(rows, columns)`"
         raise typer.fail("PD401", message, span, "one side is not a vector", fix)
-    if (op == "mul" and first and second) or (op == "div" and second):
+    if (op == "mul" and all(vectors)) or (op == "div" and vectors[1]):
         message = "a vector is multiplied or divided by a number"
         raise typer.fail("PD401", message, span, "the other way round, or two vectors")
-    args = (
-        value if kind_name(value) == "vec2" else typer.of_kind(value, REAL, span) for value in (left, right)
-    )
-    return Expr(op, VEC2, tuple(args), span=span)  # type: ignore[arg-type]  # vectors, or made real
+    args = (typer.of_kind(v, VEC2 if v.kind.name == "vec2" else REAL, place) for v, place in values)
+    return Expr(op, VEC2, tuple(args), span=span)
 
 
-def negate(typer: Typer, syntax: Syntax, scope: Scope) -> Value:
-    value, span = typer.value_of(syntax.children[0], scope), syntax.span
-    if isinstance(value, Expr) and value.kind.name == "vec2":
-        return Expr("neg", VEC2, (value,), span=span)
-    if kind_name(value) in ("element", "flag"):
-        raise typer.wrong(value, "a number", span, "an item of a list has a blank after its `-`")
-    return arithmetic(typer, "neg", [(value, span)], span)
-
-
-def quotient(typer: Typer, syntax: Syntax, scope: Scope) -> Value:
-    """`a div b`: integers, rounded down; 0 where b is 0."""
-    values: list[Placed] = []
-    for child in syntax.children:
-        value = typer.value_of(child, scope)
-        if kind_name(value) == "real":
-            raise typer.wrong(value, "an integer", child.span, "`div` divides integers; for floats say `/`")
-        whole = typer.of_kind(value, INTEGER, child.span)
-        values.append((Number(Fraction(whole.value)) if whole.op == "const" else whole, child.span))
-    _check_divisor(typer, "quotient", values[1][0], syntax)
-    return arithmetic(typer, "quotient", values, syntax.span)
-
-
-def modulo(typer: Typer, syntax: Syntax, scope: Scope) -> Value:
+def modulo(typer: Typer, syntax: Syntax, scope: Scope) -> Expr:
     """`x mod n` for an integer constant n; coordinates (and their sums) may only appear here."""
     left, right = syntax.children
     modulus = whole_constant(typer.evaluate(right, scope))
@@ -470,25 +438,24 @@ def modulo(typer: Typer, syntax: Syntax, scope: Scope) -> Value:
         label = f"expected 1 to {MAX_MODULUS}"
         raise typer.fail("PD405", "`mod` takes an integer constant", right.span, label)
     value = _coordinate_sum(typer, left, modulus, scope)
-    if isinstance(value, Number):
-        if not is_integer(value):
-            raise typer.fail("PD401", "`mod` takes integers", left.span)
-        return Number(value.value % modulus)
-    return Expr("mod", integer(0, modulus - 1), (value,), modulus, syntax.span)
+    if value.kind != NUMBER:
+        return Expr("mod", integer(0, modulus - 1), (value,), modulus, syntax.span)
+    if not is_integer(value):
+        raise typer.fail("PD401", "`mod` takes integers", left.span)
+    return number(value.value % modulus)
 
 
-def _coordinate_sum(typer: Typer, syntax: Syntax, modulus: int, scope: Scope) -> Value:
+def _coordinate_sum(typer: Typer, syntax: Syntax, modulus: int, scope: Scope) -> Expr:
     """Sums of coordinates, each reduced by the modulus, so that every part has a small declared range."""
     if syntax.kind == "name" and syntax.text in COORDINATES:
         return Expr("coordinate", integer(0, modulus - 1), (), (syntax.text, modulus), syntax.span)
     if syntax.kind in ("add", "sub"):
-        return binary(
-            typer, syntax, *[_coordinate_sum(typer, part, modulus, scope) for part in syntax.children]
-        )
+        parts = [_coordinate_sum(typer, part, modulus, scope) for part in syntax.children]
+        return _calculated(typer, syntax, parts)
     if syntax.kind == "quotient" and _names_coordinate(syntax.children[0]):
         return _coordinate_quotient(typer, syntax, modulus, scope)
     value = typer.value_of(syntax, scope)
-    return value if isinstance(value, Number) else typer.of_kind(value, INTEGER, syntax.span)
+    return value if value.kind == NUMBER else typer.of_kind(value, INTEGER, syntax.span)
 
 
 def _names_coordinate(syntax: Syntax) -> bool:
@@ -502,13 +469,13 @@ def _coordinate_quotient(typer: Typer, syntax: Syntax, modulus: int, scope: Scop
     """`row div n` under `mod m`: what `row mod (n · m)` says, divided by n."""
     left, right = syntax.children
     most = MAX_MODULUS // modulus
-    number = whole_constant(typer.evaluate(right, scope))
-    if number is None or not 1 <= number <= most:
+    divisor = whole_constant(typer.evaluate(right, scope))
+    if divisor is None or not 1 <= divisor <= most:
         label = f"expected 1 to {most}: times {modulus} it is at most {MAX_MODULUS}"
         raise typer.fail("PD405", "a coordinate is divided by an integer constant", right.span, label)
-    inner = typer.of_kind(_coordinate_sum(typer, left, modulus * number, scope), INTEGER, left.span)
-    known = Expr("mod", integer(0, modulus * number - 1), (inner,), modulus * number, left.span)
-    by = typer.of_kind(Number(Fraction(number)), INTEGER, right.span)
+    inner = typer.of_kind(_coordinate_sum(typer, left, modulus * divisor, scope), INTEGER, left.span)
+    known = Expr("mod", integer(0, modulus * divisor - 1), (inner,), modulus * divisor, left.span)
+    by = typer.of_kind(number(divisor), INTEGER, right.span)
     return Expr("quotient", integer(0, modulus - 1), (known, by), span=syntax.span)
 
 
@@ -519,16 +486,15 @@ def choose(
     if isinstance(yes[0], (Place, PlaceChoice)) and isinstance(no[0], (Place, PlaceChoice)):
         return PlaceChoice(condition, yes[0], no[0])
     a, b = typer.value(*yes), typer.value(*no)
-    kinds = {kind_name(value) or "number" for value in (a, b)}
-    numbers = [value.value for value in (a, b) if isinstance(value, Number)]
+    kinds = {value.kind.name for value in (a, b)}
     if is_integer(a) and is_integer(b):
         kind = INTEGER
-    elif kinds <= {"chance", "number"} and all(0 <= number <= 1 for number in numbers):
+    elif kinds <= {"chance", "number"} and all(v.kind == CHANCE or 0 <= v.value <= 1 for v in (a, b)):
         kind = CHANCE
     elif kinds <= {"int", "number", "real", "chance", "draw"}:
         kind = REAL
     else:  # a place is an element or a direction, whichever the other value is
-        kind = next(o for o in (yes[0], no[0], a, b) if isinstance(o, Expr)).kind
+        kind = next(o for o in (yes[0], no[0], a, b) if isinstance(o, Expr) and o.kind != NUMBER).kind
     first, second = typer.of_kind(yes[0], kind, yes[1]), typer.of_kind(no[0], kind, no[1])
     if kind == INTEGER:
         kind = integer(min(first.kind.lo, second.kind.lo), max(first.kind.hi, second.kind.hi))
@@ -643,18 +609,17 @@ def _neighborhood(typer: Typer, syntax: Syntax, scope: Scope) -> Expr:
     kernel = kernel or KERNELS["box"]
     if syntax.text == "sum":
         value = typer.value_of(arguments[0], scope)
-        match kind_name(value):
+        match value.kind.name:
             case "int":
-                assert isinstance(value, Expr)
                 kind = _sum_range(kernel, value.kind.lo, value.kind.hi)
                 return typer.bounded(Expr("sum", kind, (value,), kernel, span), span)
             case "vec2":
-                return Expr("sum", VEC2, (value,), kernel, span)  # type: ignore[arg-type]  # a vector is an Expr
+                return Expr("sum", VEC2, (value,), kernel, span)
             case "flag":
                 flags = [typer.flag(value, span)]
             case _:
-                number = typer.of_kind(value, REAL, arguments[0].span)
-                return Expr("sum", REAL, (number,), kernel, span)
+                value = typer.of_kind(value, REAL, arguments[0].span)
+                return Expr("sum", REAL, (value,), kernel, span)
     else:
         flags = [typer.condition(argument, scope) for argument in arguments]
     return Expr("count", _sum_range(kernel, 0, 1), (disjunction(flags, span),), kernel, span)
@@ -715,22 +680,11 @@ def _pick(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
         raise typer.wrong(draw, "a random draw", first.span, fix)
     operands = [(typer.evaluate(child, scope), child.span) for child in children]
     result, place = operands[-1]
-    for number in range(len(operands) - 1, 0, -1):
-        limit = Number(Fraction(number, len(operands)))
+    for rank in range(len(operands) - 1, 0, -1):
+        limit = number(Fraction(rank, len(operands)))
         below = compare(typer, "<", (draw, first.span), (limit, first.span), syntax.span)
-        result = choose(typer, below, operands[number - 1], (result, place), syntax.span)
+        result = choose(typer, below, operands[rank - 1], (result, place), syntax.span)
     return result
-
-
-def _clamp(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
-    operands: list[Placed] = [(typer.value_of(child, scope), child.span) for child in syntax.children]
-    room = arithmetic(typer, "sub", [operands[2], operands[1]], syntax.span)
-    if (room.value if isinstance(room, Number) else room.kind.hi) < 0:
-        words = [child.span.text for child in syntax.children]
-        message, label = "the bounds of `clamp` are the wrong way round", "below the other bound"
-        fix = f"write `clamp({words[0]}, {words[2]}, {words[1]})`"
-        raise typer.fail("PD406", message, syntax.children[2].span, label, fix)
-    return _meant(typer, FUNCTIONS["clamp"], operands, syntax.span)
 
 
 CALLS: dict[str, Call] = {
@@ -738,6 +692,5 @@ CALLS: dict[str, Call] = {
     "at": _at,
     **dict.fromkeys(_QUARTERS, _turned),
     "pick": _pick,
-    "clamp": _clamp,
 }
 """Functions whose arguments need more than to be of a kind."""

@@ -22,7 +22,6 @@ from powderdsl.model.expressions.operators import (
     Bounds,
     Broken,
     Items,
-    Number,
     Operand,
     Place,
     PlaceChoice,
@@ -30,8 +29,7 @@ from powderdsl.model.expressions.operators import (
     Scope,
     SetOf,
     Unresolved,
-    Value,
-    binary,
+    calculation,
     call,
     choose,
     compare,
@@ -42,9 +40,8 @@ from powderdsl.model.expressions.operators import (
     look,
     member,
     modulo,
-    negate,
     negation,
-    quotient,
+    number,
     turned,
 )
 from powderdsl.model.expressions.symbols import UnknownNames, number_value, read_bounds, read_number
@@ -63,6 +60,7 @@ from powderdsl.model.types import (
     Kind,
     Offset,
     integer,
+    plus,
 )
 from powderdsl.model.types import Value as Constant
 from powderdsl.syntax.ast import Syntax
@@ -100,7 +98,6 @@ _HELPS: dict[str, tuple[str, ...]] = {
 _OPERANDS: dict[type, str] = {
     Place: "a place",
     PlaceChoice: "a choice of places",
-    Number: "a number",
     Bounds: "a range",
     Items: "a list",
     Kernel: "a kernel",
@@ -161,7 +158,7 @@ class Typer:
     def condition(self, syntax: Syntax, scope: Scope) -> Expr:
         return self.flag(self.evaluate(syntax, scope), syntax.span)
 
-    def value_of(self, syntax: Syntax, scope: Scope) -> Value:
+    def value_of(self, syntax: Syntax, scope: Scope) -> Expr:
         return self.value(self.evaluate(syntax, scope), syntax.span)
 
     def constant(self, syntax: Syntax, kind: Kind, scope: Scope) -> Constant:
@@ -192,8 +189,6 @@ class Typer:
 
     def wrong(self, operand: Operand, wanted: str, span: Span, *helps: str) -> Poisoned:
         """Report an operand of the wrong kind; the exception to raise after it."""
-        if isinstance(operand, Broken):
-            return Poisoned()
         secondary: tuple[Label, ...] = ()
         if isinstance(operand, Expr) and operand.op == "let" and operand.span not in (None, span):
             assert operand.span is not None
@@ -239,10 +234,10 @@ class Typer:
             raise Unresolved(operand.name)
         raise self.wrong(operand, "a neighbor", span, "such as `below`, `above.left`, or `at(2, -1)`")
 
-    def value(self, operand: Operand, span: Span) -> Expr | Number:
+    def value(self, operand: Operand, span: Span) -> Expr:
         """A runtime value or a number, as arithmetic and comparisons need."""
         match operand:
-            case Expr() | Number():
+            case Expr():
                 return operand
             case SetOf(_, None):
                 return self.flag(operand, span)
@@ -253,7 +248,7 @@ class Typer:
     def of_kind(self, operand: Operand, kind: Kind, span: Span) -> Expr:
         """A value of a kind, as arguments and fields need it. Constants out of its range are reported."""
         match kind.name, operand:
-            case "flag", Number() if operand.value in (0, 1):
+            case "flag", Expr(kind=Kind(name="number")) if operand.value in (0, 1):
                 return Expr("const", FLAG, value=int(operand.value), span=span)
             case "flag", _:
                 return self.flag(operand, span)
@@ -273,12 +268,10 @@ class Typer:
                     raise self.fail("PD401", "not a direction", span, "directions are the eight neighbors")
                 return Expr("const", DIRECTION, value=OCTANTS.index(operand.offset), span=span)
         value = operand if kind.name in ("element", "direction") else self.value(operand, span)
-        if isinstance(value, Number):
-            return self._constant(value.value, kind, span)
         helps = _HELPS.get(kind.name, ())
         if isinstance(value, Expr):
             source = value.kind.name
-            if source == kind.name == "int" and value.op == "const":
+            if source == "number" or (source == kind.name == "int" and value.op == "const"):
                 return self._constant(Fraction(value.value), kind, span)
             if source == kind.name or (source == "real" and kind.name == "chance"):
                 return value
@@ -291,34 +284,34 @@ class Typer:
             helps = _integer_helps(value, span) if kind.name == "int" else helps
         raise self.wrong(value, "a number" if kind.name == "real" else _KINDS[kind.name], span, *helps)
 
-    def _constant(self, number: Fraction, kind: Kind, span: Span) -> Expr:
+    def _constant(self, value: Fraction, kind: Kind, span: Span) -> Expr:
         """A number written in a rule, as a constant of a kind."""
         match kind.name:
-            case "vec2" if number == 0:
+            case "vec2" if value == 0:
                 zero = Expr("const", REAL, value=0.0, span=span)
                 return Expr("vector", VEC2, (zero, zero), span=span)
-            case "chance" if 0 <= number <= 1:
-                return Expr("const", CHANCE, value=number, span=span)
+            case "chance" if 0 <= value <= 1:
+                return Expr("const", CHANCE, value=value, span=span)
             case "chance":
                 fix = "write a chance from `0%` to `100%`"
-                if 1 < number <= 100 and "%" not in span.text:
-                    fix = f"did you mean `{float(number):g}%`?"
-                message = f"a chance of {float(number * 100):g}%"
+                if 1 < value <= 100 and "%" not in span.text:
+                    fix = f"did you mean `{float(value):g}%`?"
+                message = f"a chance of {float(value * 100):g}%"
                 raise self.fail("PD403", message, span, "chances lie in 0%..100%", fix)
-            case "int" if number.denominator != 1:
-                label = f"{float(number):g} is not whole"
+            case "int" if value.denominator != 1:
+                label = f"{float(value):g} is not whole"
                 fix = "write an integer; a field may also be declared as `real(LOW..HIGH)`"
                 raise self.fail("PD401", "expected an integer", span, label, fix)
             case "int" | "real":
-                if kind != REAL and not kind.lo <= number <= kind.hi:
+                if kind != REAL and not kind.lo <= value <= kind.hi:
                     label = f"the range is {kind.lo:g}..{kind.hi:g}"
                     fix = "write a number in this range, or widen it where it is declared"
-                    raise self.fail("PD402", f"{float(number):g} lies outside {kind}", span, label, fix)
+                    raise self.fail("PD402", f"{float(value):g} lies outside {kind}", span, label, fix)
                 if kind.name == "int":
-                    whole = int(number)
+                    whole = int(value)
                     return Expr("const", integer(whole, whole), value=whole, span=span)
-                return Expr("const", REAL, value=float(number), span=span)
-        raise self.wrong(Number(number), _KINDS[kind.name], span, *_HELPS.get(kind.name, ()))
+                return Expr("const", REAL, value=float(value), span=span)
+        raise self.wrong(number(value), _KINDS[kind.name], span, *_HELPS.get(kind.name, ()))
 
     def offset(self, offset: Offset, span: Span) -> Offset:
         """An offset that rules can reach."""
@@ -352,7 +345,7 @@ class Typer:
         self.used.add(name)
         if name in scope.locals:
             return self.turn(scope.locals[name], scope)
-        param = symbols.params.get(f"{scope.pack}.{name}")
+        param = symbols.params.get(name) or symbols.params.get(f"{scope.pack}.{name}")
         if param is not None:  # a name that hides no other that its pack knows
             self.used.add(param.name)
             return Expr("param", param.kind, value=param.name, span=span)
@@ -441,14 +434,6 @@ class Typer:
     def attribute(self, syntax: Syntax, scope: Scope) -> Operand:
         """``place.name``, ``vector.row`` or ``pack.name``."""
         (before,) = syntax.children
-        qualified = f"{before.text}.{syntax.text}"
-        if (
-            before.kind == "name"
-            and qualified in self.symbols.params
-            and not self._is_own_word(before, scope)
-        ):
-            self.used.add(qualified)
-            return Expr("param", self.symbols.params[qualified].kind, value=qualified, span=syntax.span)
         own = self.of_pack(syntax, scope)
         if own is not None:
             return own
@@ -466,12 +451,9 @@ class Typer:
         value = self.lookup(syntax.text, word, scope, after_dot=True)
         match value:
             case Place():
-                offset = (base.offset[0] + value.offset[0], base.offset[1] + value.offset[1])
-                return Place(self.offset(offset, syntax.span))
+                return Place(self.offset(plus(base.offset, value.offset), syntax.span))
             case Expr():
                 return look(value, self.offset(base.offset, syntax.span), syntax.span)
-            case Number():  # a `let` value, the same in every cell
-                return value
             case SetOf():
                 message = f"`{syntax.text}` is not a field or property"
                 label = f"this is {'an element' if value.name else 'a set of elements'}"
@@ -481,10 +463,8 @@ class Typer:
     def of_pack(self, syntax: Syntax, scope: Scope) -> Operand | None:
         """``pack.name``, or ``below.pack.name``: what one pack defines, whatever others call theirs."""
         (pack,) = syntax.children
-        if pack.kind not in ("name", "attribute"):
-            return None
-        name = self.symbols.names.known.get(f"{pack.text}.{syntax.text}")
-        if name is None or self._is_own_word(pack, scope):
+        name = self._global_name(syntax)
+        if pack.kind not in ("name", "attribute") or name is None or self._is_own_word(pack, scope):
             return None
         found = self.find(name, syntax.span, Scope("", {}, scope.orientation))
         if pack.kind == "name":
@@ -493,6 +473,14 @@ class Typer:
             return None
         place = self.place(self.evaluate(pack.children[0], scope), pack.children[0].span)
         return look(found, place.offset, syntax.span)
+
+    def _global_name(self, syntax: Syntax) -> str | None:
+        """The name by which everything is known that ``pack.name`` stands for, if it is the name of something."""
+        (pack,) = syntax.children
+        qualified = f"{pack.text}.{syntax.text}"
+        if qualified in self.symbols.params:
+            return qualified
+        return self.symbols.names.known.get(qualified)
 
     def _is_own_word(self, word: Syntax, scope: Scope) -> bool:
         """Whether a word before a dot is a place, a vector or a name of its block, and not the name of a pack.
@@ -513,18 +501,15 @@ class Typer:
     def certain(self, syntax: Syntax, scope: Scope) -> Syntax:
         """An attribute without its question mark. Raises Unresolved if nothing that is loaded has its name."""
         (before,) = syntax.children
-        span, names = syntax.span, self.symbols.names
-        plain = replace(syntax, kind="attribute", span=Span(span.source, span.start, span.end - 1))
-        qualified = f"{before.text}.{syntax.text}"
-        if qualified in self.symbols.params or qualified in names.known:
-            return plain
-        if before.kind in ("name", "attribute"):
-            found = self.find(before.text, before.span, scope)
-            if found is None or isinstance(found, SetOf):  # a pack that has an element of its name
-                raise Unresolved(qualified)
-        if self.find(syntax.text, syntax.span, scope) is None:
-            raise Unresolved(syntax.text)
-        return plain
+        span = syntax.span
+        if self._global_name(syntax) is None:
+            if before.kind in ("name", "attribute"):
+                found = self.find(before.text, before.span, scope)
+                if found is None or isinstance(found, SetOf):  # a pack that has an element of its name
+                    raise Unresolved(f"{before.text}.{syntax.text}")
+            if self.find(syntax.text, span, scope) is None:
+                raise Unresolved(syntax.text)
+        return replace(syntax, kind="attribute", span=Span(span.source, span.start, span.end - 1))
 
     # Literals and lists
 
@@ -554,16 +539,15 @@ class Typer:
     def compare(self, syntax: Syntax, scope: Scope) -> Operand:
         operands = [self.evaluate(child, scope) for child in syntax.children]
         report_repeated(syntax.children, self.reporter)
-        if any(isinstance(operand, Place) or kind_name(operand) == "element" for operand in operands):
-            for operand, child in zip(operands, syntax.children, strict=True):
-                # `below == fluid` would ask whether the two hold alike; what is meant is `below is fluid`.
-                if isinstance(operand, Items) or (isinstance(operand, SetOf) and operand.name is None):
-                    fix = "write `is` or `is not` instead of `==` or `!=`"
-                    raise self.wrong(operand, "one element to compare with", child.span, fix)
-        headings = any(kind_name(operand) == "direction" for operand in operands)
-        values: list[tuple[Value, Span]] = []
+        kinds = {kind_name(operand) or type(operand) for operand in operands}
+        values: list[tuple[Expr, Span]] = []
         for operand, child in zip(operands, syntax.children, strict=True):
-            if headings and isinstance(operand, (Place, PlaceChoice)):
+            is_set = isinstance(operand, Items) or (isinstance(operand, SetOf) and operand.name is None)
+            if is_set and not kinds.isdisjoint(("element", Place)):
+                # `below == fluid` would ask whether the two hold alike; what is meant is `below is fluid`.
+                fix = "write `is` or `is not` instead of `==` or `!=`"
+                raise self.wrong(operand, "one element to compare with", child.span, fix)
+            if "direction" in kinds and isinstance(operand, (Place, PlaceChoice)):
                 operand = self.of_kind(operand, DIRECTION, child.span)
             values.append((self.value(operand, child.span), child.span))
         parts = [
@@ -618,7 +602,7 @@ class Typer:
                 rounds = operand.hi - operand.lo + 1
                 if rounds > 64:
                     raise self._too_long(rounds, syntax.span, "64")
-                return [Number(Fraction(i)) for i in range(operand.lo, operand.hi + 1)]
+                return [number(i) for i in range(operand.lo, operand.hi + 1)]
             case SetOf():
                 ids = sorted(operand.ids, key=self.symbols.order.__getitem__)
                 return [SetOf((i,), self.symbols.names_by_id[i]) for i in ids]
@@ -642,18 +626,13 @@ def _integer_helps(value: Expr, span: Span) -> tuple[str, ...]:
     if value.kind.name != "real":
         return ()
     declared = "or declare what takes it as `real(LOW..HIGH)`"
-    whole = all(arg.op in ("to_real", "const") for arg in value.args)
-    if value.op == "div" and whole and span.text.count("/") == 1:
-        left, _, right = span.text.partition("/")
-        return (f"integer division rounds down: `{left.strip()} div {right.strip()}`", declared)
-    factor = next((arg.value for arg in value.args if arg.op == "const"), None)
-    if value.op == "mul" and whole and isinstance(factor, (int, float)) and span.text.count("*") == 1:
-        number = next(
-            part.strip() for part in span.text.split("*") if not re.fullmatch(r"[-\d.eE%\s]+", part)
-        )
-        ratio = Fraction(factor).limit_denominator(1000)
-        times = "" if ratio.numerator == 1 else f" * {ratio.numerator}"
-        return (f"integers stay whole: `{number}{times} div {ratio.denominator}`", declared)
+    if all(arg.op in ("to_real", "const") for arg in value.args):
+        if quotient := re.fullmatch(r"([^/]+?) */ *([^/]+)", span.text):
+            return (f"integer division rounds down: `{quotient[1]} div {quotient[2]}`", declared)
+        if scaled := re.fullmatch(r"([^*]+?) *[*] *([0-9]*[.][0-9]+)", span.text):
+            ratio = Fraction(scaled[2])
+            times = f" * {ratio.numerator}" if ratio.numerator > 1 else ""
+            return (f"integers stay whole: `{scaled[1]}{times} div {ratio.denominator}`", declared)
     return ("`a div b` divides integers and rounds down", declared)
 
 
@@ -663,7 +642,7 @@ HANDLERS: dict[str, Callable[[Typer, Syntax, Scope], Operand]] = {
     "attribute": Typer.attribute,
     "optional_attribute": Typer.optional_attribute,
     **dict.fromkeys(
-        ("integer", "decimal", "percent"), lambda typer, at, scope: Number(read_number(at, typer))
+        ("integer", "decimal", "percent"), lambda typer, at, scope: number(read_number(at, typer))
     ),
     "yes": lambda typer, at, scope: TRUE,
     "no": lambda typer, at, scope: FALSE,
@@ -678,12 +657,7 @@ HANDLERS: dict[str, Callable[[Typer, Syntax, Scope], Operand]] = {
     "choose": Typer.choose,
     **dict.fromkeys(("any_of", "all_of"), Typer.quantifier),
     "call": call,
-    **dict.fromkeys(
-        ("add", "sub", "mul", "div"),
-        lambda typer, at, scope: binary(typer, at, *[typer.value_of(child, scope) for child in at.children]),
-    ),
-    "neg": negate,
-    "quotient": quotient,
+    **dict.fromkeys(("add", "sub", "mul", "div", "quotient", "neg"), calculation),
     "mod": modulo,
 }
 """One handler for every kind of syntax node that can stand in an expression."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from math import lcm
@@ -23,7 +23,6 @@ from powderdsl.model.expressions.operators import (
     negation,
 )
 from powderdsl.model.logic.satisfy import (
-    BUDGET,
     MAX_QUESTION,
     Answers,
     Budget,
@@ -50,13 +49,14 @@ from powderdsl.model.types import (
     Transform,
     footprint,
     minus,
+    plus,
 )
 
 if TYPE_CHECKING:
     from powderdsl.model.elaborate import Elaborated
 
-ALL_SUBSTEPS = 3
-"""Work for the conflicts of all substeps together, as a multiple of that for one."""
+COMPARISONS = 1_000_000
+"""Work for comparing the rules of all substeps, in nodes: a second."""
 
 GLANCE = 3
 """What a comparison of two rules costs, in nodes."""
@@ -134,13 +134,8 @@ def _claim(rule: Rule) -> Span:
     return Span(span.source, span.start, span.start + rest.start()) if rest and rest.start() else span
 
 
-@dataclass
-class _Found:
-    """A conflict as it was met first, with an example, and where it was met: passes and substeps by number."""
-
-    example: dict[Offset, int]
-    labels: list[str]
-    places: list[tuple[int, int]]
+Found = dict[Conflict, tuple[dict[Offset, int], list[tuple[int, int]]]]
+"""Conflicts with an example of each, and where they were met: passes and substeps by number."""
 
 
 def check_logic(
@@ -161,9 +156,9 @@ def check_logic(
     fires: Answers[Span] = Answers()
     useful: Answers[Span] = Answers()
     silent: dict[Span, list[tuple[Expr, Lets]]] = {}
-    conflicts: dict[Conflict, _Found] = {}
-    work: list[tuple[int, int, Pass]] = []
-    left = ALL_SUBSTEPS * BUDGET
+    conflicts: Found = {}
+    lists: list[tuple[int, Pass]] = []
+    asked = replace(facts, budget=Budget(COMPARISONS))
     for at, pass_ in enumerate(passes):
         earlier: Lets = {}
         for number, moment in enumerate(pass_.moments):
@@ -179,15 +174,18 @@ def check_logic(
                 else:
                     live.append(rule)
             if moment.policy == "prove":
-                given = min(BUDGET, left)
-                asked = replace(facts, budget=Budget(given))
-                for conflict, found in _check_substep(live, asked, lets):
-                    known = conflicts.setdefault(conflict, _Found(found, [], []))
-                    known.labels.append(moment.label)
-                    known.places.append((at, number))
-                work.append((given - asked.budget.left, len(live), pass_))
-                left -= work[-1][0]
-    if _too_much(work, reporter):
+                lists.append((len(live), pass_))
+                for conflict, elements in _check_substep(live, asked, lets):
+                    conflicts.setdefault(conflict, (elements, []))[1].append((at, number))
+    if asked.budget.is_exhausted:
+        count, longest = max(lists, key=lambda rules: rules[0])
+        message = f"comparing the rules of `{longest.name}` with each other takes too much work"
+        label = f"{count:,} rules in one list are {count * (count + 1) // 2:,} pairs"
+        helps = [
+            "choose what happens to conflicts, then nothing is compared: `conflicts: first_wins`",
+            "or divide the list until its parts are short enough: rules that need not happen at once go under `then:`",
+        ]
+        reporter.error("PD508", message, longest.span, label, helps=helps)
         return passes, []
     passes = _report_conflicts(conflicts, passes, facts, added, reporter)
     relaxed = facts.relaxed()
@@ -222,32 +220,28 @@ def _report_silent(
 
 
 def _report_conflicts(
-    conflicts: dict[Conflict, _Found],
-    passes: tuple[Pass, ...],
-    facts: Facts,
-    added: AddedPacks | None,
-    reporter: Reporter,
+    found: Found, passes: tuple[Pass, ...], facts: Facts, added: AddedPacks | None, reporter: Reporter
 ) -> tuple[Pass, ...]:
     """Report conflicts; the passes with those resolved that added packs bring about."""
     resolved: set[tuple[int, int]] = set()
-    for conflict, found in conflicts.items():
-        words = _in_words(facts, found.example)
-        pass_ = passes[found.places[0][0]]
-        ids = list(found.example.values())
-        causes = added.causes(pass_.pack, conflict.second, ids or facts.ids) if added else ()
+    for conflict, (elements, places) in found.items():
+        words = _in_words(facts, elements)
+        pass_, moments = passes[places[0][0]], [passes[at].moments[number] for at, number in places]
+        causes = (
+            added.causes(pass_.pack, conflict.second, list(elements.values()) or facts.ids) if added else ()
+        )
         if not causes:
-            conflict.report(found.labels, words, reporter)
+            conflict.report([moment.label for moment in moments], words, reporter)
             continue
-        settled = conflict.assigns or all(_may_settle(passes[at].moments[n]) for at, n in found.places)
+        settled = conflict.assigns or all(map(_may_settle, moments))
         if settled and not conflict.assigns:
-            resolved.update(found.places)
+            resolved.update(places)
         conflict.report_added(causes, pass_.name, words, settled, reporter)
-    changed = list(passes)
+    changed = [list(pass_.moments) for pass_ in passes]
     for at, number in sorted(resolved):
-        moments = list(changed[at].moments)
-        moments[number] = replace(moments[number], policy="first_wins")
-        changed[at] = replace(changed[at], moments=tuple(moments))
-    return tuple(changed)
+        changed[at][number] = replace(changed[at][number], policy="first_wins")
+    pairs = zip(passes, changed, strict=True)
+    return tuple([replace(pass_, moments=tuple(moments)) for pass_, moments in pairs])
 
 
 def _may_settle(moment: Moment) -> bool:
@@ -261,28 +255,6 @@ def _may_settle(moment: Moment) -> bool:
     return all(targets.count(rule.target) == 1 for rule in transforms if rule.effects) and not any(
         isinstance(rule, Move) for rule in moment.rules
     )
-
-
-def _too_much(work: list[tuple[int, int, Pass]], reporter: Reporter) -> bool:
-    """Report substeps whose rules take too much work to compare. Work is counted: the same rules always take the same.
-
-    Args:
-        work: for each substep the work that was spent, the number of its rules, and its pass.
-    """
-    hard = {pass_.name: (count, pass_) for spent, count, pass_ in work if spent > BUDGET}
-    together = sum(spent for spent, _, _ in work) > ALL_SUBSTEPS * BUDGET
-    if together and not hard:
-        _, count, most = max(work, key=lambda one: one[0])
-        hard = {most.name: (count, most)}
-    for count, pass_ in hard.values():
-        message = f"comparing the rules of `{pass_.name}` with each other takes too much work"
-        label = f"{count:,} rules in one list are {count * (count + 1) // 2:,} pairs"
-        helps = [
-            "choose what happens to conflicts, then nothing is compared: `conflicts: first_wins`",
-            "or divide the list until its parts are short enough: rules that need not happen at once go under `then:`",
-        ]
-        reporter.error("PD508", message, pass_.span, label, helps=helps)
-    return bool(hard)
 
 
 def _changes(rule: Rule, facts: Facts, lets: Lets) -> bool | None:
@@ -308,14 +280,14 @@ def _meetings(
     rules: Sequence[tuple[Rule, Expr]], facts: Facts, lets: Lets
 ) -> Iterator[tuple[Conflict, dict[Offset, int]]]:
     """For each rule, given with its condition, the first one, maybe itself, with which it may claim one cell."""
-    glances = Glances([mask for _, mask in rules], facts, lets)
+    asked = list(_asked((mask for _, mask in rules), facts, lets))
     for i, (second, mask) in enumerate(rules):
         undecided = None
         pairs = (
-            (first, ((other, HERE), (mask, at)))
-            for first, other in ((second, mask), *rules[:i])
-            for at in _claims(first, second)
-            if not glances.apart(other, mask, at)
+            (rules[j][0], ((rules[j][1], HERE), (mask, at)))
+            for j in (i, *range(i))
+            for at in _claims(rules[j][0], second)
+            if not _are_apart(asked[j], asked[i], at, facts.budget)
         )
         for first, question in pairs:
             if facts.budget.is_exhausted:
@@ -413,28 +385,28 @@ def _undecided(conflict: Conflict) -> Conflict:
     return replace(conflict, notes=(note,), helps=helps)
 
 
-class Glances:
-    """What the rules of a substep require of single variables: elements, fields and counts at places."""
+Asked = dict[tuple[int, Offset], frozenset[object]]
+"""What a condition leaves of single variables, each with a number and its place: elements, fields and counts."""
 
-    def __init__(self, masks: Sequence[Expr], facts: Facts, lets: Lets):
-        self._facts = facts
-        numbers: dict[tuple[str, object], int] = {}
-        self._asked: dict[int, dict[tuple[int, int, int], frozenset[object]]] = {}
-        for mask in masks:
-            self._asked[id(mask)] = {
-                (numbers.setdefault((what, name), len(numbers)), *at): values
-                for (what, name, at), values in alone(facts, mask, lets).items()
-            }
 
-    def apart(self, first: Expr, second: Expr, at: Offset) -> bool:
-        """Whether some variable cannot be as the first condition and, `at` away from it, the second ask for."""
-        self._facts.budget.left -= GLANCE
-        asked = self._asked[id(first)]
-        for (number, row, column), values in self._asked[id(second)].items():
-            known = asked.get((number, row + at[0], column + at[1]))
-            if known is not None and known.isdisjoint(values):
-                return True
-        return False
+def _asked(masks: Iterable[Expr], facts: Facts, lets: Lets) -> Iterator[Asked]:
+    numbers: dict[tuple[str, object], int] = {}
+    for mask in masks:
+        asked = alone(facts, mask, lets)
+        yield {
+            (numbers.setdefault((what, name), len(numbers)), at): values
+            for (what, name, at), values in asked.items()
+        }
+
+
+def _are_apart(first: Asked, second: Asked, at: Offset, budget: Budget) -> bool:
+    """Whether some variable cannot be as the first condition and, `at` away from it, the second ask for."""
+    budget.left -= GLANCE
+    for (number, place), values in second.items():
+        known = first.get((number, plus(place, at)))
+        if known is not None and known.isdisjoint(values):
+            return True
+    return False
 
 
 def lasting(lets: Lets) -> Lets:

@@ -425,7 +425,8 @@ def produced_ids(passes: tuple[Pass, ...], facts: Facts) -> frozenset[int]:
     """The ids that some rule may bring about."""
     found: set[int] = set()
     for _, moment in substeps(passes):
-        for target in (made for rule in moment.rules for made in _brings(rule).values()):
-            if target.op not in ("element", "look"):
-                found |= {target.value} if target.op == "const" else set(facts.ids)
+        for rule in moment.rules:
+            match rule:
+                case Transform(target=made) | Move(leaving=Expr() as made):
+                    found |= {made.value} if made.op == "const" else set(facts.ids)
     return frozenset(found)

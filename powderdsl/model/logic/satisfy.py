@@ -84,8 +84,8 @@ class Facts:
 
 def decide(facts: Facts, conditions: Conditions, lets: Lets | None = None) -> bool | None:
     """Whether the conditions may hold together; None if that takes too much work. False is a proof."""
-    if _contradict(conditions):
-        return False
+    if lets and _ask(facts, conditions, None, _Search.possible) is False:
+        return False  # whatever the values of lets are
     return _ask(facts, conditions, lets, _Search.possible)
 
 
@@ -148,24 +148,6 @@ def _ask(
             budget.left = max(budget.left, 0) + reserve
 
 
-def _contradict(conditions: Conditions) -> bool:
-    """Whether one of the conditions needs a let to hold at a place where another one needs that it does not."""
-    known: dict[tuple[object, Offset], bool] = {}
-    waiting = [(condition, at, True) for condition, at in conditions]
-    while waiting:
-        expr, at, holds = waiting.pop()
-        if expr.op == "let":
-            if known.setdefault((expr.value, at), holds) != holds:
-                return True
-        elif expr.op == "not":
-            waiting.append((expr.args[0], at, not holds))
-        elif expr.op == "look":
-            waiting.append((expr.args[0], plus(at, expr.value), holds))
-        elif expr.op == ("and" if holds else "or"):
-            waiting += [(arg, at, holds) for arg in expr.args]
-    return False
-
-
 class _Unknown(Exception):
     """The value depends on something free."""
 
@@ -198,7 +180,6 @@ class _Search:
         """Constants that the draws of each stream are compared with: between two of them all draws are alike."""
         self._cut: set[int] = set()
         """Variables of which conditions on them alone leave less than all values."""
-        self._chosen: dict[int, Any] = {}
 
     def _resolve(self, expr: Expr) -> tuple[Expr, int]:
         """The expression with this substep's lets looked through, and how many nodes it has then."""
@@ -234,8 +215,8 @@ class _Search:
         if joint is None:
             return False
         # Small domains first; what is equally small in the order in which the conditions name it.
-        keys = dict.fromkeys(key for term, _ in joint for key in term.keys)
-        return self._assign(sorted(keys, key=lambda key: len(self._domains[key])), 0, joint)
+        keys = dict.fromkeys(key for term in joint for key in term.keys)
+        return self._assign(sorted(keys, key=lambda key: len(self._domains[key])), joint)
 
     def alone(self) -> dict[Variable, frozenset[object]] | None:
         """The values that conditions on one variable leave of it, draws left out; None if one leaves nothing."""
@@ -249,14 +230,11 @@ class _Search:
         if not self.possible():
             return {}
         names = list(self._numbers)
-        elements = [(key, values) for key, values in self._domains.items() if names[key][0] == "element"]
-        return {names[key][2]: self._chosen.get(key, values[0]) for key, values in elements}
+        elements = [key for key in self._domains if names[key][0] == "element"]
+        return {names[key][2]: self._domains[key][0] for key in elements}
 
-    def _narrow(self) -> list[tuple[_Term, bool]] | None:
-        """Apply the conditions on one variable; None if they leave no assignment, else the other conditions.
-
-        Each with whether it compares numbers: their bounds may decide it before all of its variables are chosen.
-        """
+    def _narrow(self) -> list[_Term] | None:
+        """Apply the conditions on one variable; None if they leave no assignment, else the other conditions."""
         terms = []
         for condition, at in self._conditions:
             try:
@@ -268,44 +246,41 @@ class _Search:
         joint = []
         for term in terms:
             if len(term.keys) > 1:
-                joint.append((term, any(node.op in ("eq", "lt", "le") for node in term.node.walk())))
+                joint.append(term)
             elif not term.keys:
-                if not self._value(term, {}):
+                if not self._bounds(term)[1]:
                     return None
             else:
                 (key,) = term.keys
                 before = self._domains[key]
-                after = self._domains[key] = [v for v in before if self._value(term, {key: v})]
+                after = [value for value in before if self._allows(term, key, value)]
                 if not after:
                     return None
+                self._domains[key] = after
                 if len(after) < len(before):
                     self._cut.add(key)
         return joint
 
-    def _assign(self, order: list[int], index: int, joint: list[tuple[_Term, bool]]) -> bool:
-        if index == len(order):
+    def _assign(self, keys: list[int], joint: list[_Term]) -> bool:
+        """Choose values of variables, one after the other, with which the conditions may hold."""
+        if not keys:
             return True
-        key, chosen = order[index], self._chosen
-        ready, waiting = [], []
-        for term, compares in joint:
-            if key in term.keys:
-                if all(k in chosen or k == key for k in term.keys):
-                    ready.append(term)
-                elif compares:
-                    waiting.append(term)
-        for value in self._domains[key]:
-            chosen[key] = value
-            if (
-                all(self._value(term, chosen) for term in ready)
-                and all(self._bounds(term)[1] for term in waiting)
-                and self._assign(order, index + 1, joint)
-            ):
+        key, *others = keys
+        terms = [term for term in joint if key in term.keys]
+        values = self._domains[key]
+        for value in values:
+            if all(self._allows(term, key, value) for term in terms) and self._assign(others, joint):
                 return True
-        chosen.pop(key, None)
+        self._domains[key] = values
         return False
 
+    def _allows(self, term: _Term, key: int, value: Any) -> bool:
+        """Choose a variable's value: whether the condition may hold with it."""
+        self._domains[key] = [value]
+        return bool(self._bounds(term)[1])
+
     def _domain(self, what: str, name: object, at: Offset) -> list[Any]:
-        """All values of a variable, in rising order but for draws."""
+        """All values of a variable, in rising order."""
         if what == "element":
             return list(self.facts.ids)
         if what == "side":
@@ -314,7 +289,7 @@ class _Search:
             cuts = sorted(self._cuts.get(name, (0.0, 1.0)))
             between = ((a + b) / 2 for a, b in itertools.pairwise(cuts))
             # A draw of 16 or 32 bits may be a threshold itself: neither above nor below it.
-            return [*between, *(c for c in cuts if (c * 2**17) % 2 == 1 or (c * 2**33) % 2 == 1)]
+            return sorted([*between, *(c for c in cuts if (c * 2**17) % 2 == 1 or (c * 2**33) % 2 == 1)])
         kind = name.kind if isinstance(name, Expr) else self.facts.properties[str(name)].kind
         match kind.name:
             case "element":
@@ -377,88 +352,48 @@ class _Search:
     def _key(self, what: str, name: object, at: Offset) -> int:
         return self._numbers.setdefault((what, name, at), len(self._numbers))
 
-    def _value(self, term: _Term, chosen: dict[int, Any]) -> Any:
-        budget = self.budget  # `spend` written out: this is where the time goes
-        budget.left -= 1
-        if budget.left < 0:
+    def _bounds(self, term: _Term) -> Bounds:
+        """The bounds of a value for those of the variables; a flag's are 0 and 1."""
+        self.budget.left -= 1  # `spend` written out: this is where the time goes
+        if self.budget.left < 0:
             raise _Exhausted
         op, node, keys, args, about = term
+        domains = [self._domains[key] for key in keys]
         match op:
             case "variable":
-                return chosen[keys[0]]
+                return domains[0][0], domains[0][-1]
             case "const":
-                return node.value
+                return node.value, node.value
             case "property":
-                element = chosen[keys[0]]
-                return chosen[keys[1]] if element in about.stored else about.values[element]
-            case "field":
-                return chosen[keys[1]] if chosen[keys[0]] in about[0] else about[1]
-            case "and":
-                return all(self._value(arg, chosen) for arg in args)
-            case "or":
-                return any(self._value(arg, chosen) for arg in args)
-            case "choose":
-                return self._value(args[1 if self._value(args[0], chosen) else 2], chosen)
-            case "coordinate":
-                return (chosen[keys[0]] + about) % node.value[1]
-        return _evaluated(node, [self._value(arg, chosen) for arg in args])
-
-    def _bounds(self, term: _Term) -> Bounds:
-        """The bounds of the value while some variables are open; those of a flag are 0 and 1."""
-        self.budget.spend(1)
-        op, node, keys, args, about = term
-        chosen = self._chosen
-        match op:
-            case "variable":
-                return self._span(keys[0])
-            case "const":
-                return (node.value, node.value) if isinstance(node.value, (int, float, Fraction)) else _ANY
-            case "property":
-                elements = [chosen[keys[0]]] if keys[0] in chosen else self._domains[keys[0]]
-                values = [about.values[element] for element in elements if element not in about.stored]
-                numbers = [value for value in values if isinstance(value, (int, float, Fraction))]
-                if len(values) < len(elements):
-                    numbers += self._span(keys[1])
-                self.budget.spend(len(elements))
-                return min(numbers), max(numbers)
+                values = [about.values[element] for element in domains[0] if element not in about.stored]
+                if len(values) < len(domains[0]):
+                    values += domains[1][0], domains[1][-1]
+                return min(values), max(values)
             case "field":
                 elements, default = about
-                if not isinstance(default, (int, float)):
-                    return _ANY
-                low, high = self._span(keys[1])
-                if keys[0] in chosen:
-                    return (low, high) if chosen[keys[0]] in elements else (default, default)
-                return min(low, default), max(high, default)
+                values = [default] * (not elements.issuperset(domains[0]))
+                if not elements.isdisjoint(domains[0]):
+                    values += domains[1][0], domains[1][-1]
+                return min(values), max(values)
             case "coordinate":
-                return (self._value(term, chosen),) * 2 if keys[0] in chosen else (0, node.value[1] - 1)
+                values = [(side + about) % node.value[1] for side in domains[0]]
+                return min(values), max(values)
         bounds = [self._bounds(arg) for arg in args]
-        if _ANY not in bounds:
-            combined = OPERATIONS[op].between(*bounds)
-            if combined is not None:
-                return combined
-            if all(low == high for low, high in bounds):
-                return (_evaluated(node, [low for low, _ in bounds]),) * 2
-        if node.kind == FLAG:
-            return 0, 1
-        return (node.kind.lo, node.kind.hi) if node.kind.name == "int" else _ANY
-
-    def _span(self, key: int) -> Bounds:
-        """The least and the greatest value of a variable."""
-        if key in self._chosen:
-            return self._chosen[key], self._chosen[key]
-        values = self._domains[key]
-        return min(values), max(values)
+        row = OPERATIONS[op]
+        assert row.evaluate is not None
+        if all(low == high for low, high in bounds):
+            operands = [low for low, _ in bounds]
+            value = row.evaluate(*operands) if node.value is None else row.evaluate(*operands, node.value)
+            return value, value
+        combined = row.between(*bounds)
+        if combined is not None:
+            return combined
+        return (
+            (node.kind.lo, node.kind.hi) if node.kind.name == "int" else (0, 1) if node.kind == FLAG else _ANY
+        )
 
 
 _ANY: Bounds = (-math.inf, math.inf)
-
-
-def _evaluated(node: Expr, args: list[Any]) -> Any:
-    """The value of an operation for those of its arguments."""
-    evaluate = OPERATIONS[node.op].evaluate
-    assert evaluate is not None
-    return evaluate(*args) if node.value is None else evaluate(*args, node.value)
-
 
 _FLOATS = ("real", "vec2", "chance")
 
