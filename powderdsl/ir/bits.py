@@ -238,14 +238,16 @@ class Gates(Graph):
     def lower(self, node: Node) -> Node | Bits:
         """A node of a pass on bit planes. Raises NotBits."""
         args = tuple([self.values[arg] for arg in node.args])
-        whole = node.type.name == "int" or tuple in map(type, args)
-        if whole and node.op not in _INTEGERS:
+        if node.type.name != "int" and tuple not in map(type, args):
+            return self.flat(node, args)
+        if node.op not in _INTEGERS:
             raise NotBits(f"{node.op} of integers")
-        row = (_INTEGERS if whole else _OTHERS).get(node.op)
-        value: Node | Bits = row(self, node, *args) if row else self.rebuild(node, args)
-        if self.size > MAX_GATES:
-            raise NotBits(f"more than {MAX_GATES:,} gates")
-        return value
+        return _INTEGERS[node.op](self, node, *args)
+
+    def flat(self, node: Node, args: tuple[Node, ...]) -> Node:
+        """The operation of a node on flags or floats, or on one plane of each argument."""
+        row = _FLAT.get(node.op)
+        return row(self, node, *args) if row else self.rebuild(node, args)
 
     def looked_up(self, a: Bits, of: Type, function: Callable[[int], int | None], type: Type) -> Bits:
         """What a function gives for a small integer of a range; where that is None it does not matter."""
@@ -273,9 +275,9 @@ class Gates(Graph):
             matters, values = (matters >> (1 << i), values >> (1 << i)) if plane.attr else (matters, values)
             matters, values = matters & half, values & half
 
-        def made(split: Split | bool) -> Node:
-            if isinstance(split, bool):
-                return self.flag(split)
+        def made(split: Split) -> Node:
+            if split.low is None:
+                return self.flag(split is _YES)
             plane = inputs[split.input]
             if split.high is None:
                 return self.derive("xor", plane, made(split.low))
@@ -287,11 +289,15 @@ class Gates(Graph):
 class Split(NamedTuple):
     """A truth table split on an input: its value where that holds, and elsewhere; `high` is None if they are opposite."""
 
-    cost: int
-    """Gates; a half that is constant saves one."""
     input: int
-    high: Split | bool | None
-    low: Split | bool
+    high: Split | None = None
+    low: Split | None = None
+    """None of a table that is the same everywhere."""
+    cost: int = 0
+    """Gates; a half that is constant saves one."""
+
+
+_NO, _YES = Split(-1), Split(-2)
 
 
 @cache
@@ -301,10 +307,10 @@ def _half(inputs: int, i: int) -> int:
     return ((1 << (1 << inputs)) - 1) // ((1 << 2 * step) - 1) * ((1 << step) - 1)
 
 
-def _split(matters: int, values: int, inputs: int, order: Sequence[int]) -> Split | bool:
+def _split(matters: int, values: int, inputs: int, order: Sequence[int]) -> Split:
     """Split a truth table on its inputs in order; halves that agree where both matter are joined."""
     if not matters & values or not matters & ~values:
-        return bool(matters & values)
+        return _YES if matters & values else _NO
     first, rest = order[0], order[1:]
     half, step = _half(inputs, first), 1 << first
     low, high = matters & half, matters >> step & half
@@ -314,21 +320,16 @@ def _split(matters: int, values: int, inputs: int, order: Sequence[int]) -> Spli
         if differ:
             yeses ^= high
         joined = _split(low | high, nos | yeses & ~low, inputs, rest)
-        return Split(_cost(joined) + 1, first, None, joined) if differ else joined
-    parts = _split(high, yeses, inputs, rest), _split(low, nos, inputs, rest)
-    costs = _cost(parts[0]), _cost(parts[1])
-    return Split(sum(costs) + (2 if all(costs) else 1), first, *parts)
-
-
-def _cost(split: Split | bool) -> int:
-    return 0 if isinstance(split, bool) else split.cost
+        return Split(first, None, joined, joined.cost + 1) if differ else joined
+    yes, no = _split(high, yeses, inputs, rest), _split(low, nos, inputs, rest)
+    return Split(first, yes, no, yes.cost + no.cost + (2 if yes.cost and no.cost else 1))
 
 
 @lru_cache(maxsize=4096)
-def _best_split(matters: int, values: int, inputs: int, used: tuple[int, ...]) -> Split | bool:
+def _best_split(matters: int, values: int, inputs: int, used: tuple[int, ...]) -> Split:
     """The split that takes the fewest gates, of all orders of inputs; highest first where there are too many to try."""
     orders = [used[::-1]] if len(used) > 5 else permutations(used)
-    return min((_split(matters, values, inputs, order) for order in orders), key=_cost)
+    return min((_split(matters, values, inputs, order) for order in orders), key=operator.attrgetter("cost"))
 
 
 def plane_slots(slot: SlotType) -> tuple[SlotType, ...]:
@@ -356,6 +357,8 @@ def lower_pass(program: Program, pass_: PassGraph) -> PassGraph:
         gates.place = node.places[0] if node.places else ""
         try:
             values[node] = gates.lower(node)
+            if gates.size > MAX_GATES:
+                raise NotBits(f"more than {MAX_GATES:,} gates")
         except NotBits as error:
             error.place = error.place or gates.place
             raise
@@ -384,22 +387,19 @@ def _by_bit(gates: Gates, node: Node) -> Bits:
     return gates.fit(planes, node.type)
 
 
-def _shift(gates: Gates, node: Node, value: Bits) -> Bits:
-    dy, dx, wraps = node.attr
-    return tuple([gates.shift(plane, (dy, dx), wraps) for plane in gates.fit(value, node.type)])
-
-
-def _move(gates: Gates, node: Node, content: Bits, movers: Node, rest: Bits) -> Bits:
-    """Swaps stay swaps, one for each bit plane: targets exchange planes in place."""
-    planes = [
-        a if a is b and a.op == "const" else gates.derive(node.op, a, movers, b, attr=node.attr)
-        for a, b in gates.pairs(content, rest, node.type.bits)
-    ]
+def _plane_by_plane(gates: Gates, node: Node, *args: Node | Bits) -> Bits:
+    """An operation that does the same with every plane. Flags serve all planes; swaps stay swaps of planes in place."""
+    planes = []
+    for i in range(node.type.bits):
+        parts = [arg if isinstance(arg, Node) else arg[min(i, len(arg) - 1)] for arg in args]
+        planes.append(gates.flat(node, tuple(parts)))
     return gates.fit(planes, node.type)
 
 
-def _move_floats(gates: Gates, node: Node, content: Node, movers: Node, rest: Node) -> Node:
+def _move(gates: Gates, node: Node, content: Node, movers: Node, rest: Node) -> Node:
     """Floats are moved cell by cell anyway: choices between what neighbors hold."""
+    if content is rest and content.op == "const":
+        return content
     if content.type == FLAG:
         return gates.derive(node.op, content, movers, rest, attr=node.attr)
     dy, dx = node.attr
@@ -547,7 +547,7 @@ _INTEGERS: dict[str, Callable[..., Node | Bits]] = {
     "param": _by_bit,
     "coordinate": _by_bit,
     "below": _below,
-    "shift": _shift,
+    "shift": _plane_by_plane,
     "count": _count,
     "in_set": lambda gates, node, a: gates.looked_up(a, node.args[0].type, node.attr.__contains__, FLAG)[0],
     "table": lambda gates, node, a: gates.looked_up(
@@ -566,16 +566,16 @@ _INTEGERS: dict[str, Callable[..., Node | Bits]] = {
     "min": lambda gates, node, a, b: gates.choose(gates.lt(a, b), a, b, node.type),
     "max": lambda gates, node, a, b: gates.choose(gates.lt(a, b), b, a, node.type),
     "to_real": _to_real,
-    "select": lambda gates, node, condition, yes, no: gates.choose(condition, yes, no, node.type),
-    "swap": _move,
-    "arrive": _move,
+    "select": _plane_by_plane,
+    "swap": _plane_by_plane,
+    "arrive": _plane_by_plane,
 }
 """Operations that give integers or take some, by their gates."""
 
-_OTHERS: dict[str, Callable[..., Node]] = {
+_FLAT: dict[str, Callable[..., Node]] = {
     "shift": lambda gates, node, value: gates.shift(value, node.attr[:2], node.attr[2]),
     "to_real": lambda gates, node, value: gates.select(value, gates.real(1.0), gates.real(0.0)),
-    "swap": _move_floats,
-    "arrive": _move_floats,
+    "swap": _move,
+    "arrive": _move,
 }
 """Operations on flags and floats that do not stay as they are."""

@@ -45,6 +45,7 @@ from powderdsl.model.types import (
     Swap,
     Transform,
     Value,
+    footprint,
 )
 
 Parts = tuple[Node, ...]
@@ -529,9 +530,7 @@ class _PassLowering:
 
         def reach(rule: Rule, cells: Node, way: int) -> Node:
             """The cells and their targets, or under -1 these cells and those from where they are targets."""
-            if isinstance(rule, Swap | Move):
-                return build.or_(cells, build.shift(cells, (way * rule.offset[0], way * rule.offset[1])))
-            return cells
+            return build.any([build.shift(cells, (way * dy, way * dx)) for dy, dx in footprint(rule)])
 
         narrowed: list[Claim] = []
         taken = build.flag(False)
