@@ -28,7 +28,7 @@ from powderdsl.tasks.task import (
 from powderdsl.worlds.ascii import load_ascii, parse_ascii
 from powderdsl.worlds.image import read_image
 from powderdsl.worlds.raster import Setting, Shape, Size, mask
-from powderdsl.worlds.scene import draw_scene, find_scene, shipped_scenes
+from powderdsl.worlds.scene import draw_start, find_scene, shipped_scenes
 from powderdsl.worlds.scene.amounts import (
     Written,
     constants,
@@ -409,7 +409,7 @@ def _named(word: yaml_tree.Scalar, reader: Reader, ruleset: Ruleset) -> NDArray[
             message = f"the scene `{found.name}` sets `{setting.name}`"
             reader.reporter.error("PD605", message, word.span, "a picture is made of elements only")
             return None
-        return draw_scene(found, ruleset)
+        return draw_start(found, ruleset).ids
     except CompileError as error:
         pass_on(error, reader.reporter, word.span)
     return None

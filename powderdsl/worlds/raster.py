@@ -6,7 +6,7 @@ formulas use only what NumPy and torch call by the same names: one shape of a sc
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from math import isqrt
 from typing import Any
@@ -69,54 +69,14 @@ class Setting:
 
 def mask(shape: Shape, size: Size) -> NDArray[np.bool_]:
     """The cells of a shape in a grid of `size`, bool [H, W]. Cells outside the grid are cut off."""
-    cells = np.zeros(size, dtype=np.bool_)
-    window, covered = _in_window(shape, size)
-    cells[window] = covered
-    return cells
-
-
-def paint(size: Size, fill: int, paints: Iterable[Paint], ids: Mapping[str, int]) -> NDArray[np.uint8]:
-    """A world uint8 [H, W]: `fill` everywhere, then the statements in order, each over the ones before.
-
-    `ids` gives the id of every element name that the statements use.
-    """
-    world = np.full(size, fill, dtype=np.uint8)
-    for statement in paints:
-        window, covered = _in_window(statement.shape, size)
-        world[window] = np.where(covered, np.uint8(ids[statement.element]), world[window])
-    return world
-
-
-def _in_window(shape: Shape, size: Size) -> tuple[tuple[slice, slice], NDArray[np.bool_]]:
-    """The rows and columns of the grid outside of which a shape covers nothing, and the cells that it covers there."""
     if shape.kind == "frame":
-        edge = np.ones(size, dtype=np.bool_)
-        edge[1:-1, 1:-1] = False
-        return (slice(None), slice(None)), edge
-    columns = _columns(shape, size[1])
-    runs = covered_rows(np, shape.kind, shape.numbers, np.arange(columns.start, columns.stop), size)
-    first, last = (np.clip(one, 0, size[0]) for one in runs)
-    if not (first < last).any():
-        return (slice(0), slice(0)), np.zeros((0, 0), dtype=np.bool_)
-    row = np.arange(first.min(), last.max())[:, None]
-    window = (slice(row[0, 0], row[-1, 0] + 1), slice(columns.start, columns.stop))
-    return window, (row >= first) & (row < last)
-
-
-def _columns(shape: Shape, width: int) -> range:
-    """The columns of the grid outside of which a shape covers nothing: a wide grid has many."""
-    first, last = 0, width
-    match shape.kind, shape.numbers:
-        case "line", (_, int(left), _, int(end), int(thickness)):
-            # 2 + width bounds 1 + width·√(1 + slope²)/4, as no slope is steeper than 1.
-            first, last = min(left, end) - thickness - 2, max(left, end) + thickness + 3
-        case "ramp", (_, int(left), _, int(end)):
-            first, last = min(left, end), max(left, end) + 1
-        case "disk" | "square", (_, int(center), int(reach)):
-            first, last = center - reach, center + reach
-        case "box" | "arch" | "container", (_, _, int(left), end, *_):
-            first, last = left, width if end is None else end
-    return range(max(first, 0), max(min(last, width), 0))
+        cells = np.ones(size, dtype=np.bool_)
+        cells[1:-1, 1:-1] = False
+        return cells
+    runs = covered_rows(np, shape.kind, shape.numbers, np.arange(size[1]), size)
+    first, last = (np.clip(end, 0, size[0]) for end in runs)
+    row = np.arange(size[0])[:, None]
+    return (row >= first) & (row < last)
 
 
 def covered_rows(xp: Any, kind: str, numbers: Sequence[Any], column: Any, size: Size) -> Rows:

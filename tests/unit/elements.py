@@ -50,6 +50,9 @@ class Rules:
     """As much of a ruleset as worlds need."""
 
     elements: tuple[Element, ...] = ELEMENTS
+    properties: tuple[()] = ()
+    fields: tuple[()] = ()
+    order: tuple[()] = ()
 
 
 RULES = Rules()

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from powderdsl.diagnostics import CODES, CompileError, Reporter, Source, Span
-from powderdsl.worlds.raster import MAX_COORDINATE, Shape, mask, paint
-from powderdsl.worlds.scene import draw_scene, find_scene, shipped_scenes
+from powderdsl.worlds.raster import MAX_COORDINATE, Shape, mask
+from powderdsl.worlds.scene import draw_start, find_scene, shipped_scenes
 from powderdsl.worlds.scene.read import parse_statement, read_file, read_scenes
 from powderdsl.worlds.scene.statements import STATEMENTS
 from tests.unit.elements import ELEMENTS, ID, RULES, Rules
@@ -190,12 +190,12 @@ def test_every_statement_is_written_as_its_help_says():
 
 
 def load_scene(place: str | Path, rules, **options) -> np.ndarray:
-    return draw_scene(find_scene(place), rules, **options)
+    return draw_start(find_scene(place), rules, **options).ids
 
 
 def test_the_designed_worlds_are_the_recorded_ones_cell_for_cell():
     recorded = np.load(ROOT / "tests" / "data" / "population.npz")["start_ids"]
-    scenes = {scene.name: draw_scene(scene, RULES) for scene in read_file(DESIGNED)}
+    scenes = {scene.name: draw_start(scene, RULES).ids for scene in read_file(DESIGNED)}
     assert tuple(scenes) == NAMES
     for name, expected in zip(NAMES, recorded, strict=True):
         assert scenes[name].dtype == np.uint8
@@ -473,11 +473,6 @@ def test_files_that_are_no_text(tmp_path):
     with pytest.raises(CompileError) as caught:
         load_scene(path, RULES)
     assert caught.value.diagnostics[0].code == "PD102"
-
-
-def test_painting_writes_nothing_outside_the_window():
-    world = paint((3, 3), 7, [statement("disk sand at (1, 1) radius 1")], {"sand": 2})
-    assert world.tolist() == [[7, 7, 7], [7, 2, 7], [7, 7, 7]]
 
 
 @settings(max_examples=300, deadline=None)

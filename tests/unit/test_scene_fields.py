@@ -9,7 +9,7 @@ import pytest
 
 import powderdsl
 from powderdsl.diagnostics import CompileError
-from powderdsl.worlds.scene import draw_scene, find_scene, load_start
+from powderdsl.worlds.scene import load_start
 from tests.cli.commands import powderdsl as command
 
 RULES = powderdsl.load("powderworld")
@@ -59,12 +59,6 @@ def test_an_element_painted_later_is_fresh_and_a_place_keeps_its_value(tmp_path)
     assert found["momentum"].where.all(axis=1).tolist() == [True, True, False, True]
     assert found["momentum"].values[:, 0].tolist()[3] == 1
     assert found["velocity"].where.all()
-
-
-def test_what_scenes_without_settings_draw_stays_the_same(tmp_path):
-    path = written(tmp_path, "frame wall")
-    assert load_start(path, RULES).fields == {}
-    assert (load_start(path, RULES).ids == draw_scene(find_scene(path), RULES)).all()
 
 
 def test_a_run_starts_with_the_fields_of_its_scene(tmp_path):

@@ -20,7 +20,7 @@ from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.parse import line_of
 from powderdsl.syntax.sources import read_source
 from powderdsl.system.writing import failure
-from powderdsl.worlds.raster import MAX_CELLS, Paint, Setting, Shape, Size, mask, paint
+from powderdsl.worlds.raster import MAX_CELLS, Paint, Setting, Shape, Size, mask
 from powderdsl.worlds.scene.amounts import constants
 from powderdsl.worlds.scene.statements import (
     SETTING,
@@ -57,7 +57,7 @@ SIZE_RULE = f"a world has at least one row and one column, and at most {MAX_CELL
 
 @dataclass(frozen=True)
 class Scene:
-    """A drawn world. Elements are names as written: only `draw_scene` needs to know a ruleset."""
+    """A drawn world. Elements are names as written: only `draw_start` needs to know a ruleset."""
 
     name: str
     about: str
@@ -294,24 +294,6 @@ def element_ids(ruleset: Ruleset) -> dict[str, int]:
     return ids | {element.name: element.id for element in ruleset.elements}
 
 
-def draw_scene(scene: Scene, ruleset: Ruleset, *, size: Size | None = None) -> NDArray[np.uint8]:
-    """The ids uint8 [H, W] of a scene. Raises CompileError: PD604 unknown elements, PD607 a bad `size`."""
-    reporter = Reporter()
-    height, width = size or scene.size
-    if not (height >= 1 and width >= 1 and height * width <= MAX_CELLS):
-        raise failure("PD607", f"a world of {height}×{width} cells", helps=(SIZE_RULE,))
-    ids = element_ids(ruleset)
-    paints = [one for one in scene.paints if isinstance(one, Paint)]
-    used = [(scene.fill, scene.fill_span), *((one.element, one.element_span) for one in paints)]
-    names = {element.name for element in ruleset.elements}
-    for name, span in used:
-        if name not in ids:
-            helps, label = suggest(name, names, "its elements"), "not an element of this ruleset"
-            reporter.error("PD604", f"unknown element `{name}`", span, label, helps=helps)
-    reporter.raise_if_errors()
-    return paint((height, width), ids[scene.fill], paints, ids)
-
-
 def draw_start(scene: Scene, ruleset: Ruleset, *, size: Size | None = None) -> Start:
     """The start world of a scene.
 
@@ -322,26 +304,34 @@ def draw_start(scene: Scene, ruleset: Ruleset, *, size: Size | None = None) -> S
         CompileError: unknown elements (PD604) or fields (PD301), values of another kind (PD110) or out of range
             (PD402), settings that no cell can have (PD608), a bad `size` (PD607).
     """
-    ids = draw_scene(scene, ruleset, size=size)
+    size = size or scene.size
+    if not (min(size) >= 1 and size[0] * size[1] <= MAX_CELLS):
+        raise failure("PD607", f"a world of {size[0]}×{size[1]} cells", helps=(SIZE_RULE,))
+    reporter, ids = Reporter(), element_ids(ruleset)
     # Scenes may use qualified names of fields, worlds do not.
     paints = [
         replace(one, name=slot_name(ruleset, one.name)) if isinstance(one, Setting) else one
         for one in scene.paints
     ]
-    reporter, words = Reporter(), element_ids(ruleset)
+    used = [(one.element, one.element_span) for one in paints if isinstance(one, Paint)]
+    for name, span in ((scene.fill, scene.fill_span), *used):
+        if name not in ids:
+            helps = suggest(name, {element.name for element in ruleset.elements}, "its elements")
+            label = "not an element of this ruleset"
+            reporter.error("PD604", f"unknown element `{name}`", span, label, helps=helps)
     held = {slot.name: slot for slot in slots(ruleset) if slot.name != "element"}
-    values = {one: _value(one, held, words, ruleset, reporter) for one in paints if isinstance(one, Setting)}
+    values = {one: _value(one, held, ids, ruleset, reporter) for one in paints if isinstance(one, Setting)}
     reporter.raise_if_errors()
     found: dict[str, FieldValues] = {}
     for name in dict.fromkeys(one.name for one in values):
         slot = held[name]
-        unset = np.zeros((2, *ids.shape) if slot.planes == 2 else ids.shape, np.dtype(slot.dtype))
-        found[name] = FieldValues(unset, np.zeros(ids.shape, np.bool_))
-    now = np.full(ids.shape, words[scene.fill], dtype=np.uint8)
-    for one in paints if values else ():
-        cells = mask(one.shape, ids.shape)
+        unset = np.zeros((2, *size) if slot.planes == 2 else size, np.dtype(slot.dtype))
+        found[name] = FieldValues(unset, np.zeros(size, np.bool_))
+    now = np.full(size, ids[scene.fill], dtype=np.uint8)
+    for one in paints:
+        cells = mask(one.shape, size)
         if isinstance(one, Paint):
-            now[cells] = words[one.element]
+            now[cells] = ids[one.element]
             for name, field in found.items():
                 if held[name].travels:
                     field.where[cells] = False
@@ -360,7 +350,7 @@ def draw_start(scene: Scene, ruleset: Ruleset, *, size: Size | None = None) -> S
         found[one.name].values[..., cells] = np.array(values[one])[:, None]
         found[one.name].where[cells] = True
     reporter.raise_if_errors()
-    return Start(ids, found)
+    return Start(now, found)
 
 
 def _value(
