@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import Field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -133,11 +133,11 @@ def pairs(name: str, metavar: str, about: str, to: str, value: str = ".+", read:
     """An option that may be repeated: values by name. `value` is a pattern of them, `read` what makes them of text."""
 
     def mapping(ctx: click.Context, param: click.Parameter, words: tuple[str, ...]) -> dict[str, Any]:
-        values = {}
+        values: dict[str, Any] = {}
         for word in words:
             match = re.fullmatch(rf"\s*([^\s=]+)\s*=\s*({value})", word.rstrip())
-            if match is None:
-                raise click.BadParameter(f"`{word}`: write {metavar}", ctx, param)
+            if match is None or match[1] in values:
+                raise click.BadParameter(f"`{word}`: write {metavar}, a name once", ctx, param)
             values[match[1]] = read(match[2])
         return values
 
@@ -182,6 +182,11 @@ def _setting(one: Field[Any]) -> Option:
     elif isinstance(one.default, float):
         kind = float
     return option(f"--{name}", kind, about, to=one.name, multiple=isinstance(one.default, tuple))
+
+
+def given(values: Mapping[str, Any], names: Iterable[str]) -> dict[str, Any]:
+    """The values of some options, if they were given."""
+    return {name: values[name] for name in names if values.get(name) not in (None, (), {})}
 
 
 rules = click.argument("rules", metavar="RULES")

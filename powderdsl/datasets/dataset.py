@@ -34,8 +34,6 @@ from powderdsl.system.writing import failure
 
 Array = NDArray[Any]
 
-MAX_OPEN = 4096
-"""Shards that are mapped at once, at most."""
 MEANING = ("observation", "channels", "shape", "palette", "action_nvec", "choices")
 """Fields of a recipe that define what the numbers of observations and actions mean."""
 UNITS = ("world", "episode")
@@ -215,8 +213,8 @@ class Dataset:
         if number not in self._shards:
             row = self.manifest.shards[number]
             self._shards[number] = open_shard(self.folder, self.recipe, row)
-            while len(self._shards) > 1 and (
-                len(self._shards) > MAX_OPEN or sum(one.loaded for one in self._shards.values()) > self.memory
+            while (
+                len(self._shards) > 1 and sum(shard.loaded for shard in self._shards.values()) > self.memory
             ):
                 self._shards.popitem(last=False)
         self._shards.move_to_end(number)

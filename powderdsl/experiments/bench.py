@@ -273,12 +273,11 @@ class CellFigures:
 
 @dataclass(frozen=True)
 class Report:
-    """A plan and the figures of the cells that at least one round has reached."""
+    """A plan and the figures of its cells."""
 
     plan: Plan
     machine: Mapping[str, Any]
     cells: tuple[CellFigures, ...]
-    interrupted: bool = False
 
     def ratio(self, figures: CellFigures, program: str) -> float | None:
         """The processor time of a cell divided by that of a program for the same worlds; None if it is unknown."""
@@ -291,7 +290,7 @@ def measuring(plan: Plan, cells: list[CellFigures]) -> Iterator[tuple[str, Cell]
     """Measure a plan part by part; yields the kind of part and its cell.
 
     Parts are ``compile`` and ``profile``, which begin now, and ``measure``, a sample that is done. Figures of each
-    cell are added to `cells`, so a caller who stops early has what was measured so far. Torch's number of threads is that of
+    cell are added to `cells`. Torch's number of threads is that of
     each cell while this runs. Raises CompileError (PD701) for a backend or device that is not available.
     """
     import torch
@@ -444,7 +443,6 @@ def report_data(report: Report) -> dict[str, Any]:
         "rules": plan.ruleset.name,
         "elements": [element.name for element in plan.elements],
         **{name: getattr(plan, name) for name in ("workload", "device", "seed", "rounds")},
-        "interrupted": report.interrupted,
         "cells": cells,
     }
 
@@ -458,22 +456,18 @@ def report_text(report: Report) -> str:
         "{processor}, {cpus} CPUs, device {device}".format_map(machine),
     ]
     parts = ["\n".join(header)]
-    if report.cells:
-        steps = sorted({figures.steps_per_call for figures in report.cells})
-        shown = str(steps[0]) if len(steps) == 1 else f"{steps[0]} to {steps[-1]}"
-        notes = [
-            f"medians of {plan.rounds} interleaved rounds; a call makes {shown} steps, always from the same worlds",
-            "CPUs: processor time by time; less than the threads means that others were at work",
-            "to first step: compiling, which all lines of a backend share, and the first step",
-        ]
-        if plan.programs:
-            notes.append("÷: processor time divided by that of another program, from the same worlds")
-        parts += [_cell_table(report), "\n".join(notes)]
+    steps = sorted({figures.steps_per_call for figures in report.cells})
+    shown = str(steps[0]) if len(steps) == 1 else f"{steps[0]} to {steps[-1]}"
+    notes = [
+        f"medians of {plan.rounds} interleaved rounds; a call makes {shown} steps, always from the same worlds",
+        "CPUs: processor time by time; less than the threads means that others were at work",
+        "to first step: compiling, which all lines of a backend share, and the first step",
+    ]
+    if plan.programs:
+        notes.append("÷: processor time divided by that of another program, from the same worlds")
+    parts += [_cell_table(report), "\n".join(notes)]
     if profiled := [figures for figures in report.cells if figures.passes]:
         parts.append(_pass_table(profiled))
-    if report.interrupted:
-        rounds = max((len(figures.round_seconds) for figures in report.cells), default=0)
-        parts.append(f"interrupted: {rounds} of {plan.rounds} rounds were begun")
     return "\n\n".join(parts)
 
 

@@ -170,6 +170,9 @@ class Estimate:
     def __iter__(self) -> Iterator[Any]:
         return iter((self.mean, self.interval))
 
+    def __str__(self) -> str:
+        return f"{self.mean:.3f}" + ("" if self.interval is None else f" ± {self.interval:.3f}")
+
 
 def mean_and_interval(values: Sequence[float]) -> Estimate:
     """The mean, and half of its 95 % interval by Student's t."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from powderdsl.compiler import BACKENDS
 from powderdsl.diagnostics import CompileError, Diagnostic, Label, suggest
-from powderdsl.system.settings import mistakes, setting
+from powderdsl.system.settings import read_record, setting
 from powderdsl.tasks.shipped import check_split
 
 if TYPE_CHECKING:
@@ -149,33 +149,32 @@ a fully convolutional network with one score for each bin and deed."""
 
 def preset(name: str, task: str, **changes: Any) -> TrainConfig:
     """The settings of a preset, with changes. Raises CompileError (PD640) with everything that is wrong."""
-    wrong: list[Diagnostic] = []
+    problems = []
     if name not in PRESETS:
-        wrong.append(_wrong(f"there is no preset `{name}`", suggest(str(name), PRESETS, "presets")))
-    known = [one.name for one in fields(TrainConfig)]
-    unknown = [other for other in changes if other not in known]
-    wrong += [_wrong(f"there is no setting `{other}`", suggest(other, known)) for other in unknown]
-    values = {"task": task, **PRESETS.get(name, {})}
-    values |= {name: value for name, value in changes.items() if name in known}
+        problems.append("; ".join([f"there is no preset `{name}`", *suggest(str(name), PRESETS, "presets")]))
+    values = {"task": task, **PRESETS.get(name, {}), **changes}
     # The usual observation depends on the network.
     if "observation" not in changes and changes.get("network") in USUAL_OBSERVATION:
         values["observation"] = USUAL_OBSERVATION[changes["network"]]
-    values["packs"] = tuple(values.get("packs", ()))
-    return check_config(TrainConfig(**values), wrong)
+    return _checked(values, problems)
 
 
 def from_json(values: Mapping[str, Any]) -> TrainConfig:
     """Settings as `TrainConfig.as_json` gives them; missing ones have their defaults. Raises CompileError (PD640)."""
-    return preset("paper", **{"task": "", **values})
+    return _checked(values, [])
 
 
-def check_config(config: TrainConfig, known: Sequence[Diagnostic] = ()) -> TrainConfig:
-    """The same settings. Raises CompileError (PD640) with everything that is wrong in them, after what is `known`."""
-    wrong = [*known, *map(_wrong, mistakes(config))]
-    if not wrong:
-        wrong = [_wrong(sentence) for sentence in _contradictions(config)]
-    if wrong:
-        raise CompileError(wrong)
+def check_config(config: TrainConfig) -> None:
+    """Raise CompileError (PD640) with everything that is wrong in settings."""
+    _checked(config.as_json(), [])
+
+
+def _checked(values: Mapping[str, Any], problems: list[str]) -> TrainConfig:
+    config = read_record(TrainConfig, values, problems)
+    if config is not None:
+        problems += _contradictions(config)
+    if config is None or problems:
+        raise CompileError([_wrong(problem) for problem in problems])
     return config
 
 
@@ -222,5 +221,5 @@ def _contradictions(config: TrainConfig) -> Iterator[str]:
         yield "`rollout` × `envs` is 1: an update needs two actions or more"
 
 
-def _wrong(message: str, helps: Sequence[str] = ()) -> Diagnostic:
-    return Diagnostic("PD640", message, Label(None), helps=tuple(helps))
+def _wrong(message: str) -> Diagnostic:
+    return Diagnostic("PD640", message, Label(None))

@@ -28,7 +28,8 @@ MAX_HEADER = 10_000
 """Maximum bytes of an array's header."""
 _MAGIC, _ALIGNMENT, _SHAPE_ROOM = b"\x93NUMPY\1\0", 64, 21
 """How arrays begin, in version 1.0; the multiple of bytes at which their values begin; characters that may hold the first side."""
-_TYPES = {"b": "bool", "i": "int", "u": "uint", "f": "float", "U": "str"}
+_TYPES = {f"<{name[0]}{size}": f"{name}{8 * size}" for name in ("int", "uint", "float") for size in (2, 4, 8)}
+_TYPES |= {"|b1": "bool", "|i1": "int8", "|u1": "uint8"}
 _END, _LOCATOR, _END64 = struct.Struct("<4s4H2LH"), 20, struct.Struct("<4sQ2H2L4Q")
 """The end of a zip file; before it, where it is large, bytes of a pointer and another end."""
 
@@ -178,14 +179,12 @@ def _header(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> tuple[str, Head
         values = literal_eval(member.read(count).decode("latin-1").strip())
         start = member.tell()
     descr, fortran, shape = values["descr"], values["fortran_order"], values["shape"]
-    match = re.fullmatch(r"[<|](?:(b)(1)|([iu])([1248])|(f)([248])|(U)([0-9]{1,9}))", descr)
-    if match is None or any(type(side) is not int or side < 0 for side in shape):
+    dtype = "str" if re.fullmatch("<U[0-9]{1,9}", descr) else _TYPES.get(descr)
+    if dtype is None or any(type(side) is not int or side < 0 for side in shape):
         raise BadArchive(f"`{name}` is not an array of numbers")
     if fortran:
         raise BadArchive(f"`{name}` is not in C order: save `numpy.ascontiguousarray` of it")
-    letter, digits = filter(None, match.groups())
-    itemsize = int(digits) * (4 if letter == "U" else 1)
-    dtype = _TYPES[letter] if letter in "bU" else f"{_TYPES[letter]}{8 * itemsize}"
+    itemsize = int(descr[2:]) * (4 if dtype == "str" else 1)
     header = Header(tuple(shape), dtype, itemsize, start, entry)
     if entry.file_size != header.start + header.size:
         raise BadArchive(f"`{name}` has {entry.file_size - header.start:,} bytes, not {header.size:,}")

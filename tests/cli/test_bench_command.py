@@ -8,7 +8,6 @@ import pytest
 
 from powderdsl.cli import exits
 from powderdsl.cli.commands import bench as bench_command
-from powderdsl.experiments.bench import measuring
 from tests.cli.commands import powderdsl
 
 QUICK = ("bench", "life", "--size", "6x8", "--rounds", "2", "--seconds", "0.001", "--steps", "2")
@@ -61,35 +60,6 @@ def test_what_cannot_be_measured_is_refused(arguments, words):
     result = powderdsl("bench", *arguments)
     assert result.exit_code == exits.BAD_INPUT
     assert words in result.stderr
-
-
-@pytest.mark.parametrize("printed", [(), ("--json",)])
-def test_ctrl_c_reports_what_was_measured(printed, monkeypatch):
-    def interrupted(plan, cells):
-        parts = measuring(plan, cells)
-        for _ in range(2):  # the cell is compiled, one round
-            yield next(parts)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(bench_command, "measuring", interrupted)
-    result = powderdsl(*TORCH, *printed)
-    assert result.exit_code == exits.INTERRUPTED
-    if not printed:
-        assert "interrupted: 1 of 2 rounds" in result.stdout
-        return
-    data = json.loads(result.stdout)
-    assert data["interrupted"]
-    assert [len(cell["round_seconds"]) for cell in data["cells"]] == [1]
-
-
-def test_ctrl_c_before_anything_was_measured(monkeypatch):
-    def interrupted(plan, cells):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(bench_command, "measuring", interrupted)
-    result = powderdsl(*TORCH)
-    assert result.exit_code == exits.INTERRUPTED
-    assert "interrupted: 0 of 2 rounds" in result.stdout
 
 
 def test_without_a_compiler_webassembly_is_measured(monkeypatch):

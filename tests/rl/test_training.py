@@ -163,7 +163,7 @@ def test_all_mistakes_are_named() -> None:
         preset("smal", "dig", batch=1, epochs=0.5, gamma=float("nan"), network="big", envz=3, task_=0)
     text = " ".join(one.message for one in error.value.diagnostics)
     assert {one.code for one in error.value.diagnostics} == {"PD640"}
-    for word in ("`smal`", "`batch` is 1", "`epochs` is 0.5", "`gamma` is nan", "`network`", "`envz`"):
+    for word in ("`smal`", "`batch` must be", "`epochs` must be", "`gamma` must be", "`network`", "`envz`"):
         assert word in text
     assert len(error.value.diagnostics) == 7
 

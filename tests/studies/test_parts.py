@@ -78,7 +78,7 @@ def contents(folder: str) -> list[bytes]:
 def test_shards_are_all_points_each_once(of: int, tmp_path: Path) -> None:
     (tmp_path / "study.yaml").write_text(STUDY, encoding="utf-8")
     study = load_study(str(tmp_path / "study.yaml"), commands())
-    points = selected(study, "small", None, ())
+    points = selected(study, "small", None, {})
     shards = [part(points, (number, of)) for number in range(1, of + 1)]
     assert [point for shard in shards for point in shard] == points
     assert max(map(len, shards)) - min(map(len, shards)) <= 1
@@ -89,7 +89,6 @@ def test_shards_are_all_points_each_once(of: int, tmp_path: Path) -> None:
     [
         (["steps=100"], 4),
         (["steps=100,300"], 8),
-        (["steps=100", "steps=300"], 8),
         (["steps=100,200", "seed=1"], 4),
         (["seed=0,1"], 12),
         (["obstacles=some", "seed=1"], 3),
@@ -97,19 +96,18 @@ def test_shards_are_all_points_each_once(of: int, tmp_path: Path) -> None:
         (["lines=5", "obstacles=none"], "no combination has lines=5 and obstacles=none"),
         (["steps=150"], "`steps` has no value `150` here"),
         (["seed=2"], "`seed` has no value `2` here"),
-        (["steps"], "write NAME=VALUE"),
-        (["stpes=100"], "with one of steps, obstacles, lines, seed as NAME"),
-        (["steps="], "`steps` has no value ``"),
+        (["stpes=100"], "no setting is called `stpes`"),
     ],
 )
 def test_only_selects_settings_and_seeds(only: list[str], count: int | str, tmp_path: Path) -> None:
     (tmp_path / "study.yaml").write_text(STUDY, encoding="utf-8")
     study = load_study(str(tmp_path / "study.yaml"), commands())
+    wanted = dict(word.split("=") for word in only)
     if isinstance(count, int):
-        assert len(selected(study, "small", None, only)) == count
+        assert len(selected(study, "small", None, wanted)) == count
         return
     with pytest.raises(BadInput) as caught:
-        selected(study, "small", None, only)
+        selected(study, "small", None, wanted)
     assert count in caught.value.message
 
 
@@ -342,7 +340,7 @@ def test_the_recipe_for_slurm_runs_each_combination_once(tmp_path: Path) -> None
         assert words[0] == "study"
         options = dict(zip(words[2::2], words[3::2], strict=True))
         assert set(options) <= {name for one in study_command.params for name in one.opts}
-        points = selected(load_study(words[1], known), options["--size"], None, ())
+        points = selected(load_study(words[1], known), options["--size"], None, {})
         found.append(part(points, SHARD.convert(options["--shard"], None, None)))
     assert all(len(points) == 1 for points in found)
     assert [points[0] for points in found] == list(load_study("start-states", known).points("paper"))

@@ -118,7 +118,6 @@ def test_shipped_studies_pass(name: str) -> None:
         (MODELS, "packs: [gas, acid]", "packs: [gas, acdi]", "PD304", "acdi"),
         (MODELS, "packs: [gas, acid], ", "", "PD806", "tuned"),
         (MODELS, "split: held_out", "split: held_out, only: [gas, wood]", "PD304", "wood"),
-        (MODELS, "split: held_out", "split: held_out, out: x.json", "PD806", "tuned"),
         (MODELS, "elements: $elements", "elements: $elements, rulesets: 2, swap: densty", "PD301", "densty"),
         (MODELS, "split: held_out", "split: held_in", "PD801", "held_in"),
         (MODELS, "split: held_out", "rules: powderwolrd", "PD304", "powderwolrd"),

@@ -82,7 +82,7 @@ def command(
     """Measure how fast rules run.
 
     --backend, --batch, --size and --threads may be repeated. All their combinations are measured, in
-    turn, round after round, and medians are shown. Ctrl-C shows what was measured so far.
+    turn, round after round, and medians are shown.
     """
     ruleset = opt.load_rules(rules, settings)
     with user_values():
@@ -95,22 +95,15 @@ def command(
             **measurement,
         )
     machine, figures = this_machine(plan.device), list[CellFigures]()
-    interrupt: KeyboardInterrupt | None = None
     parts = len(plan.cells) * (1 + plan.rounds + plan.profile)
     with user_values() if plan.programs else nullcontext(), progress("bench", parts) as show:
-        try:
-            for done, (what, cell) in enumerate(measuring(plan, figures)):
-                show(done, f"{what} {cell}")
-        except KeyboardInterrupt as caught:  # what was measured until then is shown
-            interrupt = caught
-    measured = tuple(cell for cell in figures if cell.round_seconds)
-    report = Report(plan, machine, measured, interrupt is not None)
+        for done, (what, cell) in enumerate(measuring(plan, figures)):
+            show(done, f"{what} {cell}")
+    report = Report(plan, machine, tuple(figures))
     if printed:
         print_json(report_data(report))
     else:
         click.echo(report_text(report))
-    if interrupt is not None:
-        raise interrupt
     return OK
 
 

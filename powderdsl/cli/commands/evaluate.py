@@ -14,7 +14,7 @@ from powderdsl.cli.output import print_json
 from powderdsl.system.reports import table
 
 if TYPE_CHECKING:
-    from powderdsl.rl.evaluation import Evaluation, Score
+    from powderdsl.rl.evaluation import Evaluation
 
 
 @click.command("evaluate", cls=opt.ManyWords)
@@ -66,9 +66,16 @@ def command(
 
 
 def _text(found: Evaluation) -> list[str]:
+    from powderdsl.experiments.runs import Estimate
+    from powderdsl.rl.config import BASELINES
+
     after = "" if found.step is None else f", after {found.step:,} interactions"
     rows = [["split", "policy", "return", "above random", "above nothing", "of expert", "success", "actions"]]
-    rows += [_row(score) for score in found.scores]
+    for score in found.scores:
+        above = [str(score.above.get(other, "")) for other in BASELINES]
+        success = "" if score.success is None else f"{score.success:.0%}"
+        means = [str(Estimate(score.mean, score.interval)), *above, str(score.normalized or "")]
+        rows.append([score.split, score.policy, *means, success, f"{score.length:.1f}"])
     worlds = {score.split: score.episodes for score in found.scores}
     same = [
         f"{name}: all policies got the same return in {count} of {worlds[name]} worlds"
@@ -77,27 +84,8 @@ def _text(found: Evaluation) -> list[str]:
     ]
     same += [
         f"{name}: {one.worlds} of {worlds[name]} worlds start as a training world does; returns without them: "
-        + ", ".join(f"{policy} {_number(*of)}" for policy, of in one.without.items())
+        + ", ".join(f"{policy} {estimate}" for policy, estimate in one.without.items())
         for name, one in found.seen.items()
         if one.worlds
     ]
     return [f"{found.task}{after}", *same, *table(rows)]
-
-
-def _row(score: Score) -> list[str]:
-    from powderdsl.rl.config import BASELINES
-
-    success = "" if score.success is None else f"{score.success:.0%}"
-    return [
-        score.split,
-        score.policy,
-        _number(score.mean, score.interval),
-        *(_number(*score.above[other]) if other in score.above else "" for other in BASELINES),
-        "" if score.normalized is None else _number(*score.normalized),
-        success,
-        f"{score.length:.1f}",
-    ]
-
-
-def _number(mean: float, half: float | None) -> str:
-    return f"{mean:.3f}" + ("" if half is None else f" ± {half:.3f}")

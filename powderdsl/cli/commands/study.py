@@ -67,11 +67,11 @@ def commands() -> Mapping[tuple[str, ...], Mapping[str, str]]:
 
 # Parts of a study: the combinations that `--only`, `--seeds` and `--shard` select
 
-only_option = opt.option(
+only_option = opt.pairs(
     "--only",
     "NAME=VALUE,…",
     "Run only combinations with these values of a setting, or `seed=0,1`. May be repeated.",
-    multiple=True,
+    "only",
 )
 seeds_option = opt.option("--seeds", (1, 1000), "Runs of each combination.  [default: the study's]")
 
@@ -87,22 +87,21 @@ def _shard(text: str) -> tuple[int, int]:
 SHARD = opt.Parsed("I/N", _shard)
 
 
-def selected(study: Study, size: str, seeds: int | None, only: Sequence[str]) -> list[Point]:
+def selected(study: Study, size: str, seeds: int | None, only: Mapping[str, str]) -> list[Point]:
     """The combinations that were asked for. Raises BadInput if there are none."""
-    points = list(study.points(size, seeds))
-    known = {name: {point.names[name] for point in points} for name in points[0].names if name != SIZE}
-    wanted: dict[str, set[str]] = {}
-    for text in only:
-        name, _, values = text.partition("=")
-        if (not values and "=" not in text) or name not in known:
-            raise BadInput(f"`--only {text}`: write NAME=VALUE,… with one of {', '.join(known)} as NAME")
-        for value in sorted({*values.split(",")} - known[name]):
-            there = suggest(value, known[name]) or (f"it has {', '.join(sorted(known[name])[:20])}",)
-            raise BadInput(f"`--only {text}`: `{name}` has no value `{value}` here; {there[0]}")
-        wanted.setdefault(name, set()).update(values.split(","))
-    points = [point for point in points if all(point.names[name] in wanted[name] for name in wanted)]
+    points = every = list(study.points(size, seeds))
+    for name, text in only.items():
+        known = {point.names[name] for point in every if name in point.names and name != SIZE}
+        if not known:
+            raise BadInput(
+                f"--only: no setting is called `{name}`; {', '.join(suggest(name, every[0].names))}"
+            )
+        for value in sorted({*text.split(",")} - known):
+            there = suggest(value, known) or (f"it has {', '.join(sorted(known)[:20])}",)
+            raise BadInput(f"--only: `{name}` has no value `{value}` here; {there[0]}")
+        points = [point for point in points if point.names[name] in text.split(",")]
     if not points:
-        raise BadInput(f"no combination has {' and '.join(only)}")
+        raise BadInput(f"no combination has {' and '.join(map('='.join, only.items()))}")
     return points
 
 
@@ -130,7 +129,7 @@ class StudyCommand(click.Command):
 @seeds_option
 @only_option
 @opt.path("--out", "FOLDER", "Folder for the table and the figure.  [default: the first FOLDER]")
-def collect(folders: tuple[Path, ...], seeds: int | None, only: tuple[str, ...], out: Path | None) -> int:
+def collect(folders: tuple[Path, ...], seeds: int | None, only: dict[str, str], out: Path | None) -> int:
     """Merge the results of a study that ran in several folders, or in parts.
 
     Writes results.md, results.json and figure.png, as the study does that ran in one piece. Exits with 1 if results of
@@ -162,7 +161,7 @@ def command(
     seeds: int | None,
     jobs: int | None,
     threads: int,
-    only: tuple[str, ...],
+    only: dict[str, str],
     shard: tuple[int, int] | None,
     ray: str | None,
     out: Path | None,

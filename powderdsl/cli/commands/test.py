@@ -151,18 +151,18 @@ class _Report:
             f"{ruleset.name}: {len(runner.lines) - len(missed)} of {counted(len(runner.lines), 'rule')} happened"
             f" on {runner.worlds_run:,} worlds in {monotonic() - start:.0f} s"
         )
-        broken = sum(not result.holds for result in results)
-        failed = sum(test.failed for test in tests)
-        changed = sum(bool(test.added) for test in tests)
-        changed += sum(result.status == "differs" for result in results)
         declared = [result for result in results if result.prop.owner != "automatic"]
         parts = [counted(len(tests), "test")]
         parts += [counted(len(declared), "invariant")] if declared else []
-        bad = [f"{number} {word}" for number, word in ((failed, "failed"), (broken, "broken")) if number]
-        come = "comes" if changed == 1 else "come"
-        differ = [f"{changed} {come} out differently with added packs"] if changed else []
-        self.say(f"{ruleset.name}: {', '.join([*parts, *(bad + differ or ['all passed'])])}")
-        self.failed |= bool(bad)
+        counts = {
+            "failed": sum(test.failed for test in tests),
+            "broken": sum(not result.holds for result in results),
+            "different with added packs": sum(bool(test.added) for test in tests)
+            + sum(result.status == "differs" for result in results),
+        }
+        told = [f"{number} {word}" for word, number in counts.items() if number]
+        self.say(f"{ruleset.name}: {', '.join([*parts, *(told or ['all passed'])])}")
+        self.failed |= bool(counts["failed"] or counts["broken"])
         self.data[name] = _data(tests, results, runner.lines, missed)
 
     def _properties(self, name: str, runner: Runner) -> list[Result]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -35,11 +35,8 @@ from powderdsl.system.reading import read_json
 @opt.option("--complexity", (0, 10**6), "Short for --knob complexity=N.")
 @opt.parameters
 @opt.packs
-@opt.backend("auto")
-@click.pass_context
-def command(
-    ctx: click.Context, /, task: str | None, folder: Path | None, resume: Path | None, **_: Any
-) -> None:
+@opt.backend(None, "Backend that runs the rules.  [default: auto]")
+def command(task: str | None, folder: Path | None, resume: Path | None, **values: Any) -> None:
     """Train an agent on TASK with PPO: a shipped task's name, or a task's file.
 
     The same command again, or --resume DIR, continues where a run was interrupted; more --steps continue with one that is
@@ -48,9 +45,9 @@ def command(
     if resume is not None:
         if task is not None or folder is not None:
             raise BadInput("--resume goes without TASK and --run: the run knows its task")
-        config, folder = _config_of(resume, ctx), resume
+        config, folder = _config_of(resume, values), resume
     else:
-        config = new_config(ctx)
+        config = new_config({**values, "task": task})
         folder = folder or Path("runs") / f"{Path(config.task).stem}-seed{config.seed}"
     from powderdsl.rl.training import train
 
@@ -69,36 +66,30 @@ WHAT = ("lines", "disks", "complexity", "knobs", "settings", "packs")
 """Options that decide on worlds and rules."""
 
 
-def _given(ctx: click.Context, names: Iterable[str]) -> dict[str, Any]:
-    """The values of some options, if they were given."""
-    default = click.core.ParameterSource.DEFAULT
-    return {name: ctx.params[name] for name in names if ctx.get_parameter_source(name) not in (None, default)}
-
-
-def new_config(ctx: click.Context) -> TrainConfig:
-    """The settings of a new run. Raises CompileError and BadInput with what is wrong in them."""
-    values = ctx.params
+def new_config(values: Mapping[str, Any]) -> TrainConfig:
+    """The settings of a new run, of options. Raises CompileError and BadInput with what is wrong in them."""
     task = values["task"]
     if task is None:
         raise BadInput("say which TASK, or --resume DIR")
-    given = _given(ctx, [one.name for one in fields(TrainConfig) if one.name not in (*WHAT, "task")])
+    names = [setting.name for setting in fields(TrainConfig) if setting.name not in (*WHAT, "task")]
+    given = opt.given(values, names)
     if "init_from" in given:
         given["init_from"] = str(given["init_from"].absolute())
-    knobs = values["knobs"] | _given(ctx, ("lines", "disks", "complexity"))
+    knobs = values["knobs"] | opt.given(values, ("lines", "disks", "complexity"))
     name = str(Path(task).absolute()) if Path(task).suffix else task
     more = {"knobs": knobs, "params": values["settings"], "packs": values["packs"]}
     return preset(values["preset_name"], name, **given, **more)
 
 
-def _config_of(folder: Path, ctx: click.Context) -> TrainConfig:
+def _config_of(folder: Path, values: Mapping[str, Any]) -> TrainConfig:
     """The settings of a run, with those changed that may change."""
     from powderdsl.experiments.runs import find_run
     from powderdsl.rl.config import HOW
     from powderdsl.rl.policies import config_of
     from powderdsl.rl.training import ASKED, KIND
 
-    given = _given(ctx, [one.name for one in fields(TrainConfig) if one.name not in WHAT])
-    if any(name not in HOW for name in given) or _given(ctx, WHAT):
+    given = opt.given(values, [setting.name for setting in fields(TrainConfig) if setting.name not in WHAT])
+    if any(name not in HOW for name in given) or opt.given(values, WHAT):
         raise BadInput(f"--resume keeps what is trained; only {', '.join(HOW)} may change")
     run = find_run(folder, KIND)
     latest = read_json(run.path / ASKED) or {}

@@ -134,7 +134,7 @@ def new_config(values: Mapping[str, Any], rules_of: Callable[..., str]) -> Train
     with user_values():
         config = replace(PRESETS[values["preset"]], **given_settings(values, TrainConfig))
         rules, task = values["rules"] or "", values["task"] or config.data.task
-        short = {name: values[name] for name in KNOBS if values[name] is not None}
+        short = opt.given(values, KNOBS)
         changes = {
             **given_settings(values, DataConfig),
             "rules": rules_of(rules, task, packs, held_out) if packs or held_out else rules,
@@ -184,7 +184,7 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
     "--rulesets", (0, 1024), "Number of rulesets that training never saw, to test under.  [default: 0]"
 )
 @opt.option("--json", bool, "One JSON object instead of a table.", to="as_json")
-@opt.output("--out", "FILE", "File of the results.  [default: RUN/evaluation.json]")
+@opt.output("--out", "FILE", "Also write the results to this file.")
 def eval_command(run: str, as_json: bool, out: Path | None, **values: Any) -> None:
     """Test a network beside two baselines: that nothing changes, and each element's most frequent outcome.
 
@@ -201,10 +201,9 @@ def eval_command(run: str, as_json: bool, out: Path | None, **values: Any) -> No
     else:
         tested = evaluate(trained, worlds=values["worlds"], machine=machine, **tested_on(values))
     plain = tested.plain()
+    write_json(trained.run.path / "evaluation.json", plain)
     if out is not None:
         write_json(out, plain, follow=True)
-    else:
-        write_json(trained.run.path / "evaluation.json", plain)
     if as_json:
         print_json(plain)
     else:
@@ -282,8 +281,7 @@ def tested_on(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def given_settings(values: Mapping[str, Any], config: type) -> dict[str, Any]:
     """The settings of a dataclass that were given as options."""
-    names = [one.name for one in fields(config) if values.get(one.name) not in (None, ())]
-    return {name: values[name] for name in names}
+    return opt.given(values, [setting.name for setting in fields(config)])
 
 
 def _machine(values: dict[str, Any]) -> Machine:
@@ -300,9 +298,9 @@ def _machine(values: dict[str, Any]) -> Machine:
 
 def _refuse(values: Mapping[str, Any]) -> None:
     """Refuse options that select worlds: a dataset has its own."""
-    for one in click.get_current_context().command.params:
-        if one.name in OF_WORLDS and values.get(one.name) not in (None, (), {}):
-            raise BadInput(f"{one.opts[0]} selects worlds, and --data has its own")
+    for option in click.get_current_context().command.params:
+        if option.name in opt.given(values, OF_WORLDS):
+            raise BadInput(f"{option.opts[0]} selects worlds, and --data has its own")
 
 
 def _opened(folder: Path, task: str | None) -> Recording:

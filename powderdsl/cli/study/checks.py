@@ -178,7 +178,7 @@ class _StudyCheck:
         values = context.params
         match command:
             case ("train",):
-                config = train.new_config(context)
+                config = train.new_config(values)
                 check_task(config, _task(config.task, config.knobs, config.params, config.packs))
                 return config
             case ("evaluate",):
@@ -215,14 +215,10 @@ class _StudyCheck:
         made = next((step for step in self.study.steps if step.name == measure.of.text), None)
         if made is None or made.command not in MAKES:
             return  # reported by the reader
-        command = "evaluate" if MAKES[made.command] == AGENT else "wm eval"
-        steps = [
-            step
-            for step in self.study.steps
-            if " ".join(step.command) == command and self.study.works_on(step) == made
-            if command == "evaluate" or "out" not in dict(step.words)  # where `wm eval` writes instead
-        ]
-        if not steps and not any(step.name in self.wrong for step in self.study.steps if not step.makes_run):
+        tests = [step for step in self.study.steps if not step.makes_run]
+        steps = [step for step in tests if self.study.works_on(step) == made]
+        if not steps and not any(step.name in self.wrong for step in tests):
+            command = "evaluate" if MAKES[made.command] == AGENT else "wm eval"
             helps = [f"add a step such as `tested: {{command: {command}, on: {made.name}}}`"]
             self.reporter.error("PD806", f"no step evaluates `{made.name}`", measure.of.span, helps=helps)
         for point in self.points if steps else ():

@@ -293,23 +293,20 @@ class _StudyReader:
             self.step(key, node)
         named = self.reader.named(decl.measures, "a measure")
         measures = [measure for key, node in named if (measure := self.measure(key, node)) is not None]
-        entries = tree.entries if isinstance(tree, Mapping_) else ()
-        place = next((value.span for key, value in entries if key.text == "study"), first_line(tree))
+        places = {key.text: node.span for key, node in self.reader.pairs(tree, "a mapping")}
         for size in SIZES:
             points = math.prod((decl.seeds, *(len(axis.values[size]) for axis in axes)))
             if points > MAX_POINTS:
                 message = f"{points:,} combinations at the size `{size}`"
-                self.error("PD806", message, place, f"at most {MAX_POINTS:,}")
-        if not self.is_hidden:
-            for axis in axes:
-                names = next(iter(axis.sets.values()), {}) or {axis.name: axis.key}
-                for unused in (name for name in names if name not in self.used):
-                    helps = (f"write `${unused}` in a step, or leave it out",)
-                    self.error("PD806", f"no step uses `{unused}`", names[unused].span, helps=helps)
-            if decl.seeds > 1 and SEED not in self.used:
-                place = next(value.span for name, value in entries if name.text == "seeds")
-                helps = ("write `seed: $seed` in a step that trains, or `seeds: 1`",)
-                self.error("PD806", "no step uses `$seed`", place, helps=helps)
+                self.error("PD806", message, places.get("study", first_line(tree)), f"at most {MAX_POINTS:,}")
+        names = {SEED: places["seeds"]} if decl.seeds > 1 else {}
+        for axis in axes:
+            given = next(iter(axis.sets.values()), {}) or {axis.name: axis.key}
+            names |= {name: given[name].span for name in given}
+        for name, span in names.items():
+            if not (self.is_hidden or name in self.used):
+                helps = (f"write `${name}` in a step, or leave it out",)
+                self.error("PD806", f"no step uses `${name}`", span, helps=helps)
         steps, source = tuple(self.steps.values()), tree.span.source
         folder = Path(source.name).parent
         return Study(decl.name, decl.about, decl.seeds, tuple(axes), steps, tuple(measures), source, folder)
