@@ -17,7 +17,7 @@ from powderdsl.model.composition.layout import lay_out
 from powderdsl.model.composition.names import needs_of, report_misspelled, words_of
 from powderdsl.model.declarations import PackDecl, RulesetDecl
 from powderdsl.model.definitions import define_symbols, element_ramps
-from powderdsl.model.elaborate import Elaborated, Elaborator
+from powderdsl.model.elaborate import Elaborator
 from powderdsl.model.examples import check_assigned, check_examples
 from powderdsl.model.expressions.symbols import add_constants
 from powderdsl.model.expressions.typer import Typer
@@ -75,7 +75,8 @@ def check(
     """
     typer, given = resolve_names(packs, ruleset, reporter, palette)
     composition = typer.symbols
-    elaborated = Elaborator(typer).run(composition.passes)
+    elaborated = Elaborator(typer)
+    elaborated.run(composition.passes)
     examples = check_examples(typer)
     invariants = check_invariants(composition, typer, partial(_typer_of, packs))
     ramps = element_ramps(typer)
@@ -131,7 +132,7 @@ def _typer_of(packs: Sequence[PackDecl], names: tuple[str, ...]) -> Typer | None
         return None
 
 
-def _streams(symbols: Composition, elaborated: Elaborated, reporter: Reporter) -> tuple[Stream, ...]:
+def _streams(symbols: Composition, elaborated: Elaborator, reporter: Reporter) -> tuple[Stream, ...]:
     streams = [*symbols.streams.values(), *elaborated.streams.values()]
     by_ident: dict[int, str] = {}
     for stream in streams:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 from powderdsl.diagnostics import Span, suggest
 from powderdsl.model.builtins import DIRECTION_SETS, DIRECTIONS
@@ -53,8 +53,7 @@ from powderdsl.system.random import name_number
 MAX_MOMENTS = 1000
 MAX_RULES = 5000
 MAX_TRIED = 4 * MAX_RULES
-"""Rules with all their copies, wrong, inactive and repeated ones included."""
-MAX_BLOCKS = 5000
+"""Rules with all their copies, and loops: wrong, inactive and repeated ones included."""
 
 _QUARTERS: tuple[Matrix, ...] = (IDENTITY, ((0, 1), (-1, 0)), ((-1, 0), (0, -1)), ((0, -1), (1, 0)))
 _MIRRORED: tuple[Matrix, ...] = tuple((rows, (-a, -b)) for rows, (a, b) in _QUARTERS)
@@ -68,50 +67,43 @@ ORIENTATIONS: dict[str | None, tuple[Matrix, ...]] = {
 """The orientations in which a rule under `symmetry:` holds."""
 
 
-@dataclass
-class Elaborated:
-    """The checked passes, and facts about them that later checks need."""
-
-    passes: list[Pass] = field(default_factory=list)
-    streams: dict[str, Stream] = field(default_factory=dict)
-    overridden: set[str] = field(default_factory=set)
-    inactive: dict[Span, str] = field(default_factory=dict)
-    """Rules some copy of which asks for something that is not loaded, and its name."""
-    empty: dict[Span, str] = field(default_factory=dict)
-    """Rules that ask for a set or tag without elements, and its name."""
-    active: set[Span] = field(default_factory=set)
-    """Rules some copy of which does not."""
-
-
 class Elaborator:
-    """Turns declared passes into checked ones, one after the other."""
+    """Turns declared passes into checked ones, one after the other; knows facts about rules that later checks need."""
 
     def __init__(self, typer: Typer):
         self.typer = typer
-        self.result = Elaborated()
+        self.passes: list[Pass] = []
+        self.streams: dict[str, Stream] = {}
+        self.overridden: set[str] = set()
+        self.inactive: dict[Span, str] = {}
+        """Rules some copy of which asks for something that is not loaded, and its name."""
+        self.empty: dict[Span, str] = {}
+        """Rules that ask for a set or tag without elements, and its name."""
+        self.active: set[Span] = set()
+        """Rules some copy of which does not."""
         self._rules = self._tried = 0
-        self._blocks = 0
 
-    def run(self, passes: Mapping[str, PassDecl]) -> Elaborated:
+    def run(self, passes: Mapping[str, PassDecl]) -> None:
         for name, decl in passes.items():
             with suppress(Poisoned):
-                self.result.passes.append(self._pass(name, decl))
-        for span, name in self.result.inactive.items():
-            if span not in self.result.active:
+                self.passes.append(self._pass(name, decl))
+        for span, name in self.inactive.items():
+            if span not in self.active:
                 helps = [f"it becomes active with a pack that defines `{name}`"]
                 message = f"this rule is inactive: `{name}` is not loaded"
                 self.typer.reporter.report("PD506", message, span, "left out", helps=helps)
-        return self.result
 
     def _pass(self, name: str, decl: PassDecl) -> Pass:
-        self._name, self._pack, self._word = name, decl.pack, decl.name.text
-        rules = [rule for block in decl.walk() for rule in block.rules]
-        self._numbers = {id(rule): number for number, rule in enumerate(rules)}
+        self._name, self._decl = name, decl
+        self._numbers: dict[int, int] = {}
         self._empty_lets: set[str] = set()
         self._lets: dict[str, int] = {}
         self._pending: list[Let] = []
         self._moments: list[Moment] = []
         self._scratch: list[Field] = []
+        for block in decl.walk():
+            for rule in block.rules:
+                self._numbers[id(rule)] = len(self._numbers)
         scope = Scope(decl.pack, {})
         for item in decl.scratch:
             scope = scope.bind(**{item.name.text: self._scratch_field(item, scope)})
@@ -129,7 +121,7 @@ class Elaborator:
         except Poisoned:
             return Broken()
         default = default_of(kind, self.typer.symbols.first_id)
-        self._scratch.append(Field(name, kind, default, "place", True, None, self._pack, span))
+        self._scratch.append(Field(name, kind, default, "place", True, None, self._decl.pack, span))
         return Expr("field", kind, value=name, span=span)
 
     def _is_new(self, name: Scalar, scope: Scope) -> bool:
@@ -143,11 +135,8 @@ class Elaborator:
     def _block(
         self, block: Block, scope: Scope, label: str, symmetry: str | None, policy: str | None
     ) -> None:
-        self._blocks += 1
-        if self._blocks > MAX_BLOCKS and block.header is not None:
-            self._blocks = 0
-            message, label = "loops in loops that never end", "repeated too often"
-            raise self.typer.fail("PD508", message, block.header.span, label, "loop over fewer things")
+        if block.header is not None:
+            self._spend(1, block.header.span)
         symmetry, policy = block.symmetry or symmetry, block.conflicts or policy
         for scalar, syntax in block.lets:
             is_new = self._is_new(scalar, scope)
@@ -220,20 +209,25 @@ class Elaborator:
         self, rules: tuple[Syntax, ...], scope: Scope, label: str, symmetry: str | None, policy: str | None
     ) -> None:
         self._label = label
-        self._tried += len(rules) * len(ORIENTATIONS[symmetry])
+        self._spend(len(rules) * len(ORIENTATIONS[symmetry]), rules[0].span)
         typed: list[Rule] = []
-        for syntax in rules if self._tried <= MAX_TRIED else ():
+        for syntax in rules:
             copies: list[Rule] = []
             for matrix in ORIENTATIONS[symmetry]:
                 rules_here = self._rule(syntax, replace(scope, orientation=matrix))
                 copies += [rule for rule in rules_here if rule not in copies]
             typed += copies
         self._rules += len(typed)
-        if self._tried > MAX_TRIED or self._rules > MAX_RULES or len(self._moments) >= MAX_MOMENTS:
-            message = f"loops unroll to more than {MAX_MOMENTS} substeps or {MAX_RULES} rules"
-            raise self.typer.fail("PD508", message, rules[0].span, "here", "loop over fewer things")
+        self._spend(0, rules[0].span)
         self._moments.append(Moment(tuple(self._pending), tuple(typed), policy or "prove", label))
         self._pending = []
+
+    def _spend(self, tries: int, span: Span) -> None:
+        """Count rules and blocks that are tried. Raises Poisoned after reporting that loops unroll to too much."""
+        self._tried += tries
+        if self._tried > MAX_TRIED or self._rules > MAX_RULES or len(self._moments) >= MAX_MOMENTS:
+            message = f"loops unroll to more than {MAX_MOMENTS} substeps or {MAX_RULES} rules"
+            raise self.typer.fail("PD508", message, span, "here", "loop over fewer things")
 
     # Rules
 
@@ -251,19 +245,19 @@ class Elaborator:
                 case _:
                     rules = [self._update(syntax.children[0], scope, self._mask((), syntax, scope))]
         except Poisoned:
-            self.result.active.add(syntax.span)
+            self.active.add(syntax.span)
             return []
         except Unresolved as missing:
-            self.result.inactive[syntax.span] = missing.name
+            self.inactive[syntax.span] = missing.name
             return []
         empty = self.typer.empty | self._empty_lets
         if empty:
-            self.result.empty[syntax.span] = min(empty)
+            self.empty[syntax.span] = min(empty)
         rules = [rule for rule in rules if not (rule.mask == FALSE and self.typer.absent)]
         if rules:
-            self.result.active.add(syntax.span)
+            self.active.add(syntax.span)
         else:
-            self.result.inactive[syntax.span] = ", ".join(sorted(self.typer.absent))
+            self.inactive[syntax.span] = ", ".join(sorted(self.typer.absent))
         return rules
 
     def _mask(self, subjects: Sequence[Syntax], syntax: Syntax, scope: Scope) -> Expr:
@@ -275,8 +269,8 @@ class Elaborator:
         if clause := syntax.child("chance"):
             # Named by where the rule stands, not by how many were unrolled before it: other packs shift nothing.
             label = f"[{self._label}]" if self._label else ""
-            name = f"{self._pack}.{self._word}#{self._numbers[id(syntax)]}{label}"
-            self.result.streams[name] = Stream(name, name_number(name), 32)
+            name = f"{self._decl.qualified}#{self._numbers[id(syntax)]}{label}"
+            self.streams[name] = Stream(name, name_number(name), 32)
             parts.append(self.typer.chance_draw(name, clause.children[0], scope))
         return conjunction(parts, syntax.span)
 
@@ -354,7 +348,7 @@ class Elaborator:
             if operand.kind.name == "chance":
                 message, label = f"the chance `{name}` cannot be assigned", "chances belong to elements"
                 raise self.typer.fail("PD407", message, syntax.span, label, "declare it as an integer")
-            self.result.overridden.add(name)
+            self.overridden.add(name)
         return name, operand.kind, offset
 
     def _push(self, syntax: Syntax, scope: Scope) -> list[Rule]:

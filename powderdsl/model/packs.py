@@ -186,7 +186,7 @@ class _PackReader(Reader):
 
     def body(self, node: Node) -> tuple[tuple[Syntax, ...], tuple[Block, ...]]:
         """A rule or a list of rules (one substep), or a block or a list of blocks (one after the other)."""
-        items = node.items if isinstance(node, Sequence) else (node,)
+        items = node.items
         if not items or (isinstance(node, Scalar) and not node.text):
             helps = ["write rules, or leave the key out"]
             self.reporter.error(
@@ -222,8 +222,7 @@ class _PackReader(Reader):
 
     def often(self, node: Node | None) -> Iterator[tuple[Syntax, Syntax]]:
         """`before -> after: CHANCE`, in one mapping or a list of them."""
-        parts = node.items if isinstance(node, Sequence) else (node,)
-        for part in parts:
+        for part in node.items if node else ():
             for key, value in self.pairs(part, "a mapping from changes to chances", "write `egg -> hen: 2%`"):
                 change, chance = self.line(key, "rule"), self.line(value)
                 if change is None or chance is None:

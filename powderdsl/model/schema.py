@@ -203,22 +203,20 @@ class Reader:
 
     def made(self, kind: type[R], **values: Any) -> R | None:
         """A record of values by field, unless a field without a default lacks one."""
-        lacking = [one for one in keys_of(kind).values() if one.required and one.field not in values]
-        if any(getattr(kind, one.field, MISSING) is MISSING for one in lacking):
-            return None
+        for row in keys_of(kind).values():
+            if row.required and row.field not in values and not hasattr(kind, row.field):
+                return None
         return kind(**values)
 
     def entry(self, kind: type[E], name: Scalar, node: Node) -> E | None:
         """The record of one entry of a section. Without a mapping it is the value of its `short` key."""
         keys = keys_of(kind)
-        short = next((row for row in keys.values() if row.short), None)
-        if short is None or (isinstance(node, Mapping) and len(keys) > 1):
-            noun = kind.NOUN.split(" ", 1)[-1]
-            return self.record(
-                kind, node, f"the {noun} `{name.text}`" if noun else f"`{name.text}`", name=name
-            )
-        value = self.value(short, name, node)
-        return self.made(kind, name=name, **({} if value is None else {short.field: value}))
+        for row in keys.values():
+            if row.short and not (isinstance(node, Mapping) and len(keys) > 1):
+                value = self.value(row, name, node)
+                return self.made(kind, name=name, **({} if value is None else {row.field: value}))
+        noun = kind.NOUN.split(" ", 1)[-1]
+        return self.record(kind, node, f"the {noun} `{name.text}`" if noun else f"`{name.text}`", name=name)
 
     def entries(self, kind: type[E], node: Node | None) -> Iterator[E]:
         """The records of a section's entries."""
@@ -254,13 +252,11 @@ class Reader:
                 pairs = self.pairs(node, wanted, about) if row.maps else self.named(node, "a value")
                 if row.type == tuple[Scalar, Syntax]:
                     return tuple((name, line) for name, part in pairs if (line := self.line(part)))
-                words = []
-                for name, part in pairs:
-                    if isinstance(part, Scalar):
-                        words.append((name, part))
-                    else:
-                        self.shape(part, f"a single value for `{name.text}`", about)
-                return tuple(words)
+                return tuple(
+                    (name, word)
+                    for name, part in pairs
+                    if (word := self.single(part, "a single value", about))
+                )
             case "mapping" | "list" | "block" | "any":
                 return node
         if not isinstance(node, Scalar):
@@ -274,8 +270,8 @@ class Reader:
         if row.shape == "flag":
             return self.choice(key.text, node, ("yes", "no", "true", "false")) in ("yes", "true")
         if row.choices:
-            word = self.choice(key.text, node, row.choices)
-            return int(word) if word and row.shape == "number" else word
+            choice = self.choice(key.text, node, row.choices)
+            return int(choice) if choice and row.shape == "number" else choice
         if row.shape == "number":
             number = self.number(key.text, node, *row.bounds)
             return node if row.type is Scalar and number is not None else number
@@ -378,15 +374,12 @@ class Reader:
 
     def line(self, node: Node, start: str = "expression") -> Syntax | None:
         """The syntax of a single line; `start` is the grammar's rule for it."""
-        if isinstance(node, Scalar):
-            return parse_scalar(node, start, self.reporter)
-        self.shape(node, "one line")
-        return None
+        scalar = self.single(node, "one line")
+        return parse_scalar(scalar, start, self.reporter) if scalar else None
 
     def lines(self, node: Node, start: str = "expression") -> tuple[Syntax, ...]:
         """A line, or a list of lines."""
-        items = node.items if isinstance(node, Sequence) else (node,)
-        return tuple(line for item in items if (line := self.line(item, start)))
+        return tuple(line for item in node.items if (line := self.line(item, start)))
 
     def named(self, node: Node | None, what: str) -> Iterator[tuple[Scalar, Node]]:
         """Entries of a mapping whose keys are new names; bad names are reported and left out."""
@@ -425,14 +418,14 @@ class Reader:
         """A word or a list of words."""
         if isinstance(node, Scalar) and node.text == "":
             return ()
-        if isinstance(node, Mapping):
-            self.shape(node, "a word or a list of words")
-            return ()
-        items = node.items if isinstance(node, Sequence) else (node,)
-        for item in items:
-            if not isinstance(item, Scalar):
-                self.shape(item, "a word")
-        return tuple(item for item in items if isinstance(item, Scalar))
+        return tuple(word for item in node.items if (word := self.single(item, "a word")))
+
+    def single(self, node: Node, wanted: str, help_text: str = "") -> Scalar | None:
+        """A node that is a single value; None after reporting another one."""
+        if isinstance(node, Scalar):
+            return node
+        self.shape(node, wanted, help_text)
+        return None
 
     def formed(self, form: Form, key: str, word: Scalar) -> Any:
         """The meaning of a word of a form; None after reporting another word."""

@@ -35,6 +35,11 @@ class Scalar:
     style: str
 
     @property
+    def items(self) -> tuple[Node, ...]:
+        """Itself, as a list of one."""
+        return (self,)
+
+    @property
     def word(self) -> str:
         """The text as a name, without the `?` of one that may be absent."""
         return self.text.removesuffix("?")
@@ -59,6 +64,11 @@ class Mapping:
 
     entries: tuple[tuple[Scalar, Node], ...]
     span: Span
+
+    @property
+    def items(self) -> tuple[Node, ...]:
+        """Itself, as a list of one."""
+        return (self,)
 
     def get(self, key: str) -> Node | None:
         return next((value for name, value in self.entries if name.text == key), None)

@@ -318,7 +318,7 @@ class _TaskReader:
         for key, node in self.reader.named(self.decl.regions, "a region"):
             self.take(key)
             shapes = []
-            for item in node.items if isinstance(node, yaml_tree.Sequence) else (node,):
+            for item in node.items:
                 span = line_of(item, "shape", self.reporter)
                 if not isinstance(item, Scalar):
                     self.reader.shape(item, "a shape, such as `box rows 1:5 columns 2:8`")

@@ -53,7 +53,7 @@ from powderdsl.model.types import (
 )
 
 if TYPE_CHECKING:
-    from powderdsl.model.elaborate import Elaborated
+    from powderdsl.model.elaborate import Elaborator
 
 COMPARISONS = 1_000_000
 """Work for comparing the rules of all substeps, in nodes: a second."""
@@ -141,7 +141,7 @@ Found = dict[Conflict, tuple[dict[Offset, int], list[tuple[int, int]]]]
 def check_logic(
     passes: tuple[Pass, ...],
     facts: Facts,
-    elaborated: Elaborated,
+    elaborated: Elaborator,
     reporter: Reporter,
     added: AddedPacks | None = None,
 ) -> tuple[tuple[Pass, ...], list[Span]]:
@@ -200,7 +200,7 @@ def check_logic(
 
 
 def _report_silent(
-    span: Span, copies: list[tuple[Expr, Lets]], relaxed: Facts, elaborated: Elaborated, reporter: Reporter
+    span: Span, copies: list[tuple[Expr, Lets]], relaxed: Facts, elaborated: Elaborator, reporter: Reporter
 ) -> None:
     """Report a rule that never fires, and why."""
     if span in elaborated.inactive:

@@ -658,6 +658,6 @@ SECTIONS: dict[str, EntryMistake] = {
 
 def lines_of(node: Node) -> list[Scalar]:
     """The rules of a body: itself or the items of a list; none where there are blocks."""
-    items = node.items if isinstance(node, Sequence) else (node,)
+    items = node.items
     scalars = [item for item in items if isinstance(item, Scalar)]
     return scalars if len(scalars) == len(items) else []
