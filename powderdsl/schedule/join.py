@@ -45,7 +45,7 @@ def narrow(schedule: Schedule) -> Schedule:
     """
     schedule = _where_read(schedule)
     found = {slot: var.name for slot, var in schedule.finds}
-    olds = {str(node.attr): (found[slot],) for slot, node in schedule.leaves if slot in found}
+    olds = {node.attr: (found[slot],) for slot, node in schedule.leaves if slot in found}
     return map_each(schedule, Compute, lambda loop: [_narrowed(loop, schedule.graph, olds)])
 
 
@@ -70,7 +70,7 @@ def _where_read(schedule: Schedule) -> Schedule:
     """By field: the flags that hold wherever it is read."""
     for node, masks in on_all_paths(schedule.values, below).items():
         if field := field_of(node):
-            names, where = {str(mask.attr) for mask in masks}, node.attr if node.op == "shift" else HERE
+            names, where = {mask.attr for mask in masks}, node.attr if node.op == "shift" else HERE
             flags = {shifted[name][0] for name in names if name in shifted and shifted[name][1] == where}
             flags |= names if where == HERE else set()
             asking[field.attr] = asking.get(field.attr, flags) & flags
@@ -276,7 +276,7 @@ def _base(value: Node) -> str:
     """The field that choices begin with."""
     while value.op == "select":
         value = value.args[2]
-    return str(value.attr)
+    return value.attr
 
 
 CONTINUING = ("load", "const", "param", "add", "sub", "mul", "neg", "abs")

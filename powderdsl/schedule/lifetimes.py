@@ -165,7 +165,7 @@ def swaps(schedule: Schedule) -> Schedule:
     slot stay within its bounds wherever they are. What becomes zero afterwards does so in a loop over rows where it does.
     """
     offsets = {
-        str(statement.region.attr): statement.offset
+        statement.region.attr: statement.offset
         for statement in flat(schedule.body)
         if isinstance(statement, Move) and statement.op == "swap"
     }

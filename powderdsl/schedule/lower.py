@@ -5,7 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from powderdsl.ir.ops import Graph, Node, PassGraph, SubstepGraph, Type, nodes_of
-from powderdsl.schedule.types import ANSWER, Block, Compute, Guard, Namer, Out, Schedule, Statement, Var, load
+from powderdsl.schedule.types import (
+    ANSWER,
+    Compute,
+    Guard,
+    Namer,
+    Out,
+    Schedule,
+    Statement,
+    Var,
+    load,
+    needed,
+)
 
 
 def lower(pass_: PassGraph) -> Schedule:
@@ -17,23 +28,22 @@ def lower(pass_: PassGraph) -> Schedule:
     lowering = _Lowering(pass_)
     for step in pass_.substeps:
         lowering.substep(step)
-    lowering.body += lowering.compute(node for _, node in pass_.outputs)
+    lowering.compute(dict(pass_.outputs).values())
     leaves = tuple((slot, lowering.value(node)) for slot, node in pass_.outputs)
     return Schedule(pass_.name, tuple(lowering.finds.items()), tuple(lowering.body), leaves, lowering.graph)
 
 
 class _Lowering:
     def __init__(self, pass_: PassGraph):
-        self.graph = Graph()
-        self.namer = Namer()
+        self.graph, self.namer = Graph(), Namer()
         self.body: list[Statement] = []
         self.finds: dict[str, Var] = {}
-        self.stored: dict[int, Var] = {}
-        """The variable of each node of the pass that has one, by the node's id."""
+        self.stored: dict[Node, Var] = {}
+        """The variable of each node of the pass that has one."""
         self.current: dict[str, Node] = {}
         """The last node that was written to each slot."""
-        self.alive = {id(node) for node in nodes_of(pass_, substeps=False)}
-        self.kept = {slot: node.type for slot, node in pass_.outputs}
+        self.alive = set(nodes_of(pass_, substeps=False))
+        self.kept = dict(pass_.outputs)
         """Slots of the state that the pass changes; the other slots that it writes are scratch."""
 
     def substep(self, step: SubstepGraph) -> None:
@@ -43,59 +53,58 @@ class _Lowering:
         guarded: dict[Node, Node] = {}
         """By node that is written: the slot's old value."""
         for slot, node in step.writes:
-            if id(node) in self.alive and self.missing(node):
+            if node in self.alive and self.missing(node):
                 if always or (old := self.old(slot)) is None:
                     free.append(node)
                 else:
                     guarded[node] = old
-        self.body += self.compute((node for node in free if node not in guarded), step.place)
+        self.compute([node for node in free if node not in guarded], step.place)
         if guarded:
-            self.body += self.compute(guards, step.place)
+            self.compute(guards, step.place)
             guarded = {node: old for node, old in guarded.items() if self.missing(node)}  # it may be a mask
         if guarded:
             when = self.graph.node("some", ANSWER, tuple(map(self.value, guards)))
-            body = self.compute(guarded, step.place)
-            outs = tuple(Out(self.stored[id(node)], old, old) for node, old in guarded.items())
-            self.body.append(Guard(outs, step.place, when=when, body=body))
+            self.compute(guarded, step.place)
+            body = self.body.pop()
+            outs = tuple(
+                Out(var, old, old) for var, old in zip(body.vars.values(), guarded.values(), strict=True)
+            )
+            self.body.append(Guard(outs, step.place, when=when, body=(body,)))
         self.current |= dict(step.writes)
 
     def missing(self, node: Node) -> bool:
-        return id(node) not in self.stored and node.op not in ("const", "input")
+        return node not in self.stored and node.op not in ("const", "input")
 
     def old(self, slot: str) -> Node | None:
         """The value of a slot before a substep, if a variable holds it."""
         if (node := self.current.get(slot)) is None:
-            return load(self.graph, self.find(slot, self.kept[slot])) if slot in self.kept else None
-        return self.value(node) if id(node) in self.alive and not self.missing(node) else None
+            return self.found(slot, self.kept[slot].type) if slot in self.kept else None
+        return self.value(node) if node in self.alive and not self.missing(node) else None
 
-    def find(self, slot: str, type: Type) -> Var:
+    def found(self, slot: str, type: Type) -> Node:
+        """What the pass finds in a slot."""
         if slot not in self.finds:
             self.finds[slot] = self.namer.var(type)
-        return self.finds[slot]
+        return load(self.graph, self.finds[slot])
 
-    def compute(self, nodes: Iterable[Node], place: str = "") -> Block:
-        """The statement that stores nodes in variables."""
-        missing = [node for node in dict.fromkeys(nodes) if self.missing(node)]
-        outs = tuple(Out(self.namer.var(node.type, node), self.value(node)) for node in missing)
-        self.stored |= {id(out.var.means): out.var for out in outs}
-        return (Compute(outs, place),) if outs else ()
+    def compute(self, nodes: Iterable[Node], place: str = "") -> None:
+        """Store nodes in variables."""
+        missing = filter(self.missing, dict.fromkeys(nodes))
+        if outs := tuple([Out(self.namer.var(node.type, node), self.value(node)) for node in missing]):
+            self.body.append(Compute(outs, place))
+        for out in outs:
+            assert out.var.means is not None
+            self.stored[out.var.means] = out.var
 
     def value(self, root: Node) -> Node:
         """A node of the pass in terms of the variables defined so far."""
-        done: dict[int, Node] = {}
-        stack = [(root, False)]
-        while stack:
-            node, ready = stack.pop()
-            if id(node) in done:
-                continue
-            if id(node) in self.stored:
-                done[id(node)] = load(self.graph, self.stored[id(node)])
+        done: dict[Node, Node] = {}
+        for node in needed(root, lambda node: () if node in self.stored else node.args):
+            if node in self.stored:
+                done[node] = load(self.graph, self.stored[node])
             elif node.op == "input":
-                done[id(node)] = load(self.graph, self.find(str(node.attr), node.type))
-            elif ready:
-                args = tuple([done[id(arg)] for arg in node.args])
-                done[id(node)] = self.graph.node(node.op, node.type, args, node.attr)
+                done[node] = self.found(node.attr, node.type)
             else:
-                stack.append((node, True))
-                stack.extend((arg, False) for arg in reversed(node.args))
-        return done[id(root)]
+                args = tuple([done[arg] for arg in node.args])
+                done[node] = self.graph.node(node.op, node.type, args, node.attr)
+        return done[root]

@@ -71,12 +71,12 @@ def _element_bits(schedule: Schedule) -> dict[str, int]:
     """For each variable that holds a bit of the element: which bit. Empty if there are more than MAX_PLANES."""
     bits: dict[str, int] = {}
     slots = [(slot, var.name) for slot, var in schedule.finds]
-    slots += [(slot, str(node.attr)) for slot, node in schedule.leaves if node.op == "load"]
+    slots += [(slot, node.attr) for slot, node in schedule.leaves if node.op == "load"]
     for slot, name in slots:
         if slot.startswith(_ELEMENT):
             bits[name] = int(slot.removeprefix(_ELEMENT))
     pairs = [
-        (name, str(old.attr))
+        (name, old.attr)
         for statement in flat(schedule.body)
         for name, old in statement.olds.items()
         if old.op == "load"
@@ -141,7 +141,7 @@ def _pass_asks(schedule: Schedule, bits: dict[str, int]) -> Node | None:
             node = guard.olds[node.attr]
         if node.op != "load" or slots.get(node.attr) != slot:
             return None
-    return _asked([values.get(str(mask.attr), mask) for mask in masks], bits, {}, schedule.graph)
+    return _asked([values.get(mask.attr, mask) for mask in masks], bits, {}, schedule.graph)
 
 
 def when_present(masks: list[Node], schedule: Schedule) -> Node | None:

@@ -46,7 +46,7 @@ class RowLoop:
     @property
     def masks(self) -> tuple[str, ...]:
         """The planes of the masks, in the order in which choices are applied."""
-        return tuple(str(choice.args[0].attr) for choice in self.chains[0]) if self.chains else ()
+        return tuple(choice.args[0].attr for choice in self.chains[0]) if self.chains else ()
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def _waiting(sweeps: Sweeps) -> tuple[dict[str, Ring], dict[str, tuple[int, int]
 def region_of(loop: Compute) -> tuple[list[Node], list[str]]:
     """The parts of a loop's region: fields that must be live in some row (`live`), and planes."""
     parts = alternatives(loop.region)
-    return [part for part in parts if part.op == "live"], [str(p.attr) for p in parts if p.op == "load"]
+    return [part for part in parts if part.op == "live"], [p.attr for p in parts if p.op == "load"]
 
 
 def is_copy(loop: Compute) -> bool:
@@ -129,19 +129,19 @@ def is_copy(loop: Compute) -> bool:
 
 def reaches_of(schedule: Schedule) -> dict[str, int]:
     """The columns of each field that are read beyond the edges; ANY_PASS for fields that slots may get."""
-    reaches = {str(node.attr): ANY_PASS for node in schedule.results if node.op == "load"}
+    reaches = {node.attr: ANY_PASS for node in schedule.results if node.op == "load"}
     copies: list[tuple[str, Node]] = []  # a field whose rows may be those of another one
     for statement in flat(schedule.body):
         for node in ordered(statement.values):
             if node.op == "shift" and node.type == REAL and node.attr[2]:
-                name = str(node.args[0].attr)
+                name = node.args[0].attr
                 reaches[name] = max(reaches.get(name, 0), abs(node.attr[1]))
         copies += statement.olds.items()
     for _ in copies:
         before = dict(reaches)
         for name, old in copies:
             if old.op == "load" and old.type == REAL:
-                reaches[str(old.attr)] = max(reaches.get(str(old.attr), 0), reaches.get(name, 0))
+                reaches[old.attr] = max(reaches.get(old.attr, 0), reaches.get(name, 0))
         if reaches == before:
             break
     return reaches

@@ -102,7 +102,7 @@ class Statement:
     @cached_property
     def reads(self) -> set[str]:
         """The variables that it reads, or statements in it, without those that these define."""
-        names = {str(node.attr) for node in ordered(self.values) if node.op == "load"}
+        names = {node.attr for node in ordered(self.values) if node.op == "load"}
         return names | read_by(self.body) | read_by(self.otherwise)
 
     def with_values(self, new: Callable[[Node], Node]) -> Self:
@@ -258,7 +258,7 @@ def is_zero(value: Node) -> bool:
 def loaded(nodes: Iterable[Node]) -> Iterator[str]:
     """The names of the variables that values read, with repetitions."""
     for node in nodes:
-        yield from (str(part.attr) for part in walk(node) if part.op == "load")
+        yield from (part.attr for part in walk(node) if part.op == "load")
 
 
 def rewritten(roots: Iterable[Node], graph: Graph, rule: Rule) -> Callable[[Node], Node]:
@@ -414,11 +414,11 @@ def reads_of(values: Iterable[Node]) -> Iterator[Read]:
     """Where values read variables. What is read at neighbors is also read in the cell itself."""
     for node in ordered(values):
         if node.op == "load":
-            yield Read(str(node.attr), node.type)
+            yield Read(node.attr, node.type)
         elif node.args and node.args[0].op == "load" and node.op in ("shift", "live"):
             plane, (dy, dx, *wraps) = node.args[0], node.attr
             far, live = bool(dy or dx), node.op == "live"
-            yield Read(str(plane.attr), plane.type, dy, 0 if live else dx, True in wraps, live, far)
+            yield Read(plane.attr, plane.type, dy, 0 if live else dx, True in wraps, live, far)
 
 
 def field_reads(loop: Compute) -> Iterator[Read]:
@@ -434,7 +434,7 @@ def read_elsewhere(values: Iterable[Node]) -> set[str]:
 def planes_at_neighbors(schedule: Schedule) -> dict[str, tuple[str, tuple[int, int, bool]]]:
     """Map each variable that is another one, read at a neighbor, to that one and where it is read."""
     return {
-        out.var.name: (str(out.value.args[0].attr), out.value.attr)
+        out.var.name: (out.value.args[0].attr, out.value.attr)
         for statement in flat(schedule.body)
         if isinstance(statement, Compute)
         for out in statement.outs
@@ -472,6 +472,23 @@ def without_unread(schedule: Schedule) -> Schedule:
 
 
 Item = TypeVar("Item")
+
+
+def needed(item: Item, below: Callable[[Item], Sequence[Item]]) -> Iterator[Item]:
+    """All that an item needs, each after what is below it, then the item."""
+    done: set[Item] = set()
+    stack = [(item, False)]
+    while stack:
+        top, ready = stack.pop()
+        if top in done:
+            continue
+        parts = () if ready else below(top)
+        if parts:
+            stack.append((top, True))
+            stack += [(part, False) for part in reversed(parts)]
+        else:
+            done.add(top)
+            yield top
 
 
 def connected(items: Sequence[Item], keys: Callable[[Item], set[Any]]) -> list[list[Item]]:

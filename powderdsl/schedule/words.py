@@ -179,7 +179,7 @@ def _with_condition(loop: Compute, graph: Graph) -> Compute:
         holders[node] = None
         match node.op:
             case "load":
-                holders[node] = frozenset({str(node.attr)})
+                holders[node] = frozenset({node.attr})
             case "const" if not node.attr:
                 holders[node] = frozenset()
             case "and" | "when":
@@ -224,7 +224,7 @@ def _taken_out(guard: Guard, graph: Graph, *, near: bool = True) -> list[Stateme
     when = guard.when.args
     if not all(node.op == "load" for node in when):
         return [guard]
-    masks = {str(node.attr) for node in when}
+    masks = {node.attr for node in when}
     inside, olds = made_in(guard.body), guard.olds
     body: list[Statement] = []
     taken: dict[bool, list[Out]] = {True: [], False: []}
@@ -258,7 +258,7 @@ def _partly(loop: Compute, when: Sequence[Node], graph: Graph) -> list[Compute]:
 
     `if any m: loop words: b = m ? a[0,1] : a` → `if any m: loop words over m: b = m ? a[0,1] : a, else a`.
     """
-    masks = {str(node.attr) for node in when}
+    masks = {node.attr for node in when}
     outs: dict[bool, list[Out]] = {False: [], True: []}
     for out in loop.outs:
         old = without(out.value, masks, graph)
@@ -282,7 +282,7 @@ def _is_update(value: Node, masks: set[str], old: Node, graph: Graph) -> bool:
 
 def is_cleared(out: Out, graph: Graph) -> bool:
     """Whether an updated plane can only lose flags."""
-    return out.otherwise is not None and is_zero(without(out.value, {str(out.otherwise.attr)}, graph))
+    return out.otherwise is not None and is_zero(without(out.value, {out.otherwise.attr}, graph))
 
 
 def without(value: Node, planes: set[str], graph: Graph) -> Node:
