@@ -18,6 +18,7 @@ from powderdsl.schedule.types import (
     map_each,
     map_values,
     on_all_paths,
+    taken,
 )
 
 FAR = 100
@@ -54,23 +55,17 @@ def sources_of(node: Node) -> list[tuple[Node, Offset]]:
 
 def movable(node: Node, have: Have, most: int) -> bool:
     """Whether a flag can be recomputed at a neighbor with at most `most` gates."""
-    seen: set[tuple[Node, Offset]] = set()
-    stack = [(node, (0, 0))]
-    while stack:
-        place = top, (dy, dx) = stack.pop()
-        if place in seen or is_constant(top):
+    stack = [(node, 0, 0)]
+    for top, dy, dx in taken(stack):
+        if is_constant(top):
             continue
-        seen.add(place)
-        if len(seen) > most:
+        most -= 1
+        shifted, plain = top.op == "shift" and top.attr[2], top.op in LOGIC and not of_floats(top)
+        if most < 0 or not (have(top) or shifted or plain):
             return False
-        if have(top):
-            continue
-        if top.op == "shift" and top.attr[2]:
-            stack.append((top.args[0], (dy + top.attr[0], dx + top.attr[1])))
-        elif top.op in LOGIC and not of_floats(top):
-            stack.extend((arg, (dy, dx)) for arg in top.args)
-        else:
-            return False
+        if not have(top):
+            y, x = top.attr[:2] if shifted else (0, 0)
+            stack += [(arg, dy + y, dx + x) for arg in top.args]
     return True
 
 

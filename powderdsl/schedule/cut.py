@@ -52,6 +52,8 @@ from powderdsl.schedule.types import (
     leftover,
     load,
     loaded,
+    needed,
+    taken,
 )
 
 ONLY_READER = 4
@@ -391,12 +393,10 @@ class _Cutter:
         # A choice may build on the one below it, which the row still holds, not on those before.
         for choice in chain:
             _, value, base = choice.args
-            seen, stack = {base}, [value]
-            while stack:
-                part = stack.pop()
-                if part in seen or self.have(part):
+            stack = [value]
+            for part in taken(stack):
+                if part is base or self.have(part):
                     continue
-                seen.add(part)
                 around = part.op == "shift" and not self.have(base) and base in walk(part)
                 if around or part.op in ("select", "draw"):
                     return []
@@ -434,13 +434,10 @@ class _Cutter:
     def word_needs(self, node: Node) -> list[Node]:
         """The flags at neighbors, the floats and the movements that a loop over words reads."""
         needs: dict[Node, None] = {}
-        seen: set[Node] = set()
         stack = [node]
-        while stack:
-            top = stack.pop()
-            if top in seen or self.have(top) or top.op in UNIFORM:
+        for top in taken(stack):
+            if self.have(top) or top.op in UNIFORM:
                 continue
-            seen.add(top)
             if of_floats(top) or (self.costs.by_rows and is_movement(top)):
                 needs[top] = None
                 continue
@@ -457,13 +454,10 @@ class _Cutter:
         """The flags, then the floats, that a loop over cells reads."""
         kept = node.op == "settle" and unchanged(node, self.found)
         needs: dict[Node, None] = {}
-        seen: set[Node] = set()
         stack = [node]
-        while stack:
-            top = stack.pop()
-            if top in seen or (top is not node and self.have(top)):
+        for top in taken(stack):
+            if top is not node and self.have(top):
                 continue
-            seen.add(top)
             if top is not node and not kept and self.chain(top):
                 needs[top] = None  # long chains are applied before the loop that reads them
             elif top.op == "led":
@@ -547,16 +541,9 @@ class _Cutter:
         """A value in a loop: only variables are read at neighbors, the rest is recomputed."""
         graph = self.graph
         done: dict[tuple[Node, int, int], Node] = {}
-        stack = [((root, 0, 0), False)]
-        while stack:
-            place, ready = stack.pop()
-            if place in done:
-                continue
+        for place in needed((root, 0, 0), self.below):
             node, dy, dx = place
-            below = self.below(node, dy, dx)
-            if below and not ready:
-                stack += [(place, True), *((part, False) for part in reversed(below))]
-                continue
+            below = self.below(place)
             args = tuple([done[part] for part in below])
             if self.have(node):
                 new = self.variable(node)
@@ -573,8 +560,9 @@ class _Cutter:
             done[place] = new
         return done[root, 0, 0]
 
-    def below(self, node: Node, dy: int, dx: int) -> list[tuple[Node, int, int]]:
+    def below(self, place: tuple[Node, int, int]) -> list[tuple[Node, int, int]]:
         """The nodes from which a node at a neighbor is computed, with the neighbors at which they are read."""
+        node, dy, dx = place
         if self.have(node):
             return []
         if node.op == "shift":

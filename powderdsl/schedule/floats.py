@@ -18,6 +18,7 @@ from powderdsl.schedule.types import (
     map_values,
     on_all_paths,
     rewritten,
+    taken,
     without_unread,
 )
 
@@ -61,13 +62,8 @@ def _only_moves(value: Node, slot: str) -> bool:
 
     After one movement, `narrow` limits the loop to rows in which something moves.
     """
-    stack, seen = [value], set[Node]()
-    again = False
-    while stack:
-        node = stack.pop()
-        if node in seen:
-            continue
-        seen.add(node)
+    stack, again = [value], False
+    for node in taken(stack):
         match node.op:
             case "select":
                 stack += node.args[1:]

@@ -35,6 +35,7 @@ from powderdsl.schedule.types import (
     on_all_paths,
     planes_at_neighbors,
     rewritten,
+    taken,
 )
 
 
@@ -189,12 +190,7 @@ def _reads(values: list[Node]) -> list[tuple[Node, int, int]]:
     """Fields that values read where no mask holds: field, rows down, and the largest distance in columns."""
     reach: dict[tuple[Node, int], int] = {}
     stack = [(value, 0, 0) for value in values]
-    seen: set[tuple[Node, int, int]] = set()
-    while stack:
-        node, dy, dx = top = stack.pop()
-        if top in seen:
-            continue
-        seen.add(top)
+    for node, dy, dx in taken(stack):
         if node.op == "load" and node.type == REAL:
             reach[node, dy] = max(reach.get((node, dy), 0), abs(dx))
         elif node.op == "shift":

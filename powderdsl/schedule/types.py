@@ -20,6 +20,8 @@ ANSWER = Type("answer")
 
 _PREFIX = {"flag": "p", "real": "f", "answer": "q"}
 
+Item = TypeVar("Item")
+
 Rule = Callable[[Node], Node | None]
 """Gives a node to put in another one's place, or None."""
 
@@ -284,16 +286,22 @@ def is_movement(node: Node) -> bool:
     return node.op in ("swap", "arrive") and node.type == FLAG
 
 
-def conjunctions(node: Node) -> Iterable[Node]:
-    """A flag and the flags that must all hold for it to hold, each once, in order."""
-    seen: dict[Node, None] = {}
-    stack = [node]
+def taken(stack: list[Item]) -> Iterator[Item]:
+    """Take items from a stack, to which the caller adds others, each once."""
+    seen: set[Item] = set()
     while stack:
         top = stack.pop()
         if top not in seen:
-            seen[top] = None
-            stack.extend(reversed(top.args) if top.op == "and" else ())
-    return seen
+            seen.add(top)
+            yield top
+
+
+def conjunctions(node: Node) -> Iterator[Node]:
+    """A flag and the flags that must all hold for it to hold, each once, in order."""
+    stack = [node]
+    for top in taken(stack):
+        yield top
+        stack += reversed(top.args) if top.op == "and" else ()
 
 
 def conjuncts(node: Node) -> list[Node]:
@@ -469,9 +477,6 @@ def without_unread(schedule: Schedule) -> Schedule:
     body, live = block(schedule.body, set(loaded(schedule.results)))
     finds = tuple((slot, var) for slot, var in schedule.finds if var.name in live)
     return replace(schedule, body=body, finds=finds)
-
-
-Item = TypeVar("Item")
 
 
 def needed(item: Item, below: Callable[[Item], Sequence[Item]]) -> Iterator[Item]:

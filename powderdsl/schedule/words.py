@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from powderdsl.ir.ops import FLAG, Graph, Node, ordered
@@ -34,6 +34,7 @@ from powderdsl.schedule.types import (
     read_by,
     read_elsewhere,
     rewritten,
+    taken,
     with_values,
 )
 
@@ -101,16 +102,15 @@ def early(schedule: Schedule) -> Schedule:
     return replace(changed, body=tuple(body))
 
 
-def _gates(parts: Iterable[Node]) -> Iterable[Node]:
+def _gates(parts: Iterable[Node]) -> Iterator[Node]:
     """The operations on flags in the cell itself, and comparisons. What is read at neighbors is stored anyway."""
-    gates: dict[Node, None] = {}
     stack = [*parts]
-    while stack:
-        node = stack.pop()
-        if (node.op in LOGIC or is_comparison(node)) and node not in gates:
-            gates[node] = None
-            stack.extend(() if is_comparison(node) else node.args)
-    return gates
+    for node in taken(stack):
+        if is_comparison(node):
+            yield node
+        elif node.op in LOGIC:
+            yield node
+            stack += node.args
 
 
 def _shared(group: Sequence[_Mask]) -> list[_Mask]:
