@@ -74,8 +74,8 @@ def is_constant(node: Node) -> bool:
     return node.op in ("const", "param") or (node.op == "coordinate" and node.attr[0] == "step")
 
 
-def gate_cost(node: Node, have: Have, limit: int = 1000) -> int:
-    """The number of gates that recompute a flag in another row; `limit` if that is impossible."""
+def gate_cost(node: Node, have: Have, limit: int) -> int:
+    """The number of gates that recompute a flag in another row; `limit` if they are as many or that is impossible."""
     if have(node) or is_constant(node):
         return 0
     if node.op in (*UNIFORM, *DRAWS) or is_movement(node) or of_floats(node):

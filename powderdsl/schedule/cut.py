@@ -11,7 +11,7 @@ after another.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Literal
@@ -52,6 +52,7 @@ from powderdsl.schedule.types import (
     leftover,
     load,
     loaded,
+    map_values,
     needed,
     taken,
 )
@@ -63,19 +64,14 @@ FEWEST = 3
 """The shortest chain of choices that is worth a field of its own."""
 
 
-def cut(costs: Costs) -> Callable[[Schedule], Schedule]:
-    """The stage for a target: every `Compute` becomes loops over words and loops over cells.
+def cut(schedule: Schedule, costs: Costs) -> Schedule:
+    """Every `Compute` becomes loops over words and loops over cells, by the costs on a target.
 
     `p = f(a)[0,1] & b`, where f is costly → `loop words: t = f(a)`, `loop words: p = t[0,1] & b`.
     """
-
-    def stage(schedule: Schedule) -> Schedule:
-        cutter = _Cutter(schedule, costs)
-        body = cutter.block(schedule.body, top=True)
-        leaves = tuple((slot, cutter.renamed(node)) for slot, node in schedule.leaves)
-        return replace(schedule, body=body, leaves=leaves)
-
-    return stage
+    cutter = _Cutter(schedule, costs)
+    loops = replace(schedule, body=cutter.block(schedule.body, top=True))
+    return map_values(loops, lambda node: cutter.same.get(node.attr))
 
 
 class _Cutter:
@@ -89,24 +85,25 @@ class _Cutter:
         """The variables defined so far."""
         self.same: dict[str, Node] = {}
         """For each variable that is only another name: the load of the variable that it names."""
-        nodes = ordered(schedule.values)
-        led = {node.args[1]: node for node in nodes if node.op == "led"}
-        self.comparisons = {node: led.get(node, node) for node in nodes if is_comparison(node)}
+        self.comparisons: dict[Node, Node] = {}
         """What is computed for each comparison: itself, or only where another one holds."""
-        offsets: dict[Node, set[Offset]] = {}
-        for node in nodes:
-            for source, offset in sources_of(node):
-                offsets.setdefault(source, set()).add(offset)
-        self.askers = {source: len(where) for source, where in offsets.items()}
-        """At how many neighbors each node is read."""
-        shifted = [node.args[0] for node in nodes if node.op == "shift" and node.type == REAL]
-        self.wanted = {part for node in shifted for part in stored_parts(node, self.have, costs.floats)}
+        self.wanted: set[Node] = set()
         """Floats that are read at neighbors later."""
-        counts: Counter[Node] = Counter()
+        sources: set[tuple[Node, Offset]] = set()
+        for node in ordered(schedule.values):
+            sources.update(sources_of(node))
+            if is_comparison(node):
+                self.comparisons[node] = node
+            elif node.op == "led":
+                self.comparisons[node.args[1]] = node
+            elif node.op == "shift" and node.type == REAL:
+                self.wanted.update(stored_parts(node.args[0], self.have, costs.floats))
+        self.askers = Counter(source for source, _ in sources)
+        """At how many neighbors each node is read."""
+        self.shared: Counter[Node] = Counter()
+        """In how many masks each conjunct occurs: if such a plane is empty, so are all these masks."""
         for _, masks in asked_masks(schedule.body):
-            counts.update({part for out in masks for part in conjunctions(out.value)})
-        self.shared = {part for part, count in counts.items() if count > 1}
-        """Conjuncts that several masks have in common: if such a plane is empty, so are all these masks."""
+            self.shared.update({part for out in masks for part in conjunctions(out.value)})
         self.split_masks: dict[Node, Node] = {}
         """Masks whose first parts are stored: the stored parts and the rest."""
 
@@ -122,11 +119,6 @@ class _Cutter:
         yield self.statements
         self.statements, self.known, self.there = outer
 
-    def alias(self, names: dict[str, Node]) -> None:
-        """Note variables that are only other names of values."""
-        self.same |= names
-        self.there |= names.keys()
-
     def have(self, node: Node) -> bool:
         return node.op == "load" or node in self.known
 
@@ -135,21 +127,15 @@ class _Cutter:
         stored = node if node.op == "load" else load(self.graph, self.known[node])
         return self.same.get(stored.attr, stored)
 
-    def renamed(self, node: Node) -> Node:
-        return self.variable(node) if node.op == "load" else node
-
-    def kept(self, guard: Guard) -> dict[str, Node]:
-        """The values that variables have if a guard's body is skipped."""
-        return {name: self.renamed(old) for name, old in guard.olds.items()}
-
-    def guard(self, when: Node, body: Block, outs: Iterable[tuple[Var, Node]], place: str) -> None:
+    def guard(self, when: Node, body: Iterable[Statement], olds: dict[Var, Node], place: str) -> None:
         """Emit statements that run only if an answer is true, and the values of variables if it is not."""
-        self.emit(Guard(tuple(Out(var, old, old) for var, old in outs), place, when=when, body=body))
+        outs = tuple([Out(var, old, old) for var, old in olds.items()])
+        self.emit(Guard(outs, place, when=when, body=tuple(body)))
 
     # Statements
 
-    def block(self, body: Block, kept: Collection[str] = (), *, top: bool = False) -> Block:
-        """A block as loops. `kept`: names that the guard around the block keeps."""
+    def block(self, body: Block, *, top: bool = False) -> Block:
+        """A block as loops."""
         with self.inner() as statements:
             for before, statement, after in zip((None, *body), body, (*body[1:], None), strict=False):
                 if isinstance(statement, Guard):
@@ -160,22 +146,19 @@ class _Cutter:
                     if top and (is_mask or all(out.var.type == FLAG for out in statement.outs)):
                         self.hoist_comparisons(statement)
                     if not is_mask:
-                        self.compute(statement, kept)
+                        self.compute(statement)
                 else:
                     self.emit(statement)
         return tuple(statements)
 
-    def compute(self, loop: Compute, kept: Collection[str] = ()) -> None:
+    def compute(self, loop: Compute) -> None:
         """Store values under the names of their variables."""
         named = {out.value: out.var for out in reversed(loop.outs) if not self.have(out.value)}
         self.ensure(loop.results, loop.place, named, loop.when)
         for out in loop.outs:
             if named.get(out.value) is not out.var:
-                value = self.variable(out.value)
-                if out.var.name in kept:
-                    self.emit(Compute((Out(out.var, value),), loop.place, over="words"))
-                else:
-                    self.alias({out.var.name: value})
+                copy = replace(out, value=self.variable(out.value))
+                self.emit(Compute((copy,), loop.place, over="words"))
 
     def hoist_comparisons(self, masks: Compute) -> None:
         """Compute the comparisons of masks before the guard, with all others that the same loop can compute."""
@@ -183,65 +166,66 @@ class _Cutter:
         computed = dict.fromkeys(self.comparisons[node] for node in nodes if not self.have(node))
         if asked := [node for node in computed if not self.have(node)]:
             self.ensure(self.needs_of(asked), masks.place)
-            ready = [
-                node
-                for node in self.comparisons.values()
-                if not self.have(node) and not self.needs(node) and self.there.issuperset(loaded([node]))
-            ]
-            self.ensure([*asked, *ready], masks.place)
+            for node in self.comparisons.values():
+                if not self.have(node) and not self.needs(node) and self.there.issuperset(loaded([node])):
+                    asked.append(node)
+            self.ensure(asked, masks.place)
 
     # Masks and guards
 
     def guarded(self, masks: Compute, guard: Guard) -> None:
         """Masks and the guard that tests them: the cheap parts first, the rest only if those hold somewhere."""
-        if self.costs.by_rows:
-            parts = [part for out in masks.outs for part in self.shared_parts(out.value)]
-            self.ensure(parts, masks.place)
-        # A mask may be known by another name, or be such a part itself.
-        self.alias({out.var.name: self.variable(out.value) for out in masks.outs if self.have(out.value)})
-        masks = replace(masks, outs=tuple(out for out in masks.outs if out.var.name not in self.same))
-        if self.costs.by_rows:
-            self.candidates(masks, guard)
+        by_rows, graph, place = self.costs.by_rows, self.graph, masks.place
+        if by_rows:
+            self.ensure([part for value in masks.results for part in self.shared_parts(value)], place)
+        vars: dict[Node, Var] = {}
+        for out in masks.outs:
+            # A mask may be known by another name, or be such a part itself.
+            if self.have(out.value):
+                self.same[out.var.name] = self.variable(out.value)
+            elif vars.setdefault(out.value, out.var) is not out.var:
+                self.same[out.var.name] = load(graph, vars[out.value])
+        self.there.update(self.same)
+        split = {value: self.split(value) for value in vars}
+        if by_rows:
+            self.candidates(vars, split, guard, masks)
             self.then(guard)
             return
-        graph, place = self.graph, masks.place
-        split = {out.var.name: self.split(out.value) for out in masks.outs}
-        needs = self.needs_of(masks.results)
-        asked = {node.attr for node in guard.when.args if node.op == "load"}
-        mine = [out for out in masks.outs if out.var.name in asked]
-        if len(mine) < len(masks.outs):
-            others = tuple(out for out in masks.outs if out.var.name not in asked)
-            self.compute(replace(masks, outs=others))
-        lazy = [Out(out.var, self.lazily(*split[out.var.name])) for out in mine]
-        if not needs or not all(split[out.var.name][0] for out in mine):
+        needs = self.needs_of(vars)
+        asked = {node.attr for node in guard.when.args}
+        mine = {var: value for value, var in vars.items() if var.name in asked}
+        if len(mine) < len(vars):
+            self.compute(
+                replace(
+                    masks,
+                    outs=tuple([out for out in masks.outs if out.var.name not in self.same.keys() | asked]),
+                )
+            )
+        lazy = {var.name: Out(var, self.lazily(*split[value])) for var, value in mine.items()}
+        if not needs or not all(split[value][0] for value in mine.values()):
             self.ask(lazy, guard)
             return
         # The other parts, and what they need, are computed only if the cheap parts hold somewhere.
-        first = [
-            combined("and", split[node.attr][0], graph) if node.attr in split else node
-            for node in guard.when.args
-        ]
+        first = {var.name: combined("and", split[value][0], graph) for var, value in mine.items()}
         with self.inner() as inner:
             self.ask(lazy, guard)
-        nothing = constant(graph, FLAG)
-        names = {out.var.name for out in mine}
-        # A mask may be what a slot held before: nothing, where masks are skipped.
-        olds = {name: nothing if old.attr in names else old for name, old in self.kept(guard).items()}
-        question = self.answer(first)
+        question = self.answer([first.get(node.attr, node) for node in guard.when.args])
         self.emit(Compute((question,), place, over="words"))
-        outs = [(out.var, nothing) for out in mine] + [(guard.vars[name], old) for name, old in olds.items()]
-        self.guard(load(graph, question.var), tuple(inner), outs, guard.place)
+        nothing = constant(graph, FLAG)
+        olds = dict.fromkeys(mine, nothing)
+        for out in guard.outs:  # a mask may be what a slot held before: nothing, where masks are skipped
+            olds[out.var] = nothing if out.value.attr in lazy else out.value
+        self.guard(load(graph, question.var), inner, olds, guard.place)
 
-    def ask(self, masks: list[Out], guard: Guard) -> None:
+    def ask(self, masks: dict[str, Out], guard: Guard) -> None:
         """Store masks, test whether they hold anywhere, and emit the guard."""
-        values = {out.var.name: out.value for out in masks}
-        asked = [values.get(node.attr, node) if node.op == "load" else node for node in guard.when.args]
+        values = {name: out.value for name, out in masks.items()}
+        asked = [values.get(node.attr, node) for node in guard.when.args]
         self.ensure(self.needs_of(asked), guard.place)
-        words, question = self.computed(masks), self.answer(asked)
+        words, question = self.computed(masks.values()), self.answer(asked)
         self.emit(Compute((*words, question), guard.place, over="words"))
-        body, olds = self.block(guard.body, guard.vars), self.kept(guard)
-        outs = [(var, olds[name]) for name, var in guard.vars.items()]
-        self.guard(load(self.graph, question.var), body, outs, guard.place)
+        olds = {out.var: out.value for out in guard.outs}
+        self.guard(load(self.graph, question.var), self.block(guard.body), olds, guard.place)
 
     def answer(self, flags: Iterable[Node]) -> Out:
         """A new variable: whether one of some flags holds in any cell."""
@@ -277,75 +261,72 @@ class _Cutter:
 
     # Masks and movements by rows
 
-    def candidates(self, masks: Compute, guard: Guard) -> None:
+    def candidates(
+        self,
+        vars: dict[Node, Var],
+        split: dict[Node, tuple[list[Node], list[Node]]],
+        guard: Guard,
+        masks: Compute,
+    ) -> None:
         """Masks, in two steps where they have costly parts: these, and what they need, only if the others hold anywhere."""
         graph, place = self.graph, masks.place
-        vars: dict[Node, Var] = {}
-        for out in masks.outs:
-            if (first := vars.setdefault(out.value, out.var)) is not out.var:
-                self.alias({out.var.name: load(graph, first)})
-        split = {value: self.split(value) for value in vars}
         costly = {value: var for value, var in vars.items() if split[value][1]}
         if not costly or not all(cheap for cheap, _ in split.values()):
             self.ensure(vars, place, vars, masks.when)
             return
-        whole = [Out(var, self.lazily(*split[value])) for value, var in vars.items()]
-        if not self.needs_of(out.value for out in whole):
-            self.emit(Compute(self.computed(whole), place, when=masks.when, over="words"))
-            self.known |= vars
-            return
-        candidates = [
-            Out(self.namer.var(FLAG) if value in costly else var, combined("and", split[value][0], graph))
-            for value, var in vars.items()
-        ]
-        self.emit(Compute(self.computed(candidates), place, when=masks.when, over="words"))
-        asked = [load(graph, out.var) for out in candidates]
-        asked += [self.renamed(node) for node in guard.when.args if node.attr not in masks.vars]
-        with self.inner() as inner:
-            needs = {frozenset(conjuncts(need)): need for need in self.needs_of(vars)}
-            for value, candidate in zip(vars, candidates, strict=True):
-                cheap, rest = split[value]
-                if need := needs.get(frozenset(cheap)):  # the same parts, read at a neighbor
-                    self.known[need] = candidate.var
-                if rest:
-                    self.split_masks[value] = self.under(load(graph, candidate.var), rest)
-            # A mask that the next ones need is stored before them, under its own name.
-            self.ensure(costly, place, costly)
-        when = graph.node("some", ANSWER, tuple(dict.fromkeys(asked)))
-        outs = [(var, constant(graph, FLAG)) for var in costly.values()]
-        self.guard(when, tuple(inner), outs, guard.place)
+        outs = [Out(var, self.lazily(*split[value])) for value, var in vars.items()]
+        second = self.needs_of(out.value for out in outs)
+        if second:
+            outs = [
+                Out(self.namer.var(FLAG) if value in costly else var, combined("and", split[value][0], graph))
+                for value, var in vars.items()
+            ]
+        self.emit(Compute(self.computed(outs), place, when=masks.when, over="words"))
+        if second:
+            asked = [load(graph, out.var) for out in outs]
+            asked += [node for node in guard.when.args if node.attr not in masks.vars]
+            with self.inner() as inner:
+                needs = {frozenset(conjuncts(need)): need for need in self.needs_of(vars)}
+                for value, candidate in zip(vars, outs, strict=True):
+                    cheap, rest = split[value]
+                    if need := needs.get(frozenset(cheap)):  # the same parts, read at a neighbor
+                        self.known[need] = candidate.var
+                    if rest:
+                        self.split_masks[value] = self.under(load(graph, candidate.var), rest)
+                # A mask that the next ones need is stored before them, under its own name.
+                self.ensure(costly, place, costly)
+            when = graph.node("some", ANSWER, tuple(dict.fromkeys(asked)))
+            self.guard(when, inner, dict.fromkeys(costly.values(), constant(graph, FLAG)), guard.place)
         self.known |= vars
 
     def computed(self, outs: Iterable[Out]) -> tuple[Out, ...]:
         """Variables with the values that a loop computes."""
-        return tuple(Out(out.var, self.value(self.split_masks.get(out.value, out.value))) for out in outs)
+        return tuple([Out(out.var, self.value(self.split_masks.get(out.value, out.value))) for out in outs])
 
     def shared_parts(self, mask: Node) -> list[Node]:
         """The largest parts that a mask shares with other masks, if one loop can compute them."""
         if self.have(mask) or mask.op == "not":
             return []
-        simple = mask in self.shared and mask.op not in UNIFORM and not self.needs(mask)
-        if simple and not any(
-            node.op in DRAWS or is_movement(node) or is_comparison(node) for node in walk(mask)
-        ):
-            return [mask]
+        if self.shared[mask] > 1 and mask.op not in UNIFORM and not self.needs(mask):
+            parts = [*walk(mask)]
+            if not any(part.op in DRAWS or is_movement(part) or is_comparison(part) for part in parts):
+                return [mask]
         return [part for arg in mask.args for part in self.shared_parts(arg)] if mask.op == "and" else []
 
     def then(self, guard: Guard) -> None:
         """The body of a guard: planes that only move do so in place; the rest stays in a guard."""
-        when = self.graph.node("some", ANSWER, tuple(self.renamed(node) for node in guard.when.args))
-        outs = [out for one in guard.body if isinstance(one, Compute) for out in one.outs]
-        olds = self.kept(guard)
-        carried = self.carried(outs, olds)
-        others = tuple(out for out in outs if out.value not in carried)
+        outs = [out for loop in guard.body for out in loop.outs]
+        carried = self.carried(outs, guard.olds)
+        others = tuple([out for out in outs if out.value not in carried])
         first = any(node in carried for out in others for node in walk(out.value))
         if first:
             self.move(carried, guard.place)
-        inner: list[Statement] = [one for one in guard.body if isinstance(one, Forget)]
+        inner: list[Statement] = [part for part in guard.body if isinstance(part, Forget)]
         inner += [Compute(others, guard.place)] if others else []
         if inner:
-            body = self.block(tuple(inner), {out.var.name for out in others})
-            self.guard(when, body, [(out.var, olds[out.var.name]) for out in others], guard.place)
+            body = self.block(tuple(inner))
+            olds = {out.var: guard.olds[out.var.name] for out in others}
+            self.guard(guard.when, body, olds, guard.place)
         if not first:
             self.move(carried, guard.place)
 
@@ -364,19 +345,15 @@ class _Cutter:
         return carried
 
     def move(self, carried: dict[Node, Var], place: str) -> None:
-        """Planes that move in place."""
-        if not carried:
-            return
-        mask, planes = self.variable(next(iter(carried)).args[1]), []
-        for node, var in carried.items():
-            old, _, rest = node.args
-            leaves = old
-            if rest is not old:
-                gone = self.graph.node("not", FLAG, (mask,)) if rest.op == "and" else mask
-                leaves = self.graph.node(rest.op, FLAG, (old, gone))
-            planes.append(Out(var, leaves, old))
-        self.emit(Move(tuple(planes), place, region=mask, op=node.op, offset=node.attr))
-        self.known |= carried
+        """Planes that move together."""
+        if carried:
+            first, outs = next(iter(carried)), []
+            for node, var in carried.items():
+                old, _, leaves = map(self.value, node.args)
+                outs.append(Out(var, leaves, old))
+            movers = self.value(first.args[1])
+            self.emit(Move(tuple(outs), place, region=movers, op=first.op, offset=first.attr))
+            self.known |= carried
 
     # What must be stored
 
@@ -428,8 +405,9 @@ class _Cutter:
         _, dx, wraps = reader.attr
         # What is read at one neighbor only would fill a plane for it alone.
         alone = askers == 1
-        cheap = gate_cost(source, self.have) <= gates + (ONLY_READER if alone else 0)
-        return wraps and (is_constant(source) or (cheap and abs(dx) <= (1 if alone else 0)))
+        limit = gates + ONLY_READER * alone + 1
+        cheap = abs(dx) <= alone and gate_cost(source, self.have, limit) < limit
+        return wraps and (is_constant(source) or cheap)
 
     def word_needs(self, node: Node) -> list[Node]:
         """The flags at neighbors, the floats and the movements that a loop over words reads."""
@@ -441,13 +419,13 @@ class _Cutter:
             if of_floats(top) or (self.costs.by_rows and is_movement(top)):
                 needs[top] = None
                 continue
-            sources = dict.fromkeys(source for source, _ in sources_of(top))
+            sources = dict(sources_of(top))
             for source in sources:
                 if self.is_again(source, top):
                     stack.append(source)
                 else:
                     needs[source] = None
-            stack.extend(arg for arg in top.args if arg not in sources)
+            stack += [arg for arg in top.args if arg not in sources]
         return [*needs]
 
     def cell_needs(self, node: Node) -> list[Node]:
@@ -460,12 +438,10 @@ class _Cutter:
                 continue
             if top is not node and not kept and self.chain(top):
                 needs[top] = None  # long chains are applied before the loop that reads them
-            elif top.op == "led":
-                stack.extend(top.args)
             elif top.op == "select" and of_floats(top.args[0]) and not self.have(top.args[0]):
                 needs[top.args[0]] = None  # choices read stored flags
                 stack.extend(top.args[1:])
-            elif top.type != REAL and top is not node and not is_comparison(top):
+            elif top is not node and not of_floats(top):
                 needs |= {} if top.op == "param" else {top: None}
             elif top.op == "shift":
                 source = top.args[0]
@@ -487,18 +463,16 @@ class _Cutter:
         """Store nodes, after everything that they need. `when`: see `Compute`."""
         named = named or {}
         wanted = [node for node in dict.fromkeys(nodes) if node.op not in UNIFORM or node.type != REAL]
-        while wanted := [node for node in wanted if not self.have(node)]:
-            before = [need for need in self.needs_of(wanted) if not self.have(need)]
-            if not before:
-                break
+        while before := self.needs_of(wanted):
             self.ensure(before, place, named)
+        wanted = [node for node in wanted if not self.have(node)]
         floats = [node for node in wanted if of_floats(node)]
         # Floats that are read at neighbors later are stored here, where they are computed anyway.
         floats += [
             part for node in floats for part in walk(node) if part in self.wanted and not self.have(part)
         ]
         floats = [*dict.fromkeys(floats)]
-        flags = [node for node in wanted if node not in floats]
+        moves = [node for node in wanted if self.costs.by_rows and is_movement(node)]
 
         def outs(nodes: Iterable[Node]) -> list[Out]:
             return [Out(named.get(node) or self.namer.var(node.type), node) for node in nodes]
@@ -512,16 +486,14 @@ class _Cutter:
         floats = [node for node in floats if not self.have(node)]
         for nodes in connected(floats, _operations) if self.costs.by_rows else [floats]:
             self.loop(outs(nodes), place, "cells")
-        moves = [node for node in flags if self.costs.by_rows and is_movement(node)]
-        self.loop(outs(node for node in flags if node not in moves), place, "words", when)
-        together: dict[tuple[str, Offset, Node], list[Out]] = {}
+        flags = [node for node in wanted if not of_floats(node) and node not in moves]
+        self.loop(outs(flags), place, "words", when)
+        together: dict[tuple[str, Offset, Node], dict[Node, Var]] = {}
         for out in outs(moves):
-            content, movers, rest = map(self.variable, out.value.args)
-            key = (out.value.op, out.value.attr, movers)
-            together.setdefault(key, []).append(Out(out.var, rest, content))
-            self.known[out.value] = out.var
-        for (op, offset, movers), planes in together.items():
-            self.emit(Move(tuple(planes), place, region=movers, op=op, offset=offset))
+            key = (out.value.op, out.value.attr, self.variable(out.value.args[1]))
+            together.setdefault(key, {})[out.value] = out.var
+        for planes in together.values():
+            self.move(planes, place)
 
     def loop(
         self,

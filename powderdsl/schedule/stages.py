@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 from powderdsl.ir.ops import PassGraph
 from powderdsl.schedule.costs import Costs, conditions, thresholds
@@ -34,7 +35,7 @@ CUDA = (
     Stage("conditions", conditions, "where the result of each draw matters"),
     Stage(
         "cut",
-        cut(Costs(gates=24, floats=2)),
+        partial(cut, costs=Costs(gates=24, floats=2)),
         "where loops begin and end; a barrier costs about as much as 24 gates",
     ),
     Stage("unread", without_unread, "variables that nothing reads after `cut` are removed"),
@@ -64,7 +65,7 @@ CPU = (
     ),
     Stage(
         "cut",
-        cut(Costs(gates=6, floats=2, by_rows=True)),
+        partial(cut, costs=Costs(gates=6, floats=2, by_rows=True)),
         "where loops over rows begin and end, and which movements happen in place",
     ),
     Stage("unread", without_unread, "variables that nothing reads after `cut` are removed"),

@@ -361,7 +361,7 @@ def asked_masks(body: Block) -> Iterator[tuple[int, list[Out]]]:
     """Guards with masks in the statement before them: the position of that statement, and these masks."""
     for i, (masks, guard) in enumerate(pairwise(body)):
         if isinstance(masks, Compute) and isinstance(guard, Guard):
-            asked = {node.attr for node in guard.when.args if node.op == "load"}
+            asked = {node.attr for node in guard.when.args}
             yield i, [out for out in masks.outs if out.var.name in asked]
 
 
