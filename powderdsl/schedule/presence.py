@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Container, Iterable
 from dataclasses import dataclass, replace
 from functools import reduce
+from itertools import product, starmap
 from operator import or_
 
-from powderdsl.ir.ops import FLAG, REAL, Graph, Node, ordered
+from powderdsl.ir.ops import FLAG, REAL, Node, ordered
 from powderdsl.schedule.floats import unchanged
 from powderdsl.schedule.types import (
     ANSWER,
@@ -43,26 +44,23 @@ def presence(schedule: Schedule) -> Schedule:
     before `cut`, which takes masks apart.
     """
     bits = _element_bits(schedule)
-    leaves = [node for slot, node in schedule.leaves if slot.startswith(_ELEMENT)]
-    slots = [(slot, bits[var.name]) for slot, var in schedule.finds if var.name in bits]
-    if not bits or any(
-        slot != f"{_ELEMENT}{bit}" for slot, bit in slots
-    ):  # constants, or planes of other slots, become the element
-        return replace(schedule, body=(*schedule.body, Forget())) if leaves else schedule
+    planes = {var.name: slot for slot, var in schedule.finds if var.name in bits}
+    writes = [node.op == "load" for slot, node in schedule.leaves if slot.startswith(_ELEMENT)]
+    # Else constants, or planes of other slots, become the element.
+    if not bits or any(slot != f"{_ELEMENT}{bits[name]}" for name, slot in planes.items()):
+        return replace(schedule, body=(*schedule.body, Forget())) if writes else schedule
     body: list[Statement] = []
-    times = _times(schedule, bits)
+    needs = _Needs(schedule, bits, _times(schedule, bits))
     for statement, after in zip(schedule.body, (*schedule.body[1:], None), strict=True):
         if isinstance(statement, Guard):
-            if not _only_swaps(statement, bits):
-                statement = replace(statement, body=(Forget(), *statement.body))
-            body.append(statement)
-        elif isinstance(statement, Compute) and isinstance(after, Guard):
+            swaps = _only_swaps(statement, bits)
+            body.append(statement if swaps else replace(statement, body=(Forget(), *statement.body)))
+        elif isinstance(after, Guard):
             asked = statement.vars.keys() == {mask.attr for mask in after.when.args}
-            when = _asked(statement.results, bits, times, schedule.graph) if asked else None
-            body.append(replace(statement, when=when))
+            body.append(replace(statement, when=needs.asked(statement.results) if asked else None))
         else:
             body += [statement] if bits.keys().isdisjoint(statement.vars) else [statement, Forget()]
-    if any(node.op != "load" for node in leaves):
+    if not all(writes):
         body.append(Forget())
     return replace(schedule, body=tuple(body), when=_pass_asks(schedule, bits))
 
@@ -75,16 +73,12 @@ def _element_bits(schedule: Schedule) -> dict[str, int]:
     for slot, name in slots:
         if slot.startswith(_ELEMENT):
             bits[name] = int(slot.removeprefix(_ELEMENT))
-    pairs = [
-        (name, old.attr)
-        for statement in flat(schedule.body)
-        for name, old in statement.olds.items()
-        if old.op == "load"
-    ]
+    pairs = [pair for statement in flat(schedule.body) for pair in statement.olds.items()]
     for new, old in (*pairs, *reversed(pairs)):  # forward from the inputs, backward from the outputs
-        for known, other in ((old, new), (new, old)):
-            if known in bits:
-                bits.setdefault(other, bits[known])
+        if old.op == "load":
+            for known, other in ((old.attr, new), (new, old.attr)):
+                if known in bits:
+                    bits.setdefault(other, bits[known])
     return bits if max(bits.values(), default=MAX_PLANES) < MAX_PLANES else {}
 
 
@@ -95,24 +89,28 @@ def _times(schedule: Schedule, bits: dict[str, int]) -> dict[str, Time]:
     """
     change, changed = 0, set[int]()
     current: dict[int, str] = {}
-    begins: dict[str, int] = {}
-    ends: dict[str, int] = {}
-    loops = [statement for statement in flat(schedule.body) if isinstance(statement, Compute)]
-    for var in (*dict(schedule.finds).values(), *(out.var for loop in loops for out in loop.outs)):
-        if (bit := bits.get(var.name)) is not None:
+    times: dict[str, Time] = {}
+    for name in (*(var.name for _, var in schedule.finds), *_computed(flat(schedule.body))):
+        if (bit := bits.get(name)) is not None:
             if bit in changed:
                 change, changed = change + 1, set()
             changed.add(bit)
-            begins[var.name] = change
-            ends[current.get(bit, "")] = change
-            current[bit] = var.name
-    return {name: (begin, ends.get(name, change + 1)) for name, begin in begins.items()}
+            if old := current.get(bit):
+                times[old] = times[old][0], change
+            times[name] = change, ALWAYS[1]
+            current[bit] = name
+    return times
+
+
+def _computed(body: Iterable[Statement]) -> dict[str, Node]:
+    """The values of variables that loops compute."""
+    loops = [loop for loop in body if isinstance(loop, Compute)]
+    return {out.var.name: out.value for loop in loops for out in loop.outs}
 
 
 def _only_swaps(guard: Guard, bits: Container[str]) -> bool:
     """Whether a guard preserves the count of each element: it swaps cells, or writes no elements."""
-    loops = [statement for statement in guard.body if isinstance(statement, Compute)]
-    values = {out.var.name: out.value for loop in loops for out in loop.outs}
+    values = _computed(guard.body)
     changed = [(values[name], old) for name, old in guard.olds.items() if name in bits]
     return all(value.op == "swap" and value.args[0] is old is value.args[2] for value, old in changed)
 
@@ -123,9 +121,8 @@ def _pass_asks(schedule: Schedule, bits: dict[str, int]) -> Node | None:
     Until something changes, slots hold their values from the beginning of the pass, so every mask is judged as if it
     were the first.
     """
-    loops = [statement for statement in schedule.body if isinstance(statement, Compute)]
-    values = {out.var.name: out.value for loop in loops for out in loop.outs}
-    guards = {name: one for one in schedule.body if isinstance(one, Guard) for name in one.vars}
+    values = _computed(schedule.body)
+    guards = {name: part for part in schedule.body if isinstance(part, Guard) for name in part.vars}
     slots = {var.name: slot for slot, var in schedule.finds}
     masks: list[Node] = []
     for slot, node in schedule.leaves:
@@ -141,25 +138,13 @@ def _pass_asks(schedule: Schedule, bits: dict[str, int]) -> Node | None:
             node = guard.olds[node.attr]
         if node.op != "load" or slots.get(node.attr) != slot:
             return None
-    return _asked([values.get(mask.attr, mask) for mask in masks], bits, {}, schedule.graph)
+    return _Needs(schedule, bits, {}).asked([values.get(mask.attr, mask) for mask in masks])
 
 
 def when_present(masks: list[Node], schedule: Schedule) -> Node | None:
     """An answer without which none of some masks holds anywhere; None if none is known."""
     bits = _element_bits(schedule)
-    return _asked(masks, bits, _times(schedule, bits), schedule.graph) if bits else None
-
-
-def _asked(masks: list[Node], bits: dict[str, int], times: dict[str, Time], graph: Graph) -> Node | None:
-    """An answer that is true whenever one of some masks holds anywhere; None if none is known."""
-    needs = _Needs(bits, times)
-    ways = dict.fromkeys(needs.of(mask) for mask in masks)
-    if not ways or frozenset() in ways:
-        return None
-    present = [
-        [graph.node("present", ANSWER, (), ids) for ids in sorted(sets)] for sets in sorted(ways, key=sorted)
-    ]
-    return combined("or", [combined("and", nodes, graph) for nodes in present], graph)
+    return _Needs(schedule, bits, _times(schedule, bits)).asked(masks) if bits else None
 
 
 def asked_ids(schedule: Schedule) -> int:
@@ -184,32 +169,35 @@ class _Ids:
 class _Needs:
     """What flags say about ids. A cell has an id at a time: bits from before and after a change say nothing together."""
 
-    def __init__(self, bits: dict[str, int], times: dict[str, Time]):
-        self.bits, self.times = bits, times
+    def __init__(self, schedule: Schedule, bits: dict[str, int], times: dict[str, Time]):
+        self.graph, self.bits, self.times = schedule.graph, bits, times
         self.known: dict[Node, _Ids] = {}
-        codes = 1 << 1 + max(bits.values())
-        self.everything = (1 << codes) - 1
-        self.columns = {
-            bit: sum(1 << code for code in range(codes) if code >> bit & 1) for bit in bits.values()
-        }
+        self.codes = range(1 << 1 + max(bits.values()))
+        self.everything = (1 << len(self.codes)) - 1
 
-    def of(self, mask: Node) -> Sets:
-        """Sets of ids of each of which one must be present for the mask to hold anywhere."""
-        for node in ordered([mask]):
+    def asked(self, masks: list[Node]) -> Node | None:
+        """An answer that is true whenever one of some masks holds anywhere; None if none is known."""
+        for node in ordered(masks):
             if node not in self.known:
-                self.known[node] = self._ids(node, [self.known[arg] for arg in node.args])
-        return self.known[mask].sets
+                self.known[node] = self.ids(node, [self.known[arg] for arg in node.args])
+        ways = sorted({self.known[mask].sets for mask in masks}, key=sorted)
+        if not ways or not ways[0]:
+            return None
+        present = [[self.graph.node("present", ANSWER, (), ids) for ids in sorted(sets)] for sets in ways]
+        return combined("or", [combined("and", nodes, self.graph) for nodes in present], self.graph)
 
-    def _ids(self, node: Node, args: list[_Ids]) -> _Ids:
+    def ids(self, node: Node, args: list[_Ids]) -> _Ids:
+        """What a flag says, from what its arguments say."""
         cells, sets = [arg.cell for arg in args], [arg.sets for arg in args]
         together = node.op in ("and", "or", "xor", "not", "select")
         exact = together and all(arg.exact for arg in args)
-        times = [arg.time for arg in args if together and arg.cell != self.everything]
+        times = [ALWAYS, *(arg.time for arg in args if together and arg.cell != self.everything)]
         cell, needs = self.everything, Sets()
         match node.op:
             case "load" if node.attr in self.bits:
-                cell, exact = self.columns[self.bits[node.attr]], True
-                times = [self.times.get(node.attr, ALWAYS)]
+                bit = self.bits[node.attr]
+                cell, exact = sum(1 << code for code in self.codes if code >> bit & 1), True
+                times.append(self.times.get(node.attr, ALWAYS))
             case "const" if node.type == FLAG:
                 cell, exact = self.everything if node.attr else 0, True
             case "not" if exact:
@@ -225,18 +213,16 @@ class _Needs:
                 needs = _either(_least(sets[0] | sets[1]), sets[2])
             case "shift":
                 needs = sets[0]
-        begin, end = (
-            max([begin for begin, _ in times], default=0),
-            min([end for _, end in times], default=ALWAYS[1]),
-        )
-        if begin >= end:  # they never are together
-            cell, exact, begin, end = self.everything, False, *ALWAYS
+        begins, ends = zip(*times, strict=True)
+        time = max(begins), min(ends)
+        if time[0] >= time[1]:  # they never are together
+            cell, exact, time = self.everything, False, ALWAYS
         needs = Sets() if exact else needs
-        return _Ids(cell, exact, (begin, end), _least(needs | {cell} - {self.everything}))
+        return _Ids(cell, exact, time, _least(needs | {cell} - {self.everything}))
 
 
 def _either(a: Sets, b: Sets) -> Sets:
-    return _least(one | other for one in sorted(a) for other in sorted(b))
+    return _least(starmap(or_, product(a, b)))
 
 
 def _least(sets: Iterable[int]) -> Sets:
