@@ -21,9 +21,6 @@ from powderdsl.worlds.raster import MAX_CELLS
 MAX_REPORTED = 8
 """Wrong colors that are named one at a time. A smoothed picture has thousands."""
 
-CHUNK = 1 << 20
-"""Pixels that are looked up at once: more would take memory."""
-
 _MODES = ("1", "L", "LA", "P", "RGB", "RGBA")
 """Pixel formats of eight bits or fewer: those with more have colors that no element can have."""
 
@@ -41,21 +38,19 @@ def read_image(path: str | Path, elements: Sequence[Element]) -> NDArray[np.uint
     packed = _pixels(path).view("<u4")[..., 0]
     owners: dict[int, list[Element]] = {}
     for element in elements:
-        owners.setdefault(_pack(element.color), []).append(element)
-    for color, ramped in _ramp_colors(elements).items():
-        owners.setdefault(color, ramped)  # an element's own color wins over ramps
-    ids, known = np.zeros(packed.shape, np.uint8), np.zeros(packed.shape, np.bool_)
-    clear = {color: owned[0].id for color, owned in sorted(owners.items()) if len(owned) == 1}
-    colors, meant = np.array([*clear], dtype=np.uint32), np.array([*clear.values()], dtype=np.uint8)
-    cells = packed.reshape(-1)
-    for first in range(0, len(cells) if clear else 0, CHUNK):
-        part = slice(first, first + CHUNK)
-        place = np.searchsorted(colors, cells[part]).clip(max=len(colors) - 1)
-        found = colors[place] == cells[part]
-        known.reshape(-1)[part], ids.reshape(-1)[part] = found, np.where(found, meant[place], 0)
+        owners.setdefault(_pack(bytes.fromhex(element.color[1:])), []).append(element)
+    own, by_id = frozenset(owners), {element.id: element for element in elements}
+    for ramp in ramps(elements):  # an element's own color wins over ramps
+        for color in sorted({_pack(bytes(row)) for row in ramp.colors} - own):
+            owners.setdefault(color, []).append(by_id[ramp.id])
+    colors = np.array(sorted(owners), dtype=np.uint32)
+    meant = np.array([owners[color][0].id for color in sorted(owners)], dtype=np.uint8)
+    clear = np.array([len(owners[color]) == 1 for color in sorted(owners)])
+    place = np.searchsorted(colors, packed).clip(max=len(colors) - 1)
+    known = (colors[place] == packed) & clear[place]
     if not known.all():
         raise CompileError(_wrong_colors(path, packed, known, owners))
-    return ids
+    return meant[place]
 
 
 def _wrong_colors(
@@ -75,18 +70,8 @@ def _wrong_colors(
     return result
 
 
-def _ramp_colors(elements: Sequence[Element]) -> dict[int, list[Element]]:
-    """The colors of ramps, with the elements that may have them."""
-    found: dict[int, list[Element]] = {}
-    by_id = {element.id: element for element in elements}
-    for ramp in ramps(elements):
-        for color in dict.fromkeys(_pack("#" + bytes(row).hex()) for row in ramp.colors):
-            found.setdefault(color, []).append(by_id[ramp.id])
-    return found
-
-
-def _pack(color: str) -> int:
-    return int.from_bytes(bytes.fromhex(color[1:]) + b"\xff", "little")
+def _pack(color: bytes) -> int:
+    return int.from_bytes(color + b"\xff", "little")
 
 
 def _pixels(path: Path) -> NDArray[np.uint8]:
