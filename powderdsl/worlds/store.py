@@ -75,14 +75,15 @@ def load_world(path: str | Path, sim: Simulator) -> World:
         raise _bad(source, "does not exist") from None
     except OSError as error:
         raise _bad(source, f"cannot be read: {error.strerror or error}") from None
-    except BadArchive as error:
-        raise _bad(source, f"is not a saved world: {error}") from None
+    except (BadArchive, AttributeError, LookupError, TypeError, ValueError) as error:
+        raise _bad(source, f"is not a saved world: {' '.join(str(error).split())[:200]}") from None
 
 
 def _loaded(archive: Archive, sim: Simulator, source: Path) -> World:
-    palette, qualified, saved_in = _about(archive, source)
+    """Worlds from an archive. Raises BadArchive, or what follows from values that nothing here has written."""
+    palette, qualified, saved_in = _about(archive)
     shape = _shape(archive, sim, source)
-    clock = {name: sim.kind.from_numpy(_clock(archive, name, source)) for name in CLOCK}
+    clock = {name: sim.kind.from_numpy(_clock(archive, name)) for name in CLOCK}
     ids = archive.read(IDS)
     fields: dict[str, Any] = {}
     for key in archive.headers:
@@ -99,30 +100,23 @@ def _loaded(archive: Archive, sim: Simulator, source: Path) -> World:
                 raise _mismatch(source, problem, "load the pack that has it")
             continue
         if archive.headers[key].shape != (shape if slot.planes != 2 else (shape[0], 2, *shape[1:])):
-            raise _bad(source, f"is not a saved world: `{key}` does not fit its elements")
+            raise BadArchive(f"`{key}` does not fit its elements")
         value = archive.read(key)
         fields[slot.name] = _translated(palette, value, sim, source) if slot.kind == ELEMENT else value
-    try:
-        world = sim.replace(sim.world(_translated(palette, ids, sim, source)), **fields)
-        return World(sim, world.state, *clock.values())
-    except (ValueError, TypeError) as error:
-        raise _bad(source, str(error)) from None
+    world = sim.replace(sim.world(_translated(palette, ids, sim, source)), **fields)
+    return World(sim, world.state, *clock.values())
 
 
-def _about(archive: Archive, path: Path) -> tuple[dict[int, str], dict[str, str], str]:
+def _about(archive: Archive) -> tuple[dict[int, str], dict[str, str], str]:
     """The palette, the qualified name of each field, and the name of the ruleset."""
     header = archive.headers.get("about")
     if header is None or header.shape != () or header.dtype != "str" or header.size > MAX_ABOUT:
-        raise _bad(path, "is not a saved world: it does not say what it is")
-    try:
-        about = parse_json(archive.text("about").encode())
-        if not isinstance(about, dict) or about.get("format") != FORMAT:
-            raise _bad(path, f"was saved in another format than {FORMAT}")
-        palette = {int(number): str(name) for number, name in about["palette"].items()}
-        fields = {str(name): str(one) for name, one in about["fields"].items()}
-    except (KeyError, ValueError, TypeError, AttributeError) as error:
-        words = " ".join(str(error).split())[:200]
-        raise _bad(path, f"is not a saved world: {type(error).__name__} {words}") from None
+        raise BadArchive("it does not say what it is")
+    about = parse_json(archive.text("about").encode())
+    if not isinstance(about, dict) or about.get("format") != FORMAT:
+        raise BadArchive(f"its format is not {FORMAT}")
+    palette = {int(number): str(name) for number, name in about["palette"].items()}
+    fields = {str(name): str(word) for name, word in about["fields"].items()}
     return palette, fields, str(about.get("ruleset"))[:100]
 
 
@@ -130,13 +124,13 @@ def _shape(archive: Archive, sim: Simulator, path: Path) -> tuple[int, ...]:
     """[worlds, rows, columns], if the arrays are not larger than those of such worlds can be."""
     header = archive.headers.get(IDS)
     if header is None or header.dtype != "uint8" or len(header.shape) != 3 or 0 in header.shape:
-        raise _bad(path, "is not a saved world: it has no elements [worlds, rows, columns]")
+        raise BadArchive("it has no elements [worlds, rows, columns]")
     cells = prod(header.shape)
     check_saved(path, header.shape)
     a_cell = sum(max(1, slot.planes) * np.dtype(slot.dtype).itemsize for slot in sim.slots)
     size = sum(header.size for header in archive.headers.values())
     if size > MORE + 2 * cells * a_cell:
-        raise _bad(path, f"is not a saved world: it has {size:,} bytes of arrays for {cells:,} cells")
+        raise BadArchive(f"it has {size:,} bytes of arrays for {cells:,} cells")
     return header.shape
 
 
@@ -148,28 +142,28 @@ def check_saved(path: Path, shape: tuple[int, ...]) -> None:
         raise failure("PD607", f"{path}: {size} cells", helps=helps)
 
 
-def _clock(archive: Archive, name: str, path: Path) -> Any:
+def _clock(archive: Archive, name: str) -> Any:
     header = archive.headers.get(name)
     batch = archive.headers[IDS].shape[:1]
     if header is None or header.dtype[:1] not in "iu" or header.shape != batch:
-        raise _bad(path, f"is not a saved world: its arrays do not fit together (`{name}`)")
+        raise BadArchive(f"its arrays do not fit together (`{name}`)")
     values = archive.read(name).astype(np.int64)
     if (values < 0).any():
-        raise _bad(path, f"is not a saved world: `{name}` is below 0")
+        raise BadArchive(f"`{name}` is below 0")
     return values
 
 
 def _translated(palette: dict[int, str], ids: Any, sim: Simulator, path: Path) -> Any:
     """The file's ids as ours, uint8; reports elements that we do not have."""
     if ids.dtype != np.uint8:
-        raise _bad(path, f"is not a saved world: elements are bytes, found {ids.dtype}")
+        raise BadArchive(f"elements are bytes, found {ids.dtype}")
     ours = {element.qualified: element.id for element in sim.ruleset.elements}
     table = bytearray(256)
     data = ids.tobytes()
     for number in sorted(set(data)):
         name = palette.get(number)
         if name is None:
-            raise _bad(path, f"has the id {number}, which is not in its palette")
+            raise BadArchive(f"it has the id {number}, which is not in its palette")
         if name not in ours:
             fix = f"load the pack `{name.split('.')[0]}` too"
             raise _mismatch(path, f"the element `{name}` is not in {sim.ruleset.name}", fix)

@@ -45,7 +45,7 @@ from powderdsl.worldmodel.config import HERE, DataConfig, TrainConfig
 from powderdsl.worldmodel.networks import custom_network
 from powderdsl.worlds.ascii import read_ascii
 from powderdsl.worlds.image import read_image
-from powderdsl.worlds.scene import draw_scene, find_scene
+from powderdsl.worlds.scene import draw_start, find_scene
 from tests.semantics.test_mixed import spread
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -105,7 +105,7 @@ def diagnostics_of(one: Example) -> tuple[Diagnostic, ...]:
     path.write_text(one.text, encoding="utf-8")
     try:
         if "scene" in one.info.split():
-            draw_scene(find_scene(path), paper_rules())
+            draw_start(find_scene(path), paper_rules())
             return ()
         if "task" in one.info.split():
             return load_task_with_diagnostics(path)[1]

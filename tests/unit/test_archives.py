@@ -54,8 +54,10 @@ def test_a_small_file_with_a_large_world_is_not_unpacked(tmp_path):
 def test_worlds_that_could_not_be_loaded_are_not_saved(tmp_path):
     sim = powderdsl.compile("core", backend="reference")
     world = sim.world(np.zeros((1, 4, 4), np.uint8))
-    large = {name: value.expand(MAX_CELLS // 16 + 1, *value.shape[1:]) for name, value in world.state.items()}
-    many = powderdsl.World(sim, large, world.seed, world.index, world.step)
+    count = MAX_CELLS // 16 + 1
+    large = {name: value.expand(count, *value.shape[1:]) for name, value in world.state.items()}
+    clock = [value.expand(count) for value in (world.seed, world.index, world.step)]
+    many = powderdsl.World(sim, large, *clock)
     with pytest.raises(CompileError, match="PD607"):
         powderdsl.save(many, tmp_path / "w.npz")
     assert list(tmp_path.iterdir()) == []
