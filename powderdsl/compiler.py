@@ -197,7 +197,7 @@ def split_names(name: str | Path) -> tuple[list[str], list[str]]:
         return [str(name)], []
     plus: list[str] = []
     minus: list[str] = []
-    parts = name.split("+")
+    parts = str(name).split("+")  # callers of the Python API may pass anything
     while parts:
         count = min(len(parts), MAX_PLUSES + 1)
         head, rest = _without("+".join(parts[:count]))

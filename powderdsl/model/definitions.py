@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -24,6 +23,7 @@ from powderdsl.model.expressions.operators import Broken, Operand, Poisoned, Sco
 from powderdsl.model.expressions.symbols import (
     clamped,
     default_of,
+    in_words,
     not_a_value,
     number_value,
     read_bounds,
@@ -31,6 +31,7 @@ from powderdsl.model.expressions.symbols import (
 )
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.schema import keys_of
+from powderdsl.model.state import stored_range
 from powderdsl.model.types import (
     CHANCE,
     FLAG,
@@ -148,13 +149,11 @@ def _kind(noun: str, decl: TypedDecl, typer: Typer) -> Kind:
         return CHANCE
     if default.kind in ("yes", "no"):
         return FLAG
-    name, value, chance = decl.name.text, default.span.text, ""
-    if re.fullmatch(r"0?\.[0-9]+|[0-9]{1,2}", value):
-        chance = f"`{100 * float(value):g}%`, or " if "." in value else f"`{value}%`, or "
+    name, value = decl.name.text, default.span.text
     bounds = "real(0..1)" if "." in value else "0..9"
     raise typer.fail(
         "PD401", f"the parameter `{name}` does not say its kind", default.span, "neither a percentage nor `yes` or `no`",
-        f"write {chance}`{name}: {{type: {bounds}, default: {value}}}`",
+        f"write a percentage, or `{name}: {{type: {bounds}, default: {value}}}`",
     )  # fmt: skip
 
 
@@ -361,40 +360,29 @@ def set_params(ruleset: Ruleset, values: Mapping[str, Any], reporter: Reporter) 
             helps = suggest(name, known, "parameters") or (f"parameters: {names}",)
             reporter.error("PD309", f"unknown parameter `{name}`", None, helps=helps)
             continue
-        try:
-            found[name] = param_value(known[name], value)
-        except ValueError as error:
-            notes = [f"it is {_kind_in_words(known[name].kind)}"]
-            reporter.error("PD402", f"parameter `{name}`: {error}", None, notes=notes)
+        kind = known[name].kind
+        number = param_value(kind, value)
+        if number is None:
+            helps = (f"write {in_words(kind)}",)
+            reporter.error("PD402", f"parameter `{name}` cannot be `{value}`", None, helps=helps)
+        else:
+            found[name] = number
     return ruleset.with_params(found)
 
 
-def _kind_in_words(kind: Kind) -> str:
-    if kind.name == "chance":
-        return "a chance: write a percentage from 0% to 100%, or a number from 0 to 1"
-    if kind.name == "flag":
-        return "a flag: write yes or no"
-    return f"{'an integer' if kind.name == 'int' else 'a number'} from {kind.lo:g} to {kind.hi:g}"
-
-
-def param_value(param: Param, value: Any) -> Value:
-    """A value for a parameter from text (``"5%"``, ``"yes"``) or a number. Raises ValueError."""
-    text = value.strip() if isinstance(value, str) else None
-    flags = {"yes": 1.0, "true": 1.0, "no": 0.0, "false": 0.0}
+def param_value(kind: Kind, value: Any) -> Value | None:
+    """The value of a kind that text (``"5%"``, ``"yes"``) or a number means, if it means one."""
+    text = value.strip() if isinstance(value, str) else ""
     try:
-        if text is not None and text.endswith("%"):
-            number = float(text[:-1]) / 100
-        else:
-            number = float(value if text is None else flags.get(text, text))
+        number = float(text[:-1]) / 100 if text.endswith("%") else float(_FLAGS.get(text, value))
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{repr(value) if text is None else f'`{text}`'} is not a number") from None
-    kind = param.kind.name
-    lo, hi = (0.0, 1.0) if kind in ("chance", "flag") else (param.kind.lo, param.kind.hi)
+        return None
+    lo, hi = stored_range(kind)
     if not lo <= number <= hi:
-        bounds = "0%..100%" if kind == "chance" else f"{lo:g}..{hi:g}"
-        raise ValueError(f"{text or format(number, 'g')} lies outside {bounds}")
-    if kind not in ("int", "flag"):
+        return None
+    if kind.name not in ("int", "flag"):
         return number
-    if number != int(number):
-        raise ValueError(f"{number:g} is not an integer")
-    return int(number)
+    return int(number) if number == int(number) else None
+
+
+_FLAGS = {"yes": 1.0, "true": 1.0, "no": 0.0, "false": 0.0}

@@ -168,9 +168,9 @@ def test_a_pack_that_others_need_is_missed_once() -> None:
 @pytest.mark.parametrize(
     ("setting", "shown"),
     [
-        ("500%", "500% lies outside 0%..100%"),
-        ("2", "2 lies outside 0%..100%"),
-        ("-5%", "-5% lies outside 0%..100%"),
+        ("500%", "cannot be `500%`"),
+        ("2", "cannot be `2`"),
+        ("-5%", "cannot be `-5%`"),
     ],
 )
 def test_a_chance_of_the_command_line_is_shown_as_it_was_written(setting: str, shown: str) -> None:

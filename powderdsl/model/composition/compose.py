@@ -419,13 +419,10 @@ def _report_ids(
         name, wanted = decl.qualified, decl.number
         first = by_number.setdefault((decl.pack, wanted), decl)
         if first is not decl:
-            others = [other for other in loaded if other is not decl]
-            used = {number for other in others for number in (other.number, ids.get(other.qualified))}
-            free = next((n for n in range(MAX_ELEMENTS) if n not in used), None)
             reporter.error(
                 "PD303", f"elements `{first.name.text}` and `{decl.name.text}` have the same id {wanted}",
                 decl.id.span, "already taken", secondary=[Label(first.span, "by this one")],
-                helps=[] if free is None else [f"id {free} is free; an element without `id:` gets a free one"],
+                helps=["leave out `id:`: the element gets a free one"],
             )  # fmt: skip
         elif not recorded and ids.get(name, wanted) != wanted:
             reporter.report(

@@ -130,25 +130,28 @@ def read_kind(syntax: Syntax, typer: Typer) -> Kind:
     raise typer.fail("PD401", "not a kind", syntax.span, "expected a kind", *helps)
 
 
-_FLAGS = {"on": "yes", "true": "yes", "y": "yes", "off": "no", "false": "no", "n": "no", "none": "no"}
+_FLAGS = {
+    **dict.fromkeys(("yes", "on", "true", "y"), "yes"),
+    **dict.fromkeys(("no", "off", "false", "n", "none"), "no"),
+}
 """Words that people write for yes and no."""
+
+
+def in_words(kind: Kind) -> str:
+    """The values of a kind in a sentence that asks for one."""
+    if kind.name == "flag":
+        return "`yes` or `no`"
+    if kind.name == "chance":
+        return "a chance from 0% to 100%"
+    return f"{'an integer' if kind.name == 'int' else 'a number'} from {kind.lo:g} to {kind.hi:g}"
 
 
 def not_a_value(prop: Property, syntax: Syntax, typer: Typer) -> None:
     """Report a word as a property's value that names nothing."""
-    word = syntax.text.lower()
-    fix = "or a parameter of this pack"
-    match prop.kind.name:
-        case "flag":
-            meant = word if word in ("yes", "no") else _FLAGS.get(word)
-            form = "`yes` or `no`"
-            fix = f"write `{meant}`" if meant else f"write `yes`, `no`, {fix}"
-        case "chance":
-            form, fix = "a chance", f"write a chance such as `5%`, {fix}"
-        case _:
-            form = f"a number in {prop.kind}"
-            fix = f"write a number from {prop.kind.lo:g} to {prop.kind.hi:g}, {fix}"
-    typer.fail("PD110", f"`{syntax.text}` is not {form}", syntax.span, f"the value of `{prop.name}`", fix)
+    meant = _FLAGS.get(syntax.text.lower()) if prop.kind == FLAG else None
+    fix = f"write `{meant}`" if meant else f"write {in_words(prop.kind)}, or a parameter of this pack"
+    message = f"`{syntax.text}` is no value of `{prop.name}`"
+    typer.fail("PD110", message, syntax.span, f"expected {in_words(prop.kind)}", fix)
 
 
 def default_of(kind: Kind, first_id: int = 0) -> Value:
