@@ -71,6 +71,16 @@ class Recipe:
         """Whole actions of an episode: worlds change so often."""
         return (self.rows - 1) // 3
 
+    @property
+    def parts(self) -> list[Numbers]:
+        """The numbers of the episodes of each part."""
+        every = np.arange(self.first, self.first + self.count)
+        return [every[at : at + PART] for at in range(0, self.count, PART)]
+
+    def actions(self, level: Level, numbers: Numbers) -> NDArray[np.int16]:
+        """The whole actions of some episodes: int16 [count, n, 3]; the last may be cut off in its rows."""
+        return play(level, self.seed, numbers, -(-self.rows // 3))
+
 
 def collect(
     program: LevelProgram,
@@ -138,13 +148,13 @@ def _write(program: LevelProgram, path: Path, recipe: Recipe, report: Callable[[
         return
     parts.mkdir(exist_ok=True)
     write_text(about, json.dumps(asdict(recipe), indent=2) + "\n")
-    for first in range(0, recipe.count, PART):
-        file, count = parts / f"{first:09}.npz", min(PART, recipe.count - first)
-        if _read_part(file, recipe, program.level, count) is None:
-            frames = _played(program, recipe, first, count)
+    for numbers in recipe.parts:
+        file = parts / f"{numbers[0]:010}.npz"
+        if _read_part(file, recipe, program.level, len(numbers)) is None:
+            frames = _played(program, recipe, numbers)
             with replacing(file) as temporary, temporary.open("wb") as part:
                 write_archive(part, {"frames": frames}, COMPRESSION)
-        report(PLAYED * count)
+        report(PLAYED * len(numbers))
     rows, side = recipe.count * recipe.rows, program.level.side
     terminals = np.zeros((recipe.count, recipe.rows), dtype=np.int32)
     terminals[:, -1] = 1
@@ -161,41 +171,34 @@ def _write(program: LevelProgram, path: Path, recipe: Recipe, report: Callable[[
 def _observations(
     program: LevelProgram, parts: Path, recipe: Recipe, report: Callable[[float], None]
 ) -> Iterator[Frames]:
-    for first in range(0, recipe.count, PART):
-        count = min(PART, recipe.count - first)
-        frames = _read_part(parts / f"{first:09}.npz", recipe, program.level, count)
+    for numbers in recipe.parts:
+        frames = _read_part(parts / f"{numbers[0]:010}.npz", recipe, program.level, len(numbers))
         if frames is None:
             raise failure("PD613", f"cannot write the data set: {parts} was changed meanwhile")
-        actions = _actions(program.level, recipe, first, count)
-        for at in range(0, count, WRITTEN):
-            some = slice(at, min(at + WRITTEN, count))
-            yield rows_of(program, frames[some], actions[some], recipe.rows)
-            report((1 - PLAYED) * (some.stop - some.start))
+        actions = recipe.actions(program.level, numbers)
+        for at in range(0, len(numbers), WRITTEN):
+            observations = rows_of(
+                program, frames[at : at + WRITTEN], actions[at : at + WRITTEN], recipe.rows
+            )
+            yield observations
+            report((1 - PLAYED) * len(observations))
 
 
 def _action_rows(level: Level, recipe: Recipe) -> Iterator[NDArray[np.int32]]:
-    for first in range(0, recipe.count, PART):
-        actions = _actions(level, recipe, first, min(PART, recipe.count - first))
+    for numbers in recipe.parts:
+        actions = recipe.actions(level, numbers)
         yield actions.reshape(len(actions), -1)[:, : recipe.rows].astype(np.int32)
 
 
-def _actions(level: Level, recipe: Recipe, first: int, count: int) -> NDArray[np.int16]:
-    """The whole actions of some episodes of a file: int16 [count, n, 3]; the last may be cut off in its rows."""
-    numbers = np.arange(recipe.first + first, recipe.first + first + count)
-    return play(level, recipe.seed, numbers, -(-recipe.rows // 3))
-
-
-def _played(program: LevelProgram, recipe: Recipe, first: int, count: int) -> Frames:
+def _played(program: LevelProgram, recipe: Recipe, numbers: Numbers) -> Frames:
     """The worlds' pictures at the start and after each whole action: uint8 [count, painted + 1, H, W, 3]."""
-    actions = _actions(program.level, recipe, first, count).astype(np.int64)
-    numbers = np.arange(recipe.first + first, recipe.first + first + count)
-    world = program.start(np.full(count, recipe.seed, dtype=np.int64), numbers)
-    frames = np.empty((count, recipe.painted + 1, *world.ids.shape[1:], 3), dtype=np.uint8)
-    frames[:, 0] = world.rgb().cpu().numpy()
+    actions = recipe.actions(program.level, numbers).astype(np.int64)
+    world = program.start(np.full_like(numbers, recipe.seed), numbers)
+    frames = [world.rgb().cpu().numpy()]
     for number in range(recipe.painted):
         world = program.act(world, actions[:, number])
-        frames[:, number + 1] = world.rgb().cpu().numpy()
-    return frames
+        frames.append(world.rgb().cpu().numpy())
+    return np.stack(frames, 1)
 
 
 def rows_of(program: LevelProgram, frames: Frames, actions: NDArray[np.int16], rows: int) -> Frames:

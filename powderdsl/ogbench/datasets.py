@@ -106,15 +106,14 @@ def load_dataset(
     path = Path(dataset_path)
     try:
         with open_archive(path) as archive:
-            heads = archive.headers
+            shapes = []
             for name in ROWS:
-                if name not in heads:
-                    raise BadArchive(f"`{name}` is missing")
-                if heads[name].dtype == "str" or not heads[name].shape:
-                    raise BadArchive(f"`{name}` is not an array of numbers")
-            counts = {name: heads[name].shape[0] for name in ROWS}
-            if len(set(counts.values())) != 1:
-                raise BadArchive(f"its arrays have different numbers of rows: {counts}")
+                head = archive.headers.get(name)
+                if head is None or head.dtype == "str" or not head.shape:
+                    raise BadArchive(f"`{name}` must be an array of numbers")
+                shapes.append(head.shape[0])
+            if len(set(shapes)) > 1:
+                raise BadArchive(f"its arrays have different numbers of rows: {shapes}")
         # NumPy reads into memory that may be written to, as learners expect; what it reads has been checked above.
         with np.load(path, allow_pickle=False) as file:
             observations, actions, ends = (file[name] for name in ROWS)

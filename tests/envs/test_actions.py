@@ -158,7 +158,11 @@ def test_bad_actions_name_what_is_wrong(small: TaskProgram, task_file: Path, tmp
         env.step([[0] * 5] * 2)
     single = TensorEnv(small, 2, actions="discrete")
     single.reset(seed=0)
-    for bad, why in (([0, 160], r"actions\[1\] is 160"), ([[0], [0]], r"\[episodes\]"), ([0], "1 actions")):
+    for bad, why in (
+        ([0, 160], r"actions\[1, 0\] \(action\) is 160"),
+        ([[0], [0]], r"\[episodes\]"),
+        ([0], "1 actions"),
+    ):
         with pytest.raises(ValueError, match=why):
             single.step(bad)
     with pytest.raises(TypeError, match="integers"):
