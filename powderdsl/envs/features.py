@@ -24,20 +24,17 @@ class Expand(nn.Module):
 
     def __init__(self, sources: tuple[int, ...], tables: Tensor):
         super().__init__()
-        self.channels = len(sources)
-        self.of_source = {
-            source: [channel for channel, other in enumerate(sources) if other == source]
-            for source in dict.fromkeys(sources)
-        }
+        self.sources, self.channels = sources, len(sources)
         self.register_buffer("tables", tables)
 
     def forward(self, observed: Tensor) -> Tensor:
         """Bytes, or the same numbers as floats: [B, C, H, W]."""
         batch, _, height, width = observed.shape
         out = torch.empty(batch, self.channels, height, width, device=observed.device)
-        for source, channels in self.of_source.items():
-            values = self.get_buffer("tables")[channels].index_select(1, observed[:, source].int().flatten())
-            out[:, channels] = values.view(-1, batch, height, width).movedim(0, 1)
+        tables, numbers = self.get_buffer("tables"), observed.int().movedim(1, 0).flatten(1)
+        for channel, source in enumerate(self.sources):
+            values = tables[channel].index_select(0, numbers[source])
+            out[:, channel] = values.view(batch, height, width)
         return out
 
 

@@ -18,7 +18,7 @@ from powderdsl.simulation.simulator import MAX_CELLS
 from powderdsl.simulation.state_checks import given_mapping
 from powderdsl.system.random import MASK, mix
 from powderdsl.system.settings import check_choice, check_count
-from powderdsl.tasks.episodes import Episodes, TaskProgram, compile_task, integer_tensor, load_task
+from powderdsl.tasks.episodes import Episodes, TaskProgram, compile_task, load_task
 from powderdsl.tasks.task import Task
 
 Info = dict[str, Any]
@@ -156,7 +156,7 @@ class TensorEnv:
             base = torch.where(mask, base, self._base)
         worlds = world_seeds(base, episode, self.worlds)
         if "worlds" in given:
-            worlds = self._worlds(given["worlds"])
+            worlds = self.simulator.numbers(given["worlds"], "worlds", self.num_envs)
         if self.episodes is None:
             self.episodes = self.program.start(worlds)
         else:
@@ -203,14 +203,6 @@ class TensorEnv:
         new = torch.tensor([one or 0 for one in seeds], device=self.device)
         given = torch.tensor([one is not None for one in seeds], device=self.device)
         return torch.where(given, new, old), given
-
-    def _worlds(self, value: Any) -> Tensor:
-        tensor = integer_tensor("worlds", value, self.device)
-        if tensor.ndim > 1 or (tensor.ndim == 1 and len(tensor) != self.num_envs):
-            raise ValueError(f"worlds takes one number or {self.num_envs}, found shape {list(tensor.shape)}")
-        if bool((tensor < 0).any()):
-            raise ValueError("worlds must be 0 or more")
-        return tensor.expand(self.num_envs).clone()
 
     def _new_params(self, given: Any, mask: Tensor) -> dict[str, Tensor]:
         """The parameters after a reset of `mask`."""

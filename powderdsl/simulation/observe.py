@@ -9,7 +9,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
-from itertools import groupby
 from typing import Any, NamedTuple
 
 import torch
@@ -92,15 +91,11 @@ class Observer:
             numbers = torch.tensor(wanted, dtype=torch.int32)
             return _native(state, "channels", out, len(channels), numbers, tables)
         ids = state["element"].flatten().int()
-        for read, run in groupby(range(len(channels)), lambda at: channels[at].read):
-            first, *others = run
-            places = slice(first, first + len(others) + 1)
-            if read:
-                for at in (first, *others):
-                    out[:, at] = _component(state, channels[at].slot)
+        for at, channel in enumerate(channels):
+            if channel.read:
+                out[:, at] = _component(state, channel.slot)
             else:
-                values = tables[places].index_select(1, ids)
-                out[:, places] = values.view(-1, batch, height, width).movedim(0, 1)
+                out[:, at] = tables[at].index_select(0, ids).view(batch, height, width)
         return out
 
     @torch.no_grad()

@@ -259,8 +259,8 @@ class Simulator:
         return World(
             self,
             {name: self._fresh(slot, element) for name, slot in self.slot_by_name.items()},
-            self._numbers(seeds, "seed", batch),
-            self._numbers(self._integers(index, "index"), "index", batch),
+            self.numbers(seeds, "seed", batch),
+            self.numbers(index, "index", batch),
             self.kind.put([0] * batch, "int64"),
         )
 
@@ -288,10 +288,14 @@ class Simulator:
             raise TypeError(f"{name} must be integers, found {array.dtype}")
         return array
 
-    def _numbers(self, array: Array, name: str, batch: int) -> Array:
-        """Integers of 0 or more, one a world: int64 [B] in memory of their own."""
+    def numbers(self, given: Any, name: str, batch: int) -> Array:
+        """Integers of 0 or more, one for all worlds or one a world: int64 [B] in memory of their own.
+
+        Raises:
+            TypeError, ValueError: they are not.
+        """
         xp = self.kind.xp
-        array = xp.asarray(array, dtype=xp.int64)
+        array = xp.asarray(self._integers(given, name), dtype=xp.int64)
         if array.ndim == 0:
             array = xp.broadcast_to(array, (batch,))
         if tuple(array.shape) != (batch,) or bool((array < 0).any()):
