@@ -77,7 +77,6 @@ def changes() -> list[tuple[str, str]]:
         ("tag", 'moss: {id: 1, color: "#202020", weight: 3, tags: [green]}'),
         ("kernel", "let: {crowd: count(moss)}"),
         ("kernel", "- rock -> soil if count(moss in ring) > 1 with chance 4%"),
-        ("stream", "- rock -> soil if count(moss) > 1 and luck < 4%"),
         ("kernel", 'kernels: {far: {rows: ["1 0 1"], edges: wrap}}'),
         ("kernel", 'kernels: {far: ["1 1 1"]}'),
         ("stream", "- soil -> moss if above is moss and crowd < 3 and fate < growth"),

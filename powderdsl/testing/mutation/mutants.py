@@ -149,35 +149,6 @@ def without(operator: str, items: list[Span], number: int) -> Change:
     return Change(operator, items[number - 1].end, items[number].end, "")
 
 
-def without_action(operator: str, path: Path) -> Change:
-    """A block without its action: what stood under `then` comes at once, or the block goes."""
-    block = path[-1][0]
-    assert isinstance(block, yaml_tree.Mapping)
-    then = next((key for key, _ in block.entries if key.text == "then"), None)
-    if then is None:
-        return _without_block(operator, path[:-1])
-    cut = removed(operator, path)
-    return Change(
-        operator, cut.start, then.span.end, f"{block.span.source.text[cut.end : then.span.start]}do"
-    )
-
-
-def _without_block(operator: str, path: Path) -> Change:
-    """The block at the end of a path cut out; with its action where it is all that the action does."""
-    container, number = path[-1]
-    if isinstance(container, Sequence) and len(container.items) == 1:
-        return _without_block(operator, path[:-1])
-    inside = len(path) > 2  # a pass or block, not the list of all passes
-    if isinstance(container, yaml_tree.Mapping) and inside and is_action(container.entries[number][0]):
-        return without_action(operator, path)
-    return removed(operator, path)
-
-
-def is_action(key: Scalar) -> bool:
-    """Whether a key of a pass or block is what it does."""
-    return key.text == "do" or key.text.startswith(("for ", "repeat "))
-
-
 def inserted(operator: str, path: Path, entry: str) -> Change:
     """A new entry after one of a mapping's, written as the mapping is: with a comma, or on a line of its own."""
     node, number = path[-1]
@@ -208,9 +179,6 @@ def _whole(node: Node) -> Span:
 
 # Names that a hurried author might write instead
 
-MOST = 2
-"""The number of names that are tried in place of one."""
-
 
 @dataclass(frozen=True)
 class Names:
@@ -230,16 +198,15 @@ class Names:
         return self.kinds.get(name, "").partition(":")[0]
 
     def others(self, name: str) -> list[str]:
-        """Names of the same kind: those of the same pack first, then others."""
-        wanted = self.kinds.get(name)
-        if wanted is None:
+        """The next and the last name of the same kind: those of the same pack first, then others."""
+        if name not in self.kinds:
             return []
-        same = [other for other, kind in self.kinds.items() if kind == wanted]
+        same = [other for other, kind in self.kinds.items() if kind == self.kinds[name]]
         place = same.index(name)
         ring = same[place + 1 :] + same[:place]
         if name in self.own:
-            ring = [*(n for n in ring if n in self.own), *(n for n in ring if n not in self.own)]
-        return [*dict.fromkeys([*ring[:1], *ring[-1:]])][:MOST]
+            ring.sort(key=lambda other: other not in self.own)
+        return [*dict.fromkeys([*ring[:1], *ring[-1:]])]
 
     def with_lets(self, lets: dict[str, str]) -> Names:
         """The same names with the `let` values of a pass."""
@@ -250,37 +217,33 @@ class Names:
 def names_of(packs: Sequence_[PackDecl], pack: PackDecl) -> Names:
     """The names that rules of a pack can say."""
     kinds: dict[str, str] = dict.fromkeys(KERNELS, "kernel")
-    ranges: dict[str, tuple[int, int]] = {}
-    flags = set()
     own: set[str] = set()
-    for one in packs:
-        found = {
+    types: dict[str, str] = {}
+    for other in packs:
+        names = {
             decl.name.text: kind
             for kind in ("tag", "set", "element", "stream", "kernel")
-            for decl in getattr(one, f"{kind}s")
+            for decl in getattr(other, f"{kind}s")
         }
-        found |= _typed(one.properties, "property") | _typed(one.fields, "field")
-        if one is pack:
-            found |= _typed(one.params, "parameter")
-            own |= set(found)
-        kinds |= found
-        for decl in one.properties:
-            text = decl.type.span.text if decl.type else ""
-            bounds = re.fullmatch(r"\s*(-?\d+)\s*\.\.\s*(-?\d+)\s*", text)
-            if bounds:
-                ranges[decl.name.text] = int(bounds[1]), int(bounds[2])
-            elif text.strip() == "flag":
-                flags.add(decl.name.text)
-    return Names(kinds, frozenset(own), ranges, frozenset(flags))
+        names |= _typed(other.properties, "property") | _typed(other.fields, "field")
+        if other is pack:
+            names |= _typed(other.params, "parameter")
+            own |= set(names)
+        kinds |= names
+        types |= {decl.name.text: decl.type.span.text.strip() for decl in other.properties if decl.type}
+    bounds = {name: re.fullmatch(r"(-?\d+)\s*\.\.\s*(-?\d+)", text) for name, text in types.items()}
+    ranges = {name: (int(match[1]), int(match[2])) for name, match in bounds.items() if match}
+    flags = frozenset(name for name, text in types.items() if text == "flag")
+    return Names(kinds, frozenset(own), ranges, flags)
 
 
 def _typed(decls: Iterable[TypedDecl], kind: str) -> dict[str, str]:
     """Declared names with their kind and what they hold: a number never stands for a flag by mistake."""
-    found = {}
+    kinds = {}
     for decl in decls:
-        text = (decl.type or decl.default).span.text.strip() if (decl.type or decl.default) else ""  # type: ignore[union-attr]
-        held = (
-            "int" if re.match(r"-?\d+\s*\.\.", text) else "chance" if "%" in text else text.partition("(")[0]
-        )
-        found[decl.name.text] = f"{kind}:{held}"
-    return found
+        declared = decl.type or decl.default
+        text = declared.span.text.strip() if declared else ""
+        is_range = re.match(r"-?\d+\s*\.\.", text)
+        held = "int" if is_range else "chance" if "%" in text else text.partition("(")[0]
+        kinds[decl.name.text] = f"{kind}:{held}"
+    return kinds
