@@ -14,7 +14,7 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from powderdsl.testing.generators.rulemaker import random_ruleset_text
-from powderdsl.testing.properties.running import reference_states
+from powderdsl.testing.properties.running import Oracle
 
 BLOCKED = f"""
 import sys
@@ -40,7 +40,7 @@ def digests(first: int, stop: int) -> Iterator[str]:
             (9, choices.integer(1, 5), choices.integer(1, 5)),
             (2, choices.integer(1, 4), choices.pick((31, 33, 64, 65))),
         ):
-            for state in reference_states(rules, random_start(rules, choices, shape), 3):
+            for state in Oracle(rules).states(random_start(rules, choices, shape), 3):
                 for name, values in sorted(state.items()):
                     whole.update(f"{name} {values.dtype} {values.shape}".encode() + values.tobytes())
         yield f"{seed} {whole.hexdigest()}"

@@ -203,13 +203,15 @@ class _Report:
         text, sample, steps = read_example(path, ruleset)
         runner = Runner(ruleset, self.backend)
         search = InvariantSearch.of(runner, self.plan)
-        prop = next((trial.prop for trial in search.trials if trial.prop.text == text), None)
-        if prop is None:
+        result = next((trial for trial in search.trials if trial.prop.text == text), None)
+        if result is None:
             raise BadInput(f"{path}: {ruleset.name} has no invariant `{text}`")
-        result = Result(prop, "tested", 1, "")
-        if breaks(prop.claim, runner, sample, steps).first.any():
-            example = counterexample(prop.claim, runner, sample, steps)
-            (result,) = search.told_apart([Result(prop, "broken", 1, "", example)])
+        search.trials = [result]
+        result.reason, result.is_proven, result.worlds = "", False, 1
+        if breaks(result.prop.claim, runner, sample, steps).first.any():
+            result.sample, result.steps = sample, steps
+            result.counterexample = counterexample(result.prop.claim, runner, sample, steps)
+            search.tell_apart()
         self._tell(result, ruleset)
         self.failed |= not result.holds
         self.data[name] = {"properties": [result_data(result)]}

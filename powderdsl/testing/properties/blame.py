@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,19 +13,12 @@ from powderdsl.model.composition.added_packs import Cause, Difference
 from powderdsl.model.declarations import PackDecl
 from powderdsl.model.state import slots
 from powderdsl.model.text import one_line
-from powderdsl.model.types import Pass, Ruleset
+from powderdsl.model.types import Moment, Pass, Ruleset
 from powderdsl.testing.generators.cases import Start
 from powderdsl.testing.pack_tests.runner import ExampleResult, start_of
 from powderdsl.testing.properties.breaks import Agreement, Alike, Tested, breaks, is_paired
 from powderdsl.testing.properties.outcomes import Counterexample, Property
-from powderdsl.testing.properties.running import (
-    MARK,
-    Oracle,
-    Runner,
-    marked,
-    reference_states,
-    rule_spans,
-)
+from powderdsl.testing.properties.running import MARK, Oracle, Runner, marked, rule_spans
 
 MOST = 8
 """Added packs that are left out in turn, to see which of them matter."""
@@ -34,43 +27,34 @@ MOST = 8
 def culprits(claim: Tested, ruleset: Ruleset, sample: Start, steps: int) -> tuple[Span, ...]:
     """The lines of rules without which the claim would not have been broken there; several if only together.
 
-    Empty if no rule can be named: the backends disagree, or only many worlds show it.
+    They stand in the last substep before which the step had not broken it. Empty if no rule can be named: the backends
+    disagree, or only many worlds show it.
     """
-    if isinstance(claim, Agreement | Alike):
-        return ()
+    passes = ruleset.passes
 
     def broken(last: tuple[Pass, ...]) -> bool:
         return bool(breaks(claim, Oracle(ruleset, last), sample, steps).first.any())
 
-    for last in _turning(ruleset.passes, broken):
-        *rest, pass_ = last
-        moment = pass_.moments[-1]
-        lines = tuple(dict.fromkeys(rule.span for rule in moment.rules))
-        alone = []
-        for line in lines:
-            kept = tuple(rule for rule in moment.rules if rule.span != line)
-            part = replace(pass_, moments=(*pass_.moments[:-1], replace(moment, rules=kept)))
-            if not broken((*rest, part)):
-                alone.append(line)
-        return tuple(alone) or lines
-    return ()
+    if isinstance(claim, Agreement | Alike) or not broken(passes):
+        return ()
+    *rest, pass_ = passes[: _turning(len(passes), lambda count: broken(passes[:count]))]
+
+    def cut(moments: Sequence[Moment]) -> tuple[Pass, ...]:
+        return (*rest, replace(pass_, moments=tuple(moments)))
+
+    count = _turning(len(pass_.moments), lambda count: broken(cut(pass_.moments[:count])))
+    *before, moment = pass_.moments[:count]
+    lines = tuple(dict.fromkeys(rule.span for rule in moment.rules))
+    rules = {line: tuple(rule for rule in moment.rules if rule.span != line) for line in lines}
+    alone = [line for line in lines if not broken(cut([*before, replace(moment, rules=rules[line])]))]
+    return tuple(alone) or lines
 
 
-def _turning(
-    passes: tuple[Pass, ...], broken: Callable[[tuple[Pass, ...]], bool]
-) -> Iterator[tuple[Pass, ...]]:
-    """The beginnings of the step, each up to a substep, after which the claim is broken and was not before; last first."""
-    was = [broken(passes[:count]) for count in range(len(passes) + 1)]
-    for count in range(len(passes), 0, -1):
-        if not was[count] or was[count - 1]:
-            continue
-        pass_ = passes[count - 1]
-        parts = [replace(pass_, moments=pass_.moments[:end]) for end in range(1, len(pass_.moments) + 1)]
-        for part in reversed(parts):
-            if broken((*passes[: count - 1], part)) and not broken(
-                (*passes[: count - 1], replace(part, moments=part.moments[:-1]))
-            ):
-                yield (*passes[: count - 1], part)
+def _turning(count: int, broken: Callable[[int], bool]) -> int:
+    """The number of parts, the first and at most all `count`, from which on the claim is broken."""
+    while count > 1 and broken(count - 1):
+        count -= 1
+    return count
 
 
 # Added packs
@@ -97,26 +81,22 @@ def difference(prop: Property, ruleset: Ruleset, found: Counterexample) -> Diffe
     """The added packs that break an invariant which holds in its scope, and how they do it."""
     packs = added = ruleset.added_to(prop.scope)
     causes = _rules(ruleset, found.culprits, added)
-    states = found.before, found.after
-    there = {int(number) for state in states for number in np.unique(state["element"])}
     if not causes:  # only packs that matter: rules of others may have happened too
         packs = tuple(pack for pack in added[:MOST] if not _still(prop, ruleset, found, pack)) or added
         if not is_paired(prop.claim):
-            last = reference_states(marked(ruleset), found.sample, found.steps)[-1]
+            last = Oracle(marked(ruleset)).states(found.sample, found.steps)[-1]
             causes = _rules(ruleset, _happened(ruleset, last), packs)
-    if not causes:
-        held = [found.sample.fields.get(slot.name) for slot in slots(ruleset) if slot.kind.name == "element"]
-        held_ids = {int(number) for values in held if values is not None for number in np.unique(values)}
-        causes = [
-            Cause(element.pack, element.span, f"brings `{element.name}`")
-            for element in ruleset.elements
-            if element.id in there | held_ids and element.pack in packs
-        ]
-    if causes:
-        named = {cause.pack for cause in causes}
-        return Difference(tuple(pack for pack in added if pack in named), tuple(causes))
+    fields = (found.sample.fields.get(slot.name) for slot in slots(ruleset) if slot.kind.name == "element")
+    grids = (
+        found.before["element"],
+        found.after["element"],
+        *(cells for cells in fields if cells is not None),
+    )
+    there = {int(number) for cells in grids for number in np.unique(cells)}
     near = frozenset(element.name for element in ruleset.elements if element.id in there)
-    return Difference(packs, tuple(cause for pack in packs for cause in doings(pack, ruleset, near)[:3]))
+    causes = causes or [cause for pack in packs for cause in doings(pack, ruleset, near)]
+    named = {cause.pack for cause in causes}
+    return Difference(tuple(pack for pack in packs if pack in named) or packs, tuple(causes))
 
 
 def difference_of_test(result: ExampleResult, runner: Runner) -> Difference | None:
@@ -128,9 +108,8 @@ def difference_of_test(result: ExampleResult, runner: Runner) -> Difference | No
     causes = _rules(ruleset, _happened(ruleset, world.state), result.added)
     drawn = {char for rows in (example.given, example.expect or (), result.after) for char in "".join(rows)}
     near = frozenset(name for char, name in example.legend if char in drawn)
-    for pack in result.added:
-        if pack not in {cause.pack for cause in causes}:
-            causes += doings(pack, ruleset, near)[:3]
+    named = {cause.pack for cause in causes}
+    causes += [cause for pack in result.added if pack not in named for cause in doings(pack, ruleset, near)]
     return Difference(result.added, tuple(causes))
 
 
@@ -158,34 +137,31 @@ def _still(prop: Property, ruleset: Ruleset, found: Counterexample, pack: str) -
     sample = translated(found.sample, ruleset, fewer)
     if claim is None or sample is None:
         return False
-    return bool(breaks(claim, Oracle(fewer, fewer.passes), sample, found.steps).first.any())
+    return bool(breaks(claim, Oracle(fewer), sample, found.steps).first.any())
 
 
-def doings(pack: str, ruleset: Ruleset, near: frozenset[str] = frozenset()) -> list[Cause]:
-    """Changes that a pack makes to others, besides its rules: to some elements, or else all of them."""
+def doings(pack: str, ruleset: Ruleset, near: frozenset[str]) -> list[Cause]:
+    """Up to three changes that a pack makes, besides its rules: to some elements, or else to others, or else passes."""
     changes = list(_changes(pack, ruleset))
     close = [cause for name, cause in changes if name in near]
-    return close or [cause for name, cause in changes if name] or [cause for _, cause in changes]
+    return (close or [cause for name, cause in changes if name] or [cause for _, cause in changes])[:3]
 
 
 def _changes(pack: str, ruleset: Ruleset) -> Iterator[tuple[str, Cause]]:
-    """The other pack's element that it does something to, or nothing; and what it does."""
+    """The element that a pack does something to, or nothing; and what it does."""
     assert ruleset.declared is not None
     decl: PackDecl = next(one for one in ruleset.declared.packs if one.name.text == pack)
-    for also in decl.also:
-        name = also.name.word
-        if ruleset.element(name) is not None:
-            given = [f"the tag `{tag.word}`" for tag in also.tags] + [
-                f"`{key.word}`" for key, _ in also.values
-            ]
-            yield name, Cause(pack, also.name.span, f"gives `{name}` {' and '.join(given)}")
     for element in decl.elements:
-        if element.override:
-            yield element.name.text, Cause(pack, element.name.span, f"replaces `{element.name.text}`")
+        name, does = element.name.text, "replaces" if element.override else "brings"
+        yield name, Cause(pack, element.name.span, f"{does} `{name}`")
+    for also in decl.also:
+        if ruleset.element(also.name.word) is not None:
+            given = [f"the tag `{tag.word}`" for tag in also.tags]
+            given += [f"`{key.word}`" for key, _ in also.values]
+            name = also.name.word
+            yield name, Cause(pack, also.name.span, f"gives `{name}` {' and '.join(given)}")
     for prop in decl.properties:
         for key, _ in prop.values:
             yield key.word, Cause(pack, key.span, f"gives `{key.word}` a value of `{prop.name.text}`")
     for pass_ in decl.passes:
         yield "", Cause(pack, pass_.name.span, f"has the pass `{pass_.name.text}`")
-    for element in decl.elements:
-        yield "", Cause(pack, element.name.span, f"brings `{element.name.text}`")

@@ -15,10 +15,10 @@ from powderdsl.model.state import slots
 from powderdsl.model.types import Bounded, Claim, Local, Never, Ruleset, Symmetric, Total, Unchanging
 from powderdsl.testing.generators.cases import Array, Start, fresh, property_table
 from powderdsl.testing.properties.running import (
+    Oracle,
     Runs,
     State,
     context,
-    reference_states,
     turned_back,
     turned_cells,
     turned_sample,
@@ -84,9 +84,7 @@ def breaks(claim: Tested, runs: Runs, sample: Start, steps: int) -> Breaks:
         case Alike():
             return _breaks_of(_alike(claim, runs, sample)[None])
         case Agreement():
-            pairs = zip(
-                runs.states(sample, steps), reference_states(runs.ruleset, sample, steps), strict=True
-            )
+            pairs = zip(runs.states(sample, steps), Oracle(runs.ruleset).states(sample, steps), strict=True)
             return _breaks_of(np.stack([differences(a, b) for a, b in pairs][1:]))
     return look(claim, runs.ruleset, sample, runs.states(sample, steps))
 

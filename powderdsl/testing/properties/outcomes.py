@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from powderdsl.analysis.changes import RuleLine
 from powderdsl.arrays import np
 from powderdsl.diagnostics import CompileError, Span
 from powderdsl.model.composition.added_packs import Difference
@@ -35,6 +36,8 @@ MAX_DRAWN = 40
 
 MAX_TEXT = 200
 """Characters of a field that are shown."""
+
+UNTESTED = "no random world starts as it demands"
 
 
 @dataclass(frozen=True)
@@ -78,20 +81,32 @@ class Counterexample:
     culprits: tuple[Span, ...]
 
 
-@dataclass(frozen=True)
+@dataclass
 class Result:
-    """What became of a property, on how many worlds, and why. `reason` is a proof, or what prevents one.
+    """A property, and what became of it on how many worlds. `reason` is a proof, or what the test is about.
 
-    `status` is ``proven``, ``tested``, ``untested``, ``broken``, or ``differs``: a world breaks it because packs are
-    loaded that it does not speak of.
+    `sample` is a world that breaks it after some `steps`; `counterexample` is a small one. `difference` says how added
+    packs break it: then it holds in its scope.
     """
 
     prop: Property
-    status: str
-    worlds: int
-    reason: str
+    reason: str = ""
+    is_proven: bool = False
+    doubts: tuple[RuleLine, ...] = ()
+    """The lines that stand in the way of a proof."""
+    worlds: int = 0
+    batches: int = 0
+    sample: Start | None = None
+    steps: int = 0
     counterexample: Counterexample | None = None
     difference: Difference | None = None
+
+    @property
+    def status(self) -> str:
+        """``proven``, ``tested``, ``untested``, ``broken`` or ``differs``."""
+        if self.sample is not None:
+            return "differs" if self.difference else "broken"
+        return "proven" if self.is_proven else "tested" if self.worlds else "untested"
 
     @property
     def holds(self) -> bool:
@@ -104,7 +119,7 @@ def result_line(result: Result) -> str:
     how = {
         "proven": result.reason,
         "tested": f"{result.worlds:,} worlds{', ' + result.reason if result.reason else ''}",
-        "untested": result.reason,
+        "untested": UNTESTED,
         "differs": difference_words(result.difference) if result.difference else "",
         "broken": result.prop.place or "of every ruleset",
     }[result.status]
@@ -176,7 +191,7 @@ def result_data(result: Result) -> dict[str, Any]:
         "place": result.prop.place,
         "status": result.status,
         "worlds": result.worlds,
-        "reason": result.reason,
+        "reason": UNTESTED if result.status == "untested" else result.reason,
     }
     if result.difference is not None:
         data["difference"] = {

@@ -109,7 +109,7 @@ class QuickSearch(InvariantSearch):
 
 def quick_results(ruleset: Ruleset, ledger: Ledger) -> list[Result]:
     """What a proof or a few worlds say of each invariant; a world that breaks one is made small."""
-    search = QuickSearch.of(Oracle(ruleset, ruleset.passes), SearchPlan(), declared_only=True, ledger=ledger)
+    search = QuickSearch.of(Oracle(ruleset), SearchPlan(), declared_only=True, ledger=ledger)
     search.try_random()
     return search.finish()
 

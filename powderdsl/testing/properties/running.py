@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 from powderdsl.analysis.changes import unchanging_ids
@@ -100,59 +101,41 @@ def first_difference(
     return when
 
 
-def reference_states(
-    ruleset: Ruleset, sample: Start, steps: int, random: Mapping[str, Array] | None = None
-) -> list[State]:
-    """The same from the oracle."""
-    found = [full_state(ruleset, sample)]
-    for step in range(steps):
-        found.append(reference_step(ruleset, found[-1], sample, step, random))
-    return found
-
-
-def reference_step(
-    ruleset: Ruleset,
-    state: State,
-    sample: Start,
-    step: int,
-    random: Mapping[str, Array] | None = None,
-) -> State:
-    """One step of the oracle; `step` counts from the sample's own clock. `ruleset` may have fewer passes."""
-    bits = {stream.name: stream.bits for stream in ruleset.streams}
-    draws = {  # a draw counts as the one of the stream's resolution that it falls into
-        name: (np.floor(values * 2.0 ** bits[name]) + 0.5) / 2.0 ** bits[name]
-        for name, values in (random or {}).items()
-    }
-    params = reference.parameters(ruleset, len(sample), sample.params)
-    return reference.step(ruleset, state, _clock(sample, step), params, draws=draws)
-
-
-def _clock(sample: Start, step: int) -> reference.Clock:
-    return reference.Clock(sample.seed, sample.index, sample.step + step)
-
-
 def context(ruleset: Ruleset, state: State, sample: Start, step: int) -> reference.Context:
     """The values that a condition reads: the state of worlds, parameters, the clock."""
     params = reference.parameters(ruleset, len(sample), sample.params)
     working = reference.widened(ruleset, {slot.name: state[slot.name] for slot in slots(ruleset)})
-    return reference.Context(ruleset, working, params, {}, _clock(sample, step))
+    clock = reference.Clock(sample.seed, sample.index, sample.step + step)
+    return reference.Context(ruleset, working, params, {}, clock)
 
 
 @dataclass(frozen=True)
 class Oracle:
-    """Runs worlds on the reference; the rules of the last step may be fewer than those of the steps before."""
+    """Runs worlds on the reference. `last`: the passes of the last step, if they are fewer."""
 
     ruleset: Ruleset
-    last: tuple[Pass, ...]
+    last: tuple[Pass, ...] | None = None
 
     def of(self, ruleset: Ruleset) -> Oracle:
         """Runs other rules in the same way."""
-        return Oracle(ruleset, ruleset.passes)
+        return Oracle(ruleset)
 
     def states(self, sample: Start, steps: int, random: Mapping[str, Array] | None = None) -> list[State]:
-        states = reference_states(self.ruleset, sample, steps - 1, random)
-        cut = replace(self.ruleset, passes=self.last)
-        return [*states, reference_step(cut, states[-1], sample, steps - 1, random)]
+        """The state at the start and after each step, in storage dtypes. `random`: draws for all streams."""
+        bits = {stream.name: stream.bits for stream in self.ruleset.streams}
+        draws = {  # a draw counts as the one of the stream's resolution that it falls into
+            name: (np.floor(values * 2.0 ** bits[name]) + 0.5) / 2.0 ** bits[name]
+            for name, values in (random or {}).items()
+        }
+        params = reference.parameters(self.ruleset, len(sample), sample.params)
+        states = [full_state(self.ruleset, sample)]
+        for step in range(steps):
+            rules = self.ruleset
+            if self.last is not None and step == steps - 1:
+                rules = replace(rules, passes=self.last)
+            clock = reference.Clock(sample.seed, sample.index, sample.step + step)
+            states.append(reference.step(rules, states[-1], clock, params, draws=draws))
+        return states
 
 
 Runs = Runner | Oracle
@@ -171,27 +154,21 @@ def rule_spans(ruleset: Ruleset) -> tuple[Span, ...]:
 
 def marked(ruleset: Ruleset) -> Ruleset:
     """The same rules, each of which also sets a flag of its line where it happens; nothing reads the flags."""
-    lines = rule_spans(ruleset)
-    names = {span: f"{MARK}{number}" for number, span in enumerate(lines)}
+    names = {span: f"{MARK}{number}" for number, span in enumerate(rule_spans(ruleset))}
     home = ruleset.elements[0]
     flags = [Field(name, FLAG, 0, "place", False, None, home.pack, home.span) for name in names.values()]
-    passes = tuple(_marked_pass(pass_, names) for pass_ in ruleset.passes)
-    return replace(ruleset, fields=(*ruleset.fields, *flags), passes=passes)
 
+    def flagged(rule: Rule) -> tuple[Rule, ...]:
+        if isinstance(rule, Assign):
+            return rule, Assign(names[rule.span], (0, 0), ":=", TRUE, rule.mask, rule.span)
+        effect = Assign(names[rule.span], (0, 0), ":=", TRUE, TRUE, rule.span)
+        return (replace(rule, effects=(*rule.effects, effect)),)
 
-def _marked_pass(pass_: Pass, names: Mapping[Span, str]) -> Pass:
-    moments: list[Moment] = []
-    for moment in pass_.moments:
-        rules: list[Rule] = []
-        for rule in moment.rules:
-            name = names[rule.span]
-            if isinstance(rule, Assign):
-                rules += [rule, Assign(name, (0, 0), ":=", TRUE, rule.mask, rule.span)]
-            else:
-                effect = Assign(name, (0, 0), ":=", TRUE, TRUE, rule.span)
-                rules.append(replace(rule, effects=(*rule.effects, effect)))
-        moments.append(replace(moment, rules=tuple(rules)))
-    return replace(pass_, moments=tuple(moments))
+    def flagging(moment: Moment) -> Moment:
+        return replace(moment, rules=tuple(chain.from_iterable(map(flagged, moment.rules))))
+
+    passes = (replace(pass_, moments=tuple(map(flagging, pass_.moments))) for pass_ in ruleset.passes)
+    return replace(ruleset, fields=(*ruleset.fields, *flags), passes=tuple(passes))
 
 
 State = dict[str, Array]
@@ -234,17 +211,10 @@ def full_state(ruleset: Ruleset, sample: Start) -> State:
     """All slots of the start worlds in their storage dtypes. Cells that cannot hold a value have their usual one."""
     state: State = {"element": sample.ids}
     for slot in slots(ruleset)[1:]:
-        given = sample.fields.get(slot.name)
-        state[slot.name] = fresh(ruleset, slot, sample.ids) if given is None else given
-    return flushed(ruleset, state)
-
-
-def flushed(ruleset: Ruleset, state: State) -> State:
-    """The state with the usual value of a slot in cells that cannot hold another one."""
-    kept = {"element": state["element"]}
-    for slot in slots(ruleset)[1:]:
-        kept[slot.name] = clamped_to_holders(ruleset, slot, state[slot.name], state["element"])
-    return kept
+        values = sample.fields.get(slot.name)
+        values = fresh(ruleset, slot, sample.ids) if values is None else values
+        state[slot.name] = clamped_to_holders(ruleset, slot, values, sample.ids)
+    return state
 
 
 def random_samples(ruleset: Ruleset, seed: int, count: int) -> Iterator[Start]:
@@ -287,25 +257,22 @@ def framed(ids: Array, number: int) -> Array:
 
 def turned_cells(values: Array, turn: str) -> Array:
     """An array [..., H, W]: left and right exchanged (``mirrored``), or a quarter turn clockwise (``rotated``)."""
-    if turn == "mirrored":
-        return values[..., ::-1].copy()
-    return np.moveaxis(values, -1, -2)[..., ::-1].copy()
+    return np.flip(values if turn == "mirrored" else np.moveaxis(values, -1, -2), -1).copy()
 
 
 def turned_back(values: Array, turn: str) -> Array:
     """The inverse of `turned_cells`."""
-    if turn == "mirrored":
-        return turned_cells(values, turn)
-    return np.moveaxis(values, -1, -2)[..., ::-1, :].copy()
+    return (
+        turned_cells(values, turn) if turn == "mirrored" else np.moveaxis(np.flip(values, -1), -1, -2).copy()
+    )
 
 
 def turned_values(slot: Slot, values: Array, turn: str) -> Array:
     """A slot's array, turned."""
     cells = turned_cells(values, turn)
     if slot.kind.name == "direction":  # octants count clockwise from the right
-        return ((4 - cells.astype(np.int64)) % 8 if turn == "mirrored" else (cells + 2) % 8).astype(
-            slot.dtype
-        )
+        octants = 4 - cells.astype(np.int64) if turn == "mirrored" else cells + 2
+        return (octants % 8).astype(slot.dtype)
     if slot.planes == 2:
         rows, columns = cells[:, 0], cells[:, 1]
         parts = (rows, -columns) if turn == "mirrored" else (columns, -rows)
@@ -313,13 +280,16 @@ def turned_values(slot: Slot, values: Array, turn: str) -> Array:
     return cells
 
 
+def turned_sample(ruleset: Ruleset, sample: Start, turn: str) -> Start:
+    """Worlds, turned, with the same seeds."""
+    table = {slot.name: slot for slot in slots(ruleset)}
+    state = {
+        name: turned_values(table[name], values, turn) for name, values in full_state(ruleset, sample).items()
+    }
+    return replace(sample, ids=state.pop("element"), fields=state)
+
+
 def turned_state(ruleset: Ruleset, state: State, turn: str) -> State:
     """All slots, turned. Cells that cannot hold a value keep the usual one, which does not turn."""
-    found = {slot.name: turned_values(slot, state[slot.name], turn) for slot in slots(ruleset)}
-    return flushed(ruleset, found)
-
-
-def turned_sample(ruleset: Ruleset, sample: Start, turn: str) -> Start:
-    """The start worlds, turned, with the same seeds."""
-    state = turned_state(ruleset, full_state(ruleset, sample), turn)
-    return replace(sample, ids=state.pop("element"), fields=state)
+    fields = {name: values for name, values in state.items() if name != "element"}
+    return full_state(ruleset, turned_sample(ruleset, Start.fresh(state["element"], fields=fields), turn))

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence, Set
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from time import monotonic
 from typing import ClassVar, Self
 
-from powderdsl.analysis.changes import RuleLine
 from powderdsl.analysis.ledger import Ledger, Proven
 from powderdsl.analysis.ledger import ledger as make_ledger
 from powderdsl.analysis.proofs import prove
@@ -52,32 +51,13 @@ class SearchPlan:
 
 
 @dataclass
-class Trial:
-    """A property that is proven or tested. `reason` is the proof, or what the test is about."""
-
-    prop: Property
-    is_proven: bool
-    reason: str = ""
-    doubts: tuple[RuleLine, ...] = ()
-    """The lines that stand in the way of a proof."""
-    worlds: int = 0
-    batches: int = 0
-    sample: Start | None = None
-    steps: int = 0
-
-    @property
-    def claim(self) -> Tested:
-        return self.prop.claim
-
-
-@dataclass
 class InvariantSearch:
     """Tests the properties of one ruleset; worlds may be brought from outside too."""
 
     runner: Runs
     plan: SearchPlan
     ledger: Ledger
-    trials: list[Trial] = field(default_factory=list)
+    trials: list[Result] = field(default_factory=list)
 
     few: ClassVar[Mapping[type, int]] = {Agreement: 2, Alike: 2, Never: 8}
     """Batches for claims that are expensive to check: by the oracle, in many copies, over many steps."""
@@ -100,18 +80,18 @@ class InvariantSearch:
         search = cls(runner, plan, ledger)
         for prop in properties_of(runner.ruleset, ledger):
             if prop.owner == AUTOMATIC:
-                search.trials += [] if declared_only else [Trial(prop, False)]
+                search.trials += [] if declared_only else [Result(prop)]
                 continue
             verdict = prove(prop.claim, runner.ruleset, ledger, prop.without)  # type: ignore[arg-type]
             if isinstance(verdict, Proven):
                 given = f", given {verdict.given}" if verdict.given else ""
-                search.trials.append(Trial(prop, True, verdict.reason + given))
+                search.trials.append(Result(prop, verdict.reason + given, is_proven=True))
             else:
-                search.trials.append(Trial(prop, False, doubts=verdict.rules))
+                search.trials.append(Result(prop, doubts=verdict.rules))
         return search
 
     @property
-    def waiting(self) -> list[Trial]:
+    def waiting(self) -> list[Result]:
         """What is neither proven nor broken."""
         return [trial for trial in self.trials if not trial.is_proven and trial.sample is None]
 
@@ -131,40 +111,42 @@ class InvariantSearch:
 
     def try_sample(self, sample: Start, steps: int) -> None:
         """Check all properties that are not broken yet on some worlds."""
-        waiting: dict[frozenset[int], list[Trial]] = {}
+        waiting: dict[frozenset[int], list[Result]] = {}
         for trial in self.waiting:
             waiting.setdefault(trial.prop.without, []).append(trial)
         for without, trials in waiting.items():
             self._try_without(trials, sample.without(without, self.runner.ruleset), steps)
 
-    def _try_without(self, trials: list[Trial], sample: Start, steps: int) -> None:
+    def _try_without(self, trials: list[Result], sample: Start, steps: int) -> None:
         """Properties that demand the same of a start world: one run does for most of them."""
-        shared = [t for t in trials if not is_paired(t.claim) and steps_for(t.claim, steps) == steps]
+        shared = [
+            t for t in trials if not is_paired(t.prop.claim) and steps_for(t.prop.claim, steps) == steps
+        ]
         if shared:
             states = self.runner.states(sample, steps)
             for trial in shared:
-                self._note(trial, sample, look(trial.claim, self.runner.ruleset, sample, states))
+                self._note(trial, sample, look(trial.prop.claim, self.runner.ruleset, sample, states))
         for trial in trials:
             if trial in shared:
                 continue
-            most = self.few.get(type(trial.claim))
-            large = isinstance(trial.claim, Agreement) and sample.shape == LARGE
+            most = self.few.get(type(trial.prop.claim))
+            large = isinstance(trial.prop.claim, Agreement) and sample.shape == LARGE
             if most is not None and trial.batches >= most and not large:
                 continue
-            some = sample.select(slice(0, 4)) if isinstance(trial.claim, Alike) else sample
-            ran = steps_for(trial.claim, min(steps, 3))
-            self._note(trial, some, breaks(trial.claim, self.runner, some, ran))
+            some = sample.select(slice(0, 4)) if isinstance(trial.prop.claim, Alike) else sample
+            ran = steps_for(trial.prop.claim, min(steps, 3))
+            self._note(trial, some, breaks(trial.prop.claim, self.runner, some, ran))
 
-    def _note(self, trial: Trial, sample: Start, found: Breaks) -> None:
+    def _note(self, trial: Result, sample: Start, found: Breaks) -> None:
         trial.batches += 1
         trial.worlds += int(found.counts.sum())
         broken = np.nonzero(found.first)[0]
         if not len(broken):
             return
         first = min(broken.tolist(), key=lambda world: int(found.first[world]))
-        if isinstance(trial.claim, Symmetric) and self.runner.ruleset.streams:
+        if isinstance(trial.prop.claim, Symmetric) and self.runner.ruleset.streams:
             # The same numbers may be used in another way: then worlds agree in how often things happen.
-            turn = trial.claim.turn
+            turn = trial.prop.claim.turn
             trial.prop = replace(trial.prop, claim=Alike(turn, COPIES))
             trial.reason, trial.batches, trial.worlds = "in how often things happen", 0, 0
             return
@@ -172,53 +154,35 @@ class InvariantSearch:
 
     def finish(self) -> list[Result]:
         """Make what was found small and name the rules; the results in the order of the properties."""
-        broken = sum(trial.sample is not None for trial in self.trials)
-        return self.told_apart([self._result(trial, broken) for trial in self.trials])
+        broken = {trial.prop.text: trial for trial in self.trials if trial.sample is not None}
+        for trial in broken.values():
+            assert trial.sample is not None
+            work = Work(self.runner.ruleset, self.work // len(broken))
+            small = shrink(trial.prop.claim, self.runner, trial.sample, trial.steps, work, trial.prop.without)
+            trial.counterexample = counterexample(trial.prop.claim, self.runner, *small)
+        self.tell_apart()
+        return self.trials
 
-    def _result(self, trial: Trial, broken: int) -> Result:
-        if trial.is_proven:
-            return Result(trial.prop, "proven", 0, trial.reason)
-        if trial.sample is None:
-            if not trial.worlds:
-                return Result(trial.prop, "untested", 0, "no random world starts as it demands")
-            return Result(trial.prop, "tested", trial.worlds, trial.reason)
-        work = Work(self.runner.ruleset, self.work // broken)
-        small = shrink(trial.claim, self.runner, trial.sample, trial.steps, work, trial.prop.without)
-        example = counterexample(trial.claim, self.runner, *small)
-        return Result(trial.prop, "broken", trial.worlds, trial.reason, example)
-
-    def told_apart(self, results: Sequence[Result]) -> list[Result]:
-        """The same results; an invariant that holds in its scope, without added packs, is marked as different."""
+    def tell_apart(self) -> None:
+        """Say of each broken invariant that holds in its scope, without added packs, how these break it."""
         ruleset = self.runner.ruleset
-        scopes: dict[tuple[str, ...], dict[str, Counterexample]] = {}
-        for result in results:
-            scope = result.prop.scope
-            if result.counterexample is not None and scope and ruleset.added_to(scope):
-                scopes.setdefault(scope, {})[result.prop.text] = result.counterexample
-        differ = {
-            text
-            for scope, worlds in scopes.items()
-            for text in worlds.keys() - self._broken_in(scope, worlds)
-        }
-        return [
-            replace(one, status="differs", difference=difference(one.prop, ruleset, one.counterexample))
-            if one.prop.text in differ and one.counterexample is not None
-            else one
-            for one in results
-        ]
-
-    def _broken_in(self, scope: tuple[str, ...], worlds: Mapping[str, Counterexample]) -> Set[str]:
-        """Which invariants some world breaks with the packs of a scope alone; `worlds` break them with more packs."""
-        alone = restricted(self.runner.ruleset, scope)
-        if alone is None:
-            return worlds.keys()
-        search = self.of(self.runner.of(alone), self.plan, declared_only=True).only(worlds)
-        for world in worlds.values():
-            sample = translated(world.sample, self.runner.ruleset, alone)
-            if sample is not None:
-                search.try_sample(sample, world.steps)
-        search.try_random()
-        return {trial.prop.text for trial in search.trials if trial.sample is not None}
+        broken = [(trial, trial.counterexample) for trial in self.trials if trial.counterexample is not None]
+        for scope in dict.fromkeys(trial.prop.scope for trial, _ in broken):
+            alone = restricted(ruleset, scope) if scope and ruleset.added_to(scope) else None
+            if alone is None:
+                continue
+            some = [(trial, world) for trial, world in broken if trial.prop.scope == scope]
+            search = self.of(self.runner.of(alone), self.plan, declared_only=True)
+            search = search.only([trial.prop.text for trial, _ in some])
+            for _, world in some:
+                sample = translated(world.sample, ruleset, alone)
+                if sample is not None:
+                    search.try_sample(sample, world.steps)
+            search.try_random()
+            still = {trial.prop.text for trial in search.trials if trial.sample is not None}
+            for trial, world in some:
+                if trial.prop.text not in still:
+                    trial.difference = difference(trial.prop, ruleset, world)
 
 
 def counterexample(claim: Tested, runner: Runs, sample: Start, steps: int) -> Counterexample:

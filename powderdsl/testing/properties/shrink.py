@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from typing import Any
 
 from powderdsl.arrays import np
@@ -155,23 +156,11 @@ def _single(sample: Start) -> list[Start]:
 
 def _fresh(sample: Start) -> list[Start]:
     """With fields, parameters and the clock as in fresh worlds; with one of them, if not with all."""
-    parts: dict[str, Any] = {"fields": {}, "params": {}, "step": np.zeros_like(sample.step)}
     given = {"fields": sample.fields, "params": sample.params, "step": sample.step.any()}
-    parts = {name: usual for name, usual in parts.items() if given[name]}
-    return (
-        [replace(sample, **parts), *(replace(sample, **{name: usual}) for name, usual in parts.items())]
-        if parts
-        else []
-    )
-
-
-def _fewer_fields(sample: Start) -> list[Start]:
-    """With one field that is 0 everywhere."""
-    return [
-        replace(sample, fields={**sample.fields, name: np.zeros_like(values)})
-        for name, values in sample.fields.items()
-        if values.any()
-    ]
+    usual: dict[str, Any] = {"fields": {}, "params": {}, "step": np.zeros_like(sample.step)}
+    parts = [{name: usual[name]} for name in given if given[name]]
+    together = dict(chain.from_iterable(part.items() for part in parts))
+    return [replace(sample, **part) for part in ([together, *parts] if parts else [])]
 
 
 def _absent_fields(sample: Start) -> list[Start]:
@@ -242,7 +231,6 @@ _GROUPS: tuple[Group, ...] = (
     partial(_parts, 1, True),
     partial(_parts, 0, False),
     partial(_parts, 1, False),
-    _fewer_fields,
     _fewer_kinds,
     _fewer_values,
     _absent_fields,
