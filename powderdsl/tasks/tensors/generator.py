@@ -9,7 +9,7 @@ Painting happens on bits: an id is a few planes, a word is 64 rows of a column.
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, reduce
 from math import prod
@@ -109,53 +109,18 @@ def joined(kind: ArrayKind, parts: Sequence[Made], fixed: Mapping[str, Array]) -
     return Made(xp.concatenate([one.ids for one in parts]), regions, targets)
 
 
-class DrawTable:
-    """Which numbers a generator draws, so that all of them are hashed at once: few operations, each on many numbers.
-
-    A statement has a block of `repeats` times `wanted` draws. Statements of one number share their draws.
-    """
-
-    def __init__(self, blocks: Iterable[tuple[int, int, int]], kind: ArrayKind):
-        """`blocks`: number, repeats and wanted of each statement."""
-        self.blocks: dict[int, tuple[int, int, int]] = {}
-        """By statement: the place of its first draw, repeats, wanted."""
-        for statement, repeats, wanted in blocks:
-            _, *old = self.blocks.get(statement, (0, 0, 0))
-            self.blocks[statement] = (0, max(repeats, old[0]), max(wanted, old[1]))
-        keys: list[int] = []
-        counters: list[int] = []
-        for statement, (_, repeats, wanted) in self.blocks.items():
-            self.blocks[statement] = (len(keys), repeats, wanted)
-            keys += [statement * _STATEMENT & MASK] * (repeats * wanted)
-            counters += [r * _NUMBERS + n for r in range(repeats) for n in range(wanted)]
-        self.size = len(keys)
-        self.keys = kind.put(keys, "int64")
-        self.spread = kind.put(counters, "int64") * _COUNTER & MASK
-
-
 class Hashes:
-    """The random numbers of a batch of seeds, int64 [B]: those of a table, and others of single statements."""
+    """The random numbers of a batch of seeds, int64 [B]."""
 
-    def __init__(self, seeds: Array, table: DrawTable, kind: ArrayKind):
+    def __init__(self, seeds: Array, kind: ArrayKind):
         self.keys = base_keys(seeds, kind.xp.full_like(seeds, _INDEX), kind.xp)
-        self.table, self.kind = table, kind
-        self.drawn = self._hash(table.keys, table.spread) if table.size else None
+        self.kind = kind
 
     def draw(self, statement: int, counters: Array) -> Array:
         """32-bit numbers of one statement: int64 [B, n] for counters int64 [n]."""
         key = self.kind.put([statement * _STATEMENT & MASK], "int64")
-        return self._hash(key, (counters * _COUNTER) & MASK)
-
-    def _hash(self, keys: Array, spread: Array) -> Array:
-        keys = mix((self.keys[0][:, None] + keys) & MASK)
-        return mix((mix((keys + spread) & MASK) + self.keys[1][:, None]) & MASK)
-
-    def block(self, statement: int, repeats: int) -> Array:
-        """The draws of a statement of the table in its first repetitions: int64 [B, repeats, wanted]."""
-        assert self.drawn is not None
-        start, most, wanted = self.table.blocks[statement]
-        drawn = self.drawn[:, start : start + most * wanted]
-        return drawn.reshape(-1, most, wanted)[:, :repeats]
+        keys = mix((self.keys[0][:, None] + key) & MASK)
+        return mix((mix((keys + (counters * _COUNTER & MASK)) & MASK) + self.keys[1][:, None]) & MASK)
 
 
 _CALCULATE: dict[str, Callable[..., Any]] = {
@@ -169,21 +134,17 @@ _CALCULATE: dict[str, Callable[..., Any]] = {
 
 
 class _Draws:
-    """Values of the amounts of one statement, [B, R] for R repetitions; each draw takes the next counter."""
+    """Values of the amounts of one statement, [B, R] for R repetitions; each of its `wanted` draws takes the next counter."""
 
-    def __init__(self, hashes: Hashes, statement: int, repeats: int, names: Mapping[str, Array]):
-        self.hashes, self.names, self.kind = hashes, names, hashes.kind
-        self.statement, self.repeats = statement, repeats
-        self.drawn: Sequence[Array] | None = None
-        self.used = 0
+    def __init__(self, hashes: Hashes, statement: int, repeats: int, names: Mapping[str, Array], wanted: int):
+        self.names, self.kind = names, hashes.kind
+        counters = self.kind.arange(repeats)[:, None] * _NUMBERS + self.kind.arange(wanted)
+        drawn = hashes.draw(statement, counters.reshape(-1)).reshape(-1, repeats, wanted) if wanted else ()
+        self.drawn = iter(self.kind.xp.moveaxis(drawn, -1, 0) if wanted else ())
 
     def uniform(self, low: Array | int, high: Array | int) -> Array:
         """Integers from `low` to `high`, both included; where there are none, `low`."""
-        if self.drawn is None:
-            self.drawn = list(self.kind.xp.moveaxis(self.hashes.block(self.statement, self.repeats), -1, 0))
-        drawn = self.drawn[self.used]
-        self.used += 1
-        return low + ((drawn * (high - low + 1)) >> 32)
+        return low + ((next(self.drawn) * (high - low + 1)) >> 32)
 
     def value(self, amount: Expr) -> Array | int:
         match amount.op, [self.value(arg) for arg in amount.args]:
@@ -214,21 +175,6 @@ def _groups(generator: Generator) -> list[Group]:
     return [*generator.groups, *(group for target in generator.targets for group in target.groups)]
 
 
-def _draw_blocks(generator: Generator) -> Iterator[tuple[int, int, int]]:
-    """The draws of a generator, as `DrawTable` takes them."""
-    for name, amount in generator.lets:
-        yield name_number(name), 1, _draws_in(amount)
-    for region in generator.regions:
-        for number, shape in enumerate(region.shapes):
-            yield _shape_number(region, number), 1, _draws_in(*shape.amounts)
-    for group in _groups(generator):
-        yield group.number, 1, _draws_in(group.count)
-        for name, amount in group.lets:
-            yield name_number(name), group.most, _draws_in(amount)
-        for one in group.drawings:
-            yield one.number, group.most, _draws_in(*one.amounts) + (len(one.ids) > 1)
-
-
 def _shape_number(region: Region, place: int) -> int:
     """A region's own draws depend on its name and the shape's place."""
     return name_number(f"{region.name} {place}")
@@ -244,7 +190,6 @@ class WorldMaker:
         painted = [i for group in _groups(generator) for one in group.drawings for i in one.ids]
         held = [i for stamp in generator.stamps for row in stamp.rows for i in row if i != NOTHING]
         self.planes = max(1, max([generator.fill, *painted, *held]).bit_length())
-        self.table = DrawTable(_draw_blocks(generator), kind)
         self.fixed: dict[Drawing, Array] = {}
         """Words of shapes that are the same in every world."""
         self._bits: dict[tuple[int, int], Array] = {}
@@ -264,13 +209,13 @@ class WorldMaker:
         """The worlds of some seeds, int64 [B]."""
         chunk = max(1, len(seeds))
         if self.kind.on_cpu:
-            chunk = max(1, CHUNK_CELLS // max(self.size[0] * self.size[1], self.table.size))
+            chunk = max(1, CHUNK_CELLS // (self.size[0] * self.size[1]))
         made = [self._chunk(seeds[i : i + chunk]) for i in range(0, max(1, len(seeds)), chunk)]
         return made[0] if len(made) == 1 else joined(self.kind, made, self.fixed_cells)
 
     def _chunk(self, seeds: Array) -> Made:
         kind, height = self.kind, self.size[0]
-        hashes = Hashes(seeds, self.table, kind)
+        hashes = Hashes(seeds, kind)
         names = self._lets(self.generator.lets, hashes, 1, {})
         regions = dict(self.fixed_regions)
         for region in self.generator.regions:
@@ -303,7 +248,7 @@ class WorldMaker:
         """`names` and more of them: int64 that broadcasts to [B, R]."""
         found = dict(names)
         for name, amount in lets:
-            value = _Draws(hashes, name_number(name), repeats, found).array(amount)
+            value = _Draws(hashes, name_number(name), repeats, found, _draws_in(amount)).array(amount)
             assert value is not None
             found[name] = value
         return found
@@ -313,7 +258,7 @@ class WorldMaker:
         shape = (len(hashes.keys[0]), self.size[1], self.words)
         found = self.kind.zeros("int64", shape)
         for number, drawn in enumerate(region.shapes):
-            draws = _Draws(hashes, _shape_number(region, number), 1, names)
+            draws = _Draws(hashes, _shape_number(region, number), 1, names, _draws_in(*drawn.amounts))
             words = self.drawn_words(drawn, [draws.array(one) for one in drawn.amounts])
             found = found | self.kind.xp.broadcast_to(words, (shape[0], 1, *shape[1:]))[:, 0]
         return found
@@ -349,7 +294,7 @@ class WorldMaker:
         """Paint all groups on planes, in place."""
         xp, batch = self.kind.xp, planes.shape[1]
         for group in groups:
-            count = _Draws(hashes, group.number, 1, names).array(group.count)
+            count = _Draws(hashes, group.number, 1, names, _draws_in(group.count)).array(group.count)
             assert count is not None
             repeats = group.most
             if self.kind.on_cpu and repeats > 1:
@@ -362,8 +307,9 @@ class WorldMaker:
             local = self._lets(group.lets, hashes, repeats, names)
             painters = []
             for one in group.drawings:
-                draws = _Draws(hashes, one.number, repeats, local)
-                painters.append(_Painter(self, one, draws, once, len(planes)))
+                wanted = _draws_in(*one.amounts) + (len(one.ids) > 1)
+                draws = _Draws(hashes, one.number, repeats, local, wanted)
+                painters.append(_Painter(self, one, draws, hashes, once, len(planes)))
             for repeat in range(repeats):
                 for painter in painters:
                     painter.paint(planes, repeat, regions)
@@ -372,9 +318,11 @@ class WorldMaker:
 class _Painter:
     """One statement in all its repetitions: what it needs is computed for all of them at once."""
 
-    def __init__(self, maker: WorldMaker, drawing: Drawing, draws: _Draws, once: Array, planes: int):
+    def __init__(
+        self, maker: WorldMaker, drawing: Drawing, draws: _Draws, hashes: Hashes, once: Array, planes: int
+    ):
         """`once`: int64 [B, R, 1, 1], all bits where a world has a repetition."""
-        self.maker, self.drawing, self.draws = maker, drawing, draws
+        self.maker, self.drawing, self.hashes = maker, drawing, hashes
         repeats, kind = once.shape[1], maker.kind
         if len(drawing.ids) > 1:
             ids = kind.put(list(drawing.ids), "int64")[draws.uniform(0, len(drawing.ids) - 1)]
@@ -451,7 +399,7 @@ class _Painter:
             counters = (
                 ((halves + 1) * CHANCE_BITS + place) * (_NUMBERS * 256) + repeat * _NUMBERS + _NUMBERS - 1
             )
-            drawn = self.draws.hashes.draw(self.drawing.number, counters)
+            drawn = self.hashes.draw(self.drawing.number, counters)
             bit = -(limit >> place & 1)
             below = (bit & ~drawn) | (~(bit ^ drawn) & below)
         below = kind.xp.where(limit >> CHANCE_BITS > 0, -1, below) & MASK
