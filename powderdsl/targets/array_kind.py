@@ -71,10 +71,6 @@ class ArrayKind:
         """``bool``, ``int``, ``float`` or ``complex``."""
         return _SORTS[array.dtype.kind]
 
-    def as_bytes(self, array: Array) -> Array:
-        """The bytes of all values in C order, uint8 [n]; it may share their memory."""
-        return np.frombuffer(array.tobytes(), np.uint8)
-
     def to_numpy(self, array: Array) -> Array:
         """An array of `powderdsl.arrays`, which may share its memory."""
         return array

@@ -60,9 +60,6 @@ class Tensors(ArrayKind):
             return "complex"
         return "float" if dtype.is_floating_point else "bool" if dtype == torch.bool else "int"
 
-    def as_bytes(self, array: Tensor) -> Tensor:
-        return array.reshape(-1).view(torch.uint8)
-
     def to_numpy(self, array: Tensor) -> Any:
         return array.detach().cpu().numpy()
 

@@ -15,15 +15,15 @@ from powderdsl.model.state import slot_name
 from powderdsl.model.types import DIRECTION, Expr, Ruleset
 from powderdsl.syntax import yaml_tree
 from powderdsl.syntax.ast import Syntax
-from powderdsl.syntax.parse import line_of, parse_scalar
+from powderdsl.syntax.parse import parse_scalar
 from powderdsl.syntax.yaml_tree import Node, Scalar
-from powderdsl.tasks.drawings import choice_ids, element_ids
+from powderdsl.tasks.drawings import choice_ids, element_ids, limited, line_in, shape_in
 from powderdsl.tasks.goals import GoalChecker, parts_of
 from powderdsl.tasks.task import BLOW, MAX_SIDE, NO_CHANGE, Agent, Expert, ExpertMove, Measure
 from powderdsl.worlds.raster import Shape, Size
 from powderdsl.worlds.scene.amounts import constants
 from powderdsl.worlds.scene.read import two_integers
-from powderdsl.worlds.scene.statements import amounts_of, read_line, read_shape
+from powderdsl.worlds.scene.statements import amounts_of
 
 ACTS = {"blow": BLOW, "nothing": NO_CHANGE}
 """Words of `may:` that are not elements."""
@@ -98,8 +98,7 @@ def _choices(reader: Reader, words: Sequence[Scalar], rules: Ruleset) -> tuple[i
     """Element ids, ascending, then BLOW and NO_CHANGE."""
     elements: set[int] = set()
     for word in words:
-        span = line_of(word, "choice", reader.reporter) if word.text not in ACTS else None
-        choice = read_line(span, "choice", reader.reporter) if span else None
+        choice = line_in(word, "choice", reader) if word.text not in ACTS else None
         if choice is not None:
             elements |= set(choice_ids(choice, rules, reader.reporter, {}))
     acts = {ACTS[word.text] for word in words if word.text in ACTS}
@@ -154,9 +153,7 @@ def read_expert(
     if not isinstance(node, yaml_tree.Sequence) or not node.items:
         reader.shape(node, "a list of moves", "each starts with `- choose: …`")
         return None
-    if len(node.items) > MAX_MOVES:
-        message = f"an expert of {len(node.items)} moves"
-        reader.reporter.error("PD508", message, first_line(node), f"the limit is {MAX_MOVES}")
+    if not limited(node, MAX_MOVES, "an expert of {} moves", reader.reporter):
         return None
     moves = tuple(_Move(reader, agent, size, rules, checker).read(item) for item in node.items)
     if moves[-1].condition is not None:
@@ -249,8 +246,7 @@ class _Move:
         return None, self.checker.measured("count", syntax.children[0])
 
     def within(self, word: Scalar | None) -> Shape | None:
-        span = line_of(word, "shape", self.reporter)
-        statement = read_shape(span, self.reporter) if span is not None else None
+        statement = shape_in(word, self.reader)
         if statement is None:
             return None
         amounts = amounts_of(statement, {}, Reporter())

@@ -37,7 +37,14 @@ from powderdsl.worlds.scene.amounts import (
     report_unknown,
 )
 from powderdsl.worlds.scene.read import covers_nothing, not_a_statement
-from powderdsl.worlds.scene.statements import RANGES, Statement, amounts_of, read_line, read_statement
+from powderdsl.worlds.scene.statements import (
+    RANGES,
+    Statement,
+    amounts_of,
+    read_line,
+    read_statement,
+    shape_of,
+)
 
 Lets = Sequence[tuple[Written, Syntax | None]]
 """Names of numbers as written, in order; None for a number whose mistake has been reported."""
@@ -59,6 +66,25 @@ class Repeat:
 Item = Statement | Repeat
 
 
+def line_in(node: yaml_tree.Node | None, start: str, reader: Reader) -> Syntax | None:
+    """The syntax of a line of the language of statements; None if it is absent or after a report."""
+    span = line_of(node, start, reader.reporter)
+    return None if span is None else read_line(span, start, reader.reporter)
+
+
+def shape_in(node: yaml_tree.Node | None, reader: Reader) -> Statement | None:
+    """The shape in a line; None if it is absent or after a report."""
+    tree = line_in(node, "shape", reader)
+    return None if tree is None else shape_of(tree, reader.reporter)
+
+
+def limited(node: yaml_tree.Sequence, most: int, what: str, reporter: Reporter) -> bool:
+    """Return True if a list has at most so many items; report one that has more."""
+    if len(node.items) > most:
+        reporter.error("PD508", f"{what.format(len(node.items))}", first_line(node), f"the limit is {most:,}")
+    return len(node.items) <= most
+
+
 def read_items(node: yaml_tree.Node | None, reader: Reader, *, nested: bool = False) -> tuple[Item, ...]:
     """The items of a list of statements. `nested` lists, those of a repetition, hold no repetitions."""
     reporter = reader.reporter
@@ -67,42 +93,36 @@ def read_items(node: yaml_tree.Node | None, reader: Reader, *, nested: bool = Fa
     if not isinstance(node, yaml_tree.Sequence):
         reader.shape(node, "a list of statements", "write one `- statement` a line")
         return ()
-    if len(node.items) > MAX_STATEMENTS:
-        message = f"a list of {len(node.items):,} statements"
-        reporter.error("PD508", message, first_line(node), f"the limit is {MAX_STATEMENTS:,}")
+    if not limited(node, MAX_STATEMENTS, "a list of {:,} statements", reporter):
         return ()
-    found: list[Item | None] = []
+    items: list[Item | None] = []
     for item in node.items:
-        if isinstance(item, yaml_tree.Mapping):
-            if not nested:
-                found.append(_repeat(item, reader))
-            elif not _is_let(item):
-                _not_a_statement(item, reporter, nested)
-        elif isinstance(item, yaml_tree.Sequence):
+        if isinstance(item, yaml_tree.Sequence):
             reader.shape(item, "a statement")
-        elif span := line_of(item, "statement", reporter):
-            found.append(read_statement(span, reporter))
-    return tuple(item for item in found if item is not None)
+        elif isinstance(item, yaml_tree.Scalar):
+            span = line_of(item, "statement", reporter)
+            items.append(None if span is None else read_statement(span, reporter))
+        elif not nested and len(item.entries) == 1 and item.entries[0][0].text.startswith("repeat"):
+            items.append(_repeat(*item.entries[0], reader))
+        elif not (nested and _is_let(item)):
+            _not_a_statement(item, reporter, nested)
+    return tuple(item for item in items if item is not None)
 
 
-def _is_let(item: yaml_tree.Mapping) -> bool:
-    return [key.text for key, _ in item.entries] == ["let"]
+def _is_let(item: yaml_tree.Node) -> bool:
+    return isinstance(item, yaml_tree.Mapping) and [key.text for key, _ in item.entries] == ["let"]
 
 
-def _repeat(item: yaml_tree.Mapping, reader: Reader) -> Repeat | None:
+def _repeat(key: yaml_tree.Scalar, body: yaml_tree.Node, reader: Reader) -> Repeat | None:
     """`repeat COUNT:` with a list below it, among whose items `let:` gives names."""
-    if len(item.entries) != 1 or not item.entries[0][0].text.startswith("repeat"):
-        _not_a_statement(item, reader.reporter, nested=False)
-        return None
-    key, body = item.entries[0]
     count = read_line(key.content, "repeat", reader.reporter)
-    lets: list[tuple[Written, Syntax | None]] = []
-    for one in body.items if isinstance(body, yaml_tree.Sequence) else ():
-        if isinstance(one, yaml_tree.Mapping) and _is_let(one):
-            lets += read_lets(one.entries[0][1], reader)
     if isinstance(body, yaml_tree.Scalar) and body.text == "":
         reader.reporter.error("PD109", "a repetition of nothing", key.span, "no statements stand below it")
         return None
+    lets: list[tuple[Written, Syntax | None]] = []
+    for item in body.items if isinstance(body, yaml_tree.Sequence) else ():
+        if isinstance(item, yaml_tree.Mapping) and _is_let(item):
+            lets += read_lets(item.entries[0][1], reader)
     statements = tuple(one for one in read_items(body, reader, nested=True) if isinstance(one, Statement))
     return Repeat(count.children[0], lets, statements, key.span) if count is not None else None
 
@@ -113,8 +133,7 @@ def read_lets(node: yaml_tree.Node | None, reader: Reader) -> list[tuple[Written
     for key, value in reader.named(node, "a number"):
         if not isinstance(value, yaml_tree.Scalar):
             reader.shape(value, "a number")
-        span = line_of(value, "operand", reader.reporter)
-        lets.append((key, read_line(span, "operand", reader.reporter) if span is not None else None))
+        lets.append((key, line_in(value, "operand", reader)))
     return lets
 
 
@@ -163,9 +182,9 @@ class Drawer:
     cells: int = 0
 
     def __post_init__(self) -> None:
-        names: dict[str, Expr | None] = dict.fromkeys(sorted(self.plan.broken))
-        self.names = names | {name: number(value) for name, value in self.plan.knobs.items()}
+        self.names: dict[str, Expr | None] = dict.fromkeys(sorted(self.plan.broken))
         """The amounts of names; None for a name whose definition has been reported."""
+        self.names |= {name: number(value) for name, value in self.plan.knobs.items()}
 
     def generator(self) -> Generator:
         plan = self.plan
@@ -224,8 +243,7 @@ class Drawer:
 
     def repeated(self, repeat: Repeat) -> tuple[Group, ...]:
         self.count += 1
-        place = self.count
-        names = dict(self.names)
+        place, names = self.count, dict(self.names)
         for word, _ in repeat.lets:
             if word.text in self.names:
                 message = f"`{word.text}` already means something"
@@ -238,18 +256,17 @@ class Drawer:
             if statement.kind == "part":
                 label = "a part cannot stand in a repetition"
                 self.reporter.error("PD605", "a part in a repetition", statement.span, label)
-                continue
-            drawings.append(self.drawing(statement, names))
-        known = tuple(drawing for drawing in drawings if drawing is not None)
-        if count is None or len(known) < len(drawings):
+            elif drawing := self.drawing(statement, names):
+                drawings.append(drawing)
+        if count is None:
             return ()
         low, most = int(count.kind.lo), int(count.kind.hi)
         if low < 0 or most > MAX_REPEATS:
             label = f"they must lie in 0..{MAX_REPEATS}"
             self.reporter.error("PD606", f"{low}..{most} repetitions", repeat.count.span, label)
             return ()
-        self.cells += most * len(known)
-        return (Group(place, count, most, lets, known),) if most and known else ()
+        self.cells += most * len(drawings)
+        return (Group(place, count, most, lets, tuple(drawings)),) if most and drawings else ()
 
     def drawing(self, statement: Statement, names: Mapping[str, Expr | None]) -> Drawing | None:
         ids, over = (
@@ -261,9 +278,9 @@ class Drawer:
             if word is not None and word.text not in known:
                 report_unknown(what, word, known, self.reporter)
         amounts = amounts_of(statement, names, self.reporter, MAX_NUMBER)
-        if amounts is None:
+        if amounts is None or not self.covers_something(statement, amounts):
             return None
-        drawing = Drawing(
+        return Drawing(
             self.count,
             statement.kind,
             amounts,
@@ -273,23 +290,21 @@ class Drawer:
             stamp.text if stamp else None,
             statement.span,
         )
-        return drawing if self.covers_something(drawing) and (ids or statement.choice is None) else None
 
-    def covers_something(self, drawing: Drawing) -> bool:
+    def covers_something(self, statement: Statement, amounts: tuple[Expr | None, ...]) -> bool:
         """Return True if the shape can cover a cell; report a shape that never does."""
-        amounts = drawing.amounts
         never = ""
-        for i in range(RANGES.get(drawing.kind, 0)):
+        for i in range(RANGES.get(statement.kind, 0)):
             start, stop = amounts[2 * i], amounts[2 * i + 1]
             assert start is not None
-            low, high = start.kind.lo, self.size[i] if stop is None else stop.kind.hi
-            if low >= high or start == stop or low >= self.size[i] or high <= 0:
-                never = "rows" if i == 0 else "columns"
-        values = constants(amounts) if drawing.kind not in ("scatter", "stamp") else None
-        if values is not None and not mask(Shape(drawing.kind, values), self.size).any():
-            never = never or "cells"
+            high = self.size[i] if stop is None else min(stop.kind.hi, self.size[i])
+            if start.kind.lo >= high or high <= 0 or start == stop:
+                never = ("rows", "columns")[i]
+        values = constants(amounts) if statement.kind not in ("scatter", "stamp") else None
+        if not never and values is not None and not mask(Shape(statement.kind, values), self.size).any():
+            never = "cells"
         if never:
-            covers_nothing(drawing.span, f"none of its {never} lie", self.size, self.reporter)
+            covers_nothing(statement.span, f"none of its {never} lie", self.size, self.reporter)
         return not never
 
 
@@ -342,52 +357,46 @@ class StampDecl(Entry, noun="a stamp"):
     )
 
 
-def read_stamp(decl: StampDecl, reader: Reader, ruleset: Ruleset) -> Stamp | None:
-    """The picture of a stamp, or None after a report."""
+def read_stamp(decl: StampDecl, reader: Reader, ruleset: Ruleset) -> Stamp:
+    """The picture of a stamp, which changes nothing after a report."""
     key, art, scene = decl.name, decl.art, decl.scene
+    ids: NDArray[np.uint8] | None = None
     if (art is None) == (scene is None):
         label = "neither `art` nor `scene`" if art is None else "both `art` and `scene`"
         reader.reporter.error("PD109", f"the stamp `{key.text}` needs one picture", key.span, label)
-        return None
-    ids = _named(scene, reader, ruleset) if scene is not None else None
-    if art is not None:
-        ids = _drawn(art, _legend(decl, reader), reader, ruleset)
-    if ids is None:
-        return None
-    if max(ids.shape) > MAX_SIDE:
+    try:
+        if art is not None and scene is None:
+            ids = _drawn(art, decl, reader, ruleset)
+        elif scene is not None and art is None:
+            ids = _named(scene, reader, ruleset)
+    except CompileError as error:
+        pass_on(error, reader.reporter, (art or scene or key).span)
+    if ids is not None and max(ids.shape) > MAX_SIDE:
         message = f"a stamp of {ids.shape[0]}×{ids.shape[1]} cells"
         reader.reporter.error("PD607", message, key.span, "too large")
-        return None
-    return Stamp(key.text, tuple(map(tuple, ids.tolist())))
-
-
-def _legend(decl: StampDecl, reader: Reader) -> dict[str, str]:
-    for key, _ in decl.legend:
-        if len(key.text) != 1:
-            reader.reporter.error("PD110", "a legend has single characters", key.span, "not one character")
-    return {key.text: value.text for key, value in decl.legend if len(key.text) == 1}
+    return Stamp(key.text, ((LEAVE,),) if ids is None else tuple(map(tuple, ids.tolist())))
 
 
 def _drawn(
-    art: yaml_tree.Scalar, legend: dict[str, str], reader: Reader, ruleset: Ruleset
+    art: yaml_tree.Scalar, decl: StampDecl, reader: Reader, ruleset: Ruleset
 ) -> NDArray[np.uint8] | None:
     """ASCII art, in which `?` leaves cells as they are."""
+    for key, _ in decl.legend:
+        if len(key.text) != 1:
+            reader.reporter.error("PD110", "a legend has single characters", key.span, "not one character")
+    legend = {key.text: value.text for key, value in decl.legend if len(key.text) == 1}
     hole = replace(ruleset.elements[0], name="?", pack="?", id=LEAVE, glyph="?")
     elements: list[Element] = [one for one in ruleset.elements if one.id != LEAVE]
     if art.style == "quoted" and art.content.text.split() != art.text.split():
         helps = ["write `art: |`, and the rows below it"]
         reader.reporter.error("PD107", "art with escapes", art.span, "quoted, on one line", helps=helps)
         return None
-    try:
-        return parse_ascii(art.content, [*elements, hole], reader.reporter, {"?": "?", **legend})
-    except CompileError as error:
-        pass_on(error, reader.reporter, art.span)
-    return None
+    return parse_ascii(art.content, [*elements, hole], reader.reporter, {"?": "?", **legend})
 
 
 def _named(word: yaml_tree.Scalar, reader: Reader, ruleset: Ruleset) -> NDArray[np.uint8] | None:
     """A shipped scene, or a file beside the task's: .yaml, .png or .txt."""
-    file, _, name = word.text.rpartition("#") if "#" in word.text else (word.text, "", "")
+    file, sign, name = word.text.partition("#")
     suffix = Path(file).suffix.lower()
     known = [one.name for one in shipped_scenes()]
     if word.text not in known and suffix not in (".png", ".txt", ".yaml", ".yml"):
@@ -397,22 +406,15 @@ def _named(word: yaml_tree.Scalar, reader: Reader, ruleset: Ruleset) -> NDArray[
     path = word.text if word.text in known else path_beside(file, word.span, reader.reporter)
     if path is None:
         return None
-    beside = f"{path}#{name}" if name else str(path)
-    try:
-        if suffix == ".png":
-            return read_image(beside, ruleset.elements)
-        if suffix == ".txt":
-            return load_ascii(beside, ruleset.elements)
-        found = find_scene(beside)
-        setting = next((one for one in found.paints if isinstance(one, Setting)), None)
-        if setting is not None:
-            message = f"the scene `{found.name}` sets `{setting.name}`"
-            reader.reporter.error("PD605", message, word.span, "a picture is made of elements only")
-            return None
-        return draw_start(found, ruleset).ids
-    except CompileError as error:
-        pass_on(error, reader.reporter, word.span)
-    return None
+    if suffix in (".png", ".txt"):
+        return (read_image if suffix == ".png" else load_ascii)(f"{path}{sign}{name}", ruleset.elements)
+    scene = find_scene(f"{path}{sign}{name}")
+    setting = next((one for one in scene.paints if isinstance(one, Setting)), None)
+    if setting is not None:
+        message = f"the scene `{scene.name}` sets `{setting.name}`"
+        reader.reporter.error("PD605", message, word.span, "a picture is made of elements only")
+        return None
+    return draw_start(scene, ruleset).ids
 
 
 def pass_on(error: CompileError, reporter: Reporter, place: Span) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -303,14 +302,9 @@ def check_numbers(actions: Any, nvec: tuple[int, ...], names: tuple[str, ...]) -
     if tensor.ndim != 2 or tensor.shape[1] != len(nvec):
         raise ValueError(f"actions must have the shape [episodes, {len(nvec)}], found {list(tensor.shape)}")
     numbers = tensor.cpu().numpy()  # NumPy starts an operation on a few numbers in a fraction of torch's time
-    bad = (numbers < 0) | (numbers >= _bounds(nvec))
+    bad = (numbers < 0) | (numbers >= np.array(nvec))
     if bad.any():
         row, column = np.argwhere(bad)[0].tolist()
         value, most = int(tensor[row, column]), nvec[column] - 1
         raise ValueError(f"actions[{row}, {column}] ({names[column]}) is {value}: it must lie in 0..{most}")
     return tensor
-
-
-@lru_cache(256)
-def _bounds(nvec: tuple[int, ...]) -> np.ndarray[Any, np.dtype[np.int64]]:
-    return np.array(nvec, np.int64)

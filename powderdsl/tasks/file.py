@@ -17,7 +17,7 @@ from powderdsl.model.state import fits, size_problem
 from powderdsl.model.types import Ruleset
 from powderdsl.syntax import yaml_tree
 from powderdsl.syntax.ast import Syntax
-from powderdsl.syntax.parse import STATEMENTS, line_of, reserved_words
+from powderdsl.syntax.parse import STATEMENTS, reserved_words
 from powderdsl.syntax.yaml_tree import Node, Scalar
 from powderdsl.tasks.agents import AgentDecl, read_agent, read_expert
 from powderdsl.tasks.drawings import (
@@ -25,17 +25,20 @@ from powderdsl.tasks.drawings import (
     DrawingPlan,
     StampDecl,
     element_ids,
+    limited,
+    line_in,
     pass_on,
     read_items,
     read_lets,
     read_stamp,
+    shape_in,
 )
 from powderdsl.tasks.goals import ACTION_WORDS, FUNCTIONS, GoalChecker
-from powderdsl.tasks.task import MAX_SIDE, Goal, Knob, Split, Stamp, Task
+from powderdsl.tasks.task import MAX_SIDE, Goal, Knob, Split, Task
 from powderdsl.worlds.raster import Size
-from powderdsl.worlds.scene.amounts import Written, constants, number, read_amount, report_unknown
+from powderdsl.worlds.scene.amounts import Written, number, read_amount, report_unknown
 from powderdsl.worlds.scene.read import two_integers
-from powderdsl.worlds.scene.statements import Statement, read_line, read_shape
+from powderdsl.worlds.scene.statements import Statement
 
 
 class KnobDecl(Entry, noun="a knob"):
@@ -180,14 +183,13 @@ class _TaskReader:
         for word, _ in lets:
             self.take(word)
         regions = self.regions()
-        pictures = ((stamp, read_stamp(stamp, self.reader, self.ruleset)) for stamp in decl.stamps)
         plan = DrawingPlan(
             "train",
             fill,
             {knob.name: knob.value for knob in knobs},
             lets,
             regions,
-            {stamp.name.text: picture or Stamp(stamp.name.text, ((255,),)) for stamp, picture in pictures},
+            {stamp.name.text: read_stamp(stamp, self.reader, self.ruleset) for stamp in decl.stamps},
             self.lists(decl.parts, "a part"),
             self.lists(decl.targets, "a target"),
             read_items(decl.generate, self.reader),
@@ -279,53 +281,42 @@ class _TaskReader:
 
     def knob(self, decl: KnobDecl, above: Mapping[str, Knob]) -> Knob | None:
         key = decl.name
-        bounds, default = (self.line(word, "operand") for word in (decl.range, decl.default))
+        bounds, default = (line_in(word, "operand", self.reader) for word in (decl.range, decl.default))
         if bounds is None or default is None:
             return None
-        ends = bounds.children if bounds.kind == "range" else ()
-        amounts = [read_amount(part, {}, Reporter()) for part in ends]
-        low, high = constants(amounts) or (None, None) if ends else (None, None)
-        if low is None or high is None:
+        if bounds.kind != "range":
             self.reporter.error("PD803", "a knob's range has two integers", bounds.span, "such as `0..64`")
             return None
-        if read_amount(bounds, {}, self.reporter) is None:
-            return None
+        ends = read_amount(bounds, {}, self.reporter)
         names = {name: number(knob.value) for name, knob in above.items()}
-        unread = Reporter()
-        amount = read_amount(default, names, unread)
-        if any(diagnostic.code == "PD606" for diagnostic in unread.diagnostics):
-            read_amount(default, names, self.reporter)
+        amount = read_amount(default, names, self.reporter)
+        if ends is None or amount is None:
             return None
-        if amount is None or amount.op != "const":
-            label = "an integer, or knobs that stand above this one"
-            helps = suggest(default.span.text, above, "knobs above it")
-            self.reporter.error("PD803", f"the default of `{key.text}`", default.span, label, helps=helps)
+        if amount.op != "const":
+            self.reporter.error("PD803", f"the default of `{key.text}`", default.span, "not an integer")
             return None
-        usual = int(amount.value)
+        low, high, usual = int(ends.kind.lo), int(ends.kind.hi), int(amount.value)
         chosen = int(self.given.get(key.text, usual))
-        for one, span in ((usual, default.span), (chosen, None if key.text in self.given else default.span)):
-            if not low <= one <= high:
+        for value, span in (
+            (usual, default.span),
+            (chosen, None if key.text in self.given else default.span),
+        ):
+            if not low <= value <= high:
                 message = f"the knob `{key.text}` must lie in {low}..{high}"
-                self.reporter.error("PD803", message, span, f"{one} lies outside", notes=[f"it is {one}"])
+                self.reporter.error("PD803", message, span, f"{value} lies outside", notes=[f"it is {value}"])
         return Knob(key.text, usual, low, high, chosen, decl.about, key.span)
 
-    def line(self, word: Scalar | None, start: str) -> Syntax | None:
-        span = line_of(word, start, self.reporter)
-        return read_line(span, start, self.reporter) if span is not None else None
-
     def regions(self) -> dict[str, tuple[Statement, ...]]:
-        found = {}
+        regions = {}
         for key, node in self.reader.named(self.decl.regions, "a region"):
             self.take(key)
             shapes = []
             for item in node.items:
-                span = line_of(item, "shape", self.reporter)
                 if not isinstance(item, Scalar):
                     self.reader.shape(item, "a shape, such as `box rows 1:5 columns 2:8`")
-                elif span is not None:
-                    shapes.append(read_shape(span, self.reporter))
-            found[key.text] = tuple(one for one in shapes if one is not None)
-        return found
+                shapes.append(shape_in(item, self.reader))
+            regions[key.text] = tuple(shape for shape in shapes if shape is not None)
+        return regions
 
     def lists(self, node: Node | None, what: str) -> dict[str, Any]:
         return {key.text: read_items(item, self.reader) for key, item in self.reader.named(node, what)}
@@ -355,9 +346,7 @@ class _TaskReader:
         if not isinstance(node, yaml_tree.Sequence) or not node.items:
             self.reader.shape(node, "a list of stands", "each starts with `- stand: NAME`")
             return [base]
-        if len(node.items) > MAX_VARIANTS:
-            message = f"{len(node.items)} stands"
-            self.reporter.error("PD508", message, first_line(node), f"the limit is {MAX_VARIANTS}")
+        if not limited(node, MAX_VARIANTS, "{} stands", self.reporter):
             return [base]
         found = []
         for item in node.items:

@@ -35,7 +35,6 @@ FUNCTIONS = {**MEASURES, **MEMORIES, **ARITHMETIC}
 ACTION_WORDS = ("taken", "left", "painted", "placed", "blown")
 """Numbers that describe the last action, and the counts of actions taken and left."""
 
-_BINARY = ("add", "sub", "mul", "div", "quotient", "mod")
 REGION_LET = "in "
 """How the names of regions begin among the values that cell conditions read."""
 
@@ -89,32 +88,28 @@ class GoalChecker:
 
     def scalar(self, syntax: Syntax) -> Expr:
         kind, parts = syntax.kind, syntax.children
-        if kind in ("integer", "decimal", "percent"):
-            return Expr("const", REAL, value=float(read_number(syntax, self.typer)))
-        if kind in ("yes", "no"):
-            return Expr("const", FLAG, value=float(kind == "yes"))
-        if kind == "name":
-            return self.name(syntax)
-        if kind == "call":
-            return self.call(syntax)
-        if kind == "neg":
-            return Expr("neg", REAL, (self.scalar(parts[0]),))
-        if kind in _BINARY:
-            first, second = self.scalar(parts[0]), self.scalar(parts[1])
-            if kind in ("div", "mod") and second.op == "const" and not second.value:
-                fix = "divide by another number"
-                raise self.typer.fail("PD402", "division by zero", parts[1].span, "this is 0", fix)
-            return Expr(kind, REAL, (first, second))
-        if kind == "choose":
-            yes, condition, no = parts
-            return Expr("choose", REAL, (self.truth(condition), self.scalar(yes), self.scalar(no)))
-        if kind in ("and_", "or_"):
-            both = (self.truth(parts[0]), self.truth(parts[1]))
-            return Expr(kind.rstrip("_"), FLAG, both)
-        if kind == "not_":
-            return Expr("not", FLAG, (self.truth(parts[0]),))
-        if kind == "compare":
-            return self.compare(syntax)
+        match kind:
+            case "integer" | "decimal" | "percent":
+                return Expr("const", REAL, value=float(read_number(syntax, self.typer)))
+            case "yes" | "no":
+                return Expr("const", FLAG, value=float(kind == "yes"))
+            case "name":
+                return self.name(syntax)
+            case "call":
+                return self.call(syntax)
+            case "compare":
+                return self.compare(syntax)
+            case "choose":
+                yes, condition, no = parts
+                return Expr("choose", REAL, (self.truth(condition), self.scalar(yes), self.scalar(no)))
+            case "and_" | "or_" | "not_":
+                return Expr(kind.rstrip("_"), FLAG, tuple(map(self.truth, parts)))
+            case "neg" | "add" | "sub" | "mul" | "div" | "quotient" | "mod":
+                values = tuple(map(self.scalar, parts))
+                if kind in ("div", "mod") and values[1].op == "const" and not values[1].value:
+                    fix = "divide by another number"
+                    raise self.typer.fail("PD402", "division by zero", parts[1].span, "this is 0", fix)
+                return Expr(kind, REAL, values)
         raise self._needs_measure(syntax)
 
     def truth(self, syntax: Syntax) -> Expr:

@@ -87,7 +87,7 @@ MALFORMED = [
     # Knobs and names
     ("default: 3", "default: 30", "PD803", "30"),
     ("default: 3", "default: 3.5", "PD606", "3.5"),
-    ("default: 3", "default: lnes", "PD803", "lnes"),
+    ("default: 3", "default: lnes", "PD802", "lnes"),
     ("range: 0..9", "range: 9", "PD803", "9"),
     ("range: 0..9", "range: 9..0", "PD606", "9..0"),
     ("range: 0..9, ", "", "PD109", "{"),

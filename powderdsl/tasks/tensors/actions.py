@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from powderdsl.model.state import Slot
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.targets.cpp.program import PackedState
 from powderdsl.tasks.task import BLOW, Agent
@@ -66,8 +65,10 @@ class Blocks:
         for first, end in (axis.T[:, :, None] for axis in edges):
             width = torch.arange(int((end - first).max()), device=sim.device)
             self._lines.append(torch.minimum(first + width, end - 1))
-        self.fresh = {slot.name: sim.fresh_values(slot) for slot in sim.slots if slot.travels}
+        self.tables = {slot.name: sim.fresh_values(slot) for slot in sim.slots}
         """What a new cell holds, by id: [256] or, of vectors, [256, 2]."""
+        self.fresh = {slot.name: self.tables[slot.name] for slot in sim.slots if slot.travels}
+        """The same of what a cell's element brings along."""
         self._arrays = {name: table.cpu().numpy() for name, table in self.fresh.items()}
         self._edges = [axis.cpu().numpy() for axis in edges]
 
@@ -124,24 +125,14 @@ class Hands:
         self.choices = torch.tensor(agent.choices, device=self.device)
         self._choices = self.choices.cpu().numpy()
         self.places_elements = any(choice >= 0 for choice in agent.choices)
-        self._slots = sim.slots
-        fresh = self.blocks.fresh
-        self._by_element = [name for name, table in fresh.items() if (table != table[0]).any()]
 
     def fresh_state(self, ids: Tensor) -> dict[str, Tensor]:
         """The state of new worlds of known ids, uint8 [B, H, W]: what `Simulator.world` makes, without its checks."""
-        others = [slot for slot in self._slots if slot.name != "element"]
-        return {"element": ids, **{slot.name: self._fresh_slot(slot, ids) for slot in others}}
-
-    def _fresh_slot(self, slot: Slot, ids: Tensor) -> Tensor:
-        fresh = self.blocks.fresh
-        if slot.name in self._by_element:
-            new = fresh[slot.name][ids.int()]
-            return new.movedim(-1, 1).contiguous() if slot.planes == 2 else new
-        default = fresh[slot.name][0] if slot.name in fresh else slot.default
-        value = torch.as_tensor(default, dtype=getattr(torch, slot.dtype), device=self.device)
-        everywhere = value[..., None, None].expand(len(ids), *value.shape, *self.size)
-        return everywhere.clone(memory_format=torch.contiguous_format)
+        state = {name: table[ids.int()] for name, table in self.blocks.tables.items() if name != "element"}
+        vectors = {
+            name: cells.movedim(-1, 1).contiguous() for name, cells in state.items() if cells.ndim == 4
+        }
+        return {"element": ids, **state, **vectors}
 
     def act(self, world: World, actions: Tensor, *, reuse: bool) -> tuple[World, dict[str, Tensor]]:
         """The worlds after actions, int64 [B, 5], within their bounds. `reuse` writes into the world's own tensors.

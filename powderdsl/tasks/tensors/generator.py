@@ -2,16 +2,14 @@
 
 Every number that a world draws is a hash of its seed, the statement, the repetition and which number of the statement
 it is. So a world is the same alone and in any batch, on any device.
-
-Painting happens on bits: an id is a few planes, a word is 64 rows of a column.
 """
 
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, reduce
+from functools import reduce
 from math import prod
 from operator import or_
 from typing import Any
@@ -24,59 +22,32 @@ from powderdsl.worlds.raster import Shape, Size, covered_rows, mask
 from powderdsl.worlds.scene.amounts import constants
 
 
-def shape_words(kind: ArrayKind, shape: str, numbers: Sequence[Array | None], size: Size) -> Array:
-    """The cells of shapes, not frames, as bits: int64 [..., W, ⌈H/64⌉].
+def shape_cells(kind: ArrayKind, shape: str, numbers: Sequence[Array | None], size: Size) -> Array:
+    """The cells of shapes, not frames: bool [..., H, W].
 
     `numbers` are int64 [...], in the order of `scene.statements.NUMBERS`; None is an open end.
     """
-    xp = kind.xp
+    return cells_between(kind, *shape_rows(kind, shape, numbers, size), size)
+
+
+def shape_rows(
+    kind: ArrayKind, shape: str, numbers: Sequence[Array | None], size: Size
+) -> tuple[Array, Array]:
+    """The first row that shapes cover in each column and the one after the last: broadcast to int64 [..., W]."""
     given = [None if one is None else one[..., None] for one in numbers]
-    rows = covered_rows(xp, shape, given, kind.arange(size[1]), size)
-    first, last = (xp.clip(one, 0, size[0]) for one in rows)
-    below = [_bits_below(xp, last - base) & ~_bits_below(xp, first - base) for base in range(0, size[0], 64)]
-    return xp.stack(below, -1)
+    return covered_rows(kind.xp, shape, given, kind.arange(size[1]), size)
 
 
-def _bits_below(xp: Any, n: Array) -> Array:
-    """Words whose bits below bit n are set; all of them from 64 on."""
-    return xp.where(n >= 64, -1, (1 << xp.clip(n, 0, 63)) - 1)
-
-
-def pack(kind: ArrayKind, cells: Array) -> Array:
-    """Cells, bool [..., H, W], as bits: int64 [..., W, ⌈H/64⌉]."""
-    *batch, height, width = cells.shape
-    number, xp = -(-height // 64), kind.xp
-    missing = kind.zeros("uint8", (*batch, 64 * number - height, width))
-    padded = xp.concatenate([xp.asarray(cells, dtype=xp.uint8), missing], axis=-2)
-    bits = xp.asarray(padded.reshape(*batch, number, 64, width), dtype=xp.int64)
-    return kind.contiguous(xp.moveaxis((bits << kind.arange(64)[:, None]).sum(-2), -1, -2))
-
-
-def unpack(kind: ArrayKind, planes: Sequence[Array] | Array, height: int) -> Array:
-    """Numbers whose bits are planes, int64 [..., W, ⌈H/64⌉] each, lowest first: uint8 [..., H, W]."""
-    table = _eight_rows(kind)
-    found: Array | None = None
-    for place, words in enumerate(planes):
-        # A byte of a word is eight rows. In the table it is eight bytes, so that eight numbers are put together at once.
-        eight = kind.entries(table, kind.as_bytes(words)) << place
-        found = eight if found is None else found | eight
-    assert found is not None
-    *batch, width, number = planes[0].shape
-    columns = kind.as_bytes(found).reshape(*batch, width, 64 * number)
-    return kind.contiguous(kind.xp.moveaxis(columns[..., :height], -1, -2))
-
-
-@cache
-def _eight_rows(kind: ArrayKind) -> Array:
-    """The bits of each byte as eight bytes, which are one word: int64 [256]."""
-    return kind.put([sum((byte >> row & 1) << 8 * row for row in range(8)) for byte in range(256)], "int64")
+def cells_between(kind: ArrayKind, first: Array, last: Array, size: Size) -> Array:
+    row = kind.arange(size[0])[:, None]
+    return (row >= first[..., None, :]) & (row < last[..., None, :])
 
 
 NOTHING = 255
 """In targets and stamps: no element."""
 
-CHUNK_CELLS = 1 << 20
-"""Cells of the worlds that are made together on the CPU: their words fit its cache."""
+CHUNK_CELLS = 1 << 18
+"""Cells of the worlds that are made together on the CPU: they fit its cache."""
 
 CHANCE_BITS = 16
 """Scattered cells are drawn with that many bits: chances are multiples of 2⁻¹⁶."""
@@ -84,10 +55,6 @@ CHANCE_BITS = 16
 _NUMBERS, _STATEMENT, _COUNTER, _INDEX = 128, 0x9E3779B1, 0x85EBCA6B, 0x7A51
 """Draws of one statement and repetition; odd factors that spread counters; the worlds' index of `base_keys`, which
 keeps draws of generators apart from those of rules."""
-
-
-_LIMITED = ("scatter", "stamp")
-"""Statements whose cells are found only when they are painted."""
 
 
 @dataclass(frozen=True)
@@ -134,13 +101,31 @@ _CALCULATE: dict[str, Callable[..., Any]] = {
 
 
 class _Draws:
-    """Values of the amounts of one statement, [B, R] for R repetitions; each of its `wanted` draws takes the next counter."""
+    """The amounts of one statement, and one of some `choices` before them: each draw takes the next counter.
 
-    def __init__(self, hashes: Hashes, statement: int, repeats: int, names: Mapping[str, Array], wanted: int):
-        self.names, self.kind = names, hashes.kind
-        counters = self.kind.arange(repeats)[:, None] * _NUMBERS + self.kind.arange(wanted)
-        drawn = hashes.draw(statement, counters.reshape(-1)).reshape(-1, repeats, wanted) if wanted else ()
-        self.drawn = iter(self.kind.xp.moveaxis(drawn, -1, 0) if wanted else ())
+    `arrays` are int64 that broadcast to [B, R] for R repetitions, None for None; so is `choice`, None if there is but one.
+    """
+
+    def __init__(
+        self,
+        hashes: Hashes,
+        statement: int,
+        repeats: int,
+        names: Mapping[str, Array],
+        amounts: Sequence[Expr | None],
+        choices: int = 1,
+    ):
+        self.names, kind = names, hashes.kind
+        parts = [part for amount in amounts if amount is not None for part in amount.walk()]
+        wanted = sum(part.op == "uniform" for part in parts) + (choices > 1)
+        self.drawn: Iterator[Array] = iter(())
+        if wanted:
+            counters = kind.arange(repeats)[:, None] * _NUMBERS + kind.arange(wanted)
+            drawn = hashes.draw(statement, counters.reshape(-1)).reshape(-1, repeats, wanted)
+            self.drawn = iter(kind.xp.moveaxis(drawn, -1, 0))
+        self.choice = self.uniform(0, choices - 1) if choices > 1 else None
+        values = [None if amount is None else self.value(amount) for amount in amounts]
+        self.arrays = [kind.put(value, "int64") if isinstance(value, int) else value for value in values]
 
     def uniform(self, low: Array | int, high: Array | int) -> Array:
         """Integers from `low` to `high`, both included; where there are none, `low`."""
@@ -159,51 +144,21 @@ class _Draws:
             case op, values:
                 return _CALCULATE[op](*values)
 
-    def array(self, amount: Expr | None) -> Array | None:
-        """int64 that broadcasts to [B, R]."""
-        if amount is None:
-            return None
-        value = self.value(amount)
-        return self.kind.put(value, "int64") if isinstance(value, int) else value
-
-
-def _draws_in(*amounts: Expr | None) -> int:
-    return sum(part.op == "uniform" for one in amounts if one is not None for part in one.walk())
-
-
-def _groups(generator: Generator) -> list[Group]:
-    return [*generator.groups, *(group for target in generator.targets for group in target.groups)]
-
-
-def _shape_number(region: Region, place: int) -> int:
-    """A region's own draws depend on its name and the shape's place."""
-    return name_number(f"{region.name} {place}")
-
 
 class WorldMaker:
     """A generator made executable for one size and kind of arrays."""
 
     def __init__(self, generator: Generator, size: Size, kind: ArrayKind):
         self.generator, self.size, self.kind = generator, size, kind
-        self.words = -(-size[0] // 64)
         self.stamps = {stamp.name: _bordered(stamp.rows, kind) for stamp in generator.stamps}
-        painted = [i for group in _groups(generator) for one in group.drawings for i in one.ids]
-        held = [i for stamp in generator.stamps for row in stamp.rows for i in row if i != NOTHING]
-        self.planes = max(1, max([generator.fill, *painted, *held]).bit_length())
-        self.fixed: dict[Drawing, Array] = {}
-        """Words of shapes that are the same in every world."""
-        self._bits: dict[tuple[int, int], Array] = {}
-        nowhere = kind.zeros("int64", (size[1], self.words))
-        self.fixed_regions = {
-            region.name: reduce(or_, map(self.fixed_words, region.shapes), nowhere)[None]
+        self._fixed: dict[Drawing, Array] = {}
+        """Cells of shapes that are the same in every world."""
+        nowhere = kind.zeros("bool", size)
+        self.fixed_cells = {
+            region.name: reduce(or_, map(self.fixed, region.shapes), nowhere)[None]
             for region in generator.regions
             if not region.drawn
         }
-        self.fixed_cells = {name: self._cells([words]) for name, words in self.fixed_regions.items()}
-
-    def _cells(self, planes: Sequence[Array]) -> Array:
-        """The cells of one plane of words: bool [..., H, W]."""
-        return unpack(self.kind, planes, self.size[0]) != 0
 
     def make(self, seeds: Array) -> Made:
         """The worlds of some seeds, int64 [B]."""
@@ -214,164 +169,114 @@ class WorldMaker:
         return made[0] if len(made) == 1 else joined(self.kind, made, self.fixed_cells)
 
     def _chunk(self, seeds: Array) -> Made:
-        kind, height = self.kind, self.size[0]
-        hashes = Hashes(seeds, kind)
+        hashes = Hashes(seeds, self.kind)
         names = self._lets(self.generator.lets, hashes, 1, {})
-        regions = dict(self.fixed_regions)
+        regions = dict(self.fixed_cells)
         for region in self.generator.regions:
             if region.drawn:
                 regions[region.name] = self._region(region, hashes, names)
-        cells = {
-            name: self.fixed_cells[name] if name in self.fixed_cells else self._cells([words])
-            for name, words in regions.items()
+        ids = self._painted(self.generator.fill, self.generator.groups, hashes, names, regions)
+        targets = {
+            target.name: self._painted(NOTHING, target.groups, hashes, names, regions)
+            for target in self.generator.targets
         }
-        planes = self._canvas(len(seeds), self.generator.fill)
-        self._paint(planes, self.generator.groups, hashes, names, regions)
-        targets = {}
-        for target in self.generator.targets:
-            canvas = self._canvas(len(seeds), 0, more=1)
-            self._paint(canvas, target.groups, hashes, names, regions)
-            ids = unpack(kind, canvas[:-1], height)
-            targets[target.name] = kind.xp.where(self._cells(canvas[-1:]), ids, NOTHING)
-        return Made(unpack(kind, planes, height), cells, targets)
-
-    def _canvas(self, batch: int, fill: int, more: int = 0) -> Array:
-        """Planes of an element everywhere, int64 [P, B, W, K]; with one more plane for what has been painted."""
-        bits = [-(fill >> plane & 1) for plane in range(self.planes + more)]
-        plane = self.kind.put(bits, "int64")[:, None, None, None]
-        shape = (len(bits), batch, self.size[1], self.words)
-        return self.kind.copied(self.kind.xp.broadcast_to(plane, shape))
+        return Made(ids, regions, targets)
 
     def _lets(
         self, lets: tuple[tuple[str, Expr], ...], hashes: Hashes, repeats: int, names: Mapping[str, Array]
     ) -> dict[str, Array]:
         """`names` and more of them: int64 that broadcasts to [B, R]."""
-        found = dict(names)
+        known = dict(names)
         for name, amount in lets:
-            value = _Draws(hashes, name_number(name), repeats, found, _draws_in(amount)).array(amount)
-            assert value is not None
-            found[name] = value
-        return found
+            (known[name],) = _Draws(hashes, name_number(name), repeats, known, (amount,)).arrays
+        return known
 
     def _region(self, region: Region, hashes: Hashes, names: Mapping[str, Array]) -> Array:
-        """Words [B, W, K] of a region."""
-        shape = (len(hashes.keys[0]), self.size[1], self.words)
-        found = self.kind.zeros("int64", shape)
-        for number, drawn in enumerate(region.shapes):
-            draws = _Draws(hashes, _shape_number(region, number), 1, names, _draws_in(*drawn.amounts))
-            words = self.drawn_words(drawn, [draws.array(one) for one in drawn.amounts])
-            found = found | self.kind.xp.broadcast_to(words, (shape[0], 1, *shape[1:]))[:, 0]
-        return found
+        """The cells of a region: bool [B, H, W]."""
+        batch = len(hashes.keys[0])
+        region_cells = self.kind.zeros("bool", (batch, *self.size))
+        for number, shape in enumerate(region.shapes):
+            # A region's own draws depend on its name and the shape's place.
+            draws = _Draws(hashes, name_number(f"{region.name} {number}"), 1, names, shape.amounts)
+            if constants(shape.amounts) is not None:
+                region_cells = region_cells | self.fixed(shape)
+            else:
+                cells = shape_cells(self.kind, shape.kind, draws.arrays, self.size)
+                region_cells = region_cells | cells.reshape(-1, *self.size)
+        return region_cells
 
-    def drawn_words(self, drawing: Drawing, numbers: list[Array | None]) -> Array:
-        """The words of a shape whose numbers broadcast to [B, R]: broadcasts to [B, R, W, K]."""
-        if drawing.kind in ("frame", "fill"):
-            return self.fixed_words(drawing)
-        return shape_words(self.kind, drawing.kind, numbers, self.size)
-
-    def fixed_words(self, drawing: Drawing) -> Array:
-        """The words [W, K] of a shape of plain numbers."""
-        if drawing not in self.fixed:
+    def fixed(self, drawing: Drawing) -> Array:
+        """The cells of a shape of plain numbers: bool [H, W]."""
+        if drawing not in self._fixed:
             shape = Shape(drawing.kind, constants(drawing.amounts) or ())
-            self.fixed[drawing] = pack(self.kind, self.kind.from_numpy(mask(shape, self.size)))
-        return self.fixed[drawing]
+            self._fixed[drawing] = self.kind.from_numpy(mask(shape, self.size))
+        return self._fixed[drawing]
 
-    def fixed_bits(self, number: int, planes: int) -> Array:
-        """The bits of an id, as `_plane_bits` has them."""
-        if (number, planes) not in self._bits:
-            ids = self.kind.put([[number]], "int64")
-            self._bits[number, planes] = _plane_bits(self.kind, ids, planes, self.planes)
-        return self._bits[number, planes]
-
-    def _paint(
+    def _painted(
         self,
-        planes: Array,
+        fill: int,
         groups: tuple[Group, ...],
         hashes: Hashes,
         names: Mapping[str, Array],
         regions: Mapping[str, Array],
-    ) -> None:
-        """Paint all groups on planes, in place."""
-        xp, batch = self.kind.xp, planes.shape[1]
+    ) -> Array:
+        """All groups painted on one element: uint8 [B, H, W]."""
+        xp, batch = self.kind.xp, len(hashes.keys[0])
+        ids = self.kind.zeros("uint8", (batch, *self.size)) + self.kind.put(fill, "uint8")
         for group in groups:
-            count = _Draws(hashes, group.number, 1, names, _draws_in(group.count)).array(group.count)
+            (count,) = _Draws(hashes, group.number, 1, names, (group.count,)).arrays
             assert count is not None
             repeats = group.most
             if self.kind.on_cpu and repeats > 1:
                 # Repetitions that no world of the batch has are not drawn.
                 repeats = int(count.max()) if prod(count.shape) else 0
-            if repeats == 0:
-                continue
             active = xp.broadcast_to(self.kind.arange(repeats) < count, (batch, repeats))
-            once = -xp.asarray(active, dtype=xp.int64)[..., None, None]
             local = self._lets(group.lets, hashes, repeats, names)
-            painters = []
-            for one in group.drawings:
-                wanted = _draws_in(*one.amounts) + (len(one.ids) > 1)
-                draws = _Draws(hashes, one.number, repeats, local, wanted)
-                painters.append(_Painter(self, one, draws, hashes, once, len(planes)))
+            painters = [_Painter(self, one, hashes, local, active) for one in group.drawings]
             for repeat in range(repeats):
                 for painter in painters:
-                    painter.paint(planes, repeat, regions)
+                    ids = painter.painted(ids, repeat, regions)
+        return ids
 
 
 class _Painter:
     """One statement in all its repetitions: what it needs is computed for all of them at once."""
 
     def __init__(
-        self, maker: WorldMaker, drawing: Drawing, draws: _Draws, hashes: Hashes, once: Array, planes: int
+        self, maker: WorldMaker, drawing: Drawing, hashes: Hashes, names: Mapping[str, Array], active: Array
     ):
-        """`once`: int64 [B, R, 1, 1], all bits where a world has a repetition."""
-        self.maker, self.drawing, self.hashes = maker, drawing, hashes
-        repeats, kind = once.shape[1], maker.kind
-        if len(drawing.ids) > 1:
-            ids = kind.put(list(drawing.ids), "int64")[draws.uniform(0, len(drawing.ids) - 1)]
-            bits = _plane_bits(kind, ids, planes, maker.planes)
-        else:  # those of stamps stand in their pictures
-            bits = maker.fixed_bits(drawing.ids[0] if drawing.ids else 0, planes)
-        some = list(kind.xp.moveaxis(bits, 2, 0))
-        self.bits = some if len(some) > 1 else some * repeats
-        self.numbers: list[Array | None] = []
-        words = once
-        if drawing.kind not in _LIMITED and constants(drawing.amounts) is not None:
-            words = maker.fixed_words(drawing) & once
-        else:
-            shape = tuple(once.shape[:2])
-            for one in drawing.amounts:
-                value = draws.array(one)
-                self.numbers.append(None if value is None else kind.xp.broadcast_to(value, shape))
-            if drawing.kind not in _LIMITED:
-                words = maker.drawn_words(drawing, self.numbers) & once
-        self.words = list(kind.xp.moveaxis(words, 1, 0))
+        """`active`: bool [B, R], whether a world has a repetition."""
+        self.maker, self.drawing, self.hashes, self.active = maker, drawing, hashes, active
+        kind, shape = maker.kind, tuple(active.shape)
+        draws = _Draws(hashes, drawing.number, shape[1], names, drawing.amounts, len(drawing.ids))
+        self.numbers = [None if one is None else kind.xp.broadcast_to(one, shape) for one in draws.arrays]
+        ids = kind.put(list(drawing.ids) or [0], "uint8")
+        self.ids = kind.xp.broadcast_to(ids if draws.choice is None else ids[draws.choice], shape)
+        self.is_fixed = constants(drawing.amounts) is not None
+        if drawing.kind not in ("scatter", "stamp") and not self.is_fixed:
+            rows = shape_rows(kind, drawing.kind, self.numbers, maker.size)
+            self.rows = [kind.xp.broadcast_to(one, (*shape, maker.size[1])) for one in rows]
 
-    def paint(self, planes: Array, repeat: int, regions: Mapping[str, Array]) -> None:
-        """Paint one repetition on planes, in place."""
-        drawing, kind = self.drawing, self.maker.kind
-        words, bits = self.words[repeat], self.bits[repeat]
+    def painted(self, ids: Array, repeat: int, regions: Mapping[str, Array]) -> Array:
+        """Worlds with one repetition on top: uint8 [B, H, W]."""
+        drawing, maker = self.drawing, self.maker
+        painted = self.ids[:, repeat, None, None]
         if drawing.kind == "stamp":
-            picture = self._stamp(repeat)
-            words = words & pack(kind, picture != NOTHING)
-            layers = [pack(kind, (picture >> place & 1) != 0) for place in range(self.maker.planes)]
-            layers += [kind.xp.full_like(words, -1)] * (len(planes) - len(layers))
-            bits = kind.xp.stack(layers)
+            painted = self._stamp(repeat)
+            cells = painted != NOTHING
         elif drawing.kind == "scatter":
-            words = words & self._scattered(repeat)
+            cells = self._scattered(repeat)
+        elif self.is_fixed:
+            cells = maker.fixed(drawing)
+        else:
+            first, last = (one[:, repeat] for one in self.rows)
+            cells = cells_between(maker.kind, first, last, maker.size)
+        cells = cells & self.active[:, repeat, None, None]
         if drawing.where is not None:
-            words = words & regions[drawing.where]
+            cells = cells & regions[drawing.where]
         if drawing.over is not None:
-            words = words & self._holding(planes, drawing.over)
-        planes[...] = planes ^ ((planes ^ bits) & words)
-
-    def _holding(self, planes: Array, ids: frozenset[int]) -> Array:
-        """The words of cells that hold one of some elements."""
-        xp = self.maker.kind.xp
-        found = xp.zeros_like(planes[0])
-        for one in sorted(ids):
-            same = xp.full_like(planes[0], -1 if one >> self.maker.planes == 0 else 0)
-            for place in range(self.maker.planes):
-                same = same & (planes[place] if one >> place & 1 else ~planes[place])
-            found = found | same
-        return found
+            cells = cells & reduce(or_, [ids == one for one in sorted(drawing.over)])
+        return maker.kind.xp.where(cells, painted, ids)
 
     def _stamp(self, repeat: int) -> Array:
         """The stamp where it stands in each world: uint8 [B, H, W], NOTHING around it."""
@@ -385,15 +290,15 @@ class _Painter:
         return picture[index[0][:, :, None], index[1][:, None, :]]
 
     def _scattered(self, repeat: int) -> Array:
-        """Words [B, W, K] in which each bit is set with the chance of `chance` in a hundred.
+        """The cells, bool [B, H, W], each of which is set with the chance of `chance` in a hundred.
 
-        A draw of CHANCE_BITS bits is compared with the threshold from the last bit to the first, 64 cells at once.
+        A draw of CHANCE_BITS bits is compared with the threshold from the last bit to the first, for 32 cells at once.
         """
         kind, percent = self.maker.kind, self.numbers[0]
         assert percent is not None
         limit = (percent[:, repeat, None] << CHANCE_BITS) // 100
-        width, words = self.maker.size[1], self.maker.words
-        halves = kind.arange(2 * width * words)
+        height, width = self.maker.size
+        halves = kind.arange(2 * width * -(-height // 64))
         below = kind.xp.zeros_like(halves)[None]
         for place in range(CHANCE_BITS):
             counters = (
@@ -402,15 +307,9 @@ class _Painter:
             drawn = self.hashes.draw(self.drawing.number, counters)
             bit = -(limit >> place & 1)
             below = (bit & ~drawn) | (~(bit ^ drawn) & below)
-        below = kind.xp.where(limit >> CHANCE_BITS > 0, -1, below) & MASK
-        low, high = kind.xp.moveaxis(below.reshape(-1, width, words, 2), -1, 0)
-        return low | high << 32
-
-
-def _plane_bits(kind: ArrayKind, ids: Array, planes: int, own: int) -> Array:
-    """The bits of ids [B, R] in each plane, as whole words: int64 [P, B, R, 1, 1], planes beyond `own` set."""
-    place = kind.arange(planes)[:, None, None]
-    return kind.xp.where(place < own, -(ids >> place & 1), -1)[..., None, None]
+        below = kind.xp.where(limit >> CHANCE_BITS > 0, -1, below)
+        columns = (below[..., None] >> kind.arange(32) & 1).reshape(len(below), width, -1)[..., :height]
+        return kind.xp.moveaxis(columns, -1, -2) != 0
 
 
 def _bordered(rows: tuple[tuple[int, ...], ...], kind: ArrayKind) -> Array:

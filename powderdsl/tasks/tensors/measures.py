@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any
 
 import torch
@@ -276,7 +275,7 @@ def _value(scalar: Expr, facts: Facts) -> Tensor:
     """The same, or float64 [] where all worlds have the same."""
     match scalar.op:
         case "const":
-            return _constant(float(scalar.value), facts.now.device)
+            return torch.full((), float(scalar.value), dtype=torch.float64, device=facts.now.device)
         case "measure":
             return facts.now[:, facts.measures[scalar.value]]
         case "action":
@@ -291,11 +290,6 @@ def _value(scalar: Expr, facts: Facts) -> Tensor:
     ):
         return found.masked_fill(args[1] == 0, 0)
     return found
-
-
-@lru_cache(1024)
-def _constant(value: float, device: torch.device) -> Tensor:
-    return torch.tensor(value, dtype=torch.float64, device=device)
 
 
 _VALUES: Mapping[str, Callable[..., Tensor]] = {

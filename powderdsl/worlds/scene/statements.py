@@ -128,14 +128,8 @@ def read_statement(line: Span, reporter: Reporter) -> Statement | None:
     return Statement(painted.kind, numbers, tree.span, choice, name, region, over)
 
 
-def read_shape(line: Span, reporter: Reporter) -> Statement | None:
-    """The shape of a region: a statement without an element. None after reporting PD605 or PD606."""
-    tree = read_line(line, "shape", reporter)
-    return None if tree is None else shape_of(tree, reporter)
-
-
 def shape_of(tree: Syntax, reporter: Reporter) -> Statement | None:
-    """The shape of syntax; None after reporting PD606."""
+    """The shape of a region: a statement without an element. None after reporting PD606."""
     numbers = _numbers(tree, tree.children, reporter)
     return None if numbers is None else Statement(tree.kind, numbers, tree.span)
 
