@@ -138,8 +138,11 @@ def test_a_test_tries_five_seeds_or_its_own(folder):
         + TESTS.replace("grit", "seeded").replace("G", "S")
         + "      seed: 7\n"
     )
-    results = run_examples(package.load("core", "grit.yaml", "seeded.yaml"))
-    seeds = {result.example.pack: result.seeds for result in results}
+    worlds = []
+    results = run_examples(package.load("core", "grit.yaml", "seeded.yaml"), seen=worlds.append)
+    seeds = {
+        result.example.pack: tuple(world.seed.tolist()) for result, world in zip(results, worlds, strict=True)
+    }
     assert seeds["grit"] == SEEDS
     assert seeds["seeded"] == (7,)
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from itertools import accumulate
 from typing import TYPE_CHECKING, Any
 
 from powderdsl.arrays import NDArray, np
-from powderdsl.diagnostics import Span
 from powderdsl.model import reference
 from powderdsl.model.check import restricted, without
 from powderdsl.model.examples import direction_word
@@ -44,7 +42,6 @@ class ExampleResult:
     """
 
     example: Example
-    seeds: tuple[int, ...]
     problem: str = ""
     seed: int = 0
     step: int = 0
@@ -71,70 +68,51 @@ def run_examples(
 
     A test runs with its own seed, or with each of SEEDS. It passes if the last world looks as `expect` says, its
     fields hold what `expect_fields` says, every condition under `always` holds in every cell after every step, and
-    what `often` says happens about as often. Tests of one size run as one batch. One that does not pass runs again with
-    the packs of its scope alone, if more are loaded.
+    what `often` says happens about as often. One that does not pass runs again with the packs of its scope alone, if
+    more are loaded.
 
     Args:
         sim: what runs them, instead of a new simulator of this ruleset on a backend that starts at once.
-        seen: called with the worlds of each batch at its end.
+        seen: called with the worlds of each test at its end.
     """
     sim = sim or compile(ruleset, starting_backend("cpu"), tensors=False)
-    sizes: dict[tuple[int, int], list[int]] = {}
-    for number, example in enumerate(ruleset.tests):
-        sizes.setdefault((len(example.given), len(example.given[0])), []).append(number)
-    results: dict[int, ExampleResult] = {}
-    for numbers in sizes.values():
-        batch = [_Running.of(ruleset.tests[number], sim) for number in numbers]
-        found = _run(batch, sim, seen)
-        results |= dict(zip(numbers, found, strict=True))
-    return _judged([results[number] for number in range(len(ruleset.tests))], ruleset, sim)
+    results = [_result(example, sim, seen) for example in ruleset.tests]
+    return [replace(result, added=_added(result, ruleset, sim)) for result in results]
 
 
-def _judged(results: list[ExampleResult], ruleset: Ruleset, sim: Simulator) -> list[ExampleResult]:
-    """The results; a test that fails only with packs outside its scope names these packs."""
-    scopes: dict[tuple[str, ...], list[ExampleResult]] = {}
-    for result in results:
-        scope = result.example.scope
-        if not result.passed and scope and ruleset.added_to(scope):
-            scopes.setdefault(scope, []).append(result)
-    added: dict[Span, tuple[str, ...]] = {}
-    fewer: dict[str, list[Span]] = {}
-    for scope, wrong in scopes.items():
-        others = ruleset.added_to(scope)
-        right = _passing(restricted(ruleset, scope), {result.example.span for result in wrong}, sim)
-        added |= dict.fromkeys(right, others)
-        for pack in others[:MOST] if len(others) > 1 else ():
-            fewer.setdefault(pack, []).extend(right)
-    alone: dict[Span, tuple[str, ...]] = {}
-    for pack in (pack for pack in ruleset.packs if fewer.get(pack)):
-        for place in _passing(without(ruleset, pack), fewer[pack], sim):
-            alone[place] = (*alone.get(place, ()), pack)
-    added |= alone
-    return [replace(one, added=added.get(one.example.span, ())) for one in results]
-
-
-def _passing(ruleset: Ruleset | None, places: Collection[Span], sim: Simulator) -> tuple[Span, ...]:
-    """The places of the tests that pass with other rules."""
-    tests = tuple(replace(one, scope=()) for one in ruleset.tests if one.span in places) if ruleset else ()
-    if ruleset is None or not tests:
+def _added(result: ExampleResult, ruleset: Ruleset, sim: Simulator) -> tuple[str, ...]:
+    """The packs outside a failed test's scope with which it fails; those without each of which it passes, if any."""
+    scope = result.example.scope
+    added = ruleset.added_to(scope) if scope and not result.passed else ()
+    if not added or not _passes(result.example, restricted(ruleset, scope), sim):
         return ()
-    results = run_examples(replace(ruleset, tests=tests), sim=sim.of(ruleset))
-    return tuple(dict.fromkeys(result.example.span for result in results if result.passed))
+    some = added[:MOST] if len(added) > 1 else ()
+    return tuple(pack for pack in some if _passes(result.example, without(ruleset, pack), sim)) or added
 
 
-def start_of(example: Example, sim: Simulator, seed: int) -> World:
-    """The start world of a test, one of a seed."""
-    return _started([(example, seed)], sim)
+def _passes(example: Example, ruleset: Ruleset | None, sim: Simulator) -> bool:
+    """Whether a test passes with other rules, which may lack it."""
+    tests = [one for one in ruleset.tests if one.span == example.span] if ruleset is not None else []
+    return ruleset is not None and any(_result(one, sim.of(ruleset), None).passed for one in tests)
 
 
-def _started(worlds: Sequence[tuple[Example, int]], sim: Simulator) -> World:
-    """The start worlds of some tests of one size, with a seed each."""
-    grids = []
-    for example, _ in worlds:
-        ids = _ids(example, sim.ruleset)
-        grids.append([[ids[char] for char in row] for row in example.given])
-    world = sim.world(np.array(grids, dtype=np.uint8), seed=[seed for _, seed in worlds])
-    return with_fields(world, [example for example, _ in worlds])
+def start_of(example: Example, sim: Simulator, *seeds: int) -> World:
+    """The start worlds of a test, one for each seed."""
+    ids = _ids(example, sim.ruleset)
+    grid = np.array([[ids[char] for char in row] for row in example.given], dtype=np.uint8)
+    world = sim.world(np.stack([grid] * len(seeds)), seed=list(seeds))
+    table = {slot.name: slot for slot in sim.slots}
+    fields = {}
+    for drawn in example.fields:
+        values = sim.kind.to_numpy(world.state[drawn.name]).copy()
+        may_hold = holding(sim.ruleset, table[drawn.name], grid)
+        for row, cells in enumerate(drawn.cells):
+            for column, cell in enumerate(cells):
+                if cell and (may_hold[row, column] or not drawn.everywhere):
+                    lows = np.array([low for low, _ in cell])
+                    values[..., row, column] = lows if values.ndim == 4 else lows[0]
+        fields[drawn.name] = values
+    return sim.replace(world, **fields) if fields else world
 
 
 def _ids(example: Example, ruleset: Ruleset) -> dict[str, int]:
@@ -143,126 +121,63 @@ def _ids(example: Example, ruleset: Ruleset) -> dict[str, int]:
     return {char: ids[name] for char, name in example.legend}
 
 
-@dataclass(frozen=True)
-class _Running:
-    """A test with what its characters mean, and the seeds it runs with."""
-
-    example: Example
-    ids: Mapping[str, int]
-    seeds: tuple[int, ...]
-
-    @classmethod
-    def of(cls, example: Example, sim: Simulator) -> _Running:
-        return cls(example, _ids(example, sim.ruleset), SEEDS if example.seed is None else (example.seed,))
-
-    def stops(self) -> set[int]:
-        """The steps after which it is looked at: conditions that hold always want every one."""
-        steps = self.example.steps
-        return {steps, *(range(1, steps) if self.example.always else ())}
-
-    def look(self, world: World, step: int) -> ExampleResult | None:
-        """The failure after a step, if any; `world` holds this test's worlds alone."""
-        for index, problem, field in self._problems(world, step):
-            after = _rows(world.sim.kind.to_numpy(world.ids)[index], self.ids, self.example)
+def _result(example: Example, sim: Simulator, seen: Callable[[Any], None] | None) -> ExampleResult:
+    """What comes of a test with its own seed, or with all SEEDS."""
+    seeds = SEEDS if example.seed is None else (example.seed,)
+    world = start = start_of(example, sim, *seeds)
+    result = ExampleResult(example)
+    now = 0
+    for stop in (*(range(1, example.steps) if example.always else ()), example.steps):
+        world = sim.step(world, steps=stop - now)
+        now = stop
+        problem = next(_problems(example, world, stop), None)
+        if problem is not None:
+            index, words, field = problem
+            after = _rows(world.sim.kind.to_numpy(world.ids)[index], example, sim.ruleset)
             drawn = field_rows(field, world, index) if field else ()
-            return ExampleResult(
-                self.example, self.seeds, problem, self.seeds[index], step, after, field, drawn
-            )
-        return None
+            result = ExampleResult(example, words, seeds[index], stop, after, field, drawn)
+            break
+    if seen is not None:
+        seen(world)
+    if example.often and result.passed:
+        first = start.select(slice(0, 1))
+        words = chance_problem(first, example.steps, example.often, seeds[0])
+        result = ExampleResult(example, words, seeds[0], example.steps) if words else result
+    return result
 
-    def _problems(self, world: World, step: int) -> Iterator[tuple[int, str, str]]:
-        """The world that is wrong, how, and the field that is not as expected, if one is."""
-        example = self.example
-        for condition in example.always if step else ():
-            fails = ~reference.evaluate(condition, world_context(world, condition))
-            if fails.any():
-                index, row, column = (int(part[0]) for part in np.nonzero(fails))
-                words = one_line(condition.span) if condition.span else "a condition"
-                yield index, f"`{words}` does not hold at row {row}, column {column}", ""
-        if step < example.steps:
-            return
-        wanted = self._wanted()
+
+def _problems(example: Example, world: World, step: int) -> Iterator[tuple[int, str, str]]:
+    """The world that is wrong after a step, how, and the field that is not as expected, if one is."""
+    for condition in example.always if step else ():
+        fails = ~reference.evaluate(condition, world_context(world, condition))
+        if fails.any():
+            index, row, column = (int(part[0]) for part in np.nonzero(fails))
+            words = one_line(condition.span) if condition.span else "a condition"
+            yield index, f"`{words}` does not hold at row {row}, column {column}", ""
+    if step < example.steps:
+        return
+    ids = {**_ids(example, world.sim.ruleset), ANYTHING: -1}
+    wanted = np.array([[ids[char] for char in row] for row in example.expect or ()], np.int16)
+    if wanted.size:
         differs = (world.sim.kind.to_numpy(world.ids) != wanted) & (wanted >= 0)
         if differs.any():
             index, row, column = (int(part[0]) for part in np.nonzero(differs))
-            found, asked = int(world.ids[index, row, column]), int(wanted[row, column])
+            there, asked = int(world.ids[index, row, column]), int(wanted[row, column])
             names = {element.id: element.name for element in world.sim.ruleset.elements}
-            yield index, f"row {row}, column {column} is `{names[found]}`, not `{names[asked]}`", ""
-        for grid in example.expect_fields:
-            problem = field_problem(grid, world)
-            if problem is not None:
-                yield problem[0], f"`{grid.name}` in {problem[1]}", grid.name
-
-    def _wanted(self) -> NDArray[np.int16]:
-        """The ids that `expect` asks for, int16 [H, W]; −1 where anything will do."""
-        rows = self.example.expect or [ANYTHING * len(row) for row in self.example.given]
-        return np.array(
-            [[-1 if char == ANYTHING else self.ids[char] for char in row] for row in rows], np.int16
-        )
+            yield index, f"row {row}, column {column} is `{names[there]}`, not `{names[asked]}`", ""
+    for grid in example.expect_fields:
+        problem = field_problem(grid, world)
+        if problem is not None:
+            yield problem[0], f"`{grid.name}` in {problem[1]}", grid.name
 
 
-def _run(batch: list[_Running], sim: Simulator, seen: Callable[[Any], None] | None) -> list[ExampleResult]:
-    """Tests of one size, all at once: each has a slice of the batch."""
-    world = _started([(one.example, seed) for one in batch for seed in one.seeds], sim)
-    ends = list(accumulate(len(one.seeds) for one in batch))
-    results: dict[int, ExampleResult] = {}
-    now = 0
-    for stop in sorted(set[int]().union(*(one.stops() for one in batch))):
-        world = sim.step(world, steps=stop - now)
-        now = stop
-        for number, one in enumerate(batch):
-            if number in results or stop not in one.stops():
-                continue
-            own = world.select(slice(ends[number] - len(one.seeds), ends[number]))
-            problem = one.look(own, stop)
-            if problem is not None:
-                results[number] = problem
-    if seen is not None:
-        seen(world)
-    for number, one in enumerate(batch):
-        if one.example.often and number not in results:
-            seed = one.seeds[0]
-            start = start_of(one.example, sim, seed)
-            problem_of = chance_problem(start, one.example.steps, one.example.often, seed)
-            if problem_of:
-                results[number] = ExampleResult(one.example, one.seeds, problem_of, seed, one.example.steps)
-    return [results.get(number, ExampleResult(one.example, one.seeds)) for number, one in enumerate(batch)]
-
-
-def _rows(world: NDArray[np.uint8], ids: Mapping[str, int], example: Example) -> tuple[str, ...]:
+def _rows(world: NDArray[np.uint8], example: Example, ruleset: Ruleset) -> tuple[str, ...]:
     """A world in characters. Of two for the same element, the one that the test itself uses is taken."""
     used = "".join([*example.given, *(example.expect or ())])
     characters: dict[int, str] = {}
-    for char in sorted(ids, key=lambda char: char not in used):
-        characters.setdefault(ids[char], char)
+    for char, number in sorted(_ids(example, ruleset).items(), key=lambda pair: pair[0] not in used):
+        characters.setdefault(number, char)
     return tuple("".join(characters[number] for number in row) for row in world.tolist())
-
-
-def with_fields(world: World, examples: Sequence[Example]) -> World:
-    """Fresh worlds with the fields that their tests draw; `examples` has the test of each world."""
-    names = dict.fromkeys(grid.name for example in examples for grid in example.fields)
-    slots = {slot.name: slot for slot in world.sim.slots}
-    changed = {}
-    to_numpy = world.sim.kind.to_numpy
-    for name in names:
-        values = to_numpy(world.state[name]).copy()
-        may_hold = holding(world.sim.ruleset, slots[name], to_numpy(world.ids))
-        for index, example in enumerate(examples):
-            for grid in example.fields:
-                if grid.name == name:
-                    _draw(grid, values, index, may_hold[index])
-        changed[name] = values
-    found = world.sim.replace(world, **changed) if changed else world
-    return found
-
-
-def _draw(grid: FieldGrid, values: NDArray[Any], world: int, may_hold: NDArray[np.bool_]) -> None:
-    """Put the drawn values into those of one of some worlds, [B, H, W] or [B, 2, H, W]."""
-    for row, cells in enumerate(grid.cells):
-        for column, cell in enumerate(cells):
-            if cell and (may_hold[row, column] or not grid.everywhere):
-                drawn = [low for low, _ in cell] if values.ndim == 4 else cell[0][0]
-                values[(world, ..., row, column)] = drawn
 
 
 def field_problem(grid: FieldGrid, world: World) -> tuple[int, str] | None:
