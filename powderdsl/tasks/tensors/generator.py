@@ -121,7 +121,7 @@ class _Draws:
         self.drawn: Iterator[Array] = iter(())
         if wanted:
             counters = kind.arange(repeats)[:, None] * _NUMBERS + kind.arange(wanted)
-            drawn = hashes.draw(statement, counters.reshape(-1)).reshape(-1, repeats, wanted)
+            drawn = hashes.draw(statement, counters.reshape(-1)).reshape(-1, *counters.shape)
             self.drawn = iter(kind.xp.moveaxis(drawn, -1, 0))
         self.choice = self.uniform(0, choices - 1) if choices > 1 else None
         values = [None if amount is None else self.value(amount) for amount in amounts]
@@ -230,6 +230,8 @@ class WorldMaker:
             if self.kind.on_cpu and repeats > 1:
                 # Repetitions that no world of the batch has are not drawn.
                 repeats = int(count.max()) if prod(count.shape) else 0
+            if repeats == 0:
+                continue
             active = xp.broadcast_to(self.kind.arange(repeats) < count, (batch, repeats))
             local = self._lets(group.lets, hashes, repeats, names)
             painters = [_Painter(self, one, hashes, local, active) for one in group.drawings]

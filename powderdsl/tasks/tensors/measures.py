@@ -26,12 +26,6 @@ from powderdsl.tasks.task import Goal, Measure
 from powderdsl.tasks.tensors.generator import NOTHING
 from powderdsl.worlds.raster import Size
 
-Window = tuple[int, int, int, int]
-"""First row, the one after the last, first column, the one after the last."""
-
-_LOOKING = ("look", "count", "sum", "inside", "coordinate")
-"""Operations that read more than the cell itself: in a window they would give something else."""
-
 
 def scalars_of(goal: Goal) -> list[Expr]:
     """Every part of a goal's expressions."""
@@ -48,7 +42,7 @@ class Meter:
     """Measures made executable for one ruleset and size.
 
     Args:
-        fixed: the regions that are the same in all worlds, bool [1, H, W]: only their window is looked at.
+        fixed: the regions that are the same in all worlds, bool [1, H, W].
     """
 
     def __init__(
@@ -62,14 +56,8 @@ class Meter:
         self.ruleset, self.measures, self.size, self.device = ruleset, measures, size, device
         self._fixed = fixed
         self._counts: tuple[NativeProgram, CellCounts | None] | None = None
-        groups: dict[Window, list[int]] = {}
-        for number, measure in enumerate(measures):
-            if measure.value is not None:
-                groups.setdefault(_window(measure, size, fixed), []).append(number)
-        self._parts = [
-            _Part(ruleset, [(i, measures[i]) for i in numbers], window, device)
-            for window, numbers in groups.items()
-        ]
+        values = [(number, measure) for number, measure in enumerate(measures) if measure.value is not None]
+        self._cells = _Cells(ruleset, values, size, device) if values else None
 
     def take(
         self,
@@ -86,20 +74,19 @@ class Meter:
             counts = self._counts[1]
             if counts is not None:
                 return counts.of(state.program.library, state.handle, batch)
-        every = self._params(params, batch)
-        found: list[Tensor] = [torch.zeros(0)] * len(self.measures)
-        for part in self._parts:
-            for number, cells in part.cells(world, regions, every).items():
-                found[number] = self._reduced(self.measures[number], cells, part.window, regions)
+        cells = self._cells.of(world, regions, params) if self._cells is not None else {}
+        columns = []
         for number, measure in enumerate(self.measures):
-            if measure.target is not None:
-                target = targets[measure.target]
-                wanted = (target != NOTHING).sum((1, 2)).double()
-                same = (world.state["element"] == target).sum((1, 2)).double()
-                found[number] = same / wanted.clamp(min=1)
-        if not found:
+            if measure.target is None:
+                columns.append(self._reduced(measure, cells[number], regions))
+                continue
+            target = targets[measure.target]
+            wanted = (target != NOTHING).sum((1, 2)).double()
+            same = (world.state["element"] == target).sum((1, 2)).double()
+            columns.append(same / wanted.clamp(min=1))
+        if not columns:
             return torch.zeros(batch, 0, dtype=torch.float64, device=self.device)
-        return torch.stack([one.expand(batch) for one in found], 1)
+        return torch.stack([column.expand(batch) for column in columns], 1)
 
     def _cell_counts(self, program: NativeProgram) -> CellCounts | None:
         """What counts all measures in packed worlds, if they are numbers of cells that bit planes show."""
@@ -116,8 +103,10 @@ class Meter:
             ]
             masks = {name: pack(cells[0]) for name, cells in self._fixed.items()}
             masks |= {REGION_LET + name: words for name, words in masks.items()}
-            windows = [_window(one, self.size, self._fixed) for _, one in values]
-            rows = min(top for top, *_ in windows), max(bottom for _, bottom, *_ in windows)
+            everywhere = torch.ones(1, *self.size, dtype=torch.bool, device=self.device)
+            cells = torch.cat([self._fixed.get(str(one.region), everywhere) for _, one in values])
+            counted_rows = cells.any(2).any(0).nonzero()[:, 0].tolist() or [0]
+            rows = counted_rows[0], counted_rows[-1] + 1
             return CellCounts(counted, program.layout.planes, masks, rows)
         except (NotBits, KeyError, ValueError):
             return None  # floats, neighbors, other regions: tensors show them
@@ -131,27 +120,16 @@ class Meter:
         return float(max(1, cells))
 
     def cells(self, number: int, world: World, regions: Mapping[str, Tensor]) -> Tensor:
-        """The cells that a measure counts, bool [B, H, W]. The meter must have no fixed regions, so that it sees all."""
+        """The cells that a measure counts, bool [B, H, W]."""
+        assert self._cells is not None
+        cells = self._cells.of(world, regions, None)[number].expand(len(world.step), *self.size)
         region = self.measures[number].region
-        (part,) = (one for one in self._parts if number in one.numbers)
-        found = part.cells(world, regions, self._params(None, len(world.step)))[number]
-        found = found.expand(len(world.step), *self.size)
-        return found if region is None else found & regions[region]
+        return cells if region is None else cells & regions[region]
 
-    def _params(self, params: Mapping[str, Any] | None, batch: int) -> dict[str, Tensor]:
-        values = {one.name: (params or {}).get(one.name, float(one.default)) for one in self.ruleset.params}
-        return {
-            name: torch.as_tensor(value, dtype=torch.float64, device=self.device).expand(batch)
-            for name, value in values.items()
-        }
-
-    def _reduced(
-        self, measure: Measure, cells: Tensor, window: Window, regions: Mapping[str, Tensor]
-    ) -> Tensor:
-        """One number a world, float64 [B], of cells [B, h, w] in a window."""
-        mask = None
-        if measure.region is not None:
-            mask = _cut(regions[measure.region], window)
+    def _reduced(self, measure: Measure, cells: Tensor, regions: Mapping[str, Tensor]) -> Tensor:
+        """One number a world, float64 [B], of cells [B, H, W]."""
+        mask = None if measure.region is None else regions[measure.region]
+        if mask is not None:
             cells = cells & mask if cells.dtype == torch.bool else cells * mask
         exact = torch.int32 if cells.dtype == torch.bool else torch.int64  # counts: half the time
         total = cells.sum((1, 2), dtype=torch.float64 if cells.dtype.is_floating_point else exact).double()
@@ -160,27 +138,9 @@ class Meter:
                 count = self.size[0] * self.size[1] if mask is None else mask.sum((1, 2))
                 return total / torch.as_tensor(count, device=self.device).clamp(min=1)
             case "highest":
-                height = self.size[0] - torch.arange(window[0], window[1], device=self.device)
+                height = self.size[0] - torch.arange(self.size[0], device=self.device)
                 return (cells.any(2) * height).amax(1).double()
         return total
-
-
-def _window(measure: Measure, size: Size, fixed: Mapping[str, Tensor]) -> Window:
-    """The part of the world that a measure looks at: the whole, unless its region is small and fixed."""
-    value = measure.value
-    assert value is not None
-    whole = (0, size[0], 0, size[1])
-    if measure.region not in fixed or any(part.op in _LOOKING for part in value.walk()):
-        return whole
-    rows, columns = (fixed[str(measure.region)][0].any(axis).nonzero()[:, 0] for axis in (1, 0))
-    if not len(rows):
-        return whole
-    return int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
-
-
-def _cut(plane: Tensor, window: Window) -> Tensor:
-    top, bottom, left, right = window
-    return plane[..., top:bottom, left:right]
 
 
 def _types(ruleset: Ruleset) -> dict[str, Type]:
@@ -217,38 +177,40 @@ def _lowered(ruleset: Ruleset, measures: Sequence[tuple[int, Measure]]) -> Progr
     return run_passes(Program(ruleset.name, tuple(rows), params, streams, (graph,)))
 
 
-class _Part:
-    """The cell expressions of one window as one generated function."""
+class _Cells:
+    """The cell expressions of measures as one generated function."""
 
     def __init__(
-        self, ruleset: Ruleset, measures: list[tuple[int, Measure]], window: Window, device: torch.device
+        self, ruleset: Ruleset, measures: list[tuple[int, Measure]], size: Size, device: torch.device
     ):
-        self.window, self.device = window, device
+        self.ruleset, self.size, self.device = ruleset, size, device
         self.numbers = [number for number, _ in measures]
-        program = _lowered(ruleset, measures)
-        source, name, constants = pass_source(program.passes[0], 0)
+        source, name, constants = pass_source(_lowered(ruleset, measures).passes[0], 0)
         self.types = _types(ruleset)
         self.slots = [one for one in self.types if f"state[{one!r}]" in source]
         self.regions = _lets([measure for _, measure in measures])
         self.run: PassFunction = compiled(source, name, constants, device)
 
-    def cells(
-        self, world: World, regions: Mapping[str, Tensor], params: Mapping[str, Tensor]
+    def of(
+        self, world: World, regions: Mapping[str, Tensor], params: Mapping[str, Any] | None
     ) -> dict[int, Tensor]:
-        """The value of each cell of the window, [B, h, w], by the measure's number."""
-        top, bottom, left, right = self.window
+        """The value of each cell, [B, H, W], by the measure's number. `params` are those that differ from the rules' own."""
+        values = {one.name: (params or {}).get(one.name, float(one.default)) for one in self.ruleset.params}
+        every = {
+            name: torch.as_tensor(value, dtype=torch.float64, device=self.device).expand(len(world))
+            for name, value in values.items()
+        }
         none = torch.zeros(0, dtype=torch.int64, device=self.device)
-        shape = (len(world), bottom - top, right - left)
-        kernels = Kernels(shape, self.device, params, {}, {}, none, none, world.step)
+        kernels = Kernels((len(world), *self.size), self.device, every, {}, {}, none, none, world.step)
         planes: dict[str, Tensor] = {}
         for name in self.slots:
             vector, component = component_of(name)
             plane = world.state[name] if component is None else world.state[vector][:, component]
-            planes[name] = _cut(plane, self.window).to(_WORKING[self.types[name].name])
+            planes[name] = plane.to(_WORKING[self.types[name].name])
         for name in self.regions:
-            planes[name] = _cut(regions[name.removeprefix(REGION_LET)], self.window)
-        found = self.run(kernels, planes)
-        return {number: found[f"measure {number}"] for number in self.numbers}
+            planes[name] = regions[name.removeprefix(REGION_LET)]
+        cells = self.run(kernels, planes)
+        return {number: cells[f"measure {number}"] for number in self.numbers}
 
 
 _WORKING = {"flag": torch.bool, "int": torch.int32, "real": torch.float32}
