@@ -35,21 +35,19 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> PackFile | None:
     """YAML files that start as packs and rulesets do. Other files are ignored."""
-    if file_path.suffix not in (".yaml", ".yml"):
-        return None
-    try:
-        text = _text(file_path)
-    except (OSError, UnicodeDecodeError):
-        return None
-    return PackFile.from_parent(parent, path=file_path) if HEAD.search(text) else None
+    is_pack = file_path.suffix in (".yaml", ".yml") and HEAD.search(_text(file_path))
+    return PackFile.from_parent(parent, path=file_path) if is_pack else None
 
 
 def _text(path: Path) -> str:
-    """The text of a rule file. Raises OSError, UnicodeDecodeError."""
+    """The text of a rule file, nothing of one that cannot be read."""
     from powderdsl.syntax.sources import MAX_BYTES
     from powderdsl.system.reading import read_bytes
 
-    return read_bytes(path, MAX_BYTES).decode("utf-8")
+    try:
+        return read_bytes(path, MAX_BYTES).decode("utf-8")
+    except (OSError, UnicodeDecodeError):
+        return ""
 
 
 def home_of(path: Path) -> str:
@@ -58,15 +56,12 @@ def home_of(path: Path) -> str:
     if re.search(r"^ruleset:", text, re.MULTILINE):
         return str(path)
     for other in sorted(path.parent.glob("*.yaml")):
-        try:
-            head = _text(other)
-        except (OSError, UnicodeDecodeError):
-            continue
+        head = _text(other)
         if re.search(r"^ruleset:", head, re.MULTILINE) and path.stem in _listed("packs", head):
             return str(other)
     beside = {name: path.parent / f"{name}.yaml" for name in _listed("needs", text)}
-    found = [str(file) if file.is_file() else name for name, file in beside.items()]
-    return "+".join([*found, str(path)])
+    packs = [str(file) if file.is_file() else name for name, file in beside.items()]
+    return "+".join([*packs, str(path)])
 
 
 def _listed(key: str, text: str) -> list[str]:

@@ -14,7 +14,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache, partial
-from itertools import groupby, product
+from itertools import product
 from multiprocessing import active_children, get_context, parent_process
 from threading import Thread
 
@@ -50,10 +50,6 @@ Settings = tuple[tuple[str, str], ...]
 
 WORLDS = 1000
 """Random worlds that invariants are tried on, as many as `powderdsl test` tries."""
-
-
-class Invalid(Exception):
-    """A text that is not a rule file: a mistake of spelling, not of meaning."""
 
 
 def is_generated(example: Example) -> bool:
@@ -102,12 +98,12 @@ class Original:
             for mutant in mutants_of(pack, self.packs)
         ]
 
-    def mutated(self, mutant: Mutant) -> tuple[Ruleset, Counter[str]]:
-        """The model with the mistake and its warnings. Raises CompileError; Invalid if it cannot even be read."""
+    def mutated(self, mutant: Mutant) -> tuple[Ruleset, Counter[str]] | None:
+        """The model with the mistake and its warnings. None if its text is no rule file; raises CompileError."""
         reporter = Reporter()
         decl = read_file(Source(mutant.source.name, mutant.text), reporter)
         if reporter.has_errors or not isinstance(decl, PackDecl):
-            raise Invalid
+            return None
         packs = [decl if pack.name.text == mutant.pack else pack for pack in self.packs]
         ruleset = set_params(check(packs, self.declaration, reporter), dict(self.settings), reporter)
         reporter.raise_if_errors()
@@ -125,10 +121,6 @@ class Original:
         )
 
     @cached_property
-    def meaning(self) -> str:
-        return meaning(self.ruleset)
-
-    @cached_property
     def lowered(self) -> str:
         return lowered(self.ruleset)
 
@@ -141,6 +133,16 @@ class Original:
     def samples(self) -> list[Start]:
         """The worlds that `powderdsl test` tries first."""
         return list(random_samples(self.ruleset, 0, WORLDS))
+
+    @cached_property
+    def broken(self) -> list[Invariant]:
+        """Invariants that it breaks itself: what more packs change says nothing about a mutant."""
+        return [
+            one
+            for one in self.ruleset.invariants
+            if _is_broken(one, self, self.sim)
+            or any(_broken_in(batch, self.ruleset, [one], batch.states) for batch in self.batches())
+        ]
 
     def batches(self) -> Iterator[Batch]:
         """The samples without each set with the original's states, which are kept: the first use runs them."""
@@ -210,15 +212,16 @@ class Verdict:
 def judge(original: Original, mutant: Mutant) -> Verdict:
     """Hold a mutant against everything that its composition says about itself, cheapest first."""
     try:
-        ruleset, warnings = original.mutated(mutant)
-    except Invalid:
-        return Verdict("invalid")
+        mutated = original.mutated(mutant)
     except CompileError as error:
         return Verdict("killed", "check", error.diagnostics[0].code)
+    if mutated is None:
+        return Verdict("invalid")
+    ruleset, warnings = mutated
     new = warnings - original.warnings
     if new:
         return Verdict("killed", "check", min(new))
-    if meaning(ruleset) == original.meaning:
+    if meaning(ruleset) == meaning(original.ruleset):
         return Verdict("equivalent", "the same model")
     sim = compile(ruleset, backend=AT_ONCE)
     differs = True
@@ -246,27 +249,19 @@ def judge(original: Original, mutant: Mutant) -> Verdict:
 def failed_test(original: Original, sim: Simulator, pack: str, *, quick: bool) -> Example | None:
     """A test that the original passes and the mutant fails: one written by hand, if there is one.
 
-    `quick`: only tests that cost less than invariants; otherwise only the others. Tests run in groups: by hand before
-    generated, exact before counted, each of which runs many worlds, those of the mutated pack, short ones.
+    `quick`: only tests that cost less than invariants; otherwise only the others. Exact ones run before counted ones,
+    each of which runs many worlds, those of the mutated pack before others, short ones before long ones.
     """
 
-    def group(example: Example) -> tuple[bool, bool, bool, bool, str]:
-        is_counted, is_long = bool(example.often), example.steps > FEW_STEPS
-        alone = example.name if is_counted else ""
-        return is_generated(example), is_counted, example.pack != pack, is_long, alone
+    def cost(example: Example) -> tuple[bool, bool, bool, bool]:
+        return is_generated(example), bool(example.often), example.steps > FEW_STEPS, example.pack != pack
 
-    def is_quick(example: Example) -> bool:
-        return not (is_generated(example) or example.often or example.steps > FEW_STEPS)
-
-    tests = [
-        replace(example, scope=())  # which added packs make a test fail does not matter here
-        for example in sim.ruleset.tests
-        if is_quick(example) == quick and example.name not in original.failing
-    ]
-    for _, some in groupby(sorted(tests, key=group), group):
-        for result in run_examples(replace(sim.ruleset, tests=tuple(some)), sim=sim):
+    for example in sorted(sim.ruleset.tests, key=cost):
+        if (not any(cost(example)[:3])) == quick and example.name not in original.failing:
+            alone = replace(example, scope=())  # which added packs make a test fail does not matter here
+            (result,) = run_examples(replace(sim.ruleset, tests=(alone,)), sim=sim)
             if not result.passed:
-                return result.example
+                return example
     return None
 
 
@@ -280,9 +275,8 @@ def broken_invariant(original: Original, sim: Simulator) -> tuple[Invariant | No
     """
     ruleset = sim.ruleset
     alike = _declared(ruleset) == _declared(original.ruleset)
-    broken = original_breaks(original)
-    kept = [one for number, one in enumerate(ruleset.invariants) if number not in broken]
-    single = [one for one in kept if not is_paired(one.claim)]
+    known = {one.span.text for one in original.broken}
+    kept = [one for one in ruleset.invariants if one.span.text not in known]
     any_differs = False
     params = [[param.name for param in rules.params] for rules in (original.ruleset, ruleset)]
     if slots(original.ruleset) == slots(ruleset) and params[0] == params[1]:  # worlds hold the same
@@ -290,14 +284,13 @@ def broken_invariant(original: Original, sim: Simulator) -> tuple[Invariant | No
             states, _ = run_sample(sim, batch.sample, batch.steps)
             differs = first_difference(batch.states, states) > 0
             any_differs |= bool(differs.any())
-            asked = differs if alike else np.ones_like(differs)
-            broken_one = _broken_in(batch, sim.ruleset, single, states, asked)
-            if broken_one is not None:
-                return broken_one, True
-            if any_differs and not single:
+            broken = _broken_in(batch, ruleset, kept, states, differs if alike else None)
+            if broken is not None:
+                return broken, True
+            if any_differs and not kept:
                 break
-    broken_one = next((one for one in kept if is_paired(one.claim) and _is_broken(one, original, sim)), None)
-    return broken_one, any_differs or broken_one is not None
+    broken = next((one for one in kept if _is_broken(one, original, sim)), None)
+    return broken, any_differs or broken is not None
 
 
 def _declared(ruleset: Ruleset) -> tuple[object, ...]:
@@ -310,46 +303,33 @@ def _declared(ruleset: Ruleset) -> tuple[object, ...]:
 
 def _is_broken(invariant: Invariant, original: Original, sim: Simulator) -> bool:
     """Whether some world breaks an invariant that needs more than one run of it."""
-    ruleset = sim.ruleset
-    if isinstance(invariant.claim, Local) and horizon(ruleset) <= invariant.claim.radius:
+    ruleset, claim = sim.ruleset, invariant.claim
+    if not is_paired(claim) or (isinstance(claim, Local) and horizon(ruleset) <= claim.radius):
         return False
-    if isinstance(invariant.claim, Symmetric) and ruleset.streams:
+    if isinstance(claim, Symmetric) and ruleset.streams:
         return False  # the same draws may be used in another way, and frequencies take thousands of worlds
     runs = Runner(ruleset, sim=sim)
     samples = (sample.without(invariant.without, ruleset) for sample in original.samples[:PAIRED])
-    return any(bool(breaks(invariant.claim, runs, sample, 1).first.any()) for sample in samples)
-
-
-@lru_cache(maxsize=4)
-def original_breaks(original: Original) -> frozenset[int]:
-    """Places of invariants that the original itself breaks: what more packs change says nothing about a mutant."""
-    ruleset, sim = original.ruleset, original.sim
-
-    def is_broken(invariant: Invariant) -> bool:
-        if is_paired(invariant.claim):
-            return _is_broken(invariant, original, sim)
-        return any(
-            _broken_in(batch, ruleset, [invariant], batch.states, np.ones(len(batch.sample), bool))
-            for batch in original.batches()
-        )
-
-    return frozenset(number for number, one in enumerate(ruleset.invariants) if is_broken(one))
+    return any(bool(breaks(claim, runs, sample, 1).first.any()) for sample in samples)
 
 
 def _broken_in(
-    batch: Batch, ruleset: Ruleset, invariants: list[Invariant], states: list[State], asked: Array
+    batch: Batch,
+    ruleset: Ruleset,
+    invariants: list[Invariant],
+    states: list[State],
+    asked: Array | None = None,
 ) -> Invariant | None:
-    """The first of some invariants that one of the worlds `asked`, bool [B], breaks."""
-    tried = [
-        one
-        for one in invariants
-        if one.without == batch.without and steps_for(one.claim, batch.steps) <= batch.steps
-    ]
-    if not tried or not asked.any():
-        return None
-    sample = batch.sample.select(asked)
-    some = [{name: values[asked] for name, values in state.items()} for state in states]
-    return next((one for one in tried if look(one.claim, ruleset, sample, some).first.any()), None)
+    """The first of some invariants of one run that a world breaks; only those `asked`, bool [B], if that is given."""
+    sample = batch.sample
+    if asked is not None:
+        sample = sample.select(asked)
+        states = [{name: values[asked] for name, values in state.items()} for state in states]
+    for one in invariants if len(sample) else ():
+        fits = one.without == batch.without and steps_for(one.claim, batch.steps) <= batch.steps
+        if fits and not is_paired(one.claim) and look(one.claim, ruleset, sample, states).first.any():
+            return one
+    return None
 
 
 # Campaigns
@@ -360,17 +340,13 @@ COUNTED = ("mutants", "equivalent", "killed", *NOTICED, "survived")
 
 def sampled(mutants: list[Mutant], most: int | None, seed: int) -> list[int]:
     """Places of at most `most` mutants, each pack and kind of mistake in proportion, the same for the same seed."""
-    everything = list(range(len(mutants)))
-    if most is None or most >= len(mutants):
-        return everything
     strata: dict[tuple[str, str], list[int]] = {}
-    for number in everything:
-        strata.setdefault((mutants[number].pack, mutants[number].operator), []).append(number)
+    for number, mutant in enumerate(mutants):
+        strata.setdefault((mutant.pack, mutant.operator), []).append(number)
     random = np.random.default_rng(seed)
     ranked: list[tuple[float, int]] = []
     for numbers in strata.values():
-        start = random.random()
-        shares = (np.arange(len(numbers)) + start) / len(numbers)
+        shares = (np.arange(len(numbers)) + random.random()) / len(numbers)
         ranked += zip(shares.tolist(), random.permutation(numbers).tolist(), strict=True)
     return sorted(number for _, number in sorted(ranked)[:most])
 
@@ -445,8 +421,9 @@ def work(
     verdict = judge(original, mutant)
     if verdict.status != "survived" or not worlds:
         return number, verdict
-    ruleset, _ = original.mutated(mutant)
-    sim = compile(ruleset, backend=starting_backend("cpu"))
+    mutated = original.mutated(mutant)
+    assert mutated is not None
+    sim = compile(mutated[0], backend=starting_backend("cpu"))
     world = distinguish(original.sim, sim, focused(original, mutant), seed)
     if world is None:
         return number, verdict

@@ -6,6 +6,7 @@ import hashlib
 import re
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from textwrap import indent
@@ -132,24 +133,18 @@ def _legend(
     loaded. Elements of packs that this one does not need may be absent: the test then waits.
     """
     needed = needs_of({decl.name.text: decl for decl in packs})[pack]
-    chosen = {f"{one.name.text}.{decl.name.text}": decl.glyph for one in packs for decl in one.elements}
+    chosen = {f"{one.name.text}.{decl.name.text}" for one in packs for decl in one.elements if decl.glyph}
+    known = {e.qualified: e.glyph for e in ruleset.elements if e.pack in needed and e.qualified in chosen}
     glyphs: dict[int, str] = {}
     legend = []
-    for element in there:
-        if chosen.get(element.qualified) and element.pack in needed and element.glyph not in glyphs.values():
+    for element in sorted(there, key=lambda element: element.qualified not in known):
+        if element.qualified in known and element.glyph not in glyphs.values():
             glyphs[element.id] = element.glyph
-    for element in there:
-        if element.id in glyphs:
             continue
-        taken = {
-            *glyphs.values(),
-            "?",
-            *(e.glyph for e in ruleset.elements if e.pack in needed and chosen.get(e.qualified)),
-        }
+        taken = {*glyphs.values(), *known.values(), *"?\"'\\#"}
         wanted = [element.glyph, *element.name, *element.name.upper(), *LETTERS]
-        glyph = next(one for one in wanted if one not in taken and one not in "\"'\\#")
-        glyphs[element.id] = glyph
-        legend.append((glyph, element.name if element.pack in needed else f"{element.name}?"))
+        glyphs[element.id] = next(glyph for glyph in wanted if glyph not in taken)
+        legend.append((glyphs[element.id], element.name if element.pack in needed else f"{element.name}?"))
     return glyphs, legend
 
 
@@ -237,59 +232,56 @@ def distinguish(
     """
     known = {slot.name for slot in second.slots}
     names = tuple(slot.name for slot in first.slots if slot.name in known)
-    # Worlds whose fields hold anything that they can, with the usual parameters.
-    fielded = random_samples(first.ruleset, seed, FIELDED) if set(first.slots) == set(second.slots) else ()
-    plain = ((replace(drawn, params={}, step=np.zeros_like(drawn.step)), 2) for drawn in fielded)
-    only_fields: tuple[Start, int] | None = None
-    for sample, steps in chain(fresh_samples(first.ruleset, focus, seed), plain):
-        one, other = (run_sample(sim, sample, steps)[0] for sim in (first, second))
-        for compared in (names[:1], names):
-            when = first_difference(one, other, compared)
+    tries = TRIED_SEEDS if first.ruleset.streams or second.ruleset.streams else 1
+
+    def states(sample: Start, steps: int) -> tuple[list[State], list[State]]:
+        return run_sample(first, sample, steps)[0], run_sample(second, sample, steps)[0]
+
+    def differs(compared: Sequence[str], sample: Start, steps: int) -> Array:
+        return first_difference(*states(sample, steps), compared)
+
+    for compared in (names[:1], names):  # the worlds' elements show more than their fields
+        # Worlds whose fields hold anything that they can, with the usual parameters.
+        fielded = (
+            random_samples(first.ruleset, seed, FIELDED) if set(first.slots) == set(second.slots) else ()
+        )
+        plain = ((replace(drawn, params={}, step=np.zeros_like(drawn.step)), 2) for drawn in fielded)
+        for sample, steps in chain(fresh_samples(first.ruleset, focus, seed), plain):
+            when = differs(compared, sample, steps)
             if not when.any():
                 continue
             soonest = int(np.where(when > 0, when, steps + 1).argmin())
-            smaller = sample.one(soonest), int(when[soonest])
-            if compared == ("element",):
-                return _small(first, second, *smaller, compared)
-            only_fields = only_fields or smaller
-    return None if only_fields is None else _small(first, second, *only_fields, names)
-
-
-def _small(
-    first: Simulator, second: Simulator, sample: Start, steps: int, names: tuple[str, ...]
-) -> Distinction:
-    def judge(some: Start, most: int) -> Array:
-        one, other = (run_sample(sim, some, most)[0] for sim in (first, second))
-        return first_difference(one, other, names)
-
-    tries = TRIED_SEEDS if first.ruleset.streams or second.ruleset.streams else 1
-    small, steps = shrink_while(judge, sample, steps, tries, Work(first.ruleset, WORK))
-    if tries == 1:
-        small = replace(small, seed=np.zeros_like(small.seed))
-    one, other = (run_sample(sim, small, steps)[0][-1] for sim in (first, second))
-    slot = next(name for name in names if (one[name] != other[name]).any())
-    return Distinction(small, steps, slot, one, other)
+            small, steps = shrink_while(
+                partial(differs, compared),
+                sample.one(soonest),
+                int(when[soonest]),
+                tries,
+                Work(first.ruleset, WORK),
+            )
+            if tries == 1:
+                small = replace(small, seed=np.zeros_like(small.seed))
+            one, other = (ran[-1] for ran in states(small, steps))
+            slot = next(name for name in compared if (one[name] != other[name]).any())
+            return Distinction(small, steps, slot, one, other)
+    return None
 
 
 def fresh_samples(ruleset: Ruleset, focus: Sequence[int], seed: int) -> Iterator[tuple[Start, int]]:
     """Worlds and how many steps they run, small ones first."""
-    known = [element.id for element in ruleset.elements]
+    known = np.array([element.id for element in ruleset.elements])
     frames = sorted(unchanging_ids(ruleset))
     for number, (least_rows, least_columns, worlds, steps) in enumerate(ROUNDS):
         rows, columns = fitting(ruleset, least_rows), fitting(ruleset, least_columns)
         random = np.random.default_rng([seed, number])
         ids = np.empty((worlds, rows, columns), np.uint8)
         for group in range(0, worlds, GROUP):
-            palette = _palette(known, focus, KINDS[group // GROUP % len(KINDS)], random)
-            ids[group : group + GROUP] = random.choice(palette, (GROUP, rows, columns))
+            kinds = KINDS[group // GROUP % len(KINDS)]
+            palette = random.permutation(known).tolist()
+            if len(focus) and random.random() < 0.8:
+                palette = [*random.permutation(focus).tolist()[: max(1, kinds - 1)], *palette]
+            ids[group : group + GROUP] = random.choice(
+                [*dict.fromkeys(palette)][:kinds], (GROUP, rows, columns)
+            )
         if frames and min(rows, columns) > 2:
             ids[worlds // 2 :] = framed(ids[worlds // 2 :], frames[0])
         yield Start.fresh(ids).seeded(), steps
-
-
-def _palette(known: list[int], focus: Sequence[int], kinds: int, random: np.random.Generator) -> list[int]:
-    some = random.permutation(np.array(known, np.int64)).tolist()
-    if len(focus) and random.random() < 0.8:
-        kept = random.permutation(np.array(focus, np.int64)).tolist()[: max(1, kinds - 1)]
-        some = [*kept, *(one for one in some if one not in kept)]
-    return some[:kinds]

@@ -12,13 +12,14 @@ from powderdsl.analysis.ledger import AGAINST
 from powderdsl.arrays import np
 from powderdsl.model import reference
 from powderdsl.model.state import slots
-from powderdsl.model.types import Bounded, Claim, Local, Never, Ruleset, Symmetric, Total, Unchanging
+from powderdsl.model.types import Bounded, Claim, Expr, Local, Never, Ruleset, Symmetric, Total, Unchanging
 from powderdsl.testing.generators.cases import Array, Start, fresh, property_table
 from powderdsl.testing.properties.running import (
     Oracle,
     Runs,
     State,
     context,
+    differences,
     turned_back,
     turned_cells,
     turned_sample,
@@ -78,14 +79,14 @@ def breaks(claim: Tested, runs: Runs, sample: Start, steps: int) -> Breaks:
         case Local():
             other, mask = touched(runs.ruleset, sample)
             first, second = (runs.states(start, 1)[-1] for start in (sample, other))
-            return _breaks_of((differences(first, second) & ~near(mask, claim.radius))[None])
+            return _breaks_of([differences(first, second) & ~near(mask, claim.radius)])
         case Symmetric():
-            return _breaks_of(_symmetric(claim, runs, sample)[None])
+            return _breaks_of([_symmetric(claim, runs, sample)])
         case Alike():
-            return _breaks_of(_alike(claim, runs, sample)[None])
+            return _breaks_of([_alike(claim, runs, sample)])
         case Agreement():
             pairs = zip(runs.states(sample, steps), Oracle(runs.ruleset).states(sample, steps), strict=True)
-            return _breaks_of(np.stack([differences(a, b) for a, b in pairs][1:]))
+            return _breaks_of([differences(a, b) for a, b in pairs][1:])
     return look(claim, runs.ruleset, sample, runs.states(sample, steps))
 
 
@@ -97,76 +98,59 @@ def is_paired(claim: Tested) -> bool:
 def look(claim: Tested, ruleset: Ruleset, sample: Start, states: list[State]) -> Breaks:
     """Whether worlds, of which these are the states, break a claim that needs one run only."""
     ids = [state["element"] for state in states]
+
+    def evaluated(expr: Expr) -> list[Array]:
+        contexts = (context(ruleset, state, sample, step) for step, state in enumerate(states))
+        return [reference.evaluate(expr, at) for at in contexts]
+
     match claim:
         case Unchanging():
-            held = [np.isin(one, sorted(claim.ids)) for one in ids[:-1]]
-            return _breaks_of(
-                np.stack([mask & (a != b) for mask, a, b in zip(held, ids, ids[1:], strict=False)])
-            )
+            held = sorted(claim.ids)
+            return _breaks_of([np.isin(old, held) & (old != new) for old, new in pairwise(ids)])
         case Total():
-            return _total(claim, ruleset, sample, states)
+            wrong, masks = AGAINST[claim.trend], []
+            for old, new in pairwise(values.astype(np.int64) for values in evaluated(claim.value)):
+                masks.append(wrong((new - old).sum((1, 2)), 0)[:, None, None] & wrong(new, old))
+            return _breaks_of(masks)
+        case Never() if claim.steps > 1:
+            run, masks = np.zeros(ids[0].shape, np.int64), []
+            for holds in evaluated(claim.condition)[1:]:
+                run = np.where(holds, run + 1, 0)
+                masks.append(run >= claim.steps)
+            return _breaks_of(masks)
         case Never():
-            held = [
-                reference.evaluate(claim.condition, context(ruleset, state, sample, step))
-                for step, state in enumerate(states)
-            ]
-            return _never(claim.steps, held)
+            return _never(evaluated(claim.condition))
         case Bounded():
-            fields = [_field(ruleset, claim.field, state) for state in states]
+            prop = ruleset.property(claim.field)
+            if claim.field in states[0] or prop is None:
+                fields = [state[claim.field] for state in states]
+            else:
+                fields = [property_table(ruleset, prop)[cells] for cells in ids]
             outside = [np.asarray((values < claim.lo) | (values > claim.hi)) for values in fields]
-            return _never(1, [np.asarray(mask.any(1)) if mask.ndim == 4 else mask for mask in outside])
+            return _never([np.asarray(mask.any(1)) if mask.ndim == 4 else mask for mask in outside])
         case KnownIds():
             known = [element.id for element in ruleset.elements]
             named = [slot.name for slot in slots(ruleset) if slot.kind.name == "element"]
-            masks = [reduce(or_, [~np.isin(state[name], known) for name in named]) for state in states[1:]]
-            return _breaks_of(np.stack(masks))
+            return _breaks_of(
+                [reduce(or_, [~np.isin(state[name], known) for name in named]) for state in states[1:]]
+            )
     raise TypeError(f"{type(claim).__name__} needs more than one run")
 
 
-def _breaks_of(masks: Array, counts: Array | None = None) -> Breaks:
-    """From bool [steps, B, H, W]: what is broken after each step."""
+def _never(held: list[Array]) -> Breaks:
+    """By where something forbidden holds, from the start on: a world that starts with it does not count."""
+    return _breaks_of(held[1:], np.asarray(~held[0].any((1, 2))))
+
+
+def _breaks_of(by_step: list[Array], counts: Array | None = None) -> Breaks:
+    """From bool [B, H, W] for each step: what is broken after it."""
+    masks = np.stack(by_step)
     batch, _, width = masks.shape[1:]
-    broken = masks.reshape(len(masks), batch, -1).any(2)
-    if counts is not None:
-        broken = broken & counts
+    counts = np.ones(batch, bool) if counts is None else counts
+    broken = masks.reshape(len(masks), batch, -1).any(2) & counts
     first = np.where(broken.any(0), broken.argmax(0) + 1, 0)
-    at_first = masks[np.maximum(first - 1, 0), np.arange(batch)].reshape(batch, -1)
-    flat = at_first.argmax(1)
-    cell = np.stack([flat // width, flat % width], 1)
-    return Breaks(first, cell, np.ones(batch, bool) if counts is None else counts)
-
-
-def _total(claim: Total, ruleset: Ruleset, sample: Start, states: list[State]) -> Breaks:
-    values = [
-        reference.evaluate(claim.value, context(ruleset, state, sample, step)).astype(np.int64)
-        for step, state in enumerate(states)
-    ]
-    masks = []
-    for before, after in pairwise(values):
-        change = (after - before).sum((1, 2))
-        wrong = AGAINST[claim.trend]
-        masks.append(wrong(change, 0)[:, None, None] & wrong(after, before))
-    return _breaks_of(np.stack(masks))
-
-
-def _never(steps: int, held: list[Array]) -> Breaks:
-    """A condition by step, from the start on: it must not hold for `steps` steps in a row."""
-    if steps == 1:
-        return _breaks_of(np.stack(held[1:]), np.asarray(~held[0].any((1, 2))))
-    run = np.zeros(held[0].shape, np.int64)
-    masks = []
-    for one in held[1:]:
-        run = np.where(one, run + 1, 0)
-        masks.append(run >= steps)
-    return _breaks_of(np.stack(masks))
-
-
-def _field(ruleset: Ruleset, name: str, state: State) -> Array:
-    if name in state:
-        return state[name]
-    prop = ruleset.property(name)
-    assert prop is not None
-    return property_table(ruleset, prop)[state["element"]]
+    at_first = masks[np.maximum(first - 1, 0), np.arange(batch)].reshape(batch, -1).argmax(1)
+    return Breaks(first, np.stack([at_first // width, at_first % width], 1), counts)
 
 
 # Claims about two runs
@@ -190,15 +174,6 @@ def touched(ruleset: Ruleset, sample: Start) -> tuple[Start, Array]:
         usual = fresh(ruleset, table[name], ids)
         fields[name] = np.where(mask[:, None] if values.ndim == 4 else mask, usual, values)
     return replace(sample, ids=ids, fields=fields), mask
-
-
-def differences(first: State, second: State) -> Array:
-    """bool [B, H, W]: cells in which two states differ."""
-    wrong = np.zeros(first["element"].shape, bool)
-    for name, values in first.items():
-        unequal = values != second[name]
-        wrong = wrong | (unequal.any(1) if unequal.ndim == 4 else unequal)
-    return wrong
 
 
 def near(mask: Array, radius: int) -> Array:

@@ -95,10 +95,17 @@ def first_difference(
     """After which step each world of two runs differs in one of these slots or in any, 0 if it does not: int [B]."""
     when = np.zeros(len(first[0]["element"]), np.int64)
     for step in range(len(first) - 1, 0, -1):
-        for name in first[step] if names is None else names:
-            wrong = (first[step][name] != second[step][name]).reshape(len(when), -1).any(1)
-            when[wrong] = step
+        when[differences(first[step], second[step], names).any((1, 2))] = step
     return when
+
+
+def differences(first: State, second: State, names: Iterable[str] | None = None) -> Array:
+    """bool [B, H, W]: cells in which two states differ, in some slots or in any."""
+    wrong = np.zeros(first["element"].shape, bool)
+    for name in first if names is None else names:
+        unequal = first[name] != second[name]
+        wrong = wrong | (unequal.any(1) if unequal.ndim == 4 else unequal)
+    return wrong
 
 
 def context(ruleset: Ruleset, state: State, sample: Start, step: int) -> reference.Context:
