@@ -16,8 +16,8 @@ from powderdsl.testing.generators.grammar import (
     Phrase,
     Phrases,
     Production,
-    either,
     flag_of_a_loop,
+    productions,
 )
 from powderdsl.testing.generators.trees import Tree, write_yaml
 
@@ -211,13 +211,13 @@ def ruleset_text(choices: Choices, manner: Manner) -> str:
     """The text of a random rule file, by these choices."""
     grammar = {**WORDS, **EXPRESSIONS, **RULES}
     if manner.borders:
-        grammar["kernel"] = either("")
+        grammar["kernel"] = productions("")
     else:
         del grammar["coordinate"], grammar["inside"]
     if not manner.draws:
-        grammar["chance clause"] = either("")
+        grammar["chance clause"] = productions("")
     if "assign" not in manner.forms:
-        grammar["effects"] = either("")
+        grammar["effects"] = productions("")
     words = Vocabulary(choices, manner, Phrases(choices, grammar, {"flag of a loop": flag_of_a_loop}))
     sections = words.sections()
     passes: dict[str, Tree] = {}
