@@ -6,6 +6,7 @@ After a mistake has been reported, readers go on with values that are legal: no 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from powderdsl.diagnostics import Reporter, Span, suggest
 from powderdsl.model.builtins import DIRECTIONS, OCTANTS
@@ -15,7 +16,6 @@ from powderdsl.model.state import slot_name
 from powderdsl.model.types import DIRECTION, Expr, Ruleset
 from powderdsl.syntax import yaml_tree
 from powderdsl.syntax.ast import Syntax
-from powderdsl.syntax.parse import parse_scalar
 from powderdsl.syntax.yaml_tree import Node, Scalar
 from powderdsl.tasks.drawings import choice_ids, element_ids, limited, line_in, shape_in
 from powderdsl.tasks.goals import GoalChecker, parts_of
@@ -140,9 +140,6 @@ def _pair(reader: Reader, node: Node | None, key: str, usual: int, size: Size) -
     return pair
 
 
-MOST = "most(CELLS)"
-
-
 def read_expert(
     reader: Reader, node: Node, agent: Agent, size: Size, rules: Ruleset, checker: GoalChecker
 ) -> Expert | None:
@@ -155,7 +152,8 @@ def read_expert(
         return None
     if not limited(node, MAX_MOVES, "an expert of {} moves", reader.reporter):
         return None
-    moves = tuple(_Move(reader, agent, size, rules, checker).read(item) for item in node.items)
+    read = _Move(reader, agent, size, rules, checker).read
+    moves = tuple(map(read, node.items))
     if moves[-1].condition is not None:
         message, helps = "the last move has a condition", ["add a move without `if:` for all other cases"]
         place = first_line(node.items[-1])
@@ -163,42 +161,39 @@ def read_expert(
     return Expert(moves)
 
 
+@dataclass(frozen=True)
 class _Move:
-    """Reads a move."""
+    """Reads moves."""
 
-    def __init__(self, reader: Reader, agent: Agent, size: Size, rules: Ruleset, checker: GoalChecker):
-        self.reader, self.reporter, self.agent, self.size = reader, reader.reporter, agent, size
-        self.rules, self.checker = rules, checker
+    reader: Reader
+    agent: Agent
+    size: Size
+    rules: Ruleset
+    checker: GoalChecker
 
     def read(self, node: Node) -> ExpertMove:
         decl = self.reader.record(MoveDecl, node, "a move") or MoveDecl()
         choice = self.choice(decl.choose)
         cell, most = self.place(decl.at)
         if cell is not None and (decl.within is not None or decl.least is not None):
-            message, helps = "only `at: most(CELLS)` counts cells", ["remove `within` and `least`"]
-            self.reporter.error("PD804", message, first_line(node), "not used", helps=helps)
-        return ExpertMove(
-            choice or 0,
-            self.toward(decl, choice),
-            cell,
-            most,
-            self.condition(decl.condition),
-            self.within(decl.within),
-            decl.least or 1,
-        )
+            fix = "remove `within` and `least`"
+            self.wrong("only `at: most(CELLS)` counts cells", first_line(node), "not used", fix)
+        toward, condition = self.toward(decl, choice), self.condition(decl.condition)
+        within = self.within(decl.within)
+        return ExpertMove(choice or 0, toward, cell, most, condition, within, decl.least or 1)
+
+    def wrong(self, message: str, span: Span, label: str, *helps: str) -> None:
+        self.reader.reporter.error("PD804", message, span, label, helps=helps)
 
     def choice(self, word: Scalar | None) -> int | None:
         """A place among the agent's choices; None if it is missing, or after a report."""
         if word is None:
             return None
-        if word.text in ACTS:
-            ids: tuple[int, ...] = (ACTS[word.text],)
-        else:
-            ids = element_ids(word, self.rules, self.reporter)[:1]
+        reporter = self.reader.reporter
+        ids = (ACTS[word.text],) if word.text in ACTS else element_ids(word, self.rules, reporter)[:1]
         if ids and ids[0] not in self.agent.choices:
             message = f"the agent may not choose `{word.text}`"
-            helps = [f"add `{word.text}` to `may:`"]
-            self.reporter.error("PD804", message, word.span, "not among its choices", helps=helps)
+            self.wrong(message, word.span, "not among its choices", f"add `{word.text}` to `may:`")
             return None
         return self.agent.choices.index(ids[0]) if ids else None
 
@@ -210,17 +205,16 @@ class _Move:
         blows = self.agent.choices[choice] == BLOW
         if blows and word is None:
             message, helps = "a move that blows lacks `toward`", ["`toward: right`"]
-            self.reporter.error("PD109", message, decl.choose.span, "where?", helps=helps)
+            self.reader.reporter.error("PD109", message, decl.choose.span, "where?", helps=helps)
         elif word is not None and not blows:
-            message = "only `choose: blow` has a direction"
-            self.reporter.error("PD804", message, word.span, "not used", helps=["remove `toward`"])
+            self.wrong("only `choose: blow` has a direction", word.span, "not used", "remove `toward`")
         elif word is not None:
             try:
                 ((octant, _),) = read_word(word.text, DIRECTION, {})
                 return OCTANTS[int(octant)]
-            except WordProblem as wrong:
+            except WordProblem as problem:
                 close = suggest(word.text, DIRECTIONS, "directions")
-                self.reporter.error("PD804", wrong.message, word.span, wrong.label, helps=close)
+                self.wrong(problem.message, word.span, problem.label, *close)
         return 0, 0
 
     def place(self, node: Node | None) -> tuple[tuple[int, int] | None, Measure | None]:
@@ -231,17 +225,16 @@ class _Move:
             cell = two_integers(node)
             if cell is None or not all(0 <= at < side for at, side in zip(cell, self.size, strict=True)):
                 label = f"[row, column] within {self.size[0]}×{self.size[1]} cells"
-                self.reporter.error("PD804", "no such cell", node.span, label)
+                self.wrong("no such cell", node.span, label)
             return cell, None
         if not isinstance(node, Scalar):
-            self.reader.shape(node, f"[row, column] or `{MOST}`")
+            self.reader.shape(node, "[row, column] or `most(CELLS)`")
             return None, None
-        syntax = parse_scalar(node, "expression", self.reporter)
+        syntax = self.reader.line(node)
         if syntax is None:
             return None, None
         if syntax.kind != "call" or syntax.text != "most" or len(syntax.children) != 1:
-            helps = [f"write `{MOST}`, or `[row, column]`"]
-            self.reporter.error("PD804", "this is not a place", node.span, "where?", helps=helps)
+            self.wrong("this is not a place", node.span, "where?", "write `most(CELLS)`, or `[row, column]`")
             return None, None
         return None, self.checker.measured("count", syntax.children[0])
 
@@ -253,7 +246,7 @@ class _Move:
         numbers = None if amounts is None else constants(amounts)
         if numbers is None:
             message = "the shape of a move is the same in all worlds"
-            self.reporter.error("PD803", message, statement.span, "no draws or names here")
+            self.reader.reporter.error("PD803", message, statement.span, "no draws or names here")
         return Shape(statement.kind, numbers or ())
 
     def condition(self, syntax: Syntax | None) -> Expr | None:
@@ -267,6 +260,6 @@ class _Move:
         ):
             message, label = "a move sees the world as it is now", "what was before is not known here"
             helps = ["use `count(…)`, `share(…)`, `taken` or `left`"]
-            self.reporter.error("PD406", message, syntax.span, label, helps=helps)
+            self.reader.reporter.error("PD406", message, syntax.span, label, helps=helps)
             return None
         return condition

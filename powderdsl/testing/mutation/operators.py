@@ -28,50 +28,46 @@ from powderdsl.testing.mutation.mutants import (
     written,
 )
 
-SIMILAR = {
-    **{place: ("neighbor", *others) for place, others in {
-        "above": ("below", "left"), "below": ("above", "right"), "left": ("right", "below"), "right": ("left", "above"),
-        "here": ("above", "right"),
-    }.items()},
-    **{name: ("side", *(other for other in DIRECTION_SETS if other != name)) for name in DIRECTION_SETS},
-    **{f"{shape}(": ("kernel", *(f"{other}(" for other in KERNEL_SHAPES if other != shape)) for shape in KERNEL_SHAPES},
-    "row": ("coordinate", "column"), "column": ("coordinate", "row"), "step": ("coordinate", "row"),
-    "<": ("comparison", "<=", ">"), "<=": ("comparison", "<", ">="), ">": ("comparison", ">=", "<"),
-    ">=": ("comparison", ">", "<="), "==": ("comparison", "!=", ">="), "!=": ("comparison", "==", "<"),
-    ":=": ("write", "+=", "-="), "+=": ("write", "-=", ":="), "-=": ("write", "+=", ":="),
-    "and": ("connective", "or"), "or": ("connective", "and"), "any(": ("connective", "all("), "all(": ("connective", "any("),
-    "min(": ("arithmetic", "max("), "max(": ("arithmetic", "min("), "abs(": ("arithmetic", "("),
-    "yes": ("constant", "no"), "no": ("constant", "yes"),
-}  # fmt: skip
-"""Words and signs of the language: the kind of mistake, and what stands for them. A neighbor: the opposite, and one around
-the corner."""
+
+def table(text: str) -> dict[str, tuple[str, ...]]:
+    """The kind of mistake for each word, and what is written instead: `KIND: WORD → OTHER | OTHER; …`."""
+    lines = (line.split(": ", 1) for line in text.strip().splitlines())
+    rows = ((kind, *entry.split(" → ")) for kind, entries in lines for entry in entries.split("; "))
+    return {word: (kind, *others.split(" | ")) for kind, word, others in rows}
+
+
+SIMILAR = table("""
+neighbor: above → below | left; below → above | right; left → right | below; right → left | above; here → above | right
+coordinate: row → column; column → row; step → row
+comparison: < → <= | >; <= → < | >=; > → >= | <; >= → > | <=; == → != | >=; != → == | <
+write: := → += | -=; += → -= | :=; -= → += | :=
+connective: and → or; or → and; any( → all(; all( → any(
+arithmetic: min( → max(; max( → min(; abs( → (
+constant: yes → no; no → yes
+""")
+"""What stands for words and signs of the language. For a neighbor: the opposite, and one around the corner."""
+
+SIMILAR |= {name: ("side", *(other for other in DIRECTION_SETS if other != name)) for name in DIRECTION_SETS}
+SIMILAR |= {
+    f"{shape}(": ("kernel", *(f"{other}(" for other in KERNEL_SHAPES if other != shape))
+    for shape in KERNEL_SHAPES
+}
 
 WORD = re.compile(r"->|[<>=!:+-]=|[<>]|[a-z]\w*\(|\d+(?:\.\d+)?(?:e-?\d+)?%?|[A-Za-z_]\w*")
 """A sign, the name of a function, a number, a name."""
 
-TEMPLATES: dict[str, tuple[str, ...]] = {
-    "and_": ("connective", "{0}", "{1}"),
-    "or_": ("connective", "{0}", "{1}"),
-    "not_": ("negation", "{0}"),
-    "is_": ("comparison", "{0} is not {1}"),
-    "is_not": ("comparison", "{0} is {1}"),
-    "in_": ("comparison", "{0} not in {1}"),
-    "not_in": ("comparison", "{0} in {1}"),
-    "in_kernel": ("kernel", "{0}"),
-    "any_but": ("set", "{0}"),
-    "add": ("arithmetic", "{0} - {1}"),
-    "sub": ("arithmetic", "{0} + {1}"),
-    "mul": ("arithmetic", "{0} / {1}"),
-    "div": ("arithmetic", "{0} * {1}"),
-    "quotient": ("arithmetic", "{0} * {1}"),
-    "choose": ("arithmetic", "{2} if {1} else {0}"),
-    "clamp": ("arithmetic", "({0})"),
-    "opposite": ("neighbor", "{0}"),
-    "clockwise": ("neighbor", "{0}"),
-    "counterclockwise": ("neighbor", "{0}"),
-    "neg": ("constant", "{0}"),
-}
-"""The kind of mistake in each kind of syntax or call, and what is written instead: `{0}` is the first operand."""
+TEMPLATES = table("""
+connective: and_ → {0} | {1}; or_ → {0} | {1}
+negation: not_ → {0}
+comparison: is_ → {0} is not {1}; is_not → {0} is {1}; in_ → {0} not in {1}; not_in → {0} in {1}
+kernel: in_kernel → {0}
+set: any_but → {0}
+arithmetic: add → {0} - {1}; sub → {0} + {1}; mul → {0} / {1}; div → {0} * {1}; quotient → {0} * {1}
+arithmetic: choose → {2} if {1} else {0}; clamp → ({0})
+neighbor: opposite → {0}; clockwise → {0}; counterclockwise → {0}
+constant: neg → {0}
+""")
+"""What stands for kinds of syntax and calls: `{0}` is the first operand."""
 
 Changes = Iterator[Change]
 
