@@ -5,10 +5,10 @@ A code is permanent: never reused, its page stays when it is retired.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from difflib import get_close_matches
 from enum import Enum
 from pathlib import Path
+from typing import NamedTuple
 
 
 class Severity(Enum):
@@ -19,79 +19,78 @@ class Severity(Enum):
     NOTE = "note"
 
 
-@dataclass(frozen=True)
-class Code:
+class Code(NamedTuple):
     """A row: the code, its slug (names the fault, not the fix), how severe it is."""
 
     code: str
     slug: str
-    severity: Severity
+    severity: Severity = Severity.ERROR
 
 
-_ERROR, _WARNING, _NOTE = Severity.ERROR, Severity.WARNING, Severity.NOTE
+_WARNING, _NOTE = Severity.WARNING, Severity.NOTE
 
 _ROWS = (
     # PD1xx: files, YAML, shape
-    ("PD101", "file-not-readable", _ERROR),
-    ("PD102", "file-too-large", _ERROR),
-    ("PD103", "invalid-yaml", _ERROR),
-    ("PD104", "duplicate-key", _ERROR),
-    ("PD105", "forbidden-yaml", _ERROR),
-    ("PD106", "document-too-deep", _ERROR),
-    ("PD107", "wrong-shape", _ERROR),
-    ("PD108", "unknown-key", _ERROR),
-    ("PD109", "missing-key", _ERROR),
-    ("PD110", "invalid-literal", _ERROR),
-    ("PD111", "invalid-name", _ERROR),
-    ("PD112", "path-leaves-folder", _ERROR),
+    ("PD101", "file-not-readable"),
+    ("PD102", "file-too-large"),
+    ("PD103", "invalid-yaml"),
+    ("PD104", "duplicate-key"),
+    ("PD105", "forbidden-yaml"),
+    ("PD106", "document-too-deep"),
+    ("PD107", "wrong-shape"),
+    ("PD108", "unknown-key"),
+    ("PD109", "missing-key"),
+    ("PD110", "invalid-literal"),
+    ("PD111", "invalid-name"),
+    ("PD112", "path-leaves-folder"),
     ("PD113", "empty-section", _WARNING),
     # PD2xx: the syntax of one line
-    ("PD201", "syntax-error", _ERROR),
-    ("PD202", "expression-too-large", _ERROR),
-    ("PD203", "quoted-expression", _ERROR),
-    ("PD204", "mixed-list", _ERROR),
+    ("PD201", "syntax-error"),
+    ("PD202", "expression-too-large"),
+    ("PD203", "quoted-expression"),
+    ("PD204", "mixed-list"),
     # PD3xx: names
-    ("PD301", "unknown-name", _ERROR),
-    ("PD302", "redefinition", _ERROR),
-    ("PD303", "duplicate-id", _ERROR),
-    ("PD304", "unknown-pack", _ERROR),
-    ("PD305", "missing-pack", _ERROR),
-    ("PD306", "conflicting-packs", _ERROR),
-    ("PD307", "pass-cycle", _ERROR),
-    ("PD308", "shadowed-name", _ERROR),
-    ("PD309", "unknown-parameter", _ERROR),
-    ("PD310", "unknown-ruleset-entry", _ERROR),
-    ("PD311", "reserved-word", _ERROR),
+    ("PD301", "unknown-name"),
+    ("PD302", "redefinition"),
+    ("PD303", "duplicate-id"),
+    ("PD304", "unknown-pack"),
+    ("PD305", "missing-pack"),
+    ("PD306", "conflicting-packs"),
+    ("PD307", "pass-cycle"),
+    ("PD308", "shadowed-name"),
+    ("PD309", "unknown-parameter"),
+    ("PD310", "unknown-ruleset-entry"),
+    ("PD311", "reserved-word"),
     ("PD312", "name-qualified", _NOTE),
     ("PD313", "id-taken", _NOTE),
-    ("PD314", "ruleset-cycle", _ERROR),
+    ("PD314", "ruleset-cycle"),
     ("PD315", "optional-name-misspelled", _WARNING),
     ("PD316", "value-contested", _WARNING),
     ("PD317", "value-replaced", _NOTE),
     ("PD318", "override-changes-id", _WARNING),
     # PD4xx: kinds and ranges
-    ("PD401", "wrong-kind", _ERROR),
-    ("PD402", "value-out-of-range", _ERROR),
-    ("PD403", "chance-out-of-range", _ERROR),
+    ("PD401", "wrong-kind"),
+    ("PD402", "value-out-of-range"),
+    ("PD403", "chance-out-of-range"),
     ("PD404", "chance-not-representable", _WARNING),
-    ("PD405", "not-constant", _ERROR),
-    ("PD406", "wrong-arguments", _ERROR),
-    ("PD407", "not-assignable", _ERROR),
+    ("PD405", "not-constant"),
+    ("PD406", "wrong-arguments"),
+    ("PD407", "not-assignable"),
     ("PD408", "range-overflow", _WARNING),
-    ("PD409", "offset-too-far", _ERROR),
+    ("PD409", "offset-too-far"),
     # PD5xx: the logic of rules
-    ("PD501", "movement-conflict", _ERROR),
-    ("PD502", "write-conflict", _ERROR),
+    ("PD501", "movement-conflict"),
+    ("PD502", "write-conflict"),
     ("PD503", "rule-never-fires", _WARNING),
     ("PD504", "element-never-appears", _NOTE),
     ("PD505", "empty-set", _NOTE),
     ("PD506", "rule-asleep", _NOTE),
     ("PD507", "unused-definition", _WARNING),
-    ("PD508", "expansion-too-large", _ERROR),
+    ("PD508", "expansion-too-large"),
     ("PD509", "rule-does-nothing", _WARNING),
     ("PD510", "invariant-says-nothing", _WARNING),
-    ("PD511", "invariant-cannot-hold", _ERROR),
-    ("PD512", "invariant-broken", _ERROR),
+    ("PD511", "invariant-cannot-hold"),
+    ("PD512", "invariant-broken"),
     ("PD513", "condition-decides-nothing", _WARNING),
     ("PD514", "rule-overruled", _WARNING),
     ("PD515", "scope-outgrown", _NOTE),
@@ -99,45 +98,45 @@ _ROWS = (
     ("PD517", "conflict-with-added-pack", _WARNING),
     ("PD518", "effect-undecided", _NOTE),
     # PD6xx: worlds, scenes, files
-    ("PD601", "unknown-world", _ERROR),
-    ("PD602", "invalid-world-file", _ERROR),
-    ("PD603", "palette-mismatch", _ERROR),
-    ("PD604", "unknown-world-element", _ERROR),
-    ("PD605", "invalid-statement", _ERROR),
-    ("PD606", "invalid-number", _ERROR),
-    ("PD607", "invalid-world-size", _ERROR),
-    ("PD608", "empty-shape", _ERROR),
-    ("PD609", "unknown-color", _ERROR),
-    ("PD610", "unknown-glyph", _ERROR),
-    ("PD611", "ragged-rows", _ERROR),
-    ("PD612", "missing-package", _ERROR),
-    ("PD613", "file-not-writable", _ERROR),
-    ("PD620", "no-such-run", _ERROR),
-    ("PD621", "another-run", _ERROR),
-    ("PD622", "run-in-use", _ERROR),
-    ("PD623", "run-does-not-fit", _ERROR),
-    ("PD624", "training-diverged", _ERROR),
-    ("PD625", "invalid-network", _ERROR),
-    ("PD626", "no-cluster", _ERROR),
-    ("PD627", "results-differ", _ERROR),
-    ("PD630", "invalid-dataset", _ERROR),
-    ("PD631", "dataset-mismatch", _ERROR),
-    ("PD640", "invalid-setting", _ERROR),
+    ("PD601", "unknown-world"),
+    ("PD602", "invalid-world-file"),
+    ("PD603", "palette-mismatch"),
+    ("PD604", "unknown-world-element"),
+    ("PD605", "invalid-statement"),
+    ("PD606", "invalid-number"),
+    ("PD607", "invalid-world-size"),
+    ("PD608", "empty-shape"),
+    ("PD609", "unknown-color"),
+    ("PD610", "unknown-glyph"),
+    ("PD611", "ragged-rows"),
+    ("PD612", "missing-package"),
+    ("PD613", "file-not-writable"),
+    ("PD620", "no-such-run"),
+    ("PD621", "another-run"),
+    ("PD622", "run-in-use"),
+    ("PD623", "run-does-not-fit"),
+    ("PD624", "training-diverged"),
+    ("PD625", "invalid-network"),
+    ("PD626", "no-cluster"),
+    ("PD627", "results-differ"),
+    ("PD630", "invalid-dataset"),
+    ("PD631", "dataset-mismatch"),
+    ("PD640", "invalid-setting"),
     # PD7xx: limits of a backend
-    ("PD701", "backend-not-available", _ERROR),
-    ("PD702", "too-large-for-webassembly", _ERROR),
+    ("PD701", "backend-not-available"),
+    ("PD702", "too-large-for-webassembly"),
     # PD8xx: tasks
-    ("PD801", "unknown-task", _ERROR),
-    ("PD802", "unknown-task-name", _ERROR),
-    ("PD803", "invalid-knob", _ERROR),
-    ("PD804", "invalid-agent", _ERROR),
+    ("PD801", "unknown-task"),
+    ("PD802", "unknown-task-name"),
+    ("PD803", "invalid-knob"),
+    ("PD804", "invalid-agent"),
     ("PD805", "constant-reward", _WARNING),
-    ("PD806", "invalid-study", _ERROR),
+    ("PD806", "invalid-study"),
     # PD9xx: our own mistakes
-    ("PD901", "internal-error", _ERROR),
+    ("PD901", "internal-error"),
 )
 
-CODES: dict[str, Code] = {row[0]: Code(*row) for row in _ROWS}
+CODES: dict[str, Code] = {code: Code(code, *rest) for code, *rest in _ROWS}
 
 _PAGES = Path(__file__).resolve().parent / "pages"
 
