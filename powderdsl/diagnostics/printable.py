@@ -13,9 +13,8 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, TextIO, cast
 
-_BREAKS = "\t\n"
-_CONTROLS = "\x00-\x08\x0b-\x1f\x7f-\x9f"
-"""C0 and C1: escape sequences begin with one, and others move the cursor. Without tab and line feed."""
+_CONTROLS = "\x00-\x1f\x7f-\x9f"
+"""C0 and C1: escape sequences begin with one, and others move the cursor."""
 _FORMATS = (
     "\u00ad\u0600-\u0605\u061c\u06dd\u070f\u0890\u0891\u08e2\u180e\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff"
     "\ufff9-\ufffb\U000110bd\U000110cd\U00013430-\U0001345f\U0001bca0-\U0001bca3\U0001d173-\U0001d17a"
@@ -28,7 +27,6 @@ _SURROGATES = "\ud800-\udfff"
 """Bytes of file names that are not UTF-8."""
 
 _UNPRINTABLE = re.compile(f"[{_CONTROLS}{_FORMATS}{_BLANKS}{_SURROGATES}]")
-_NOT_IN_LINES = re.compile(f"[{_BREAKS}{_CONTROLS}{_FORMATS}{_BLANKS}{_SURROGATES}]")
 _STYLE = re.compile(r"(\x1b\[[0-9;]*m)")
 
 
@@ -41,17 +39,19 @@ def printable(text: str, *, lines: bool = False) -> str:
     Args:
         lines: keep line breaks and tabs, which one line of a message cannot have.
     """
-    return (_UNPRINTABLE if lines else _NOT_IN_LINES).sub(_escaped, text)
+    return _UNPRINTABLE.sub(
+        lambda match: match[0] if lines and match[0] in "\t\n" else _escaped(match[0]), text
+    )
 
 
 def styled(text: str) -> str:
     """A text whose colors stay, and everything else as `printable` has it. What comes from files is escaped before."""
     pieces = _STYLE.split(text)
-    return "".join(one if at % 2 else printable(one, lines=True) for at, one in enumerate(pieces))
+    return "".join(piece if at % 2 else printable(piece, lines=True) for at, piece in enumerate(pieces))
 
 
-def _escaped(match: re.Match[str]) -> str:
-    units = match[0].encode("utf-16-be", "surrogatepass")
+def _escaped(char: str) -> str:
+    units = char.encode("utf-16-be", "surrogatepass")
     return "".join(f"\\u{units[at : at + 2].hex()}" for at in range(0, len(units), 2))
 
 
@@ -65,10 +65,7 @@ def spelled(word: str) -> str:
     letters (full width, mathematical), does not.
     """
     odd = set(look_alikes(word))
-    return "".join(
-        _escaped(match) if match[0] in odd else match[0]
-        for match in re.finditer(r".", printable(word), re.DOTALL)
-    )
+    return "".join(_escaped(char) if char in odd else char for char in printable(word))
 
 
 def look_alikes(word: str) -> tuple[str, ...]:
