@@ -45,11 +45,6 @@ class NotBits(Exception):
         self.place = place
 
 
-def is_const(node: Node, value: object) -> bool:
-    """Whether a node is this flag everywhere."""
-    return node.op == "const" and node.attr is value
-
-
 def _opposite(a: Node, b: Node) -> bool:
     return (a.op == "not" and a.args[0] is b) or (b.op == "not" and b.args[0] is a)
 
@@ -61,14 +56,14 @@ def simpler(build: Graph, op: str, args: tuple[Node, ...], attr: Hashable = None
     if row.evaluate is not None and len(constants) == len(args):
         return build.const(row.value(attr, *constants), row.type_of(attr, args))
     match op, args:
-        case "not", (a,):  # not not a = a
-            return a.args[0] if a.op == "not" else None
+        case "not", (Node("not", args=(a,)),):  # not not a = a
+            return a
         case "and" | "or", (a, b):
             absorbing = op == "or"
             for x, y in ((a, b), (b, a)):
-                if is_const(x, absorbing):  # a and no = no, a or yes = yes
-                    return x
-                if is_const(x, not absorbing) or x is y:  # a and yes = a, a and a = a
+                if x.op == "const":  # a and no = no, a or yes = yes, a and yes = a
+                    return x if x.attr is absorbing else y
+                if x is y:  # a and a = a
                     return y
                 if x.op == "not" and x.args[0] is y:  # a and not a = no
                     return build.flag(absorbing)
@@ -84,13 +79,13 @@ def simpler(build: Graph, op: str, args: tuple[Node, ...], attr: Hashable = None
             if yes is no:
                 return yes
             if yes.type == FLAG:
-                if is_const(yes, True) or yes is condition:  # select(c, yes, b) = c or b
+                if yes is condition or (yes.op == "const" and yes.attr):  # select(c, yes, b) = c or b
                     return build.or_(condition, no)
-                if is_const(yes, False):
+                if yes.op == "const":
                     return build.and_(build.not_(condition), no)
-                if is_const(no, False) or no is condition:
+                if no is condition or (no.op == "const" and not no.attr):
                     return build.and_(condition, yes)
-                if is_const(no, True):
+                if no.op == "const":
                     return build.or_(build.not_(condition), yes)
                 if _opposite(yes, no):
                     return build.derive("xor", build.not_(condition), yes)

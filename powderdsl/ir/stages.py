@@ -12,7 +12,7 @@ from functools import partial, reduce
 from math import frexp
 from typing import NamedTuple
 
-from powderdsl.ir.bits import is_const, simpler
+from powderdsl.ir.bits import simpler
 from powderdsl.ir.ops import OPS, REAL, Graph, Node, PassGraph, Program, Type, nodes_of, verify
 from powderdsl.ir.single import single, square_root, stepped
 
@@ -91,9 +91,10 @@ def fold(node: Node, build: Graph) -> Node | None:
             return build.derive("mul", a, build.real(1.0 / b))  # x / 2^k = x · 2^-k, exactly
         case "select", (c, a, Node("select", _, (again, _, d))), _ if c is again:
             return build.select(c, a, d)  # select(c, a, select(c, b, d)) = select(c, a, d)
-        case "swap" | "arrive", (content, movers, rest), _:
-            # nothing moves, or everything is alike
-            return rest if is_const(movers, False) or (content.op == "const" and rest is content) else None
+        case "swap" | "arrive", (_, Node("const", attr=False), rest), _:  # nothing moves
+            return rest
+        case "swap" | "arrive", (Node("const") as content, _, rest), _ if rest is content:
+            return rest  # everything is alike
         case "shift", (Node("coordinate", attr=("step", *_)) as a,), (*_, True):
             return a
         case "shift", (Node("const" | "param") as a,), (dy, dx, wraps):
