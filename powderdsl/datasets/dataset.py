@@ -163,24 +163,17 @@ class Dataset:
         values["observation"] = torch.cat([values["observation"], last])
         return Episode(number, int(shard.arrays["world"][place]), **values)
 
-    def transitions(
-        self, batch: int, *, seed: int = 0, device: str | torch.device = "cpu", start: int = 0
-    ) -> Batches:
-        """Endless minibatches of `batch` transitions, all equally likely, drawn with replacement.
+    def transitions(self, batch: int, **how: Any) -> Batches:
+        """Endless minibatches of `batch` transitions, all equally likely, drawn with replacement. `how`: see `Batches`."""
+        return Batches(Transitions(self), batch, **how)
 
-        Minibatch n depends on `seed` and n alone. `start` is the first one's number, to continue where one stopped.
-        """
-        return Batches(Transitions(self), batch, seed, device, start)
-
-    def sequences(
-        self, length: int, batch: int, *, seed: int = 0, device: str | torch.device = "cpu", start: int = 0
-    ) -> Batches:
+    def sequences(self, length: int, batch: int, **how: Any) -> Batches:
         """Endless minibatches [B, L, …] of `length` transitions in a row of one episode, all equally likely.
 
         Raises:
             ValueError: no episode is that long.
         """
-        return Batches(Transitions(self, length=length), batch, seed, device, start)
+        return Batches(Transitions(self, length=length), batch, **how)
 
     # Reading
 
@@ -315,14 +308,25 @@ class Batches(IterableDataset[Batch]):
 
     It is also a dataset for `torch.utils.data.DataLoader` with ``batch_size=None``. Worker w of W reads every W-th
     minibatch from the w-th, so the loader yields the same minibatches in the same order with any number of workers.
+
+    Args:
+        seed: minibatch n depends on it and on n alone. start: the first one's number, to continue where one stopped.
     """
 
-    def __init__(self, rows: Transitions, batch: int, seed: int, device: str | torch.device, number: int):
+    def __init__(
+        self,
+        rows: Transitions,
+        batch: int,
+        *,
+        seed: int = 0,
+        device: str | torch.device = "cpu",
+        start: int = 0,
+    ):
         check_count("batch", batch, 1 << 24)
         check_count("seed", seed, (1 << 62) - 1, least=0)
-        check_count("start", number, (1 << 62) - 1, least=0)
+        check_count("start", start, (1 << 62) - 1, least=0)
         self.rows, self.batch, self.seed, self.device = rows, batch, seed, device
-        self.number = number
+        self.number = start
         """Of the next minibatch; in a worker, of the first one that its workers read next."""
 
     def __iter__(self) -> Batches:

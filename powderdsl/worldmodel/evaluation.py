@@ -46,8 +46,7 @@ class Tested:
     """Worlds of each test, or transitions that were recorded."""
     scores: Mapping[str, Mapping[str, Score]]
     missing: Mapping[str, tuple[str, ...]]
-    palette: tuple[str | None, ...]
-    step: int
+    trained: Trained
 
     def mean(self, predictor: str) -> float:
         """The mean of the worlds' losses, each counted once."""
@@ -63,10 +62,10 @@ class Tested:
             "split": self.split,
             "only": list(self.only),
             "worlds_each": self.worlds,
-            "iterations": self.step,
+            "iterations": self.trained.checkpoint.step,
             "mean": {name: {**total[name].plain(), "loss": self.mean(name)} for name in names},
             "tests": {test: {name: one[name].plain() for name in names} for test, one in self.scores.items()},
-            "elements": elements_of(total[MODEL], self.palette),
+            "elements": elements_of(total[MODEL], self.trained.palette),
             "reliability": total[MODEL].reliability(),
             "left_out": {name: list(lacking) for name, lacking in self.missing.items()},
         }
@@ -105,8 +104,7 @@ def evaluate(
         worlds=count,
         scores=scores,
         missing={variant.name: variant.elements for variant in unseen.missing},
-        palette=trained.palette,
-        step=trained.checkpoint.step,
+        trained=trained,
     )
 
 
@@ -142,8 +140,7 @@ def evaluate_recording(trained: Trained, recording: Recording, *, machine: Machi
         worlds=sum(len(ends) for _, ends in pairs),
         scores={"transitions": {name: score(one, pairs, slots) for name, one in predictors.items()}},
         missing={},
-        palette=trained.palette,
-        step=trained.checkpoint.step,
+        trained=trained,
     )
 
 

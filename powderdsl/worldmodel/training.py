@@ -79,7 +79,6 @@ def train(
     machine: Machine = HERE,
     worlds: Worlds | None = None,
     recording: Recording | None = None,
-    identity: Mapping[str, Any] | None = None,
     network: nn.Module | CustomNetwork | None = None,
     parent: Checkpoint | None = None,
     note: Mapping[str, Any] | None = None,
@@ -94,8 +93,6 @@ def train(
     Args:
         worlds: your own, instead of those of the task that `config.data` names, whose rules and split then say nothing.
         recording: transitions with actions, instead of worlds: see `recordings.open_recording`.
-        identity: what else decides which weights come out, such as what your own worlds depend on: kept in ``run.json``,
-            and compared when a run continues.
         network: your own, with ids uint8 [B, H, W] -> logits [B, slots, H, W], or a `CustomNetwork`, whose name the run
             records; the paper's U-net otherwise.
         parent: weights to start from, of the run that `finetuned` was given.
@@ -123,7 +120,7 @@ def train(
     elif config.recorded is not None:
         raise does_not_fit(path, "it learns from a dataset, which is not given")
     palette = _palette_for(config, path, worlds)
-    identity = dict(identity or {})
+    identity: dict[str, Any] = {}
     if recording is None and worlds is None:
         worlds = own_worlds = task_worlds(config.data, **machine.simulation, palette=palette)
         identity["worlds"] = own_worlds.fingerprint

@@ -84,6 +84,7 @@ class TaskWorlds:
     Args:
         partly: leave out worlds that the rules cannot have; `missing` says which.
         palette: the ids of a network's slots, as `compiler.load` takes them.
+        machine: backend, device and threads, as `compile_task` takes them.
 
     Raises:
         CompileError: with all that is wrong in the task, the rules, the knobs or the parameters; PD604 where worlds need
@@ -94,11 +95,9 @@ class TaskWorlds:
         self,
         config: DataConfig,
         *,
-        device: str = "cpu",
-        threads: int = 1,
-        backend: str = "auto",
         partly: bool = False,
         palette: Palette | None = None,
+        **machine: Any,
     ):
         params = None if config.rules else config.params
         task = load_task(config.task, knobs=config.knobs, params=params, palette=palette)
@@ -117,10 +116,10 @@ class TaskWorlds:
         """The names of the variants: seed s gives variant s mod their number."""
         self.fingerprint = fingerprint(watched.splits)
         """A name for how these worlds start, besides their rules: another if the task's file has been changed."""
-        self.device = torch.device(device)
+        self.device = torch.device(machine.get("device", "cpu"))
         """Where worlds are run."""
         self._task, self._source = task, source
-        self._machine: dict[str, Any] = {"backend": backend, "device": device, "threads": threads}
+        self._machine = machine
         self._programs: dict[tuple[Any, ...], TaskProgram] = {}
         if source is None:
             self.rulesets = [Drawn(0)]
@@ -128,8 +127,10 @@ class TaskWorlds:
             return
         numbers = range(config.first_ruleset, config.first_ruleset + config.rulesets)
         self.rulesets = [source.draw(number) for number in numbers]
-        if backend == "auto":  # compiling many rulesets would take longer than running them
-            self._machine["backend"] = starting_backend(device)
+        if (
+            machine.get("backend", "auto") == "auto"
+        ):  # compiling many rulesets would take longer than running them
+            self._machine = {**machine, "backend": starting_backend(str(self.device))}
 
     def start(self, seeds: Tensor) -> MixedWorld:
         """The worlds of seeds, int64 [B]."""

@@ -382,7 +382,7 @@ def _run(config: TrainConfig, folder: Path, values: dict[str, Any], **more: Any)
 
 def _told(tested: Tested, plain: Mapping[str, Any]) -> Iterator[str]:
     """The results of a test as tables. `plain` has them for JSON."""
-    yield f"{tested.rules}, {tested.task}/{tested.split}, after {tested.step:,} iterations"
+    yield f"{tested.rules}, {tested.task}/{tested.split}, after {plain['iterations']:,} iterations"
     rows = [["test", "predictor", *next(iter(plain["mean"].values()))]]
     for name, scores in {**plain["tests"], "mean": plain["mean"]}.items():
         rows += [[name, who, *map(_number, score.values())] for who, score in scores.items()]

@@ -235,8 +235,7 @@ def draw(path: Path, panels: Sequence[Panel], title: str, *, follow: bool = Fals
             for place, samples in zip(line.places, line.samples, strict=True):
                 axes.plot([place] * len(samples), samples, "k.", markersize=3, alpha=0.4)
         for name, value in panel.baselines.items():
-            axes.axhline(value, color="0.4", linestyle="--", linewidth=1)
-            axes.annotate(name, (1, value), xycoords=("axes fraction", "data"), fontsize=8, ha="right")
+            axes.axhline(value, color="0.4", linestyle="--", linewidth=1, label=name)
         if panel.ticks:
             axes.set_xticks(range(len(panel.ticks)), panel.ticks)
         if sum(map(len, panel.ticks)) > 40:
@@ -245,7 +244,7 @@ def draw(path: Path, panels: Sequence[Panel], title: str, *, follow: bool = Fals
         axes.set_xlabel(panel.across)
         axes.set_ylabel(panel.up)
         axes.grid(linewidth=0.3)
-        if any(line.label for line in panel.lines):
+        if axes.get_legend_handles_labels()[1]:
             axes.legend(fontsize=8)
     figure.suptitle(title, fontsize=8, wrap=True)
     with replacing(path, follow=follow) as temporary:
