@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from powderdsl.arrays import NDArray, np
 from powderdsl.cli.exits import BadInput
+from powderdsl.cli.output import color_wanted
 from powderdsl.diagnostics.printable import printable, unguarded
 from powderdsl.model.types import Element, Field
 from powderdsl.simulation.draw import contact_sheet, looks, rgb, scale, shown_fields, to_numpy
@@ -96,8 +97,7 @@ class LiveView:
             view.show(ids, caption="step 12")
 
     Where the output is not a terminal, frames follow one another as plain text. With NO_COLOR set
-    (https://no-color.org) or an encoding without half blocks, glyphs are redrawn in place. Worlds that do not
-    fit are thinned out. On a terminal, frames follow one another no faster than `fps`.
+    (https://no-color.org) glyphs are redrawn in place. Worlds that do not fit are thinned out. On a terminal, frames follow one another no faster than `fps`.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class LiveView:
         self.stream: TextIO = unguarded(sys.stdout if stream is None else stream)
         self.elements = elements
         self.in_place = self.stream.isatty() and os.environ.get("TERM") != "dumb"
-        self.color = self.in_place and not os.environ.get("NO_COLOR") and _can_encode(self.stream)
+        self.color = color_wanted(self.stream)
         self._looks = looks(elements, fields)
         self._height = 0
         self._frame_seconds, self._due = 1 / fps if fps else 0.0, time.perf_counter()
@@ -165,11 +165,3 @@ class LiveView:
     def _write(self, text: str) -> None:
         self.stream.write(text)
         self.stream.flush()
-
-
-def _can_encode(stream: TextIO) -> bool:
-    try:
-        UPPER_HALF.encode(getattr(stream, "encoding", None) or "utf-8")
-    except (UnicodeEncodeError, LookupError):
-        return False
-    return True

@@ -290,16 +290,15 @@ class Transitions(torch.utils.data.Dataset[Batch]):
         place = np.searchsorted(self._ends, numbers, side="right")
         first = numbers - np.concatenate([[0], self._ends])[place]
         source, episode = self.episodes.source[place], self.episodes.number[place]
-        out: list[Array] = []
-        for number in np.unique(source).tolist() or [0]:
-            rows = np.flatnonzero(source == number)
-            parts = self.datasets[number].gather(episode[rows], first[rows], self.length or 1)
-            if len(rows) == len(numbers):
-                out = parts
-                break
-            out = out or [np.empty((len(numbers), *part.shape[1:]), part.dtype) for part in parts]
-            for whole, part in zip(out, parts, strict=True):
-                whole[rows] = part
+        places = [np.flatnonzero(source == number) for number in range(len(self.datasets))]
+        parts = [
+            data.gather(episode[rows], first[rows], self.length or 1)
+            for data, rows in zip(self.datasets, places, strict=True)
+        ]
+        out = parts[0]
+        if len(parts) > 1:
+            order = np.argsort(np.concatenate(places))
+            out = [np.concatenate(columns)[order] for columns in zip(*parts, strict=True)]
         return Batch(*(torch.from_numpy(value if self.length else value[:, 0]) for value in out))
 
 

@@ -329,8 +329,10 @@ def read_run(path: str | Path, kind: str | None = None) -> RunFolder:
     raise no_run(folder, f"its {ABOUT} is damaged")
 
 
-def find_run(text: str | Path, kind: str | None = None) -> RunFolder:
+def find_run(text: str | Path | RunFolder, kind: str | None = None) -> RunFolder:
     """A run by the path of its folder, or by its name in ``runs/``. Raises CompileError (PD620)."""
+    if isinstance(text, RunFolder):
+        return text
     folder, kept = Path(text), Path("runs")
     if not folder.exists() and folder.name == str(text) and kept.is_dir():
         if (kept / text / ABOUT).exists():

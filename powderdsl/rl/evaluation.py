@@ -224,7 +224,7 @@ def subject(
     """A run, its settings, and its task with some packs added; a task has no run. Raises CompileError."""
     if isinstance(run_or_task, Task):
         return None, TrainConfig(run_or_task.name), run_or_task
-    run = run_or_task if isinstance(run_or_task, RunFolder) else find_run(run_or_task, "ppo")
+    run = find_run(run_or_task, "ppo")
     return run, config_of(run), task_of(run, packs)
 
 

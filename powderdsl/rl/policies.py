@@ -94,7 +94,7 @@ def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: b
     Raises:
         CompileError: PD620 if there is no such run or checkpoint; PD623 if the environment does not fit the run.
     """
-    found = run if isinstance(run, RunFolder) else find_run(run, "ppo")
+    found = find_run(run, "ppo")
     config = config_of(found)
     if env.observation.kind != config.observation:
         why = f"it sees `{config.observation}`; the environment shows `{env.observation.kind}`"

@@ -342,7 +342,7 @@ def load_trained(
         CompileError: PD620 if there is no run, or no checkpoint that can be read; PD623 if the weights do not fit, or the
             network is not given, or another one; PD625 if it cannot be made.
     """
-    run = path if isinstance(path, RunFolder) else find_run(path, KIND)
+    run = find_run(path, KIND)
     try:
         config = TrainConfig.of(run.config)
     except (KeyError, TypeError, ValueError, AttributeError) as error:

@@ -192,13 +192,6 @@ def test_no_color_means_glyphs_in_place(monkeypatch):
     assert LiveView(ELEMENTS, screen).color
 
 
-def test_an_encoding_without_half_blocks_gets_glyphs():
-    screen = Screen(True, encoding="ascii")
-    with LiveView(ELEMENTS, screen) as view:
-        view.show(np.array([[0, 1]]))
-    assert replay(screen.written)[0][0] == ".#"
-
-
 @pytest.mark.parametrize(("columns", "lines"), [(80, 24), (64, 34), (63, 100), (10, 5), (1, 1)])
 @pytest.mark.parametrize("no_color", ["", "1"])
 def test_what_is_shown_fits_the_terminal(monkeypatch, columns, lines, no_color):

@@ -303,17 +303,17 @@ def _mutated(
         finally:
             events.close()  # its processes end
     judged = [(every[number], verdicts[number]) for number in sorted(verdicts)]
-    by_pack = {
-        own: [verdict for mutant, verdict in judged if mutant.pack == own]
-        for own in dict.fromkeys(mutant.pack for mutant, _ in judged)
-    }
+    by_pack: dict[str, list[Verdict]] = {}
+    for mutant, verdict in judged:
+        by_pack.setdefault(mutant.pack, []).append(verdict)
     if not as_json:
-        click.echo("".join(f"{line}\n" for line in _survivors(judged)), nl=False)
+        lines = [*_survivors(judged)]
         if interrupt is not None:
-            click.echo(f"interrupted after {len(judged)} of {counted(len(numbers), 'mutant')}")
-        for title, own in by_pack.items():
-            click.echo(f"{title}: {summary(own)}")
-        click.echo(f"{name}: {summary(list(verdicts.values()))} in {monotonic() - began:.0f} s")
+            lines.append(f"interrupted after {len(judged)} of {counted(len(numbers), 'mutant')}")
+        lines += [f"{title}: {summary(own)}" for title, own in by_pack.items()]
+        click.echo(
+            "\n".join([*lines, f"{name}: {summary(list(verdicts.values()))} in {monotonic() - began:.0f} s"])
+        )
     if write:
         _write(judged)
     if interrupt is not None:

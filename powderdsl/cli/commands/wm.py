@@ -31,8 +31,8 @@ OF_WORLDS = {one.name for one in (*fields(DataConfig), *fields(Variety))} - {"ta
 OF_WORLDS |= {*KNOBS, "packs", "held_out", "settings", "worlds", "after"}
 """Options that select worlds: a dataset has its own."""
 MACHINE = ("device", "threads", "backend", "store")
-CURVES = {"loss/train": "training worlds", "loss/validation": "held-out worlds"}
-"""Metrics that are plotted, and their labels."""
+CURVES = ("loss/train", "loss/validation")
+"""Metrics that are plotted."""
 
 _network = opt.option(
     "--network",
@@ -229,11 +229,7 @@ def show_command(run: str, out: Path, curve: bool, scale: int, **values: Any) ->
         from powderdsl.worldmodel.training import KIND
 
         record = find_run(run, KIND)
-        curves = [
-            replace(curve, label=label)
-            for metric, label in CURVES.items()
-            for curve in curves_of([record], metric)
-        ]
+        curves = [replace(curve, label=metric) for metric in CURVES for curve in curves_of([record], metric)]
         if not curves:
             raise BadInput(f"{record.path} has no losses yet")
         write_curves(out, curves, "loss", {}, record.path.name)
@@ -269,14 +265,7 @@ def _show(found: list[Strip], rules: Ruleset, out: Path, scale: int) -> None:
 
 def tested_on(values: Mapping[str, Any]) -> dict[str, Any]:
     """What the options of a test say about its worlds."""
-    return {
-        "task": values["task"],
-        "split": values["split"] or "designed",
-        "rules": values["rules"],
-        "only": values.get("only") or None,
-        "knobs": values.get("knobs") or None,
-        "rulesets": values.get("rulesets") or 0,
-    }
+    return opt.given(values, ("task", "split", "rules", "only", "knobs", "rulesets"))
 
 
 def given_settings(values: Mapping[str, Any], config: type) -> dict[str, Any]:
