@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import chain
-from math import prod
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,9 +23,6 @@ ANIMATIONS = (".gif", ".mp4")
 SUFFIXES = (".png", *ANIMATIONS, ".npz")
 MOST_PICTURES = 64
 """The maximum number of worlds in a picture."""
-
-SMALL_BATCH = 1 << 20
-"""Cells of a batch up to which one thread is as fast as several: distributing work costs time."""
 
 
 @dataclass(frozen=True)
@@ -60,8 +56,8 @@ class Playback:
 @opt.option("--every", (1, 10**6), "Show every n-th step.", 1)
 @opt.option("--fps", (1, 240), "Frames per second.", 30)
 @opt.option("--watch", bool, "Show the first world in the terminal while it runs.")
-@opt.option("--threads", (1, 1024), "CPU threads.  [default: 1 for small batches]")
-@click.option("-v", "--verbose", is_flag=True, help="Report the speed, and how many cells each element has.")
+@opt.option("--threads", (1, 1024), "CPU threads.", 1)
+@click.option("-v", "--verbose", is_flag=True, help="Report the speed and the backend.")
 def command(
     rules: str,
     world: str | None,
@@ -71,7 +67,7 @@ def command(
     backend: str,
     device: str,
     settings: dict[str, str],
-    threads: int | None,
+    threads: int,
     verbose: bool,
     **playback: Any,
 ) -> None:
@@ -84,12 +80,15 @@ def command(
     plan = Playback(**playback)
     from powderdsl.cli.start_worlds import start
 
-    first = start(ruleset, world, size, batch, seed, backend=backend, device=device, threads=threads or 1)
+    first = start(ruleset, world, size, batch, seed, backend=backend, device=device, threads=threads)
     if plan.out is not None and plan.suffix == ".npz":
         from powderdsl.worlds.store import check_saved
 
         check_saved(plan.out, first.shape)
-    used = _set_threads(threads, first)
+    if first.sim.kind.xp.__name__ == "torch":
+        import torch
+
+        torch.set_num_threads(threads)
     began = time.perf_counter()
     last = play(first, plan)
     took = time.perf_counter() - began
@@ -99,34 +98,13 @@ def command(
     )
     if verbose:
         rate = count * height * width * plan.steps / max(took, 1e-9)
-        head += f" ({rate:,.0f} cells/s; {last.sim.running} on {last.sim.device}, {counted(used, 'thread')})"
+        head += (
+            f" ({rate:,.0f} cells/s; {last.sim.running} on {last.sim.device}, {counted(threads, 'thread')})"
+        )
     click.echo(head + (f" -> {plan.out}" if plan.out else ""), err=True)
     if verbose:
         for note in last.sim.notes:
             click.echo(f"  {note}", err=True)
-        click.echo(_populations(first, last), err=True)
-
-
-def _set_threads(threads: int | None, world: World) -> int:
-    """Set and return how many threads torch uses, if it runs: `threads`, or one for small batches."""
-    if world.sim.kind.xp.__name__ != "torch":
-        return 1
-    import torch
-
-    if threads is not None:
-        torch.set_num_threads(threads)
-    elif prod(world.shape) <= SMALL_BATCH:
-        torch.set_num_threads(1)
-    return torch.get_num_threads()
-
-
-def _populations(start: World, end: World) -> str:
-    """How many cells each element has, before and after."""
-    cells = [world.sim.kind.to_numpy(world.ids).tobytes() for world in (start, end)]
-    elements = start.sim.ruleset.elements
-    width = max(len(element.name) for element in elements)
-    rows = [(element.name, *(ids.count(element.id) for ids in cells)) for element in elements]
-    return "\n".join(f"  {name:<{width}}  {old:>9,} -> {new:>9,}" for name, old, new in rows if old or new)
 
 
 def play(start: World, plan: Playback) -> World:
