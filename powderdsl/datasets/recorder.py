@@ -102,9 +102,6 @@ def record(
     name = policy if isinstance(policy, str) else policy_name
     if not name:
         raise ValueError("a policy that is a function needs a policy_name, by which its data are known")
-    reserved = {"num_envs", "autoreset_mode", "actions", "action_mask"} & how.keys()
-    if reserved:
-        raise TypeError(f"record does not take {sorted(reserved)[0]}")
     env = TensorEnv(task, 1, observation=observation, autoreset_mode="disabled", **how)
     recipe = recipe_of(env, policy=name, episodes=episodes, seed=seed, compress=compress, shard=shard)
     sight = observation_of(sees or observation, env.simulator, env.task.size)

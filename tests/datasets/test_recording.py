@@ -229,7 +229,7 @@ def test_folders_of_others_are_left_alone(small: TaskProgram, tmp_path: Path) ->
             {"policy": lambda observed, keys: [[9] * 5] * 2, "policy_name": "bad"},
             r"actions\[0, 0\] \(x\) is 9",
         ),
-        ({"num_envs": 3}, "record does not take num_envs"),
+        ({"num_envs": 3}, "multiple values for argument 'num_envs'"),
     ],
 )
 def test_bad_arguments_are_refused(
