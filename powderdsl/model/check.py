@@ -11,7 +11,7 @@ from functools import partial
 from itertools import chain
 
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Severity, Span
-from powderdsl.model.composition.added_packs import AddedPacks, Difference, report_contested
+from powderdsl.model.composition.added_packs import AddedPacks, Difference
 from powderdsl.model.composition.compose import Composition, Palette, compose, title
 from powderdsl.model.composition.layout import lay_out
 from powderdsl.model.composition.names import needs_of, report_misspelled, words_of
@@ -82,7 +82,6 @@ def check(
     ramps = element_ramps(typer)
     typer.unknown.report()
     reporter.raise_if_errors()
-    report_contested(composition, reporter)
     report_misspelled(packs, composition.ruleset, elsewhere, reporter)
 
     elements = tuple(replace(element, ramp=ramps.get(name)) for name, element in composition.elements.items())

@@ -47,7 +47,6 @@ from powderdsl.model.types import (
     Value,
 )
 from powderdsl.syntax.ast import Syntax
-from powderdsl.syntax.yaml_tree import Scalar
 
 ORDERED = ("int", "flag", "real")
 """Kinds of fields that a color can follow: their values have an order."""
@@ -92,29 +91,39 @@ def define_symbols(typer: Typer) -> list[tuple[str, int, Span]]:
             symbols.properties[name] = Property(
                 name, kind, (), frozenset(), prop.pack, prop.span, word if word != name else ""
             )
-    for name, field in names.declared(FieldDecl).items():
+    for name, decl in names.declared(FieldDecl).items():
         with suppress(Poisoned):
-            symbols.fields[name] = _field(name, field, typer)
+            symbols.fields[name] = _field(name, decl, typer)
     given = _element_values(typer)
     for name, known in symbols.properties.items():
         prop = properties[name]
         usual = _value(known, prop.default, prop.pack, typer) if prop.default else default_of(known.kind)
         values = [usual] * symbols.slots
-        for element in elements.values():
-            if (name, element.name) in given:
-                values[element.id] = _value(known, *given[name, element.name], typer)
+        for word, (pack, _, syntax) in given[name].items():
+            values[elements[word].id] = _value(known, syntax, pack, typer)
         symbols.properties[name] = replace(known, values=tuple(values))
-    for name, decl in typer.sets.items():
+    for name, field in symbols.fields.items():
+        own: dict[int, Value] = {}
+        for word, (pack, span, syntax) in given[name].items():
+            number = elements[word].id
+            with suppress(Poisoned):
+                _check_may_have(field, number, word, span, typer)
+                value = clamped(typer.constant(syntax, field.kind, Scope(pack, {})), field.kind)
+                own |= {number: value} if value != field.default else {}
+        symbols.fields[name] = replace(field, own=tuple(sorted(own.items())))
+    for name, named_set in typer.sets.items():
         try:
             if name not in symbols.constants:
-                typer.resolve_set(name, decl.members.span)
+                typer.resolve_set(name, named_set.members.span)
         except Poisoned:
             symbols.constants.setdefault(name, Broken())
         except Unresolved:
             symbols.constants.setdefault(name, SetOf(()))
     typer.used.clear()
     return [
-        (name, elements[of].id, syntax.span) for (name, of), (syntax, _) in given.items() if of in elements
+        (name, elements[word].id, syntax.span)
+        for name in properties
+        for word, (_, _, syntax) in given[name].items()
     ]
 
 
@@ -203,29 +212,26 @@ def _field(name: str, decl: FieldDecl, typer: Typer) -> Field:
     )  # fmt: skip
 
 
-Given = Mapping[tuple[str, str], tuple[Syntax, str]]
-"""By property and element, global names: the value that holds, and the pack that gives it."""
+def _element_values(typer: Typer) -> dict[str, dict[str, tuple[str, Span, Syntax]]]:
+    """By property or field and element, global names: the pack whose value holds, its place and it.
 
-
-def _element_values(typer: Typer) -> Given:
-    """The properties' values of single elements; fields get theirs. Reports keys that name nothing."""
-    symbols = typer.symbols
-    properties = symbols.names.declared(PropertyDecl)
-    declared: dict[str, PropertyDecl | FieldDecl] = {**properties, **symbols.names.declared(FieldDecl)}
-    given: dict[tuple[str, str], tuple[Syntax, str]] = {}
-    own: dict[str, dict[int, Value]] = {}
+    Reports keys that name nothing, and values that are replaced by others.
+    """
+    symbols, names = typer.symbols, typer.symbols.names
+    declared: dict[str, PropertyDecl | FieldDecl] = {
+        **names.declared(PropertyDecl),
+        **names.declared(FieldDecl),
+    }
+    given: dict[str, dict[str, tuple[str, Span, Syntax]]] = {name: {} for name in declared}
     for pack, name, word, key, syntax in symbols.given_values():
-        element = symbols.elements.get(word)
-        field = symbols.fields.get(name)
-        if name in properties:
-            given[name, word] = (syntax, pack)
-        elif name not in declared:
+        if name not in declared:
             keys = (own for own in keys_of(ElementDecl) if own != "override")
             report_unknown("property", key, (*declared, *keys), typer.reporter, "PD108")
-        elif field and element and _may_have(field, element.id, word, key, typer):
-            with suppress(Poisoned):
-                value = typer.constant(syntax, field.kind, Scope(pack, {}))
-                own.setdefault(name, {})[element.id] = clamped(value, field.kind)
+        elif word in symbols.elements:
+            held = pack, key.span, syntax
+            if word in given[name]:
+                report_replaced(name, word, given[name][word], held, symbols, typer.reporter)
+            given[name][word] = held
     for name, decl in declared.items():
         for key, _ in decl.values:
             if key.is_optional or symbols.element(key.word, decl.pack) is not None:
@@ -238,15 +244,11 @@ def _element_values(typer: Typer) -> Given:
                 typer.reporter.error("PD108", f"unknown key `{key.text}`", key.span, label, helps=helps)
             else:
                 report_unknown("element", key, symbols.elements, typer.reporter)
-    for name, values in own.items():
-        field = symbols.fields[name]
-        changed = tuple((number, value) for number, value in sorted(values.items()) if value != field.default)
-        symbols.fields[name] = replace(field, own=changed)
     return given
 
 
-def _may_have(field: Field, number: int, element: str, key: Scalar, typer: Typer) -> bool:
-    """Whether fresh cells of the element can have a value of their own; reports if not."""
+def _check_may_have(field: Field, number: int, element: str, span: Span, typer: Typer) -> None:
+    """Raises Poisoned after reporting that fresh cells of the element can have no value of their own."""
     if field.at != "element":
         label, fix = "a field of a place belongs to no element", "say `at: element`"
     elif field.resets:
@@ -254,12 +256,12 @@ def _may_have(field: Field, number: int, element: str, key: Scalar, typer: Typer
     elif field.of is not None and number not in field.of:
         label, fix = f"`of:` leaves `{element}` out", f"add `{element}` to `of:`"
     else:
-        return True
-    typer.reporter.error(
-        "PD407", f"`{element}` cannot have a `{field.name}` of its own", key.span, label,
-        secondary=[Label(field.span, "declared here")], helps=[fix],
-    )  # fmt: skip
-    return False
+        return
+    message, declared = (
+        f"`{element}` cannot have a `{field.name}` of its own",
+        Label(field.span, "declared here"),
+    )
+    raise typer.fail("PD407", message, span, label, fix, secondary=[declared])
 
 
 def _value(prop: Property, syntax: Syntax, pack: str, typer: Typer) -> Value | str:
@@ -291,8 +293,7 @@ def element_ramps(typer: Typer) -> dict[str, ColorRamp]:
     symbols = typer.symbols
     properties = symbols.names.declared(PropertyDecl)
     fields = symbols.names.declared(FieldDecl)
-    places: dict[str, tuple[str, Span]] = {}
-    ramps: dict[str, ColorRamp] = {}
+    given: dict[str, tuple[str, Span, ColorRamp]] = {}
     for name, entry in symbols.entries:
         if entry.ramp is None:
             continue
@@ -309,11 +310,11 @@ def element_ramps(typer: Typer) -> dict[str, ColorRamp]:
                 report_unknown("field", word, symbols.fields, typer.reporter)
             if field is None or element is None:
                 continue
-            ramp, here = _ramp(field, element, entry.ramp, typer), (pack, entry.ramp.name.span)
-            if name in ramps and ramps[name] != ramp:
-                report_replaced("color_by", name, places[name], here, symbols, typer.reporter)
-            places[name], ramps[name] = here, ramp
-    return ramps
+            held = pack, entry.ramp.name.span, _ramp(field, element, entry.ramp, typer)
+            if name in given:
+                report_replaced("color_by", name, given[name], held, symbols, typer.reporter)
+            given[name] = held
+    return {name: ramp for name, (_, _, ramp) in given.items()}
 
 
 def _ramp(field: Field, element: Element, decl: RampDecl, typer: Typer) -> ColorRamp:

@@ -15,6 +15,7 @@ from powderdsl.diagnostics import Label, Reporter, Span
 from powderdsl.model.composition.compose import Composition
 from powderdsl.model.composition.names import listed, words_of
 from powderdsl.model.declarations import PackDecl
+from powderdsl.model.types import ColorRamp
 from powderdsl.syntax.ast import Syntax
 
 CODES = ("PD501", "PD502")
@@ -63,33 +64,20 @@ def pack_words(pack: PackDecl) -> Iterator[str]:
 # Values
 
 
-def report_contested(composition: Composition, reporter: Reporter) -> None:
-    """Report values that are replaced by others."""
-    known: dict[tuple[str, str], tuple[str, Span, Syntax]] = {}
-    for pack, name, element, key, syntax in composition.given_values():
-        if element in composition.elements and name in composition.names.versions:
-            if (name, element) in known:
-                before, place, value = known[name, element]
-                if _meaning(value) != _meaning(syntax):
-                    report_replaced(name, element, (before, place), (pack, key.span), composition, reporter)
-            known[name, element] = pack, key.span, syntax
+Given = tuple[str, Span, Syntax | ColorRamp]
+"""What a pack gives an element: the pack, where, the value."""
 
 
 def report_replaced(
-    what: str,
-    element: str,
-    lost: tuple[str, Span],
-    held: tuple[str, Span],
-    composition: Composition,
-    reporter: Reporter,
+    what: str, element: str, lost: Given, held: Given, composition: Composition, reporter: Reporter
 ) -> None:
     """Report that a pack replaces what another one gives an element: a note if it needs that pack, else a warning.
 
     What a ruleset gives replaces that of its packs without a word; a pack that is added to it may replace it.
     """
-    (before, old), (after, new) = lost, held
+    (before, old, lost_value), (after, new, value) = lost, held
     needs = composition.names.needs
-    if after not in needs:  # a ruleset knows what its packs say
+    if after not in needs or _meaning(lost_value) == _meaning(value):  # a ruleset knows what its packs say
         return
     if before not in needs or before in needs[after]:
         reporter.report(
@@ -104,8 +92,10 @@ def report_replaced(
     )  # fmt: skip
 
 
-def _meaning(value: Syntax) -> object:
+def _meaning(value: Syntax | ColorRamp) -> object:
     """Numbers by what they come to, anything else by its words."""
+    if isinstance(value, ColorRamp):
+        return value
     text = " ".join(value.span.text.split())
     try:
         return Fraction(text[:-1]) / 100 if text.endswith("%") else Fraction(text)
@@ -118,7 +108,7 @@ def _meaning(value: Syntax) -> object:
 
 
 @dataclass(frozen=True)
-class Given:
+class Change:
     """What an added pack does to an element: `word` is a tag or a value that it gives, or empty for the element itself.
 
     `noun` says which: ``tag`` or ``value``.
@@ -139,7 +129,7 @@ class AddedPacks:
     check_alone: CheckAlone
     _conflicts: dict[tuple[str, ...], frozenset[Span] | None] = field(default_factory=dict)
 
-    def causes(self, pack: str, place: Span, ids: Sequence[int]) -> tuple[Given, ...]:
+    def causes(self, pack: str, place: Span, ids: Sequence[int]) -> tuple[Change, ...]:
         """The changes by added packs that cause a conflict in `pack`; empty if it has the conflict without them.
 
         Args:
@@ -168,11 +158,11 @@ class AddedPacks:
             return None
         return frozenset(one.primary.span for one in errors if one.primary.span is not None)
 
-    def _given(self, element: str, scope: tuple[str, ...], words: frozenset[str]) -> list[Given]:
+    def _given(self, element: str, scope: tuple[str, ...], words: frozenset[str]) -> list[Change]:
         """The tags among some words that packs outside a scope give an element, else such values, else the element itself."""
         composition = self.composition
-        tags: list[Given] = []
-        values: list[Given] = []
+        tags: list[Change] = []
+        values: list[Change] = []
         for name, entry in composition.entries:
             pack = entry.pack
             if name != element or pack in scope or pack not in composition.names.needs:
@@ -184,7 +174,7 @@ class AddedPacks:
                 for scalar in scalars:
                     word = composition.names.of(pack, scalar.word)
                     if word.rpartition(".")[2] in words:
-                        given.append(Given(pack, element, noun, word, scalar.span))
+                        given.append(Change(pack, element, noun, word, scalar.span))
         made = composition.elements[element]
-        brings = [] if made.pack in scope else [Given(made.pack, element, "", "", made.span)]
+        brings = [] if made.pack in scope else [Change(made.pack, element, "", "", made.span)]
         return tags or values or brings

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from powderdsl.diagnostics import Label, Reporter, Span
 from powderdsl.model.builtins import MAX_SIDE_MULTIPLE
-from powderdsl.model.composition.added_packs import AddedPacks, Given
+from powderdsl.model.composition.added_packs import AddedPacks, Change
 from powderdsl.model.composition.names import listed
 from powderdsl.model.expressions.operators import (
     ELEMENT_HERE,
@@ -94,7 +94,7 @@ class Conflict:
         )  # fmt: skip
 
     def report_added(
-        self, causes: Sequence[Given], pass_name: str, example: str, settled: bool, reporter: Reporter
+        self, causes: Sequence[Change], pass_name: str, example: str, settled: bool, reporter: Reporter
     ) -> None:
         """Report it at the changes by added packs that cause it: a warning if `settled`, because one rule wins."""
         first, *more = causes
