@@ -355,14 +355,11 @@ def _find(word: str, reporter: Reporter, ruleset: RulesetDecl | None) -> Path | 
         return path
     if _is_there(word):
         return Path(word)
-    folder = os.path.isdir(word)
-    if is_path(word):
-        message = f"`{word}` is a folder" if folder else f"no file `{word}`"
-        helps = ["name a rule file in it"] if folder else ["check the path"]
-        reporter.error("PD101", message, None, helps=helps)
+    if is_path(word) or os.path.isdir(word):
+        message = f"`{word}` is a folder" if os.path.isdir(word) else f"no file `{word}`"
+        reporter.error("PD101", message, None, helps=["check the path of the rule file"])
     else:
-        notes = [f"`{word}` is a folder: name a rule file in it"] if folder else []
-        _report_unknown(word, None, reporter, notes)
+        _report_unknown(word, None, reporter)
     return None
 
 
@@ -387,11 +384,11 @@ def _find_beside(word: str, reporter: Reporter, ruleset: RulesetDecl, span: Span
     return None
 
 
-def _report_unknown(word: str, span: Span | None, reporter: Reporter, notes: Sequence[str] = ()) -> None:
+def _report_unknown(word: str, span: Span | None, reporter: Reporter) -> None:
     close = get_close_matches(word, shipped_rules(), n=1)
     helps = [f"did you mean `{close[0]}`?"] if close else ["shipped: " + ", ".join(shipped_rules())]
     label = "not shipped, and no file" if span else ""
-    reporter.error("PD304", f"no pack or ruleset `{word}`", span, label, notes=notes, helps=helps)
+    reporter.error("PD304", f"no pack or ruleset `{word}`", span, label, helps=helps)
 
 
 @collection_paused()

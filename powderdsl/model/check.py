@@ -187,22 +187,18 @@ def _bare(decl: RulesetDecl | None, gone: set[str]) -> RulesetDecl | None:
 
 def with_outgrown(ruleset: Ruleset, remarks: tuple[Diagnostic, ...]) -> tuple[Diagnostic, ...]:
     """The same remarks, where warnings that nobody would get without the added packs are notes (PD515)."""
-    warnings = [
-        one
+    warnings = {
+        one: span
         for one in remarks
-        if one.severity is Severity.WARNING and one.primary.span and one.code not in OF_COMPOSITIONS
-    ]
+        if one.severity is Severity.WARNING and (span := one.primary.span) and one.code not in OF_COMPOSITIONS
+    }
     if not warnings or ruleset.declared is None or len(ruleset.packs) < 2:
         return remarks
     composition = compose(ruleset.declared.packs, ruleset.declared.ruleset, Reporter())
     notes: dict[Diagnostic, Diagnostic] = {}
     authors: list[PackDecl | RulesetDecl] = [*composition.packs.values(), *composition.ruleset.lineage]
     for author in authors:
-        own = {
-            one: one.primary.span
-            for one in warnings
-            if one.primary.span and one.primary.span.source == author.source
-        }
+        own = {one: span for one, span in warnings.items() if span.source == author.source}
         if not own:
             continue
         words = _known_words(author)

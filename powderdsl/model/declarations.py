@@ -347,11 +347,8 @@ class RulesetDecl(Record, noun="a ruleset"):
     @property
     def placed(self) -> list[str]:
         """The packs of that ruleset, except packs that others of the same name replace."""
-        sources = {one.source.name for one in self.placing.lineage}
         members = self.members
-        return [
-            name for name in self.placing.members if members.get(name, self.placing).source.name in sources
-        ]
+        return [name for name, one in self.placing.members.items() if members.get(name, one) is one]
 
     @property
     def renames(self) -> dict[str, tuple[Scalar, Scalar]]:

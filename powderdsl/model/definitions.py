@@ -337,12 +337,9 @@ def _ramp(field: Field, element: Element, decl: RampDecl, typer: Typer) -> Color
         fix = f"write a range within `{least}..{most}`, or leave out `over` for all of it"
         raise typer.fail("PD402", message, decl.over.span, label, fix, secondary=declared)
     if lo == hi:
-        place, fix = decl.field.span, f"widen the kind of `{field.name}`, or remove `color_by`"
-        if decl.over is not None:
-            place, fix = decl.over.span, "give a range of at least two values"
-        raise typer.fail(
-            "PD402", f"a range of the single value {lo}", place, "the color cannot change here", fix
-        )
+        place, label = (decl.over or decl.field).span, "the color cannot change here"
+        fix = "give a range of at least two values, or remove `color_by`"
+        raise typer.fail("PD402", f"a range of the single value {lo}", place, label, fix)
     return ColorRamp(field.name, decl.start or element.color, decl.end, lo, hi, kind.name == "real")
 
 

@@ -163,10 +163,8 @@ class Elaborator:
             rounds = int(header.text) if len(header.text) < 4 else 1000
             if not 1 <= rounds <= 64:
                 fix = "write a number from 1 to 64; a `repeat` inside another multiplies"
-                if rounds < 1:
-                    fix = "leave the rules out, or write a number from 1 to 64"
                 message, label = f"a loop of {header.text} rounds", "1 to 64 are possible"
-                self.typer.reporter.error("PD508", message, header.span, label, helps=[fix])
+                self.typer.fail("PD508", message, header.span, label, fix)
                 return []
             return [(scope, f"{label}round {i + 1}") for i in range(rounds)]
         try:

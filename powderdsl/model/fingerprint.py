@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import MISSING, Field, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from fractions import Fraction
 from types import MappingProxyType
-from typing import Any
 
 UNMEANING = MappingProxyType({"meaning": False})
 """Metadata of dataclass fields that change nothing about what happens: texts, colors, tests."""
@@ -29,7 +28,11 @@ def fingerprint(model: object) -> str:
 def _digest(value: object, known: dict[int, tuple[object, str]]) -> str:
     if is_dataclass(value):
         if id(value) not in known:
-            parts = [f"{field.name}={_digest(part, known)}" for field, part in _meaning(value)]
+            parts = []
+            for field in fields(value):
+                part = getattr(value, field.name)
+                if field.compare and field.metadata.get("meaning", True) and part != field.default:
+                    parts.append(f"{field.name}={_digest(part, known)}")
             text = f"{type(value).__name__}({','.join(parts)})"
             # The value is kept: another object could get its id.
             known[id(value)] = value, hashlib.sha256(text.encode()).hexdigest()
@@ -41,13 +44,3 @@ def _digest(value: object, known: dict[int, tuple[object, str]]) -> str:
     if value is None or isinstance(value, str | int | float | Fraction):
         return repr(value)
     raise TypeError(f"no fingerprint of a {type(value).__name__}")
-
-
-def _meaning(value: Any) -> list[tuple[Field[Any], Any]]:
-    found = []
-    for field in fields(value):
-        part = getattr(value, field.name)
-        default = field.default_factory() if field.default_factory is not MISSING else field.default
-        if field.compare and field.metadata.get("meaning", True) and (default is MISSING or part != default):
-            found.append((field, part))
-    return found

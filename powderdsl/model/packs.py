@@ -12,15 +12,12 @@ from powderdsl.model.builtins import MAX_RADIUS
 from powderdsl.model.declarations import (
     Block,
     Definition,
-    ElementDecl,
     KernelDecl,
     PackDecl,
     PassDecl,
-    RampDecl,
     RulesetDecl,
     StreamDecl,
     TestDecl,
-    TintDecl,
 )
 from powderdsl.model.schema import E, R, Reader, first_line, keys_of, read_tree
 from powderdsl.syntax.ast import Syntax
@@ -37,7 +34,7 @@ def read_file(source: Source, reporter: Reporter) -> PackDecl | RulesetDecl | No
     tree = read_tree(source, reporter, "a pack starts with `pack: NAME`")
     if tree is None:
         return None
-    reader = _PackReader(reporter, (PackDecl, PassDecl, ElementDecl, RampDecl, TintDecl))
+    reader = _PackReader(reporter)
     if not isinstance(tree, Mapping):
         reader.shape(tree, "a pack: a mapping that starts with `pack: NAME`")
         return None

@@ -183,14 +183,10 @@ Entries = dict[str, tuple[Scalar, Node]]
 
 
 class Reader:
-    """Reads records from located YAML, reporting what does not fit.
+    """Reads records from located YAML, reporting what does not fit."""
 
-    `homes` are records to which a key may belong that stands in another one.
-    """
-
-    def __init__(self, reporter: Reporter, homes: tuple[type[Record], ...] = ()):
+    def __init__(self, reporter: Reporter):
         self.reporter = reporter
-        self.homes = homes
 
     # Records
 
@@ -357,9 +353,9 @@ class Reader:
         close = suggest(word, known, f"keys of {what}")
         if close and close[0].startswith("did"):
             return close
-        home = next((one.NOUN for one in self.homes if one is not kind and word in keys_of(one)), None)
-        if home is not None:
-            return (f"`{word}` is a key of {home}: check the indentation",)
+        for home in RECORDS.values():
+            if home.NOUN and home.__module__ == kind.__module__ and word in keys_of(home):
+                return (f"`{word}` is a key of {home.NOUN}: check the indentation",)
         return close or ("known keys: " + ", ".join(known),)
 
     # Values

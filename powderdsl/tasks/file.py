@@ -136,7 +136,7 @@ def read_task(
     tree = read_tree(source, reporter, "a task starts with `task: NAME`")
     reporter.raise_if_errors()
     assert tree is not None
-    reader = Reader(reporter, (TaskDecl, AgentDecl, RewardDecl, SplitDecl))
+    reader = Reader(reporter)
     decl = reader.record(TaskDecl, tree, "a task")
     word = decl.rules if decl is not None else None
     names = names_in_file(word.text, word.span, reporter) if word is not None and word.text else None
