@@ -12,7 +12,6 @@ import shlex
 import shutil
 import signal
 import subprocess
-import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -22,7 +21,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryFile
 
-from powderdsl.system.interrupts import held_back
 from powderdsl.system.user_cache import cache_folder
 from powderdsl.system.writing import scratch_folder
 from powderdsl.targets import cache
@@ -58,51 +56,38 @@ def find_compiler() -> Compiler:
     Raises:
         NoCompiler: none works. If `$CXX` is set, no other compiler is tried.
     """
-    return _find(os.environ.get("CXX", ""), os.environ.get("PATH", ""))
-
-
-@lru_cache(maxsize=8)
-def _find(cxx: str, path: str) -> Compiler:
-    """As above, for these values of the environment. Only successes are cached."""
+    cxx = os.environ.get("CXX", "").strip()
     try:
         candidates: list[tuple[str, ...]] = (
-            [tuple(shlex.split(cxx))] if cxx.strip() else [("g++",), ("c++",), ("clang++",)]
+            [tuple(shlex.split(cxx))] if cxx else [("g++",), ("c++",), ("clang++",)]
         )
     except ValueError as error:
         raise NoCompiler(f"{MISSING}: $CXX is `{cxx}`: {error}") from None
-    package = None if cxx.strip() else find_spec("ziglang")
+    package = None if cxx else find_spec("ziglang")
     if package is not None and package.origin:
         # The program itself: `python -m ziglang` would start Python once more.
         candidates.append((str(Path(package.origin).with_name("zig")), "c++"))
     for command in candidates:
-        if version := _version(command):
+        program = shutil.which(command[0])
+        if program and (version := _version(command, program)):
             zig = "c++" in command[1:] and any("zig" in Path(word).name for word in command)
-            family = "zig" if zig else "clang" if "clang" in version else "gcc"
-            return Compiler(command, family, version)
-    if cxx.strip():
+            return Compiler(command, "zig" if zig else "clang" if "clang" in version else "gcc", version)
+    if cxx:
         raise NoCompiler(f"{MISSING}: $CXX is `{cxx}`, which cannot be run")
-    tried = [" ".join(command) for command in candidates]
-    tried += [] if len(candidates) > 3 else ["the package ziglang"]
-    raise NoCompiler(f"{MISSING}: tried " + ", ".join(tried))
+    tried = [*map(" ".join, candidates), *([] if package else ["the package ziglang"])]
+    raise NoCompiler(f"{MISSING}: tried {', '.join(tried)}")
 
 
-def _version(command: tuple[str, ...]) -> str:
-    """The first line of `--version`; empty if the command does not run."""
-    if shutil.which(command[0]) is None:
-        return ""
+@lru_cache(maxsize=8)
+def _version(command: tuple[str, ...], program: str) -> str:
+    """The first line of `--version`; empty if the command, which is this program, does not run."""
     try:
-        result = subprocess.run(
-            [*command, "--version"],
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=30,
-            check=True,
+        output = subprocess.check_output(
+            [*command, "--version"], stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL, timeout=30
         )
     except (OSError, subprocess.SubprocessError):
         return ""
-    return (result.stdout.strip().splitlines() or ["unknown"])[0]
+    return (output.decode(errors="replace").strip().splitlines() or ["unknown"])[0]
 
 
 ARCHITECTURE = "POWDERDSL_ARCH"
@@ -154,8 +139,6 @@ def processor() -> str:
 
 
 # Libraries
-
-TIMEOUT = 600
 
 
 @dataclass(frozen=True)
@@ -250,31 +233,27 @@ def run_compilers(scratch: Path, *commands: list[str]) -> tuple[int, str]:
         scratch: a folder for their temporary files.
 
     Raises:
-        NoCompiler: one cannot be started, or they take longer than TIMEOUT.
+        NoCompiler: one cannot be started.
     """
     environment = {**os.environ, "TMPDIR": str(scratch), "LC_ALL": "C"}
     processes: list[subprocess.Popen[bytes]] = []
     with TemporaryFile() as messages:
         try:
             for command in commands:
-                with held_back():  # a process that starts while a signal raises would be unknown to us
-                    # A session of its own: g++ starts other programs, which are ended with it.
-                    process = subprocess.Popen(
-                        command,
-                        stdin=subprocess.DEVNULL,
-                        stdout=subprocess.DEVNULL,
-                        stderr=messages,
-                        env=environment,
-                        start_new_session=True,
-                    )
-                    processes.append(process)
-                    _running.append(process)
-            end = time.monotonic() + TIMEOUT
-            codes = [process.wait(max(0.0, end - time.monotonic())) for process in processes]
+                # A session of its own: g++ starts other programs, which are ended with it.
+                process = subprocess.Popen(
+                    command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    stderr=messages,
+                    env=environment,
+                    start_new_session=True,
+                )
+                processes.append(process)
+                _running.append(process)
+            codes = [process.wait() for process in processes]
         except OSError as error:
             raise NoCompiler(f"{commands[0][0]} could not be run: {error}") from None
-        except subprocess.TimeoutExpired:
-            raise NoCompiler(f"{commands[0][0]} took longer than {TIMEOUT} s") from None
         finally:
             _end(processes)
         messages.seek(0)
@@ -297,19 +276,6 @@ def _end(processes: Iterable[subprocess.Popen[bytes]]) -> None:
 @atexit.register
 def _end_all() -> None:
     _end([*_running])
-
-
-def loadable(source: str, ruleset: str = "", units: int = 1) -> Path:
-    """The path of a library that has been loaded, see `build`. Raises NoCompiler."""
-    problem: OSError | None = None
-    for _ in range(2):
-        path = build(source, ruleset, units)
-        try:
-            load_library(path)
-            return path
-        except OSError as error:  # another process has just removed it, or it cannot be loaded at all
-            problem = error
-    raise NoCompiler(f"compiled code cannot be loaded: {problem}")
 
 
 _TYPES = {"p": ctypes.c_void_p, "i": ctypes.c_int, "l": ctypes.c_int64, "f": ctypes.c_float, "-": None}
@@ -340,8 +306,11 @@ SIGNATURES = {
 
 @lru_cache(maxsize=64)
 def load_library(path: Path) -> ctypes.CDLL:
-    """The library, loaded once per process, with its functions declared."""
-    library = ctypes.CDLL(str(path))
+    """The library, loaded once per process, with its functions declared. Raises NoCompiler."""
+    try:
+        library = ctypes.CDLL(str(path))
+    except OSError as error:
+        raise NoCompiler(f"compiled code cannot be loaded: {error}") from None
     for name, signature in SIGNATURES.items():
         function = getattr(library, name)
         result, arguments = signature.split()
