@@ -83,13 +83,14 @@ def layout_of(program: Program) -> Layout:
 def native_layout(program: Program) -> NativeLayout:
     """The layout of a program on planes, with the distances at which it reads."""
     layout = NativeLayout(**vars(layout_of(program)))
-    for node in (node for pass_ in program.passes for node in nodes_of(pass_)):
-        if node.op in ("shift", "swap", "arrive"):
-            dy, dx, *wraps = node.attr
-            # A value recomputed at a neighbor reads neighbors itself, up to a few levels deep.
-            layout.cover(halo=-(-4 * max(abs(dy), abs(dx)) // 16) * 16)
-            if node.type.name != "real":
-                layout.cover(**{"beyond_rows" if wraps == [False] else "around_rows": abs(dy)})
+    for pass_ in program.passes:
+        for node in nodes_of(pass_):
+            if node.op in ("shift", "swap", "arrive"):
+                dy, dx, *wraps = node.attr
+                # A value recomputed at a neighbor reads neighbors itself, up to a few levels deep.
+                layout.cover(halo=-(-4 * max(abs(dy), abs(dx)) // 16) * 16)
+                if node.type.name != "real":
+                    layout.cover(**{"beyond_rows" if wraps == [False] else "around_rows": abs(dy)})
     return layout
 
 

@@ -67,7 +67,8 @@ class Values(Generic[Named]):
             needed = () if ready else self.needed(node)
             if needed:
                 stack.append((node, True))
-                stack.extend((arg, False) for arg in reversed(needed))
+                for arg in reversed(needed):
+                    stack.append((arg, False))
             else:
                 self.known[id(node)] = self.named(node, self.node(node))
         return self.known[id(root)]

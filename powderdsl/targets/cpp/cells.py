@@ -9,7 +9,7 @@ from powderdsl.ir.single import all_ones, single
 from powderdsl.schedule.join import keeps
 from powderdsl.schedule.rows import ANY_PASS, RowLoop, Rows, region_of, rows_of
 from powderdsl.schedule.types import Sweeps, alternatives, is_zero
-from powderdsl.targets.layout import NativeLayout, literal, param_key
+from powderdsl.targets.layout import NativeLayout, braced, literal, param_key
 from powderdsl.targets.printing import CellValues
 
 AT_ONCE = 4
@@ -129,7 +129,7 @@ def held(value: Node) -> str:
 
 def on_all(type: str, items: Iterable[str], call: str) -> str:
     """A call on an array of pointers, which is named `all` in it."""
-    return f"{{ {type} all[] = {{{', '.join(items)}}}; {call} }}"
+    return f"{{ {type} all[] = {braced(items)}; {call} }}"
 
 
 class _Loop(CellValues[str]):

@@ -59,7 +59,7 @@ def native_source(program: Program, width: int = 0) -> NativeSource:
         asked |= asked_ids(schedule)
         passes.append(pass_text(schedule, number, layout))
         calls.append(f"  pass_{number}(c); TICK({number})")
-    sizes = {
+    sizes: dict[str, object] = {
         "WIDTH": width,
         "STREAMS": len(layout.streams),
         "STEP_PLANES": len(layout.step_planes),
@@ -68,10 +68,11 @@ def native_source(program: Program, width: int = 0) -> NativeSource:
         "SLOTS": len(layout.planes),
         "COINS": len(layout.coins),
         "REALS": len(layout.reals),
-        **{name.upper(): size for name, size in vars(layout).items() if isinstance(size, int)},
-        "SNAP": literal(SNAP),
-        "PASSES": len(passes),
     }
+    for name, size in vars(layout).items():
+        if isinstance(size, int):
+            sizes[name.upper()] = size
+    sizes |= {"SNAP": literal(SNAP), "PASSES": len(passes)}
     before, after = "\n".join(map(_header, LIBRARY)), "\n".join(map(_header, DRIVER))
     units = 2 if sum(map(len, passes)) >= UNIT_SIZE else 1
     lines = [

@@ -53,7 +53,17 @@ def pass_text(schedule: Schedule, number: int, layout: NativeLayout) -> str:
             lines.append(f"{KINDS[var.type.name]}* {var.name} = keep({place});")
     for var in rest.values():
         lines.append(f"{KINDS[var.type.name]}* {var.name};")
-    return "\n".join([*lines, *printer.block(schedule.body), *printer.leave(schedule), "}"])
+    lines += printer.block(schedule.body)
+    places, names = [], {}
+    for i, (slot, node) in enumerate(schedule.leaves):
+        var = Var(held(node), node.type)
+        lines.append(f"{KINDS[var.type.name]}* s{i} = keep({var.name});")
+        places.append(printer.slot(slot, var))
+        if node.op == "load":
+            names[var.name] = f"give(c, {var.name});"
+    for i, place in enumerate(places):  # all new values are read before any is stored
+        lines.append(f"if ({place}) give(c, {place}); {place} = s{i};")
+    return "\n".join([*lines, " ".join(names.values()), "}"])
 
 
 KINDS = {"real": "Field", "flag": "Plane"}
@@ -112,19 +122,6 @@ class _Printer(Printer):
     def forget(self, _: Forget) -> Iterator[str]:
         yield "c.present = ~0ull;"
 
-    def leave(self, schedule: Schedule) -> Iterator[str]:
-        """The new values of slots; all are read before any is stored."""
-        places, names = [], {}
-        for i, (slot, node) in enumerate(schedule.leaves):
-            var = Var(held(node), node.type)
-            yield f"{KINDS[var.type.name]}* s{i} = keep({var.name});"
-            places.append(self.slot(slot, var))
-            if node.op == "load":
-                names[var.name] = f"give(c, {var.name});"
-        for i, place in enumerate(places):
-            yield f"if ({place}) give(c, {place}); {place} = s{i};"
-        yield " ".join(names.values())
-
     def guard(self, guard: Guard) -> Iterator[str]:
         yield f"if ({answer(guard.when)}) {{"
         yield from self.block(guard.body)
@@ -151,7 +148,7 @@ class _Printer(Printer):
                 if out.into:
                     yield f"give(c, {out.into});"
             return
-        news = [f"&{name}" for name in move.vars]
+        news = [*map("&{}".format, move.vars)]
         for out in move.outs:
             old = held(out.value) if copies else move.olds[out.var.name].attr
             yield f"{out.var.name} = {out.into or f'keep({old})'};"
@@ -166,7 +163,7 @@ class _Printer(Printer):
         for leaves, planes in groups.items() if groups and not copies else ():
             function = "swap_planes" if move.op == "swap" else f"arrive_planes<{leaves.upper()}>"
             call = f"{function}(c, {movers}, {dy}, {dx}, all, {len(planes)});"
-            yield on_all("Plane** const", (f"&{out.var.name}" for out in planes), call)
+            yield on_all("Plane** const", map("&{0.var.name}".format, planes), call)
 
     def update(self, loop: Compute) -> Iterator[str]:
         """Planes that change only in words where a mask holds. Empty ones that can only lose flags need no copy."""
@@ -227,8 +224,8 @@ class _Words(WordText):
     def __init__(self, layout: NativeLayout):
         super().__init__()
         self.layout = layout
-        self.edges: dict[tuple[str, str], int] = {}
-        """The largest distance in rows at which a plane is read, by the function that prepares such rows and the plane."""
+        self.edges: dict[str, int] = {}
+        """The largest distance in rows at which a plane is read, by the call that prepares such rows."""
         self.clear: dict[int, bool] = {}
         self.places: dict[str, str] = {}
         """The planes that hold the old values of planes which are changed in place."""
@@ -239,7 +236,7 @@ class _Words(WordText):
 
     def ready(self) -> str:
         """Statements before the loop that prepare the rows of other strips."""
-        return " ".join(f"{call}(c, {plane}, {rows});" for (call, plane), rows in self.edges.items())
+        return " ".join(map("{}, {});".format, self.edges, self.edges.values()))
 
     def plane(self, name: str) -> str:
         """The pointer to a plane's words."""
@@ -330,8 +327,8 @@ class _Words(WordText):
         dy, dx, wraps = node.attr
         plane = str(node.args[0].attr)
         if dy:
-            key = "edges" if wraps else "bare_edges", plane
-            self.edges[key] = max(self.edges.get(key, 0), abs(dy))
+            call = f"{'edges' if wraps else 'bare_edges'}(c, {plane}"
+            self.edges[call] = max(self.edges.get(call, 0), abs(dy))
         if not wraps:
             row = f"row_or_nothing(c, {plane}, y + {dy})"
             return f"columns_zero(c, {row}, w, {dx})" if dx else f"{row}[w]"
