@@ -67,11 +67,11 @@ class Observer:
             looks: Any = {"ramps": self._ramps, "tints": self._tints, "fields": state}
             return out.copy_(rgb(state["element"], colors, kind=Tensors(self.device), **looks))
         program = state.program
-        slot, bits, _ = program.planes_of("element")
+        slot, bits, _ = program.planes["element"]
         _native(state, "rgb", out, slot, bits, colors)
         for ramp in self._ramps:
             real = ramp.starts.dtype == torch.float32
-            field = (program.layout.reals[ramp.field], 0, 0) if real else program.planes_of(ramp.field)
+            field = (program.layout.reals[ramp.field], 0, 0) if real else program.planes[ramp.field]
             places = slot, bits, ramp.id, int(real), *map(int, field), len(ramp.starts)
             _native(state, "ramp", out, *places, ramp.starts, ramp.colors)
         for tint in self._tints:
@@ -113,7 +113,7 @@ class Observer:
         batch, height, width = shape_of(state)
         out = self.buffer(out, (batch, len(self._bits), height, word_count(width)), torch.int64)
         if isinstance(state, PackedState):
-            places = [state.program.planes_of(name)[0] + bit for name, bit in self._bits]
+            places = [state.program.planes[name][0] + bit for name, bit in self._bits]
             numbers = torch.tensor(places, dtype=torch.int32)
             return _native(state, "planes", out, len(places), numbers)
         for place, (name, bit) in enumerate(self._bits):
@@ -260,7 +260,7 @@ def _native_channel(channel: Channel, number: int, state: PackedState) -> tuple[
     program = state.program
     if channel.slot in program.layout.reals:
         return 4, program.layout.reals[channel.slot], 0, 0
-    slot, bits, signed = program.planes_of(channel.slot)
+    slot, bits, signed = program.planes[channel.slot]
     if channel.read:
         return 3, slot, bits, int(signed)
     return (2, slot, bits, number) if channel.one_hot is None else (1, slot, bits, channel.one_hot)

@@ -130,10 +130,17 @@ class OwnedBatch(PackedArrays):
         return self.__copy__()
 
 
+def like_of(state: Mapping[str, Array]) -> Like:
+    """The dtypes and shapes of a state, without unpacking anything."""
+    if isinstance(state, PackedArrays):
+        return state.like
+    return {name: (value.dtype, tuple(value.shape)) for name, value in state.items()}
+
+
 def shape_of(state: Mapping[str, Array]) -> tuple[int, int, int]:
     """(worlds, rows, columns) of a state, without unpacking anything."""
-    like = getattr(state, "like", None)  # what packed states know of their tensors
-    batch, height, width = state["element"].shape if like is None else like["element"][1]
+    shape = state.like["element"][1] if isinstance(state, PackedArrays) else state["element"].shape
+    batch, height, width = shape
     return batch, height, width
 
 

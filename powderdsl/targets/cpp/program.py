@@ -17,9 +17,9 @@ from powderdsl.ir.ops import Program
 from powderdsl.system.reading import read_bytes
 from powderdsl.targets import cache
 from powderdsl.targets.codec import Piece, parameters, pieces
-from powderdsl.targets.cpp.build import current, load_library, loadable
+from powderdsl.targets.cpp.build import build, current, load_library
 from powderdsl.targets.cpp.source import native_source
-from powderdsl.targets.job import Job, Like, OwnedBatch
+from powderdsl.targets.job import Job, Like, OwnedBatch, like_of, shape_of
 from powderdsl.targets.layout import Layout
 
 BATCH_SIZES = 16
@@ -52,7 +52,7 @@ def compile_program(program: Program, planes: Program, width: int) -> NativeCode
         NoCompiler: there is no C++ compiler, or it failed.
     """
     source, layout, units = native_source(planes, width)
-    library = loadable(source, program.name, units)
+    library = build(source, program.name, units)
     return NativeCode(library, width, layout, pieces(program), tuple(p.name for p in planes.passes))
 
 
@@ -161,28 +161,27 @@ class NativeProgram:
         self.layout, self.threads = code.layout, threads
         self.pieces, self._passes = code.pieces, code.passes
         self._inputs: dict[int, Inputs] = {}
-        self._planes = {
+        self.planes = {
             name: (self.layout.planes[parts[0].planes[0]], len(parts[0].planes), parts[0].signed)
             for name, parts in self.pieces.items()
             if not parts[0].is_real
         }
+        """The first plane of a state tensor, the number of planes, and whether the last one is a sign."""
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
         """The state `job.steps` later. Jobs with given draws or chosen passes are for other backends."""
         assert not job.draws
         assert job.passes is None
         state, (seed, index, start, since) = job.state, job.clock
-        if not (seed.is_contiguous() and index.is_contiguous() and start.is_contiguous()):
-            seed, index, start = seed.contiguous(), index.contiguous(), start.contiguous()
+        seed, index, start = seed.contiguous(), index.contiguous(), start.contiguous()
         inputs = self._inputs.get(start.shape[0])
         if inputs is None or inputs.params is not job.params:
             inputs = self._made_inputs(job.params, start.shape[0])
         if isinstance(state, PackedState) and state.program is self:
-            like, copy = state.like, not job.reuse
+            copy = not job.reuse
             handle = state.handle if copy else state.take()
         else:
-            copy = False
-            handle, like = self._pack(state)
+            copy, handle = False, self._pack(state)
         seconds = None if job.timing is None else (ctypes.c_double * len(self._passes))()
         handle = self.library.pd_run(
             handle, copy, job.steps, self.threads,
@@ -191,7 +190,7 @@ class NativeProgram:
         if job.timing is not None and seconds is not None:
             for name, spent in zip(self._passes, seconds, strict=True):
                 job.timing.add(name, spent)
-        return PackedState(self, handle, like)
+        return PackedState(self, handle, like_of(state))
 
     def _made_inputs(self, params: Mapping[str, Tensor], batch: int) -> Inputs:
         """The inputs of some parameters, kept for the next call with the same mapping."""
@@ -202,26 +201,19 @@ class NativeProgram:
         self._inputs[batch] = inputs = Inputs(params, bits, floats)
         return inputs
 
-    def _pack(self, state: Mapping[str, Tensor]) -> tuple[int, Like]:
-        batch, height, width = state["element"].shape
-        handle = self.library.pd_new(batch, height, width)
-        like: dict[str, tuple[torch.dtype, tuple[int, ...]]] = {}
+    def _pack(self, state: Mapping[str, Tensor]) -> int:
+        handle: int = self.library.pd_new(*shape_of(state))
         for name, value in state.items():
             value = value.contiguous()
-            like[name] = (value.dtype, tuple(value.shape))
             for part, number, bits, _ in self.parts(name, value):
                 if bits:
                     self.library.pd_load(handle, number, bits, value.element_size(), part.data_ptr())
                 else:
                     self.library.pd_load_real(handle, number, part.data_ptr(), value.stride(0))
-        return handle, like
+        return handle
 
     def parts(self, name: str, value: Tensor) -> Iterator[tuple[Tensor, int, int, bool]]:
-        """The parts of a state tensor in slots, each with its field's number and 0 bits, or as `planes_of` says."""
+        """The parts of a state tensor in slots, each with its field's number and 0 bits, or as `planes` says."""
         for piece in self.pieces[name]:
-            number = (self.layout.reals[piece.slot], 0, False) if piece.is_real else self._planes[name]
+            number = (self.layout.reals[piece.slot], 0, False) if piece.is_real else self.planes[name]
             yield piece.of(value), *number
-
-    def planes_of(self, name: str) -> tuple[int, int, bool]:
-        """The first plane of a state tensor, the number of planes, and whether the last one is a sign."""
-        return self._planes[name]

@@ -13,7 +13,7 @@ from powderdsl.targets import words as torch_words
 from powderdsl.targets.codec import parameters, pieces
 from powderdsl.targets.cuda import build
 from powderdsl.targets.cuda.source import KernelSource, cuda_source
-from powderdsl.targets.job import Job, Like, PackedArrays, Runnable, unavailable
+from powderdsl.targets.job import Job, Like, PackedArrays, Runnable, like_of, shape_of, unavailable
 from powderdsl.targets.torch.program import packed_program
 
 _HELP = "run on the device `cuda`, or on the backend `torch`, or on `native` on the CPU"
@@ -119,7 +119,7 @@ class CudaProgram:
 
     def _pack(self, state: Mapping[str, Tensor]) -> DeviceState:
         """State slots as packed planes and reals."""
-        (batch, height, width), device = state["element"].shape, state["element"].device
+        (batch, height, width), device = shape_of(state), state["element"].device
         layout = self.kernel(height, width)[0].layout
         row_words = -(-width // 32)
         planes = torch.zeros(
@@ -128,9 +128,7 @@ class CudaProgram:
         reals = torch.zeros(
             batch, max(1, len(layout.reals)), height, width, dtype=torch.float32, device=device
         )
-        like = {}
         for name, value in state.items():
-            like[name] = (value.dtype, tuple(value.shape))
             for piece in self._pieces[name]:
                 if piece.is_real:
                     reals[:, layout.reals[piece.slot]] = piece.of(value)
@@ -138,7 +136,7 @@ class CudaProgram:
                 for i, plane in enumerate(piece.planes):
                     words = torch_words.pack((value >> i) & 1 != 0)
                     planes[:, layout.planes[plane]] = words.view(torch.int32)[..., :row_words]
-        return DeviceState(self, planes, reals, like)
+        return DeviceState(self, planes, reals, like_of(state))
 
     def unpack(self, state: DeviceState, name: str) -> Tensor:
         """One slot of a state in its storage dtype."""

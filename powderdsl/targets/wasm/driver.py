@@ -130,13 +130,6 @@ class Batches:
         with body.each(first, first + self.library.rows) as line:
             yield line
 
-    def close_line(self, field: Value, line: Value, start: Value, alive: Value) -> None:
-        """What comes after a line's values; `alive` is not 0 if one of them is not."""
-        live = body.let(op("i32.ne", alive, 0))
-        (field + line)[LIVE] = live
-        field[SOME] |= live
-        self.library.finish_line(start)
-
 
 class Driver(Batches):
     """Makes the functions that a host calls.
@@ -156,7 +149,7 @@ class Driver(Batches):
         self.define(
             self.allocate, self.release, self.copy, self.scratch, self.load, self.store, export=export
         )
-        self.define(self.enter, self.begin, self.leave, self.run, export=export)
+        self.define(self.enter, self.begin, self.run, export=export)
         for number, pass_ in enumerate(self.passes if export else ()):
             self.library.module.export(pass_, str(number))
         return self.calls
@@ -177,8 +170,7 @@ class Driver(Batches):
             body.otherwise()
             with body.when(op("i32.ne", library.world_rows, rows)):
                 body.trap()
-        count = body.let((worlds + 1) >> library.strips.equals(0))
-        count.set(either(library.strips, worlds, count))
+        count = body.let(either(library.strips, worlds, (worlds + 1) >> 1))
         size = (worlds * per_world + count * memory.group + (HEADER + 4 * 15)) & ~15
         batch = body.let(library.bump(size))
         batch[WORLDS], batch[GROUPS] = worlds, count
@@ -311,7 +303,10 @@ class Driver(Batches):
                     value = body.let(word(source + at))
                     word(start + at).set(value)
                     alive |= value << 1
-                self.close_line(field, line, start, alive)
+                live = body.let(op("i32.ne", alive, 0))
+                (field + line)[LIVE] = live
+                field[SOME] |= live
+                library.finish_line(start)
                 source += 4 * memory.width
 
     def _store_real(self, batch: I32, slot: I32, address: I32, apart: I32) -> None:
@@ -336,7 +331,6 @@ class Driver(Batches):
                     body.do(self.calls["begin"](batch, group, step))
                     for pass_ in self.passes:
                         body.do(pass_())
-                body.do(self.calls["leave"]())
         with body.each(0, batch[WORLDS], some=False) as world:
             clock = self.clock_of(batch, 2, world)
             clock += counted(steps)
@@ -351,7 +345,6 @@ class Driver(Batches):
         """A group becomes the one that runs: parameters, and what the keys of its worlds have in common at all steps."""
         library, memory, layout = self.library, self.memory, self.layout
         library.group.set(self.part(batch, 3) + number * memory.group)
-        library.present.set(library.group[memory.present])
         for lane in range(LANES):
             with body.scope():
                 worlds, world = body.let(batch[WORLDS]), self.world_of(batch, number, lane)
@@ -427,10 +420,6 @@ class Driver(Batches):
             with body.when(library.present.equals(-1)):
                 body.do(look())
 
-    def leave(self) -> None:
-        """The group keeps the ids that are present."""
-        self.library.group[self.memory.present] = self.library.present
-
     def _constant_field(self, value: F32) -> Value:
         """A new field of equal values."""
         library, width = self.library, self.memory.width
@@ -494,15 +483,14 @@ class Driver(Batches):
         with body.scope():
             table = body.let(library.bump((lines << 2) + 15 & ~15))
             word(self.memory.table(dy, wraps=wraps)).set(table)
-            height = body.let(library.world_rows)
+            height = library.world_rows
             with body.each(0, lines) as line:
                 y = body.let(line % height)
-                other = body.let(y + dy)
-                seen = line - y + other
                 if wraps:
-                    other.set(op("i32.rem_s", other, height))
-                    other.set(either(op("i32.lt_s", other, 0), other + height, other))
-                word(table + (line << 2)).set(seen if wraps else either(other < height, seen, lines))
+                    other = line - y + (y + (height * abs(dy) + dy)) % height
+                else:
+                    other = either((y + dy) < height, line + dy, lines)
+                word(table + (line << 2)).set(other)
 
     def _fixed(self, kind: int, a: int, b: int) -> Value:
         """A plane of a bit of coordinates (0: rows, 1: columns; modulus, bit), or of `inside` (2: rows, columns).

@@ -223,7 +223,6 @@ class Library:
         """Planes: without a flag, with all; with all, and in the halo those of rows that lie in the world."""
         self.calm, self.zeros, self.group = variable("i32"), variable("i32"), variable("i32")
         """A field without a live line; a line of zeros; the group that runs."""
-        self.present = variable("i64")
         self.world_rows = variable("i32")
         """Rows of a world; 0 before the first batch."""
         self.row_list = variable("i32")
@@ -239,6 +238,11 @@ class Library:
         self.mix = define(self._mix)
         self.draw_below, self.draw_below_planes = define(self._draw_below), define(self._draw_below_planes)
         self.coin = define(self._coin)
+
+    @property
+    def present(self) -> Place:
+        """The ids that are present in the group that runs."""
+        return self.group[self.memory.present]
 
     # Memory
 
@@ -454,15 +458,18 @@ class Library:
 
     # Columns
 
-    def columns(self, row: Value, at: Value, x: Value, dx: int, *, wraps: bool) -> Value:
-        """The flags `dx` columns to the right, of any row with more than a word. Beyond the width they are garbage.
+    def columns(self, row: Value, offset: int, at: Value, x: Value, dx: int, *, wraps: bool) -> Value:
+        """The flags `dx` columns to the right. Beyond the width they are garbage.
 
         Args:
-            row: the address of the row's first word.
+            row, offset: the address of the row's first word.
             at: bytes from there to the word.
             x: the column of the word's first flag, as an i32.
         """
         memory = self.memory
+        if memory.words == 1:
+            return self.rotated(load("v128.load", row, offset), dx, wraps=wraps)
+        row = body.let(row + offset)
         if not memory.whole or abs(dx) >= WORD:
             return self._columns(wraps=wraps)(row, x + dx)
         last = const("i32", memory.row - 16)

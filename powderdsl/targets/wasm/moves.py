@@ -120,7 +120,7 @@ class _Mover:
             def seen(row: Local, dx: int) -> Value:
                 if not dx:
                     return load("v128.load", row + w)
-                return library.columns(row, w, x, dx, wraps=True)
+                return library.columns(row, 0, w, x, dx, wraps=True)
 
             there = body.let(seen(other, dx)) if self.kind == "swap" else old
             back = body.let(seen(source, -dx))

@@ -10,14 +10,13 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from math import prod
 from threading import RLock
-from typing import Any
 
 from powderdsl.ir.ops import Program
 from powderdsl.ir.text import structure
 from powderdsl.system.memo import Memo
 from powderdsl.targets.array_kind import Array, ArrayKind
 from powderdsl.targets.codec import parameters, pieces
-from powderdsl.targets.job import Job, Like, OwnedBatch, shape_of
+from powderdsl.targets.job import Job, Like, OwnedBatch, like_of, shape_of
 from powderdsl.targets.layout import layout_of
 from powderdsl.targets.wasm.driver import numbers_of
 from powderdsl.targets.wasm.host import Compiled, this_host
@@ -82,11 +81,11 @@ class WasmProgram:
             state = dict(state)
         with instance:
             if isinstance(state, WasmState):
-                batch, like = state.take() if job.reuse else instance.copy(state), state.like
+                batch = state.take() if job.reuse else instance.copy(state)
             else:
-                batch, like = instance.pack(state)
+                batch = instance.pack(state)
             instance.run(batch, job, shape[0])
-        return WasmState(instance, batch, like)
+        return WasmState(instance, batch, like_of(state))
 
 
 class Instance:
@@ -142,21 +141,19 @@ class Instance:
         self.call("copy", state.handle, batch)
         return batch
 
-    def pack(self, state: Mapping[str, Array]) -> tuple[int, Like]:
+    def pack(self, state: Mapping[str, Array]) -> int:
         """A batch with a state."""
         worlds, rows, _ = shape_of(state)
         batch = self.new(worlds, rows)
-        like: dict[str, tuple[Any, tuple[int, ...]]] = {}
         for name, given in state.items():
             value = self.kind.contiguous(given)
-            like[name] = (value.dtype, tuple(value.shape))
             if bool(value.any()):  # a new batch holds zeros
                 data = bytes(self.kind.bytes_of(value))
                 at = self.call("scratch", len(data))
                 self.running.write(at, data)
-                for numbers in self.transfers(name, value.dtype.itemsize, like[name][1], at):
+                for numbers in self.transfers(name, value.dtype.itemsize, value.shape, at):
                     self.call("load", batch, *numbers)
-        return batch, like
+        return batch
 
     def read(self, batch: int, name: str, like: Like) -> Array:
         """One slot as a new array of its storage dtype."""
@@ -194,7 +191,6 @@ class Instance:
                     before = time.perf_counter()
                     self.call(str(number))
                     job.timing.add(pass_.name, time.perf_counter() - before)
-            self.call("leave")
 
 
 class WasmState(OwnedBatch):

@@ -77,10 +77,11 @@ class WordLoop(Loop):
         library, memory = self.library, self.memory
         stop = body.let(library.cells)
         any_flags = [body.let(0, "v128") for _ in self.outs]
-        self.y = self.row = self.x = None
+        self.y: Value | None = None
         if memory.words == 1:
             with body.each(0, stop, 16) as at:
-                self.at = at
+                self.at = self.row = at
+                self.within = self.x = ZERO
                 self.word(any_flags)
         else:
             y = body.let(0)
@@ -143,12 +144,10 @@ class WordValues(Values[Value]):
             return self.known[id(draw)]
         args = self.args(node)
         match node.op:
-            case "load" | "inside":
-                return self.plane(node)
             case "coordinate" if node.attr[0] == "step":
                 number = self.memory.layout.step_planes[node.attr[1:]]
                 return load("v128.load", 0, self.memory.at("steps", number))
-            case "coordinate":
+            case "load" | "inside" | "coordinate":
                 return self.plane(node)
             case "and" | "or" | "xor":
                 for value, other in (node.args, node.args[::-1]) if node.op == "and" else ():
@@ -189,16 +188,10 @@ class WordValues(Values[Value]):
         loop, memory = self.loop, self.memory
         plane = loop.held[str(node.args[0].attr)]
         offset = memory.base + dy * memory.row
-        if memory.words == 1:
-            row = load("v128.load", plane + loop.at, offset)
-            value = self.library.rotated(row, dx, wraps=wraps) if dx else row
-        elif dx:
-            assert loop.row is not None
-            assert loop.x is not None
-            start = body.let(plane + loop.row + offset)
-            value = self.library.columns(start, loop.within, loop.x, dx, wraps=wraps)
-        else:
-            value = load("v128.load", plane + loop.at, offset)
+        value: Value = load("v128.load", plane + loop.at, offset)
+        if dx:
+            row = plane + loop.row
+            value = self.library.columns(row, offset, loop.within, loop.x, dx, wraps=wraps)
         if dy and not wraps:
             return value & load("v128.load", self.library.inside + loop.at, offset)
         if dx and not memory.whole:
