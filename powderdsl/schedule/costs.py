@@ -18,6 +18,7 @@ from powderdsl.schedule.types import (
     map_each,
     map_values,
     on_all_paths,
+    rewritten,
     taken,
 )
 
@@ -168,13 +169,13 @@ def conditions(schedule: Schedule) -> Schedule:
                     yield arg, flags | dict.fromkeys(others[: MAX_CONDITIONS - len(flags)])
 
         where = on_all_paths(roots, below)  # a variable's value is read everywhere
-        done: dict[Node, Node] = {}
-        for node in ordered(roots):
-            args = [done[arg] for arg in node.args]
-            if node.op in DRAWS and node in random and where[node]:
-                args.append(combined("and", where[node], graph))
-            done[node] = graph.node(node.op, node.type, tuple(args), node.attr)
-        return [statement.with_values(lambda node: done.get(node, node))]
+
+        def rule(node: Node) -> Node | None:
+            facts = where.get(node) if node.op in DRAWS else None
+            args = (*node.args, combined("and", facts or (), graph))
+            return graph.node(node.op, FLAG, args, node.attr) if facts else None
+
+        return [statement.with_values(rewritten(statement.values, graph, rule))]
 
     return map_each(schedule, Compute, change)
 

@@ -16,6 +16,7 @@ from powderdsl.schedule.types import (
     Forget,
     Guard,
     Move,
+    Out,
     Release,
     Schedule,
     Statement,
@@ -63,20 +64,23 @@ def _block(body: Sequence[Statement], indent: str, names: _Names) -> Iterator[st
 
 def _statement(statement: Statement, indent: str, names: _Names) -> Iterator[str]:
     values, outs = _Values(statement.values, names), statement.outs
+
+    def given(out: Out, value: Node, word: str, rest: Node | None) -> Iterator[str]:
+        text, other = values.text(value), f" {word} {values.text(rest)}" if rest is not None else ""
+        yield from values.taken(indent)
+        into = f" into {names.of(out.into)}" if out.into else ""
+        yield f"{indent}{names.of(out.var.name)} = {text}{other}{into}"
+
     match statement:
         case Compute(over=over, region=region, when=when):
             if over:
                 where = f" over {values.text(region)}" if region is not None else ""
                 where += f" when {values.text(when)}" if when is not None else ""
-                yield from (f"{indent}{line}" for line in values.taken())
+                yield from values.taken(indent)
                 yield f"{indent}loop {over}{where}"
                 indent += "  "
             for out in outs:
-                value = values.text(out.value)
-                yield from (f"{indent}{line}" for line in values.taken())
-                into = f" into {names.of(out.into)}" if out.into else ""
-                rest = f" else {values.text(out.otherwise)}" if out.otherwise is not None else ""
-                yield f"{indent}{names.of(out.var.name)} = {value}{rest}{into}"
+                yield from given(out, out.value, "else", out.otherwise)
         case Sweeps(loops=loops, parts=parts):
             for loop, part, lag in statement.placed():
                 if len(loops) > 1:
@@ -85,14 +89,13 @@ def _statement(statement: Statement, indent: str, names: _Names) -> Iterator[str
                 yield from _statement(loop, indent + ("  " if len(loops) > 1 else ""), names)
         case Move(region=movers, op=op, offset=(dy, dx), olds=olds):
             yield f"{indent}{op} by {values.text(movers)} [{dy:+d},{dx:+d}]"
+            indent += "  "
             for out in outs:
                 old = olds[out.var.name]
-                leaves = "" if out.value is old else f" leaving {values.text(out.value)}"
-                into = f" into {names.of(out.into)}" if out.into else ""
-                yield f"{indent}  {names.of(out.var.name)} = {values.text(old)}{leaves}{into}"
+                yield from given(out, old, "leaving", None if out.value is old else out.value)
         case Guard(when=when, body=inner):
             asked = " | ".join(map(values.text, when.args or (when,)))
-            yield from (f"{indent}{line}" for line in values.taken())
+            yield from values.taken(indent)
             yield f"{indent}if any {asked}"
             yield from _block(inner, indent + "  ", names)
             if outs:
@@ -116,10 +119,10 @@ class _Values:
         self.lines: list[str] = []
         self.count = 0
 
-    def taken(self) -> list[str]:
+    def taken(self, indent: str) -> list[str]:
         """The lines added since the last call."""
         lines, self.lines = self.lines, []
-        return lines
+        return [f"{indent}{line}" for line in lines]
 
     def text(self, root: Node) -> str:
         for node in ordered([root]):

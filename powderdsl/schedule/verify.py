@@ -32,9 +32,7 @@ def verify(schedule: Schedule, after: str) -> None:
     """
     try:
         checker = _Checker({var.name: var for _, var in schedule.finds})
-        end = checker.block(schedule.body, set(checker.vars))
-        for node in schedule.results:
-            checker.value(node, end)
+        checker.values(schedule.results, checker.block(schedule.body, set(checker.vars)))
     except InvalidIR as error:
         raise InvalidIR(f"after {after}, pass {schedule.name}: {error}") from None
 
@@ -47,25 +45,22 @@ class _Checker:
     def block(self, body: Sequence[Statement], live: set[str]) -> set[str]:
         """The variables that exist after a block."""
         for statement in body:
-            for node in statement.values:
-                self.value(node, live)
+            self.values(statement.values, live)
             for out in statement.outs:
-                types = {node.type for node in (out.value, out.otherwise) if node is not None}
-                demand(types == {out.var.type}, f"{out.var.name} is a {out.var.type}, but gets others")
+                for node in (out.value, out.otherwise or out.value):
+                    demand(node.type == out.var.type, f"{out.var.name} gets a {node.type}")
             end, skipped = self.block(statement.body, live), self.block(statement.otherwise, live)
+            names, ended = statement.vars.keys(), statement.ended
             if isinstance(statement, Guard):
-                demand(statement.when.type == ANSWER, "a guard asks for no answer")
-                kept = statement.vars.keys()
-                demand(kept <= end, f"{in_order(kept - end)} are kept, but not made")
-                made = skipped - live - kept
+                demand(names <= end, f"{in_order(names - end)} are kept, but not made")
+                made = skipped - live - names
                 demand(not made, f"{in_order(made)} are made only where a body is skipped")
-                live = live & end | kept  # the body defines them; outside they exist from its end
+                live = live & end | names  # the body defines them; outside they exist from its end
                 continue
             if isinstance(statement, Sweeps):
                 _check_order(statement)
                 live = end.difference(statement.frees)
                 continue
-            ended = statement.ended
             demand(ended <= live, f"{in_order(ended - live)} are released or overwritten, but not there")
             if isinstance(statement, Compute):
                 demand(
@@ -74,13 +69,9 @@ class _Checker:
                 )
                 far = read_elsewhere(statement.values) if statement.over == "words" else set()
                 demand(not ended & far, f"{in_order(ended & far)} are overwritten, but read at neighbors")
-            elif isinstance(statement, Move):
-                types = {var.type for var in statement.vars.values()}
-                demand(len(types) == 1, "flags and floats move apart")
-                same = all(out.value is out.otherwise for out in statement.outs)
-                demand(types == {FLAG} or (statement.op == "swap" and same), "floats are exchanged")
-                demand(statement.op in ("swap", "arrive"), f"a movement by {statement.op}")
-                demand(statement.region.type == FLAG, "movers are flags")
+            elif isinstance(statement, Move) and {var.type for var in statement.vars.values()} != {FLAG}:
+                same = all(out.value is out.otherwise and out.var.type == REAL for out in statement.outs)
+                demand(same and statement.op == "swap", "floats are exchanged, apart from flags")
             live = live - ended
             for name, var in statement.vars.items():
                 demand(self.vars.setdefault(name, var) is var, f"two variables are called {name}")
@@ -88,8 +79,8 @@ class _Checker:
                 live.add(name)
         return live
 
-    def value(self, root: Node, live: set[str]) -> None:
-        for node in ordered([root]):
+    def values(self, roots: Sequence[Node], live: set[str]) -> None:
+        for node in ordered(roots):
             if node.op == "load":
                 demand(node.attr in live, f"{node.attr} is read, but not there")
                 demand(self.vars[node.attr].type == node.type, f"{node.attr} is read as a {node.type}")
