@@ -36,12 +36,13 @@ def late(schedule: Schedule) -> Schedule:
     known: dict[str, Node] = {}
 
     def rule(node: Node) -> Node | None:
-        return known.get(node.attr) if node.op == "load" else None
+        return known.get(node.attr)
 
     for statement in flat(schedule.body):
         new = rewritten(statement.values, schedule.graph, rule)
-        if isinstance(statement, Compute):
-            known |= {out.var.name: new(out.value) for out in statement.outs if out.var.type == REAL}
+        for out in statement.outs if isinstance(statement, Compute) else ():
+            if out.var.type == REAL:
+                known[out.var.name] = new(out.value)
     schedule = map_values(schedule, rule)
     namer, slots = Namer(schedule), dict(schedule.finds)
     outs: dict[Node, Out] = {}
@@ -94,18 +95,18 @@ def chosen(schedule: Schedule) -> Schedule:
 
 def _at_neighbor(value: Node, where: tuple[int, int, bool], graph: Graph) -> Node | None:
     """A float at a neighbor, if it is a constant or a choice between such floats, up to its sign."""
-    match value.op:
-        case "const":
-            return value
-        case "neg":
-            args = [_at_neighbor(value.args[0], where, graph)]
-        case "select" if value.args[0].op not in ("param", "const"):
-            flag = graph.node("shift", FLAG, (value.args[0],), where)
-            args = [flag, *(_at_neighbor(arg, where, graph) for arg in value.args[1:])]
-        case _:
+    if value.op == "const":
+        return value
+    if value.op not in ("neg", "select") or value.args[0].op in ("param", "const"):
+        return None
+    args = []
+    for arg in value.args:
+        flag = arg.type == FLAG
+        new = graph.node("shift", FLAG, (arg,), where) if flag else _at_neighbor(arg, where, graph)
+        if new is None:
             return None
-    found = tuple(arg for arg in args if arg is not None)
-    return graph.node(value.op, REAL, found) if len(found) == len(args) else None
+        args.append(new)
+    return graph.node(value.op, REAL, tuple(args))
 
 
 def led(schedule: Schedule) -> Schedule:

@@ -198,7 +198,7 @@ def _reads(values: list[Node]) -> list[tuple[Node, int, int]]:
         else:
             stack += [(arg, dy, dx) for arg in node.args[2 if node.op == "select" else 0 :]]
     order = ordered(values)
-    reads = ((field, dy, dx) for (field, dy), dx in reach.items())
+    reads = [(field, dy, dx) for (field, dy), dx in reach.items()]
     return sorted(reads, key=lambda read: (order.index(read[0]), read[1]))
 
 
@@ -258,14 +258,11 @@ def _continued(first: Compute, second: Compute, reads: Counter[str], graph: Grap
     simple = all(node.type == REAL and node.op in CONTINUING for node in nodes)
     known = {_base(value) for value in made.values()} | made.keys()
     inside = Counter(loaded(second.values))
-    names = {*loaded([*second.results, second.region])}
-    if not simple or sum(bool(node.args) for node in nodes) > FEW or not known >= names:
+    few = sum(bool(node.args) for node in nodes) <= FEW
+    if not (simple and few and known >= second.reads) or any(reads[name] != inside[name] for name in made):
         return None
-    if any(reads[name] != inside[name] for name in made):
-        return None
-    new = rewritten(nodes, graph, lambda node: made.get(node.attr) if node.op == "load" else None)
-    outs = tuple(Out(out.var, new(out.value), out.otherwise) for out in second.outs)
-    return replace(first, outs=outs)
+    new = rewritten(nodes, graph, lambda node: made.get(node.attr))
+    return replace(first, outs=tuple([replace(out, value=new(out.value)) for out in second.outs]))
 
 
 def _base(value: Node) -> str:
@@ -288,15 +285,15 @@ def _components(run: Sequence[Compute]) -> list[list[Compute]]:
 def _joined(run: Sequence[Compute], reads: Counter[str]) -> Sweeps:
     """The loops with their parts and lags, and the fields that only loops of the same part read."""
     parts, lags = _places(run)
-    inside = [Counter[str]() for _ in run]
+    inside = Counter[tuple[int, str]]()
     for loop, part in zip(run, parts, strict=True):
-        inside[part].update(loaded(loop.values))
-    passing = (
-        out.var.name
+        inside.update((part, name) for name in loaded(loop.values))
+    passing = [
+        name
         for loop, part in zip(run, parts, strict=True)
-        for out in loop.outs
-        if out.var.type == REAL and reads[out.var.name] == inside[part][out.var.name]
-    )
+        for name, var in loop.vars.items()
+        if var.type == REAL and reads[name] == inside[part, name]
+    ]
     return Sweeps(frees=tuple(passing), body=tuple(run), parts=tuple(parts), lags=tuple(lags))
 
 

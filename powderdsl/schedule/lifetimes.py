@@ -114,7 +114,7 @@ def _put_off(sweeps: Sweeps, after: set[str], namer: Namer, graph: Graph) -> Swe
     olds = {name: load(graph, var) for name, var in waiting.items()}
     loops = []
     for one in sweeps.body:
-        new = rewritten(one.values, graph, lambda node: olds.get(node.attr) if node.op == "load" else None)
+        new = rewritten(one.values, graph, lambda node: olds.get(node.attr))
         loops.append(one.with_values(new))
     outs = tuple(replace(out, var=waiting.get(out.var.name, out.var)) for out in loop.outs)
     zero = constant(graph, REAL)
@@ -179,16 +179,14 @@ def swaps(schedule: Schedule) -> Schedule:
     namer, graph = Namer(schedule), schedule.graph
 
     def change(loop: Compute) -> list[Statement]:
-        found = [_swap(out.value, offsets, shifted) for out in loop.outs if loop.over != "words"]
-        first = found[0] if found else None
-        if first is None:
+        swaps = [_swap(out.value, offsets, shifted) for out in loop.outs]
+        ways = {swap[0] if swap else None for swap in swaps}
+        way = ways.pop() if loop.over != "words" and len(ways) == 1 else None
+        if way is None:
             return [loop]
-        movers, offset, _, fresh = first
+        movers, offset, fresh = way
         planes, outs = [], []
-        for out, swap in zip(loop.outs, found, strict=True):
-            if swap is None or (swap[0], swap[1], swap[3]) != (movers, offset, fresh):
-                return [loop]
-            old = swap[2]
+        for out, (_, old) in zip(loop.outs, filter(None, swaps), strict=True):
             slot = settled.get(old.attr)
             if out.value.op == "settle" and (slot is None or slots.get(out.var.name) != slot):
                 return [loop]
@@ -196,10 +194,10 @@ def swaps(schedule: Schedule) -> Schedule:
             if slot is not None:
                 settled[moved.name] = settled[out.var.name] = slot
             planes.append(Out(moved, old, old))
-            value = load(graph, moved)
+            value = last = load(graph, moved)
             for mask in fresh:
                 value = graph.node("select", REAL, (mask, constant(graph, REAL), value))
-            outs.append(Out(out.var, value, load(graph, moved)))
+            outs.append(Out(out.var, value, last))
         move = Move(tuple(planes), loop.place, region=movers, op="swap", offset=offset)
         region = combined("or", fresh, graph)
         return [move, Compute(tuple(outs), loop.place, region, over="cells")] if fresh else [move]
@@ -207,11 +205,14 @@ def swaps(schedule: Schedule) -> Schedule:
     return without_unread(map_each(schedule, Compute, change))
 
 
+Way = tuple[Node, Offset, tuple[Node, ...]]
+"""The movers of a swap, where they go, and the flags under which values are zero afterwards, the last to be asked first."""
+
+
 def _swap(
     value: Node, offsets: Mapping[str, Offset], shifted: Mapping[str, tuple[str, tuple[int, int, bool]]]
-) -> tuple[Node, Offset, Node, tuple[Node, ...]] | None:
-    """The swap whose result a value is: its movers, where they go, the field whose values they exchange, and the flags
-    under which the value is zero afterwards, the last one first to be asked.
+) -> tuple[Way, Node] | None:
+    """The swap whose result a value is, and the field whose values it exchanges.
 
     Movers come before or after their targets: no cell is both.
     """
@@ -221,17 +222,16 @@ def _swap(
         fresh, value = (value.args[0], *fresh), value.args[2]
     if value.op != "select" or value.args[2].op != "select":
         return None
-    field = value.args[2].args[2]
-    chosen = [choice.args[:2] for choice in (value, value.args[2])]
-    if field.op != "load" or field.type != REAL or any(mask.op != "load" for mask, _ in chosen):
+    first, yes, second, no, field = *value.args[:2], *value.args[2].args
+    if field.op != "load" or {first.op, second.op} != {"load"}:
         return None
-    for (movers, there), (targets, back) in (chosen, chosen[::-1]):
+    for movers, there, targets, back in ((first, yes, second, no), (second, no, first, yes)):
         dy, dx = offset = offsets.get(movers.attr, (0, 0))
         ways = (dy, dx, True), (-dy, -dx, True)
         reads = [(node.op, node.args[:1], node.attr) for node in (there, back)]
         exchanged = reads == [("shift", (field,), way) for way in ways]
         if offset != (0, 0) and exchanged and shifted.get(targets.attr) == (movers.attr, ways[1]):
-            return movers, offset, field, fresh
+            return (movers, offset, fresh), field
     return None
 
 

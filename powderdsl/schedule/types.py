@@ -385,7 +385,10 @@ def map_each(schedule: Schedule, kind: type[Kind], change: Callable[[Kind], Iter
     """The schedule with every statement of a kind, nested or not, replaced by other statements."""
 
     def block(body: Block) -> Block:
-        return tuple(new for old in body for new in (change(old) if isinstance(old, kind) else (old,)))
+        result: list[Statement] = []
+        for old in body:
+            result += change(old) if isinstance(old, kind) else (old,)
+        return tuple(result)
 
     return map_blocks(schedule, block)
 
@@ -500,12 +503,15 @@ def connected(items: Sequence[Item], keys: Callable[[Item], set[Any]]) -> list[l
     """Items in groups, all in order: those that share keys, or are connected through others that do, are together."""
     groups: list[tuple[set[Any], list[int]]] = []
     for number, item in enumerate(items):
-        own = keys(item)
-        same = [group for group in groups if not own.isdisjoint(group[0])]
-        numbers = sorted([number, *(old for _, members in same for old in members)])
-        groups = [group for group in groups if own.isdisjoint(group[0])]
-        groups.append((own.union(*(others for others, _ in same)), numbers))
-    return [[items[number] for number in members] for members in sorted(members for _, members in groups)]
+        group, apart = (keys(item), [number]), []
+        for other in groups:
+            if group[0].isdisjoint(other[0]):
+                apart.append(other)
+            else:
+                group = group[0] | other[0], other[1] + group[1]
+        groups = [*apart, group]
+    members = sorted([sorted(numbers) for _, numbers in groups])
+    return [[items[number] for number in numbers] for numbers in members]
 
 
 class Namer:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from powderdsl.ir.ops import FLAG, Graph, Node, ordered
 from powderdsl.schedule.costs import DRAWS, LOGIC, UNIFORM
@@ -42,13 +42,8 @@ WORTH = 3
 """How many gates of a mask must be shared with others for a plane of their own, and how many masks must share gates."""
 
 
-@dataclass(frozen=True)
-class _Mask:
-    """A mask, and its conjuncts that are known early."""
-
-    place: int
-    value: Node
-    parts: tuple[Node, ...]
+Mask = tuple[int, Node, list[Node]]
+"""The number of a statement, a mask that it computes, and conjuncts of the mask that are known early."""
 
 
 def early(schedule: Schedule) -> Schedule:
@@ -57,38 +52,42 @@ def early(schedule: Schedule) -> Schedule:
     `m = a & b & c; if any m: a' = …; n = a' & ~b & c` → `s = b & c, t = ~b & c; m = a & s; …; n = a' & t`.
     """
     graph, namer = schedule.graph, Namer(schedule)
-    known = {name: i for i, statement in enumerate(schedule.body) for name in statement.vars}
+    known: dict[str, int] = {}
     users: dict[Node, int] = {}
     """The first statement that computes each value."""
-    for i, statement in reversed([*enumerate(schedule.body)]):
-        users |= dict.fromkeys(ordered(statement.values), i)
-    groups: dict[int, list[_Mask]] = {}
+    for i, statement in enumerate(schedule.body):
+        known |= dict.fromkeys(statement.vars, i)
+        users = dict.fromkeys(ordered(statement.values), i) | users
+    groups: dict[int, list[Mask]] = {}
     """Masks with the conjuncts that depend on the same statement last."""
     for i, masks in asked_masks(schedule.body):
         for out in masks:
             parts: dict[int, list[Node]] = {}
             for part in conjuncts(out.value):
-                if not any(node.op in DRAWS or is_movement(node) for node in ordered([part])):
-                    since = max((known.get(name, -1) for name in loaded([part])), default=-1)
+                since = -1
+                for node in ordered([part]):
+                    if node.op in DRAWS or is_movement(node):
+                        break
+                    since = max(since, known.get(node.attr, -1))
+                else:
                     parts.setdefault(since, []).append(part)
             for since, nodes in parts.items():
-                groups.setdefault(since, []).append(_Mask(i, out.value, tuple(nodes)))
+                groups.setdefault(since, []).append((i, out.value, nodes))
     before: dict[int, list[Out]] = {}
     planes: dict[Node, dict[Node, Node]] = {}
     """By mask: the loads of planes, by the parts that they replace."""
     for group in filter(None, map(_shared, groups.values())):
         outs: dict[frozenset[Node], Out] = {}
-        for mask in group:
-            if (key := frozenset(mask.parts)) not in outs:
-                outs[key] = Out(namer.var(FLAG), combined("and", mask.parts, graph))
-            plane = load(graph, outs[key].var)
-            planes.setdefault(mask.value, {}).update(dict.fromkeys(mask.parts, plane))
-        before.setdefault(min(users[mask.value] for mask in group), []).extend(outs.values())
+        for _, mask, nodes in group:
+            if (key := frozenset(nodes)) not in outs:
+                outs[key] = Out(namer.var(FLAG), combined("and", nodes, graph))
+            planes.setdefault(mask, {}).update(dict.fromkeys(nodes, load(graph, outs[key].var)))
+        before.setdefault(min(users[mask] for _, mask, _ in group), []).extend(outs.values())
     if not planes:
         return schedule
     new: dict[Node, Node] = {}
     for node in ordered(schedule.values):
-        new[node] = graph.node(node.op, node.type, tuple(new[arg] for arg in node.args), node.attr)
+        new[node] = graph.node(node.op, node.type, tuple([new[arg] for arg in node.args]), node.attr)
         if node in planes:
             rest = [new[part] for part in conjuncts(node) if part not in planes[node]]
             new[node] = combined("and", dict.fromkeys([*planes[node].values(), *rest]), graph)
@@ -113,15 +112,18 @@ def _gates(parts: Iterable[Node]) -> Iterator[Node]:
             stack += node.args
 
 
-def _shared(group: Sequence[_Mask]) -> list[_Mask]:
+def _shared(group: Sequence[Mask]) -> list[Mask]:
     """The masks of a group with the parts that share gates with other masks, if these are worth a plane."""
-    count = Counter(gate for mask in group for gate in _gates(mask.parts))
-    shared = []
-    for mask in group:
-        parts = tuple(part for part in mask.parts if any(count[gate] > 1 for gate in _gates([part])))
-        if sum(count[gate] > 1 for gate in _gates(parts)) >= WORTH:
-            shared.append(replace(mask, parts=parts))
-    return shared if len({mask.place for mask in shared}) >= WORTH else []
+    count: Counter[Node] = Counter()
+    for _, _, parts in group:
+        count.update(_gates(parts))
+    shared = {gate for gate, masks in count.items() if masks > 1}
+    worthy: list[Mask] = []
+    for place, mask, parts in group:
+        parts = [part for part in parts if not shared.isdisjoint(_gates([part]))]
+        if len(shared.intersection(_gates(parts))) >= WORTH:
+            worthy.append((place, mask, parts))
+    return worthy if len({place for place, _, _ in worthy}) >= WORTH else []
 
 
 MAX_CONDITIONS = 4
@@ -137,28 +139,32 @@ def empty(schedule: Schedule) -> Schedule:
     def change(loop: Compute) -> list[Statement]:
         if loop.over != "words" or loop.region is not None:
             return [loop]
-        alone = [replace(loop, outs=(out,), when=None) for out in loop.outs if is_whole(out.value)]
-        rest = replace(loop, outs=tuple(out for out in loop.outs if not is_whole(out.value)))
-        return [*alone, _with_condition(rest, schedule.graph)] if rest.outs else [*alone]
+        loops: list[Statement] = []
+        rest: list[Out] = []
+        for out in loop.outs:
+            if is_whole(out.value):
+                loops.append(replace(loop, outs=(out,), when=None))
+            else:
+                rest.append(out)
+        return [*loops, _with_condition(replace(loop, outs=tuple(rest)), schedule.graph)] if rest else loops
 
     return map_each(schedule, Compute, change)
 
 
 def is_whole(value: Node) -> bool:
     """Whether a value is one operation on whole planes: `a`, `0`, `a[dy,dx]`, `a & ~b`, `a | b`."""
-    args = value.args
+    ops = sorted([arg.op for arg in value.args])
     match value.op:
         case "load":
             return True
         case "const":
             return not value.attr
         case "shift":
-            return args[0].op == "load" and value.attr[2]
+            return ops == ["load"] and value.attr[2]
         case "or":
-            return all(arg.op == "load" for arg in args)
+            return ops == ["load", "load"]
         case "and":
-            gone = [arg for arg in args if arg.op == "not" and arg.args[0].op == "load"]
-            return len(gone) == 1 and any(arg.op == "load" for arg in args)
+            return ops == ["load", "not"] and difference(value)[1].op == "load"
     return False
 
 
@@ -170,38 +176,36 @@ def difference(value: Node) -> tuple[Node, Node]:
 
 def _with_condition(loop: Compute, graph: Graph) -> Compute:
     """The loop with a condition: of some sets of planes, one plane must be non-empty for a value to hold anywhere."""
-    nodes = ordered(loop.results)
-    holders: dict[Node, frozenset[str] | None] = {}
-    """For each flag: planes such that it holds nowhere if all of them are empty; None if none are known."""
-    for node in nodes:
-        sets = [holders[arg] for arg in node.args[node.op == "select" :]]
-        known = [names for names in sets if names is not None]
-        holders[node] = None
+    holders: dict[Node, frozenset[str]] = {}
+    """For flags of which such a set is known: planes such that it holds nowhere if all of them are empty."""
+    loads: dict[str, Node] = {}
+    for node in ordered(loop.results):
+        args = node.args[node.op == "select" :]
+        known = [holders[arg] for arg in args if arg in holders]
         match node.op:
             case "load":
                 holders[node] = frozenset({node.attr})
+                loads[node.attr] = node
             case "const" if not node.attr:
                 holders[node] = frozenset()
-            case "and" | "when":
-                holders[node] = min(known, key=lambda names: (len(names), sorted(names)), default=None)
-            case "shift" | "or" | "xor" | "select" if len(known) == len(sets):
+            case "and" | "when" if known:
+                holders[node] = min(known, key=lambda names: (len(names), sorted(names)))
+            case "shift" | "or" | "xor" | "select" if len(known) == len(args):
                 holders[node] = frozenset[str]().union(*known)
     ways: list[list[frozenset[str]]] = []
     for value in loop.results:
         parts = [value.args[0], *conjuncts(value.args[1])] if value.op == "when" else conjuncts(value)
-        needs = dict.fromkeys(names for part in parts if (names := holders[part]) is not None)
+        needs = dict.fromkeys([holders[part] for part in parts if part in holders])
         if not needs:
             return loop
         conditions = sorted(needs, key=len)[:MAX_CONDITIONS]
         if not any(set(way) <= set(conditions) for way in ways):
-            ways = [*(way for way in ways if not set(conditions) < set(way)), conditions]
-    loads = {node.attr: node for node in nodes if node.op == "load"}
-
-    def some(names: frozenset[str]) -> Node:
-        flags = [graph.node("any", ANSWER, (loads[name],)) for name in in_order(names)]
-        return combined("or", flags, graph, ANSWER)
-
-    answers = [combined("and", [*map(some, way)], graph) for way in ways]
+            ways = [*[way for way in ways if not set(conditions) < set(way)], conditions]
+    answers = []
+    for way in ways:
+        flags = [[graph.node("any", ANSWER, (loads[name],)) for name in in_order(names)] for names in way]
+        some = [combined("or", nodes, graph, ANSWER) for nodes in flags]
+        answers.append(combined("and", some, graph))
     before = [] if loop.when is None else [loop.when]
     return replace(loop, when=combined("and", [*before, combined("or", answers, graph)], graph))
 
@@ -221,13 +225,12 @@ def updates(schedule: Schedule) -> Schedule:
 
 def _taken_out(guard: Guard, graph: Graph, *, near: bool = True) -> list[Statement]:
     """The loops that leave a guard, and what remains of it. `near`: also loops that read other planes at neighbors."""
-    when = guard.when.args
-    if not all(node.op == "load" for node in when):
+    when, olds, inside = guard.when.args, guard.olds, made_in(guard.body).keys()
+    if {node.op for node in when} != {"load"}:
         return [guard]
     masks = {node.attr for node in when}
-    inside, olds = made_in(guard.body), guard.olds
     body: list[Statement] = []
-    taken: dict[bool, list[Out]] = {True: [], False: []}
+    leaving: dict[bool, list[Out]] = {True: [], False: []}
     """Values by whether they read neighbors; those come first, before these change."""
     for statement in guard.body:
         if not isinstance(statement, Compute) or statement.over != "words" or statement.when is not None:
@@ -236,21 +239,22 @@ def _taken_out(guard: Guard, graph: Graph, *, near: bool = True) -> list[Stateme
         rest = []
         for out in statement.outs:
             old, far = olds.get(out.var.name), bool(read_elsewhere([out.value]))
-            stays = old is None or (far and not near) or any(name in inside for name in loaded([out.value]))
+            stays = old is None or (far and not near) or not inside.isdisjoint(loaded([out.value]))
             if old is None or stays or not _is_update(out.value, masks, old, graph):
                 rest.append(out)
             else:
-                taken[far].append(replace(out, otherwise=old))
-        body += _partly(replace(statement, outs=tuple(rest)), when, graph) if rest else []
-    elsewhere = read_elsewhere(out.value for out in taken[True])
-    if any(olds[out.var.name].attr in elsewhere for out in taken[True]):
-        return _taken_out(guard, graph, near=False)  # in place, such a loop would read what it has changed
+                leaving[far].append(replace(out, otherwise=old))
+        body += _partly(replace(statement, outs=tuple(rest)), when, graph)
     region = combined("or", when, graph)
-    loops = [Compute(tuple(outs), guard.place, region, over="words") for outs in taken.values() if outs]
-    names = made_in(loops)
-    outs = tuple(out for out in guard.outs if out.var.name not in names)
+    loops = [Compute(tuple(outs), guard.place, region, over="words") for outs in leaving.values()]
+    overwritten = {old.attr for old in loops[0].olds.values()}
+    if not overwritten.isdisjoint(read_elsewhere(loops[0].results)):
+        return _taken_out(guard, graph, near=False)  # in place, such a loop would read what it has changed
+    loops = [loop for loop in loops if loop.outs]
+    names = made_in(loops).keys()
+    outs = tuple([out for out in guard.outs if out.var.name not in names])
     left = [replace(guard, body=tuple(body), outs=outs)] if body else []
-    return [*left, *loops] if names.keys().isdisjoint(read_by(tuple(body))) else [*loops, *left]
+    return [*left, *loops] if names.isdisjoint(read_by(tuple(body))) else [*loops, *left]
 
 
 def _partly(loop: Compute, when: Sequence[Node], graph: Graph) -> list[Compute]:
@@ -259,13 +263,16 @@ def _partly(loop: Compute, when: Sequence[Node], graph: Graph) -> list[Compute]:
     `if any m: loop words: b = m ? a[0,1] : a` → `if any m: loop words over m: b = m ? a[0,1] : a, else a`.
     """
     masks = {node.attr for node in when}
-    outs: dict[bool, list[Out]] = {False: [], True: []}
+    whole: list[Out] = []
+    partly: list[Out] = []
     for out in loop.outs:
         old = without(out.value, masks, graph)
-        partly = out.value.op != "load" and _is_update(out.value, masks, old, graph)
-        outs[partly].append(replace(out, otherwise=old) if partly else out)
+        if out.value.op != "load" and _is_update(out.value, masks, old, graph):
+            partly.append(replace(out, otherwise=old))
+        else:
+            whole.append(out)
     region = combined("or", when, graph)
-    parts = [replace(loop, outs=tuple(outs[False])), replace(loop, outs=tuple(outs[True]), region=region)]
+    parts = [replace(loop, outs=tuple(whole)), replace(loop, outs=tuple(partly), region=region)]
     return [part for part in parts if part.outs]
 
 
