@@ -71,7 +71,7 @@ def cut(schedule: Schedule, costs: Costs) -> Schedule:
     """
     cutter = _Cutter(schedule, costs)
     loops = replace(schedule, body=cutter.block(schedule.body, top=True))
-    return map_values(loops, lambda node: cutter.same.get(node.attr))
+    return map_values(loops, lambda node: cutter.same.get(node.attr)) if cutter.same else loops
 
 
 class _Cutter:
