@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any, NamedTuple, TypeVar
@@ -148,10 +148,6 @@ def _ask(
             budget.left = max(budget.left, 0) + reserve
 
 
-class _Unknown(Exception):
-    """The value depends on something free."""
-
-
 class _Term(NamedTuple):
     """A part of a condition at its place. `keys` are the numbers of the variables that it reads, in order.
 
@@ -164,102 +160,67 @@ class _Term(NamedTuple):
     args: tuple[_Term, ...] = ()
     about: Any = None
 
+    def conjuncts(self) -> Iterator[_Term]:
+        """What must hold so that it holds, if it is a condition."""
+        if self.op != "and":
+            yield self
+        else:
+            for arg in self.args:
+                yield from arg.conjuncts()
+
 
 class _Search:
     """One question. Lets of the substep are looked through; conjunctions are split."""
 
     def __init__(self, facts: Facts, conditions: Conditions, lets: Lets):
         self.facts, self.budget, self.lets = facts, facts.budget, lets
-        self._opened: dict[str, tuple[Expr, int]] = {}
-        self._conditions: list[tuple[Expr, Offset]] = []
-        for condition, at in conditions:
-            self._split(self._resolve(condition)[0], at)
+        self._opened: dict[tuple[str, Offset], tuple[_Term, int]] = {}
         self._numbers: dict[Variable, int] = {}
-        self._domains: dict[int, list[Any]] = {}
         self._cuts: dict[object, set[float]] = {}
         """Constants that the draws of each stream are compared with: between two of them all draws are alike."""
-        self._cut: set[int] = set()
-        """Variables of which conditions on them alone leave less than all values."""
-
-    def _resolve(self, expr: Expr) -> tuple[Expr, int]:
-        """The expression with this substep's lets looked through, and how many nodes it has then."""
-        if expr.op == "let" and expr.value in self.lets:
-            name = str(expr.value)
-            if name not in self._opened:
-                value, size = self._resolve(self.lets[name])
-                self._opened[name] = (value, size) if size <= MAX_LET else (expr, 1)
-            return self._opened[name]
-        self.budget.spend(1)
-        if not expr.args:
-            return expr, 1
-        args, size, same = [], 1, True
-        for arg in expr.args:
-            new, nodes = self._resolve(arg)
-            args.append(new)
-            size += nodes
-            same &= new is arg
-        return expr if same else replace(expr, args=tuple(args)), size
-
-    def _split(self, condition: Expr, at: Offset) -> None:
-        if condition.op == "and":
-            for arg in condition.args:
-                self._split(arg, at)
-        elif condition.op == "look":
-            self._split(condition.args[0], plus(at, condition.value))
-        else:
-            self._conditions.append((condition, at))
+        self._terms = [part for expr, at in conditions for part in self._term(expr, at).conjuncts()]
+        self._names = list(self._numbers)
+        self._domains = {key: self._domain(*self._names[key]) for term in self._terms for key in term.keys}
 
     def possible(self) -> bool:
         """False if no assignment satisfies all conditions."""
-        joint = self._narrow()
-        if joint is None:
+        if not self._narrow():
             return False
         # Small domains first; what is equally small in the order in which the conditions name it.
+        joint = [term for term in self._terms if len(term.keys) > 1]
         keys = dict.fromkeys(key for term in joint for key in term.keys)
         return self._assign(sorted(keys, key=lambda key: len(self._domains[key])), joint)
 
     def alone(self) -> dict[Variable, frozenset[object]] | None:
         """The values that conditions on one variable leave of it, draws left out; None if one leaves nothing."""
-        if self._narrow() is None:
+        whole = self._domains.copy()
+        if not self._narrow():
             return None
-        cut = [(name, key) for name, key in self._numbers.items() if key in self._cut and name[0] != "draw"]
-        return {name: frozenset(self._domains[key]) for name, key in cut}
+        return {
+            self._names[key]: frozenset(values)
+            for key, values in self._domains.items()
+            if len(values) < len(whole[key]) and self._names[key][0] != "draw"
+        }
 
     def example(self) -> dict[Offset, int]:
         """An element for each place that the conditions ask about, with which they hold."""
         if not self.possible():
             return {}
-        names = list(self._numbers)
-        elements = [key for key in self._domains if names[key][0] == "element"]
-        return {names[key][2]: self._domains[key][0] for key in elements}
+        elements = [key for key in self._domains if self._names[key][0] == "element"]
+        return {self._names[key][2]: self._domains[key][0] for key in elements}
 
-    def _narrow(self) -> list[_Term] | None:
-        """Apply the conditions on one variable; None if they leave no assignment, else the other conditions."""
-        terms = []
-        for condition, at in self._conditions:
-            try:
-                terms.append(self._term(condition, at))
-            except _Unknown:
-                continue
-        names = list(self._numbers)
-        self._domains = {key: self._domain(*names[key]) for term in terms for key in term.keys}
-        joint = []
-        for term in terms:
-            if len(term.keys) > 1:
-                joint.append(term)
-            elif not term.keys:
-                if not self._bounds(term)[1]:
-                    return None
-            else:
+    def _narrow(self) -> bool:
+        """Apply the conditions on one variable, or none; False if they leave no assignment."""
+        for term in self._terms:
+            if not term.keys and not self._bounds(term)[1]:
+                return False
+            if len(term.keys) == 1:
                 (key,) = term.keys
-                before = self._domains[key]
-                after = [value for value in before if self._allows(term, key, value)]
-                if not after:
-                    return None
-                self._domains[key] = after
-                if len(after) < len(before):
-                    self._cut.add(key)
-        return joint
+                values = [value for value in self._domains[key] if self._allows(term, key, value)]
+                if not values:
+                    return False
+                self._domains[key] = values
+        return True
 
     def _assign(self, keys: list[int], joint: list[_Term]) -> bool:
         """Choose values of variables, one after the other, with which the conditions may hold."""
@@ -301,13 +262,16 @@ class _Search:
         return list(range(int(kind.lo), int(kind.hi) + 1))
 
     def _term(self, node: Expr, at: Offset) -> _Term:
-        """The expression at a place. Raises _Unknown if one of its variables cannot be enumerated."""
+        """The expression at a place. What cannot be enumerated is ``unknown``."""
         self.budget.spend(1)
+        unknown = _Term("unknown", node)
         match node.op:
             case "const":
                 return _Term("const", node)
             case "look":
                 return self._term(node.args[0], plus(at, node.value))
+            case "let" if node.value in self.lets and (opened := self._open(node, at)):
+                return opened
             case "element":
                 return self._variable(node, "element", None, at)
             case "draw":
@@ -315,16 +279,15 @@ class _Search:
             case "property":
                 prop = self.facts.properties[str(node.value)]
                 if any(isinstance(value, str) for value in prop.values):
-                    raise _Unknown
+                    return unknown
                 keys = [self._key("element", None, at)]
                 if prop.stored:
                     keys.append(self._key("property", prop.name, at))
                 return _Term("property", node, tuple(keys), about=prop)
             case "field" if (limited := self.facts.fields.get(str(node.value))) and limited.of is not None:
                 about = limited.of, limited.default
-                return _Term(
-                    "field", node, (self._key("element", None, at), self._key("value", node, at)), about=about
-                )
+                keys = [self._key("element", None, at), self._key("value", node, at)]
+                return _Term("field", node, tuple(keys), about=about)
             case "coordinate":
                 # The step is the same everywhere. A row or column is known from that of another place if no seam comes
                 # between: where the sides of the world are multiples of its modulus. Elsewhere it is free everywhere.
@@ -334,8 +297,15 @@ class _Search:
                 if self.facts.side_multiple % modulus:
                     return self._variable(node, "value", node, at)
                 return _Term("coordinate", node, (self._key("side", axis, HERE),), about=at[axis == "column"])
-        if _is_opaque(node):
-            return self._variable(node, "value", node, at)
+            case "field" | "let" | "count" | "sum" | "inside" | "octant" | "param":
+                kind = node.kind
+                if kind.name in (*_FLOATS, "draw", "number") or kind.hi - kind.lo >= MAX_DOMAIN:
+                    return unknown
+                return self._variable(node, "value", node, at)
+            case "eq" | "lt" | "le" if any(a.kind.name in _FLOATS and a.op != "const" for a in node.args):
+                return self._variable(node, "value", node, at)
+        if OPERATIONS[node.op].evaluate is None:
+            return unknown
         args = tuple([self._term(arg, at) for arg in node.args])
         if node.op == "lt" and any(arg.kind.name == "draw" for arg in node.args):
             parts = list(node.walk())
@@ -345,6 +315,15 @@ class _Search:
                     cuts = self._cuts.setdefault(part.value, {0.0, 1.0})
                     cuts.update(float(number) % 1 for number in numbers)
         return _Term(node.op, node, tuple(dict.fromkeys([key for arg in args for key in arg.keys])), args)
+
+    def _open(self, let: Expr, at: Offset) -> _Term | None:
+        """The value of a let at a place, if it is not too large."""
+        if (let.value, at) not in self._opened:
+            before = self.budget.left
+            term = self._term(self.lets[let.value], at)
+            self._opened[let.value, at] = term, before - self.budget.left
+        term, size = self._opened[let.value, at]
+        return term if size <= MAX_LET else None
 
     def _variable(self, node: Expr, what: str, name: object, at: Offset) -> _Term:
         return _Term("variable", node, (self._key(what, name, at),))
@@ -379,15 +358,16 @@ class _Search:
                 values = [(side + about) % node.value[1] for side in domains[0]]
                 return min(values), max(values)
         bounds = [self._bounds(arg) for arg in args]
-        row = OPERATIONS[op]
-        assert row.evaluate is not None
-        if all(low == high for low, high in bounds):
-            operands = [low for low, _ in bounds]
-            value = row.evaluate(*operands) if node.value is None else row.evaluate(*operands, node.value)
-            return value, value
-        combined = row.between(*bounds)
-        if combined is not None:
-            return combined
+        if op != "unknown":
+            row = OPERATIONS[op]
+            assert row.evaluate is not None
+            if all(low == high for low, high in bounds):
+                more = [] if node.value is None else [node.value]
+                value = row.evaluate(*[low for low, _ in bounds], *more)
+                return value, value
+            combined = row.between(*bounds)
+            if combined is not None:
+                return combined
         return (
             (node.kind.lo, node.kind.hi) if node.kind.name == "int" else (0, 1) if node.kind == FLAG else _ANY
         )
@@ -396,17 +376,3 @@ class _Search:
 _ANY: Bounds = (-math.inf, math.inf)
 
 _FLOATS = ("real", "vec2", "chance")
-
-
-def _is_opaque(node: Expr) -> bool:
-    """Whether a node is a variable of its own: a count, a field, or something that floats decide."""
-    kind, op = node.kind, node.op
-    if op in ("field", "let", "count", "sum", "inside", "octant", "param"):
-        if kind.name in (*_FLOATS, "draw", "number") or kind.hi - kind.lo >= MAX_DOMAIN:
-            raise _Unknown
-        return True
-    if op in ("eq", "lt", "le") and any(a.kind.name in _FLOATS and a.op != "const" for a in node.args):
-        return True
-    if OPERATIONS[op].evaluate is None:
-        raise _Unknown
-    return False
