@@ -5,12 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from functools import lru_cache, reduce
+from functools import lru_cache
 from math import ceil, floor
 from typing import TYPE_CHECKING
 
 from powderdsl.diagnostics import Reporter, Source, Span, suggest
-from powderdsl.model.builtins import COORDINATES, ELSEWHERE, KERNEL_SHAPES, KERNELS, MAX_RADIUS, shaped_kernel
+from powderdsl.model.builtins import (
+    COORDINATES,
+    ELSEWHERE,
+    KERNEL_SHAPES,
+    KERNELS,
+    MAX_MAGNITUDE,
+    MAX_RADIUS,
+    shaped_kernel,
+)
+from powderdsl.model.composition.names import words_of
 from powderdsl.model.operations import COMPARISONS, FUNCTIONS, INTEGER, NUMBER, OPERATIONS, PLACE, Operation
 from powderdsl.model.types import (
     CHANCE,
@@ -204,11 +213,14 @@ def is_integer(value: Expr) -> bool:
     return value.value.denominator == 1 if value.kind == NUMBER else value.kind.name == "int"
 
 
-def whole_constant(operand: Operand) -> int | None:
-    """The integer that an operand is, if it is a constant one."""
-    if isinstance(operand, Expr) and operand.kind == NUMBER and is_integer(operand):
-        return int(operand.value)
-    return None
+def whole(
+    typer: Typer, syntax: Syntax, scope: Scope, lo: int, hi: int, message: str, label: str = "", *helps: str
+) -> int:
+    """An integer constant from `lo` to `hi`."""
+    value = typer.evaluate(syntax, scope)
+    if isinstance(value, Expr) and value.kind == NUMBER and is_integer(value) and lo <= value.value <= hi:
+        return int(value.value)
+    raise typer.fail("PD405", message, syntax.span, label or f"expected {lo} to {hi}", *helps)
 
 
 def arithmetic(typer: Typer, op: str, values: Sequence[Placed], span: Span) -> Expr:
@@ -349,10 +361,17 @@ def holds(typer: Typer, left: Operand, right: Operand, syntax: Syntax) -> Expr:
             low, high = (number(right.lo), span), (number(right.hi), span)
             parts = [compare(typer, "<=", low, value, span), compare(typer, "<=", value, high, span)]
             return conjunction(parts, span)
-        case _, Items() if any(_stands_alone(item) for item in right.items):
+        case _, Items() if any(
+            isinstance(item, Place) or kind_name(item) in ("number", "direction") for item in right.items
+        ):  # the others join to a set of elements
             return disjunction([_equals(typer, left, item, syntax) for item in right.items], span)
         case _, Expr() if right.kind == NUMBER:
-            raise _not_a_set(typer, syntax)
+            message, fix = "`in` asks for a range or a set", "compare numbers with `==`"
+            if syntax.kind in ("is_", "is_not"):
+                message = "`is` asks for an element or a direction"
+            elif syntax.children[1].kind == "sub":
+                fix = "a range is written `LOW..HIGH`"
+            raise typer.fail("PD401", message, second, "this is a number", fix)
         case _, Absent():
             return FALSE
         case Absent(), _:
@@ -363,27 +382,12 @@ def holds(typer: Typer, left: Operand, right: Operand, syntax: Syntax) -> Expr:
     return member(typer.of_kind(left, ELEMENT, first), ids, span)
 
 
-def _stands_alone(item: Operand) -> bool:
-    """Whether an item of a list is compared by itself: numbers and directions. The others join to a set of elements."""
-    return isinstance(item, Place) or kind_name(item) in ("number", "direction")
-
-
 def _equals(typer: Typer, left: Operand, item: Operand, syntax: Syntax) -> Expr:
     """Whether `left` is one item of a list: numbers are compared, places and elements named."""
-    if isinstance(item, Expr) and item.kind == NUMBER and kind_name(left) != "number":
+    if isinstance(item, Expr) and item.kind == NUMBER:
         value = typer.value(left, syntax.children[0].span)
         return compare(typer, "==", (value, syntax.span), (item, syntax.span), syntax.span)
     return holds(typer, left, item, syntax)
-
-
-def _not_a_set(typer: Typer, syntax: Syntax) -> Poisoned:
-    second = syntax.children[1]
-    message, fix = "`in` asks for a range or a set", "compare numbers with `==`"
-    if syntax.kind in ("is_", "is_not"):
-        message = "`is` asks for an element or a direction"
-    elif second.kind == "sub":
-        fix = "a range is written `LOW..HIGH`"
-    return typer.fail("PD401", message, second.span, "this is a number", fix)
 
 
 # Arithmetic
@@ -433,10 +437,7 @@ def _on_vectors(typer: Typer, op: str, values: Sequence[Placed], span: Span) -> 
 def modulo(typer: Typer, syntax: Syntax, scope: Scope) -> Expr:
     """`x mod n` for an integer constant n; coordinates (and their sums) may only appear here."""
     left, right = syntax.children
-    modulus = whole_constant(typer.evaluate(right, scope))
-    if modulus is None or not 1 <= modulus <= MAX_MODULUS:
-        label = f"expected 1 to {MAX_MODULUS}"
-        raise typer.fail("PD405", "`mod` takes an integer constant", right.span, label)
+    modulus = whole(typer, right, scope, 1, MAX_MODULUS, "`mod` takes an integer constant")
     value = _coordinate_sum(typer, left, modulus, scope)
     if value.kind != NUMBER:
         return Expr("mod", integer(0, modulus - 1), (value,), modulus, syntax.span)
@@ -452,27 +453,17 @@ def _coordinate_sum(typer: Typer, syntax: Syntax, modulus: int, scope: Scope) ->
     if syntax.kind in ("add", "sub"):
         parts = [_coordinate_sum(typer, part, modulus, scope) for part in syntax.children]
         return _calculated(typer, syntax, parts)
-    if syntax.kind == "quotient" and _names_coordinate(syntax.children[0]):
+    if syntax.kind == "quotient" and not set(words_of(syntax.children[0])).isdisjoint(COORDINATES):
         return _coordinate_quotient(typer, syntax, modulus, scope)
     value = typer.value_of(syntax, scope)
     return value if value.kind == NUMBER else typer.of_kind(value, INTEGER, syntax.span)
 
 
-def _names_coordinate(syntax: Syntax) -> bool:
-    """Whether a sum has a coordinate among its terms."""
-    if syntax.kind in ("add", "sub"):
-        return any(_names_coordinate(child) for child in syntax.children)
-    return syntax.kind == "name" and syntax.text in COORDINATES
-
-
 def _coordinate_quotient(typer: Typer, syntax: Syntax, modulus: int, scope: Scope) -> Expr:
     """`row div n` under `mod m`: what `row mod (n · m)` says, divided by n."""
     left, right = syntax.children
-    most = MAX_MODULUS // modulus
-    divisor = whole_constant(typer.evaluate(right, scope))
-    if divisor is None or not 1 <= divisor <= most:
-        label = f"expected 1 to {most}: times {modulus} it is at most {MAX_MODULUS}"
-        raise typer.fail("PD405", "a coordinate is divided by an integer constant", right.span, label)
+    message = "a coordinate is divided by an integer constant"
+    divisor = whole(typer, right, scope, 1, MAX_MODULUS // modulus, message)
     inner = typer.of_kind(_coordinate_sum(typer, left, modulus * divisor, scope), INTEGER, left.span)
     known = Expr("mod", integer(0, modulus * divisor - 1), (inner,), modulus * divisor, left.span)
     by = typer.of_kind(number(divisor), INTEGER, right.span)
@@ -536,10 +527,11 @@ def call(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
 def _applied(typer: Typer, function: Operation, operands: list[tuple[Operand, Span]], span: Span) -> Operand:
     """An operation on arguments of the kinds that it takes."""
     if NUMBER in function.takes:
-        first, *others = ((typer.value(*operand), operand[1]) for operand in operands)
-        if not others:
-            return arithmetic(typer, function.name, [first], span)
-        result, _ = reduce(lambda a, b: (arithmetic(typer, function.name, [a, b], span), span), others, first)
+        values = [(typer.value(*operand), operand[1]) for operand in operands]
+        while len(values) > len(function.parameters):
+            pair, rest = values[:2], values[2:]
+            values = [(arithmetic(typer, function.name, pair, span), span), *rest]
+        result = arithmetic(typer, function.name, values, span)
         return typer.of_kind(result, INTEGER, span) if is_integer(result) else result
     assert function.gives is not None
     args, value = [], None
@@ -580,23 +572,15 @@ def _meant(
 
 def _kernel(typer: Typer, syntax: Syntax, scope: Scope) -> Kernel | None:
     """The kernel that stands after `in`, if it is one."""
-    found: Operand | None = None
-    if syntax.kind == "name" and (syntax.text not in KERNEL_SHAPES or syntax.text in KERNELS):
-        found = typer.find(syntax.text, syntax.span, scope)
-    elif syntax.kind in ("name", "call") and syntax.text in KERNEL_SHAPES:
+    found = typer.find(syntax.text, syntax.span, scope) if syntax.kind == "name" else None
+    if found is None and syntax.text in KERNEL_SHAPES:
         found = typer.evaluate(syntax, scope)
     return found if isinstance(found, Kernel) else None
 
 
 def _shaped(typer: Typer, syntax: Syntax, scope: Scope) -> Kernel:
     (argument,) = syntax.children
-    radius = whole_constant(typer.evaluate(argument, scope))
-    if radius is None:
-        label = f"expected 1 to {MAX_RADIUS}"
-        raise typer.fail("PD405", "a radius is an integer constant", argument.span, label)
-    if not 1 <= radius <= MAX_RADIUS:
-        label = f"a radius lies in 1..{MAX_RADIUS}"
-        raise typer.fail("PD402", f"a kernel of radius {radius}", argument.span, label)
+    radius = whole(typer, argument, scope, 1, MAX_RADIUS, "a radius is an integer constant")
     return shaped_kernel(syntax.text, radius)
 
 
@@ -636,15 +620,11 @@ def _sum_range(kernel: Kernel, lo: float, hi: float) -> Kind:
 
 
 def _at(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
-    steps = []
-    for child in syntax.children:
-        step = whole_constant(typer.evaluate(child, scope))
-        if step is None:
-            label = "not an integer constant"
-            fix = "where it varies, loop over the values: `any(… for n in 0..3)`"
-            raise typer.fail("PD405", "`at` takes two integer constants", child.span, label, fix)
-        steps.append(step)
-    return typer.turn(Place(typer.offset((steps[0], steps[1]), syntax.span)), scope)
+    message, label = "`at` takes two integer constants", "not an integer constant"
+    fix = "where it varies, loop over the values: `any(… for n in 0..3)`"
+    most = MAX_MAGNITUDE
+    rows, columns = (whole(typer, c, scope, -most, most, message, label, fix) for c in syntax.children)
+    return typer.turn(Place(typer.offset((rows, columns), syntax.span)), scope)
 
 
 _QUARTERS = {"clockwise": 1, "opposite": 2, "counterclockwise": 3}
