@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache
 
 from powderdsl.model.operations import FUNCTIONS
@@ -36,32 +35,18 @@ def grid_kernel(name: str, rows: tuple[tuple[int, ...], ...], wrap: bool = False
     return Kernel(name, weights, wrap)
 
 
-@dataclass(frozen=True)
-class KernelShape:
-    """A neighborhood of any radius: which of the cells (rows, columns) away belong to it."""
-
-    about: str
-    covers: Callable[[int, int, int], bool]
-    """Of rows, columns, radius."""
-
-
-KERNEL_SHAPES: dict[str, KernelShape] = {
-    "box": KernelShape(
-        "all cells at most R rows and R columns away", lambda dy, dx, r: max(abs(dy), abs(dx)) <= r
-    ),
-    "ring": KernelShape(
-        "the border of that box: exactly R away", lambda dy, dx, r: max(abs(dy), abs(dx)) == r
-    ),
-    "disc": KernelShape(
-        "the cells nearer than R + ½, as a circle", lambda dy, dx, r: dy * dy + dx * dx <= r * r + r
-    ),
-    "diamond": KernelShape(
-        "the cells at most R steps to the sides away", lambda dy, dx, r: abs(dy) + abs(dx) <= r
-    ),
-    "cross": KernelShape("row and column of the cell, R to each side", lambda dy, dx, r: 0 in (dy, dx)),
-    "plus": KernelShape("the same without the cell", lambda dy, dx, r: (dy == 0) != (dx == 0)),
+KERNEL_SHAPES: dict[str, Callable[[int, int, int], bool]] = {
+    # the cells at most R rows and R columns away, and the border of that box
+    "box": lambda dy, dx, r: max(abs(dy), abs(dx)) <= r,
+    "ring": lambda dy, dx, r: max(abs(dy), abs(dx)) == r,
+    # the cells nearer than R + ½, as a circle, and those at most R steps to the sides away
+    "disc": lambda dy, dx, r: dy * dy + dx * dx <= r * r + r,
+    "diamond": lambda dy, dx, r: abs(dy) + abs(dx) <= r,
+    # row and column of the cell, with it and without it
+    "cross": lambda dy, dx, r: 0 in (dy, dx),
+    "plus": lambda dy, dx, r: (dy == 0) != (dx == 0),
 }
-"""Kernels that take a radius: `box(5)`. With radius 1 they are those of KERNELS; a disc is a box then, a diamond a cross."""
+"""Which cells, rows and columns away, belong to kernels that take a radius: `box(5)`. With radius 1 they are those of KERNELS; a disc is a box then, a diamond a cross."""
 
 MAX_RADIUS = 15
 """The largest radius of a kernel: 31 rows of 31 weights."""
@@ -70,7 +55,7 @@ MAX_RADIUS = 15
 @lru_cache(maxsize=256)
 def shaped_kernel(shape: str, radius: int, name: str = "", wrap: bool = False) -> Kernel:
     """The kernel of a shape and radius. Its name is as it is written, `box(5)`, unless it has one of its own."""
-    covers, reach = KERNEL_SHAPES[shape].covers, range(-radius, radius + 1)
+    covers, reach = KERNEL_SHAPES[shape], range(-radius, radius + 1)
     weights = tuple((dy, dx, 1) for dy in reach for dx in reach if covers(dy, dx, radius))
     return Kernel(name or f"{shape}({radius})", weights, wrap)
 

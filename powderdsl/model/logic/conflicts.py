@@ -177,7 +177,7 @@ def check_logic(
                 lists.append((len(live), pass_))
                 for conflict, elements in _check_substep(live, asked, lets):
                     conflicts.setdefault(conflict, (elements, []))[1].append((at, number))
-    if asked.budget.is_exhausted:
+    if asked.budget.left < 0:
         count, longest = max(lists, key=lambda rules: rules[0])
         message = f"comparing the rules of `{longest.name}` with each other takes too much work"
         label = f"{count:,} rules in one list are {count * (count + 1) // 2:,} pairs"
@@ -290,7 +290,7 @@ def _meetings(
             if not _are_apart(asked[j], asked[i], at, facts.budget)
         )
         for first, question in pairs:
-            if facts.budget.is_exhausted:
+            if facts.budget.left < 0:
                 return
             answer = decide(facts, question, lets)
             if answer:
@@ -300,7 +300,7 @@ def _meetings(
             if answer is None and undecided is None:
                 undecided = first
         else:
-            if undecided is not None and not facts.budget.is_exhausted:
+            if undecided is not None and facts.budget.left >= 0:
                 yield _undecided(_conflict(undecided, second)), {}
 
 

@@ -154,7 +154,7 @@ def _report_overruled(
 def _matters(rule: Rule, rivals: Sequence[Rule], moment: Moment, facts: Facts) -> bool | None:
     """Whether a rule that may happen is not always overruled by its rivals; None if that takes too much work."""
     facts.budget.left -= len(moment.rules) // GLANCES
-    if facts.budget.is_exhausted:
+    if facts.budget.left < 0:
         return None
     here = rule.mask, HERE
     if not rivals or decide(facts, [here], moment.values) is False:

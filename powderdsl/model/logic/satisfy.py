@@ -54,10 +54,6 @@ class Budget:
         if self.left < 0:
             raise _Exhausted
 
-    @property
-    def is_exhausted(self) -> bool:
-        return self.left < 0
-
 
 @dataclass(frozen=True)
 class Facts:
@@ -188,8 +184,8 @@ class _Search:
             return False
         # Small domains first; what is equally small in the order in which the conditions name it.
         joint = [term for term in self._terms if len(term.keys) > 1]
-        keys = dict.fromkeys(key for term in joint for key in term.keys)
-        return self._assign(sorted(keys, key=lambda key: len(self._domains[key])), joint)
+        sizes = {key: len(self._domains[key]) for term in joint for key in term.keys}
+        return self._assign(sorted(sizes, key=sizes.__getitem__), joint)
 
     def alone(self) -> dict[Variable, frozenset[object]] | None:
         """The values that conditions on one variable leave of it, draws left out; None if one leaves nothing."""
@@ -278,7 +274,7 @@ class _Search:
                 return self._variable(node, "draw", node.value, at)
             case "property":
                 prop = self.facts.properties[str(node.value)]
-                if any(isinstance(value, str) for value in prop.values):
+                if str in map(type, prop.values):
                     return unknown
                 keys = [self._key("element", None, at)]
                 if prop.stored:
@@ -337,33 +333,32 @@ class _Search:
         if self.budget.left < 0:
             raise _Exhausted
         op, node, keys, args, about = term
-        domains = [self._domains[key] for key in keys]
+        values, own = (self._domains[keys[0]], self._domains[keys[-1]]) if keys else ([], [])
         match op:
             case "variable":
-                return domains[0][0], domains[0][-1]
+                return values[0], values[-1]
             case "const":
                 return node.value, node.value
             case "property":
-                values = [about.values[element] for element in domains[0] if element not in about.stored]
-                if len(values) < len(domains[0]):
-                    values += domains[1][0], domains[1][-1]
-                return min(values), max(values)
+                found = [about.values[element] for element in values if element not in about.stored]
+                if len(found) < len(values):
+                    found += own[0], own[-1]
+                return min(found), max(found)
             case "field":
                 elements, default = about
-                values = [default] * (not elements.issuperset(domains[0]))
-                if not elements.isdisjoint(domains[0]):
-                    values += domains[1][0], domains[1][-1]
-                return min(values), max(values)
+                found = [] if elements.isdisjoint(values) else [own[0], own[-1]]
+                if not elements.issuperset(values):
+                    found.append(default)
+                return min(found), max(found)
             case "coordinate":
-                values = [(side + about) % node.value[1] for side in domains[0]]
-                return min(values), max(values)
-        bounds = [self._bounds(arg) for arg in args]
-        if op != "unknown":
-            row = OPERATIONS[op]
+                found = [(side + about) % node.value[1] for side in values]
+                return min(found), max(found)
+        if args:
+            row, bounds = OPERATIONS[op], list(map(self._bounds, args))
             assert row.evaluate is not None
-            if all(low == high for low, high in bounds):
-                more = [] if node.value is None else [node.value]
-                value = row.evaluate(*[low for low, _ in bounds], *more)
+            lows, highs = zip(*bounds, strict=True)
+            if lows == highs:
+                value = row.evaluate(*lows) if node.value is None else row.evaluate(*lows, node.value)
                 return value, value
             combined = row.between(*bounds)
             if combined is not None:
