@@ -327,19 +327,21 @@ def _best_split(matters: int, values: int, inputs: int, used: tuple[int, ...]) -
     return min((_split(matters, values, inputs, order) for order in orders), key=operator.attrgetter("cost"))
 
 
-def plane_slots(slot: SlotType) -> tuple[SlotType, ...]:
-    """The slots of an integer's bit planes, lowest bit first; flags and floats stay one slot."""
-    if slot.type.name != "int":
-        return (slot,)
-    return tuple(
-        SlotType(plane_name(slot.name, i), FLAG, int(slot.default) >> i & 1, slot.resets)
-        for i in range(slot.type.bits)
-    )
+def plane_slots(slots: Iterable[SlotType]) -> tuple[SlotType, ...]:
+    """The slots of the bit planes of integers, lowest bit first; flags and floats stay one slot."""
+    planes: list[SlotType] = []
+    for slot in slots:
+        if slot.type.name != "int":
+            planes.append(slot)
+            continue
+        for i in range(slot.type.bits):
+            planes.append(SlotType(plane_name(slot.name, i), FLAG, int(slot.default) >> i & 1, slot.resets))
+    return tuple(planes)
 
 
 def lower_bits(program: Program) -> Program:
     """The program on bit planes. Raises NotBits for the first pass that they cannot carry."""
-    slots = tuple(plane for slot in program.slots for plane in plane_slots(slot))
+    slots = plane_slots(program.slots)
     return replace(program, slots=slots, passes=tuple([lower_pass(program, p) for p in program.passes]))
 
 

@@ -53,7 +53,7 @@ def segments(program: Program, carry: Callable[[Program, PassGraph], Carried] = 
         part = replace(program, slots=slots, passes=tuple(form.cells for form in forms))
         planes = replace(
             part,
-            slots=tuple(plane for slot in slots for plane in plane_slots(slot)),
+            slots=plane_slots(slots),
             passes=tuple(form.planes for form in forms if form.planes is not None),
         )
         parts.append(Segment(part, planes if packed else None))

@@ -174,7 +174,7 @@ def _specialise(tables: Tables, node: Node, build: Graph) -> Node | None:
         return None
     parts = _conjuncts(node)
     known = {part.args[0]: part.attr for part in parts if part.op == "in_set"}
-    done: dict[Node, Node] = {part: part for part in parts if part.op == "in_set"}
+    done: dict[Node, Node] = {}
 
     def substitute(part: Node) -> Node:
         """The condition with tables of known elements replaced."""

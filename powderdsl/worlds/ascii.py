@@ -85,9 +85,15 @@ def write_ascii(ids: Any, elements: Sequence[Element]) -> str:
     return "".join("".join(map(characters.__getitem__, row)) + "\n" for row in ids.tolist())
 
 
+def ids_by_name(elements: Sequence[Element]) -> dict[str, int]:
+    """Ids by plain and qualified name."""
+    ids = {element.qualified: element.id for element in elements}
+    return ids | {element.name: element.id for element in elements}
+
+
 def _characters(elements: Sequence[Element], legend: Mapping[str, str]) -> dict[str, int]:
     """Element ids by character: the legend's, then the glyphs that it does not use."""
-    by_name = {element.qualified: element.id for element in elements} | {e.name: e.id for e in elements}
+    by_name = ids_by_name(elements)
     characters: dict[str, int] = {}
     for character, name in legend.items():
         if name not in by_name:

@@ -147,7 +147,7 @@ def test_buffers(rules: str, in_place: bool) -> None:
     pool: Pool | None = None
     loaded = load(rules)
     for program, pass_ in packed_passes(loaded):
-        planes = [plane for slot in program.slots for plane in plane_slots(slot)]
+        planes = plane_slots(program.slots)
         kinds = {slot.name: "real" if slot.type.name == "real" else "flag" for slot in planes}
         homes = {name: [n for n in kinds if kinds[n] == kinds[name]].index(name) for name in kinds}
         own = {kind: sum(1 for one in kinds.values() if one == kind) for kind in ("flag", "real")}

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import Protocol
 
 from powderdsl.diagnostics import Reporter, Span, suggest
 from powderdsl.model.operations import OPERATIONS
 from powderdsl.model.types import Expr, integer
 from powderdsl.syntax.ast import Syntax
+from powderdsl.syntax.yaml_tree import Scalar
 
 AMOUNTS = {
     **{op: op for op in ("add", "sub", "mul", "quotient", "mod", "neg")},
@@ -22,14 +22,8 @@ integer from a range that includes both ends."""
 MAX_DIGITS = 9
 
 
-class Written(Protocol):
-    """A word of a file and its location."""
-
-    @property
-    def text(self) -> str: ...
-
-    @property
-    def span(self) -> Span: ...
+Written = Syntax | Scalar
+"""A word of a file and its location."""
 
 
 def number(value: int, span: Span | None = None) -> Expr:

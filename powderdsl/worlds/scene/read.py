@@ -20,6 +20,7 @@ from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.parse import line_of
 from powderdsl.syntax.sources import read_source
 from powderdsl.system.writing import failure
+from powderdsl.worlds.ascii import ids_by_name
 from powderdsl.worlds.raster import MAX_CELLS, Paint, Setting, Shape, Size, mask
 from powderdsl.worlds.scene.amounts import constants
 from powderdsl.worlds.scene.statements import (
@@ -288,12 +289,6 @@ def read_file(path: Path) -> tuple[Scene, ...]:
     return scenes
 
 
-def element_ids(ruleset: Ruleset) -> dict[str, int]:
-    """Ids by plain and qualified name."""
-    ids = {element.qualified: element.id for element in ruleset.elements}
-    return ids | {element.name: element.id for element in ruleset.elements}
-
-
 def draw_start(scene: Scene, ruleset: Ruleset, *, size: Size | None = None) -> Start:
     """The start world of a scene.
 
@@ -307,7 +302,7 @@ def draw_start(scene: Scene, ruleset: Ruleset, *, size: Size | None = None) -> S
     size = size or scene.size
     if not (min(size) >= 1 and size[0] * size[1] <= MAX_CELLS):
         raise failure("PD607", f"a world of {size[0]}×{size[1]} cells", helps=(SIZE_RULE,))
-    reporter, ids = Reporter(), element_ids(ruleset)
+    reporter, ids = Reporter(), ids_by_name(ruleset.elements)
     # Scenes may use qualified names of fields, worlds do not.
     paints = [
         replace(one, name=slot_name(ruleset, one.name)) if isinstance(one, Setting) else one
