@@ -114,7 +114,7 @@ def test_what_planes_refuse_and_rules_cannot_say() -> None:
     number = build.input("number", integer(0, 1 << 25))
     slots = (SlotType("number", number.type, 0, False), SlotType("found", FLAG, 0, False))
     rare = build.in_set(number, frozenset({3, 1 << 20}))
-    rounded = build.derive("lt", build.to_real(number), build.real(2.5))
+    rounded = build.derive("lt", build.derive("to_real", number), build.real(2.5))
     for node, why in ((rare, "a table over 26 planes"), (rounded, "an integer too large for float32")):
         pass_ = PassGraph("made", "made", (), (("found", node),))
         found = carry(Program("made", slots, (), (), (pass_,)), pass_)
