@@ -218,10 +218,14 @@ def test_profiling_runs_what_running_runs(rules, torch):
     plan = Plan(rules, **TINY)
     world = start_worlds(sim, plan, plan.cells[1])
     seen = []
-    program = sim._program
-    job_seen = []
-    original = program.run
-    program.run = lambda job: job_seen.append(original(job)) or job_seen[-1]
+    job_seen, whole = [], sim._program.whole
+
+    class Watched:
+        def run(self, job):
+            job_seen.append(whole.run(job))
+            return job_seen[-1]
+
+    sim._program = sim._program._replace(whole=Watched())
     sim.profile(world, 2)
     seen.append(sim.step(world, 2).ids)
     assert len(job_seen) == 2
