@@ -120,21 +120,18 @@ class ByWidth:
             self._latest = self._of(0 if code is None else code.width)
 
     def _of(self, width: int) -> Runnable:
-        program = self._programs.get(width)
-        if program is None:
-            with building(self._how):
-                program = self._programs.setdefault(width, self._make(width))
-        return program
-
-    def _make(self, width: int) -> Runnable:
-        if self._first is not None:
-            return AutoProgram(
-                *self._first, self._cells, partial(self._recalled, width), partial(self._compiled, width)
-            )
-        try:
-            return self._compiled(width)
-        except NoCompiler as error:
-            raise _refusal(error) from None
+        if width in self._programs:
+            return self._programs[width]
+        recalled, compiled = partial(self._recalled, width), partial(self._compiled, width)
+        with building(self._how):
+            if self._first is not None:
+                program: Runnable = AutoProgram(*self._first, self._cells, recalled, compiled)
+            else:
+                try:
+                    program = compiled()
+                except NoCompiler as error:
+                    raise _refusal(error) from None
+            return self._programs.setdefault(width, program)
 
     def _recalled(self, width: int) -> Runnable | None:
         """Native code that was compiled before. Raises NoCompiler if none could be made."""

@@ -317,8 +317,8 @@ class Simulator:
                 element cannot hold one.
         """
         state, xp = dict(world.state), self.kind.xp
-        if "ids" in fields or "element" in fields:
-            given = fields.pop("ids", None) if "ids" in fields else fields.pop("element")
+        given = fields.pop("ids", fields.pop("element", None))
+        if given is not None:
             ids = self._shaped(self._integers(given, "ids"), "ids", world.shape)
             check_ids(self.kind, ids, "ids", self.ruleset)
             element = xp.asarray(ids, dtype=xp.uint8)

@@ -167,7 +167,7 @@ def test_bad_actions_name_what_is_wrong(small: TaskProgram, task_file: Path, tmp
             single.step(bad)
     with pytest.raises(TypeError, match="integers"):
         single.step([0.0, 1.0])
-    with pytest.raises(ValueError, match="did you mean `discrete`"):
+    with pytest.raises(ValueError, match="actions is one of multidiscrete, discrete, full"):
         TensorEnv(small, actions="discreet")
     with pytest.raises(ValueError, match="1,048,576 at most"):
         action_form("discrete", agent(*range(20), bins=(256, 256)), CPU)
