@@ -167,9 +167,10 @@ def read(names: Sequence[str | Path], reporter: Reporter) -> tuple[list[PackDecl
         left_out |= dict.fromkeys(minus)
         for word in plus:
             reader.read(word)
-    for word in (word for word in left_out if word not in packs):
-        helps = suggest(word, packs, "packs")
-        reporter.error("PD304", f"`{word}` is left out, but it was not there", None, helps=helps)
+    for word in left_out:
+        if word not in packs:
+            helps = suggest(word, packs, "packs")
+            reporter.error("PD304", f"`{word}` is left out, but it was not there", None, helps=helps)
     if not names:
         example = "name a shipped ruleset or a file: `powderworld`"
         reporter.error("PD304", "no rules were named", None, helps=[example])

@@ -274,11 +274,6 @@ class PackDecl(Record, noun="a pack"):
     tests: tuple[TestDecl, ...] = keyed("small worlds, and what becomes of them", (), shape="list")
 
     @property
-    def definitions(self) -> tuple[Definition, ...]:
-        """All its definitions in the shared namespace; passes have a namespace of their own."""
-        return tuple(decl for section in SHARED for decl in getattr(self, section))
-
-    @property
     def entries(self) -> tuple[ElementDecl | AlsoDecl, ...]:
         """Its entries for single elements."""
         return (*self.elements, *self.also)

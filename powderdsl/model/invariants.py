@@ -57,9 +57,9 @@ def check_invariants(
     """
     written: list[tuple[str, Syntax, RulesetDecl | None]]
     written = [(name, line, None) for name, pack in composition.packs.items() for line in pack.invariants]
-    gone = composition.left_out
     for ruleset in composition.ruleset.lineage:
-        written += [(ruleset.name.text, with_optional(line, gone), ruleset) for line in ruleset.invariants]
+        for line in ruleset.invariants:
+            written.append((ruleset.name.text, with_optional(line, composition.left_out), ruleset))
     found = []
     reporter = typer.reporter
     for pack, line, author in written:

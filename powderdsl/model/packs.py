@@ -111,9 +111,11 @@ class _PackReader(Reader):
 
     def streams(self, node: Node | None) -> Iterator[StreamDecl]:
         if node is None or isinstance(node, Mapping):
-            return self.entries(StreamDecl, node)
-        words = (word for word in self.words(node) if self.name(word, StreamDecl.NOUN))
-        return (StreamDecl(name=word, pack=self.owner) for word in words)
+            yield from self.entries(StreamDecl, node)
+            return
+        for word in self.words(node):
+            if self.name(word, StreamDecl.NOUN):
+                yield StreamDecl(name=word, pack=self.owner)
 
     def kernel(self, key: Scalar, node: Node) -> KernelDecl | None:
         """Rows of weights, a shape with its radius, or a mapping with one of them and `edges`."""

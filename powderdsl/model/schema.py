@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import MISSING, dataclass, field, fields, replace
 from difflib import get_close_matches
-from types import NoneType, UnionType
+from types import UnionType
 from typing import Any, ClassVar, TypeVar, dataclass_transform, get_args, get_origin, get_type_hints
 
 from powderdsl.diagnostics import Reporter, Source, Span, suggest
@@ -124,8 +124,8 @@ def keys_of(kind: type[Record]) -> dict[str, Key]:
             continue
         row: Key = item.metadata["key"]
         hint = hints[item.name]
-        arms = [arm for arm in get_args(hint) if arm is not NoneType] if isinstance(hint, UnionType) else []
-        hint = arms[0] if len(arms) == 1 else hint
+        if isinstance(hint, UnionType) and len(get_args(hint)) == 2:  # a value or None
+            hint = get_args(hint)[0]
         shape = "word" if hint is str and (row.choices or row.form) else _SHAPES.get(hint, "any")
         if shape == "any" and get_origin(hint) is tuple:
             hint = get_args(hint)[0]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import fields
 from fractions import Fraction
 
@@ -38,15 +38,14 @@ _ATOM = 9
 _PLACES = {offset: name for name, offset in DIRECTIONS.items()}
 
 
-def print_model(ruleset: Ruleset, passes: Iterable[str] | None = None) -> str:
+def print_model(ruleset: Ruleset, passes: Collection[str] | None = None) -> str:
     """The whole model, or only these passes of it. Ends with a line break; equal models give equal texts."""
     printer = _Printer(ruleset)
-    chosen = None if passes is None else frozenset(passes)
-    lines = [] if chosen is not None else [*printer.head(), ""]
-    blocks = ["\n".join(printer.pass_lines(p)) for p in ruleset.passes if chosen is None or p.name in chosen]
-    text = "\n".join(lines) + ("\n" if lines else "") + "\n\n".join(blocks)
-    kernels = printer.kernel_lines() if chosen is None else []
-    return text.rstrip("\n") + "\n" + ("\n" + "\n".join(kernels) + "\n" if kernels else "")
+    shown = (item for item in ruleset.passes if passes is None or item.name in passes)
+    blocks = ["\n".join(printer.pass_lines(item)) for item in shown]
+    if passes is None:
+        blocks = ["\n".join(printer.head()), *blocks, "\n".join(printer.kernel_lines())]
+    return "\n\n".join(filter(None, blocks)) + "\n"
 
 
 def print_tree(packs: Iterable[PackDecl], pass_name: str | None = None) -> str:

@@ -101,14 +101,16 @@ class Composition:
     @cached_property
     def side_multiple(self) -> int:
         """The least common multiple of what the packs ask of the sides of worlds."""
-        return lcm(*(pack.side_multiple for pack in self.packs.values()))
+        return lcm(*map(attrgetter("side_multiple"), self.packs.values()))
 
     @cached_property
     def left_out(self) -> frozenset[str]:
         """Names of packs that a ruleset leaves out: its own lines may use them as if they ended in `?`."""
-        return frozenset(
-            decl.name.text for pack in self.ruleset.left_out.values() for decl in pack.definitions
-        )
+        words: set[str] = set()
+        for pack in self.ruleset.left_out.values():
+            for section in SHARED:
+                words.update(decl.name.text for decl in getattr(pack, section))
+        return frozenset(words)
 
     def scope(self, author: str | RulesetDecl, words: Iterable[str] = ()) -> tuple[str, ...]:
         """The packs that the author of a pack or ruleset knew, in load order. All others were added.
@@ -406,12 +408,12 @@ def _report_ids(
 ) -> None:
     """Report elements without an id, two elements of one pack with the same id, and ids that differ from the file."""
     loaded = [decl for decl in wishes if decl.qualified in names.known]
-    lacking = [decl for decl in loaded if decl.qualified not in ids]
-    if lacking:
-        reporter.error(
-            "PD508", f"{len(loaded)} elements", lacking[0].span, f"the limit is {MAX_ELEMENTS}", helps=["load fewer packs"]
-        )  # fmt: skip
-    holders = {number: name for name, number in ids.items()}
+    for decl in loaded:
+        if decl.qualified not in ids:
+            label = f"the limit is {MAX_ELEMENTS}"
+            reporter.error("PD508", f"{len(loaded)} elements", decl.span, label, helps=["load fewer packs"])
+            break
+    holders = dict(zip(ids.values(), ids, strict=True))
     by_number: dict[tuple[str, int], ElementDecl] = {}
     for decl in loaded:
         if decl.id is None or decl.number is None:

@@ -281,10 +281,12 @@ def report_misspelled(
     """
     known: set[str] = set()
     for pack in (*packs, *ruleset.left_out.values()):
-        known.update(decl.name.text for decl in (*pack.definitions, *pack.params, *pack.passes))
+        for section in (*SHARED, "params", "passes"):
+            known.update(decl.name.text for decl in getattr(pack, section))
         for decl in pack.passes:
-            lets = (name for block in decl.walk() for name, _ in block.lets)
-            known.update(name.text for name in (*(item.name for item in decl.scratch), *lets))
+            known.update(field.name.text for field in decl.scratch)
+            for block in decl.walk():
+                known.update(name.text for name, _ in block.lets)
     asked: dict[str, dict[Span, None]] = {}
     for word, span in _optional_names((*packs, ruleset)):
         if word not in known:
