@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, Generic, TypeVar
 
@@ -18,24 +18,24 @@ Named = TypeVar("Named")
 class Printer:
     """Prints each statement by the method that is named after its class."""
 
+    whole: Callable[[Out], Any]
+    words: Callable[[Compute], Any]
+    update: Callable[[Compute], Any]
+
     def printed(self, statement: Statement) -> Any:
         """The result of a statement's method."""
         return getattr(self, type(statement).__name__.lower())(statement)
+
+    def block(self, body: Sequence[Statement]) -> Any:
+        """The lines of statements."""
+        for statement in body:
+            yield from self.printed(statement)
 
     def compute(self, loop: Compute) -> Any:
         """A loop over words: an operation on whole planes, planes that are computed anew, or an update where a mask holds."""
         if len(loop.outs) == 1 and loop.over == "words" and is_whole(loop.outs[0].value):
             return self.whole(loop.outs[0])
         return self.words(loop) if loop.region is None else self.update(loop)
-
-    def whole(self, out: Out) -> Any:
-        raise NotImplementedError
-
-    def words(self, loop: Compute) -> Any:
-        raise NotImplementedError
-
-    def update(self, loop: Compute) -> Any:
-        raise NotImplementedError
 
 
 class Values(Generic[Named]):
@@ -134,10 +134,13 @@ def drawn_where(draw: Node) -> Node | None:
 
 
 class CellValues(Values[Named]):
-    """Floats, and flags that compare them. `choices` are all choices that the block computes."""
+    """Floats, and flags that compare them: the values `nodes` of a loop. `choices` are all choices among them."""
 
     direct = ("select", "led", "shift")
-    choices: list[Node]
+
+    def __init__(self, nodes: Iterable[Node]) -> None:
+        super().__init__()
+        self.choices = [node for node in nodes if node.op == "select"]
 
     def variable(self, value: Named) -> Named:
         """A new variable, which choices change."""

@@ -136,10 +136,9 @@ class _Loop(CellValues[str]):
     """The text of row y of a loop. Its values are those of the cells of a chunk: floats, or flags as bits."""
 
     def __init__(self, number: int, plan: RowLoop, rows: Rows, layout: NativeLayout):
-        super().__init__()
+        super().__init__(ordered(plan.loop.results))
         self.number, self.plan, self.rows, self.layout = number, plan, rows, layout
         self.outs = plan.loop.outs
-        self.choices = [node for node in ordered(out.value for out in self.outs) if node.op == "select"]
         self.passing = [out.var.name for out in self.outs if out.var.name in rows.rings]
         self.lasting = [out for out in self.outs if out.var.type == REAL and out.var.name not in rows.rings]
         self.fields = [out.var.name for out in self.outs if out.var.type == REAL]

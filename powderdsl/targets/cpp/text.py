@@ -15,7 +15,6 @@ from powderdsl.schedule.types import (
     Out,
     Release,
     Schedule,
-    Statement,
     Sweeps,
     Var,
     alternatives,
@@ -91,10 +90,6 @@ class _Printer(Printer):
         if var.type == REAL:
             return f"c.real[{self.layout.reals[name]}]"
         return f"c.slot[{self.layout.planes[name]}]"
-
-    def block(self, body: Sequence[Statement]) -> Iterator[str]:
-        for statement in body:
-            yield from self.printed(statement)
 
     def whole(self, out: Out) -> Iterator[str]:
         """An operation on whole planes that tests for empty ones itself."""

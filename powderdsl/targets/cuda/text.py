@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from powderdsl.ir.ops import FLAG, REAL, Node, ordered
 from powderdsl.schedule.lifetimes import Buffer
-from powderdsl.schedule.types import ANSWER, Compute, Guard, Out, Schedule, Statement, Sync
+from powderdsl.schedule.types import ANSWER, Compute, Guard, Schedule, Sync
 from powderdsl.targets.layout import Layout, literal, param_key
 from powderdsl.targets.printing import GATES, CellValues, Printer, WordText, drawn_where
 
@@ -39,10 +39,6 @@ class _Printer(Printer):
 
     def number(self, name: str) -> int:
         return self.buffers[name][1]
-
-    def block(self, body: Sequence[Statement]) -> Iterator[str]:
-        for statement in body:
-            yield from self.printed(statement)
 
     def sync(self, _: Sync) -> Iterator[str]:
         yield "SYNC();"
@@ -84,7 +80,7 @@ class _Printer(Printer):
         yield from (f"{name} = ANY({name});" for name in answers)
 
     def cells(self, loop: Compute) -> Iterator[str]:
-        cells = _Cells(self, loop.outs)
+        cells = _Cells(self, loop)
         lives, stores, ends = [], [], []
         dirty, quiet = "", []
         for out in loop.outs:
@@ -195,13 +191,11 @@ class _Words(WordText):
 class _Cells(CellValues[str]):
     """Values of one cell, which a warp computes for the 32 cells of a word; masks are tested by word."""
 
-    def __init__(self, printer: _Printer, outs: Sequence[Out]):
-        super().__init__()
+    def __init__(self, printer: _Printer, loop: Compute):
+        super().__init__(ordered(loop.results))
         self.printer, self.layout = printer, printer.layout
         self.masks: dict[int, str] = {}
         """Words of flags by buffer, read before the cells."""
-        nodes = ordered(out.value for out in outs)
-        self.choices = [node for node in nodes if node.op == "select"]
 
     def name(self, text: str, type: str = "float", prefix: str = "v") -> str:
         name = self.fresh(prefix)

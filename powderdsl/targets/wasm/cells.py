@@ -287,10 +287,9 @@ class Chunks(CellValues[Value]):
     """Values of four cells: floats, or flags as lanes of ones."""
 
     def __init__(self, loop: CellLoop, words: dict[str, Local]):
-        super().__init__()
+        super().__init__(loop.nodes)
         self.loop, self.library, self.words = loop, loop.library, words
         self.memory = loop.memory
-        self.choices = [node for node in loop.nodes if node.op == "select"]
         self.uses = Counter(id(arg) for node in loop.nodes for arg in node.args)
 
     def nibble(self, node: Node) -> Value:

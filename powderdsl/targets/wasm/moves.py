@@ -136,11 +136,7 @@ class _Mover:
 
 
 def move_groups(
-    library: Library,
-    move: Move,
-    movers: Local,
-    groups: Mapping[Leftover, Sequence[Local]],
-    targets: Callee,
+    library: Library, move: Move, movers: Local, groups: Mapping[Leftover, Sequence[Local]], targets: Callee
 ) -> None:
     """Move planes in place, by what their movers leave behind. `targets` makes the plane of targets: movers, it."""
     entered = body.let(library.take())

@@ -248,14 +248,7 @@ class Standalone(Batches):
         self._put(fresh)
 
     def set(
-        self,
-        field: I32,
-        component: I32,
-        top: I32,
-        bottom: I32,
-        left: I32,
-        right: I32,
-        value: F64,
+        self, field: I32, component: I32, top: I32, bottom: I32, left: I32, right: I32, value: F64
     ) -> None:
         body.do(self.calls["show"]())
         self._cut(top, bottom, self.face.rows)
