@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import deepcopy
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -256,29 +257,26 @@ def _clone(learner: _Learner, run: RunFolder, config: TrainConfig, metrics: Metr
         )
     dataset = Dataset.open(folder)
     dataset.require(env)
-    numbers = clone(learner.model.policy, dataset, config)
-    metrics.write(0, {f"clone/{name}": value for name, value in numbers.items()})
+    metrics.write(0, {"clone/loss": clone(learner.model.policy, dataset, config)})
 
 
-def clone(policy: ActorCriticPolicy, dataset: Dataset, config: TrainConfig) -> dict[str, float]:
+def clone(policy: ActorCriticPolicy, dataset: Dataset, config: TrainConfig) -> float:
     """Behavior cloning: fit a policy to a dataset, its likelihood of the actions, and its values to the discounted returns.
 
     `config.init_epochs` times as many transitions are drawn as there are; which ones depends on `config.seed` alone. The
     learning rate falls to zero.
 
     Returns:
-        means over the last hundred updates at most: the loss, the accuracy (the share of transitions whose recorded
-        action is the policy's likeliest) and the error of values.
+        the loss, without that of the values: its mean over the last hundred updates at most.
     """
     rows, returns = Transitions(dataset), _returns(dataset, config.gamma)
     updates = max(1, config.init_epochs * len(rows) // CLONING_BATCH)
     spread = max(float(returns.var()), 1e-6)  # so that values do not outweigh actions
     optimizer = torch.optim.Adam(policy.parameters(), lr=CLONING_RATE)
+    rate = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda number: 1 - number / updates)
     policy.set_training_mode(True)
-    figures = []
+    losses = []
     for number in range(updates):
-        for group in optimizer.param_groups:
-            group["lr"] = CLONING_RATE * (1 - number / updates)
         numbers = drawn(config.seed, number, CLONING_BATCH, len(rows))
         batch = rows[numbers]
         observed = batch.observation.to(policy.device)
@@ -291,13 +289,10 @@ def clone(policy: ActorCriticPolicy, dataset: Dataset, config: TrainConfig) -> d
         loss.backward()
         torch.nn.utils.clip_grad_norm_(policy.parameters(), config.max_grad_norm)
         optimizer.step()
-        if number >= (updates - 1) // 100 * 100:
-            with torch.no_grad():
-                likeliest: Any = policy.get_distribution(observed).mode()
-            agree = (likeliest == actions).all(1).float().mean()
-            figures.append([-float(likelihood.detach().mean()), float(agree), float(error.detach())])
+        rate.step()
+        losses.append(-float(likelihood.detach().mean()))
     policy.set_training_mode(False)
-    return dict(zip(("loss", "accuracy", "value_error"), np.mean(figures, 0).tolist(), strict=True))
+    return fmean(losses[-100:])
 
 
 def _returns(dataset: Dataset, gamma: float) -> NDArray[np.float32]:
