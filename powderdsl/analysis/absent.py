@@ -51,7 +51,7 @@ def find_wants(ruleset: Ruleset, facts: Facts) -> dict[RuleLine, Wants]:
     for pass_ in ruleset.passes:
         lets: Lets = {}
         for moment in pass_.moments:
-            asked = Asked.of(moment, facts)
+            asked = Asked(moment, facts, moment.values)
             for rule in moment.rules:
                 if asked.may(rule):
                     wants = _wants(rule, asked, lets | asked.lets, named)

@@ -73,10 +73,6 @@ class Asked:
     facts: Facts
     lets: dict[str, Expr]
 
-    @classmethod
-    def of(cls, moment: Moment, facts: Facts) -> Asked:
-        return cls(moment, facts, moment.values)
-
     def may(self, rule: Rule, *more: Condition) -> bool:
         """Whether the rule may happen while these conditions hold too. False is a proof."""
         first = ((rule.mask, HERE), *more)
@@ -144,7 +140,7 @@ def find_changes(ruleset: Ruleset, facts: Facts, *, together: bool = True) -> li
     """Effects of each line, in the order in which the lines first run; `together`: also of several at once."""
     found: dict[RuleLine, Found] = {}
     for pass_, moment in substeps(ruleset.passes):
-        asked = Asked.of(moment, facts)
+        asked = Asked(moment, facts, moment.values)
         for rule in moment.rules:
             line = rule_line(rule, pass_)
             effects = found.setdefault(line, Found(line))

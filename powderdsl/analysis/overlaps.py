@@ -17,6 +17,7 @@ from powderdsl.model.types import (
     Rule,
     Ruleset,
     Transform,
+    alike,
     footprint,
     minus,
     substeps,
@@ -69,7 +70,7 @@ def find_overlaps(ruleset: Ruleset, facts: Facts) -> tuple[Overlap, ...]:
 
 def _candidates(ruleset: Ruleset, facts: Facts) -> Iterator[Candidate]:
     for pass_, moment in substeps(ruleset.passes):
-        asked = Asked.of(moment, facts)
+        asked = Asked(moment, facts, moment.values)
         live = [rule for rule in moment.rules if asked.may(rule)]
         if moment.policy != "prove":
             yield from _claims(asked, pass_)
@@ -87,20 +88,13 @@ def _claims(asked: Asked, pass_: Pass) -> Iterator[Candidate]:
             if same and outcome == "first wins":
                 outcome = "both dropped"
             if (same and isinstance(first, Move) and first.leaving is None) or (
-                outcome == "first wins" and _alike(first, second)
+                outcome == "first wins" and alike(first, second)
             ):
                 continue  # cells of one rule that share a place move in rows
             overlap = Overlap(outcome, rule_line(first, pass_), rule_line(second, pass_))
             shifts = {minus(a, b): None for a in footprint(first) for b in footprint(second)}
             ways = (((first.mask, HERE), (second.mask, at)) for at in shifts if not (same and at == HERE))
             yield overlap, ways, asked.lets
-
-
-def _alike(first: Rule, second: Rule) -> bool:
-    """Whether it makes no difference which of two transforms happens."""
-    if not isinstance(first, Transform) or not isinstance(second, Transform):
-        return False
-    return first.target == second.target and first.effects == second.effects
 
 
 def _writes(rules: list[Rule], asked: Asked, pass_: Pass) -> Iterator[Candidate]:

@@ -272,6 +272,13 @@ def writes_of(rule: Rule) -> tuple[Assign, ...]:
     return (rule,) if isinstance(rule, Assign) else rule.effects
 
 
+def alike(first: Rule, second: Rule) -> bool:
+    """Whether it makes no difference which of two transforms happens."""
+    if not isinstance(first, Transform) or not isinstance(second, Transform):
+        return False
+    return first.target == second.target and first.effects == second.effects
+
+
 def footprint(rule: Rule) -> tuple[Offset, ...]:
     """The cells that a rule claims, seen from the cell where its condition holds."""
     return (HERE, rule.offset) if isinstance(rule, (Swap, Move)) else (HERE,)

@@ -168,7 +168,11 @@ def check_logic(
             for rule in moment.rules:
                 happens = decide(facts, [(rule.mask, HERE)], lets)
                 fires.add(rule.span, happens)
-                useful.add(rule.span, happens and _changes(rule, facts, lets))
+                changes = happens
+                if happens and isinstance(rule, Transform) and rule.target.op == "const" and not rule.effects:
+                    other = negation(member(ELEMENT_HERE, (rule.target.value,)))
+                    changes = decide(facts, [(rule.mask, HERE), (other, HERE)], lets)
+                useful.add(rule.span, changes)
                 if happens is False:
                     silent.setdefault(rule.span, []).append((rule.mask, lets))
                 else:
@@ -257,13 +261,6 @@ def _may_settle(moment: Moment) -> bool:
     )
 
 
-def _changes(rule: Rule, facts: Facts, lets: Lets) -> bool | None:
-    if isinstance(rule, Transform) and rule.target.op == "const" and not rule.effects:
-        same = member(ELEMENT_HERE, (rule.target.value,))
-        return decide(facts, [(rule.mask, HERE), (negation(same), HERE)], lets)
-    return True
-
-
 def _check_substep(
     rules: list[Rule], facts: Facts, lets: Lets
 ) -> Iterator[tuple[Conflict, dict[Offset, int]]]:
@@ -301,7 +298,13 @@ def _meetings(
                 undecided = first
         else:
             if undecided is not None and facts.budget.left >= 0:
-                yield _undecided(_conflict(undecided, second)), {}
+                # That their conditions exclude each other would not help.
+                note = "their conditions combine too many values to decide whether they can meet"
+                helps = (
+                    "choose what happens if they do: `conflicts: first_wins`",
+                    "or put one of them under `then:`",
+                )
+                yield replace(_conflict(undecided, second), notes=(note,), helps=helps), {}
 
 
 _PLACES = {(0, 0): "here", (-1, 0): "above", (1, 0): "below", (0, -1): "on the left", (0, 1): "on the right"}
@@ -376,13 +379,6 @@ def _parity(conflict: Conflict, question: Conditions, facts: Facts, lets: Lets) 
     note = f"they meet only at the seam of a world whose sides are not multiples of {multiple}"
     fix = f"allow only worlds without a seam: `side_multiple: {multiple}`, a key of the pack"
     return replace(conflict, notes=(*conflict.notes, note), helps=(fix, *conflict.helps[1:]))
-
-
-def _undecided(conflict: Conflict) -> Conflict:
-    """The conflict of two rules whose conditions are too hard to decide: excluding each other would not help."""
-    note = "their conditions combine too many values to decide whether they can meet"
-    helps = ("choose what happens if they do: `conflicts: first_wins`", "or put one of them under `then:`")
-    return replace(conflict, notes=(note,), helps=helps)
 
 
 Asked = dict[tuple[int, Offset], frozenset[object]]

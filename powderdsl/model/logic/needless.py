@@ -33,6 +33,7 @@ from powderdsl.model.types import (
     Rule,
     Ruleset,
     Transform,
+    alike,
     plus,
     substeps,
     writes_of,
@@ -167,16 +168,16 @@ def _rivals(rule: Rule, place: int, moment: Moment) -> list[Rule]:
     rivals: list[Rule] = []
     for number, other in enumerate(moment.rules):
         earlier = number < place
-        if number == place or other.span == rule.span:
-            continue
-        if isinstance(rule, Assign) and isinstance(other, Assign):
-            same = (other.field, other.offset) == (rule.field, rule.offset)
-            if same and not earlier and other.op == ":=":
-                rivals.append(other)
-        elif isinstance(rule, Transform) and isinstance(other, Transform):
-            same = other.target == rule.target and other.effects == rule.effects
-            if moment.policy == "drop_both" or (earlier and (same or moment.policy == "first_wins")):
-                rivals.append(other)
+        match rule, other:
+            case Assign(), Assign(op=":="):
+                wins = not earlier and (other.field, other.offset) == (rule.field, rule.offset)
+            case Transform(), Transform():
+                settled = alike(rule, other) or moment.policy == "first_wins"
+                wins = moment.policy == "drop_both" or (earlier and settled)
+            case _:
+                wins = False
+        if wins and other.span != rule.span:
+            rivals.append(other)
     return rivals
 
 

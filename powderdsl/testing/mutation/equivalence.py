@@ -12,7 +12,7 @@ import numpy as np
 from powderdsl.ir.lower import lower_pass, lower_substep, part_names
 from powderdsl.ir.ops import COMMUTATIVE, OPS, REAL, Graph, Node, Offset
 from powderdsl.model.state import slots
-from powderdsl.model.types import Pass, Ruleset
+from powderdsl.model.types import Pass, Ruleset, minus, plus
 
 
 def proven_equal(first: Ruleset, second: Ruleset) -> bool:
@@ -205,28 +205,20 @@ class Comparison:
             raise Undecided
 
 
-def _plus(a: Offset, b: Offset) -> Offset:
-    return a[0] + b[0], a[1] + b[1]
-
-
-def _minus(a: Offset, b: Offset) -> Offset:
-    return a[0] - b[0], a[1] - b[1]
-
-
 def _reads(node: Node, at: Offset) -> list[tuple[Node, Offset]]:
     """The parts of a node and where they are read."""
     match node.op:
         case "shift":
-            return [(node.args[0], _plus(at, node.attr[:2]))]
+            return [(node.args[0], plus(at, node.attr[:2]))]
         case "count":
-            return [(node.args[0], _plus(at, (dy, dx))) for dy, dx, _ in node.attr[0]]
+            return [(node.args[0], plus(at, (dy, dx))) for dy, dx, _ in node.attr[0]]
         case "swap":
             content, movers, rest = node.args
-            there, back = _plus(at, node.attr), _minus(at, node.attr)
+            there, back = plus(at, node.attr), minus(at, node.attr)
             return [(movers, at), (content, there), (movers, back), (content, back), (rest, at)]
         case "arrive":
             content, movers, rest = node.args
-            back = _minus(at, node.attr)
+            back = minus(at, node.attr)
             return [(movers, back), (content, back), (rest, at)]
     return [(arg, at) for arg in node.args]
 
@@ -409,7 +401,7 @@ class _Cases:
             total += self.variables[_others(node, at)]
             weights = tuple(weight for weight in weights if weight[:2] == (0, 0))
         for dy, dx, weight in weights:
-            held = self.value(node.args[0], _plus(at, (dy, dx)))
+            held = self.value(node.args[0], plus(at, (dy, dx)))
             if not wraps and (dy, dx) != (0, 0):
                 held = held * self.variables[("inside", at, (dy, dx))]
             total += weight * held
