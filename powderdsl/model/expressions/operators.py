@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from functools import lru_cache
+from functools import lru_cache, partial
 from math import ceil, floor
 from typing import TYPE_CHECKING
 
@@ -168,21 +168,18 @@ def negation(value: Expr, span: Span | None = None) -> Expr:
     return value.args[0] if value.op == "not" else Expr("not", FLAG, (value,), span=span)
 
 
-def conjunction(values: list[Expr], span: Span | None = None) -> Expr:
-    """All of them, constants folded."""
-    return _folded("and", values, TRUE, FALSE, span)
-
-
-def disjunction(values: list[Expr], span: Span | None = None) -> Expr:
-    """Any of them, constants folded."""
-    return _folded("or", values, FALSE, TRUE, span)
-
-
-def _folded(op: str, values: list[Expr], neutral: Expr, absorbing: Expr, span: Span | None) -> Expr:
+def _folded(op: str, neutral: Expr, absorbing: Expr, values: list[Expr], span: Span | None = None) -> Expr:
     if absorbing in values:
         return absorbing
     kept = [value for value in values if value != neutral]
     return _joined(op, kept, span) if kept else neutral
+
+
+conjunction = partial(_folded, "and", TRUE, FALSE)
+"""All of some conditions, constants folded."""
+
+disjunction = partial(_folded, "or", FALSE, TRUE)
+"""Any of some conditions, constants folded."""
 
 
 def _joined(op: str, values: list[Expr], span: Span | None) -> Expr:
@@ -264,7 +261,7 @@ def compare(typer: Typer, sign: str, left: Placed, right: Placed, span: Span) ->
     evaluate = OPERATIONS[op].evaluate
     if evaluate is not None and a.kind == b.kind == NUMBER:
         return TRUE if evaluate(a.value, b.value) else FALSE
-    kinds = {value.kind.name for value in (a, b)} - {"number"}
+    kinds = {a.kind.name, b.kind.name} - {"number"}
     if "draw" in kinds:
         return _compare_draw(typer, op, left, right, span)
     if kinds & {"element", "direction", "flag", "vec2"}:
@@ -278,7 +275,7 @@ def compare(typer: Typer, sign: str, left: Placed, right: Placed, span: Span) ->
             a = number(floor(a.value) + (op == "le"))
         elif not is_integer(b):
             b = number(ceil(b.value) - (op == "le"))
-    return Expr(op, FLAG, tuple(typer.of_kind(value, kind, span) for value in (a, b)), span=span)
+    return Expr(op, FLAG, (typer.of_kind(a, kind, span), typer.of_kind(b, kind, span)), span=span)
 
 
 def _compare_discrete(typer: Typer, op: str, left: Placed, right: Placed, span: Span) -> Expr:
@@ -395,13 +392,14 @@ def _equals(typer: Typer, left: Operand, item: Operand, syntax: Syntax) -> Expr:
 
 def calculation(typer: Typer, syntax: Syntax, scope: Scope) -> Expr:
     """`+ - * / div` on numbers and vectors. `a div b` divides integers, rounded down; 0 where b is 0."""
-    return _calculated(typer, syntax, [typer.value_of(child, scope) for child in syntax.children])
+    return _calculated(typer, syntax, lambda child: typer.value_of(child, scope))
 
 
-def _calculated(typer: Typer, syntax: Syntax, values: Sequence[Expr]) -> Expr:
+def _calculated(typer: Typer, syntax: Syntax, value_of: Callable[[Syntax], Expr]) -> Expr:
     op, span = syntax.kind, syntax.span
-    placed: list[Placed] = []
-    for value, child in zip(values, syntax.children, strict=True):
+    values: list[Placed] = []
+    for child in syntax.children:
+        value = value_of(child)
         if value.kind in _COMPARABLE:
             helps = ["an item of a list has a blank after its `-`"] if op == "neg" else []
             raise typer.wrong(value, "a number", child.span, *helps)
@@ -409,12 +407,12 @@ def _calculated(typer: Typer, syntax: Syntax, values: Sequence[Expr]) -> Expr:
             raise typer.wrong(value, "an integer", child.span, "`div` divides integers; for floats say `/`")
         if op == "quotient" and not is_integer(value):
             value = typer.of_kind(value, INTEGER, child.span)
-        placed.append((value, child.span))
-    if op in ("div", "quotient") and values[1].op == "const" and values[1].value == 0:
+        values.append((value, child.span))
+    if op in ("div", "quotient") and values[1][0].op == "const" and values[1][0].value == 0:
         raise typer.fail("PD402", "division by zero", syntax.children[1].span, "this is 0")
-    if any(value.kind.name == "vec2" for value in values):
-        return _on_vectors(typer, op, placed, span)
-    result = arithmetic(typer, op, placed, span)
+    if any(value.kind.name == "vec2" for value, _ in values):
+        return _on_vectors(typer, op, values, span)
+    result = arithmetic(typer, op, values, span)
     if result.kind != NUMBER:
         return typer.bounded(result, span)
     if abs(result.value) > 10**6 or result.value.denominator > 10**18:
@@ -451,8 +449,7 @@ def _coordinate_sum(typer: Typer, syntax: Syntax, modulus: int, scope: Scope) ->
     if syntax.kind == "name" and syntax.text in COORDINATES:
         return Expr("coordinate", integer(0, modulus - 1), (), (syntax.text, modulus), syntax.span)
     if syntax.kind in ("add", "sub"):
-        parts = [_coordinate_sum(typer, part, modulus, scope) for part in syntax.children]
-        return _calculated(typer, syntax, parts)
+        return _calculated(typer, syntax, lambda part: _coordinate_sum(typer, part, modulus, scope))
     if syntax.kind == "quotient" and not set(words_of(syntax.children[0])).isdisjoint(COORDINATES):
         return _coordinate_quotient(typer, syntax, modulus, scope)
     value = typer.value_of(syntax, scope)
@@ -612,8 +609,12 @@ def _neighborhood(typer: Typer, syntax: Syntax, scope: Scope) -> Expr:
 def _sum_range(kernel: Kernel, lo: float, hi: float) -> Kind:
     """The range of a weighted sum. A neighbor outside the grid counts as zero, so it is a summand too."""
     lo, hi = min(lo, 0), max(hi, 0)
-    ends = [sorted((w * lo, w * hi)) for _, _, w in kernel.weights]
-    return integer(sum(end[0] for end in ends), sum(end[1] for end in ends))
+    least: float = 0
+    most: float = 0
+    for _, _, weight in kernel.weights:
+        least += min(weight * lo, weight * hi)
+        most += max(weight * lo, weight * hi)
+    return integer(least, most)
 
 
 # Places and directions

@@ -265,12 +265,17 @@ def _check_substep(
     rules: list[Rule], facts: Facts, lets: Lets
 ) -> Iterator[tuple[Conflict, dict[Offset, int]]]:
     """The conflicts of one substep, with an example: of rules that move or transform, of assignments, of effects."""
-    movers = [rule for rule in rules if not isinstance(rule, Assign)]
-    yield from _meetings([(rule, rule.mask) for rule in movers], facts, lets)
-    sets = [(rule, rule.mask) for rule in rules if isinstance(rule, Assign) and rule.op == ":="]
-    yield from _meetings(sets, facts, lets)
-    effects = [(one, rule.mask) for rule in movers for one in rule.effects if one.op == ":="]
-    yield from _meetings(effects, facts, lets)
+    movers: list[tuple[Rule, Expr]] = []
+    writes: list[tuple[Rule, Expr]] = []
+    effects: list[tuple[Rule, Expr]] = []
+    for rule in rules:
+        if not isinstance(rule, Assign):
+            movers.append((rule, rule.mask))
+            effects += [(effect, rule.mask) for effect in rule.effects if effect.op == ":="]
+        elif rule.op == ":=":
+            writes.append((rule, rule.mask))
+    for claims in (movers, writes, effects):
+        yield from _meetings(claims, facts, lets)
 
 
 def _meetings(
