@@ -162,10 +162,13 @@ class _Cutter:
 
     def hoist_comparisons(self, masks: Compute) -> None:
         """Compute the comparisons of masks before the guard, with all others that the same loop can compute."""
-        nodes = [node for value in masks.results for node in walk(value) if is_comparison(node)]
-        computed = dict.fromkeys(self.comparisons[node] for node in nodes if not self.have(node))
-        if asked := [node for node in computed if not self.have(node)]:
-            self.ensure(self.needs_of(asked), masks.place)
+        asked: list[Node] = []
+        for value in masks.results:
+            for node in walk(value):
+                if is_comparison(node) and not self.have(node) and not self.have(self.comparisons[node]):
+                    asked.append(self.comparisons[node])
+        if asked:
+            self.ensure(self.needs_of(dict.fromkeys(asked)), masks.place)
             for node in self.comparisons.values():
                 if not self.have(node) and not self.needs(node) and self.there.issuperset(loaded([node])):
                     asked.append(node)
@@ -194,13 +197,9 @@ class _Cutter:
         needs = self.needs_of(vars)
         asked = {node.attr for node in guard.when.args}
         mine = {var: value for value, var in vars.items() if var.name in asked}
-        if len(mine) < len(vars):
-            self.compute(
-                replace(
-                    masks,
-                    outs=tuple([out for out in masks.outs if out.var.name not in self.same.keys() | asked]),
-                )
-            )
+        others = tuple([Out(var, value) for value, var in vars.items() if var.name not in asked])
+        if others:
+            self.compute(Compute(others, place))
         lazy = {var.name: Out(var, self.lazily(*split[value])) for var, value in mine.items()}
         if not needs or not all(split[value][0] for value in mine.values()):
             self.ask(lazy, guard)
@@ -214,7 +213,8 @@ class _Cutter:
         nothing = constant(graph, FLAG)
         olds = dict.fromkeys(mine, nothing)
         for out in guard.outs:  # a mask may be what a slot held before: nothing, where masks are skipped
-            olds[out.var] = nothing if out.value.attr in lazy else out.value
+            skipped = self.same.get(out.value.attr, out.value).attr in lazy
+            olds[out.var] = nothing if skipped else out.value
         self.guard(load(graph, question.var), inner, olds, guard.place)
 
     def ask(self, masks: dict[str, Out], guard: Guard) -> None:
@@ -390,9 +390,10 @@ class _Cutter:
         if self.costs.by_rows and is_movement(node):
             return [arg for arg in node.args if not self.have(arg)]
         if chain := self.chain(node):
-            parts = [part for choice in chain for part in self.cell_needs(choice.args[1])]
-            needs = [*(choice.args[0] for choice in chain), *parts, chain[-1].args[2]]
-            return [need for need in needs if not self.have(need) and need not in chain]
+            needs = [choice.args[0] for choice in chain]
+            for choice in chain:
+                needs += self.cell_needs(choice.args[1])
+            return [need for need in (*needs, chain[-1].args[2]) if not self.have(need) and need not in chain]
         return self.cell_needs(node) if of_floats(node) else self.word_needs(node)
 
     def is_again(self, source: Node, reader: Node) -> bool:
@@ -466,27 +467,28 @@ class _Cutter:
         while before := self.needs_of(wanted):
             self.ensure(before, place, named)
         wanted = [node for node in wanted if not self.have(node)]
-        floats = [node for node in wanted if of_floats(node)]
-        # Floats that are read at neighbors later are stored here, where they are computed anyway.
-        floats += [
-            part for node in floats for part in walk(node) if part in self.wanted and not self.have(part)
-        ]
-        floats = [*dict.fromkeys(floats)]
-        moves = [node for node in wanted if self.costs.by_rows and is_movement(node)]
+        cells = dict.fromkeys(filter(of_floats, wanted))
+        for node in [
+            *cells
+        ]:  # floats that are read at neighbors later are stored where they are computed anyway
+            for part in walk(node):
+                if part in self.wanted and not self.have(part):
+                    cells[part] = None
 
         def outs(nodes: Iterable[Node]) -> list[Out]:
             return [Out(named.get(node) or self.namer.var(node.type), node) for node in nodes]
 
         chains: dict[tuple[Node, ...], list[Out]] = {}
-        for out in outs(filter(self.chain, floats)):
+        for out in outs(filter(self.chain, cells)):
             masks = tuple(choice.args[0] for choice in self.chain(out.value))
             chains.setdefault(masks, []).append(out)
         for group in chains.values():  # chains with the same masks share a loop
             self.loop(group, place, "choices")
-        floats = [node for node in floats if not self.have(node)]
+        floats = [node for node in cells if not self.have(node)]
         for nodes in connected(floats, _operations) if self.costs.by_rows else [floats]:
             self.loop(outs(nodes), place, "cells")
-        flags = [node for node in wanted if not of_floats(node) and node not in moves]
+        moves = [node for node in wanted if self.costs.by_rows and is_movement(node)]
+        flags = [node for node in wanted if node not in cells and node not in moves]
         self.loop(outs(flags), place, "words", when)
         together: dict[tuple[str, Offset, Node], dict[Node, Var]] = {}
         for out in outs(moves):
@@ -535,7 +537,7 @@ class _Cutter:
     def below(self, place: tuple[Node, int, int]) -> list[tuple[Node, int, int]]:
         """The nodes from which a node at a neighbor is computed, with the neighbors at which they are read."""
         node, dy, dx = place
-        if self.have(node):
+        if self.have(node) or not node.args:
             return []
         if node.op == "shift":
             sy, sx, wraps = node.attr

@@ -110,7 +110,7 @@ def ask_regions(schedule: Schedule) -> Schedule:
             return [loop]
         region = rewritten([loop.region], graph, anywhere)(loop.region)
         question = Out(namer.var(ANSWER), graph.node("any", ANSWER, (region,)))
-        outs = tuple(Out(var, loop.olds[name], loop.olds[name]) for name, var in loop.vars.items())
+        outs = tuple([replace(out, value=out.otherwise or out.value) for out in loop.outs])
         guard = Guard(outs, loop.place, when=load(graph, question.var), body=(loop,))
         return [Compute((question,), loop.place, over="words"), guard]
 
@@ -124,9 +124,12 @@ def _narrowed(loop: Compute, graph: Graph, slots: Mapping[str, tuple[str]]) -> C
     """
     if loop.over == "words":
         return loop
-    kept = [unchanged(out.value, slots.get(out.var.name, ())) for out in loop.outs]
-    rest = [old for old, _ in filter(None, kept)]
-    flags = [mask for _, masks in filter(None, kept) for mask in masks]
+    rest: list[Node] = []
+    flags: list[Node] = []
+    for out in loop.outs:
+        if kept := unchanged(out.value, slots.get(out.var.name, ())):
+            rest.append(kept[0])
+            flags += kept[1]
     if loop.over != "cells" or len(rest) < len(loop.outs):
         calm = _calm(loop.results)
         if calm is None:

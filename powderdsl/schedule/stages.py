@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from typing import Literal
 
 from powderdsl.ir.ops import PassGraph
 from powderdsl.schedule.costs import Costs, conditions, thresholds
@@ -21,70 +22,48 @@ from powderdsl.schedule.words import early, empty, updates
 
 @dataclass(frozen=True)
 class Stage:
-    """A transformation of schedules that preserves their meaning."""
+    """A transformation of schedules that preserves their meaning. `only` names the targets that have it, if not all do."""
 
     name: str
     apply: Callable[[Schedule], Schedule]
     about: str
+    only: Literal["", "cpu", "cuda"] = ""
 
 
-CUDA = (
+_CPU_COSTS, _CUDA_COSTS = Costs(gates=6, floats=2, by_rows=True), Costs(gates=24, floats=2)
+
+# fmt: off
+_STAGES = (
     Stage("thresholds", thresholds, "which draws are compared with a parameter"),
     Stage("late", late, "floats are computed where they are used"),
+    Stage("chosen", chosen, "which floats at neighbors follow from a flag; before `cut`, which would store them", "cpu"),
     Stage("led", led, "which comparisons are computed only where another one holds"),
     Stage("conditions", conditions, "where the result of each draw matters"),
-    Stage(
-        "cut",
-        partial(cut, costs=Costs(gates=24, floats=2)),
-        "where loops begin and end; a barrier costs about as much as 24 gates",
-    ),
+    Stage("presence", presence,
+          "which elements must be present for work to be done; before `cut`, which takes masks apart", "cpu"),
+    Stage("early", early,
+          "which parts of masks are computed once for several; after `presence`, which reads whole masks", "cpu"),
+    Stage("cut", partial(cut, costs=_CPU_COSTS),
+          "where loops over rows begin and end, and which movements happen in place", "cpu"),
+    Stage("cut", partial(cut, costs=_CUDA_COSTS),
+          "where loops begin and end; a barrier costs about as much as 24 gates", "cuda"),
     Stage("unread", without_unread, "variables that nothing reads after `cut` are removed"),
+    Stage("updates", updates,
+          "which planes change only where a mask holds; before `empty`, which takes loops apart", "cpu"),
+    Stage("empty", empty, "which loops over words give nothing because a plane is empty", "cpu"),
     Stage("narrow", narrow, "in which cells a loop has anything to do"),
-    Stage("regions", ask_regions, "loops that have nothing to do anywhere are skipped"),
+    Stage("regions", ask_regions, "loops that have nothing to do anywhere are skipped", "cuda"),
+    Stage("swaps", swaps, "which fields exchange values in place; after `cut`, which decides by which planes", "cpu"),
+    Stage("join", join, "which loops over cells run as one; after `narrow`, which decides what they read", "cpu"),
+    Stage("release", release, "when a plane is no longer needed; last, after all reads have their place", "cpu"),
 )
-"""For blocks of threads, each of which holds some worlds in shared memory."""
+# fmt: on
 
-
-CPU = (
-    Stage("thresholds", thresholds, "which draws are compared with a parameter"),
-    Stage("late", late, "floats are computed where they are used"),
-    Stage(
-        "chosen", chosen, "which floats at neighbors follow from a flag; before `cut`, which would store them"
-    ),
-    Stage("led", led, "which comparisons are computed only where another one holds"),
-    Stage("conditions", conditions, "where the result of each draw matters"),
-    Stage(
-        "presence",
-        presence,
-        "which elements must be present for work to be done; before `cut`, which takes masks apart",
-    ),
-    Stage(
-        "early",
-        early,
-        "which parts of masks are computed once for several; after `presence`, which reads whole masks",
-    ),
-    Stage(
-        "cut",
-        partial(cut, costs=Costs(gates=6, floats=2, by_rows=True)),
-        "where loops over rows begin and end, and which movements happen in place",
-    ),
-    Stage("unread", without_unread, "variables that nothing reads after `cut` are removed"),
-    Stage(
-        "updates",
-        updates,
-        "which planes change only where a mask holds; before `empty`, which takes loops apart",
-    ),
-    Stage("empty", empty, "which loops over words give nothing because a plane is empty"),
-    Stage("narrow", narrow, "in which cells a loop has anything to do"),
-    Stage(
-        "swaps",
-        swaps,
-        "which fields exchange values in place; after `cut`, which decides by which planes",
-    ),
-    Stage("join", join, "which loops over cells run as one; after `narrow`, which decides what they read"),
-    Stage("release", release, "when a plane is no longer needed; last, after all reads have their place"),
-)
+CPU = tuple(stage for stage in _STAGES if stage.only != "cuda")
 """For a thread that processes some worlds side by side, plane by plane, in C++ or WebAssembly."""
+
+CUDA = tuple(stage for stage in _STAGES if stage.only != "cpu")
+"""For blocks of threads, each of which holds some worlds in shared memory."""
 
 
 PLANNERS = {"native": CPU, "wasm": CPU, "cuda": CUDA}
