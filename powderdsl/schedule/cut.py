@@ -80,7 +80,7 @@ class _Cutter:
         self.statements: list[Statement] = []
         self.known: dict[Node, Var] = {}
         """The variables of the values stored so far."""
-        self.found = {var.name for _, var in schedule.finds}
+        self.found = schedule.found
         self.there = set(self.found)
         """The variables defined so far."""
         self.same: dict[str, Node] = {}

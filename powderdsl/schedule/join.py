@@ -75,7 +75,7 @@ def _where_read(schedule: Schedule) -> Schedule:
             flags = {shifted[name][0] for name in names if name in shifted and shifted[name][1] == where}
             flags |= names if where == HERE else set()
             asking[field.attr] = asking.get(field.attr, flags) & flags
-    there = {var.name for _, var in schedule.finds}
+    there = set(schedule.found)
 
     def change(loop: Compute) -> list[Statement]:
         outs = []

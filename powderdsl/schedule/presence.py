@@ -44,7 +44,7 @@ def presence(schedule: Schedule) -> Schedule:
     before `cut`, which takes masks apart.
     """
     bits = _element_bits(schedule)
-    planes = {var.name: slot for slot, var in schedule.finds if var.name in bits}
+    planes = {name: slot for name, slot in schedule.found.items() if name in bits}
     writes = [node.op == "load" for slot, node in schedule.leaves if slot.startswith(_ELEMENT)]
     # Else constants, or planes of other slots, become the element.
     if not bits or any(slot != f"{_ELEMENT}{bits[name]}" for name, slot in planes.items()):
@@ -68,9 +68,8 @@ def presence(schedule: Schedule) -> Schedule:
 def _element_bits(schedule: Schedule) -> dict[str, int]:
     """For each variable that holds a bit of the element: which bit. Empty if there are more than MAX_PLANES."""
     bits: dict[str, int] = {}
-    slots = [(slot, var.name) for slot, var in schedule.finds]
-    slots += [(slot, node.attr) for slot, node in schedule.leaves if node.op == "load"]
-    for slot, name in slots:
+    ends = [(node.attr, slot) for slot, node in schedule.leaves if node.op == "load"]
+    for name, slot in (*schedule.found.items(), *ends):
         if slot.startswith(_ELEMENT):
             bits[name] = int(slot.removeprefix(_ELEMENT))
     pairs = [pair for statement in flat(schedule.body) for pair in statement.olds.items()]
@@ -90,7 +89,7 @@ def _times(schedule: Schedule, bits: dict[str, int]) -> dict[str, Time]:
     change, changed = 0, set[int]()
     current: dict[int, str] = {}
     times: dict[str, Time] = {}
-    for name in (*(var.name for _, var in schedule.finds), *_computed(flat(schedule.body))):
+    for name in (*schedule.found, *_computed(flat(schedule.body))):
         if (bit := bits.get(name)) is not None:
             if bit in changed:
                 change, changed = change + 1, set()
@@ -123,7 +122,7 @@ def _pass_asks(schedule: Schedule, bits: dict[str, int]) -> Node | None:
     """
     values = _computed(schedule.body)
     guards = {name: part for part in schedule.body if isinstance(part, Guard) for name in part.vars}
-    slots = {var.name: slot for slot, var in schedule.finds}
+    slots = schedule.found
     masks: list[Node] = []
     for slot, node in schedule.leaves:
         if node.type == REAL and node.op == "load":

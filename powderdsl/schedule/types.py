@@ -228,6 +228,11 @@ class Schedule:
     buffers: tuple[tuple[str, tuple[str, int]], ...] = ()
     """The kind and number of each variable's buffer, for targets that number buffers."""
 
+    @cached_property
+    def found(self) -> dict[str, str]:
+        """The slots whose values variables hold from the beginning."""
+        return {var.name: slot for slot, var in self.finds}
+
     @property
     def results(self) -> list[Node]:
         """The values that the pass leaves in slots."""
@@ -260,7 +265,9 @@ def is_zero(value: Node) -> bool:
 def loaded(nodes: Iterable[Node]) -> Iterator[str]:
     """The names of the variables that values read, with repetitions."""
     for node in nodes:
-        yield from (part.attr for part in walk(node) if part.op == "load")
+        for part in walk(node):
+            if part.op == "load":
+                yield part.attr
 
 
 def rewritten(roots: Iterable[Node], graph: Graph, rule: Rule) -> Callable[[Node], Node]:
@@ -472,7 +479,7 @@ def without_unread(schedule: Schedule) -> Schedule:
         for statement in reversed(body):
             outs = tuple([out for out in statement.outs if out.var.name in live])
             inner, _ = block(statement.body, live)
-            if outs or any(isinstance(part, Forget) for part in (statement, *inner)):
+            if outs or Forget in map(type, (statement, *inner)):
                 result.append(replace(statement, outs=outs, body=inner))
                 live = live.difference(statement.vars) | result[-1].reads
         return tuple(reversed(result)), live
