@@ -11,8 +11,6 @@ from typing import Any, ClassVar
 from powderdsl.arrays import np
 
 Array = Any
-Bytes = Any
-"""An object that has the buffer protocol."""
 
 _SORTS = {"b": "bool", "i": "int", "u": "int", "f": "float", "c": "complex"}
 
@@ -85,6 +83,6 @@ class ArrayKind:
         """The array of cells in C order; it may share their memory."""
         return np.frombuffer(memory, dtype).reshape(shape)
 
-    def bytes_of(self, array: Array) -> Bytes:
-        """The cells of a contiguous array in C order."""
+    def bytes_of(self, array: Array) -> Any:
+        """The cells of a contiguous array in C order, as an object that has the buffer protocol."""
         return array.tobytes()

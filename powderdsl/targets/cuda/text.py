@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from powderdsl.ir.ops import FLAG, REAL, Node, ordered
-from powderdsl.schedule.lifetimes import Buffer
 from powderdsl.schedule.types import ANSWER, Compute, Guard, Schedule, Sync
 from powderdsl.targets.layout import Layout, literal, param_key
 from powderdsl.targets.printing import GATES, CellValues, Printer, WordText, drawn_where
@@ -30,15 +29,14 @@ _FLOATS = {
 
 def pass_text(schedule: Schedule, layout: Layout) -> str:
     """The statements of a pass."""
-    return "\n".join(_Printer(dict(schedule.buffers), layout).block(schedule.body))
+    numbers = {name: number for name, (_, number) in schedule.buffers}
+    return "\n".join(_Printer(numbers, layout).block(schedule.body))
 
 
 class _Printer(Printer):
-    def __init__(self, buffers: dict[str, Buffer], layout: Layout):
-        self.buffers, self.layout = buffers, layout
-
-    def number(self, name: str) -> int:
-        return self.buffers[name][1]
+    def __init__(self, numbers: dict[str, int], layout: Layout):
+        self.numbers, self.layout = numbers, layout
+        """The numbers of buffers by variable."""
 
     def sync(self, _: Sync) -> Iterator[str]:
         yield "SYNC();"
@@ -68,7 +66,7 @@ class _Printer(Printer):
             held.append(f"o_{name}[ROUNDS]")
             own = f"o_{name}[k]" if loop.held else f"o_{name}"
             stores.append(f"{'' if loop.held else 'const u32 '}{own} = {values.of(out.value)} & valid;")
-            back.append(f"P({self.number(name)})[i] = {own};")
+            back.append(f"P({self.numbers[name]})[i] = {own};")
         yield from (f"bool {name} = false;" for name in answers)
         body = ["FOR_WORDS(k, i) { PLACE(i);", *values.lines, *asks, *stores]
         if loop.held:
@@ -84,7 +82,7 @@ class _Printer(Printer):
         lives, stores, ends = [], [], []
         dirty, quiet = "", []
         for out in loop.outs:
-            live, number = f"n_{out.var.name}", self.number(out.var.name)
+            live, number = f"n_{out.var.name}", self.numbers[out.var.name]
             value = cells.of(out.value)
             lives.append(f" u32 {live} = 0;")
             if out.var.type == REAL:
@@ -140,7 +138,7 @@ class _Words(WordText):
             return GATES[node.op].format(*args)
         match node.op:
             case "load":
-                return f"P({self.printer.number(attr)})[i]"
+                return f"P({self.printer.numbers[attr]})[i]"
             case "shift":
                 return self.shift(node)
             case "when":
@@ -161,14 +159,14 @@ class _Words(WordText):
             case "chance" | "below_planes" | "below_param":
                 return self.draw(node, args)
             case "live":
-                number = self.printer.number(node.args[0].attr)
+                number = self.printer.numbers[node.args[0].attr]
                 dy, reach = attr
                 return f"near(N({number}), l, y, w, {dy}, {reach})" if dy or reach else f"N({number})[i]"
         raise AssertionError(f"no cuda kernel for {node.op}")
 
     def shift(self, node: Node) -> str:
         dy, dx, wraps = node.attr
-        plane = f"P({self.printer.number(node.args[0].attr)})"
+        plane = f"P({self.printer.numbers[node.args[0].attr]})"
         row = self.row(dy) if dy else "(i - w)"
         value = f"columns({plane} + {row}, w, {dx})" if dx else f"{plane}[{row} + w]"
         return value if wraps else f"{value} & inside_word(y, w, {dy}, {dx})"
@@ -208,7 +206,7 @@ class _Cells(CellValues[str]):
             case "const":
                 return literal(float(attr))
             case "load" if node.type == REAL:
-                return self.name(f"F({self.printer.number(attr)})[cell]")
+                return self.name(f"F({self.printer.numbers[attr]})[cell]")
             case "param":
                 return self.name(f"PARAM_REAL({self.layout.param_reals[attr[0]]})")
             case "draw":
@@ -229,7 +227,7 @@ class _Cells(CellValues[str]):
     def shift(self, node: Node) -> str:
         dy, dx, wraps = node.attr
         row, column = self.place("row", dy), self.place("column", dx)
-        value = f"F({self.printer.number(node.args[0].attr)})[{row} + {column}]"
+        value = f"F({self.printer.numbers[node.args[0].attr]})[{row} + {column}]"
         if wraps:
             return value
         within = f"y + {dy} >= 0 && y + {dy} < HEIGHT && x + {dx} >= 0 && x + {dx} < WIDTH"
@@ -247,7 +245,7 @@ class _Cells(CellValues[str]):
         """The word of a flag."""
         if node.op == "param":
             return f"PARAM_FLAG({self.layout.param_planes[param_key(node)]})"
-        return self.masks.setdefault(self.printer.number(node.attr), f"m{len(self.masks)}")
+        return self.masks.setdefault(self.printer.numbers[node.attr], f"m{len(self.masks)}")
 
     def led(self, node: Node) -> str:
         """A comparison, computed only where another one holds."""

@@ -78,15 +78,10 @@ class Pass(Printer):
     # Variables
 
     def define(self, var: Var, value: Value) -> Local:
-        self.declare([var])
+        if var.name not in self.vars:
+            self.vars[var.name] = body.variable("i32")
         self.vars[var.name].set(value)
         return self.vars[var.name]
-
-    def declare(self, variables: Iterable[Var]) -> None:
-        """Variables that are set later."""
-        for var in variables:
-            if var.name not in self.vars:
-                self.vars[var.name] = body.variable("i32")
 
     def of(self, node: Node) -> Local:
         return self.vars[str(node.attr)]
@@ -136,7 +131,6 @@ class Pass(Printer):
     @contextmanager
     def where(self, condition: Value, olds: Mapping[Var, Node]) -> Iterator[None]:
         """Statements that run if a condition holds; if not, variables that they define get other values."""
-        self.declare(olds)
         with body.when(condition):
             yield
             if olds:
