@@ -80,19 +80,14 @@ def check_choice(name: str, value: Any, choices: Sequence[str]) -> None:
         raise ValueError(f"{name} is one of {', '.join(choices)}; found {value!r}")
 
 
-def mistakes(config: Any) -> list[str]:
-    """A sentence for each setting whose value it does not take."""
+def check_settings(config: Any) -> None:
+    """Raise ValueError with a sentence for each setting whose value it does not take."""
     problems: list[str] = []
     for name, (hint, _) in _fields_of(type(config)).items():  # type: ignore[arg-type]  # types are hashable
         if get_origin(hint) is Annotated:
             _read(hint, getattr(config, name), name, problems)
-    return problems
-
-
-def check_settings(config: Any) -> None:
-    """Raise ValueError with all `mistakes`."""
-    if wrong := mistakes(config):
-        raise ValueError("; ".join(wrong))
+    if problems:
+        raise ValueError("; ".join(problems))
 
 
 def read_record(kind: type[Record], data: Any, problems: list[str], path: str = "") -> Record | None:

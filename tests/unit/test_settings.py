@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from powderdsl.cli.options import settings_of
-from powderdsl.system.settings import check_settings, mistakes, setting
+from powderdsl.system.settings import check_settings, setting
 
 
 @dataclass(frozen=True)
@@ -22,14 +22,16 @@ class Config:
 
 @pytest.mark.parametrize("wrong", [0, 10, 2.0, True, "3", None, float("nan"), 10**400])
 def test_numbers_out_of_bounds(wrong: object) -> None:
-    (found,) = mistakes(Config(rounds=wrong))  # type: ignore[arg-type]
-    assert found == f"`rounds` must be an integer from 1 to 9, found {wrong!r:.80}"
+    with pytest.raises(ValueError, match="must be") as caught:
+        check_settings(Config(rounds=wrong))  # type: ignore[arg-type]
+    assert str(caught.value) == f"`rounds` must be an integer from 1 to 9, found {wrong!r:.80}"
 
 
 @pytest.mark.parametrize("wrong", [-0.1, float("nan"), float("inf"), False, "1", 10**400])
 def test_reals_out_of_bounds(wrong: object) -> None:
-    (found,) = mistakes(Config(decay=wrong))  # type: ignore[arg-type]
-    assert found == f"`decay` must be a number from 0 to 1, found {wrong!r:.80}"
+    with pytest.raises(ValueError, match="must be") as caught:
+        check_settings(Config(decay=wrong))  # type: ignore[arg-type]
+    assert str(caught.value) == f"`decay` must be a number from 0 to 1, found {wrong!r:.80}"
 
 
 def test_all_mistakes_are_said_at_once() -> None:
