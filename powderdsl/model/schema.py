@@ -246,20 +246,14 @@ class Reader:
             case "pairs":
                 wanted = f"a mapping from {row.maps}"
                 pairs = self.pairs(node, wanted, about) if row.maps else self.named(node, "a value")
-                if row.type == tuple[Scalar, Syntax]:
-                    return tuple((name, line) for name, part in pairs if (line := self.line(part)))
-                return tuple(
-                    (name, word)
-                    for name, part in pairs
-                    if (word := self.single(part, "a single value", about))
-                )
+                read = self.line if row.type == tuple[Scalar, Syntax] else self.single
+                return tuple((name, value) for name, part in pairs if (value := read(part)))
             case "mapping" | "list" | "block" | "any":
                 return node
         if not isinstance(node, Scalar):
             is_set = row.shape == "line" and isinstance(node, Sequence)
-            self.shape(
-                node, f"a single value for `{key.text}`", "a set is written `(a, b)`" if is_set else about
-            )
+            fix = "a set is written `(a, b)`" if is_set else about
+            self.shape(node, f"a single value for `{key.text}`", fix)
             return None
         if row.form is not None:
             return self.formed(row.form, key.text, node)
@@ -320,7 +314,7 @@ class Reader:
         if isinstance(value, Scalar):
             is_empty = value.style == "plain" and not value.text
         else:
-            is_empty = row.required and row.shape == "words" and not getattr(value, "items", True)
+            is_empty = row.required and row.shape == "words" and not value.items
         if not is_empty:
             return False
         comment = comment_after(key)
@@ -416,7 +410,7 @@ class Reader:
             return ()
         return tuple(word for item in node.items if (word := self.single(item, "a word")))
 
-    def single(self, node: Node, wanted: str, help_text: str = "") -> Scalar | None:
+    def single(self, node: Node, wanted: str = "a single value", help_text: str = "") -> Scalar | None:
         """A node that is a single value; None after reporting another one."""
         if isinstance(node, Scalar):
             return node

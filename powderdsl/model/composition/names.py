@@ -308,13 +308,11 @@ def report_misspelled(
 def words_of_tree(tree: Node | None) -> Iterator[str]:
     """The names that a pack's file defines, from its structure alone."""
     for key, section in tree.entries if isinstance(tree, MappingNode) else ():
-        if key.text in (*SHARED, "passes") and not isinstance(section, Scalar):
-            pairs = (
-                section.entries
-                if isinstance(section, MappingNode)
-                else ((item, item) for item in section.items)
-            )
-            yield from (name.text for name, _ in pairs if isinstance(name, Scalar))
+        if key.text in (*SHARED, "passes"):
+            names: Iterable[Node] = section.items
+            if isinstance(section, MappingNode):
+                names = (name for name, _ in section.entries)
+            yield from (name.text for name in names if isinstance(name, Scalar))
 
 
 def _optional_names(value: object) -> Iterator[tuple[str, Span]]:
