@@ -213,8 +213,8 @@ def _alike(claim: Alike, runs: Runs, sample: Start) -> Array:
         second = runs.states(turned, 1)[-1]["element"]
         mask = np.zeros(second.shape[1:], bool)
         for element in runs.ruleset.elements:
-            a = turned_cells(first == element.id, claim.turn).sum(0) / claim.copies
-            b = (second == element.id).sum(0) / claim.copies
+            a = turned_cells(first == element.id, claim.turn).sum(0).astype(np.float64) / claim.copies
+            b = (second == element.id).sum(0).astype(np.float64) / claim.copies
             mean = (a + b) / 2
             margin = SIGMAS * np.sqrt(2 * mean * (1 - mean) / claim.copies) + 1e-9
             mask = mask | (np.abs(a - b) > margin)

@@ -264,14 +264,14 @@ def framed(ids: Array, number: int) -> Array:
 
 def turned_cells(values: Array, turn: str) -> Array:
     """An array [..., H, W]: left and right exchanged (``mirrored``), or a quarter turn clockwise (``rotated``)."""
-    return np.flip(values if turn == "mirrored" else np.moveaxis(values, -1, -2), -1).copy()
+    return (values if turn == "mirrored" else np.moveaxis(values, -1, -2))[..., ::-1].copy()
 
 
 def turned_back(values: Array, turn: str) -> Array:
     """The inverse of `turned_cells`."""
-    return (
-        turned_cells(values, turn) if turn == "mirrored" else np.moveaxis(np.flip(values, -1), -1, -2).copy()
-    )
+    if turn == "mirrored":
+        return turned_cells(values, turn)
+    return np.moveaxis(values, -1, -2)[..., ::-1, :].copy()
 
 
 def turned_values(slot: Slot, values: Array, turn: str) -> Array:
