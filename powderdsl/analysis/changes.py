@@ -32,9 +32,6 @@ from powderdsl.model.types import (
 MAX_QUESTION = 20_000
 """Nodes evaluated for one question, after which the answer is that it may be."""
 
-MAX_PAIRS = 1024
-"""Pairs of elements that are asked about one at a time where a rule computes what a cell becomes."""
-
 Condition = tuple[Expr, Offset]
 Pairs = Set[tuple[int, int]]
 Ids = Set[int]
@@ -208,18 +205,12 @@ def _pairs(before: Ids, after: Ids) -> Pairs:
 
 def _becomes(rule: Transform, asked: Asked, known: Pairs = frozenset()) -> Iterator[tuple[int, int]]:
     """The pairs (before, after) of a transform that are not known yet."""
-    ids = asked.facts.ids
-    if rule.target.op == "const":
-        after = int(rule.target.value)
-        for before in ids:
-            if before != after and (before, after) not in known and asked.may(rule, is_(before)):
-                yield before, after
-        return
-    firsts = asked.elements(rule, HERE)
-    lasts = [number for number in ids if asked.may(rule, (member(rule.target, (number,)), HERE))]
-    few = len(firsts) * len(lasts) <= MAX_PAIRS
-    for before, after in sorted(_pairs(firsts, {*lasts}) - known):
-        if not few or asked.may(rule, is_(before), (member(rule.target, (after,)), HERE)):
+    firsts, lasts = asked.elements(rule, HERE), {rule.target.value}
+    if rule.target.op != "const":
+        candidates = asked.facts.ids
+        lasts = {number for number in candidates if asked.may(rule, (member(rule.target, (number,)), HERE))}
+    for before, after in sorted(_pairs(firsts, lasts) - known):
+        if asked.may(rule, is_(before), (member(rule.target, (after,)), HERE)):
             yield before, after
 
 

@@ -552,12 +552,13 @@ def _meant(
     typer: Typer, function: Operation, operands: Sequence[tuple[Operand, Span]], span: Span
 ) -> Operand:
     """What a call stands for. Mistakes are shown at the arguments, or at the call."""
-    places = {name: place for name, (_, place) in zip(function.parameters, operands, strict=True)}
+    given = dict(zip(function.parameters, operands, strict=True))
 
     def placed(node: Syntax) -> Syntax:
-        return replace(node, children=tuple(map(placed, node.children)), span=places.get(node.text, span))
+        place = given[node.text][1] if node.text in given else span
+        return replace(node, children=tuple(map(placed, node.children)), span=place)
 
-    names = {name: operand for name, (operand, _) in zip(function.parameters, operands, strict=True)}
+    names = {name: operand for name, (operand, _) in given.items()}
     result = typer.evaluate(placed(_meaning(function)), Scope("", names))
     # An argument that the meaning repeats is copied, which doubles from call to call.
     typer.spend(sum(1 for _ in result.walk()) if isinstance(result, Expr) else 1, span)
