@@ -40,11 +40,10 @@ class PowderVecEnv(Face, VecEnv):
 
     def reset(self) -> Array:
         """Begin all episodes with the seeds and options that `seed` and `set_options` have left; they count once."""
-        seeds = None if all(one is None for one in self._seeds) else self._seeds
         options = self._options[0]
-        if any(one is not options and one != options for one in self._options):
+        if any(other is not options and other != options for other in self._options):
             raise ValueError("all worlds share one environment: they take the same options")
-        observed, info = self.tensors.reset(seed=seeds, options=options)
+        observed, info = self.tensors.reset(seed=self._seeds, options=options)
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = [{"world": world} for world in info["world"].tolist()]

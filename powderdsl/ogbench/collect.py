@@ -229,12 +229,10 @@ def _read_part(file: Path, recipe: Recipe, level: Level, count: int) -> Frames |
     shape = (count, recipe.painted + 1, level.side, level.side, 3)
     try:
         with open_archive(file) as archive:
-            head = archive.headers.get("frames")
-            if head is None or head.shape != shape or head.dtype != "uint8":
-                return None
-            return np.asarray(archive.read("frames"))
-    except (OSError, BadArchive):
+            frames = archive.read("frames")
+    except (OSError, BadArchive, KeyError):
         return None
+    return frames if frames.shape == shape else None
 
 
 # Scripts
