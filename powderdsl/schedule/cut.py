@@ -515,9 +515,8 @@ class _Cutter:
         """A value in a loop: only variables are read at neighbors, the rest is recomputed."""
         graph = self.graph
         done: dict[tuple[Node, int, int], Node] = {}
-        for place in needed((root, 0, 0), self.below):
+        for place, below in needed((root, 0, 0), self.below):
             node, dy, dx = place
-            below = self.below(place)
             args = tuple([done[part] for part in below])
             if self.have(node):
                 new = self.variable(node)

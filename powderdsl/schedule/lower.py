@@ -99,12 +99,12 @@ class _Lowering:
     def value(self, root: Node) -> Node:
         """A node of the pass in terms of the variables defined so far."""
         done: dict[Node, Node] = {}
-        for node in needed(root, lambda node: () if node in self.stored else node.args):
+        for node, parts in needed(root, lambda node: () if node in self.stored else node.args):
             if node in self.stored:
                 done[node] = load(self.graph, self.stored[node])
             elif node.op == "input":
                 done[node] = self.found(node.attr, node.type)
             else:
-                args = tuple([done[arg] for arg in node.args])
+                args = tuple([done[arg] for arg in parts])
                 done[node] = self.graph.node(node.op, node.type, args, node.attr)
         return done[root]

@@ -489,21 +489,20 @@ def without_unread(schedule: Schedule) -> Schedule:
     return replace(schedule, body=body, finds=finds)
 
 
-def needed(item: Item, below: Callable[[Item], Sequence[Item]]) -> Iterator[Item]:
-    """All that an item needs, each after what is below it, then the item."""
+def needed(item: Item, below: Callable[[Item], Sequence[Item]]) -> Iterator[tuple[Item, Sequence[Item]]]:
+    """All that an item needs, then the item: each once, after what is below it, and with that."""
     done: set[Item] = set()
-    stack = [(item, False)]
+    stack: list[tuple[Item, Sequence[Item] | None]] = [(item, None)]
     while stack:
-        top, ready = stack.pop()
+        top, parts = stack.pop()
         if top in done:
             continue
-        parts = () if ready else below(top)
-        if parts:
-            stack.append((top, True))
-            stack += [(part, False) for part in reversed(parts)]
+        if parts is None and (parts := below(top)):
+            stack.append((top, parts))
+            stack += [(part, None) for part in reversed(parts)]
         else:
             done.add(top)
-            yield top
+            yield top, parts
 
 
 def connected(items: Sequence[Item], keys: Callable[[Item], set[Any]]) -> list[list[Item]]:
