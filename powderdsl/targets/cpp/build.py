@@ -140,6 +140,8 @@ def processor() -> str:
 
 # Libraries
 
+TIMEOUT = 600
+
 
 @dataclass(frozen=True)
 class Building:
@@ -233,7 +235,7 @@ def run_compilers(scratch: Path, *commands: list[str]) -> tuple[int, str]:
         scratch: a folder for their temporary files.
 
     Raises:
-        NoCompiler: one cannot be started.
+        NoCompiler: one cannot be started, or takes longer than TIMEOUT.
     """
     environment = {**os.environ, "TMPDIR": str(scratch), "LC_ALL": "C"}
     processes: list[subprocess.Popen[bytes]] = []
@@ -251,9 +253,12 @@ def run_compilers(scratch: Path, *commands: list[str]) -> tuple[int, str]:
                 )
                 processes.append(process)
                 _running.append(process)
-            codes = [process.wait() for process in processes]
+            # Without a limit, waiting holds a lock, and a fork would take the compilers for its own.
+            codes = [process.wait(TIMEOUT) for process in processes]
         except OSError as error:
             raise NoCompiler(f"{commands[0][0]} could not be run: {error}") from None
+        except subprocess.TimeoutExpired:
+            raise NoCompiler(f"{commands[0][0]} took longer than {TIMEOUT} s") from None
         finally:
             _end(processes)
         messages.seek(0)
