@@ -191,15 +191,15 @@ def check_logic(
         ]
         reporter.error("PD508", message, longest.span, label, helps=helps)
         return passes, []
-    passes = _report_conflicts(conflicts, passes, facts, added, reporter)
-    relaxed = facts.relaxed()
+    if conflicts:
+        passes = _report_conflicts(conflicts, passes, facts, added, reporter)
     for span in useful.where(False):
         if fires[span]:
             label = "the cell already holds that element"
             fix = "remove it, or name another element after `->`"
             reporter.report("PD509", "this rule changes nothing", span, label, helps=[fix])
         else:
-            _report_silent(span, silent[span], relaxed, elaborated, reporter)
+            _report_silent(span, silent[span], facts.relaxed(), elaborated, reporter)
     return passes, useful.where(None)
 
 
