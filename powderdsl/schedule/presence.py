@@ -182,11 +182,8 @@ class _Needs:
         ways = sorted({self.known[mask].sets for mask in masks}, key=sorted)
         if not ways or not ways[0]:
             return None
-        answers = []
-        for sets in ways:
-            present = [self.graph.node("present", ANSWER, (), ids) for ids in sorted(sets)]
-            answers.append(combined("and", present, self.graph))
-        return combined("or", answers, self.graph)
+        present = [[self.graph.node("present", ANSWER, (), ids) for ids in sorted(sets)] for sets in ways]
+        return combined("or", [combined("and", nodes, self.graph) for nodes in present], self.graph)
 
     def ids(self, node: Node, args: list[_Ids]) -> _Ids:
         """What a flag says, from what its arguments say."""
