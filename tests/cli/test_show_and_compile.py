@@ -28,7 +28,8 @@ def _repository(monkeypatch):
 def test_show_lists_elements_reactions_passes_and_parameters():
     lines = powderdsl("show", "powderworld").stdout.splitlines()
     tables = [line for line in lines if line and not line.startswith(" ")]
-    assert [line.split()[0] for line in tables[3:]] == ["Elements", "Reactions", "Passes,", "Parameters"]
+    titles = [line.split()[0] for line in tables[3:]]
+    assert titles == ["Elements", "Fields", "Reactions", "Passes,", "Parameters"]
     rules = package.load("powderworld")
     for element in rules.elements:
         row = next(line for line in lines if line.split()[:2] == [str(element.id), element.name])
@@ -59,10 +60,16 @@ def test_show_as_json(name):
     assert [row["name"] for row in data["elements"]] == [element.name for element in rules.elements]
     assert [row["name"] for row in data["passes"]] == [one.name for one in rules.passes]
     assert [row["moments"] for row in data["passes"]] == [len(one.moments) for one in rules.passes]
-    assert {row["name"] for row in data["params"]} == {param.name for param in rules.params}
+    assert {row["name"]: row["value"] for row in data["params"]} == {
+        param.name: float(param.default) for param in rules.params
+    }
+    for row, element in zip(data["elements"], rules.elements, strict=True):
+        values = {prop.name: prop.values[element.id] for prop in rules.properties}
+        assert row["properties"] == {
+            name: value if isinstance(value, int) else float(value) for name, value in values.items()
+        }
     for row in data["reactions"]:
-        assert row["from"]
-        assert row["to"]
+        assert {*row["from"], *row["to"]} <= {element.name for element in rules.elements}
         file, line = row["where"].rsplit(":", 1)
         assert row["rule"].split()[0] in Path(file).read_text().splitlines()[int(line) - 1]
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
@@ -18,8 +18,8 @@ from powderdsl.cli.exits import BadInput
 from powderdsl.cli.output import color_wanted, print_json
 from powderdsl.diagnostics import Span
 from powderdsl.diagnostics.printable import printable, write_styled
-from powderdsl.model.text import place_of, show_set, show_value
-from powderdsl.model.types import Element, Pass, Property, Ruleset
+from powderdsl.model.text import element_name, one_line, place_of, show_set, show_value
+from powderdsl.model.types import ColorRamp, Element, Pass, Property, Ruleset
 from powderdsl.system.reports import Painted, table
 from powderdsl.tasks.shipped import is_task
 
@@ -64,7 +64,15 @@ def command(
 
 
 Tables = dict[str, list[dict[str, Any]]]
-"""Rows by column, by name of their table."""
+"""Rows by column, by name of their table. A mapping in a row has a column for each of its keys."""
+
+
+class Shown(NamedTuple):
+    """A cell that tables show as text, while JSON has its data."""
+
+    text: str
+    data: Any
+
 
 TITLES = {
     "passes": "Passes, in order",
@@ -77,20 +85,37 @@ TITLES = {
 def _show(head: dict[str, Any], tables: Tables, as_json: bool) -> None:
     """Print what something consists of; on a terminal with swatches of colors."""
     if as_json:
-        print_json({**head, **tables})
+        print_json(_data({**head, **tables}))
         return
     styled = color_wanted(sys.stdout)
     about = f": {head['about']}" if head["about"] else ""
     lines = [printable(f"{head['name']}{about}")]
     lines += [f"{name}: {_text(value)}" for name, value in head.items() if name not in ("name", "about")]
     for name, parts in tables.items():
-        rows = [[_text(cell, styled) for cell in part.values()] for part in parts]
-        lines += ["", TITLES.get(name, name.capitalize()), *table([[*parts[0]], *rows] if parts else [])]
+        rows = [dict(_columns(part)) for part in parts]
+        cells = [[_text(cell, styled) for cell in row.values()] for row in rows]
+        lines += ["", TITLES.get(name, name.capitalize()), *table([[*rows[0]], *cells] if rows else [])]
     write_styled(sys.stdout, "\n".join(lines) + "\n")
+
+
+def _data(value: Any) -> Any:
+    """Cells as data, in lists and mappings."""
+    if isinstance(value, Shown):
+        return value.data
+    if isinstance(value, dict):
+        return {name: _data(part) for name, part in value.items()}
+    return [_data(part) for part in value] if isinstance(value, list) else value
+
+
+def _columns(row: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+    for name, value in row.items():
+        yield from value.items() if isinstance(value, dict) else ((name, value),)
 
 
 def _text(value: Any, styled: bool = False) -> str:
     """A cell as text; names are separated by spaces."""
+    if isinstance(value, Shown):
+        value = value.text
     text = " ".join(value) if isinstance(value, list) else str(value)
     if not (styled and COLOR.search(text)):
         return text
@@ -115,16 +140,17 @@ def _of_rules(ruleset: Ruleset) -> tuple[dict[str, Any], Tables]:
     elements = [
         {
             **_described(element, "id", "name", "pack", "glyph", "color"),
-            "color_by": _ramp_text(element),
-            **{prop.name: _property_text(ruleset, prop, element) for prop in ruleset.properties},
+            "color_by": _ramp(element.ramp),
+            "properties": {prop.name: _property(ruleset, prop, element) for prop in ruleset.properties},
             "tags": sorted(element.tags),
+            **_described(element, "about", "where"),
         }
         for element in ruleset.elements
     ]
+    fields = [_described(field, "name", "pack", "at", "kind", "where") for field in ruleset.fields]
     changes = [
         {
-            "from": show_set(ruleset, before),
-            "to": show_set(ruleset, after),
+            **{side: _elements(ruleset, ids) for side, ids in (("from", before), ("to", after))},
             "pass": line.pass_name,
             "rule": line.text,
             "where": str(line),
@@ -135,7 +161,7 @@ def _of_rules(ruleset: Ruleset) -> tuple[dict[str, Any], Tables]:
         {
             **_described(pass_, "name", "pack"),
             "moments": len(pass_.moments),
-            "rules": len(rule_spans(pass_)),
+            "rules": _rules(pass_),
             "where": place_of(pass_.span),
         }
         for pass_ in ruleset.passes
@@ -143,31 +169,56 @@ def _of_rules(ruleset: Ruleset) -> tuple[dict[str, Any], Tables]:
     params = [
         {
             "name": param.name,
-            "value": show_value(ruleset, param.kind, param.default),
-            "kind": str(param.kind),
-            "about": param.about,
-            "where": place_of(param.span),
+            "value": Shown(show_value(ruleset, param.kind, param.default), _plain(param.default)),
+            **_described(param, "kind", "about", "where"),
         }
         for param in ruleset.params
     ]
-    return head, {"elements": elements, "reactions": changes, "passes": passes, "params": params}
+    return head, {
+        "elements": elements,
+        "fields": fields,
+        "reactions": changes,
+        "passes": passes,
+        "params": params,
+    }
 
 
 def _described(part: Any, *names: str) -> dict[str, Any]:
-    """Some attributes of a part."""
-    return {name: getattr(part, name) for name in names}
+    """Some attributes of a part of the model, and where it is written."""
+    special = {"kind": lambda: str(part.kind), "where": lambda: place_of(part.span)}
+    return {name: special[name]() if name in special else getattr(part, name) for name in names}
 
 
-def _ramp_text(element: Element) -> str:
-    """The field that its color follows, and both ends."""
-    ramp = element.ramp
-    return f"{ramp.start} -> {ramp.end} by {ramp.field} {ramp.lo}..{ramp.hi}" if ramp else ""
+def _plain(value: Any) -> Any:
+    """A constant for JSON: chances are numbers in 0..1."""
+    if isinstance(value, str | int):
+        return value
+    return [_plain(part) for part in value] if isinstance(value, tuple) else float(value)
 
 
-def _property_text(ruleset: Ruleset, prop: Property, element: Element) -> str:
-    """Its value; `*` where cells may hold one of their own."""
-    text = show_value(ruleset, prop.kind, prop.values[element.id])
-    return f"{text}*" if element.id in prop.stored else text
+def _elements(ruleset: Ruleset, ids: Iterable[int]) -> Shown:
+    return Shown(show_set(ruleset, ids), [element_name(ruleset, number) for number in ids])
+
+
+def _rules(pass_: Pass) -> Shown:
+    """The number of a pass's rules, and their lines."""
+    spans = rule_spans(pass_)
+    return Shown(str(len(spans)), [{"rule": one_line(span), "where": place_of(span)} for span in spans])
+
+
+def _ramp(ramp: ColorRamp | None) -> Shown:
+    """The field that an element's color follows, and both ends."""
+    if ramp is None:
+        return Shown("", None)
+    data = {"field": ramp.field, "from": ramp.start, "to": ramp.end, "over": [ramp.lo, ramp.hi]}
+    return Shown(f"{ramp.start} -> {ramp.end} by {ramp.field} {ramp.lo}..{ramp.hi}", data)
+
+
+def _property(ruleset: Ruleset, prop: Property, element: Element) -> Shown:
+    """A property's value; text has a `*` where cells may hold one of their own."""
+    value = prop.values[element.id]
+    text = show_value(ruleset, prop.kind, value)
+    return Shown(f"{text}*" if element.id in prop.stored else text, _plain(value))
 
 
 # Tasks
@@ -177,15 +228,20 @@ def _of_task(task: Task) -> tuple[dict[str, Any], Tables]:
     head = {
         **_described(task, "name", "about"),
         "rules": task.ruleset.name,
-        "size": f"{task.size[0]}×{task.size[1]} cells",
-        "agent": "; ".join(_agent_text(task)),
+        "size": Shown(f"{task.size[0]}×{task.size[1]} cells", task.size),
+        "agent": Shown("; ".join(_agent_text(task)), task.agent),
     }
     splits = [
         {**_described(split, "name", "about"), "stands": [stand.name for stand in split.variants]}
         for split in task.splits
     ]
     knobs = [
-        {"name": knob.name, "value": knob.value, "range": f"{knob.lo}..{knob.hi}", "about": knob.about}
+        {
+            "name": knob.name,
+            "value": knob.value,
+            "range": Shown(f"{knob.lo}..{knob.hi}", [knob.lo, knob.hi]),
+            "about": knob.about,
+        }
         for knob in task.knobs
     ]
     return head, {"splits": splits, "knobs": knobs}
