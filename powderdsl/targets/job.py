@@ -132,15 +132,16 @@ class OwnedBatch(PackedArrays):
 
 def like_of(state: Mapping[str, Array]) -> Like:
     """The dtypes and shapes of a state, without unpacking anything."""
-    if isinstance(state, PackedArrays):
-        return state.like
+    like: Like | None = getattr(state, "like", None)  # `isinstance` is slow with an abstract class
+    if like is not None:
+        return like
     return {name: (value.dtype, tuple(value.shape)) for name, value in state.items()}
 
 
 def shape_of(state: Mapping[str, Array]) -> tuple[int, int, int]:
     """(worlds, rows, columns) of a state, without unpacking anything."""
-    shape = state.like["element"][1] if isinstance(state, PackedArrays) else state["element"].shape
-    batch, height, width = shape
+    like = getattr(state, "like", None)
+    batch, height, width = state["element"].shape if like is None else like["element"][1]
     return batch, height, width
 
 

@@ -15,7 +15,7 @@ import torch
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.simulation.simulator import compile as compile_rules
 from powderdsl.targets.cpp.build import Building, building
-from powderdsl.targets.cpp.program import BATCH_SIZES
+from powderdsl.targets.cpp.program import KEPT_INPUTS
 from powderdsl.testing.generators.cases import load_text
 from tests.compilers import skip_without_compiler
 
@@ -142,7 +142,7 @@ def test_defaults_cannot_be_changed_through_a_copy(sims: Pair) -> None:
 def test_batch_sizes_alternate(sims: Pair) -> None:
     """More of them than are kept, in strips and in lanes."""
     native, plain = sims
-    sizes = [1, 9, 2, 1, 9, *range(1, BATCH_SIZES + 3), 1, 9]
+    sizes = [1, 9, 2, 1, 9, *range(1, KEPT_INPUTS + 3), 1, 9]
     worlds = {batch: start(native, batch) for batch in set(sizes)}
     for batch in sizes:
         worlds[batch] = native.step(worlds[batch])

@@ -22,8 +22,8 @@ from powderdsl.targets.cpp.source import native_source
 from powderdsl.targets.job import Job, Like, OwnedBatch, like_of, shape_of
 from powderdsl.targets.layout import Layout
 
-BATCH_SIZES = 16
-"""The most batch sizes for which a program keeps the inputs of parameters."""
+KEPT_INPUTS = 16
+"""How many mappings of parameters a program keeps the inputs for."""
 
 
 @dataclass(frozen=True)
@@ -161,6 +161,7 @@ class NativeProgram:
         self.layout, self.threads = code.layout, threads
         self.pieces, self._passes = code.pieces, code.passes
         self._inputs: dict[int, Inputs] = {}
+        """By the `id` of the mapping, which they keep alive."""
         self.planes = {
             name: (self.layout.planes[parts[0].planes[0]], len(parts[0].planes), parts[0].signed)
             for name, parts in self.pieces.items()
@@ -174,34 +175,31 @@ class NativeProgram:
         assert job.passes is None
         state, (seed, index, start, since) = job.state, job.clock
         seed, index, start = seed.contiguous(), index.contiguous(), start.contiguous()
-        inputs = self._inputs.get(start.shape[0])
-        if inputs is None or inputs.params is not job.params:
-            inputs = self._made_inputs(job.params, start.shape[0])
-        if isinstance(state, PackedState) and state.program is self:
-            copy = not job.reuse
-            handle = state.handle if copy else state.take()
-        else:
-            copy, handle = False, self._pack(state)
+        inputs = self._inputs.get(id(job.params)) or self._made_inputs(job.params, len(start))
+        reuse = job.reuse
+        if not (isinstance(state, PackedState) and state.program is self):
+            state, reuse = self._packed(state), True
+        handle = state.take() if reuse else state.handle
         seconds = None if job.timing is None else (ctypes.c_double * len(self._passes))()
         handle = self.library.pd_run(
-            handle, copy, job.steps, self.threads,
+            handle, not reuse, job.steps, self.threads,
             seed.data_ptr(), index.data_ptr(), start.data_ptr(), since, inputs.planes.data_ptr(), inputs.reals.data_ptr(), seconds,
         )  # fmt: skip
         if job.timing is not None and seconds is not None:
             for name, spent in zip(self._passes, seconds, strict=True):
                 job.timing.add(name, spent)
-        return PackedState(self, handle, like_of(state))
+        return PackedState(self, handle, state.like)
 
     def _made_inputs(self, params: Mapping[str, Tensor], batch: int) -> Inputs:
         """The inputs of some parameters, kept for the next call with the same mapping."""
         layout = self.layout
         bits, floats = parameters(torch, params, layout.param_planes, layout.param_reals, batch)
-        if len(self._inputs) >= BATCH_SIZES:
+        if len(self._inputs) >= KEPT_INPUTS:
             self._inputs = {}  # not cleared: another thread may be reading it
-        self._inputs[batch] = inputs = Inputs(params, bits, floats)
+        self._inputs[id(params)] = inputs = Inputs(params, bits, floats)
         return inputs
 
-    def _pack(self, state: Mapping[str, Tensor]) -> int:
+    def _packed(self, state: Mapping[str, Tensor]) -> PackedState:
         handle: int = self.library.pd_new(*shape_of(state))
         for name, value in state.items():
             value = value.contiguous()
@@ -210,7 +208,7 @@ class NativeProgram:
                     self.library.pd_load(handle, number, bits, value.element_size(), part.data_ptr())
                 else:
                     self.library.pd_load_real(handle, number, part.data_ptr(), value.stride(0))
-        return handle
+        return PackedState(self, handle, like_of(state))
 
     def parts(self, name: str, value: Tensor) -> Iterator[tuple[Tensor, int, int, bool]]:
         """The parts of a state tensor in slots, each with its field's number and 0 bits, or as `planes` says."""
