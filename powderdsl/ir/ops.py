@@ -7,16 +7,17 @@ control flow inside a substep. Equal nodes of one graph are the same object, so 
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Container, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import reduce
 from itertools import chain, starmap
-from typing import Any
+from typing import Any, TypeVar
 
 from powderdsl.ir.single import larger, single, smaller, square_root
 
 Offset = tuple[int, int]
 Range = tuple[int, int]
+Item = TypeVar("Item")
 
 SNAP = 2.0**-20
 """Floats of a smaller magnitude are stored as zero."""
@@ -64,7 +65,7 @@ class Threshold:
         return f"{'lt' if self.strict else 'le'}{self.bits}"
 
 
-_TYPE = operator.attrgetter("type")
+_ARGS, _TYPE = operator.attrgetter("args"), operator.attrgetter("type")
 
 
 @dataclass(frozen=True)
@@ -386,21 +387,26 @@ class Program:
     passes: tuple[PassGraph, ...]
 
 
-def ordered(roots: Iterable[Node], known: Container[int] = ()) -> list[Node]:
-    """All nodes that some nodes need, arguments before their users, in a stable order; those `known` by id left out."""
-    seen: dict[int, Node] = {}
-    for root in roots:
-        stack = [root] if id(root) not in known else []
-        while stack:
-            node = stack[-1]
-            for arg in node.args:
-                if id(arg) not in seen and id(arg) not in known:
-                    stack.append(arg)
-                    break
-            else:
-                seen[id(node)] = node
-                stack.pop()
-    return list(seen.values())
+def needed(roots: Iterable[Item], below: Callable[[Item], Sequence[Item]]) -> dict[Item, Sequence[Item]]:
+    """All that some items need, and these: each after what is below it, with that."""
+    done: dict[Item, Sequence[Item]] = {}
+    begun: dict[Item, Sequence[Item]] = {}
+    stack = [*roots][::-1]
+    while stack:
+        top = stack[-1]
+        if top in done:
+            stack.pop()
+        elif top in begun:
+            done[top] = begun[top]
+        else:
+            begun[top] = below(top)
+            stack += reversed(begun[top])
+    return done
+
+
+def ordered(roots: Iterable[Node]) -> list[Node]:
+    """All nodes that some nodes need, arguments before their users, in a stable order."""
+    return [*needed(roots, _ARGS)]
 
 
 def nodes_of(pass_: PassGraph, *, substeps: bool = True) -> list[Node]:
@@ -413,16 +419,22 @@ def nodes_of(pass_: PassGraph, *, substeps: bool = True) -> list[Node]:
     return ordered([*[node for _, node in (*writes, *pass_.outputs)], *guards])
 
 
-def walk(node: Node) -> Iterator[Node]:
-    """A node and everything below it, each once."""
-    seen: set[int] = set()
-    stack = [node]
+def taken(stack: list[Item]) -> Iterator[Item]:
+    """Take items from a stack, to which the caller adds others, each once."""
+    seen: set[Item] = set()
     while stack:
         top = stack.pop()
-        if id(top) not in seen:
-            seen.add(id(top))
+        if top not in seen:
+            seen.add(top)
             yield top
-            stack.extend(top.args)
+
+
+def walk(node: Node) -> Iterator[Node]:
+    """A node and everything below it, each once."""
+    stack = [node]
+    for top in taken(stack):
+        yield top
+        stack += top.args
 
 
 class InvalidIR(AssertionError):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from hashlib import sha256
 
-from powderdsl.ir.ops import Node, PassGraph, Program, nodes_of, ordered
+from powderdsl.ir.ops import Node, PassGraph, Program, needed, nodes_of
 
 
 def print_program(program: Program, only: str | None = None) -> str:
@@ -25,18 +25,20 @@ def print_program(program: Program, only: str | None = None) -> str:
 
 def _pass_lines(pass_: PassGraph) -> list[str]:
     """One pass. Numbers are given in order of use, so that they do not depend on what was built and dropped."""
-    names: dict[int, str] = {}
+    names: dict[Node, str] = {}
     lines = [f"pass {pass_.name}"]
 
     def show(root: Node) -> str:
-        for node in ordered([root], names):
-            parts = [names[id(arg)] for arg in node.args]
+        for node in needed([root], lambda node: () if node in names else node.args):
+            if node in names:
+                continue
+            parts = [names[arg] for arg in node.args]
             if node.attr is not None:
                 parts.append(attr_text(node.attr))
-            names[id(node)] = f"%{len(names)}"
+            names[node] = f"%{len(names)}"
             text = f"{node.op} {', '.join(parts)} : {node.type}".replace("  ", " ")
-            lines.append(f"    {names[id(node)]} = {text}")
-        return names[id(root)]
+            lines.append(f"    {names[node]} = {text}")
+        return names[root]
 
     for number, step in enumerate(pass_.substeps):
         label = f" ({step.label})" if step.label else ""

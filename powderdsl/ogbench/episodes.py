@@ -326,7 +326,7 @@ class Episodes:
             left = [row for row, at in enumerate(active) if len(lists[at]) > time]
             if len(left) < len(active):
                 ids, pictures = world.ids, world.rgb()
-                ended = {*range(len(active))}.difference(left)
+                ended = sorted({*range(len(active))}.difference(left))
                 goals |= {active[row]: Goal(ids[row].clone(), pictures[row].clone()) for row in ended}
                 if not left:
                     break

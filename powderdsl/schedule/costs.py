@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from powderdsl.ir.ops import FLAG, Graph, Node, Offset, ordered
+from powderdsl.ir.ops import FLAG, Graph, Node, Offset, ordered, taken
 from powderdsl.schedule.floats import of_floats
 from powderdsl.schedule.types import (
     Compute,
@@ -19,7 +19,6 @@ from powderdsl.schedule.types import (
     map_values,
     on_all_paths,
     rewritten,
-    taken,
 )
 
 FAR = 100

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Literal
 
-from powderdsl.ir.ops import FLAG, REAL, Node, Offset, ordered, walk
+from powderdsl.ir.ops import FLAG, REAL, Node, Offset, needed, ordered, taken, walk
 from powderdsl.schedule.costs import (
     DRAWS,
     UNIFORM,
@@ -53,8 +53,6 @@ from powderdsl.schedule.types import (
     load,
     loaded,
     map_values,
-    needed,
-    taken,
 )
 
 ONLY_READER = 4
@@ -89,9 +87,9 @@ class _Cutter:
         """What is computed for each comparison: itself, or only where another one holds."""
         self.wanted: set[Node] = set()
         """Floats that are read at neighbors later."""
-        sources: set[tuple[Node, Offset]] = set()
+        sources: dict[tuple[Node, Offset], None] = {}
         for node in ordered(schedule.values):
-            sources.update(sources_of(node))
+            sources |= dict.fromkeys(sources_of(node))
             if is_comparison(node):
                 self.comparisons[node] = node
             elif node.op == "led":
@@ -515,7 +513,7 @@ class _Cutter:
         """A value in a loop: only variables are read at neighbors, the rest is recomputed."""
         graph = self.graph
         done: dict[tuple[Node, int, int], Node] = {}
-        for place, below in needed((root, 0, 0), self.below):
+        for place, below in needed([(root, 0, 0)], self.below).items():
             node, dy, dx = place
             args = tuple([done[part] for part in below])
             if self.have(node):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Container, Iterator
 from dataclasses import replace
 
-from powderdsl.ir.ops import FLAG, REAL, Graph, Node, ordered
+from powderdsl.ir.ops import FLAG, REAL, Graph, Node, ordered, taken
 from powderdsl.schedule.types import (
     Compute,
     Facts,
@@ -18,7 +18,6 @@ from powderdsl.schedule.types import (
     map_values,
     on_all_paths,
     rewritten,
-    taken,
     without_unread,
 )
 

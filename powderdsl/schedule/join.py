@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from powderdsl.ir.ops import FLAG, OPS, REAL, Graph, Node, ordered
+from powderdsl.ir.ops import FLAG, OPS, REAL, Graph, Node, ordered, taken
 from powderdsl.ir.single import single
 from powderdsl.schedule.floats import unchanged
 from powderdsl.schedule.types import (
@@ -35,7 +35,6 @@ from powderdsl.schedule.types import (
     on_all_paths,
     planes_at_neighbors,
     rewritten,
-    taken,
 )
 
 

@@ -180,11 +180,10 @@ def swaps(schedule: Schedule) -> Schedule:
 
     def change(loop: Compute) -> list[Statement]:
         swaps = [_swap(out.value, offsets, shifted) for out in loop.outs]
-        ways = {swap[0] if swap else None for swap in swaps}
-        way = ways.pop() if loop.over != "words" and len(ways) == 1 else None
-        if way is None:
+        ways = dict.fromkeys(swap and swap[0] for swap in swaps)
+        if loop.over == "words" or len(ways) != 1 or swaps[0] is None:
             return [loop]
-        movers, offset, fresh = way
+        movers, offset, fresh = swaps[0][0]
         planes, outs = [], []
         for out, (_, old) in zip(loop.outs, filter(None, swaps), strict=True):
             slot = settled.get(old.attr)

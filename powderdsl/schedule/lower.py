@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from powderdsl.ir.ops import Graph, Node, PassGraph, SubstepGraph, Type, nodes_of
+from powderdsl.ir.ops import Graph, Node, PassGraph, SubstepGraph, Type, needed, nodes_of
 from powderdsl.schedule.types import (
     ANSWER,
     Compute,
@@ -15,7 +15,6 @@ from powderdsl.schedule.types import (
     Statement,
     Var,
     load,
-    needed,
 )
 
 
@@ -96,10 +95,13 @@ class _Lowering:
             assert out.var.means is not None
             self.stored[out.var.means] = out.var
 
+    def below(self, node: Node) -> tuple[Node, ...]:
+        return () if node in self.stored else node.args
+
     def value(self, root: Node) -> Node:
         """A node of the pass in terms of the variables defined so far."""
         done: dict[Node, Node] = {}
-        for node, parts in needed(root, lambda node: () if node in self.stored else node.args):
+        for node, parts in needed([root], self.below).items():
             if node in self.stored:
                 done[node] = load(self.graph, self.stored[node])
             elif node.op == "input":

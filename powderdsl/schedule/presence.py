@@ -33,7 +33,7 @@ Time = tuple[int, int]
 ALWAYS: Time = (0, 1 << 30)
 """A half-open range of changes of the element."""
 
-Sets = frozenset[int]
+Sets = tuple[int, ...]
 """Sets of ids (bits of a word): at least one id of each must be present."""
 
 
@@ -179,10 +179,10 @@ class _Needs:
         for node in ordered(masks):
             if node not in self.known:
                 self.known[node] = self.ids(node, [self.known[arg] for arg in node.args])
-        ways = sorted({self.known[mask].sets for mask in masks}, key=sorted)
+        ways = sorted({tuple(sorted(self.known[mask].sets)) for mask in masks})
         if not ways or not ways[0]:
             return None
-        present = [[self.graph.node("present", ANSWER, (), ids) for ids in sorted(sets)] for sets in ways]
+        present = [[self.graph.node("present", ANSWER, (), ids) for ids in sets] for sets in ways]
         return combined("or", [combined("and", nodes, self.graph) for nodes in present], self.graph)
 
     def ids(self, node: Node, args: list[_Ids]) -> _Ids:
@@ -191,7 +191,9 @@ class _Needs:
         together = node.op in ("and", "or", "xor", "not", "select")
         exact = together and all(arg.exact for arg in args)
         times = [ALWAYS, *(arg.time for arg in args if together and arg.cell != self.everything)]
-        cell, needs = self.everything, Sets()
+        cell: int = self.everything
+        cell = self.everything
+        needs: Sets = ()
         match node.op:
             case "load" if node.attr in self.bits:
                 bit = self.bits[node.attr]
@@ -202,22 +204,22 @@ class _Needs:
             case "not" if exact:
                 cell = self.everything ^ cells[0]
             case "and":
-                cell, needs = cells[0] & cells[1], _least(sets[0] | sets[1])
+                cell, needs = cells[0] & cells[1], _least(sets[0] + sets[1])
             case "or" | "xor":
                 both = cells[0] & cells[1] if exact and node.op == "xor" else 0
                 cell, needs = (cells[0] | cells[1]) ^ both, _either(*sets)
             case "select":
                 chosen = cells[0] if exact else 0
                 cell = cells[0] & cells[1] | cells[2] & ~chosen
-                needs = _either(_least(sets[0] | sets[1]), sets[2])
+                needs = _either(_least(sets[0] + sets[1]), sets[2])
             case "shift":
                 needs = sets[0]
         begins, ends = zip(*times, strict=True)
         time = max(begins), min(ends)
         if time[0] >= time[1]:  # they never are together
             cell, exact, time = self.everything, False, ALWAYS
-        needs = Sets() if exact else needs
-        return _Ids(cell, exact, time, _least(needs | {cell} - {self.everything}))
+        own = () if cell == self.everything else (cell,)
+        return _Ids(cell, exact, time, own if exact else _least(needs + own))
 
 
 def _either(a: Sets, b: Sets) -> Sets:
@@ -230,4 +232,4 @@ def _least(sets: Iterable[int]) -> Sets:
     for ids in sorted(sets, key=lambda ids: (ids.bit_count(), ids)):
         if not any(smaller & ids == smaller for smaller in least):
             least.append(ids)
-    return frozenset(least[:MAX_SETS])
+    return tuple(least[:MAX_SETS])

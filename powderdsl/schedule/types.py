@@ -13,14 +13,12 @@ from functools import cached_property
 from itertools import pairwise
 from typing import Any, Literal, Self, TypeVar
 
-from powderdsl.ir.ops import FLAG, REAL, Graph, Node, Type, ordered, walk
+from powderdsl.ir.ops import FLAG, REAL, Graph, Item, Node, Type, ordered, taken, walk
 
 ANSWER = Type("answer")
 """One truth value for all cells, such as whether a flag is set anywhere."""
 
 _PREFIX = {"flag": "p", "real": "f", "answer": "q"}
-
-Item = TypeVar("Item")
 
 Rule = Callable[[Node], Node | None]
 """Gives a node to put in another one's place, or None."""
@@ -293,16 +291,6 @@ def is_movement(node: Node) -> bool:
     return node.op in ("swap", "arrive") and node.type == FLAG
 
 
-def taken(stack: list[Item]) -> Iterator[Item]:
-    """Take items from a stack, to which the caller adds others, each once."""
-    seen: set[Item] = set()
-    while stack:
-        top = stack.pop()
-        if top not in seen:
-            seen.add(top)
-            yield top
-
-
 def conjunctions(node: Node) -> Iterator[Node]:
     """A flag and the flags that must all hold for it to hold, each once, in order."""
     stack = [node]
@@ -487,22 +475,6 @@ def without_unread(schedule: Schedule) -> Schedule:
     body, live = block(schedule.body, set(loaded(schedule.results)))
     finds = tuple((slot, var) for slot, var in schedule.finds if var.name in live)
     return replace(schedule, body=body, finds=finds)
-
-
-def needed(item: Item, below: Callable[[Item], Sequence[Item]]) -> Iterator[tuple[Item, Sequence[Item]]]:
-    """All that an item needs, then the item: each once, after what is below it, and with that."""
-    done: set[Item] = set()
-    stack: list[tuple[Item, Sequence[Item] | None]] = [(item, None)]
-    while stack:
-        top, parts = stack.pop()
-        if top in done:
-            continue
-        if parts is None and (parts := below(top)):
-            stack.append((top, parts))
-            stack += [(part, None) for part in reversed(parts)]
-        else:
-            done.add(top)
-            yield top, parts
 
 
 def connected(items: Sequence[Item], keys: Callable[[Item], set[Any]]) -> list[list[Item]]:

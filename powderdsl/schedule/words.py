@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
-from powderdsl.ir.ops import FLAG, Graph, Node, ordered
+from powderdsl.ir.ops import FLAG, Graph, Node, ordered, taken
 from powderdsl.schedule.costs import DRAWS, LOGIC, UNIFORM
 from powderdsl.schedule.floats import is_comparison
 from powderdsl.schedule.presence import when_present
@@ -34,7 +34,6 @@ from powderdsl.schedule.types import (
     read_by,
     read_elsewhere,
     rewritten,
-    taken,
     with_values,
 )
 
