@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial, reduce
@@ -169,20 +169,17 @@ def lower_expression(expr: Expr, at: Inputs) -> Parts:
         case "vector", ((y,), (x,)):
             return y, x
     name = OPERATIONS[expr.op].lowers or expr.op
-    return _each(partial(build.derive, name, attr=value), *args)
+    # Numbers beside vectors serve both parts.
+    return tuple([
+        build.derive(name, *[parts[i % len(parts)] for parts in args], attr=value)
+        for i in range(max(map(len, args), default=1))
+    ])  # fmt: skip
 
 
 def node(expr: Expr, at: Inputs) -> Node:
     """The node of an expression that is not a vector."""
     (number,) = lower_expression(expr, at)
     return number
-
-
-def _each(function: Callable[..., Node], *values: Parts) -> Parts:
-    """Apply to numbers, or to both parts of vectors; numbers beside vectors serve both parts."""
-    if all(len(value) == 1 for value in values):
-        return (function(*[number for (number,) in values]),)
-    return tuple([function(*[value[part % len(value)] for value in values]) for part in (0, 1)])
 
 
 def _real(build: Graph, value: float | Fraction) -> Node:

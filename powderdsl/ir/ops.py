@@ -437,6 +437,19 @@ def walk(node: Node) -> Iterator[Node]:
         stack += top.args
 
 
+def conjunctions(node: Node) -> Iterator[Node]:
+    """A flag and the flags that must all hold for it to hold, each once, in order."""
+    stack = [node]
+    for top in taken(stack):
+        yield top
+        stack += reversed(top.args) if top.op == "and" else ()
+
+
+def conjuncts(node: Node) -> list[Node]:
+    """These flags without those that are conjunctions themselves."""
+    return [part for part in conjunctions(node) if part.op != "and"]
+
+
 class InvalidIR(AssertionError):
     """The compiler made something illegal: a bug of ours, never of a rule file."""
 

@@ -13,7 +13,7 @@ from math import frexp
 from typing import NamedTuple
 
 from powderdsl.ir.bits import simpler
-from powderdsl.ir.ops import OPS, REAL, Graph, Node, PassGraph, Program, Type, nodes_of, verify
+from powderdsl.ir.ops import OPS, REAL, Graph, Node, PassGraph, Program, Type, conjuncts, nodes_of, verify
 from powderdsl.ir.single import single, square_root, stepped
 
 Rewrite = Callable[[Node, Graph], Node | None]
@@ -172,7 +172,7 @@ def specialise(pass_: PassGraph) -> PassGraph:
 def _specialise(tables: Tables, node: Node, build: Graph) -> Node | None:
     if node.op != "and" or not _tables(node, tables):
         return None
-    parts = _conjuncts(node)
+    parts = conjuncts(node)
     known = {part.args[0]: part.attr for part in parts if part.op == "in_set"}
     done: dict[Node, Node] = {}
 
@@ -199,10 +199,6 @@ def _tables(node: Node, known: Tables) -> frozenset[Node]:
         own = node.args if node.op == "table" else ()
         known[node] = frozenset(own).union(*parts)
     return known[node]
-
-
-def _conjuncts(node: Node) -> list[Node]:
-    return [part for arg in node.args for part in _conjuncts(arg)] if node.op == "and" else [node]
 
 
 def share(node: Node, build: Graph) -> Node | None:

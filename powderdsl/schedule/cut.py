@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Literal
 
-from powderdsl.ir.ops import FLAG, REAL, Node, Offset, needed, ordered, taken, walk
+from powderdsl.ir.ops import FLAG, REAL, Node, Offset, conjunctions, conjuncts, needed, ordered, taken, walk
 from powderdsl.schedule.costs import (
     DRAWS,
     UNIFORM,
@@ -44,8 +44,6 @@ from powderdsl.schedule.types import (
     Var,
     asked_masks,
     combined,
-    conjunctions,
-    conjuncts,
     connected,
     constant,
     is_movement,

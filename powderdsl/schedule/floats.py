@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Container, Iterator
 from dataclasses import replace
 
-from powderdsl.ir.ops import FLAG, REAL, Graph, Node, ordered, taken
+from powderdsl.ir.ops import FLAG, REAL, Graph, Node, conjuncts, ordered, taken
 from powderdsl.schedule.types import (
     Compute,
     Facts,
     Namer,
     Out,
     Schedule,
-    conjuncts,
+    choices,
     flat,
     load,
     map_values,
@@ -160,13 +160,10 @@ def _conjunctions(node: Node, facts: Facts) -> Iterator[tuple[Node, Facts]]:
 
 def unchanged(value: Node, names: Container[str]) -> tuple[Node, list[Node]] | None:
     """For a clamped slot under choices: its old value, and the masks without which it keeps it (it was clamped)."""
-    masks = []
     if value.op not in ("settle", "select"):
         return None
-    node = value.args[0] if value.op == "settle" else value
-    while node.op == "select":
-        masks.append(node.args[0])
-        node = node.args[2]
+    chain, node = choices(value.args[0] if value.op == "settle" else value)
+    masks = [choice.args[0] for choice in chain]
     known = node.op == "load" and node.attr in names and all(mask.op != "param" for mask in masks)
     return (node, masks) if known else None
 

@@ -21,6 +21,7 @@ from powderdsl.schedule.types import (
     Schedule,
     Statement,
     Sweeps,
+    choices,
     combined,
     connected,
     constant,
@@ -258,20 +259,13 @@ def _continued(first: Compute, second: Compute, reads: Counter[str], graph: Grap
         return None
     nodes = ordered(second.results)
     simple = all(node.type == REAL and node.op in CONTINUING for node in nodes)
-    known = {_base(value) for value in made.values()} | made.keys()
+    known = {choices(value)[1].attr for value in made.values()} | made.keys()
     inside = Counter(loaded(second.values))
     few = sum(bool(node.args) for node in nodes) <= FEW
     if not (simple and few and known >= second.reads) or any(reads[name] != inside[name] for name in made):
         return None
     new = rewritten(nodes, graph, lambda node: made.get(node.attr))
     return replace(first, outs=tuple([replace(out, value=new(out.value)) for out in second.outs]))
-
-
-def _base(value: Node) -> str:
-    """The field that choices begin with."""
-    while value.op == "select":
-        value = value.args[2]
-    return value.attr
 
 
 CONTINUING = ("load", "const", "param", "add", "sub", "mul", "neg", "abs")
@@ -285,36 +279,21 @@ def _components(run: Sequence[Compute]) -> list[list[Compute]]:
 
 
 def _joined(run: Sequence[Compute], reads: Counter[str]) -> Sweeps:
-    """The loops with their parts and lags, and the fields that only loops of the same part read."""
-    parts, lags = _places(run)
-    inside = Counter[tuple[int, str]]()
-    for loop, part in zip(run, parts, strict=True):
-        inside.update((part, name) for name in loaded(loop.values))
-    passing = [
-        name
-        for loop, part in zip(run, parts, strict=True)
-        for name, var in loop.vars.items()
-        if var.type == REAL and reads[name] == inside[part, name]
-    ]
-    return Sweeps(frees=tuple(passing), body=tuple(run), parts=tuple(parts), lags=tuple(lags))
-
-
-def _places(run: Sequence[Compute]) -> tuple[list[int], list[int]]:
-    """The part of each loop and its lag.
+    """The loops with their parts and lags, and the fields that only loops of the same part read.
 
     A row that is read at other columns was stored a row earlier: a processor waits for what it has just stored if a load
     does not begin where the store did.
     """
-    parts: list[int] = []
-    lags: list[int] = []
-    made: dict[str, tuple[int, int]] = {}
+    loops: list[Compute] = []
+    made: dict[str, Compute] = {}
+    inside = Counter[tuple[int, str]]()
+    part = 0
     for loop in run:
-        reads = [read for read in field_reads(loop) if read.name in made]
-        around = [made[read.name][0] + 1 for read in reads if read.wraps and read.dy]
-        parts.append(max([*around, *parts[-1:]], default=0))
-        behind = [
-            made[read.name][1] + read.dy + (read.dx != 0) for read in reads if made[read.name][0] == parts[-1]
-        ]
-        lags.append(max([0, *behind]))
-        made |= {out.var.name: (parts[-1], lags[-1]) for out in loop.outs if out.var.type == REAL}
-    return parts, lags
+        before = [(read, made[read.name]) for read in field_reads(loop) if read.name in made]
+        part = max([part, *[maker.part + 1 for read, maker in before if read.wraps and read.dy]])
+        behind = [maker.lag + read.dy + (read.dx != 0) for read, maker in before if maker.part == part]
+        loops.append(replace(loop, part=part, lag=max([0, *behind])))
+        made |= {name: loops[-1] for name, var in loop.vars.items() if var.type == REAL}
+        inside.update((part, name) for name in loaded(loop.values))
+    passing = [name for name, loop in made.items() if reads[name] == inside[loop.part, name]]
+    return Sweeps(frees=tuple(passing), body=tuple(loops))

@@ -107,7 +107,7 @@ def _put_off(sweeps: Sweeps, after: set[str], namer: Namer, graph: Graph) -> Swe
     loop = sweeps.body[0]
     lasting = [out for out in loop.outs if out.var.name not in sweeps.frees]
     free = [lag for lag, reader in _last_reads(sweeps, after).values() if reader == 0]
-    choices = loop.over == "choices" and loop.region is not None and not any(sweeps.parts)
+    choices = loop.over == "choices" and loop.region is not None and not sweeps.body[-1].part
     if not choices or not lasting or len(free) < len(lasting):
         return sweeps
     waiting = {out.var.name: namer.var(REAL) for out in lasting}
@@ -120,11 +120,10 @@ def _put_off(sweeps: Sweeps, after: set[str], namer: Namer, graph: Graph) -> Swe
     zero = constant(graph, REAL)
     region = combined("or", [graph.node("live", FLAG, (old,), (0, 0)) for old in olds.values()], graph)
     stored = tuple(Out(out.var, olds[out.var.name], zero) for out in lasting)
+    last = Compute(stored, loop.place, region, over="cells", lag=max(free))
     return Sweeps(
         frees=(*sweeps.frees, *(var.name for var in waiting.values())),
-        body=(replace(loops[0], outs=outs), *loops[1:], Compute(stored, loop.place, region, over="cells")),
-        parts=(*sweeps.parts, 0),
-        lags=(*sweeps.lags, max(free)),
+        body=(replace(loops[0], outs=outs), *loops[1:], last),
     )
 
 
@@ -132,11 +131,11 @@ def _last_reads(sweeps: Sweeps, after: set[str]) -> dict[str, tuple[int, int]]:
     """By field that may be written over: the least lag with which that can be done to a row, and its last reader."""
     reads: dict[str, tuple[int, int]] = {}
     kept = after.union(sweeps.vars)
-    for number, (loop, part, lag) in enumerate(sweeps.placed()):
+    for number, loop in enumerate(sweeps.body):
         for read in field_reads(loop):
-            if part > 0 or (read.live and read.dy):
+            if loop.part > 0 or (read.live and read.dy):
                 kept.add(read.name)
-            reads[read.name] = max(reads.get(read.name, (0, 0))[0], lag - read.dy + 1), number
+            reads[read.name] = max(reads.get(read.name, (0, 0))[0], loop.lag - read.dy + 1), number
     return {name: last for name, last in reads.items() if name not in kept}
 
 
@@ -144,9 +143,11 @@ def _overtaken(sweeps: Sweeps, after: set[str]) -> Sweeps:
     """Loops with fields that overwrite a field which earlier loops of the part have read in all rows so far."""
     reads = _last_reads(sweeps, after)
     loops = []
-    for number, (loop, part, lag) in enumerate(sweeps.placed()):
+    for number, loop in enumerate(sweeps.body):
         free = [
-            name for name, (least, reader) in reads.items() if least <= lag and reader < number and part == 0
+            name
+            for name, (least, reader) in reads.items()
+            if least <= loop.lag and reader < number and loop.part == 0
         ]
         outs = []
         for out in loop.outs:

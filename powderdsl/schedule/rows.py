@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from powderdsl.ir.ops import REAL, Node, ordered
 from powderdsl.schedule.join import keeps
-from powderdsl.schedule.types import Compute, Out, Schedule, Sweeps, alternatives, field_reads, flat
+from powderdsl.schedule.types import Compute, Out, Schedule, Sweeps, alternatives, choices, field_reads, flat
 
 ANY_PASS = 1 << 30
 """A field is read as far as any pass reads its slot."""
@@ -30,15 +30,13 @@ class Ring:
 
 @dataclass(frozen=True)
 class RowLoop:
-    """A loop over cells in a run of loops, which runs `lag` rows behind the first of its part.
+    """A loop over cells in a run of loops.
 
     `marked` are the planes whose rows are marked before the run, to find those in which the loop has work. `chains` and
     `masks` are those of a loop over choices; its masks begin at `first_mask` of all that are turned.
     """
 
     loop: Compute
-    part: int
-    lag: int
     marked: tuple[str, ...]
     chains: tuple[tuple[Node, ...], ...]
     first_mask: int
@@ -78,12 +76,12 @@ def rows_of(sweeps: Sweeps, reaches: Mapping[str, int]) -> Rows:
     made = sweeps.vars
     loops = []
     turned = 0
-    for loop, part, lag in sweeps.placed():
+    for loop in sweeps.body:
         chains = chains_of(loop) if loop.over == "choices" else []
         _, planes = region_of(loop)
         # Choices test their masks themselves.
         marked = [] if chains else [name for name in planes if name not in made]
-        loops.append(RowLoop(loop, part, lag, tuple(marked), tuple(map(tuple, chains)), turned))
+        loops.append(RowLoop(loop, tuple(marked), tuple(map(tuple, chains)), turned))
         turned += -(-len(loops[-1].masks) // TURNED) * TURNED
     first = sweeps.body[0]
     places = {out.into: out.var.name for out in first.outs if out.into is not None} if keeps(first) else {}
@@ -92,14 +90,14 @@ def rows_of(sweeps: Sweeps, reaches: Mapping[str, int]) -> Rows:
 
 def _waiting(sweeps: Sweeps) -> tuple[dict[str, Ring], dict[str, tuple[int, int]], int]:
     """The rings of passing fields, the rows that are saved of others, and the number of rows that wait in all."""
-    lags = {name: lag for loop, _, lag in sweeps.placed() for name in loop.vars}
+    lags = {name: loop.lag for loop in sweeps.body for name in loop.vars}
     depths = dict.fromkeys(sweeps.frees, 1)
     bare: dict[str, int | None] = dict.fromkeys(sweeps.frees, 0)
     below = {out.into: 0 for loop in sweeps.body for out in loop.outs if out.into is not None}
-    for loop, _, lag in sweeps.placed():
+    for loop in sweeps.body:
         for read in field_reads(loop):
             if (name := read.name) in depths:
-                depths[name] = max(depths[name], lag - lags[name] - read.dy + 1)
+                depths[name] = max(depths[name], loop.lag - lags[name] - read.dy + 1)
                 around, reach = read.wraps and read.dx, bare[name]
                 bare[name] = None if around or reach is None else max(reach, abs(read.dx))
             elif name in below and read.wraps:
@@ -150,14 +148,10 @@ def reaches_of(schedule: Schedule) -> dict[str, int]:
 def chains_of(loop: Compute) -> list[list[Node]]:
     """The chains of choices of a loop, all on the same masks, in the order in which choices are applied."""
     chains: list[list[Node]] = []
-    below: set[int] = set()
+    below: set[Node] = set()
     for node in reversed(ordered(loop.results)):
-        if node.op != "select" or id(node) in below:
-            continue
-        chain: list[Node] = []
-        while node.op == "select":
-            chain.append(node)
-            below.add(id(node))
-            node = node.args[2]
-        chains.append(chain[::-1])
+        if node.op == "select" and node not in below:
+            chain, _ = choices(node)
+            below.update(chain)
+            chains.append(chain[::-1])
     return chains[::-1]

@@ -81,12 +81,14 @@ def _statement(statement: Statement, indent: str, names: _Names) -> Iterator[str
                 indent += "  "
             for out in outs:
                 yield from given(out, out.value, "else", out.otherwise)
-        case Sweeps(loops=loops, parts=parts):
-            for loop, part, lag in statement.placed():
-                if len(loops) > 1:
-                    behind = f", {lag} behind" if lag else ""
-                    yield f"{indent}row by row{f', part {part}' if parts[-1] else ''}{behind}"
-                yield from _statement(loop, indent + ("  " if len(loops) > 1 else ""), names)
+        case Sweeps(body=(loop,)):
+            yield from _statement(loop, indent, names)
+        case Sweeps(body=loops):
+            for loop in loops:
+                part = f", part {loop.part}" if loops[-1].part else ""
+                behind = f", {loop.lag} behind" if loop.lag else ""
+                yield f"{indent}row by row{part}{behind}"
+                yield from _statement(loop, indent + "  ", names)
         case Move(region=movers, op=op, offset=(dy, dx), olds=olds):
             yield f"{indent}{op} by {values.text(movers)} [{dy:+d},{dx:+d}]"
             indent += "  "

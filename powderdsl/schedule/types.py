@@ -13,7 +13,7 @@ from functools import cached_property
 from itertools import pairwise
 from typing import Any, Literal, Self, TypeVar
 
-from powderdsl.ir.ops import FLAG, REAL, Graph, Item, Node, Type, ordered, taken, walk
+from powderdsl.ir.ops import FLAG, REAL, Graph, Item, Node, Type, ordered, walk
 
 ANSWER = Type("answer")
 """One truth value for all cells, such as whether a flag is set anywhere."""
@@ -125,6 +125,9 @@ class Compute(Statement):
     """
 
     over: Literal["", "words", "cells", "choices"] = ""
+    part: int = 0
+    lag: int = 0
+    """Where it runs in a `Sweeps`."""
     held: bool = False
     """Whether all values are computed before any is stored, since it overwrites what it reads at neighbors (`buffers`)."""
 
@@ -185,22 +188,16 @@ class Release(Statement):
 class Sweeps(Statement):
     """Consecutive loops over cells that run together, world by world and row by row, so that data stay in the cache.
 
-    Each loop runs `lags` rows behind the first of its part: then the rows that it reads of earlier loops are there. A
+    Each loop runs `lag` rows behind the first of its part: then the rows that it reads of earlier loops are there. A
     loop that reads an earlier one around the edge is in a later part, which begins when all rows are done. It frees
     fields that only loops of one part read: they need memory for a few rows. Stages change it as a whole.
     """
 
     body: tuple[Compute, ...]
-    parts: tuple[int, ...]
-    lags: tuple[int, ...]
 
     @property
     def loops(self) -> tuple[Compute, ...]:
         return self.body
-
-    def placed(self) -> Iterator[tuple[Compute, int, int]]:
-        """Each loop with its part and lag."""
-        return zip(self.body, self.parts, self.lags, strict=True)
 
 
 class Forget(Statement):
@@ -286,22 +283,18 @@ def combined(op: str, nodes: Iterable[Node], graph: Graph, type: Type = FLAG) ->
     return result or constant(graph, type, op == "and")
 
 
+def choices(value: Node) -> tuple[list[Node], Node]:
+    """The choices of a chain, the last one to be applied first, and the value that they begin with."""
+    chain = []
+    while value.op == "select":
+        chain.append(value)
+        value = value.args[2]
+    return chain, value
+
+
 def is_movement(node: Node) -> bool:
     """Whether a node is a plane in which cells move."""
     return node.op in ("swap", "arrive") and node.type == FLAG
-
-
-def conjunctions(node: Node) -> Iterator[Node]:
-    """A flag and the flags that must all hold for it to hold, each once, in order."""
-    stack = [node]
-    for top in taken(stack):
-        yield top
-        stack += reversed(top.args) if top.op == "and" else ()
-
-
-def conjuncts(node: Node) -> list[Node]:
-    """These flags without those that are conjunctions themselves."""
-    return [part for part in conjunctions(node) if part.op != "and"]
 
 
 def alternatives(region: Node | None) -> list[Node]:

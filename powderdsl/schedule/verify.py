@@ -95,7 +95,8 @@ def _check_order(sweeps: Sweeps) -> None:
     """A row is computed before loops that run together read it, or hold masks of choices; none reads it around the edge."""
     made: dict[str, tuple[int, int, Type]] = {}
     seen: list[tuple[str, int]] = []
-    for loop, part, lag in sweeps.placed():
+    for loop in sweeps.body:
+        part, lag = loop.part, loop.lag
         for read in field_reads(loop):
             before, behind, _ = made.get(read.name, (part, lag - read.dy, REAL))
             if before == part:

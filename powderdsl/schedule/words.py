@@ -6,7 +6,8 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
-from powderdsl.ir.ops import FLAG, Graph, Node, ordered, taken
+from powderdsl.ir.bits import simpler
+from powderdsl.ir.ops import FLAG, OPS, Graph, Node, conjuncts, ordered, taken
 from powderdsl.schedule.costs import DRAWS, LOGIC, UNIFORM
 from powderdsl.schedule.floats import is_comparison
 from powderdsl.schedule.presence import when_present
@@ -22,7 +23,6 @@ from powderdsl.schedule.types import (
     Var,
     asked_masks,
     combined,
-    conjuncts,
     constant,
     in_order,
     is_movement,
@@ -295,23 +295,9 @@ def without(value: Node, planes: set[str], graph: Graph) -> Node:
     """A flag where some planes are zero."""
 
     def rule(node: Node) -> Node | None:
-        known = [bool(arg.attr) if arg.op == "const" else None for arg in node.args]
-        match node.op:
-            case "load" if node.attr in planes:
-                return constant(graph, FLAG)
-            case "and" | "or":
-                if (ends := node.op == "or") in known:
-                    return constant(graph, FLAG, ends)
-                return combined(node.op, [arg for arg in node.args if arg.op != "const"], graph)
-            case "xor" if False in known:
-                return node.args[1 - known.index(False)]
-            case "not" if known[0] is not None:
-                return constant(graph, FLAG, not known[0])
-            case "select" if known[0] is not None:
-                return node.args[1] if known[0] else node.args[2]
-            case "select" if known[1:] == [False, False]:
-                return constant(graph, FLAG)
-        return None
+        if node.op == "load" and node.attr in planes:
+            return constant(graph, FLAG)
+        return simpler(graph, node.op, node.args, node.attr) if node.op in OPS else None
 
     return rewritten([value], graph, rule)(value)
 

@@ -24,8 +24,7 @@ def test_box_sums_follow_choices() -> None:
     *_, last = (one for one in flat(planned("wind").body) if isinstance(one, Sweeps))
     # Damped choices; sums of three columns; sums of three rows of these.
     assert [loop.over for loop in last.loops] == ["choices", "cells", "cells"]
-    assert last.parts == (0, 0, 0)
-    assert last.lags == (0, 1, 2)
+    assert [(loop.part, loop.lag) for loop in last.body] == [(0, 0), (0, 1), (0, 2)]
     written = [out.var.name for loop in last.loops for out in loop.outs]
     assert last.frees == tuple(written[:4])
     # Two rows behind, the result takes the place of what the choices read up to a row below and above.
@@ -38,8 +37,8 @@ def test_no_field_is_there_twice() -> None:
     """Also where choices read the rows around: their result waits until these rows are no longer read."""
     *_, first, last = (one for one in flat(planned("wind").body) if isinstance(one, Sweeps))
     assert first.loops[0].over == "choices"
-    assert first.lags[0] == 0
-    assert first.lags[-1] == 2
+    assert first.body[0].lag == 0
+    assert first.body[-1].lag == 2
     assert [out.into for out in first.loops[-1].outs] == [read.name for read in _old(first)]
     assert {out.into for out in last.loops[-1].outs} == {out.var.name for out in first.loops[-1].outs}
 
@@ -52,7 +51,10 @@ def _old(sweeps: Sweeps) -> list[Read]:
 def test_a_row_is_not_read_before_it_is_there() -> None:
     schedule = planned("wind")
     early = tuple(
-        replace(one, lags=(0,) * len(one.loops)) if isinstance(one, Sweeps) else one for one in schedule.body
+        replace(one, body=tuple(replace(loop, lag=0) for loop in one.body))
+        if isinstance(one, Sweeps)
+        else one
+        for one in schedule.body
     )
     with pytest.raises(InvalidIR, match="before it is"):
         verify(replace(schedule, body=early), "join")

@@ -56,10 +56,11 @@ def sweeps_text(sweeps: Sweeps, layout: NativeLayout, reaches: Mapping[str, int]
     lines += [_addresses(rows), f"EACH_WORLD {{ {pointers}"]
     part = -1
     for loop in loops:
-        lag, last = loop.plan.lag, max(plan.lag for plan in rows.loops if plan.part == loop.plan.part)
-        if loop.plan.part != part:
+        own = loop.plan.loop
+        lag, last = own.lag, max(other.lag for other in sweeps.body if other.part == own.part)
+        if own.part != part:
             lines += ["}"] if loop.number else []
-            part = loop.plan.part
+            part = own.part
             lines.append(f"for (int step = 0; step < rows + {last}; step++) {{")
         lines.append(f"if (const int y = step - {lag}; (u32)y < (u32)rows) {{\n{loop.text()}\n}}")
         if loop.passing and lag < last:
