@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from powderdsl.ir.ops import Node, Program, Threshold, nodes_of
@@ -20,10 +20,10 @@ class Layout:
     step_planes: dict[tuple[int, int], int] = field(default_factory=dict)
     fixed: dict[tuple[int, int, int], int] = field(default_factory=dict)
 
-    def limit(self, draw: Node) -> list[int]:
-        """The planes of the parameter that a draw is compared with, the highest bit first."""
+    def limit(self, draw: Node) -> int:
+        """The first of the planes of the parameter that a draw is compared with: of its highest bit; the others follow."""
         _, bits, name, threshold = draw.attr
-        return [self.param_planes[name, threshold, bit] for bit in range(bits, -1, -1)]
+        return self.param_planes[name, threshold, bits]
 
 
 @dataclass
@@ -72,7 +72,9 @@ def layout_of(program: Program) -> Layout:
                 case "param" if node.type.name == "real":
                     number(layout.param_reals, node.attr[0])
                 case "param":
-                    number(layout.param_planes, param_key(node))
+                    name, threshold, bit = param_key(node)
+                    for i in range(threshold.bits, -1, -1) if threshold else (bit,):
+                        number(layout.param_planes, (name, threshold, i))
                 case "coordinate" if node.attr[0] == "step":
                     number(layout.step_planes, node.attr[1:])
                 case "coordinate" | "inside":
@@ -92,11 +94,6 @@ def native_layout(program: Program) -> NativeLayout:
                 if node.type.name != "real":
                     layout.cover(**{"beyond_rows" if wraps == [False] else "around_rows": abs(dy)})
     return layout
-
-
-def is_run(numbers: Sequence[int]) -> bool:
-    """Tell whether each number is the one before plus 1."""
-    return [*numbers] == [*range(numbers[0], numbers[0] + len(numbers))]
 
 
 def number(table: dict, key: object) -> int:

@@ -22,14 +22,10 @@ class Printer:
     words: Callable[[Compute], Any]
     update: Callable[[Compute], Any]
 
-    def printed(self, statement: Statement) -> Any:
-        """The result of a statement's method."""
-        return getattr(self, type(statement).__name__.lower())(statement)
-
     def block(self, body: Sequence[Statement]) -> Any:
         """The lines of statements."""
         for statement in body:
-            yield from self.printed(statement)
+            yield from getattr(self, type(statement).__name__.lower())(statement)
 
     def compute(self, loop: Compute) -> Any:
         """A loop over words: an operation on whole planes, planes that are computed anew, or an update where a mask holds."""

@@ -160,6 +160,28 @@ static void begin_step(Context& c, const Clocks& k, int number, long done) {
       c.step_bits[i][l] = (step % STEP_TABLE[i].a) >> STEP_TABLE[i].b & 1 ? FULL : 0;
     }
 }
+// Finds which of the ids that passes ask for are present, from products of their low and high bits.
+static void look(Context& c) {
+  constexpr int LOW = ELEMENTS / 2, IDS = std::min(1 << ELEMENTS, 64);
+  V found[IDS] = {};
+  for (int i = 0; i < c.g.cells(); i++) {
+    V part[2][1 << (ELEMENTS - LOW)];
+    part[0][0] = part[1][0] = splat(FULL);
+#pragma GCC unroll 8
+    for (int bit = 0; bit < ELEMENTS; bit++) {
+      const V flags = c.slot[ELEMENT[bit]]->data[i];
+      V* products = part[bit >= LOW];
+      const int count = 1 << (bit < LOW ? bit : bit - LOW);
+#pragma GCC unroll 8
+      for (int k = 0; k < count; k++) products[count + k] = products[k] & flags, products[k] &= ~flags;
+    }
+#pragma GCC unroll 64
+    for (int id = 0; id < IDS; id++)
+      if (ASKED >> id & 1) found[id] |= part[0][id & ((1 << LOW) - 1)] & part[1][id >> LOW];
+  }
+  c.present = 0;
+  for (int id = 0; id < IDS; id++) c.present |= (u64)(ASKED >> id & 1 && any(found[id])) << id;
+}
 static void run_group(Context& c, Batch& b, int number, long steps, const Clocks& k, const uint8_t* planes, const float* reals) {
   c.lanes = std::min(LANES, b.lanes() - number * LANES);
   for (int l = 0; l < (c.g.strips ? 1 : LANES); l++) {
@@ -190,6 +212,7 @@ static void run_group(Context& c, Batch& b, int number, long steps, const Clocks
   for (long s = 0; s < steps; s++) {
     begin_step(c, k, number, (long)k.since + s);
     reset_slots(c);
+    if (ASKED && c.present == ~0ull) look(c);
     run_passes(c);
   }
   for (int i = 0; i < SLOTS; i++) own(c, c.slot[i]), group.slot[i] = c.slot[i];
@@ -336,14 +359,7 @@ API void* pd_copy(const void* batch) {
   }
   return b;
 }
-API void pd_load(void* batch, int slot, int bits, int item, const void* data) {
-  Batch& b = *(Batch*)batch;
-  if (item == 1) load_values(b, slot, bits, (const uint8_t*)data);
-  else if (item == 2) load_values(b, slot, bits, (const int16_t*)data);
-  else load_values(b, slot, bits, (const int32_t*)data);
-}
-API void pd_load_real(void* batch, int slot, const float* data, int64_t world_stride) {
-  Batch& b = *(Batch*)batch;
+static void load_reals(Batch& b, int slot, const float* data, int64_t apart) {
   Context* c = borrow(b.g);
   for (Group& group : b.groups) {
     group.real[slot]->still = true;
@@ -351,7 +367,7 @@ API void pd_load_real(void* batch, int slot, const float* data, int64_t world_st
   }
   for (int lane = 0; lane < b.lanes(); lane++) {
     Field* f = b.groups[lane / LANES].real[slot];
-    const float* cells = data + b.at(lane, world_stride, b.g.width);
+    const float* cells = data + b.at(lane, apart, b.g.width);
     for (int y = 0; y < b.g.height; y++) {
       int r = lane % LANES * b.g.height + y;
       float* row = f->data + (size_t)r * b.g.stride + HALO;
@@ -362,6 +378,14 @@ API void pd_load_real(void* batch, int slot, const float* data, int64_t world_st
     }
   }
   put_back(c);
+}
+// In the following functions, slots without bits are floats, and `item` is the bytes of a cell.
+API void pd_load(void* batch, int slot, int bits, int item, const void* data, int64_t apart) {
+  Batch& b = *(Batch*)batch;
+  if (!bits) load_reals(b, slot, (const float*)data, apart);
+  else if (item == 1) load_values(b, slot, bits, (const uint8_t*)data);
+  else if (item == 2) load_values(b, slot, bits, (const int16_t*)data);
+  else load_values(b, slot, bits, (const int32_t*)data);
 }
 // Some worlds of a batch anew, from arrays of these worlds alone: the lanes of world places[k] from the k-th world.
 template <class Visit> static void in_places(Batch& b, int count, const int64_t* places, Visit visit) {
@@ -391,14 +415,7 @@ template <class T> static void put_values(Batch& b, int slot, int bits, int coun
     }
   });
 }
-API void pd_put(void* batch, int slot, int bits, int item, int count, const int64_t* places, const void* data) {
-  Batch& b = *(Batch*)batch;
-  if (item == 1) put_values(b, slot, bits, count, places, (const uint8_t*)data);
-  else if (item == 2) put_values(b, slot, bits, count, places, (const int16_t*)data);
-  else put_values(b, slot, bits, count, places, (const int32_t*)data);
-}
-API void pd_put_real(void* batch, int slot, int count, const int64_t* places, const float* data) {
-  Batch& b = *(Batch*)batch;
+static void put_reals(Batch& b, int slot, int count, const int64_t* places, const float* data) {
   Context* c = borrow(b.g);
   in_places(b, count, places, [&](Group& group, int lane, int64_t begin) {
     Field* f = group.real[slot];
@@ -413,6 +430,13 @@ API void pd_put_real(void* batch, int slot, int count, const int64_t* places, co
   });
   put_back(c);
 }
+API void pd_put(void* batch, int slot, int bits, int item, const void* data, int count, const int64_t* places) {
+  Batch& b = *(Batch*)batch;
+  if (!bits) put_reals(b, slot, count, places, (const float*)data);
+  else if (item == 1) put_values(b, slot, bits, count, places, (const uint8_t*)data);
+  else if (item == 2) put_values(b, slot, bits, count, places, (const int16_t*)data);
+  else put_values(b, slot, bits, count, places, (const int32_t*)data);
+}
 
 // One box of cells in each world: int64 [worlds][4], first row, the one after the last, first column, the one after the
 // last; empty where nothing changes. Visits the rows of each lane that lie in it.
@@ -424,8 +448,7 @@ template <class Visit> static void in_boxes(Batch& b, const int64_t* boxes, Visi
     if (first < last && box[2] < box[3]) visit(b.groups[lane / LANES], lane % LANES, b.g.strips ? lane / LANES : lane, first, last, box);
   }
 }
-API void pd_fill(void* batch, int slot, int bits, const int64_t* boxes, const int64_t* values) {
-  Batch& b = *(Batch*)batch;
+static void fill_values(Batch& b, int slot, int bits, const int64_t* boxes, const int64_t* values) {
   in_boxes(b, boxes, [&](Group& group, int lane, int world, int first, int last, const int64_t* box) {
     group.present = ~0ull;
     for (int i = 0; i < bits; i++) {
@@ -447,8 +470,7 @@ API void pd_fill(void* batch, int slot, int bits, const int64_t* boxes, const in
     }
   });
 }
-API void pd_fill_real(void* batch, int slot, const int64_t* boxes, const float* values) {
-  Batch& b = *(Batch*)batch;
+static void fill_reals(Batch& b, int slot, const int64_t* boxes, const float* values) {
   Context* c = borrow(b.g);
   in_boxes(b, boxes, [&](Group& group, int lane, int world, int first, int last, const int64_t* box) {
     Field* f = group.real[slot];
@@ -464,6 +486,11 @@ API void pd_fill_real(void* batch, int slot, const int64_t* boxes, const float* 
     }
   });
   put_back(c);
+}
+API void pd_fill(void* batch, int slot, int bits, const void* values, const int64_t* boxes) {
+  Batch& b = *(Batch*)batch;
+  if (bits) fill_values(b, slot, bits, boxes, (const int64_t*)values);
+  else fill_reals(b, slot, boxes, (const float*)values);
 }
 // Runs a batch, or a copy of it, and returns what has run. `seconds`: null, or to which each pass adds its time.
 API void* pd_run(void* batch, int copy, int64_t steps, int threads, const u64* seed, const u64* index, const u64* step, int64_t since, const uint8_t* planes, const float* reals, double* seconds) {

@@ -104,12 +104,9 @@ class PackedState(OwnedBatch):
 
     def write(self, name: str, out: Tensor) -> Tensor:
         """One slot, written into a tensor of its storage dtype whose worlds are contiguous; returns it."""
-        library, size, stride = self.program.library, out.element_size(), out.stride(0)
-        for part, number, bits, signed in self.program.parts(name, out):
-            if bits:
-                library.pd_store(self.handle, number, bits, signed, size, part.data_ptr(), stride)
-            else:
-                library.pd_store_real(self.handle, number, part.data_ptr(), stride)
+        store, size, stride = self.program.library.pd_store, out.element_size(), out.stride(0)
+        for part, slot, bits, signed in self.program.parts(name, out):
+            store(self.handle, slot, bits, signed, size, part.data_ptr(), stride)
         return out
 
     def fill(self, boxes: Tensor, values: Mapping[str, Tensor], *, reuse: bool) -> PackedState:
@@ -121,16 +118,12 @@ class PackedState(OwnedBatch):
             values: by slot: int64 [B], float32 [B] for reals, float32 [B, 2] for vectors.
             reuse: write to this state itself, and return it.
         """
-        changed, library = self if reuse else self.__copy__(), self.program.library
-        boxes = boxes.contiguous()
+        changed, boxes = self if reuse else self.__copy__(), boxes.contiguous()
         for name, value in values.items():
             changed._arrays.pop(name, None)
-            for part, number, bits, _ in self.program.parts(name, value):
+            for part, slot, bits, _ in self.program.parts(name, value):
                 numbers = part.contiguous()
-                if bits:
-                    library.pd_fill(changed.handle, number, bits, boxes.data_ptr(), numbers.data_ptr())
-                else:
-                    library.pd_fill_real(changed.handle, number, boxes.data_ptr(), numbers.data_ptr())
+                self.program.library.pd_fill(changed.handle, slot, bits, numbers.data_ptr(), boxes.data_ptr())
         return changed
 
     def put(self, places: Tensor, state: Mapping[str, Tensor], *, reuse: bool) -> PackedState:
@@ -138,18 +131,13 @@ class PackedState(OwnedBatch):
 
         `reuse`: write to this state itself, and return it.
         """
-        changed, library = self if reuse else self.__copy__(), self.program.library
+        changed, places = self if reuse else self.__copy__(), places.contiguous()
         changed._arrays.clear()
-        places = places.contiguous()
-        count, at = len(places), places.data_ptr()
+        put, count, at = self.program.library.pd_put, len(places), places.data_ptr()
         for name, value in state.items():
-            for part, number, bits, _ in self.program.parts(name, value):
-                plane = part.contiguous()
-                if bits:
-                    size = plane.element_size()
-                    library.pd_put(changed.handle, number, bits, size, count, at, plane.data_ptr())
-                else:
-                    library.pd_put_real(changed.handle, number, count, at, plane.data_ptr())
+            for part, slot, bits, _ in self.program.parts(name, value):
+                cells = part.contiguous()
+                put(changed.handle, slot, bits, cells.element_size(), cells.data_ptr(), count, at)
         return changed
 
 
@@ -171,8 +159,6 @@ class NativeProgram:
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
         """The state `job.steps` later. Jobs with given draws or chosen passes are for other backends."""
-        assert not job.draws
-        assert job.passes is None
         state, (seed, index, start, since) = job.state, job.clock
         seed, index, start = seed.contiguous(), index.contiguous(), start.contiguous()
         inputs = self._inputs.get(id(job.params)) or self._made_inputs(job.params, len(start))
@@ -203,11 +189,9 @@ class NativeProgram:
         handle: int = self.library.pd_new(*shape_of(state))
         for name, value in state.items():
             value = value.contiguous()
-            for part, number, bits, _ in self.parts(name, value):
-                if bits:
-                    self.library.pd_load(handle, number, bits, value.element_size(), part.data_ptr())
-                else:
-                    self.library.pd_load_real(handle, number, part.data_ptr(), value.stride(0))
+            for part, slot, bits, _ in self.parts(name, value):
+                size, stride = value.element_size(), value.stride(0)
+                self.library.pd_load(handle, slot, bits, size, part.data_ptr(), stride)
         return PackedState(self, handle, like_of(state))
 
     def parts(self, name: str, value: Tensor) -> Iterator[tuple[Tensor, int, int, bool]]:

@@ -13,7 +13,7 @@ from powderdsl.system.memo import collection_paused
 from powderdsl.targets.cpp.text import pass_text
 from powderdsl.targets.layout import NativeLayout, braced, literal, native_layout
 
-GENERATOR_VERSION = 11
+GENERATOR_VERSION = 12
 """Part of every cache key; increase it when generated code changes meaning."""
 
 LIBRARY = ("vectors", "runtime", "planes", "movements", "fields")
@@ -81,10 +81,8 @@ def native_source(program: Program, width: int = 0) -> NativeSource:
         before,
         *_in_units(passes, units, len(after)),
         f"{ONLY_IN}0",
-        *_tables(program, layout),
-        *_look(layout, asked),
+        *_tables(program, layout, asked),
         "static void run_passes(Context& c) {\n  START;",
-        *(["  if (c.present == ~0ull) look(c);"] if asked else []),
         *calls,
         "}",
         after,
@@ -104,10 +102,12 @@ struct FixedPlane { int kind, a, b; };
 struct StepPlane { u64 a; int b; };"""
 
 
-def _tables(program: Program, layout: NativeLayout) -> Iterator[str]:
-    """The types of tables, and tables of slots that a step resets, of planes and of streams."""
-    planes, reals, idents = [], [], []
+def _tables(program: Program, layout: NativeLayout, asked: int) -> Iterator[str]:
+    """The types of tables, and tables of slots that a step resets, of planes and of streams; the ids that passes ask for."""
+    planes, reals, idents, elements = [], [], [], []
     for slot in program.slots:
+        if slot.name.startswith(ELEMENT):
+            elements.append(layout.planes[slot.name])
         if slot.resets and slot.name in layout.planes:
             planes.append((layout.planes[slot.name], int(slot.default)))
         elif slot.resets:
@@ -120,6 +120,8 @@ def _tables(program: Program, layout: NativeLayout) -> Iterator[str]:
     yield f"static const std::vector<FixedPlane> FIXED = {braced(map(braced, layout.fixed))};"
     yield f"static const std::vector<StepPlane> STEP_TABLE = {braced(map(braced, layout.step_planes))};"
     yield f"static const std::vector<u32> STREAM_IDENT = {braced(idents)};"
+    yield f"constexpr int ELEMENTS = {len(elements)}, ELEMENT[] = {braced([*elements, 0])};"
+    yield f"constexpr u64 ASKED = {asked:#x}ull;"
 
 
 def _in_units(passes: Sequence[str], units: int, driver: int) -> Iterator[str]:
@@ -133,29 +135,3 @@ def _in_units(passes: Sequence[str], units: int, driver: int) -> Iterator[str]:
         yield f"void pass_{number}(Context& c);"
     for text in passes:
         yield f"{ONLY_IN}{chosen[text]}\n{text}\n#endif"
-
-
-def _look(layout: NativeLayout, asked: int) -> Iterator[str]:
-    """The function that finds which of the ids in `asked` are present, from products of their low and high bits."""
-    if not asked:
-        yield "static void look(Context&) {}"
-        return
-    planes = [plane for name, plane in layout.planes.items() if name.startswith(ELEMENT)]
-    ids = [code for code in range(1 << len(planes)) if asked >> code & 1]
-    low, present = len(planes) // 2, []
-    yield "static void look(Context& c) {"
-    for bit, plane in enumerate(planes):
-        yield f"const V* e{bit} = c.slot[{plane}]->data;"
-    for code in ids:
-        yield f"V id{code} = splat(0);"
-    yield "for (size_t i = 0; i < c.g.cells(); i++) {"
-    for bit in range(len(planes)):
-        yield f"const V b{bit} = e{bit}[i];"
-    for name, bits in (("low", range(low)), ("high", range(low, len(planes)))):
-        for code in range(1 << len(bits)):
-            factors = [f"{'' if code >> i & 1 else '~'}b{bit}" for i, bit in enumerate(bits)]
-            yield f"const V {name}{code} = {' & '.join(factors) or '~splat(0)'};"
-    for code in ids:
-        yield f"id{code} |= low{code & (1 << low) - 1} & high{code >> low};"
-        present.append(f"(any(id{code}) ? 1ull << {code} : 0)")
-    yield f"}}\nc.present = {' | '.join(present)};\n}}"

@@ -22,7 +22,7 @@ from powderdsl.schedule.types import (
 )
 from powderdsl.schedule.words import difference, is_cleared
 from powderdsl.targets.cpp.cells import held, on_all, sweeps_text
-from powderdsl.targets.layout import NativeLayout, fixed_key, is_run, number, param_key
+from powderdsl.targets.layout import NativeLayout, fixed_key, number, param_key
 from powderdsl.targets.printing import GATES, Printer, WordText, drawn_where, limited_draw
 
 LOOP = (
@@ -309,13 +309,11 @@ class _Words(WordText):
             return f"{wanted} & ~{self.pointer(f'coin_plane(c, {coin}, {stream})')}[i]"
         if node.op == "chance":
             return f"draw_below(c, {stream}, y, w, {wanted}, {bits}, {node.attr[2]}ull)"
-        planes = self.layout.limit(node) if node.op == "below_param" else ()
-        if planes and is_run(planes):
-            limit = f"c.param_bits + {planes[0]}"
+        if node.op == "below_param":
+            limit = f"c.param_bits + {self.layout.limit(node)}"
         else:
             limit = self.fresh("limit")
-            of_params = [f"c.param_bits[{plane}]" for plane in planes]
-            self.lines.append(f"const V {limit}[] = {{{', '.join(of_params or args[: bits + 1])}}};")
+            self.lines.append(f"const V {limit}[] = {{{', '.join(args[: bits + 1])}}};")
         return f"draw_below_planes(c, {stream}, y, w, {wanted}, {bits}, {limit})"
 
     def shift(self, node: Node) -> str:

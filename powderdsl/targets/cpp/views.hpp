@@ -84,8 +84,12 @@ template <class T> static void store_values(const Batch& b, int slot, int bits, 
     });
   }
 }
+static void store_real(const Grid& g, const Field* f, int lane, float* out);
 API void pd_store(const void* batch, int slot, int bits, int negative, int item, void* data, int64_t apart) {
   const Batch& b = *(const Batch*)batch;
+  for (int lane = 0; !bits && lane < b.lanes(); lane++)
+    store_real(b.g, b.groups[lane / LANES].real[slot], lane % LANES, (float*)data + b.at(lane, apart, b.g.width));
+  if (!bits) return;
   if (item == 1) store_values(b, slot, bits, negative, (uint8_t*)data, apart);
   else if (item == 2) store_values(b, slot, bits, negative, (uint16_t*)data, apart);
   else store_values(b, slot, bits, negative, (u32*)data, apart);
@@ -233,11 +237,6 @@ API void pd_channels(const void* batch, int count, const Channel* channels, cons
   for (int lane = 0; lane < b.lanes(); lane++)
     for (int i = 0; i < count; i++)
       store_channel(b, channels[i], tables, lane, data + b.at(lane, apart, b.g.width) + (int64_t)i * b.g.world_height() * b.g.width);
-}
-API void pd_store_real(const void* batch, int slot, float* data, int64_t apart) {
-  const Batch& b = *(const Batch*)batch;
-  for (int lane = 0; lane < b.lanes(); lane++)
-    store_real(b.g, b.groups[lane / LANES].real[slot], lane % LANES, data + b.at(lane, apart, b.g.width));
 }
 
 typedef uint8_t Bytes __attribute__((vector_size(CHUNK), may_alias));

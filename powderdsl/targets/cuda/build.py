@@ -23,9 +23,8 @@ OPTIONS = ("--std=c++17", "--fmad=false", "--prec-div=true", "--prec-sqrt=true",
 """No contraction and no flushing: every operation is rounded separately, so that all backends agree bit for bit."""
 
 ENTRY = b"powderdsl_steps"
-_SHARED_LIMIT, _MAJOR, _MINOR = 97, 75, 76
 _DYNAMIC_SHARED = 8
-"""Attribute numbers of the driver's interface."""
+"""The number of an attribute of functions in the driver's interface."""
 
 
 class NoCuda(Exception):
@@ -79,18 +78,6 @@ def check(code: int, what: str) -> None:
         text = ctypes.c_char_p()
         driver().cuGetErrorString(code, ctypes.byref(text))
         raise NoCuda(f"{what}: {(text.value or b'unknown error').decode()} ({code})")
-
-
-def device_limits(device: int) -> tuple[int, str]:
-    """Bytes of shared memory that a block may have on a device, and its architecture, such as ``sm_90``. Raises NoCuda."""
-    value, handle, values = ctypes.c_int(), ctypes.c_int(), []
-    check(driver().cuInit(0), "the CUDA driver does not start")
-    check(driver().cuDeviceGet(ctypes.byref(handle), device), f"no CUDA device {device}")
-    for number in (_SHARED_LIMIT, _MAJOR, _MINOR):
-        check(driver().cuDeviceGetAttribute(ctypes.byref(value), number, handle), "a question to the device")
-        values.append(value.value)
-    shared, major, minor = values
-    return shared, f"sm_{major}{minor}"
 
 
 def machine_code(source: KernelSource, architecture: str, version: str) -> bytes:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import reduce
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -37,6 +38,7 @@ def cuda_program(program: Program, device: torch.device) -> Runnable:
         try:
             with torch.cuda.device(device):
                 torch.empty(1, device=device)  # makes the context current in this thread
+                architecture = f"sm_{limits.major}{limits.minor}"
                 start = build.load_kernel(build.machine_code(source, architecture, version), source)
         except build.NoCuda as error:
             raise unavailable("cuda", str(error), _HELP) from None
@@ -50,15 +52,13 @@ def cuda_program(program: Program, device: torch.device) -> Runnable:
     try:
         if device.type != "cuda":
             raise build.NoCuda("its kernels run on a CUDA device")
-        with torch.cuda.device(device):
-            torch.empty(1, device=device)  # creates the context
-            shared_limit, architecture = build.device_limits(torch.cuda.current_device())
+        limits: Any = torch.cuda.get_device_properties(device)
+        build.driver()
         build.nvrtc(version)
     except build.NoCuda as error:
         raise unavailable("cuda", str(error), _HELP) from None
-    return packed_program(
-        program, device, lambda cells, planes: CudaProgram(cells, planes, compile, shared_limit)
-    )
+    shared = limits.shared_memory_per_block_optin
+    return packed_program(program, device, lambda cells, planes: CudaProgram(cells, planes, compile, shared))
 
 
 class DeviceState(PackedArrays):
@@ -97,8 +97,6 @@ class CudaProgram:
     @torch.no_grad()
     def run(self, job: Job) -> DeviceState:
         """The state `job.steps` later. Jobs with given draws or chosen passes are for other backends."""
-        assert not job.draws
-        assert job.passes is None
         state = job.state
         if isinstance(state, DeviceState) and state.program is self:
             after = DeviceState(self, state.planes.clone(), state.reals.clone(), state.like)

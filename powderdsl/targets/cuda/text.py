@@ -180,7 +180,8 @@ class _Words(WordText):
             return f"draw_below({stream}, l, y, w, {wanted}, {bits}, {node.attr[2]}ull)"
         limit = args[: bits + 1]
         if node.op == "below_param":
-            limit = [f"PARAM_FLAG({number})" for number in self.layout.limit(node)]
+            first = self.layout.limit(node)
+            limit = [f"PARAM_FLAG({first + i})" for i in range(bits + 1)]
         name = self.fresh("limit")
         self.lines.append(f"const u32 {name}[] = {{{', '.join(limit)}}};")
         return f"draw_below_planes({stream}, l, y, w, {wanted}, {bits}, {name})"

@@ -120,7 +120,7 @@ class Pass(Printer):
 
     def block(self, body: Sequence[Statement]) -> None:
         for statement in body:
-            self.printed(statement)
+            getattr(self, type(statement).__name__.lower())(statement)
 
     def release(self, release: Release) -> None:
         self.give(release.frees)

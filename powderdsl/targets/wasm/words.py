@@ -11,7 +11,7 @@ from operator import or_
 from powderdsl.ir.ops import Node, ordered
 from powderdsl.schedule.costs import is_coin
 from powderdsl.schedule.types import Compute, alternatives, loaded, reads_of
-from powderdsl.targets.layout import Layout, fixed_key, is_run, param_key
+from powderdsl.targets.layout import Layout, fixed_key, param_key
 from powderdsl.targets.printing import Values, drawn_where, limited_draw
 from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, body, const, load, op
 from powderdsl.targets.wasm.library import SOME, WORD, ZERO, Library, choose, some
@@ -212,13 +212,11 @@ class WordValues(Values[Value]):
         at = self.library.word_number(self.loop.at, self.loop.y)
         if node.op == "chance":
             return self.library.draw_below(at, wanted, keys, const("i64", node.attr[2] << (64 - bits)))
-        planes = layout.limit(node) if node.op == "below_param" else []
-        together = bool(planes) and is_run(planes)
-        limit = memory.at("params", planes[0]) if together else memory.at("limits")
-        if not together:
-            of_params = [load("v128.load", 0, memory.at("params", plane)) for plane in planes]
-            for i, plane in enumerate(of_params or args[: bits + 1]):
-                load("v128.load", 0, memory.at("limits", i)).set(plane)
-        end = limit + 16 * (bits + 1)
-        drawn = self.library.draw_below_planes(at, wanted, keys, limit, end)
-        return drawn if together else body.let(drawn)
+        if node.op == "below_param":
+            limit = memory.at("params", layout.limit(node))
+        else:
+            limit = memory.at("limits")
+            for i, plane in enumerate(args[: bits + 1]):
+                load("v128.load", 0, limit + 16 * i).set(plane)
+        drawn = self.library.draw_below_planes(at, wanted, keys, limit, limit + 16 * (bits + 1))
+        return drawn if node.op == "below_param" else body.let(drawn)
