@@ -300,7 +300,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "stages": stages,
     "planner": planner,
     "commands": commands,
-    **{f"keys {context}": partial(keys, context) for context in RECORDS},
+    **{f"keys {context}": partial(keys, context) for context, kind in RECORDS.items() if keys_of(kind)},
 }
 """What can stand between markers, by name."""
 

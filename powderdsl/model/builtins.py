@@ -77,6 +77,9 @@ KIND_WORDS: dict[str, str] = {
 }
 """Kinds of properties, fields and parameters, besides ranges of integers, LOW..HIGH."""
 
+FLAG_WORDS = {"yes": 1, "true": 1, "no": 0, "false": 0}
+"""How flags are written outside rules: in drawn fields, and for parameters."""
+
 MAX_OFFSET = 15
 """How far a rule may look in one step."""
 

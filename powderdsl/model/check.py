@@ -78,7 +78,8 @@ def check(
     elaborated = Elaborator(typer)
     elaborated.run(composition.passes)
     examples = check_examples(typer)
-    invariants = check_invariants(composition, typer, partial(_typer_of, packs))
+    check_alone = partial(_check_some, Declared(tuple(packs), None), alone=True)
+    invariants = check_invariants(composition, typer, check_alone)
     ramps = element_ramps(typer)
     typer.unknown.report()
     reporter.raise_if_errors()
@@ -92,9 +93,7 @@ def check(
     for name, ids in stored.items():
         properties[name] = replace(properties[name], stored=ids)
     check_assigned(examples, composition, reporter)
-    added = None
-    if not alone:
-        added = AddedPacks(composition, partial(_check_some, Declared(tuple(packs), None), alone=True))
+    added = None if alone else AddedPacks(composition, check_alone)
     passes, undecided = check_logic(passes, facts, elaborated, reporter, added)
     report_unused(composition, typer, produced_ids(passes, facts))
     order, matrix = lay_out(composition, passes, reporter)
@@ -121,14 +120,6 @@ def check(
     undecided += report_undrawn(found, given, facts, reporter)
     report_undecided(undecided, reporter)
     return found
-
-
-def _typer_of(packs: Sequence[PackDecl], names: tuple[str, ...]) -> Typer | None:
-    """A typer that knows only some of these packs; None if they cannot be composed."""
-    try:
-        return resolve_names([pack for pack in packs if pack.name.text in names], None, Reporter())[0]
-    except CompileError:
-        return None
 
 
 def _streams(symbols: Composition, elaborated: Elaborator, reporter: Reporter) -> tuple[Stream, ...]:

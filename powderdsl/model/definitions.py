@@ -9,6 +9,7 @@ from difflib import get_close_matches
 from typing import Any
 
 from powderdsl.diagnostics import Label, Reporter, Span, suggest
+from powderdsl.model.builtins import FLAG_WORDS
 from powderdsl.model.composition.added_packs import report_replaced
 from powderdsl.model.composition.names import report_unknown
 from powderdsl.model.declarations import (
@@ -23,9 +24,6 @@ from powderdsl.model.expressions.operators import Broken, Operand, Poisoned, Sco
 from powderdsl.model.expressions.symbols import (
     clamped,
     default_of,
-    in_words,
-    not_a_value,
-    number_value,
     read_bounds,
     read_kind,
 )
@@ -268,20 +266,18 @@ def _value(prop: Property, syntax: Syntax, pack: str, typer: Typer) -> Value | s
     """A property's value as a pack gives it. It may name a parameter, which stays changeable."""
     scope, kind = Scope(pack, {}), prop.kind
     if syntax.kind == "name" and typer.find(syntax.text, syntax.span, scope) is None:
-        not_a_value(prop, syntax, typer)
+        message, label = f"`{syntax.text}` is no value of `{prop.name}`", f"expected {in_words(kind)}"
+        fix = f"write {in_words(kind)}, or a parameter of this pack"
+        typer.fail("PD110", message, syntax.span, label, fix)
         return default_of(kind)
-    try:
+    with suppress(Poisoned, Unresolved):
         expr = typer.of_kind(typer.evaluate(syntax, scope), kind, syntax.span)
-    except (Poisoned, Unresolved):
-        return default_of(kind)
-    if expr.op == "param":
-        if expr.kind.name != kind.name or not kind.lo <= expr.kind.lo <= expr.kind.hi <= kind.hi:
-            label, fix = f"it is {expr.kind}", f"declare it as {kind}"
-            typer.fail("PD402", f"the parameter may leave {kind}", syntax.span, label, fix)
-        return str(expr.value)
-    if expr.op == "const":
-        return number_value(expr, kind)
-    typer.fail("PD405", "expected a constant or a parameter", syntax.span, "depends on the world")
+        if expr.op != "param":
+            return typer.settled(expr, syntax.span)
+        if expr.kind.name == kind.name and kind.lo <= expr.kind.lo <= expr.kind.hi <= kind.hi:
+            return str(expr.value)
+        label, fix = f"it is {expr.kind}", f"declare it as {kind}"
+        typer.fail("PD402", f"the parameter may leave {kind}", syntax.span, label, fix)
     return default_of(kind)
 
 
@@ -368,11 +364,17 @@ def set_params(ruleset: Ruleset, values: Mapping[str, Any], reporter: Reporter) 
     return ruleset.with_params(found)
 
 
+def in_words(kind: Kind) -> str:
+    """The values of a kind in a sentence that asks for one."""
+    wanted = f"{'an integer' if kind.name == 'int' else 'a number'} from {kind.lo:g} to {kind.hi:g}"
+    return {"flag": "`yes` or `no`", "chance": "a chance from 0% to 100%"}.get(kind.name, wanted)
+
+
 def param_value(kind: Kind, value: Any) -> Value | None:
     """The value of a kind that text (``"5%"``, ``"yes"``) or a number means, if it means one."""
     text = value.strip() if isinstance(value, str) else ""
     try:
-        number = float(text[:-1]) / 100 if text.endswith("%") else float(_FLAGS.get(text, value))
+        number = float(text[:-1]) / 100 if text.endswith("%") else float(FLAG_WORDS.get(text, value))
     except (TypeError, ValueError, OverflowError):
         return None
     lo, hi = stored_range(kind)
@@ -381,6 +383,3 @@ def param_value(kind: Kind, value: Any) -> Value | None:
     if kind.name not in ("int", "flag"):
         return number
     return int(number) if number == int(number) else None
-
-
-_FLAGS = {"yes": 1.0, "true": 1.0, "no": 0.0, "false": 0.0}

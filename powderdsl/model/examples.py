@@ -10,7 +10,7 @@ from itertools import chain, product
 from math import lcm
 
 from powderdsl.diagnostics import Label, Reporter, Span, suggest
-from powderdsl.model.builtins import DIRECTIONS, OCTANTS
+from powderdsl.model.builtins import DIRECTIONS, FLAG_WORDS, OCTANTS
 from powderdsl.model.composition.compose import Composition
 from powderdsl.model.composition.names import report_unknown, words_of
 from powderdsl.model.declarations import ElementDecl, TestDecl
@@ -33,7 +33,6 @@ FORMS = {
 }
 """For each kind: a noun for its words, and how they are written."""
 
-_FLAGS = {"yes": 1, "true": 1, "no": 0, "false": 0}
 _OCTANTS = {
     f"{first}.{second}".removesuffix(".here"): OCTANTS.index(plus(DIRECTIONS[first], DIRECTIONS[second]))
     for first, second in product(DIRECTIONS, repeat=2)
@@ -66,7 +65,7 @@ def read_word(word: str, kind: Kind, ids: Mapping[str, int], *, ranges: bool = F
     Raises:
         WordProblem: it is not a value of this kind.
     """
-    table = {"flag": _FLAGS, "element": ids, "direction": _OCTANTS}.get(kind.name)
+    table = {"flag": FLAG_WORDS, "element": ids, "direction": _OCTANTS}.get(kind.name)
     values: list[Bounds] = []
     if table is not None:
         parts = [word]

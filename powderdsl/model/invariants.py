@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from powderdsl.diagnostics import Reporter, Span, suggest
+from powderdsl.model.composition.added_packs import CheckAlone
 from powderdsl.model.composition.compose import Composition, with_optional
 from powderdsl.model.composition.names import words_of
 from powderdsl.model.declarations import RulesetDecl
@@ -48,12 +48,12 @@ TRENDS = {"rises": "never rises", "falls": "never falls", "changes": "constant"}
 
 
 def check_invariants(
-    composition: Composition, typer: Typer, typer_of: Callable[[tuple[str, ...]], Typer | None]
+    composition: Composition, typer: Typer, check_alone: CheckAlone
 ) -> tuple[Invariant, ...]:
     """The invariants of all packs and of the ruleset, except invariants that need a pack which is not loaded.
 
     Args:
-        typer_of: what checks expressions against the names of some packs alone; None if they make no ruleset.
+        check_alone: what an invariant that cannot hold is tried with: the packs of its scope.
     """
     written: list[tuple[str, Syntax, RulesetDecl | None]]
     written = [(name, line, None) for name, pack in composition.packs.items() for line in pack.invariants]
@@ -77,7 +77,7 @@ def check_invariants(
             )  # fmt: skip
         added = [name for name in composition.packs if name not in scope]
         for remark in typer.reporter.diagnostics:
-            if remark.code == "PD511" and added and _can_hold(typer_of(scope), line, pack):
+            if remark.code == "PD511" and added and check_alone(scope, Reporter()):
                 names = ", ".join(f"`{name}`" for name in added)
                 words_there = f"with {names}, `{one_line(line.span)}` can no longer hold"
                 reporter.report("PD515", words_there, remark.primary.span, remark.primary.text)
@@ -100,16 +100,6 @@ def _claim(typer: Typer, line: Syntax, pack: str) -> tuple[Claim, frozenset[int]
             raise typer.fail("PD511", "this invariant cannot hold", what.span, label)
         typer.absent.clear()  # a world is without elements of packs that are not loaded
     return _Statement(typer, scope).claim(line), without
-
-
-def _can_hold(typer: Typer | None, line: Syntax, pack: str) -> bool:
-    """Whether nothing is wrong with an invariant where only the packs of its scope are loaded."""
-    try:
-        return typer is not None and bool(_claim(typer, line, pack))
-    except Poisoned:
-        return False
-    except Unresolved:
-        return True
 
 
 _FORMS = (

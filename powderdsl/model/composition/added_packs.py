@@ -107,20 +107,6 @@ def _meaning(value: Syntax | ColorRamp) -> object:
 # `conflicts: first_wins`, where that changes nothing for the packs that the author of the rules knew.
 
 
-@dataclass(frozen=True)
-class Change:
-    """What an added pack does to an element: `word` is a tag or a value that it gives, or empty for the element itself.
-
-    `noun` says which: ``tag`` or ``value``.
-    """
-
-    pack: str
-    element: str
-    noun: str
-    word: str
-    span: Span
-
-
 @dataclass
 class AddedPacks:
     """Finds conflicts that a pack has only because other packs were added to it."""
@@ -129,8 +115,8 @@ class AddedPacks:
     check_alone: CheckAlone
     _conflicts: dict[tuple[str, ...], frozenset[Span] | None] = field(default_factory=dict)
 
-    def causes(self, pack: str, place: Span, ids: Sequence[int]) -> tuple[Change, ...]:
-        """The changes by added packs that cause a conflict in `pack`; empty if it has the conflict without them.
+    def causes(self, pack: str, place: Span, ids: Sequence[int]) -> tuple[Cause, ...]:
+        """What added packs do that causes a conflict in `pack`; empty if it has the conflict without them.
 
         Args:
             place: where the conflict is reported. ids: elements with which the rules meet.
@@ -158,11 +144,11 @@ class AddedPacks:
             return None
         return frozenset(one.primary.span for one in errors if one.primary.span is not None)
 
-    def _given(self, element: str, scope: tuple[str, ...], words: frozenset[str]) -> list[Change]:
+    def _given(self, element: str, scope: tuple[str, ...], words: frozenset[str]) -> list[Cause]:
         """The tags among some words that packs outside a scope give an element, else such values, else the element itself."""
         composition = self.composition
-        tags: list[Change] = []
-        values: list[Change] = []
+        tags: list[Cause] = []
+        values: list[Cause] = []
         for name, entry in composition.entries:
             pack = entry.pack
             if name != element or pack in scope or pack not in composition.names.needs:
@@ -174,7 +160,7 @@ class AddedPacks:
                 for scalar in scalars:
                     word = composition.names.of(pack, scalar.word)
                     if word.rpartition(".")[2] in words:
-                        given.append(Change(pack, element, noun, word, scalar.span))
+                        given.append(Cause(pack, scalar.span, f"gives `{element}` the {noun} `{word}`"))
         made = composition.elements[element]
-        brings = [] if made.pack in scope else [Change(made.pack, element, "", "", made.span)]
+        brings = [] if made.pack in scope else [Cause(made.pack, made.span, f"adds `{element}`")]
         return tags or values or brings

@@ -26,9 +26,7 @@ from powderdsl.model.types import (
     DIRECTION,
     ELEMENT,
     FLAG,
-    Expr,
     Kind,
-    Property,
     Stream,
     Value,
     integer,
@@ -130,30 +128,6 @@ def read_kind(syntax: Syntax, typer: Typer) -> Kind:
     raise typer.fail("PD401", "not a kind", syntax.span, "expected a kind", *helps)
 
 
-_FLAGS = {
-    **dict.fromkeys(("yes", "on", "true", "y"), "yes"),
-    **dict.fromkeys(("no", "off", "false", "n", "none"), "no"),
-}
-"""Words that people write for yes and no."""
-
-
-def in_words(kind: Kind) -> str:
-    """The values of a kind in a sentence that asks for one."""
-    if kind.name == "flag":
-        return "`yes` or `no`"
-    if kind.name == "chance":
-        return "a chance from 0% to 100%"
-    return f"{'an integer' if kind.name == 'int' else 'a number'} from {kind.lo:g} to {kind.hi:g}"
-
-
-def not_a_value(prop: Property, syntax: Syntax, typer: Typer) -> None:
-    """Report a word as a property's value that names nothing."""
-    meant = _FLAGS.get(syntax.text.lower()) if prop.kind == FLAG else None
-    fix = f"write `{meant}`" if meant else f"write {in_words(prop.kind)}, or a parameter of this pack"
-    message = f"`{syntax.text}` is no value of `{prop.name}`"
-    typer.fail("PD110", message, syntax.span, f"expected {in_words(prop.kind)}", fix)
-
-
 def default_of(kind: Kind, first_id: int = 0) -> Value:
     """The value of something whose file gives no default: zero or the nearest bound to it; the first element."""
     if kind.name in ("int", "real", "vec2"):
@@ -174,15 +148,6 @@ def clamped(default: Value, kind: Kind) -> Value:
 def clamped_number(value: float | Fraction, kind: Kind) -> float:
     kept = min(max(float(value), kind.lo), kind.hi)
     return kept if abs(kept) >= SNAP else 0.0
-
-
-def number_value(expr: Expr, kind: Kind) -> Value:
-    """The constant in an expression that `Typer.of_kind` accepted."""
-    if kind.name == "vec2":
-        parts = [arg.value for arg in expr.args]
-        return (float(parts[0]), float(parts[1]))
-    assert expr.op == "const"
-    return expr.value
 
 
 # Unknown names

@@ -44,7 +44,7 @@ from powderdsl.model.expressions.operators import (
     number,
     turned,
 )
-from powderdsl.model.expressions.symbols import UnknownNames, number_value, read_bounds, read_number
+from powderdsl.model.expressions.symbols import UnknownNames, read_bounds, read_number
 from powderdsl.model.logic.needless import report_repeated
 from powderdsl.model.operations import FUNCTIONS
 from powderdsl.model.types import (
@@ -136,6 +136,19 @@ class Typer:
     def evaluate(self, syntax: Syntax, scope: Scope) -> Operand:
         """The operand that syntax stands for. Raises Poisoned after reporting, Unresolved if it depends on an absent name."""
         self.spend(1, syntax.span)
+        match syntax.kind:
+            case "yes":
+                return TRUE
+            case "no":
+                return FALSE
+            case "integer" | "decimal" | "percent":
+                return number(read_number(syntax, self))
+            case "range":
+                return Bounds(*read_bounds(syntax, self))
+            case "any":
+                return SetOf(tuple(self.symbols.names_by_id))
+            case "not_":
+                return negation(self.condition(syntax.children[0], scope), syntax.span)
         return HANDLERS[syntax.kind](self, syntax, scope)
 
     def spend(self, parts: int, span: Span) -> None:
@@ -167,10 +180,15 @@ class Typer:
             value = self.of_kind(self.evaluate(syntax, scope), kind, syntax.span)
         except Unresolved as missing:
             raise self.fail("PD301", f"unknown name `{missing.name}`", syntax.span) from None
+        return self.settled(value, syntax.span)
+
+    def settled(self, value: Expr, span: Span) -> Constant:
+        """The number, or the pair, that an expression is if it is constant."""
         parts = value.args if value.op == "vector" else (value,)
         if any(part.op != "const" for part in parts):
-            raise self.fail("PD405", "expected a constant", syntax.span, "depends on the world")
-        return number_value(value, kind)
+            raise self.fail("PD405", "expected a constant", span, "depends on the world")
+        numbers = tuple(part.value for part in parts)
+        return numbers if value.op == "vector" else numbers[0]
 
     # Operands of the kind that their place needs, or reports why not
 
@@ -641,17 +659,9 @@ HANDLERS: dict[str, Callable[[Typer, Syntax, Scope], Operand]] = {
     "optional_name": Typer.optional_name,
     "attribute": Typer.attribute,
     "optional_attribute": Typer.optional_attribute,
-    **dict.fromkeys(
-        ("integer", "decimal", "percent"), lambda typer, at, scope: number(read_number(at, typer))
-    ),
-    "yes": lambda typer, at, scope: TRUE,
-    "no": lambda typer, at, scope: FALSE,
-    "range": lambda typer, at, scope: Bounds(*read_bounds(at, typer)),
     "tuple": Typer.tuple_,
-    "any": lambda typer, at, scope: SetOf(tuple(typer.symbols.names_by_id)),
     "any_but": Typer.any_but,
     **dict.fromkeys(("or_", "and_"), Typer.logic),
-    "not_": lambda typer, at, scope: negation(typer.condition(at.children[0], scope), at.span),
     "compare": Typer.compare,
     **dict.fromkeys(("is_", "is_not", "in_", "not_in"), Typer.is_),
     "choose": Typer.choose,
@@ -660,4 +670,4 @@ HANDLERS: dict[str, Callable[[Typer, Syntax, Scope], Operand]] = {
     **dict.fromkeys(("add", "sub", "mul", "div", "quotient", "neg"), calculation),
     "mod": modulo,
 }
-"""One handler for every kind of syntax node that can stand in an expression."""
+"""By kind of syntax node, what reads an expression whose parts have operands of their own."""

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 from powderdsl.diagnostics import Label, Reporter, Span
 from powderdsl.model.builtins import MAX_SIDE_MULTIPLE
-from powderdsl.model.composition.added_packs import AddedPacks, Change
-from powderdsl.model.composition.names import listed
+from powderdsl.model.composition.added_packs import AddedPacks, Cause
 from powderdsl.model.expressions.operators import (
     ELEMENT_HERE,
     TRUE,
@@ -94,25 +93,18 @@ class Conflict:
         )  # fmt: skip
 
     def report_added(
-        self, causes: Sequence[Change], pass_name: str, example: str, settled: bool, reporter: Reporter
+        self, causes: Sequence[Cause], pass_name: str, example: str, settled: bool, reporter: Reporter
     ) -> None:
-        """Report it at the changes by added packs that cause it: a warning if `settled`, because one rule wins."""
+        """Report it at what added packs do to cause it: a warning if `settled`, because one rule wins."""
         first, *more = causes
-        words = [f"`{one.word}`" for one in causes if one.word and one.element == first.element]
-        several = len(words) > 1
-        what = f"adds `{first.element}`"
-        if words:
-            what = f"gives `{first.element}` the {first.noun}{'s' * several} {listed(words)}"
-        secondary = [Label(one.span, "and this" if one.word else "this element too") for one in more]
+        secondary = [Label(cause.span, "and this") for cause in more]
         secondary.append(Label(self.first, "claims the cell"))
         if self.second != self.first:
             secondary.append(Label(self.second, "claims it too"))
+        words = " or ".join(dict.fromkeys(f"`{cause.span.text}`" for cause in causes))
         helps = [
-            f"give `{first.element}` other values, so that it does not fulfill the conditions of both rules"
+            f"leave out {words} here, or see to it that the element meets the conditions of one rule only"
         ]
-        if first.noun == "tag":
-            needless = "all of them" if several else "that"
-            helps = [f"leave out {' or '.join(words)} here, if `{first.element}` need not be {needless}"]
         notes = [example] if example else []
         if not settled:
             helps.append(f"or ask the author of `{pass_name}` for a policy, such as `conflicts: first_wins`")
@@ -120,7 +112,7 @@ class Conflict:
             notes.append("the assignment that stands last holds")
         else:
             notes.append("the rule that stands first holds, as with `conflicts: first_wins`")
-        message = f"`{first.pack}` {what}: two rules of `{pass_name}` may claim one cell with it"
+        message = f"`{first.pack}` {first.does}: two rules of `{pass_name}` may claim one cell with it"
         reporter.report(
             "PD517" if settled else self.code, message, first.span, "because of this",
             secondary=secondary, notes=notes, helps=helps,
