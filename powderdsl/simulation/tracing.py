@@ -10,7 +10,7 @@ it, and ordinary simulators do not change.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import count, groupby, islice
 from math import isfinite
@@ -25,7 +25,6 @@ from powderdsl.model.expressions.operators import TRUE, look
 from powderdsl.model.state import Slot, scratch_slots, slot_name
 from powderdsl.model.text import element_name, one_line, place_of, show_expr, show_offset, show_value
 from powderdsl.model.types import (
-    ELEMENT,
     FLAG,
     Assign,
     Expr,
@@ -48,7 +47,6 @@ Cell = tuple[int, int]
 """(row, column)."""
 
 HERE: Offset = (0, 0)
-_LEAVES = ("element", "property", "field", "let", "draw", "coordinate", "param", "inside", "count", "sum")
 
 _WITHOUT_RULE = {
     "limit": "no rule: cells of this element keep the field's default",
@@ -97,116 +95,124 @@ def numbered_rules(ruleset: Ruleset) -> tuple[NumberedRule, ...]:
 # What happens in a step
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Substep:
     """A substep as it happened: what it found, and its rules. Arrays have a batch of one.
 
-    `lets` has the expression of each `let` so far and what that read, `masks` where each rule happened, by `id`.
+    `rules` and `masks`, where they happened, are by `id`; `lets` has each `let` so far and the substep that fixed it.
     """
 
     policy: str
-    rules: tuple[NumberedRule, ...]
-    at: reference.Context
-    lets: Mapping[str, tuple[Let, reference.Context]]
+    rules: Mapping[int, NumberedRule]
     masks: Mapping[int, Array]
+    at: reference.Context
+    lets: dict[str, tuple[Let, Substep]]
 
     def near(self, cell: Cell, offset: Offset, way: int = 1) -> Cell:
         """The neighbor of a cell, or, with -1, the cell whose neighbor it is; the grid wraps around."""
         _, height, width = self.at.shape
         return (cell[0] + way * offset[0]) % height, (cell[1] + way * offset[1]) % width
 
-    def happened(self, rule: Rule, cell: Cell) -> bool:
-        return bool(self.masks[id(rule)][(0, *cell)])
-
-    def parts(self, rule: Rule, cell: Cell) -> tuple[Part, ...]:
-        """A rule's condition in one cell, split at its `and`s. Flags fixed by `let` are split too, as they were fixed."""
-        return tuple(self._split(rule.mask, self.at, None, cell))
-
-    def _split(self, expr: Expr, at: reference.Context, let: str | None, cell: Cell) -> Iterator[Part]:
-        if expr.op == "and":
-            for arg in expr.args:
-                yield from self._split(arg, at, let, cell)
-        elif expr.op == "let" and expr.kind == FLAG:
-            fixed, then = self.lets[expr.value]
-            yield from self._split(fixed.value, then, _written(expr.value), cell)
-        elif not (expr.op == "const" and expr.value):
-            yield Part(expr, at, let, self, cell)
+    def value(self, expr: Expr, cell: Cell) -> Any:
+        """An expression's value in a cell: see `pick`."""
+        return pick(reference.evaluate(expr, self.at), cell)
 
 
 @dataclass(frozen=True)
-class Write:
-    """One write to one slot of the cell. Values are NumPy numbers, or two of a vector.
+class Asked:
+    """A rule of a substep, and the cell in which its condition was asked."""
 
-    `cell` is where the rule's condition held; `source` is where content came from that moved here. `substep` is None
-    before the first one.
-    """
+    rule: NumberedRule
+    substep: Substep
+    cell: Cell
+
+    @property
+    def happened(self) -> bool:
+        return bool(self.substep.masks[id(self.rule.rule)][(0, *self.cell)])
+
+    @cached_property
+    def parts(self) -> tuple[Part, ...]:
+        """The condition, split at its `and`s. Flags fixed by `let` are split too, as they were fixed."""
+        return tuple(_split(Part(self.rule.rule.mask, self.substep, self.cell)))
+
+    @property
+    def failed(self) -> tuple[Part, ...]:
+        """The parts that do not hold. If none failed, the rule gave way to another one, or happened."""
+        return tuple(part for part in self.parts if not part.holds)
+
+    @property
+    def held(self) -> tuple[Part, ...]:
+        return tuple(part for part in self.parts if part.holds)
+
+    @property
+    def gave_way(self) -> str | None:
+        """The policy of `conflicts:` under which it gave way, if it did."""
+        return None if self.happened or self.failed else self.substep.policy
+
+
+@dataclass(frozen=True)
+class Change:
+    """What a slot of the cell held before and after. Values are NumPy numbers, or two of a vector."""
 
     slot: Slot
     before: Any
     after: Any
-    how: str
-    substep: Substep | None
-    rule: NumberedRule | None = None
-    cell: Cell | None = None
-    source: Cell | None = None
 
     @property
     def changed(self) -> bool:
         return not np.array_equal(self.before, self.after)
 
-    @cached_property
-    def parts(self) -> tuple[Part, ...]:
-        """The parts of the condition that let its rule happen; none without a rule."""
-        if self.rule is None or self.substep is None or self.cell is None:
-            return ()
-        return self.substep.parts(self.rule.rule, self.cell)
 
+@dataclass(frozen=True)
+class Write(Change):
+    """One write to a slot of the cell: by a rule that was asked, or by none.
 
-@dataclass
-class RecordedStep:
-    """A step as it happens: its substeps, and all writes to all slots of one cell, scratch fields among them, in order.
-
-    Each write finds what the one before it left; what the last one leaves is what the step leaves. States are the
-    reference's: integers int64, floats float32, [1, H, W] or [1, 2, H, W].
+    `source` is where content came from that moved here.
     """
 
-    rules: Iterator[NumberedRule]
-    cell: Cell
-    begin: reference.State
-    end: reference.State = field(default_factory=dict)
-    substeps: list[Substep] = field(default_factory=list)
-    writes: list[Write] = field(default_factory=list)
+    how: str
+    asked: Asked | None = None
+    source: Cell | None = None
+
+
+class RecordedStep:
+    """The next step of a batch of one world, with default parameters: its substeps, and all writes to one cell, in order.
+
+    Writes are those to all slots, scratch fields among them. Each finds what the one before it left; what the last one
+    leaves is what the step leaves. States are the reference's: integers int64, floats float32, [1, H, W] or [1, 2, H, W].
+    """
+
+    def __init__(self, world: World, cell: Cell):
+        ruleset, to_numpy = world.sim.ruleset, world.sim.kind.to_numpy
+        state = {name: to_numpy(value) for name, value in world.state.items()}
+        clock = reference.Clock(*(to_numpy(part) for part in (world.seed, world.index, world.step)))
+        self.cell, self.substeps, self.writes = cell, list[Substep](), list[Write]()
+        self._rules = iter(numbered_rules(ruleset))
+        self.begin = reference.widened(ruleset, state)
+        params = reference.parameters(ruleset, 1, {})
+        self.end = reference.widened(ruleset, reference.step(ruleset, state, clock, params, watch=self))
 
     def begins(self, moment: Moment, at: reference.Context, masks: Mapping[int, Array]) -> None:
         """Record a substep: see `reference.Watch`."""
-        now = replace(at, lets=dict(at.lets))
-        earlier = self.substeps[-1].lets if self.substeps else {}
-        lets = {**earlier, **{let.name: (let, now) for let in moment.lets}}
-        rules = tuple(islice(self.rules, len(moment.rules)))
-        self.substeps.append(Substep(moment.policy, rules, now, lets, masks))
+        rules = {id(numbered.rule): numbered for numbered in islice(self._rules, len(moment.rules))}
+        lets = dict(self.substeps[-1].lets) if self.substeps else {}
+        substep = Substep(moment.policy, rules, masks, replace(at, lets=dict(at.lets)), lets)
+        lets.update({let.name: (let, substep) for let in moment.lets})
+        self.substeps.append(substep)
 
     def wrote(self, change: reference.Change, before: Array, after: Array, mask: Array | None = None) -> None:
         """Record a write to the cell. One without a rule counts if it changes something."""
-        substep = self.substeps[-1] if self.substeps else None
-        write = Write(change.slot, pick(before, self.cell), pick(after, self.cell), change.how, substep)
-        if change.rule is None:
-            self.writes += [write] if write.changed else []
-        elif substep is not None and mask is not None and mask[(0, *self.cell)]:
-            rule = next(numbered for numbered in substep.rules if numbered.rule is change.rule)
+        asked = source = None
+        if change.rule is not None and mask is not None:
+            if not mask[(0, *self.cell)]:
+                return
+            substep = self.substeps[-1]
+            asked = Asked(substep.rules[id(change.rule)], substep, substep.near(self.cell, change.asked))
             source = None if change.source is None else substep.near(self.cell, change.source)
-            asked = substep.near(self.cell, change.asked)
-            self.writes.append(replace(write, rule=rule, cell=asked, source=source))
-
-
-def record_step(world: World, cell: Cell) -> RecordedStep:
-    """The next step of a batch of one world, with default parameters, recorded."""
-    ruleset, to_numpy = world.sim.ruleset, world.sim.kind.to_numpy
-    state = {name: to_numpy(value) for name, value in world.state.items()}
-    clock = reference.Clock(*(to_numpy(part) for part in (world.seed, world.index, world.step)))
-    step = RecordedStep(iter(numbered_rules(ruleset)), cell, reference.widened(ruleset, state))
-    params = reference.parameters(ruleset, 1, {})
-    step.end = reference.widened(ruleset, reference.step(ruleset, state, clock, params, watch=step))
-    return step
+        old, new = pick(before, self.cell), pick(after, self.cell)
+        write = Write(change.slot, old, new, change.how, asked, source)
+        if asked or write.changed:
+            self.writes.append(write)
 
 
 def pick(array: Array, cell: Cell) -> Any:
@@ -230,78 +236,87 @@ class Read:
     shown: str
     cell: Cell | None
     element: str | None
-    counted: tuple[Cell, ...] = ()
+    counted: tuple[Cell, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
     """One of the conditions that must all hold for a rule to happen, in one cell.
 
-    `at` is the state that it reads; `let` names the one that it comes from.
+    `substep` has the state that it reads; `let` names the one that it comes from.
     """
 
     expr: Expr
-    at: reference.Context
-    let: str | None
     substep: Substep
     cell: Cell
+    let: str | None = None
 
     @property
     def text(self) -> str:
-        return show_expr(self.at.ruleset, self.expr)
+        return show_expr(self.substep.at.ruleset, self.expr)
 
     @cached_property
     def holds(self) -> bool:
-        return bool(pick(reference.evaluate(self.expr, self.at), self.cell))
+        return bool(self.substep.value(self.expr, self.cell))
 
     @cached_property
     def reads(self) -> tuple[Read, ...]:
         """Everything that the condition read, each value once."""
         reads: dict[str, Read] = {}
-        for read in self._reads(self.expr, self.at, HERE):
+        for read in _reads(self.expr, self.substep, self.cell, HERE):
             reads.setdefault(read.text, read)
         return tuple(reads.values())
 
-    def _reads(self, expr: Expr, at: reference.Context, offset: Offset) -> Iterator[Read]:
-        if expr.op == "look":
-            dy, dx = expr.value
-            yield from self._reads(expr.args[0], at, (offset[0] + dy, offset[1] + dx))
-        elif expr.op not in _LEAVES:
-            for arg in expr.args:
-                yield from self._reads(arg, at, offset)
-        else:
-            yield self._leaf(expr, at, offset)
-            if expr.op == "let" and expr.value in self.substep.lets:
-                let, then = self.substep.lets[expr.value]
-                yield from self._reads(let.value, then, offset)
 
-    def _leaf(self, expr: Expr, at: reference.Context, offset: Offset) -> Read:
-        ruleset, place = at.ruleset, self.substep.near(self.cell, offset)
-        value = pick(reference.evaluate(expr, at), place)
-        if expr.op == "element" and offset != HERE:
-            text = show_offset(offset)
-        else:
-            text = _written(show_expr(ruleset, look(expr, offset)))
-        element, counted = None, []
-        if expr.op == "property" or (expr.op in ("field", "let") and offset != HERE):
-            element = element_name(
-                ruleset, int(pick(reference.evaluate(Expr("element", ELEMENT), at), place))
-            )
-        if expr.op == "count":  # the neighbors with a weight where the argument holds
-            holds, kernel = reference.evaluate(expr.args[0], at), expr.value
-            for dy, dx, weight in kernel.weights:
-                there = self.substep.near(place, (dy, dx))
-                inside = there == (place[0] + dy, place[1] + dx)
-                if weight and (inside or kernel.wrap) and holds[(0, *there)]:
-                    counted.append(there)
-        return Read(
-            text,
-            plain(ruleset, expr.kind, value),
-            show_at_cell(ruleset, expr.kind, value),
-            None if expr.op in ("param", "coordinate") else place,
-            element,
-            tuple(counted),
-        )
+def _split(part: Part) -> Iterator[Part]:
+    expr = part.expr
+    if expr.op == "and":
+        for arg in expr.args:
+            yield from _split(replace(part, expr=arg))
+    elif expr.op == "let" and expr.kind == FLAG:
+        let, substep = part.substep.lets[expr.value]
+        yield from _split(Part(let.value, substep, part.cell, _written(let.name)))
+    elif not (expr.op == "const" and expr.value):
+        yield part
+
+
+def _reads(expr: Expr, substep: Substep, cell: Cell, offset: Offset) -> Iterator[Read]:
+    """What an expression reads where it is evaluated `offset` away from the cell."""
+    if expr.op == "look":
+        dy, dx = expr.value
+        yield from _reads(expr.args[0], substep, cell, (offset[0] + dy, offset[1] + dx))
+    elif expr.args and expr.op not in ("count", "sum"):
+        for arg in expr.args:
+            yield from _reads(arg, substep, cell, offset)
+    elif expr.op != "const":
+        yield _read(expr, substep, substep.near(cell, offset), offset)
+        if expr.op == "let":
+            let, fixed = substep.lets[expr.value]
+            yield from _reads(let.value, fixed, cell, offset)
+
+
+def _read(expr: Expr, substep: Substep, place: Cell, offset: Offset) -> Read:
+    ruleset, state, value = substep.at.ruleset, substep.at.state, substep.value(expr, place)
+    away, element, counted = offset != HERE, None, []
+    if expr.op == "property" or (away and expr.op in ("field", "let")):
+        element = element_name(ruleset, int(pick(state["element"], place)))
+    if expr.op == "count":  # the neighbors with a weight where the argument holds
+        holds, kernel = reference.evaluate(expr.args[0], substep.at), expr.value
+        for dy, dx, weight in kernel.weights:
+            there = substep.near(place, (dy, dx))
+            inside = there == (place[0] + dy, place[1] + dx)
+            if weight and (inside or kernel.wrap) and pick(holds, there):
+                counted.append(there)
+    return Read(
+        show_offset(offset)
+        if away and expr.op == "element"
+        else _written(show_expr(ruleset, look(expr, offset))),
+        plain(ruleset, expr.kind, value),
+        show_at_cell(ruleset, expr.kind, value),
+        None if expr.op in ("param", "coordinate") else place,
+        element,
+        tuple(counted),
+    )
 
 
 def _written(name: str) -> str:
@@ -337,37 +352,24 @@ def show_at_cell(ruleset: Ruleset, kind: Kind, value: Any) -> str:
 
 
 @dataclass(frozen=True)
-class Miss:
-    """A rule that would have written the cell, and did not. `cell` is where its condition was asked.
-
-    `failed` are the parts that do not hold, `held` the others. If none failed, the rule gave way to another one under
-    the policy of `conflicts:`.
-    """
-
-    rule: NumberedRule
-    cell: Cell
-    failed: tuple[Part, ...]
-    held: tuple[Part, ...]
-    policy: str
-
-
-@dataclass(frozen=True)
 class Trace:
-    """One cell in one step. `before` and `after` are NumPy values by slot, for the slots that were asked for."""
+    """One cell in one step, for the slots that were asked for.
+
+    `slots` say what the step changed, without scratch fields, which live in their pass. `misses` are rules that would
+    have written the cell, and did not happen.
+    """
 
     ruleset: Ruleset
     world: int
     cell: Cell
     step: int
-    slots: tuple[Slot, ...]
-    before: dict[str, Any]
-    after: dict[str, Any]
+    slots: tuple[Change, ...]
     writes: tuple[Write, ...]
-    misses: tuple[Miss, ...]
+    misses: tuple[Asked, ...]
 
     def writer(self, slot: str = "element") -> NumberedRule | None:
         """The rule that last wrote a slot; None if no rule did."""
-        rules = [write.rule for write in self.writes if write.slot.name == slot and write.rule]
+        rules = [write.asked.rule for write in self.writes if write.slot.name == slot and write.asked]
         return rules[-1] if rules else None
 
 
@@ -403,23 +405,18 @@ def trace(
         raise ValueError("the first step is step 1")
     slots = _slots(world, of)
     alone, cell = world.select([number]), (row, column)
-    recorded = record_step(world.sim.step(alone, step - 1), cell)
-    writes = [write for write in recorded.writes if write.slot.name in slots]
+    recorded = RecordedStep(world.sim.step(alone, step - 1), cell)
+    writes = tuple(write for write in recorded.writes if write.slot.name in slots)
     misses = _misses(recorded, slots.values(), every_rule)
     if not every_rule:
-        lines = {_line(write.rule) for write in writes if write.rule}
-        misses = [miss for miss in misses if _line(miss.rule) not in lines]
-    return Trace(
-        world.sim.ruleset,
-        number,
-        cell,
-        int(alone.step[0]) + step,
-        tuple(slots.values()),
-        {name: pick(array, cell) for name, array in recorded.begin.items() if name in slots},
-        {name: pick(array, cell) for name, array in recorded.end.items() if name in slots},
-        tuple(writes),
-        tuple(misses),
+        lines = {_line(write.asked.rule) for write in writes if write.asked}
+        misses = tuple(miss for miss in misses if _line(miss.rule) not in lines)
+    changes = tuple(
+        Change(slot, *(pick(state[name], cell) for state in (recorded.begin, recorded.end)))
+        for name, slot in slots.items()
+        if name in recorded.end
     )
+    return Trace(world.sim.ruleset, number, cell, int(alone.step[0]) + step, changes, writes, misses)
 
 
 def _slots(world: World, names: Iterable[str] | None) -> dict[str, Slot]:
@@ -443,28 +440,26 @@ def _line(rule: NumberedRule) -> tuple[Span, str]:
     return rule.span, rule.pass_name
 
 
-def _misses(step: RecordedStep, slots: Iterable[Slot], every_rule: bool) -> list[Miss]:
+def _misses(step: RecordedStep, slots: Iterable[Slot], every_rule: bool) -> tuple[Asked, ...]:
     """Rules that did not happen where they would have written the cell. Unless all are asked for, a line counts once a cell."""
-    misses: dict[Any, Miss] = {}
+    misses: dict[Any, Asked] = {}
     for substep in step.substeps:
-        for numbered in substep.rules:
-            rule = numbered.rule
-            offsets = [offset for slot in slots for offset in _writes_at(rule, slot)]
+        for numbered in substep.rules.values():
+            offsets = [offset for slot in slots for offset in _writes_at(numbered.rule, slot)]
             for place in dict.fromkeys(substep.near(step.cell, offset, -1) for offset in offsets):
+                asked = Asked(numbered, substep, place)
                 key = (numbered.number if every_rule else _line(numbered), place)
-                if key in misses or substep.happened(rule, place):
-                    continue
-                parts = substep.parts(rule, place)
-                failed = tuple(islice((part for part in parts if not part.holds), None if every_rule else 2))
-                if not every_rule and failed:
-                    # Of a rule that nearly happened one part fails, which is not what element the cell is.
-                    asks = failed[0].expr
-                    about_itself = asks.op == "member" and asks.args[0].op == "element"
-                    if len(failed) > 1 or len(parts) == 1 or about_itself:
-                        continue
-                held = tuple(part for part in parts if part not in failed)
-                misses[key] = Miss(numbered, place, failed, held, substep.policy)
-    return list(misses.values())
+                if key not in misses and not asked.happened and (every_rule or _nearly(asked)):
+                    misses[key] = asked
+    return tuple(misses.values())
+
+
+def _nearly(asked: Asked) -> bool:
+    """Whether one part of a condition failed, and not the one that asks what element the cell is, or none."""
+    failed = list(islice((part.expr for part in asked.parts if not part.holds), 2))
+    if len(failed) != 1:
+        return not failed
+    return len(asked.parts) > 1 and not (failed[0].op == "member" and failed[0].args[0].op == "element")
 
 
 def _writes_at(rule: Rule, slot: Slot) -> Iterator[Offset]:
@@ -501,64 +496,60 @@ def trace_text(trace: Trace, *, color: bool = False) -> str:
     return "\n\n".join(blocks)
 
 
-def _event(write: Write) -> tuple[object, ...]:
+def _event(write: Write) -> tuple[Asked | None, str | None]:
     """A key that is equal for all writes of one rule in one substep."""
-    return id(write.substep), id(write.rule), write.cell, _WITHOUT_RULE.get(write.how)
+    return write.asked, _WITHOUT_RULE.get(write.how)
 
 
-def _change(trace: Trace, slot: Slot, before: Any, after: Any) -> str:
-    old, new = (show_at_cell(trace.ruleset, slot.kind, value) for value in (before, after))
-    return f"{slot.name}: {new}, as before" if old == new else f"{slot.name}: {old} -> {new}"
+def _change(trace: Trace, change: Change) -> str:
+    name, kind = change.slot.name, change.slot.kind
+    old, new = (show_at_cell(trace.ruleset, kind, value) for value in (change.before, change.after))
+    return f"{name}: {new}, as before" if old == new else f"{name}: {old} -> {new}"
 
 
 def _head(trace: Trace) -> str:
     lines = [f"cell {_at(trace.cell)} in step {trace.step} of {trace.ruleset.name}"]
     for slot in trace.slots:
-        if slot.name in trace.after:  # a scratch field lives in its pass
-            change = _change(trace, slot, trace.before[slot.name], trace.after[slot.name])
-            rule = trace.writer(slot.name)
-            lines.append(f"  {change}, by {rule.place}" if rule and " -> " in change else f"  {change}")
-    if not any(write.rule for write in trace.writes):
+        change, rule = _change(trace, slot), trace.writer(slot.slot.name)
+        lines.append(f"  {change}, by {rule.place}" if rule and " -> " in change else f"  {change}")
+    if not any(write.asked for write in trace.writes):
         lines.append("  no rule wrote it")
     return "\n".join(map(printable, lines))
 
 
 def _writes_text(trace: Trace, writes: list[Write], color: bool) -> str:
-    lines, first = [], writes[0]
+    lines, asked = [], writes[0].asked
     for write in writes:
         if write.changed:
             moved = f", moved here from {_at(write.source)}" if write.source else ""
-            change = _change(trace, write.slot, write.before, write.after)
-            lines.append(_painted(change, "32;1", color) + moved)
+            lines.append(_painted(_change(trace, write), "32;1", color) + moved)
     if not lines:
         names = dict.fromkeys(write.slot.name for write in writes)
         lines = [f"{printable(', '.join(names))}: written again, as before"]
-    if first.rule is None or first.cell is None:
-        return "\n".join([*lines, f"  = {_WITHOUT_RULE[first.how]}"])
-    return "\n".join(lines + _source(trace, first.rule, first.cell, first.parts, [Label(first.rule.span)]))
+    if asked is None:
+        return "\n".join([*lines, f"  = {_WITHOUT_RULE[writes[0].how]}"])
+    return "\n".join([*lines, *_source(trace, asked, [Label(asked.rule.span)])])
 
 
-def _miss_text(trace: Trace, miss: Miss, color: bool) -> str:
-    span = miss.rule.span
-    labels = [Label(part.expr.span or span, _reads_text(part)) for part in miss.failed]
+def _miss_text(trace: Trace, miss: Asked, color: bool) -> str:
+    span, failed = miss.rule.span, miss.failed
+    labels = [Label(part.expr.span or span, _reads_text(part)) for part in failed]
     if not labels:
         labels = [Label(span, "all of its condition holds: it gave way to a rule that claims a cell too")]
     elif all(label.span and label.span.line != span.line for label in labels):
         labels.append(Label(span, ""))
-    head = _painted("almost" if len(miss.failed) <= 1 else "not", "33;1", color)
-    but = " and ".join(f"`{part.text}`" for part in miss.failed) or f"`conflicts: {miss.policy}`"
-    source = _source(trace, miss.rule, miss.cell, miss.held, labels)
-    return "\n".join([f"{head}, but for {printable(but)}", *source])
+    head = _painted("almost" if len(failed) <= 1 else "not", "33;1", color)
+    but = " and ".join(f"`{part.text}`" for part in failed) or f"`conflicts: {miss.gave_way}`"
+    return "\n".join([f"{head}, but for {printable(but)}", *_source(trace, miss, labels)])
 
 
-def _source(
-    trace: Trace, rule: NumberedRule, asked: Cell, held: Iterable[Part], labels: list[Label]
-) -> list[str]:
+def _source(trace: Trace, asked: Asked, labels: list[Label]) -> list[str]:
     """The source lines of labels, and below them the rule and the parts of its condition that hold."""
+    rule = asked.rule
     label = f" ({rule.label})" if rule.label else ""
-    where = f", asked at {_at(asked)}" if asked != trace.cell else ""
+    where = f", asked at {_at(asked.cell)}" if asked.cell != trace.cell else ""
     notes = [f"pass {rule.pass_name} of {rule.pack}, substep {rule.moment}{label}{where}"]
-    for part in held:
+    for part in asked.held:
         values, span = _reads_text(part), part.expr.span
         come = f" (`{part.let}`, {place_of(span)})" if part.let and span else ""
         notes.append(f"holds: {part.text}{come}{'; ' if values else ''}{values}")
@@ -596,9 +587,9 @@ SCHEMA = 1
 def trace_data(trace: Trace) -> dict[str, Any]:
     """Rows and columns count from 0, steps, lines, columns of text, rules and substeps from 1."""
 
-    def change(slot: Slot, before: Any, after: Any) -> dict[str, Any]:
-        values = {"before": before, "after": after}
-        return {key: plain(trace.ruleset, slot.kind, value) for key, value in values.items()}
+    def values(change: Change) -> dict[str, Any]:
+        kind, both = change.slot.kind, {"before": change.before, "after": change.after}
+        return {key: plain(trace.ruleset, kind, value) for key, value in both.items()}
 
     return {
         "schema": SCHEMA,
@@ -607,22 +598,23 @@ def trace_data(trace: Trace) -> dict[str, Any]:
         "cell": trace.cell,
         "step": trace.step,
         "slots": {
-            slot.name: change(slot, trace.before[slot.name], trace.after[slot.name])
-            | {"writer": _data(trace.writer(slot.name))}
-            for slot in trace.slots
-            if slot.name in trace.after
+            change.slot.name: values(change) | {"writer": _data(trace.writer(change.slot.name))}
+            for change in trace.slots
         },
         "writes": [
-            {"slot": write.slot.name, **change(write.slot, write.before, write.after)}
-            | {name: _data(getattr(write, name)) for name in ("how", "rule", "cell", "source", "parts")}
+            {"slot": write.slot.name, **values(write), "how": write.how, "source": write.source}
+            | (_picked(write.asked, "rule", "cell", "parts") if write.asked else _NOT_ASKED)
             for write in trace.writes
         ],
-        "almost": [
-            {name: _data(getattr(miss, name)) for name in ("rule", "cell", "failed", "held")}
-            | {"gave_way": None if miss.failed else miss.policy}
-            for miss in trace.misses
-        ],
+        "almost": [_picked(miss, "rule", "cell", "failed", "held", "gave_way") for miss in trace.misses],
     }
+
+
+_NOT_ASKED: dict[str, Any] = {"rule": None, "cell": None, "parts": []}
+
+
+def _picked(value: object, *names: str) -> dict[str, Any]:
+    return {name: _data(getattr(value, name)) for name in names}
 
 
 def _data(value: Any) -> Any:
@@ -631,14 +623,12 @@ def _data(value: Any) -> Any:
         case tuple():
             return [_data(item) for item in value]
         case NumberedRule():
-            numbered = {"number": value.number, "pack": value.pack, "pass": value.pass_name}
-            numbered |= {"moment": value.moment, "label": value.label, "text": one_line(value.span)}
-            return numbered | _place(value.span)
+            numbered = _picked(value, "number", "pack", "moment", "label")
+            return numbered | {"pass": value.pass_name, "text": one_line(value.span), **_place(value.span)}
         case Part():
-            part = {"text": value.text, "holds": value.holds, "let": value.let}
-            return part | _place(value.expr.span) | {"reads": _data(value.reads)}
+            return _picked(value, "text", "holds", "let", "reads") | _place(value.expr.span)
         case Read():
-            return {name: item for name, item in vars(value).items() if name != "shown"}
+            return _picked(value, "text", "value", "cell", "element", "counted")
     return value
 
 

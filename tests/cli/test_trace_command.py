@@ -80,7 +80,7 @@ def test_a_saved_world_has_several_to_choose_from():
     [
         (("--at", "9,1", "--step", 1), "no cell 9,1: the world has 4 rows and 3 columns"),
         (("--at", "here", "--step", 1), "write ROW,COLUMN"),
-        (("--at", "1,1", "--step", 0), "integer from 1"),
+        (("--at", "1,1", "--step", 0), "0 is not in the range"),
         (("--at", "1,1", "--step", 1, "--of", "momentun"), "did you mean `momentum`?"),
         (("--at", "1,1", "--step", 1, "--of", "density"), "follows from the element"),
         (("--at", "1,1", "--step", 1, "--number", 7), "no world 7"),

@@ -431,4 +431,4 @@ def test_scenes_and_traces_take_qualified_fields() -> None:
         assert (fields[mine][0], fields[other][1]) == ([4, 4], [6, 6])
         sim = powderdsl.compile(rules, "reference")
         world = sim.world(start.ids[None])
-        assert list(trace(world, 0, 0, 1, of=["one.wet"]).before) == [mine]
+        assert [one.slot.name for one in trace(world, 0, 0, 1, of=["one.wet"]).slots] == [mine]

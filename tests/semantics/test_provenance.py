@@ -10,7 +10,7 @@ import pytest
 from powderdsl.compiler import load
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import compile
-from powderdsl.simulation.tracing import SLOT, Provenance, Recorder, record_step
+from powderdsl.simulation.tracing import SLOT, Provenance, RecordedStep, Recorder
 from powderdsl.testing.generators.cases import Start, random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.fuzz import STARTS_AT_ONCE
@@ -90,8 +90,8 @@ def assert_traced_alike(ruleset: Ruleset) -> None:
         assert bool((found.numbers[changed] > 0).all()), "a change without a writer"
         for number in range(len(world)):
             for cell in np.ndindex(*shape[1:]):
-                step = record_step(world.select([number]), cell)
-                rules = [one.rule for one in step.writes if one.slot.name == "element"]
+                step = RecordedStep(world.select([number]), cell)
+                rules = [one.asked and one.asked.rule for one in step.writes if one.slot.name == "element"]
                 assert found.rule_at(*cell, world=number) == (rules[-1] if rules else None)
 
 

@@ -12,7 +12,7 @@ import pytest
 from powderdsl.compiler import load
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import World, compile
-from powderdsl.simulation.tracing import Miss, Trace, pick, record_step, trace, trace_data, trace_text
+from powderdsl.simulation.tracing import Asked, RecordedStep, Trace, pick, trace, trace_data, trace_text
 from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.semantics.test_differential import seeded_ruleset
@@ -59,7 +59,7 @@ def traced(body: str, drawing: str, row: int, column: int, of: str = "element", 
     return trace(world_of(lab(body), drawing, **fields), row, column, of=[of])
 
 
-def only_miss(found: Trace) -> Miss:
+def only_miss(found: Trace) -> Asked:
     assert len(found.misses) == 1, found.misses
     return found.misses[0]
 
@@ -78,11 +78,16 @@ def test_a_swap_names_its_rule_and_both_sources():
         (write,) = found.writes
         assert write.how == "arrive"
         assert write.source == source
-        assert write.cell == (0, 0)
-        assert write.rule is not None
-        assert write.rule.span.line == line_of(lab(body), "swap below")
-        assert values(write.parts) == {"element": "rock", "weight": 5, "below.weight": 1, "below": "void"}
-    assert found.writer() is write.rule
+        assert write.asked is not None
+        assert write.asked.cell == (0, 0)
+        assert write.asked.rule.span.line == line_of(lab(body), "swap below")
+        assert values(write.asked.parts) == {
+            "element": "rock",
+            "weight": 5,
+            "below.weight": 1,
+            "below": "void",
+        }
+        assert found.writer() is write.asked.rule
 
 
 def test_content_that_moves_brings_its_fields_as_assignments_left_them():
@@ -99,16 +104,19 @@ def test_writes_stand_in_order_across_moments_and_passes():
     found = traced(body, ".", 0, 0)
     ids = [(int(one.before), int(one.after)) for one in found.writes]
     assert ids == [(0, 1), (1, 2), (2, 3)]
-    assert [one.rule.moment for one in found.writes if one.rule] == [1, 2, 3]
+    assert [one.asked.rule.moment for one in found.writes if one.asked] == [1, 2, 3]
 
 
 def test_a_push_and_an_effect_name_the_cell_whose_condition_held():
     found = traced("do: push gale by 3 away from bomb", ".b.", 0, 0, "gale")
     (write,) = found.writes
-    assert write.cell == (0, 1)
+    assert write.asked is not None
+    assert write.asked.cell == (0, 1)
     assert write.after.tolist() == [0, -3]
     found = traced("do: rock -> void, then right.mark += 2", "o.", 0, 1, "mark")
-    assert [(one.how, one.cell, int(one.after)) for one in found.writes] == [("effect", (0, 0), 2)]
+    assert [(one.how, one.asked.cell, int(one.after)) for one in found.writes if one.asked] == [
+        ("effect", (0, 0), 2)
+    ]
 
 
 def test_what_no_rule_does_is_told_too():
@@ -132,7 +140,7 @@ def test_a_chance_that_failed_shows_the_draw_and_the_chance():
     read = values([part])
     assert read["lab.luck"] == 0
     clock = world_of(lab("do: rock -> bomb if coin < luck"), "o")
-    step = record_step(clock, (0, 0))
+    step = RecordedStep(clock, (0, 0))
     assert read["draw(coin)"] == float(step.substeps[0].at.draws["coin"][0, 0, 0])
     assert part.expr.span is not None
     assert part.expr.span.text == "coin < luck"
@@ -145,13 +153,17 @@ def test_a_count_names_the_neighbors_it_found():
     assert (read.value, read.counted) == (2, ((0, 0), (1, 2)))
     found = traced("do: rock -> moth if count(bomb) > 2", "b../bob/...", 1, 1)
     assert not found.misses
-    assert found.writes[0].parts[1].reads[0].counted == ((0, 0), (1, 0), (1, 2))
+    asked = found.writes[0].asked
+    assert asked is not None
+    assert asked.parts[1].reads[0].counted == ((0, 0), (1, 0), (1, 2))
 
 
 def test_a_let_is_taken_apart_as_it_was_fixed():
     body = "let: {ready: rock and count(bomb) > 0 and below is void}\ndo: bomb -> void\nthen: rock -> moth if ready"
     found = traced(body, "ob/..", 0, 0)
-    assert {part.let for part in found.writes[0].parts} == {
+    asked = found.writes[0].asked
+    assert asked is not None
+    assert {part.let for part in asked.parts} == {
         None,
         "ready",
     }  # the bomb was still there when it was fixed
@@ -181,7 +193,7 @@ def test_a_rule_about_other_elements_is_no_near_miss_unless_all_are_asked_for():
 def test_a_rule_that_gave_way_says_so():
     body = "conflicts: drop_both\ndo:\n  - rock -> bomb\n  - swap right if rock"
     miss = trace(world_of(lab(body), "o.."), 0, 0, of=["element"]).misses
-    assert [(one.failed, one.policy) for one in miss] == [((), "drop_both")] * 2
+    assert [(one.failed, one.gave_way) for one in miss] == [((), "drop_both")] * 2
 
 
 def test_a_sleeping_name_wakes_with_its_pack():
@@ -244,7 +256,7 @@ def test_whatever_happens_can_be_printed(first):
         found = trace(world, seed % 3, seed % 4, 2, every_rule=True)
         data = json.loads(json.dumps(trace_data(found), allow_nan=False))
         assert len(data["writes"]) == len(found.writes)
-        assert all(part.holds for write in found.writes for part in write.parts)
+        assert all(part.holds for write in found.writes if write.asked for part in write.asked.parts)
         text = trace_text(found)
         assert text.startswith(f"cell {seed % 3},{seed % 4} in step")
         assert text.count("but for") == len(found.misses)
@@ -260,20 +272,18 @@ def explained(ruleset: Ruleset, shape: tuple[int, int, int], seed: int) -> int:
     for number in range(len(world)):
         after = sim.step(world).select([number]).state
         for cell in np.ndindex(*shape[1:]):
-            step = record_step(world.select([number]), cell)
+            step = RecordedStep(world.select([number]), cell)
             writes = step.writes
             for name in step.end:
                 held = pick(step.begin[name], cell)
                 for write in writes:
                     if write.slot.name == name:
                         assert np.array_equal(write.before, held), (name, cell, write)
-                        assert write.changed or write.rule is not None
+                        assert write.changed or write.asked is not None
                         held = write.after
                 assert np.array_equal(held, pick(after[name].numpy(), cell)), (name, cell)
             for write in writes:
-                if write.rule is not None:
-                    assert write.substep is not None
-                    assert write.cell is not None
-                    assert write.substep.happened(write.rule.rule, write.cell)
+                if write.asked is not None:
+                    assert write.asked.happened
                     count += 1
     return count
