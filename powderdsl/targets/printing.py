@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, Generic, TypeVar
 
-from powderdsl.ir.ops import Node, ordered
+from powderdsl.ir.ops import Node, needed, ordered
 from powderdsl.schedule.costs import DRAWS
 from powderdsl.schedule.types import Compute, Out, Statement
 from powderdsl.schedule.words import is_whole
@@ -45,8 +45,8 @@ class Values(Generic[Named]):
         self.known: dict[object, Named] = {}
         self.count = 0
 
-    def node(self, node: Node) -> Named:
-        """The name or expression of a node."""
+    def node(self, node: Node, args: Sequence[Named]) -> Named:
+        """The name or expression of a node, from the names of the arguments that get some before (`below`)."""
         raise NotImplementedError
 
     def named(self, node: Node, value: Named) -> Named:
@@ -55,27 +55,17 @@ class Values(Generic[Named]):
 
     def of(self, root: Node) -> Named:
         """The name of a value."""
-        stack = [(root, False)]
-        while stack:
-            node, ready = stack.pop()
-            if id(node) in self.known:
-                continue
-            needed = () if ready else self.needed(node)
-            if needed:
-                stack.append((node, True))
-                for arg in reversed(needed):
-                    stack.append((arg, False))
-            else:
-                self.known[id(node)] = self.named(node, self.node(node))
+        for node, below in needed([root], self.below).items():
+            if id(node) not in self.known:
+                args = [self.known[id(arg)] for arg in below]
+                self.known[id(node)] = self.named(node, self.node(node, args))
         return self.known[id(root)]
 
-    def needed(self, node: Node) -> Sequence[Node]:
+    def below(self, node: Node) -> Sequence[Node]:
         """The arguments that get names before a node does."""
-        return node.args[:1] if node.op == "when" else () if node.op in self.direct else node.args
-
-    def args(self, node: Node) -> list[Named]:
-        """The names of these arguments."""
-        return [self.known[id(arg)] for arg in self.needed(node)]
+        if id(node) in self.known or node.op in self.direct:
+            return ()
+        return node.args[:1] if node.op == "when" else node.args
 
     def fresh(self, prefix: str) -> str:
         """A name that the block does not have yet."""
@@ -130,13 +120,13 @@ def drawn_where(draw: Node) -> Node | None:
 
 
 class CellValues(Values[Named]):
-    """Floats, and flags that compare them: the values `nodes` of a loop. `choices` are all choices among them."""
+    """Floats, and flags that compare them: the values `nodes` of a loop."""
 
     direct = ("select", "led", "shift")
 
     def __init__(self, nodes: Iterable[Node]) -> None:
         super().__init__()
-        self.choices = [node for node in nodes if node.op == "select"]
+        self.nodes = [*nodes]
 
     def variable(self, value: Named) -> Named:
         """A new variable, which choices change."""
@@ -159,6 +149,10 @@ class CellValues(Values[Named]):
         self.known |= {id(chain[0]): name for chain, name in zip(chains, variables, strict=True)}
         return variables[0]
 
+    def led_by(self, leader: Node) -> list[Node]:
+        """The comparisons that are computed only where another flag holds, their leader."""
+        return [node for node in self.nodes if node.op == "led" and node.args[0] is leader]
+
     def chain(self, node: Node) -> list[Node]:
         """A choice and those below it in its third argument, the outermost first."""
         chain: list[Node] = []
@@ -171,8 +165,8 @@ class CellValues(Values[Named]):
         """The chain of a choice, and others on the same masks. None of them depends on another."""
         chains = [self.chain(node)]
         masks = [choice.args[0] for choice in chains[0]]
-        for other in self.choices:
-            chain = [] if other is node or id(other) in self.known else self.chain(other)
+        for other in self.nodes:
+            chain = [] if other is node else self.chain(other)
             same = len(chain) > 1 and [choice.args[0] for choice in chain] == masks
             if same and not any(_depends(other, one[0]) or _depends(one[0], other) for one in chains):
                 chains.append(chain)

@@ -148,8 +148,6 @@ class _Loop(CellValues[str]):
         """Names of pointers to rows, set up once a row, by their values."""
         self.words: dict[str, str] = {}
         """Names of words of planes, read once a row and word, by the plane."""
-        self.blocks: dict[str, tuple[list[str], dict[object, str], list[str]]] = {}
-        """Lines that run only where a comparison holds somewhere in the chunk, by the comparison's name."""
         layout.cover(marks=number + 1 if plan.marked else 0, marked=len(plan.marked))
 
     def before(self) -> Iterator[str]:
@@ -223,8 +221,6 @@ class _Loop(CellValues[str]):
     def swept(self) -> Iterator[str]:
         """A row of a loop over cells."""
         texts = [(out, self.of(out.value)) for out in self.outs]
-        for first, (lines, _, ends) in self.blocks.items():
-            self.lines.append(f"if ({first}) {{ {' '.join([*lines, *ends])} }}")
         stores, counts, lives = [], [], []
         for out, value in texts:
             name = out.var.name
@@ -354,7 +350,7 @@ class _Loop(CellValues[str]):
             word = self.words.setdefault(str(node.attr), f"m{len(self.words)}")
         return f"(u32)({word} >> (x & (BITS - 1)) & ALL)"
 
-    def node(self, node: Node) -> str:
+    def node(self, node: Node, args: Sequence[str]) -> str:
         attr = node.attr
         match node.op:
             case "const":
@@ -378,7 +374,6 @@ class _Loop(CellValues[str]):
                 within = wraps or not dx or self.is_bare(field)
                 self.layout.cover(reach=abs(dx) if within else 0)
                 return self.temporary(loaded if within else f"inside_columns({loaded}, x, {dx}, width)")
-        args = [self.known[id(arg)] for arg in node.args]
         if node.op == "div" and node.args[1].op == "const" and node.args[1].attr:
             return self.temporary(quotient(args[0], float(node.args[1].attr)))
         text = _FLOATS[node.op].format(*args, *map(literal, attr or ()))
@@ -392,18 +387,17 @@ class _Loop(CellValues[str]):
         return name
 
     def led(self, node: Node) -> str:
-        """A comparison, computed only where its leader holds somewhere in the chunk."""
-        leader, comparison = node.args
-        first = self.of(leader)
-        name = self.fresh("b")
-        self.lines.append(f"u32 {name} = 0;")
-        lines, known, ends = self.blocks.setdefault(first, ([], dict(self.known), []))
-        outer, before = self.lines, self.known
-        self.lines, self.known = lines, known
-        value = self.of(comparison)
-        self.lines, self.known = outer, before
-        ends.append(f"{name} = {value} & {first};")
-        return name
+        """A comparison, computed only where its leader holds somewhere in the chunk, together with others it leads."""
+        first, led = self.of(node.args[0]), self.led_by(node.args[0])
+        names: dict[object, str] = {id(comparison): self.fresh("b") for comparison in led}
+        with self.inner() as lines:
+            values = [self.of(comparison.args[1]) for comparison in led]
+        for name, value in zip(names.values(), values, strict=True):
+            self.lines.append(f"u32 {name} = 0;")
+            lines.append(f"{name} = {value} & {first};")
+        self.lines.append(f"if ({first}) {{ {' '.join(lines)} }}")
+        self.known |= names
+        return names[id(node)]
 
     def variable(self, value: str) -> str:
         name = self.fresh("v")

@@ -221,7 +221,6 @@ class _Words(WordText):
         self.layout = layout
         self.edges: dict[str, int] = {}
         """The largest distance in rows at which a plane is read, by the call that prepares such rows."""
-        self.clear: dict[int, bool] = {}
         self.places: dict[str, str] = {}
         """The planes that hold the old values of planes which are changed in place."""
         self.read: dict[str, str] = {}
@@ -255,29 +254,12 @@ class _Words(WordText):
     def clean(self, node: Node) -> str:
         """The value with zeros beyond the grid's width."""
         name = self.of(node)
-        return name if self.is_clean(node) else self.name(f"{name} & valid")
+        return name if node.op in CLEAN else self.name(f"{name} & valid")
 
-    def is_clean(self, node: Node) -> bool:
-        """Tell whether bits beyond the width are known to be zero."""
-        if id(node) not in self.clear:
-            match node.op:
-                case "coordinate":
-                    clear = node.attr[0] != "step"
-                case "and":
-                    clear = any(map(self.is_clean, node.args))
-                case "or" | "xor":
-                    clear = all(map(self.is_clean, node.args))
-                case "select":
-                    clear = all(map(self.is_clean, node.args[1:]))
-                case _:
-                    clear = node.op in CLEAN
-            self.clear[id(node)] = clear
-        return self.clear[id(node)]
-
-    def node(self, node: Node) -> str:
+    def node(self, node: Node, args: Sequence[str] = ()) -> str:
         if (draw := limited_draw(node)) is not None:
             return self.known[id(draw)]
-        attr, args = node.attr, self.args(node)
+        attr = node.attr
         if node.op in GATES:
             return GATES[node.op].format(*args)
         match node.op:

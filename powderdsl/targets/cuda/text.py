@@ -132,8 +132,8 @@ class _Words(WordText):
             self.lines.append(f"const int {name} = row(l, y, {dy});")
         return self.known["row", dy]
 
-    def node(self, node: Node) -> str:
-        args, attr = self.args(node), node.attr
+    def node(self, node: Node, args: Sequence[str]) -> str:
+        attr = node.attr
         if node.op in GATES:
             return GATES[node.op].format(*args)
         match node.op:
@@ -201,7 +201,7 @@ class _Cells(CellValues[str]):
         self.lines.append(f"const {type} {name} = {text};")
         return name
 
-    def node(self, node: Node) -> str:
+    def node(self, node: Node, args: Sequence[str]) -> str:
         attr = node.attr
         match node.op:
             case "const":
@@ -219,7 +219,6 @@ class _Cells(CellValues[str]):
                 return self.choice(node)
             case "led":
                 return self.led(node)
-        args = [self.known[id(arg)] for arg in node.args]
         text = _FLOATS[node.op].format(*args, *map(literal, attr or ()))
         if text.startswith("--"):  # minus a negative number
             text = f"-({text[1:]})"

@@ -303,9 +303,8 @@ class Chunks(CellValues[Value]):
         once = isinstance(value, Local) or node.op == "const" or self.uses[id(node)] < 2
         return value if once else body.let(value)
 
-    def node(self, node: Node) -> Value:
-        attr, args = node.attr, [self.known[id(arg)] for arg in node.args if id(arg) in self.known]
-        memory, loop = self.memory, self.loop
+    def node(self, node: Node, args: Sequence[Value]) -> Value:
+        attr, memory, loop = node.attr, self.memory, self.loop
         match node.op:
             case "const":
                 return floats(float(attr))
@@ -351,12 +350,12 @@ class Chunks(CellValues[Value]):
         leader = node.args[0]
         first = self.of(leader)
         first = self.known[id(leader)] = first if isinstance(first, Local) else body.let(first)
-        led = [one for one in self.loop.nodes if one.op == "led" and one.args[0] is leader]
+        led = self.led_by(leader)
         values = [body.let(0, "v128") for _ in led]
         with body.when(some(first)), self.inner():
-            for one, value in zip(led, values, strict=True):
-                value.set(self.of(one.args[1]) & first)
-        self.known |= {id(one): value for one, value in zip(led, values, strict=True)}
+            for comparison, value in zip(led, values, strict=True):
+                value.set(self.of(comparison.args[1]) & first)
+        self.known |= zip(map(id, led), values, strict=True)
         return self.known[id(node)]
 
     def variable(self, value: Value) -> Value:

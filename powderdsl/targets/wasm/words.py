@@ -139,10 +139,9 @@ class WordValues(Values[Value]):
             return const("v128", (1 << self.memory.width) - 1)
         return (self.library.everything + self.loop.at)[self.memory.flags]
 
-    def node(self, node: Node) -> Value:
+    def node(self, node: Node, args: Sequence[Value]) -> Value:
         if (draw := limited_draw(node)) is not None:
             return self.known[id(draw)]
-        args = self.args(node)
         match node.op:
             case "coordinate" if node.attr[0] == "step":
                 number = self.memory.layout.step_planes[node.attr[1:]]
