@@ -21,6 +21,7 @@ from powderdsl.targets.wasm import program
 from powderdsl.targets.wasm.binary import Module
 from powderdsl.targets.wasm.program import Instance, WasmProgram, WasmState
 from powderdsl.targets.wasm.source import wasm_module
+from powderdsl.testing.generators.rulemaker import random_ruleset_text
 from tests.wasm.jobs import hashes, hashes_in_v8, write_job
 
 
@@ -38,6 +39,13 @@ def test_the_module_of_powderworld_is_small() -> None:
 
 def test_modules_are_deterministic() -> None:
     assert module_of("core+water", 70).code == module_of("core+water", 70).code
+
+
+def test_branches_use_the_variables_of_others_again(tmp_path: Path) -> None:
+    """A loop here has some 90,000 values, nearly all of them in branches; engines allow 50,000 variables."""
+    rules = tmp_path / "long.yaml"
+    rules.write_text(random_ruleset_text(4017), encoding="utf-8")
+    wasmtime.Module.validate(wasmtime.Engine(), module_of(str(rules), 64).code)
 
 
 def test_modules_import_nothing_and_have_bounded_memory() -> None:

@@ -352,7 +352,7 @@ class Chunks(CellValues[Value]):
         first = self.known[id(leader)] = first if isinstance(first, Local) else body.let(first)
         led = self.led_by(leader)
         values = [body.let(0, "v128") for _ in led]
-        with body.when(some(first)), self.inner():
+        with body.when(some(first)), body.scope(), self.inner():
             for comparison, value in zip(led, values, strict=True):
                 value.set(self.of(comparison.args[1]) & first)
         self.known |= zip(map(id, led), values, strict=True)
@@ -362,8 +362,7 @@ class Chunks(CellValues[Value]):
         return body.let(value)
 
     def chosen(self, mask: Node, variables: Sequence[Value], values: Sequence[Node]) -> None:
-        bits = body.let(self.nibble(mask) & 15)
-        with body.when(bits):
+        with body.scope(), body.when(bits := body.let(self.nibble(mask) & 15)):
             lanes = body.let(spread(bits))
             new = [self.of(value) for value in values]
             new = [value if len(new) == 1 else body.let(value) for value in new]

@@ -178,7 +178,7 @@ class WordValues(Values[Value]):
     def lazy(self, node: Node) -> Value:
         """A conjunction whose second part is computed only where the first holds somewhere in the word."""
         value = body.let(0, "v128")
-        with body.when(some(self.of(node.args[0]))), self.inner():
+        with body.when(some(self.of(node.args[0]))), body.scope(), self.inner():
             value.set(self.of(node.args[1]))
         return value
 
