@@ -27,14 +27,12 @@ from powderdsl.ir.stages import PIPELINE
 from powderdsl.model.builtins import (
     DIRECTION_SETS,
     DIRECTIONS,
-    KERNEL_SHAPES,
     KERNELS,
     KIND_WORDS,
     MAX_MAGNITUDE,
     MAX_OFFSET,
     MAX_RADIUS,
     RESERVED,
-    shaped_kernel,
 )
 from powderdsl.model.composition.names import MAX_PASSES
 from powderdsl.model.elaborate import MAX_MOMENTS, MAX_RULES
@@ -115,14 +113,6 @@ def kernels() -> str:
         return " / ".join(" ".join(str(weights.get((dy, dx), 0)) for dx in reach) for dy in reach)
 
     return table(("kernel", "rows"), [(f"`{name}`", drawn(kernel)) for name, kernel in KERNELS.items()])
-
-
-def kernel_shapes() -> str:
-    def sizes(shape: str) -> str:
-        return ", ".join(str(len(shaped_kernel(shape, radius).weights)) for radius in (1, 2, 3, 5))
-
-    rows = [(f"`{name}(R)`", shape.about, sizes(name)) for name, shape in KERNEL_SHAPES.items()]
-    return table(("kernel", "cells", "how many for R = 1, 2, 3, 5"), rows)
 
 
 def functions() -> str:
@@ -288,7 +278,6 @@ TABLES: dict[str, Callable[[], str]] = {
     "directions": directions,
     "direction sets": direction_sets,
     "kernels": kernels,
-    "kernel shapes": kernel_shapes,
     "functions": functions,
     "kinds": kinds,
     "words": words,
