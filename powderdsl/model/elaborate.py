@@ -47,7 +47,6 @@ from powderdsl.model.types import (
     Transform,
 )
 from powderdsl.syntax.ast import Syntax
-from powderdsl.syntax.yaml_tree import Scalar
 from powderdsl.system.random import name_number
 
 MAX_MOMENTS = 1000
@@ -114,7 +113,7 @@ class Elaborator:
 
     def _scratch_field(self, decl: ScratchDecl, scope: Scope) -> Operand:
         name, span = f"{self._name}.{decl.name.text}", decl.name.span
-        if not self._is_new(decl.name, scope) or decl.type is None:
+        if not self.typer.is_new(decl.name, scope) or decl.type is None:
             return Broken()
         try:
             kind = read_kind(decl.type, self.typer)
@@ -124,14 +123,6 @@ class Elaborator:
         self._scratch.append(Field(name, kind, default, "place", True, None, self._decl.pack, span))
         return Expr("field", kind, value=name, span=span)
 
-    def _is_new(self, name: Scalar, scope: Scope) -> bool:
-        """Whether a local name is new; reports one that hides another."""
-        hides = self.typer.hides(name.text, name.span, scope)
-        if hides:
-            message, label = f"`{name.text}` is already defined here", "hides that definition"
-            self.typer.reporter.error("PD308", message, name.span, label, helps=["choose another name"])
-        return not hides
-
     def _block(
         self, block: Block, scope: Scope, label: str, symmetry: str | None, policy: str | None
     ) -> None:
@@ -139,7 +130,7 @@ class Elaborator:
             self._spend(1, block.header.span)
         symmetry, policy = block.symmetry or symmetry, block.conflicts or policy
         for scalar, syntax in block.lets:
-            is_new = self._is_new(scalar, scope)
+            is_new = self.typer.is_new(scalar, scope)
             scope = scope.bind(**{scalar.text: self._let(scalar.text, syntax, scope) if is_new else Broken()})
         rounds = self._rounds(block, scope, label)
         if rounds == [] and block.header is not None and not self.typer.reporter.has_errors:
@@ -237,7 +228,10 @@ class Elaborator:
                 case "swap" | "move":
                     rules = [self._movement(syntax, scope)]
                 case "transform":
-                    rules = [self._transform(syntax, scope)]
+                    who, target = syntax.children[:2]
+                    mask = self._mask([who], syntax, scope)
+                    value = self.typer.of_kind(self.typer.evaluate(target, scope), ELEMENT, target.span)
+                    rules = [Transform(mask, value, self._effects(syntax, scope), syntax.span)]
                 case "push":
                     rules = self._push(syntax, scope)
                 case _:
@@ -271,12 +265,6 @@ class Elaborator:
             self.streams[name] = Stream(name, name_number(name), 32)
             parts.append(self.typer.chance_draw(name, clause.children[0], scope))
         return conjunction(parts, syntax.span)
-
-    def _transform(self, syntax: Syntax, scope: Scope) -> Rule:
-        who, target = syntax.children[:2]
-        mask = self._mask([who], syntax, scope)
-        value = self.typer.of_kind(self.typer.evaluate(target, scope), ELEMENT, target.span)
-        return Transform(mask, value, self._effects(syntax, scope), syntax.span)
 
     def _movement(self, syntax: Syntax, scope: Scope) -> Rule:
         who, where = syntax.children[:2]

@@ -232,9 +232,9 @@ def compose(
         )  # fmt: skip
     groups = _groups(loaded, ruleset)
     wishes = [_wishes(group, names, reporter) for group in groups]
-    natural = _composed_ids(wishes, ruleset is not NO_RULESET)
+    natural = _ids(wishes, names, ruleset is not NO_RULESET)
     asking = [*chain.from_iterable(wishes)]
-    ids = natural if palette is None else _recorded_ids(asking, names, palette)
+    ids = _ids(wishes, names, ruleset is not NO_RULESET, palette) if palette else natural
     _report_ids(asking, ids, names, reporter, recorded=palette is not None)
     elements = _elements(declared, ids, reporter)
     wanted = ruleset.placing.slots or 0
@@ -356,51 +356,33 @@ def _wishes(group: Sequence[PackDecl], names: Names, reporter: Reporter) -> list
     return wishes + others
 
 
-def _composed_ids(groups: Sequence[Sequence[ElementDecl]], of_ruleset: bool) -> dict[str, int]:
+def _ids(
+    groups: Sequence[Sequence[ElementDecl]], names: Names, of_ruleset: bool, palette: Palette = ()
+) -> dict[str, int]:
     """Ids by qualified name. Earlier wishes are decided first, so further packs change nothing.
 
-    An element has the id that its file gives, unless that is taken. All others have the lowest free id above those of
-    the ruleset's packs, the first group, or, without a ruleset, above all ids so far.
+    An element has the id that a palette has for it, or for one that it overrides. Else it has the id that its file
+    gives, unless that is taken or beyond the palette. All others have the lowest free id: above those of the ruleset's
+    packs, the first group, or, without a ruleset, above all ids so far; under a palette anywhere.
     """
+    recorded = {name: number for number, name in enumerate(palette) if name is not None}
     ids: dict[str, int] = {}
-    free = list(range(MAX_ELEMENTS))
+    free = [number for number in range(MAX_ELEMENTS) if number not in recorded.values()]
     highest = -1
     for place, group in enumerate(groups):
         for decl in group:
-            if not free:
-                return ids
-            number = decl.number
-            if number not in free:
-                number = next((n for n in free if n > highest), free[0])
-            ids[decl.qualified] = number
-            free.remove(number)
-            if place == 0 or not of_ruleset:
-                highest = max(highest, number)
+            versions = names.versions.get(names.known.get(decl.qualified, ""), [decl])
+            number = next((recorded[one.qualified] for one in versions if one.qualified in recorded), None)
+            if number is None and free:
+                number = decl.number
+                if number not in free or 0 < len(palette) <= number:
+                    number = next((n for n in free if n > highest), free[0])
+                free.remove(number)
+                if not palette and (place == 0 or not of_ruleset):
+                    highest = max(highest, number)
+            if number is not None:
+                ids[decl.qualified] = number
     return ids
-
-
-def _recorded_ids(wishes: Iterable[ElementDecl], names: Names, palette: Palette) -> dict[str, int]:
-    """Ids by qualified name, where a palette has them; others get its free ids, then those behind its end.
-
-    An element has the id of the one that it overrides. An element that asks for a free id of the palette gets it.
-    """
-    known = {name: number for number, name in enumerate(palette) if name is not None}
-    ids: dict[str, int] = {}
-    later: list[ElementDecl] = []
-    for decl in wishes:
-        versions = names.versions.get(names.known.get(decl.qualified, ""), [decl])
-        recorded = [known[one.qualified] for one in versions if one.qualified in known]
-        if recorded:
-            ids[decl.qualified] = recorded[0]
-        else:
-            later.append(decl)
-    free = [n for n in range(len(palette)) if palette[n] is None and n not in ids.values()]
-    for decl in later:
-        if decl.number in free:
-            ids[decl.qualified] = decl.number
-            free.remove(decl.number)
-    waiting = [decl.qualified for decl in later if decl.qualified not in ids]
-    return ids | dict(zip(waiting, (*free, *range(len(palette), MAX_ELEMENTS)), strict=False))
 
 
 def _report_ids(

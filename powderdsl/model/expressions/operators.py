@@ -390,16 +390,15 @@ def _equals(typer: Typer, left: Operand, item: Operand, syntax: Syntax) -> Expr:
 # Arithmetic
 
 
-def calculation(typer: Typer, syntax: Syntax, scope: Scope) -> Expr:
-    """`+ - * / div` on numbers and vectors. `a div b` divides integers, rounded down; 0 where b is 0."""
-    return _calculated(typer, syntax, lambda child: typer.value_of(child, scope))
+def calculation(typer: Typer, syntax: Syntax, scope: Scope, modulus: int = 0) -> Expr:
+    """`+ - * / div` on numbers and vectors, or on coordinates under a modulus.
 
-
-def _calculated(typer: Typer, syntax: Syntax, value_of: Callable[[Syntax], Expr]) -> Expr:
+    `a div b` divides integers, rounded down; 0 where b is 0.
+    """
     op, span = syntax.kind, syntax.span
     values: list[Placed] = []
     for child in syntax.children:
-        value = value_of(child)
+        value = _coordinate_sum(typer, child, modulus, scope) if modulus else typer.value_of(child, scope)
         if value.kind in _COMPARABLE:
             helps = ["an item of a list has a blank after its `-`"] if op == "neg" else []
             raise typer.wrong(value, "a number", child.span, *helps)
@@ -449,7 +448,7 @@ def _coordinate_sum(typer: Typer, syntax: Syntax, modulus: int, scope: Scope) ->
     if syntax.kind == "name" and syntax.text in COORDINATES:
         return Expr("coordinate", integer(0, modulus - 1), (), (syntax.text, modulus), syntax.span)
     if syntax.kind in ("add", "sub"):
-        return _calculated(typer, syntax, lambda part: _coordinate_sum(typer, part, modulus, scope))
+        return calculation(typer, syntax, scope, modulus)
     if syntax.kind == "quotient" and not set(words_of(syntax.children[0])).isdisjoint(COORDINATES):
         return _coordinate_quotient(typer, syntax, modulus, scope)
     value = typer.value_of(syntax, scope)

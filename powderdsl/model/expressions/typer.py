@@ -64,6 +64,7 @@ from powderdsl.model.types import (
 )
 from powderdsl.model.types import Value as Constant
 from powderdsl.syntax.ast import Syntax
+from powderdsl.syntax.yaml_tree import Scalar
 
 MAX_ROUNDS = 4096
 """The most rounds of one loop over several variables."""
@@ -380,13 +381,22 @@ class Typer:
                 return Expr(op, table[name].kind, value=name, span=span)
         return Expr("draw", DRAW, value=name, span=span) if name in symbols.streams else None
 
-    def hides(self, name: str, span: Span, scope: Scope) -> bool:
-        """Whether a new local name would hide one that its pack knows. Names of other packs may be hidden."""
-        if name in scope.locals:
+    def is_new(self, name: Scalar | Syntax, scope: Scope) -> bool:
+        """Whether a local name is new; reports one that hides another which its pack knows."""
+        names, word = self.symbols.names, name.text
+        found = scope.locals.get(word) or self.find(word, name.span, Scope(scope.pack, {}))
+        if found is None or (
+            word not in scope.locals and not names.knows(scope.pack, names.of(scope.pack, word))
+        ):
             return True
-        found = self.find(name, span, Scope(scope.pack, {}))
-        names = self.symbols.names
-        return found is not None and names.knows(scope.pack, names.of(scope.pack, name))
+        self.fail(
+            "PD308",
+            f"`{word}` is already defined here",
+            name.span,
+            "hides that definition",
+            "choose another name",
+        )
+        return False
 
     def resolve_set(self, name: str, span: Span) -> Operand:
         if name in self.resolving:
@@ -598,9 +608,8 @@ class Typer:
         domains: dict[str, list[Operand]] = {}
         for binding in bindings:
             variable, domain = binding.children
-            if self.hides(variable.text, variable.span, scope) or variable.text in domains:
-                message, label = f"`{variable.text}` is already defined here", "hides that definition"
-                raise self.fail("PD308", message, variable.span, label, "choose another name")
+            if not self.is_new(variable, scope.bind(**dict.fromkeys(domains, Broken()))):
+                raise Poisoned
             self.used.add(variable.text)
             # A variable is turned where it is used, and only there.
             domains[variable.text] = self.domain(domain, replace(scope, orientation=IDENTITY))
