@@ -8,10 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import chain
 
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Severity, Span
-from powderdsl.model.composition.added_packs import AddedPacks, Difference
+from powderdsl.model.composition.added_packs import AddedPacks, Difference, pack_words
 from powderdsl.model.composition.compose import Composition, Palette, compose, title
 from powderdsl.model.composition.layout import lay_out
 from powderdsl.model.composition.names import needs_of, report_misspelled, words_of
@@ -209,9 +208,7 @@ def _known_words(author: PackDecl | RulesetDecl) -> list[str]:
     """The words of a pack's own rules and elements, or a ruleset's invariants, by which it shows what it knows."""
     if isinstance(author, RulesetDecl):
         return [word for line in author.invariants for word in words_of(line)]
-    lines = chain(author.lines, (one.members for one in author.sets))
-    words = [word for line in lines for word in words_of(line)]
-    words += [also.name.word for also in author.also]
+    words = [*pack_words(author), *(also.name.word for also in author.also)]
     for entry in author.entries:
         words += [scalar.word for scalar in (*(key for key, _ in entry.values), *entry.tags)]
     return words

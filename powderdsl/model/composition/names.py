@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
+from graphlib import CycleError, TopologicalSorter
 from itertools import pairwise
 from typing import Any, TypeVar
 
@@ -196,26 +197,20 @@ def with_stand_ins(packs: Iterable[PackDecl]) -> dict[str, PackDecl]:
     return loaded
 
 
-def in_order(names: Iterable[str], after: Mapping[str, Collection[str]]) -> tuple[list[str], list[str]]:
-    """The names in a stable topological order, and the names of the first cycle that was met."""
+def in_order(names: Iterable[str], after: Mapping[str, Collection[str]]) -> list[str]:
+    """The names in a stable topological order; those of a cycle as they stand."""
     ordered: list[str] = []
-    stuck: list[str] = []
     waiting = list(names)
     while waiting:
-        for ready in waiting:
-            if not set(after[ready]).intersection(waiting):
-                break
-        else:
-            stuck = stuck or list(waiting)
-            ready = waiting[0]
+        ready = next((name for name in waiting if not set(after[name]).intersection(waiting)), waiting[0])
         waiting.remove(ready)
         ordered.append(ready)
-    return ordered, stuck
+    return ordered
 
 
 def needed_first(packs: Mapping[str, PackDecl]) -> list[str]:
     """The packs in load order, but each after the packs that it needs. Packs that need each other keep their order."""
-    return in_order(packs, {name: needs for name, (_, *needs) in needs_of(packs).items()})[0]
+    return in_order(packs, {name: needs for name, (_, *needs) in needs_of(packs).items()})
 
 
 # The order of passes
@@ -241,17 +236,15 @@ def order_passes(names: Names, reporter: Reporter) -> dict[str, PassDecl]:
                         earlier[second][first] = scalar.span
                     else:
                         report_unknown("pass", scalar, passes, reporter)
-    ordered, stuck = in_order(passes, earlier)
-    if stuck:
-        _report_cycle(stuck, earlier, reporter)
-    return {name: passes[name] for name in ordered}
+    try:
+        TopologicalSorter(earlier).prepare()
+    except CycleError as error:
+        _report_cycle(error.args[1][::-1], earlier, reporter)
+    return {name: passes[name] for name in in_order(passes, earlier)}
 
 
-def _report_cycle(waiting: list[str], earlier: dict[str, dict[str, Span]], reporter: Reporter) -> None:
-    path = [waiting[0]]
-    while len(set(path)) == len(path):
-        path.append(next(name for name in earlier[path[-1]] if name in waiting))
-    cycle = path[path.index(path[-1]) :]
+def _report_cycle(cycle: list[str], earlier: dict[str, dict[str, Span]], reporter: Reporter) -> None:
+    """Report passes each of which comes after the next one."""
     (place, label), *more = [
         (earlier[later][first], f"`{first}` before `{later}`") for later, first in pairwise(cycle)
     ]
