@@ -79,7 +79,7 @@ class LevelProgram:
         self.blocks = Blocks(self.simulator, (level.side, level.side), (edges, edges))
         """The blocks of all places, without the frame."""
         self._covers = (edges[:, 1] > edges[:, 0]).cpu().numpy()
-        self.paints = torch.from_numpy(palette(ruleset.elements)[self.ids]).to(self.device)
+        self.paints = torch.from_numpy(palette(ruleset.elements)[self.ids, :3]).to(self.device)
         """The colors of what agents paint: uint8 [n, 3]."""
 
     def start(self, seeds: Numbers, indices: Numbers) -> World:

@@ -20,8 +20,8 @@ OUTLINES = ((255, 0, 160), (0, 160, 255), (255, 160, 0), (0, 200, 80))
 
 
 def palette(elements: Sequence[Element]) -> NDArray[np.uint8]:
-    """The elements' colors by id, uint8 [highest id + 1, 3]; ids that no element has are black."""
-    table = np.zeros((max((element.id for element in elements), default=-1) + 1, 3), dtype=np.uint8)
+    """The elements' colors by id, uint8 [256, 4]: red, green, blue, nothing. Ids that no element has are black."""
+    table = np.zeros((256, 4), dtype=np.uint8)
     for element in elements:
         table[element.id] = _components(element.color)
     return table
@@ -31,8 +31,8 @@ def palette(elements: Sequence[Element]) -> NDArray[np.uint8]:
 class Ramp:
     """The colors of the element `id` by the values of a field: `colors[n]` where n of `starts` are reached.
 
-    `starts` ascend, int32 [n] or float32 [n] as the field; `colors` is uint8 [n + 1, 3]. A picture only compares
-    values, so it is the same on every machine.
+    `starts` ascend, int32 [n] or float32 [n] as the field; `colors` is uint8 [n + 1, 4], as of
+    `palette`. A picture only compares values, so it is the same on every machine.
     """
 
     id: int
@@ -64,7 +64,9 @@ def tints(fields: Sequence[Field]) -> tuple[CellTint, ...]:
     tints = []
     for field in fields:
         if (tint := field.tint) is not None:
-            red, green, blue = (float(np.float32(part) / np.float32(255)) for part in _components(tint.color))
+            red, green, blue, _ = (
+                float(np.float32(part) / np.float32(255)) for part in _components(tint.color)
+            )
             most = float(np.float32(tint.most))
             tints.append(CellTint(field.name, (red, green, blue), float(tint.full), most))
     return tuple(tints)
@@ -88,7 +90,7 @@ def _steps(ramp: ColorRamp) -> tuple[NDArray[Any], NDArray[np.uint8]]:
     ends = [_components(color) for color in (ramp.start, ramp.end)]
     parts = [np.array(_first_values(new - old, ramp), dtype) for old, new in zip(*ends, strict=True)]
     starts = np.unique(np.concatenate(parts)).astype(dtype)
-    colors = np.zeros((len(starts) + 1, 3), dtype=np.uint8)
+    colors = np.zeros((len(starts) + 1, 4), dtype=np.uint8)
     for channel, (old, new) in enumerate(zip(*ends, strict=True)):
         reached = np.searchsorted(parts[channel], starts, side="right")
         colors[:, channel] = old + (1 if new > old else -1) * np.concatenate([[0], reached])
@@ -130,7 +132,7 @@ def rgb(
     fields: Mapping[str, Array] | None = None,
     kind: ArrayKind | None = None,
 ) -> Array:
-    """Pictures uint8 [..., H, W, 3] of ids [..., H, W], which all have a color: [n, 3], as of `palette`.
+    """Pictures uint8 [..., H, W, 3] of ids [..., H, W] in the colors of a `palette`.
 
     With `ramps`, cells of their elements have the color of their value in `fields`, arrays [..., H, W] by name. With
     `tints`, cells are tinted by vectors in `fields`, float [..., 2, H, W], after that and in order. Everything is of
@@ -212,6 +214,6 @@ def to_numpy(image: Array) -> NDArray[Any]:
     return image.detach().cpu().numpy() if hasattr(image, "detach") else np.asarray(image)
 
 
-def _components(color: str) -> tuple[int, int, int]:
-    red, green, blue = bytes.fromhex(color[1:])
-    return red, green, blue
+def _components(color: str) -> tuple[int, ...]:
+    """Red, green, blue, and 0."""
+    return (*bytes.fromhex(color[1:]), 0)

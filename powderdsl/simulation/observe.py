@@ -18,7 +18,7 @@ from powderdsl.ir.lower import ir_type, part_names
 from powderdsl.ir.ops import component_of
 from powderdsl.model.state import Slot, property_dtype, property_values, slots
 from powderdsl.model.types import Ruleset
-from powderdsl.simulation.draw import Ramp, palette, ramps, rgb, tints
+from powderdsl.simulation.draw import looks, rgb
 from powderdsl.targets.cpp.program import PackedState
 from powderdsl.targets.job import shape_of
 from powderdsl.targets.tensor_kind import Tensors
@@ -50,7 +50,6 @@ class Observer:
         self.ruleset = ruleset
         self.device = torch.empty(0, device=device).device  # with its number
         self.slots: dict[str, Slot] = {slot.name: slot for slot in slots(ruleset)}
-        self._tints = tints(ruleset.fields)
 
     @torch.no_grad()
     def read(self, state: State, name: str, out: Any = None) -> Tensor:
@@ -62,19 +61,18 @@ class Observer:
     @torch.no_grad()
     def rgb(self, state: State, out: Any = None) -> Tensor:
         """Pictures uint8 [B, H, W, 3], a pixel a cell, in the elements' colors, which may follow fields; then tints."""
-        out, colors = self.buffer(out, (*shape_of(state), 3), torch.uint8), self._palette
+        out, shown = self.buffer(out, (*shape_of(state), 3), torch.uint8), self._looks
         if not isinstance(state, PackedState):
-            looks: Any = {"ramps": self._ramps, "tints": self._tints, "fields": state}
-            return out.copy_(rgb(state["element"], colors, kind=Tensors(self.device), **looks))
+            return out.copy_(rgb(state["element"], fields=state, kind=Tensors(self.device), **shown))
         program = state.program
         slot, bits, _ = program.planes["element"]
-        _native(state, "rgb", out, slot, bits, colors)
-        for ramp in self._ramps:
+        _native(state, "rgb", out, slot, bits, shown["colors"])
+        for ramp in shown["ramps"]:
             real = ramp.starts.dtype == torch.float32
             field = (program.layout.reals[ramp.field], 0, 0) if real else program.planes[ramp.field]
             places = slot, bits, ramp.id, int(real), *map(int, field), len(ramp.starts)
             _native(state, "ramp", out, *places, ramp.starts, ramp.colors)
-        for tint in self._tints:
+        for tint in shown["tints"]:
             row, column = (program.layout.reals[piece.slot] for piece in program.pieces[tint.field])
             numbers = torch.tensor([*tint.color, tint.full, tint.most])
             _native(state, "tint", out, row, column, numbers)
@@ -175,27 +173,14 @@ class Observer:
         return tuple(bits)
 
     @cached_property
-    def _palette(self) -> Tensor:
-        """uint8 [256, 4]: red, green, blue, nothing."""
-        return self._colors(palette(self.ruleset.elements), 256)
-
-    @cached_property
-    def _ramps(self) -> tuple[Ramp, ...]:
-        """As tensors, with four bytes a color."""
-        return tuple(
-            replace(
-                ramp,
-                starts=torch.from_numpy(ramp.starts).to(self.device),
-                colors=self._colors(ramp.colors, len(ramp.colors)),
-            )
-            for ramp in ramps(self.ruleset.elements)
-        )
-
-    def _colors(self, colors: Any, count: int) -> Tensor:
-        """Colors uint8 [n, 3] with a fourth byte, and black up to `count` of them."""
-        table = torch.zeros(count, 4, dtype=torch.uint8)
-        table[: len(colors), :3] = torch.from_numpy(colors)
-        return table.to(self.device)
+    def _looks(self) -> dict[str, Any]:
+        """`draw.looks` of the ruleset, as tensors."""
+        shown, on_device = looks(self.ruleset.elements, self.ruleset.fields), Tensors(self.device).from_numpy
+        ramps = [
+            replace(ramp, starts=on_device(ramp.starts), colors=on_device(ramp.colors))
+            for ramp in shown["ramps"]
+        ]
+        return {**shown, "colors": on_device(shown["colors"]), "ramps": ramps}
 
     @cached_property
     def _channels(self) -> tuple[tuple[Channel, ...], Tensor]:

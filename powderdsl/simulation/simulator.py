@@ -111,9 +111,9 @@ class World:
         prop = sim.ruleset.property(name)
         if prop is None:
             raise unknown_slot(sim.ruleset, name)
-        dtype = getattr(sim.kind.xp, property_dtype(prop))
-        values = sim.kind.xp.asarray(sim.kind.entries(sim.table(name), self.ids), dtype=dtype)
-        return values if out is None else sim.observer.buffer(out, self.shape, dtype).copy_(values)
+        table = sim.kind.put(property_values(sim.ruleset, name), property_dtype(prop))
+        values = sim.kind.entries(table, self.ids)
+        return values if out is None else sim.observer.buffer(out, self.shape, values.dtype).copy_(values)
 
     def matrix(self, out: Array | None = None) -> Array:
         """All channels of the ruleset's `matrix:` as float32 [B, C, H, W]: elements one-hot, then fields."""
@@ -172,7 +172,6 @@ class Simulator:
         self._how: dict[str, Any] = {"threads": threads, "tensors": tensors, "memo": memo}
         self._defaults = lru_cache(BATCH_SIZES)(self._default_parameters)
         """Parameters of a batch: the same mapping for the same size, which programs recognize. Nobody writes to it."""
-        self._tables: dict[str, Array] = {}
         self._program = make_program(ruleset, backend, self.kind, threads, memo)
 
     def of(self, ruleset: Ruleset) -> Simulator:
@@ -217,12 +216,6 @@ class Simulator:
     def slots(self) -> tuple[Slot, ...]:
         """The arrays of a world's state."""
         return tuple(self.slot_by_name.values())
-
-    def table(self, name: str) -> Array:
-        """A property's values by id, parameters at their defaults: float64 [256]."""
-        if name not in self._tables:
-            self._tables[name] = self.kind.put(property_values(self.ruleset, name), "float64")
-        return self._tables[name]
 
     def fresh_values(self, slot: Slot) -> Array:
         """What new cells of elements hold in a slot, by id: of its dtype, [256] or [256, 2]."""

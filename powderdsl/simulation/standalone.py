@@ -92,9 +92,8 @@ def _stored(slot: Slot, ruleset: Ruleset, parts: tuple[Piece, ...]) -> Stored:
 
 
 def _knob(param: Param) -> Knob:
-    kind = param.kind
-    low, high = (0.0, 1.0) if kind.name in ("chance", "flag") else (kind.lo, kind.hi)
-    return Knob(param.name, float(param.default), low, high, kind.name in ("int", "flag"))
+    low, high = map(float, stored_range(param.kind))
+    return Knob(param.name, float(param.default), low, high, param.kind.name in ("int", "flag"))
 
 
 def _about(ruleset: Ruleset, size: tuple[int, int], knobs: Sequence[Knob]) -> dict[str, Any]:

@@ -251,9 +251,7 @@ def sheet(found: list[Strip], rules: Ruleset, *, factor: int = 2) -> NDArray[np.
 
     Colors do not follow fields here: networks predict elements alone.
     """
-    known = palette(rules.elements)
-    colors = np.zeros((256, 3), dtype=np.uint8)
-    colors[: len(known)] = known  # a network may predict slots that the rules leave vacant: black
+    colors = palette(rules.elements)
     pictures = []
     for strip in found:
         pictures += [rgb(ids, colors) for ids in (strip.start, strip.truth, strip.predicted)]

@@ -41,7 +41,7 @@ def read_image(path: str | Path, elements: Sequence[Element]) -> NDArray[np.uint
         owners.setdefault(_pack(bytes.fromhex(element.color[1:])), []).append(element)
     own, by_id = frozenset(owners), {element.id: element for element in elements}
     for ramp in ramps(elements):  # an element's own color wins over ramps
-        for color in sorted({_pack(bytes(row)) for row in ramp.colors} - own):
+        for color in sorted({_pack(bytes(row[:3])) for row in ramp.colors} - own):
             owners.setdefault(color, []).append(by_id[ramp.id])
     colors = np.array(sorted(owners), dtype=np.uint32)
     meant = np.array([owners[color][0].id for color in sorted(owners)], dtype=np.uint8)
