@@ -65,15 +65,14 @@ class Observer:
         if not isinstance(state, PackedState):
             return out.copy_(rgb(state["element"], fields=state, kind=Tensors(self.device), **shown))
         program = state.program
-        slot, bits, _ = program.planes["element"]
+        slot, bits, _ = program.homes["element"]
         _native(state, "rgb", out, slot, bits, shown["colors"])
         for ramp in shown["ramps"]:
-            real = ramp.starts.dtype == torch.float32
-            field = (program.layout.reals[ramp.field], 0, 0) if real else program.planes[ramp.field]
-            places = slot, bits, ramp.id, int(real), *map(int, field), len(ramp.starts)
+            field = program.homes[ramp.field]
+            places = slot, bits, ramp.id, int(not field[1]), *map(int, field), len(ramp.starts)
             _native(state, "ramp", out, *places, ramp.starts, ramp.colors)
         for tint in shown["tints"]:
-            row, column = (program.layout.reals[piece.slot] for piece in program.pieces[tint.field])
+            row, column = (program.homes[piece.slot][0] for piece in program.pieces[tint.field])
             numbers = torch.tensor([*tint.color, tint.full, tint.most])
             _native(state, "tint", out, row, column, numbers)
         return out
@@ -111,7 +110,7 @@ class Observer:
         batch, height, width = shape_of(state)
         out = self.buffer(out, (batch, len(self._bits), height, word_count(width)), torch.int64)
         if isinstance(state, PackedState):
-            places = [state.program.planes[name][0] + bit for name, bit in self._bits]
+            places = [state.program.homes[name][0] + bit for name, bit in self._bits]
             numbers = torch.tensor(places, dtype=torch.int32)
             return _native(state, "planes", out, len(places), numbers)
         for place, (name, bit) in enumerate(self._bits):
@@ -242,10 +241,9 @@ def _component(state: State, name: str) -> Tensor:
 
 def _native_channel(channel: Channel, number: int, state: PackedState) -> tuple[int, int, int, int]:
     """A channel as native code has it: kind, first plane or float slot, planes, value."""
-    program = state.program
-    if channel.slot in program.layout.reals:
-        return 4, program.layout.reals[channel.slot], 0, 0
-    slot, bits, signed = program.planes[channel.slot]
+    slot, bits, signed = state.program.homes[channel.slot]
+    if not bits:
+        return 4, slot, 0, 0
     if channel.read:
         return 3, slot, bits, int(signed)
     return (2, slot, bits, number) if channel.one_hot is None else (1, slot, bits, channel.one_hot)

@@ -56,12 +56,6 @@ def find(folder: Path, key: str) -> Path | None:
     return None
 
 
-def key_and_name(path: Path) -> tuple[str, str]:
-    """The key and the name of a file in the cache."""
-    key, _, name = path.name.split("-")
-    return key, name
-
-
 def add(folder: Path, key: str, code: bytes, name: str) -> Path:
     """Write code into the cache; the path of its file.
 

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from powderdsl.ir.ops import Node, Program, Threshold, nodes_of
+from powderdsl.targets.codec import Piece
 
 
 @dataclass
@@ -19,6 +20,14 @@ class Layout:
     param_reals: dict[str, int] = field(default_factory=dict)
     step_planes: dict[tuple[int, int], int] = field(default_factory=dict)
     fixed: dict[tuple[int, int, int], int] = field(default_factory=dict)
+
+    def home(self, piece: Piece) -> tuple[int, int, bool]:
+        """Where a piece of the state is: its field's number, 0 and False; or that of its first plane, how many planes there
+        are, and whether the last one is a sign.
+        """
+        if piece.is_real:
+            return self.reals[piece.slot], 0, False
+        return self.planes[piece.planes[0]], len(piece.planes), piece.signed
 
     def limit(self, draw: Node) -> int:
         """The first of the planes of the parameter that a draw is compared with: of its highest bit; the others follow."""

@@ -64,15 +64,14 @@ def recall(key: str) -> NativeCode | None:
         return None
     # Whoever can write into the folder has his libraries run as well: a pickle is no less safe than they are.
     code: NativeCode = pickle.loads(read_bytes(path, cache.LIMIT))
-    library = cache.find(folder, cache.key_and_name(code.library)[0])
+    library = cache.find(folder, code.library.name.split("-")[0])
     return None if library is None else replace(code, library=library)
 
 
 def remember(key: str, code: NativeCode) -> None:
     """Store the rest of a compiled program under a key. A cache that cannot be written only costs time."""
-    _, name = cache.key_and_name(code.library)
     with suppress(OSError):
-        cache.add(current().place(), key, pickle.dumps(code), f"{name}.layout")
+        cache.add(current().place(), key, pickle.dumps(code), f"{code.library.name.split('-')[2]}.layout")
 
 
 class Inputs(NamedTuple):
@@ -150,12 +149,9 @@ class NativeProgram:
         self.pieces, self._passes = code.pieces, code.passes
         self._inputs: dict[int, Inputs] = {}
         """By the `id` of the mapping, which they keep alive."""
-        self.planes = {
-            name: (self.layout.planes[parts[0].planes[0]], len(parts[0].planes), parts[0].signed)
-            for name, parts in self.pieces.items()
-            if not parts[0].is_real
+        self.homes = {
+            piece.slot: self.layout.home(piece) for parts in self.pieces.values() for piece in parts
         }
-        """The first plane of a state tensor, the number of planes, and whether the last one is a sign."""
 
     def run(self, job: Job) -> Mapping[str, Tensor]:
         """The state `job.steps` later. Jobs with given draws or chosen passes are for other backends."""
@@ -195,7 +191,6 @@ class NativeProgram:
         return PackedState(self, handle, like_of(state))
 
     def parts(self, name: str, value: Tensor) -> Iterator[tuple[Tensor, int, int, bool]]:
-        """The parts of a state tensor in slots, each with its field's number and 0 bits, or as `planes` says."""
+        """The parts of a state tensor, each with its home."""
         for piece in self.pieces[name]:
-            number = (self.layout.reals[piece.slot], 0, False) if piece.is_real else self.planes[name]
-            yield piece.of(value), *number
+            yield piece.of(value), *self.homes[piece.slot]

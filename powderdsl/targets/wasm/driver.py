@@ -55,9 +55,8 @@ WEIGHTS = bytes(1 << i for i in range(8)) * 2
 
 def numbers_of(piece: Piece, layout: Layout, size: int) -> tuple[int, int, int, int]:
     """What `load` and `store` take for a piece of the state whose cells have some bytes: slot, planes, signed, size."""
-    if piece.is_real:
-        return len(layout.planes) + layout.reals[piece.slot], 0, 0, size
-    return layout.planes[piece.planes[0]], len(piece.planes), int(piece.signed), size
+    slot, planes, signed = layout.home(piece)
+    return slot if planes else len(layout.planes) + slot, planes, int(signed), size
 
 
 class Batches:

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import TypeVar
@@ -223,16 +224,18 @@ class Standalone(Batches):
 
     # Boxes
 
-    def _cut(self, start: Local, stop: Local, most: int) -> None:
-        """A side of a box, within the grid; nothing is done with an empty one."""
-        stop.set(either(op("i32.gt_s", stop, most), most, stop))
-        start.set(either(op("i32.lt_s", start, 0), 0, start))
-        with body.when(op("i32.ge_s", start, stop)):
-            body.leave()
+    @contextmanager
+    def _each_cell(self, top: Local, bottom: Local, left: Local, right: Local) -> Iterator[Local]:
+        """The cells of a box that lie within the grid; the function ends before, if there are none."""
+        for start, stop, most in ((top, bottom, self.face.rows), (left, right, self.memory.width)):
+            stop.set(either(op("i32.gt_s", stop, most), most, stop))
+            start.set(either(op("i32.lt_s", start, 0), 0, start))
+            with body.when(op("i32.ge_s", start, stop)):
+                body.leave()
+        with body.each(top, bottom) as y, body.each(left, right) as x:
+            yield body.let(y * self.memory.width + x)
 
     def paint(self, element: I32, top: I32, bottom: I32, left: I32, right: I32) -> None:
-        self._cut(top, bottom, self.face.rows)
-        self._cut(left, right, self.memory.width)
         with body.when(element >= 256):
             body.leave()
         with body.when(op("i32.ne", load("i32.load8_u", element, self.valid), element)):
@@ -241,8 +244,7 @@ class Standalone(Batches):
         fresh = [slot for slot in self.face.fields if slot.of_element]
         for slot in fresh:
             body.do(self.reads[slot.name]())
-        with body.each(top, bottom) as y, body.each(left, right) as x:
-            cell = body.let(y * self.memory.width + x)
+        with self._each_cell(top, bottom, left, right) as cell:
             load("i32.load8_u", self.cells_at + cell).set(element)
             self._freshen(cell, element, fresh)
         self._put(fresh)
@@ -251,8 +253,6 @@ class Standalone(Batches):
         self, field: I32, component: I32, top: I32, bottom: I32, left: I32, right: I32, value: F64
     ) -> None:
         body.do(self.calls["show"]())
-        self._cut(top, bottom, self.face.rows)
-        self._cut(left, right, self.memory.width)
         for slot in _of_number(field, self.face.fields):
             with body.when(component >= len(slot.pieces)):
                 body.leave()
@@ -260,9 +260,8 @@ class Standalone(Batches):
             convert = "f32.demote_f64" if slot.pieces[0].is_real else "i32.trunc_sat_f64_s"
             stored = body.let(op(convert, _within(value, slot.low, slot.high)))
             base = body.let(component * (self.count * slot.size))
-            with body.each(top, bottom) as y, body.each(left, right) as x:
-                place = base + (y * self.memory.width + x) * slot.size
-                load(slot.load, place, self.parts[slot.name][0][1]).set(stored)
+            with self._each_cell(top, bottom, left, right) as cell:
+                load(slot.load, base + cell * slot.size, self.parts[slot.name][0][1]).set(stored)
             body.do(self.takes[slot.name]())
 
     # Parameters
