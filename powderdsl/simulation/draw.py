@@ -173,8 +173,6 @@ def tint_cells(kind: ArrayKind, image: Array, vectors: Array, tint: CellTint) ->
 
 def scale(image: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
     """Every pixel of [..., H, W, 3] as a square of `factor` by `factor`."""
-    if factor == 1:
-        return image
     return np.repeat(np.repeat(image, factor, axis=-3), factor, axis=-2)
 
 
@@ -189,8 +187,8 @@ def contact_sheet(
     height, width = pictures[0].shape[:2]
     columns = min(columns or math.ceil(math.sqrt(len(pictures))), len(pictures))
     rows = math.ceil(len(pictures) / columns)
-    sheet = np.zeros((rows * (height + gap) + gap, columns * (width + gap) + gap, 3), dtype=np.uint8)
-    sheet[:] = 255
+    size = rows * (height + gap) + gap, columns * (width + gap) + gap, 3
+    sheet = np.full(size, 255, dtype=np.uint8)
     for place, picture in enumerate(pictures):
         top, left = gap + place // columns * (height + gap), gap + place % columns * (width + gap)
         sheet[top : top + height, left : left + width] = picture
@@ -202,8 +200,7 @@ def outline(
 ) -> None:
     """Draw the edge of a set of cells into a picture uint8 [H·factor, W·factor, 3], one pixel wide, inside it."""
     pixels = np.repeat(np.repeat(cells, factor, 0), factor, 1)
-    padded = np.zeros([side + 2 for side in pixels.shape], bool)
-    padded[1:-1, 1:-1] = pixels
+    padded = np.pad(pixels, 1)
     inner = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
     image[pixels & ~inner] = color
 

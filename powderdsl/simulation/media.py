@@ -110,6 +110,4 @@ def _indexed(images: Any, frame: NDArray[np.uint8]) -> Any:
 def _even(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """H.264 stores color at half the size, so both sides must be even: the last row or column is doubled."""
     height, width = frame.shape[:2]
-    if height % 2:
-        frame = np.concatenate([frame, frame[-1:]])
-    return np.concatenate([frame, frame[:, -1:]], axis=1) if width % 2 else frame
+    return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), "edge")

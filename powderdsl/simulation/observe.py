@@ -197,8 +197,8 @@ class Observer:
             if channel.id is not None:
                 table[channel.id] = 1
             elif prop is not None and not read:
-                values = torch.tensor(property_values(self.ruleset, name), dtype=torch.float64)
-                table[:] = values.to(getattr(torch, property_dtype(prop)))
+                dtype = getattr(torch, property_dtype(prop))
+                table[:] = torch.tensor(property_values(self.ruleset, name), dtype=dtype)
         return tuple(channels), tables.to(self.device)
 
     def buffer(self, out: Any, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:

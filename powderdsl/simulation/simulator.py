@@ -467,8 +467,7 @@ class Simulator:
         timing, params = PassClock(self.device), self._defaults(len(world))
         clock = Clock(world.seed, world.index, world.start, world.since)
         self._program.run(Job(world.state, clock, _whole_count(steps), params, {}, None, timing=timing))
-        known = [name for name in self.passes if name in timing.seconds]
-        return {name: timing.seconds[name] for name in self.passes} if known else {}
+        return {name: timing.seconds[name] for name in self.passes} if timing.seconds else {}
 
 
 def compile(

@@ -116,7 +116,7 @@ def test_frames_are_redrawn_in_place_and_the_cursor_comes_back():
         view.show(second, caption="step 2")
     lines, colors, visible = replay(screen.written)
     assert lines == ["▀" * 6, "▀" * 6, "step 2", ""]
-    water = tuple(COLORS[3].tolist())
+    water = tuple(COLORS[3, :3].tolist())
     assert colors[0] == [(water, water)] * 6
     assert visible
 
@@ -138,7 +138,7 @@ def test_motion_tints():
         with LiveView(ELEMENTS, screen, fields=fields) as view:
             view.show(torch.zeros((2, 2), dtype=torch.uint8), fields={"velocity": field})
     _, colors, _ = replay(screens[0].written)
-    empty = tuple(COLORS[0].tolist())
+    empty = tuple(COLORS[0, :3].tolist())
     assert colors[0][0] == (empty, empty)
     assert colors[0][1][0] == empty
     assert colors[0][1][1] not in (empty, None)
