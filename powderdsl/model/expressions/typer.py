@@ -460,11 +460,14 @@ class Typer:
         return found
 
     def attribute(self, syntax: Syntax, scope: Scope) -> Operand:
-        """``place.name``, ``vector.row`` or ``pack.name``."""
+        """``place.name``, ``vector.row``, ``pack.name`` or ``place.pack.name``: what one pack defines has its name with it."""
         (before,) = syntax.children
-        own = self.of_pack(syntax, scope)
-        if own is not None:
-            return own
+        name, value = self._global_name(syntax), None
+        if name and before.kind in ("name", "attribute") and not self._is_own_word(before, scope):
+            value = self.find(name, syntax.span, Scope("", {}, scope.orientation))
+            if value is not None and before.kind == "name":
+                return value
+            before = before.children[0] if value is not None else before
         base = self.evaluate(before, scope)
         word = Span(syntax.span.source, syntax.span.end - len(syntax.text), syntax.span.end)
         if isinstance(base, Absent):
@@ -476,7 +479,7 @@ class Typer:
             raise self.fail("PD301", message, word, "not a part of it", fix)
         if not isinstance(base, Place):
             raise self.wrong(base, "a neighbor before the dot", before.span, "such as `below.FIELD`")
-        value = self.lookup(syntax.text, word, scope, after_dot=True)
+        value = value or self.lookup(syntax.text, word, scope, after_dot=True)
         match value:
             case Place():
                 return Place(self.offset(plus(base.offset, value.offset), syntax.span))
@@ -487,20 +490,6 @@ class Typer:
                 label = f"this is {'an element' if value.name else 'a set of elements'}"
                 raise self.fail("PD401", message, word, label, f"write `{before.span.text} is {syntax.text}`")
         raise self.wrong(value, "a field, property or neighbor after the dot", word)
-
-    def of_pack(self, syntax: Syntax, scope: Scope) -> Operand | None:
-        """``pack.name``, or ``below.pack.name``: what one pack defines, whatever others call theirs."""
-        (pack,) = syntax.children
-        name = self._global_name(syntax)
-        if pack.kind not in ("name", "attribute") or name is None or self._is_own_word(pack, scope):
-            return None
-        found = self.find(name, syntax.span, Scope("", {}, scope.orientation))
-        if pack.kind == "name":
-            return found
-        if not isinstance(found, Expr):
-            return None
-        place = self.place(self.evaluate(pack.children[0], scope), pack.children[0].span)
-        return look(found, place.offset, syntax.span)
 
     def _global_name(self, syntax: Syntax) -> str | None:
         """The name by which everything is known that ``pack.name`` stands for, if it is the name of something."""
