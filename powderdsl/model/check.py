@@ -18,7 +18,7 @@ from powderdsl.model.declarations import PackDecl, RulesetDecl
 from powderdsl.model.definitions import define_symbols, element_ramps
 from powderdsl.model.elaborate import Elaborator
 from powderdsl.model.examples import check_assigned, check_examples
-from powderdsl.model.expressions.symbols import add_constants
+from powderdsl.model.expressions.symbols import add_constants, report_unknown_names
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.invariants import check_invariants
 from powderdsl.model.logic.conflicts import check_logic
@@ -80,7 +80,7 @@ def check(
     check_alone = partial(_check_some, Declared(tuple(packs), None), alone=True)
     invariants = check_invariants(composition, typer, check_alone)
     ramps = element_ramps(typer)
-    typer.unknown.report()
+    report_unknown_names(typer)
     reporter.raise_if_errors()
     report_misspelled(packs, composition.ruleset, elsewhere, reporter)
 

@@ -242,7 +242,8 @@ class Reader:
             case "section":
                 return tuple(self.entries(row.type, node))
             case "record":
-                return self._part(row.type, key, node)
+                given = {"name": key} if issubclass(row.type, Entry) else {}
+                return self.record(row.type, node, f"`{key.text}`", **given)
             case "pairs":
                 wanted = f"a mapping from {row.maps}"
                 pairs = self.pairs(node, wanted, about) if row.maps else self.named(node, "a value")
@@ -268,15 +269,6 @@ class Reader:
         if row.type is Syntax:
             return self.line(node)
         return " ".join(node.text.split()) if row.type is str else node
-
-    def _part(self, kind: type[Record], key: Scalar, node: Node) -> Any:
-        """The record below a key."""
-        keys = keys_of(kind)
-        if isinstance(node, Mapping) and not node.entries and not any(one.required for one in keys.values()):
-            helps = [", ".join(f"`{name}`: {one.about}" for name, one in keys.items())]
-            self.reporter.error("PD109", f"`{key.text}` says nothing", node.span, "empty", helps=helps)
-            return None
-        return self.record(kind, node, f"`{key.text}`", **({"name": key} if issubclass(kind, Entry) else {}))
 
     def mapping(self, kind: type[Record], node: Node, what: str) -> Entries:
         """The entries of a mapping by key, unknown keys reported and left out, missing ones reported."""

@@ -10,6 +10,7 @@ from powderdsl.compiler import load_with_diagnostics, names_in_file, read
 from powderdsl.diagnostics import CompileError, Reporter, Source, suggest
 from powderdsl.model.check import resolve_names
 from powderdsl.model.composition.compose import Palette
+from powderdsl.model.expressions.symbols import report_unknown_names
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.operations import FUNCTIONS as RULE_FUNCTIONS
 from powderdsl.model.schema import NAME_FORM, Entry, Reader, Record, first_line, keyed, read_tree
@@ -152,7 +153,7 @@ def read_task(
         raise
     loaded, composed = read(rules, Reporter())
     typer, _ = resolve_names(loaded, composed, Reporter(), palette)
-    typer.reporter = typer.unknown.reporter = reporter
+    typer.reporter = reporter
     return _TaskReader(reader, decl, ruleset, typer, rules, knobs or {}).task()
 
 
@@ -207,7 +208,7 @@ class _TaskReader:
             if key.text in plan.parts and key.text not in used:
                 message = f"the part `{key.text}` is never used"
                 self.reporter.report("PD507", message, key.span, "no list has it", helps=["remove it"])
-        self.typer.unknown.report()
+        report_unknown_names(self.typer)
         self.reporter.raise_if_errors()
         assert agent is not None
         return Task(

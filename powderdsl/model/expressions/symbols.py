@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
-from powderdsl.diagnostics import Label, Reporter, Span, suggest
+from powderdsl.diagnostics import Label, suggest
 from powderdsl.model.builtins import (
     DIRECTION_SETS,
     DIRECTIONS,
@@ -156,42 +156,30 @@ MAX_PLACES = 4
 """Places of a name that are shown besides the first."""
 
 
-class UnknownNames:
-    """Names that were looked up and not found: each is reported once, with all its places."""
+def report_unknown_names(typer: Typer) -> None:
+    """Report every name that was looked up and not found once, with all its places, then forget them."""
+    for (name, after_dot), places in typer.unknown.items():
+        first, *others = sorted(places, key=lambda span: (span.source.name, span.start))
+        label = "no loaded pack has such a field or property" if after_dot else "no loaded pack defines it"
+        more = [Label(span, "and here") for span in others[:MAX_PLACES]]
+        notes = [f"and in {len(others) - MAX_PLACES} more places"] if len(others) > MAX_PLACES else []
+        fix = _fix(name, places[first], after_dot, typer.symbols)
+        typer.reporter.error(
+            "PD301", f"unknown name `{name}`", first, label, secondary=more, notes=notes, helps=[fix]
+        )
+    typer.unknown.clear()
 
-    def __init__(self, symbols: Composition, reporter: Reporter):
-        self.symbols = symbols
-        self.reporter = reporter
-        self._places: dict[tuple[str, bool], dict[Span, tuple[str, ...]]] = {}
 
-    def add(self, name: str, span: Span, known_here: Iterable[str], *, after_dot: bool) -> None:
-        """Remember a name at a place. `known_here` are local names that it could have been meant for."""
-        self._places.setdefault((name, after_dot), {})[span] = tuple(known_here)
-
-    def report(self) -> None:
-        """Report every name that came up, then forget them."""
-        for (name, after_dot), places in self._places.items():
-            first, *others = sorted(places, key=lambda span: (span.source.name, span.start))
-            label = (
-                "no loaded pack has such a field or property" if after_dot else "no loaded pack defines it"
-            )
-            more = [Label(span, "and here") for span in others[:MAX_PLACES]]
-            notes = [f"and in {len(others) - MAX_PLACES} more places"] if len(others) > MAX_PLACES else []
-            helps = self._fix(name, places[first], after_dot)
-            self.reporter.error(
-                "PD301", f"unknown name `{name}`", first, label, secondary=more, notes=notes, helps=helps
-            )
-        self._places.clear()
-
-    def _fix(self, name: str, known_here: tuple[str, ...], after_dot: bool) -> tuple[str, ...]:
-        elsewhere = [qualified for qualified in self.symbols.params if qualified.endswith(f".{name}")]
-        if elsewhere:
-            return (f"write `{elsewhere[0]}`: a parameter of another pack is named with its pack",)
-        if not after_dot and name.lower() in ELSEWHERE:
-            return (ELSEWHERE[name.lower()],)
-        symbols, params = self.symbols, (name.split(".")[1] for name in self.symbols.params)
-        others = DIRECTIONS if after_dot else (*symbols.constants, *params, *known_here, *FUNCTIONS)
-        close = suggest(name, (*symbols.properties, *symbols.fields, *symbols.streams, *others))
-        if close and close[0].startswith("did"):
-            return close
-        return (f"load the pack that defines it, or write `{name}?` if that may be absent",)
+def _fix(name: str, known_here: Iterable[str], after_dot: bool, symbols: Composition) -> str:
+    """What to write instead of an unknown name. `known_here` are local names that it could have been meant for."""
+    elsewhere = [qualified for qualified in symbols.params if qualified.endswith(f".{name}")]
+    if elsewhere:
+        return f"write `{elsewhere[0]}`: a parameter of another pack is named with its pack"
+    if not after_dot and name.lower() in ELSEWHERE:
+        return ELSEWHERE[name.lower()]
+    params = (qualified.split(".")[1] for qualified in symbols.params)
+    others = DIRECTIONS if after_dot else (*symbols.constants, *params, *known_here, *FUNCTIONS)
+    close = suggest(name, (*symbols.properties, *symbols.fields, *symbols.streams, *others))
+    if close and close[0].startswith("did"):
+        return close[0]
+    return f"load the pack that defines it, or write `{name}?` if that may be absent"

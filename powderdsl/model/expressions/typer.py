@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from itertools import pairwise, product
@@ -44,7 +44,7 @@ from powderdsl.model.expressions.operators import (
     number,
     turned,
 )
-from powderdsl.model.expressions.symbols import UnknownNames, read_bounds, read_number
+from powderdsl.model.expressions.symbols import read_bounds, read_number
 from powderdsl.model.logic.needless import report_repeated
 from powderdsl.model.operations import FUNCTIONS
 from powderdsl.model.types import (
@@ -129,7 +129,8 @@ class Typer:
         self.empty: set[str] = set()
         """Tags and sets without elements that the rule asks for."""
         self.resolving: list[str] = []
-        self.unknown = UnknownNames(symbols, reporter)
+        self.unknown: dict[tuple[str, bool], dict[Span, Iterable[str]]] = {}
+        """Names that were not found, and whether they stand after a dot: their places, each with the local names there."""
         self._sets_too_deep = False
         self._work = self._rule_start = 0
         self._rule_span: Span | None = None
@@ -349,13 +350,13 @@ class Typer:
     # Names
 
     def lookup(self, name: str, span: Span, scope: Scope, *, after_dot: bool = False) -> Operand:
-        """The operand of a name. An unknown one is reported once, with all its places, by `unknown.report`."""
+        """The operand of a name. An unknown one is reported once, with all its places, by `report_unknown_names`."""
         found = self.find(name, span, scope)
         if found is not None:
             return found
         if self.symbols.is_declared(name, scope.pack):
             raise Poisoned  # what is wrong with its declaration has been reported
-        self.unknown.add(name, span, scope.locals, after_dot=after_dot)
+        self.unknown.setdefault((name, after_dot), {})[span] = scope.locals
         raise Poisoned
 
     def find(self, name: str, span: Span, scope: Scope) -> Operand | None:
