@@ -134,6 +134,7 @@ _TORCH = (
     "targets.torch.program",
     "targets.arrays.program",
     "targets.cpp.program",
+    "targets.cuda.build",
     "targets.cuda.program",
     "targets.cpp.counts",
     "simulation.native",

@@ -1,7 +1,6 @@
 """NVRTC and the CUDA driver through ctypes: compile kernels, cache them, launch them on a stream.
 
-NVRTC comes with torch, so no toolkit has to be installed. torch is not imported here; callers have made its context
-current.
+NVRTC comes with torch, so no toolkit has to be installed; the context is that of torch.
 """
 
 from __future__ import annotations
@@ -14,6 +13,8 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
+
+import torch
 
 from powderdsl.system.user_cache import cache_folder
 from powderdsl.targets import cache as native_cache
@@ -110,11 +111,7 @@ def machine_code(source: KernelSource, architecture: str, version: str) -> bytes
 def compile_text(compiler: ctypes.CDLL, text: str, options: Sequence[str]) -> bytes:
     """Machine code of a source by NVRTC. Raises NoCuda with the first lines of its messages."""
     program, size = ctypes.c_void_p(), ctypes.c_size_t()
-    created = compiler.nvrtcCreateProgram(
-        ctypes.byref(program), text.encode(), b"powderdsl.cu", 0, None, None
-    )
-    if created:
-        raise NoCuda(f"NVRTC does not start ({created})")
+    compiler.nvrtcCreateProgram(ctypes.byref(program), text.encode(), b"powderdsl.cu", 0, None, None)
     try:
         given = (ctypes.c_char_p * len(options))(*(option.encode() for option in options))
         if compiler.nvrtcCompileProgram(program, len(options), given):
@@ -122,8 +119,7 @@ def compile_text(compiler: ctypes.CDLL, text: str, options: Sequence[str]) -> by
             log = ctypes.create_string_buffer(size.value)
             compiler.nvrtcGetProgramLog(program, log)
             raise NoCuda("NVRTC failed:\n" + "\n".join(log.value.decode(errors="replace").splitlines()[:8]))
-        if compiler.nvrtcGetCUBINSize(program, ctypes.byref(size)):
-            raise NoCuda("NVRTC made no machine code")
+        compiler.nvrtcGetCUBINSize(program, ctypes.byref(size))
         code = ctypes.create_string_buffer(size.value)
         compiler.nvrtcGetCUBIN(program, code)
         return code.raw
@@ -131,26 +127,27 @@ def compile_text(compiler: ctypes.CDLL, text: str, options: Sequence[str]) -> by
         compiler.nvrtcDestroyProgram(ctypes.byref(program))
 
 
-Start = Callable[[Worlds, int, int], None]
-"""Launches a kernel: its argument, the number of blocks, the address of the stream."""
+Launch = Callable[[Worlds, int], None]
+"""Runs a kernel on the current stream: its argument, and the number of blocks."""
 
 
-def load_kernel(code: bytes, source: KernelSource) -> Start:
-    """A kernel from machine code, loaded permanently into the current context. Raises NoCuda."""
-    cuda = driver()
+def load_kernel(code: bytes, source: KernelSource, device: torch.device) -> Launch:
+    """A kernel from machine code, loaded permanently into a device's context. Raises NoCuda."""
+    cuda, shared = driver(), source.shared
     module, function = ctypes.c_void_p(), ctypes.c_void_p()
-    check(cuda.cuModuleLoadData(ctypes.byref(module), code), "a kernel could not be loaded")
-    check(cuda.cuModuleGetFunction(ctypes.byref(function), module, ENTRY), "a kernel has no entry")
-    check(
-        cuda.cuFuncSetAttribute(function, _DYNAMIC_SHARED, source.shared),
-        f"{source.shared} bytes of shared memory",
-    )
+    with torch.cuda.device(device):
+        torch.empty(1, device=device)  # makes the context current in this thread
+        check(cuda.cuModuleLoadData(ctypes.byref(module), code), "a kernel could not be loaded")
+        check(cuda.cuModuleGetFunction(ctypes.byref(function), module, ENTRY), "a kernel has no entry")
+        check(cuda.cuFuncSetAttribute(function, _DYNAMIC_SHARED, shared), f"{shared} bytes of shared memory")
 
-    def start(worlds: Worlds, blocks: int, stream: int) -> None:
+    def launch(worlds: Worlds, blocks: int) -> None:
         arguments = (ctypes.c_void_p * 1)(ctypes.cast(ctypes.byref(worlds), ctypes.c_void_p))
-        code = cuda.cuLaunchKernel(
-            function, blocks, 1, 1, source.threads, 1, 1, source.shared, ctypes.c_void_p(stream), arguments, None
-        )  # fmt: skip
+        with torch.cuda.device(device):
+            stream = ctypes.c_void_p(torch.cuda.current_stream(device).cuda_stream)
+            code = cuda.cuLaunchKernel(
+                function, blocks, 1, 1, source.threads, 1, 1, shared, stream, arguments, None
+            )  # fmt: skip
         check(code, "a kernel could not be started")
 
-    return start
+    return launch

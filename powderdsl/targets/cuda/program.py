@@ -19,10 +19,7 @@ from powderdsl.targets.torch.program import packed_program
 
 _HELP = "run on the device `cuda`, or on the backend `torch`, or on `native` on the CPU"
 
-Launch = Callable[[build.Worlds, int], None]
-"""Runs a kernel on the current stream: its argument, and the number of blocks."""
-
-Compile = Callable[[KernelSource], Launch]
+Compile = Callable[[KernelSource], build.Launch]
 """Makes a kernel from its source, for one device."""
 
 
@@ -34,20 +31,12 @@ def cuda_program(program: Program, device: torch.device) -> Runnable:
     """
     version = torch.version.cuda or ""
 
-    def compile(source: KernelSource) -> Launch:
+    def compile(source: KernelSource) -> build.Launch:
         try:
-            with torch.cuda.device(device):
-                torch.empty(1, device=device)  # makes the context current in this thread
-                architecture = f"sm_{limits.major}{limits.minor}"
-                start = build.load_kernel(build.machine_code(source, architecture, version), source)
+            code = build.machine_code(source, f"sm_{limits.major}{limits.minor}", version)
+            return build.load_kernel(code, source, device)
         except build.NoCuda as error:
             raise unavailable("cuda", str(error), _HELP) from None
-
-        def launch(worlds: build.Worlds, blocks: int) -> None:
-            with torch.cuda.device(device):
-                start(worlds, blocks, torch.cuda.current_stream(device).cuda_stream)
-
-        return launch
 
     try:
         if device.type != "cuda":
@@ -85,9 +74,9 @@ class CudaProgram:
     def __init__(self, program: Program, planes: Program, compile: Compile, shared_limit: int):
         self._planes, self._compile, self._limit = planes, compile, shared_limit
         self._pieces = pieces(program)
-        self._kernels: dict[tuple[int, int], tuple[KernelSource, Launch]] = {}
+        self._kernels: dict[tuple[int, int], tuple[KernelSource, build.Launch]] = {}
 
-    def kernel(self, height: int, width: int) -> tuple[KernelSource, Launch]:
+    def kernel(self, height: int, width: int) -> tuple[KernelSource, build.Launch]:
         """The kernel for a size of grid, compiled on first use."""
         if (height, width) not in self._kernels:
             source = cuda_source(self._planes, height, width, self._limit)
