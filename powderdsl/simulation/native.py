@@ -124,13 +124,14 @@ class ByWidth:
             return self._programs[width]
         recalled, compiled = partial(self._recalled, width), partial(self._compiled, width)
         with building(self._how):
-            if self._first is not None:
-                program: Runnable = AutoProgram(*self._first, self._cells, recalled, compiled)
-            else:
-                try:
-                    program = compiled()
-                except NoCompiler as error:
-                    raise _refusal(error) from None
+            try:
+                program = (
+                    AutoProgram(*self._first, self._cells, recalled, compiled)
+                    if self._first is not None
+                    else recalled() or compiled()
+                )
+            except NoCompiler as error:
+                raise _refusal(error) from None
             return self._programs.setdefault(width, program)
 
     def _recalled(self, width: int) -> Runnable | None:
@@ -139,30 +140,22 @@ class ByWidth:
         return None if code is None else NativeProgram(code, self._threads)
 
     def _compiled(self, width: int) -> Runnable:
-        """Native code, from the cache or compiled now; passes that do not fit bit planes run on cells.
+        """Native code, compiled now or by another process meanwhile; passes that do not fit bit planes run on cells.
 
         Raises NoCompiler: there is no C++ compiler, or it failed.
         """
-        codes = []
-
-        def compiled(program: Program, planes: Program) -> NativeProgram:
-            codes.append(compile_program(program, planes, width))
-            return NativeProgram(codes[-1], self._threads)
-
-        program = self._recalled(width)
-        if program is not None:
-            return program
         key = start_key(self._ruleset, width)
         with turn(current().place(), key):
-            program = self._recalled(width)  # from another process, while this one waited
-            if program is None:
-                parts = segments(self._lowered())
-                program = mixed_program(
-                    parts, compiled, lambda cells: TorchProgram(cells, torch.device("cpu"))
-                )
-                if len(parts) == len(codes) == 1:
-                    remember(key, codes[0])
-                    remember(start_key(self._ruleset), codes[0])
+            if (program := self._recalled(width)) is not None:
+                return program
+            program = mixed_program(
+                segments(self._lowered()),
+                lambda program, planes: NativeProgram(compile_program(program, planes, width), self._threads),
+                lambda cells: TorchProgram(cells, torch.device("cpu")),
+            )
+            if isinstance(program, NativeProgram):
+                remember(key, program.code)
+                remember(start_key(self._ruleset), program.code)
         return program
 
     @property

@@ -145,8 +145,8 @@ class NativeProgram:
 
     def __init__(self, code: NativeCode, threads: int):
         self.library = load_library(code.library)
-        self.layout, self.threads = code.layout, threads
-        self.pieces, self._passes = code.pieces, code.passes
+        self.code, self.threads = code, threads
+        self.layout, self.pieces = code.layout, code.pieces
         self._inputs: dict[int, Inputs] = {}
         """By the `id` of the mapping, which they keep alive."""
         self.homes = {
@@ -162,13 +162,13 @@ class NativeProgram:
         if not (isinstance(state, PackedState) and state.program is self):
             state, reuse = self._packed(state), True
         handle = state.take() if reuse else state.handle
-        seconds = None if job.timing is None else (ctypes.c_double * len(self._passes))()
+        seconds = None if job.timing is None else (ctypes.c_double * len(self.code.passes))()
         handle = self.library.pd_run(
             handle, not reuse, job.steps, self.threads,
             seed.data_ptr(), index.data_ptr(), start.data_ptr(), since, inputs.planes.data_ptr(), inputs.reals.data_ptr(), seconds,
         )  # fmt: skip
         if job.timing is not None and seconds is not None:
-            for name, spent in zip(self._passes, seconds, strict=True):
+            for name, spent in zip(self.code.passes, seconds, strict=True):
                 job.timing.add(name, spent)
         return PackedState(self, handle, state.like)
 
