@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -220,7 +221,7 @@ def _element_values(typer: Typer) -> dict[str, dict[str, tuple[str, Span, Syntax
         **names.declared(PropertyDecl),
         **names.declared(FieldDecl),
     }
-    given: dict[str, dict[str, tuple[str, Span, Syntax]]] = {name: {} for name in declared}
+    given: dict[str, dict[str, tuple[str, Span, Syntax]]] = defaultdict(dict)
     for pack, name, word, key, syntax in symbols.given_values():
         if name not in declared:
             keys = (own for own in keys_of(ElementDecl) if own != "override")

@@ -265,14 +265,10 @@ def compose(
 
 def title(loaded: Collection[str], ruleset: RulesetDecl) -> str:
     """The title of what is loaded: a ruleset, packs left out of it, packs added: ``ruleset-pack+pack``."""
-    named = [ruleset]
-    for one in reversed(ruleset.beside):  # a ruleset that a later one extends has no title of its own
-        if all(one.source.name not in {base.source.name for base in known.lineage} for known in named):
-            named.insert(0, one)
-    members = list(dict.fromkeys(name for one in named for name in one.members))
+    members = ruleset.members
     gone = [f"-{name}" for name in members if name not in loaded]
     added = [f"+{name}" for name in loaded if name not in members]
-    return "".join(["+".join(one.name.text for one in named), *gone, *added]).removeprefix("+")
+    return "".join([ruleset.name.text, *gone, *added]).removeprefix("+")
 
 
 def _check_needs(loaded: Mapping[str, PackDecl], reporter: Reporter) -> None:

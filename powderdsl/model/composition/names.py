@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
@@ -202,7 +203,7 @@ def in_order(names: Iterable[str], after: Mapping[str, Collection[str]]) -> list
     ordered: list[str] = []
     waiting = list(names)
     while waiting:
-        ready = next((name for name in waiting if not set(after[name]).intersection(waiting)), waiting[0])
+        ready = next((name for name in waiting if {*after[name]} & {*waiting} <= {name}), waiting[0])
         waiting.remove(ready)
         ordered.append(ready)
     return ordered
@@ -210,7 +211,7 @@ def in_order(names: Iterable[str], after: Mapping[str, Collection[str]]) -> list
 
 def needed_first(packs: Mapping[str, PackDecl]) -> list[str]:
     """The packs in load order, but each after the packs that it needs. Packs that need each other keep their order."""
-    return in_order(packs, {name: needs for name, (_, *needs) in needs_of(packs).items()})
+    return in_order(packs, needs_of(packs))
 
 
 # The order of passes
@@ -225,7 +226,7 @@ def order_passes(names: Names, reporter: Reporter) -> dict[str, PassDecl]:
             "PD508", f"{len(passes):,} passes", last, f"the limit is {MAX_PASSES}", helps=["load fewer packs"]
         )
         return passes
-    earlier: dict[str, dict[str, Span]] = {name: {} for name in passes}
+    earlier: dict[str, dict[str, Span]] = defaultdict(dict)
     for name, versions in names.versions.items():
         for decl in reversed(versions):
             for scalars, is_after in ((decl.after, True), (decl.before, False)):

@@ -153,6 +153,10 @@ class Typer:
                 return negation(self.condition(syntax.children[0], scope), syntax.span)
         return HANDLERS[syntax.kind](self, syntax, scope)
 
+    def operands(self, syntax: Syntax, scope: Scope) -> list[Operand]:
+        """The operands of its parts."""
+        return [self.evaluate(child, scope) for child in syntax.children]
+
     def spend(self, parts: int, span: Span) -> None:
         """Count parts of expressions. Raises Poisoned once a rule, or all of them, have too many."""
         if self._work > MAX_WORK:
@@ -532,7 +536,7 @@ class Typer:
     # Literals and lists
 
     def tuple_(self, syntax: Syntax, scope: Scope) -> Operand:
-        items = tuple(self.evaluate(child, scope) for child in syntax.children)
+        items = tuple(self.operands(syntax, scope))
         if all(isinstance(item, (SetOf, Absent)) for item in items):
             return self.set_of(Items(items), syntax.span)
         return Items(items)
@@ -544,7 +548,7 @@ class Typer:
     # Logic
 
     def logic(self, syntax: Syntax, scope: Scope) -> Operand:
-        operands = [self.evaluate(child, scope) for child in syntax.children]
+        operands = self.operands(syntax, scope)
         report_repeated(syntax.children, self.reporter)
         if all(isinstance(operand, (SetOf, Absent)) for operand in operands):
             sets = [set(self.set_of(operand, syntax.span).ids) for operand in operands]
@@ -555,7 +559,7 @@ class Typer:
         return (disjunction if syntax.kind == "or_" else conjunction)(flags, syntax.span)
 
     def compare(self, syntax: Syntax, scope: Scope) -> Operand:
-        operands = [self.evaluate(child, scope) for child in syntax.children]
+        operands = self.operands(syntax, scope)
         report_repeated(syntax.children, self.reporter)
         kinds = {kind_name(operand) or type(operand) for operand in operands}
         values: list[tuple[Expr, Span]] = []
@@ -575,7 +579,7 @@ class Typer:
         return conjunction(parts, syntax.span)
 
     def is_(self, syntax: Syntax, scope: Scope) -> Operand:
-        left, right = (self.evaluate(child, scope) for child in syntax.children)
+        left, right = self.operands(syntax, scope)
         result = holds(self, left, right, syntax)
         return result if syntax.kind in ("is_", "in_") else negation(result, syntax.span)
 

@@ -89,15 +89,14 @@ def _report_decided(passes: tuple[Pass, ...], silent: Sequence[Span], reporter: 
         for part in (*moment.values.values(), *_parts(moment.rules)):
             for node in part.walk():
                 if node.op in COMPARISONS.values() and node.span is not None:
-                    kinds = [arg.kind for arg in node.args]
+                    left, right = node.args
                     outcome = None
-                    if {kind.name for kind in kinds} == {"int"} and {arg.op for arg in node.args} != {
-                        "const"
-                    }:
-                        outcome = OPERATIONS[node.op].between(*((kind.lo, kind.hi) for kind in kinds))
+                    if left.kind.name == right.kind.name == "int" and not left.op == right.op == "const":
+                        bounds = (left.kind.lo, left.kind.hi), (right.kind.lo, right.kind.hi)
+                        outcome = OPERATIONS[node.op].between(*bounds)
                     outcomes.setdefault(node.span, set()).add(outcome)
-    for span, bounds in outcomes.items():
-        if bounds in ({(True, True)}, {(False, False)}) and not _inside_any(span, silent):
+    for span, known in outcomes.items():
+        if known in ({(True, True)}, {(False, False)}) and not _inside_any(span, silent):
             reporter.report(
                 "PD513", "this comparison decides nothing", span, "its result is the same in every world",
                 helps=["look at the bounds of both sides", "remove it, if it is meant so"],
