@@ -13,7 +13,6 @@ from powderdsl.schedule.types import (
     Schedule,
     Statement,
     combined,
-    constant,
     is_movement,
     map_each,
     map_values,
@@ -183,7 +182,7 @@ def _chosen(node: Node, arg: Node, graph: Graph) -> Node:
     """Where a choice reads one of its two values: its condition or the opposite; everywhere, if both are that value."""
     condition, yes, no = node.args
     if yes is no:
-        return constant(graph, FLAG, True)
+        return graph.flag(True)
     return condition if arg is yes else graph.node("not", FLAG, (condition,))
 
 

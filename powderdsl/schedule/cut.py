@@ -45,7 +45,6 @@ from powderdsl.schedule.types import (
     asked_masks,
     combined,
     connected,
-    constant,
     is_movement,
     leftover,
     load,
@@ -206,7 +205,7 @@ class _Cutter:
             self.ask(lazy, guard)
         question = self.answer([first.get(node.attr, node) for node in guard.when.args])
         self.emit(Compute((question,), place, over="words"))
-        nothing = constant(graph, FLAG)
+        nothing = graph.flag(False)
         olds = dict.fromkeys(mine, nothing)
         for out in guard.outs:  # a mask may be what a slot held before: nothing, where masks are skipped
             skipped = self.same.get(out.value.attr, out.value).attr in lazy
@@ -292,7 +291,7 @@ class _Cutter:
                 # A mask that the next ones need is stored before them, under its own name.
                 self.ensure(costly, place, costly)
             when = graph.node("some", ANSWER, tuple(dict.fromkeys(asked)))
-            self.guard(when, inner, dict.fromkeys(costly.values(), constant(graph, FLAG)), guard.place)
+            self.guard(when, inner, dict.fromkeys(costly.values(), graph.flag(False)), guard.place)
         self.known |= vars
 
     def computed(self, outs: Iterable[Out]) -> tuple[Out, ...]:

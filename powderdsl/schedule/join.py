@@ -24,7 +24,6 @@ from powderdsl.schedule.types import (
     choices,
     combined,
     connected,
-    constant,
     field_reads,
     in_order,
     is_zero,
@@ -82,7 +81,7 @@ def _where_read(schedule: Schedule) -> Schedule:
         for out in loop.outs:
             flags = in_order(asking.get(out.var.name, set()) & there)
             if loop.over == "cells" and out.var.type == REAL and out.var.means is None and flags:
-                args = graph.node("load", FLAG, (), flags[0]), out.value, constant(graph, REAL)
+                args = graph.node("load", FLAG, (), flags[0]), out.value, graph.real(0.0)
                 out = replace(out, value=graph.node("select", REAL, args))
             outs.append(out)
         there.update(loop.vars)
@@ -139,7 +138,7 @@ def _narrowed(loop: Compute, graph: Graph, slots: Mapping[str, tuple[str]]) -> C
             graph.node("live", FLAG, (field,), (dy, reach)) for field, dy, reach in _reads(loop.results)
         ]
         rest = [
-            constant(graph, out.var.type, bool(number) and out.var.type == FLAG)
+            graph.const(bool(number) and out.var.type == FLAG, out.var.type)
             for out, number in zip(loop.outs, numbers, strict=True)
         ]
     outs = tuple(replace(out, otherwise=other) for out, other in zip(loop.outs, rest, strict=True))

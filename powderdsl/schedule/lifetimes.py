@@ -23,7 +23,6 @@ from powderdsl.schedule.types import (
     Sync,
     Var,
     combined,
-    constant,
     field_reads,
     flat,
     in_order,
@@ -117,7 +116,7 @@ def _put_off(sweeps: Sweeps, after: set[str], namer: Namer, graph: Graph) -> Swe
         new = rewritten(one.values, graph, lambda node: olds.get(node.attr))
         loops.append(one.with_values(new))
     outs = tuple(replace(out, var=waiting.get(out.var.name, out.var)) for out in loop.outs)
-    zero = constant(graph, REAL)
+    zero = graph.real(0.0)
     region = combined("or", [graph.node("live", FLAG, (old,), (0, 0)) for old in olds.values()], graph)
     stored = tuple(Out(out.var, olds[out.var.name], zero) for out in lasting)
     last = Compute(stored, loop.place, region, over="cells", lag=max(free))
@@ -196,7 +195,7 @@ def swaps(schedule: Schedule) -> Schedule:
             planes.append(Out(moved, old, old))
             value = last = load(graph, moved)
             for mask in fresh:
-                value = graph.node("select", REAL, (mask, constant(graph, REAL), value))
+                value = graph.node("select", REAL, (mask, graph.real(0.0), value))
             outs.append(Out(out.var, value, last))
         move = Move(tuple(planes), loop.place, region=movers, op="swap", offset=offset)
         region = combined("or", fresh, graph)
@@ -394,7 +393,7 @@ def copies(pairs: Sequence[tuple[Var, Node]], graph: Graph) -> Iterator[Compute]
     floats = [(var, value) for var, value in pairs if var.type == REAL]
     if floats:
         lives = (graph.node("live", FLAG, (old,), (0, 0)) for _, old in floats if old.op == "load")
-        outs = tuple(Out(var, value, constant(graph, REAL)) for var, value in floats)
+        outs = tuple(Out(var, value, graph.real(0.0)) for var, value in floats)
         yield Compute(outs, region=combined("or", lives, graph), over="cells")
 
 

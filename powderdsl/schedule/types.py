@@ -247,11 +247,6 @@ def load(graph: Graph, var: Var) -> Node:
     return graph.node("load", var.type, (), var.name)
 
 
-def constant(graph: Graph, type: Type, value: float | bool = False) -> Node:
-    """The same value in all cells."""
-    return graph.node("const", type, (), value if type != REAL else float(value))
-
-
 def is_zero(value: Node) -> bool:
     """Whether a value is the constant 0."""
     return value.op == "const" and not value.attr
@@ -280,7 +275,7 @@ def combined(op: str, nodes: Iterable[Node], graph: Graph, type: Type = FLAG) ->
     result: Node | None = None
     for node in nodes:
         result = node if result is None else graph.node(op, result.type, (result, node))
-    return result or constant(graph, type, op == "and")
+    return result or graph.node("const", type, (), op == "and")
 
 
 def choices(value: Node) -> tuple[list[Node], Node]:

@@ -23,7 +23,6 @@ from powderdsl.schedule.types import (
     Var,
     asked_masks,
     combined,
-    constant,
     in_order,
     is_movement,
     is_zero,
@@ -296,7 +295,7 @@ def without(value: Node, planes: set[str], graph: Graph) -> Node:
 
     def rule(node: Node) -> Node | None:
         if node.op == "load" and node.attr in planes:
-            return constant(graph, FLAG)
+            return graph.flag(False)
         return simpler(graph, node.op, node.args, node.attr) if node.op in OPS else None
 
     return rewritten([value], graph, rule)(value)
