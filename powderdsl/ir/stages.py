@@ -83,8 +83,6 @@ def fold(node: Node, build: Graph) -> Node | None:
             return a
         case "add", (Node("const", attr=0), b), _:
             return b
-        case "quotient", (a, Node("const", attr=1)), _:
-            return a
         case "mod", (x,), modulus if x.type.lo >= 0 and x.type.hi < modulus:
             return x
         case "div", (a, Node("const", attr=b)), _ if b and frexp(abs(b))[0] == 0.5:
@@ -93,8 +91,6 @@ def fold(node: Node, build: Graph) -> Node | None:
             return build.select(c, a, d)  # select(c, a, select(c, b, d)) = select(c, a, d)
         case "swap" | "arrive", (_, Node("const", attr=False), rest), _:  # nothing moves
             return rest
-        case "swap" | "arrive", (Node("const") as content, _, rest), _ if rest is content:
-            return rest  # everything is alike
         case "shift", (Node("coordinate", attr=("step", *_)) as a,), (*_, True):
             return a
         case "shift", (Node("const" | "param") as a,), (dy, dx, wraps):
@@ -128,8 +124,6 @@ def resolve(node: Node, build: Graph) -> Node | None:
         case "shift", (Node("table", _, (x,), values),), (dy, dx, True):
             # shift(table(x)) = table(shift(x)), so that comparisons see the table
             return build.derive("table", build.shift(x, (dy, dx)), attr=values)
-        case "in_set", (Node("table") as a,), members:
-            return _where(a, members.__contains__, build)
         case "eq" | "lt" | "le", (Node("table", _, (x,), values) as a, Node("table") as b), _:
             # a < b = (a == v and v < b), or the same for another value v of a
             known = sorted(set(values[max(x.type.lo, 0) : x.type.hi + 1]))

@@ -48,7 +48,6 @@ from powderdsl.schedule.types import (
     is_movement,
     leftover,
     load,
-    loaded,
     map_values,
 )
 
@@ -156,18 +155,13 @@ class _Cutter:
                 self.emit(Compute((copy,), loop.place, over="words"))
 
     def hoist_comparisons(self, masks: Compute) -> None:
-        """Compute the comparisons of masks before the guard, with all others that the same loop can compute."""
+        """Compute the comparisons of masks before the guard."""
         asked: list[Node] = []
         for value in masks.results:
             for node in walk(value):
                 if is_comparison(node) and not self.have(node) and not self.have(self.comparisons[node]):
                     asked.append(self.comparisons[node])
-        if asked:
-            self.ensure(self.needs_of(dict.fromkeys(asked)), masks.place)
-            for node in self.comparisons.values():
-                if not self.have(node) and not self.needs(node) and self.there.issuperset(loaded([node])):
-                    asked.append(node)
-            self.ensure(asked, masks.place)
+        self.ensure(asked, masks.place)
 
     # Masks and guards
 

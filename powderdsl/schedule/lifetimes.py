@@ -22,6 +22,7 @@ from powderdsl.schedule.types import (
     Sweeps,
     Sync,
     Var,
+    backwards,
     combined,
     field_reads,
     flat,
@@ -46,31 +47,25 @@ def release(schedule: Schedule) -> Schedule:
     """
     namer, graph = Namer(schedule), schedule.graph
 
-    def block(body: Block, live: set[str]) -> Block:
-        """The statements with releases. `live`: the variables that are read after them."""
-        lives = [live]
-        for statement in reversed(body):
-            lives.append(lives[-1].difference(statement.vars) | statement.reads)
-        result: list[Statement] = []
-        for statement, after in zip(body, lives[-2::-1], strict=True):
-            used = statement.reads | {name for name, var in statement.vars.items() if var.type != ANSWER}
-            if isinstance(statement, Guard):
-                # Outer variables are released after the guard, whether its body runs or not.
-                statement = replace(statement, body=block(statement.body, after | used))
-            elif isinstance(statement, Move):
-                statement = _in_place(statement, after)
-            elif isinstance(statement, Compute) and statement.region is not None:
-                statement = _updated(statement, after)
-            elif isinstance(statement, Sweeps) and keeps(statement.body[0]):
-                statement = replace(statement, body=(_updated(statement.body[0], after),))
-            elif isinstance(statement, Sweeps):
-                statement = _overtaken(_put_off(statement, after, namer, graph), after)
-            result.append(statement)
-            if gone := used - after - statement.ended:
-                result.append(Release(frees=tuple(in_order(gone))))
-        return tuple(result)
+    def change(statement: Statement, after: set[str]) -> list[Statement]:
+        used = statement.reads | {name for name, var in statement.vars.items() if var.type != ANSWER}
+        if isinstance(statement, Guard):
+            # Outer variables are released after the guard, whether its body runs or not.
+            body, _ = backwards(statement.body, after | used, change)
+            statement = replace(statement, body=body)
+        elif isinstance(statement, Move):
+            statement = _in_place(statement, after)
+        elif isinstance(statement, Compute) and statement.region is not None:
+            statement = _updated(statement, after)
+        elif isinstance(statement, Sweeps) and keeps(statement.body[0]):
+            statement = replace(statement, body=(_updated(statement.body[0], after),))
+        elif isinstance(statement, Sweeps):
+            statement = _overtaken(_put_off(statement, after, namer, graph), after)
+        gone = used - after - statement.ended
+        return [statement, Release(frees=tuple(in_order(gone)))] if gone else [statement]
 
-    return replace(schedule, body=block(schedule.body, set(loaded(schedule.results))))
+    body, _ = backwards(schedule.body, set(loaded(schedule.results)), change)
+    return replace(schedule, body=body)
 
 
 def _in_place(move: Move, after: set[str]) -> Move:

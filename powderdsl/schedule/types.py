@@ -446,21 +446,31 @@ def read_by(body: Block) -> set[str]:
     return set[str]().union(*[statement.reads for statement in body]) - made_in(body).keys()
 
 
+def backwards(
+    body: Block, live: set[str], change: Callable[[Statement, set[str]], Sequence[Statement]]
+) -> tuple[Block, set[str]]:
+    """A block in which other statements replace each, given the variables that are read after it; and what the block reads.
+
+    `live`: the variables that are read after the block.
+    """
+    result: list[Statement] = []
+    for statement in reversed(body):
+        if statements := change(statement, live):
+            live = live.difference(statement.vars) | statements[0].reads
+            result += reversed(statements)
+    return tuple(reversed(result)), live
+
+
 def without_unread(schedule: Schedule) -> Schedule:
     """The schedule without unread variables; guards keep only what is read after them."""
 
-    def block(body: Block, live: set[str]) -> tuple[Block, set[str]]:
-        """The statements that are needed if some variables are read after them, and what is read before them."""
-        result: list[Statement] = []
-        for statement in reversed(body):
-            outs = tuple([out for out in statement.outs if out.var.name in live])
-            inner, _ = block(statement.body, live)
-            if outs or Forget in map(type, (statement, *inner)):
-                result.append(replace(statement, outs=outs, body=inner))
-                live = live.difference(statement.vars) | result[-1].reads
-        return tuple(reversed(result)), live
+    def change(statement: Statement, live: set[str]) -> list[Statement]:
+        outs = tuple([out for out in statement.outs if out.var.name in live])
+        inner, _ = backwards(statement.body, live, change)
+        used = outs or Forget in map(type, (statement, *inner))
+        return [replace(statement, outs=outs, body=inner)] if used else []
 
-    body, live = block(schedule.body, set(loaded(schedule.results)))
+    body, live = backwards(schedule.body, set(loaded(schedule.results)), change)
     finds = tuple((slot, var) for slot, var in schedule.finds if var.name in live)
     return replace(schedule, body=body, finds=finds)
 
