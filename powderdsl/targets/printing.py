@@ -97,11 +97,10 @@ class WordText(Values[str]):
     type: str
 
     def named(self, node: Node, value: str) -> str:
-        return value if value.isidentifier() else self.name(value)
-
-    def name(self, text: str) -> str:
+        if value.isidentifier():
+            return value
         name = self.fresh("t")
-        self.lines.append(f"const {self.type} {name} = {text};")
+        self.lines.append(f"const {self.type} {name} = {value};")
         return name
 
 

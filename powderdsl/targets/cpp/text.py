@@ -254,7 +254,7 @@ class _Words(WordText):
     def clean(self, node: Node) -> str:
         """The value with zeros beyond the grid's width."""
         name = self.of(node)
-        return name if node.op in CLEAN else self.name(f"{name} & valid")
+        return name if node.op in CLEAN else self.named(node, f"{name} & valid")
 
     def node(self, node: Node, args: Sequence[str] = ()) -> str:
         if (draw := limited_draw(node)) is not None:
@@ -270,7 +270,7 @@ class _Words(WordText):
             case "when":
                 return self.lazy(node)
             case "const":
-                return self.name("valid" if attr else "splat(0)")
+                return "valid" if attr else "splat(0)"
             case "param":
                 return f"c.param_bits[{self.layout.param_planes[param_key(node)]}]"
             case "coordinate" if attr[0] == "step":
