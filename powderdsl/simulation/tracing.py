@@ -692,33 +692,21 @@ def _marked(ruleset: Ruleset) -> Ruleset:
     for pass_ in ruleset.passes:
         moments = []
         for moment in pass_.moments:
-            numbered = list(zip(moment.rules, numbers, strict=False))
-            if moment.policy in ("prove", "overwrite"):  # all rules happen where their conditions hold
-                marks = [
-                    (arrives, _mark(number, offset, rule, rule.mask))
-                    for rule, number in numbered
-                    for arrives, offset in _element_writes(rule)
-                ]
-                marks.sort(key=lambda mark: mark[0])
-                rules = (*moment.rules, *(mark for _, mark in marks))
-            else:  # of the cells that rules claim each has one writer
-                rules = tuple(_marked_rule(rule, number) for rule, number in numbered)
-            moments.append(replace(moment, rules=rules))
+            rules, late = list(moment.rules), list[tuple[bool, Assign]]()
+            for place, rule in enumerate(moment.rules):
+                number, writes = next(numbers), _element_writes(rule)
+                mark = Expr("const", integer(number, number), value=number)
+                if moment.policy in ("prove", "overwrite"):  # all rules happen where their conditions hold
+                    late += [
+                        (arrives, Assign(SLOT, at, ":=", mark, rule.mask, rule.span))
+                        for arrives, at in writes
+                    ]
+                elif not isinstance(rule, Assign):  # of the cells that rules claim each has one writer
+                    marks = (Assign(SLOT, at, ":=", mark, TRUE, rule.span) for _, at in writes)
+                    rules[place] = replace(rule, effects=(*rule.effects, *marks))
+            rules += [mark for _, mark in sorted(late, key=lambda mark: mark[0])]
+            moments.append(replace(moment, rules=tuple(rules)))
         passes.append(replace(pass_, moments=tuple(moments)))
     kind = integer(0, max(1, next(numbers) - 1))
     slot = Field(SLOT, kind, 0, "place", True, None, ruleset.elements[0].pack, ruleset.elements[0].span)
     return replace(ruleset, fields=(*ruleset.fields, slot), passes=tuple(passes))
-
-
-def _marked_rule(rule: Rule, number: int) -> Rule:
-    """The rule with effects that leave its number in every cell whose element it writes."""
-    if isinstance(rule, Assign):
-        return rule
-    marks = [_mark(number, offset, rule) for _, offset in _element_writes(rule)]
-    return replace(rule, effects=(*rule.effects, *marks))
-
-
-def _mark(number: int, place: Offset, rule: Rule, mask: Expr = TRUE) -> Assign:
-    """The assignment of a rule's number to a cell that it writes."""
-    value = Expr("const", integer(number, number), value=number)
-    return Assign(SLOT, place, ":=", value, mask, rule.span)
