@@ -162,9 +162,11 @@ class _ExampleReader:
         always = tuple(typer.condition(syntax, scope) for syntax in decl.always)
         often = []
         for change, chance in decl.often:
-            before, after = (typer.condition(part, scope) for part in change.children)
+            before, after = change.children
             part = Fraction(typer.constant(chance, CHANCE, scope))  # type: ignore[arg-type]  # a chance is a fraction
-            often.append(Often(before, after, part, change.span))
+            often.append(
+                Often(typer.condition(before, scope), typer.condition(after, scope), part, change.span)
+            )
         drawn = set("".join((*given, *(expect or ()))))
         words = sorted(meaning for character, meaning in self.legend.items() if character in drawn)
         words += [grid.name for grid in (*fields, *expect_fields)]

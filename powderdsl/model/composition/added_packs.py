@@ -53,10 +53,17 @@ class Difference:
 
 def pack_words(pack: PackDecl) -> Iterator[str]:
     """Every name in a pack's rules, sets, invariants, tests and color ramps."""
-    yield from (one.ramp.field.word.rpartition(".")[2] for one in pack.entries if one.ramp)
-    lines = [*pack.lines, *pack.invariants, *(one.members for one in pack.sets)]
-    lines += [line for test in pack.tests for line in test.always]
-    lines += [decl.of for decl in pack.fields if decl.of is not None]
+    for entry in pack.entries:
+        if entry.ramp is not None:
+            yield entry.ramp.field.word.rpartition(".")[2]
+    lines = [*pack.lines, *pack.invariants]
+    for named_set in pack.sets:
+        lines.append(named_set.members)
+    for test in pack.tests:
+        lines += test.always
+    for decl in pack.fields:
+        if decl.of is not None:
+            lines.append(decl.of)
     for line in lines:
         yield from words_of(line)
 

@@ -56,8 +56,9 @@ def _blocks(composition: Composition, passes: tuple[Pass, ...]) -> list[list[str
     blocks: list[list[str]] = [[] for _ in range(max(place.values()) + 1)]
     first: dict[str, int] = {}
     for pass_, moment in substeps(passes):
-        for write in (write for rule in moment.rules for write in writes_of(rule)):
-            first[write.field] = min(place[pass_.pack], first.get(write.field, place[pass_.pack]))
+        for rule in moment.rules:
+            for write in writes_of(rule):
+                first[write.field] = min(place[pass_.pack], first.get(write.field, place[pass_.pack]))
     for name, prop in composition.properties.items():
         if prop.stored:
             blocks[max(first.get(name, 0), place[prop.pack])].append(name)

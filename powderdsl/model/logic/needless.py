@@ -392,18 +392,21 @@ def overridden_ids(passes: tuple[Pass, ...], names: Sequence[str], facts: Facts)
 
     A value of its own may fulfill the condition of another such rule, so this continues until nothing is added.
     """
+    writes: list[tuple[Assign, Lets]] = []
+    for _, moment in substeps(passes):
+        for rule in moment.rules:
+            writes += [(write, moment.values) for write in writes_of(rule) if write.field in names]
     found: dict[str, frozenset[int]] = {}
     more: dict[str, frozenset[int]] = {name: frozenset() for name in names}
     while more != found:
         found = more.copy()
         stored = {name: replace(facts.properties[name], stored=ids) for name, ids in found.items()}
         now = replace(facts, properties={**facts.properties, **stored})
-        for _, moment in substeps(passes):
-            for write in (write for rule in moment.rules for write in writes_of(rule) if write.field in more):
-                for number in facts.ids:
-                    question = (member(ELEMENT_HERE, (number,)), write.offset), (write.mask, HERE)
-                    if number not in more[write.field] and satisfiable(now, question, moment.values):
-                        more[write.field] |= {number}
+        for write, lets in writes:
+            for number in facts.ids:
+                question = (member(ELEMENT_HERE, (number,)), write.offset), (write.mask, HERE)
+                if number not in more[write.field] and satisfiable(now, question, lets):
+                    more[write.field] |= {number}
     return found
 
 
