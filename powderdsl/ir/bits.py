@@ -10,7 +10,7 @@ import operator
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cache, lru_cache, reduce
+from functools import cache, lru_cache, partial, reduce
 from itertools import permutations
 from typing import Any, NamedTuple
 
@@ -342,7 +342,7 @@ def plane_slots(slots: Iterable[SlotType]) -> tuple[SlotType, ...]:
 def lower_bits(program: Program) -> Program:
     """The program on bit planes. Raises NotBits for the first pass that they cannot carry."""
     slots = plane_slots(program.slots)
-    return replace(program, slots=slots, passes=tuple([lower_pass(program, p) for p in program.passes]))
+    return replace(program, slots=slots, passes=tuple(map(partial(lower_pass, program), program.passes)))
 
 
 def lower_pass(program: Program, pass_: PassGraph) -> PassGraph:

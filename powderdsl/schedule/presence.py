@@ -110,8 +110,11 @@ def _computed(body: Iterable[Statement]) -> dict[str, Node]:
 def _only_swaps(guard: Guard, bits: Container[str]) -> bool:
     """Whether a guard preserves the count of each element: it swaps cells, or writes no elements."""
     values = _computed(guard.body)
-    changed = [(values[name], old) for name, old in guard.olds.items() if name in bits]
-    return all(value.op == "swap" and value.args[0] is old is value.args[2] for value, old in changed)
+    return all(
+        values[name].op == "swap" and values[name].args[0] is old is values[name].args[2]
+        for name, old in guard.olds.items()
+        if name in bits
+    )
 
 
 def _pass_asks(schedule: Schedule, bits: dict[str, int]) -> Node | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 
 from powderdsl.ir.bits import simpler
 from powderdsl.ir.ops import FLAG, OPS, Graph, Node, conjuncts, ordered, taken
@@ -218,7 +219,7 @@ def updates(schedule: Schedule) -> Schedule:
     Outside the guard, `release` finds out that most old planes end there, so that the words are changed in place.
     `if any m: b = a & ~m, else b = a` → `loop words over m: b = a & ~m, else a`.
     """
-    return map_each(schedule, Guard, lambda guard: _taken_out(guard, schedule.graph))
+    return map_each(schedule, Guard, partial(_taken_out, graph=schedule.graph))
 
 
 def _taken_out(guard: Guard, graph: Graph, *, near: bool = True) -> list[Statement]:
