@@ -239,8 +239,9 @@ def test_show_prints_ramps(stove: Path) -> None:
         one["name"]: one
         for one in json.loads(run_command("show", "core+stove.yaml", "--json").stdout)["elements"]
     }
-    assert data["stove"]["color_by"] == "#303030 -> #FF3000 by heat 0..9"
-    assert data["wall"]["color_by"] == ""
+    ramp = {"field": "heat", "from": "#303030", "to": "#FF3000", "over": [0, 9]}
+    assert data["stove"]["color_by"] == ramp
+    assert data["wall"]["color_by"] is None
     assert (
         "#303030 #303030 -> #FF3000 by heat 0..9"
         in run_command("compile", "core+stove.yaml", "--emit", "model").stdout
