@@ -20,7 +20,7 @@ def test_what_runs_on_the_cpu_is_refused_elsewhere(backend: str) -> None:
 
 def test_other_devices_run_tensors() -> None:
     program = make_program(powderdsl.load("life"), "auto", Tensors(torch.device("meta")))
-    assert program.running == "torch"
+    assert program.name == "torch"
 
 
 def test_without_a_compiler_native_names_what_needs_none(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -187,17 +187,17 @@ def test_a_link_stays_a_link_and_its_target_is_written(tmp_path):
         temporary.write_text("new")
     assert (tmp_path / "x.txt").is_symlink()
     assert (tmp_path / "far" / "x.txt").read_text() == "new"
-    (tmp_path / "y.txt").symlink_to("far/new.txt")  # which is not there yet
-    result = command("compile", "core", "--emit", "ir", "--out", tmp_path / "y.txt")
+    (tmp_path / "y.wasm").symlink_to("far/new.wasm")  # which is not there yet
+    result = command("export", "core", "--out", tmp_path / "y.wasm")
     assert result.exit_code == 0
-    assert (tmp_path / "far" / "new.txt").read_text()
-    assert (tmp_path / "y.txt").is_symlink()
+    assert (tmp_path / "far" / "new.wasm").read_bytes()
+    assert (tmp_path / "y.wasm").is_symlink()
 
 
 @pytest.mark.parametrize("kind", ["pipe", "folder", "device", "socket"])
 def test_nothing_but_files_is_replaced(kind, tmp_path):
-    path = irregular(tmp_path, ".txt")[kind]
-    result = command("compile", "core", "--emit", "ir", "--out", path)
+    path = irregular(tmp_path, ".wasm")[kind]
+    result = command("export", "core", "--out", path)
     assert result.exit_code == 2
     assert "PD613" in result.stderr
     assert "it is not a regular file" in result.output
@@ -205,5 +205,5 @@ def test_nothing_but_files_is_replaced(kind, tmp_path):
 
 
 def test_a_loop_of_links_is_not_written(tmp_path):
-    (tmp_path / "x.txt").symlink_to("x.txt")
-    assert command("compile", "core", "--emit", "ir", "--out", tmp_path / "x.txt").exit_code == 2
+    (tmp_path / "x.wasm").symlink_to("x.wasm")
+    assert command("export", "core", "--out", tmp_path / "x.wasm").exit_code == 2

@@ -150,7 +150,7 @@ def test_worlds_for_tests_are_no_worlds_of_training(dunes: str) -> None:
     assert len(set(seeds.tolist())) == 24
     assert int(seeds.min()) >= TEST_SEEDS
     assert (seeds.view(8, 3) % 8 == torch.arange(8)[:, None]).all()
-    with pytest.raises(ValueError, match="`states` is 4294967297"):
+    with pytest.raises(ValueError, match="`states` must be an integer from 1 to 4,294,967,296"):
         DataConfig(task=dunes, states=TEST_SEEDS + 1)
 
 
