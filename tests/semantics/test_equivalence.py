@@ -8,7 +8,7 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.simulation.simulator import compile
 from powderdsl.testing.generators.cases import load_text
 from powderdsl.testing.mutation.equivalence import proven_equal
-from powderdsl.testing.mutation.judging import Invalid, Original, meaning
+from powderdsl.testing.mutation.judging import Original, meaning
 from powderdsl.testing.properties.running import first_difference, run_sample
 
 HEAD = """\
@@ -131,10 +131,13 @@ def claimed(rules: str, most: int):
     original = Original.of(rules)
     for mutant in original.mutants()[::-1][:most]:
         try:
-            ruleset, _ = original.mutated(mutant)
-        except (Invalid, CompileError):
+            mutated = original.mutated(mutant)
+        except CompileError:
             continue
-        if meaning(ruleset) != original.meaning and proven_equal(original.ruleset, ruleset):
+        if mutated is None:
+            continue
+        ruleset, _ = mutated
+        if meaning(ruleset) != meaning(original.ruleset) and proven_equal(original.ruleset, ruleset):
             sim = compile(ruleset, backend="wasm")
             wrong = any(
                 first_difference(batch.states, run_sample(sim, batch.sample, batch.steps)[0]).any()
