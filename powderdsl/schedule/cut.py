@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import pairwise
 from typing import Literal
 
 from powderdsl.ir.ops import FLAG, REAL, Node, Offset, conjunctions, conjuncts, needed, ordered, taken, walk
@@ -42,7 +43,6 @@ from powderdsl.schedule.types import (
     Schedule,
     Statement,
     Var,
-    asked_masks,
     combined,
     connected,
     is_movement,
@@ -96,8 +96,11 @@ class _Cutter:
         """At how many neighbors each node is read."""
         self.shared: Counter[Node] = Counter()
         """In how many masks each conjunct occurs: if such a plane is empty, so are all these masks."""
-        for _, masks in asked_masks(schedule.body):
-            self.shared.update({part for out in masks for part in conjunctions(out.value)})
+        for masks, guard in pairwise(schedule.body):
+            if isinstance(masks, Compute) and isinstance(guard, Guard):
+                asked = {node.attr for node in guard.when.args}
+                values = [out.value for out in masks.outs if out.var.name in asked]
+                self.shared.update({part for value in values for part in conjunctions(value)})
         self.split_masks: dict[Node, Node] = {}
         """Masks whose first parts are stored: the stored parts and the rest."""
 

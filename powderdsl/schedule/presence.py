@@ -143,12 +143,6 @@ def _pass_asks(schedule: Schedule, bits: dict[str, int]) -> Node | None:
     return _Needs(schedule, bits, {}).asked([values.get(mask.attr, mask) for mask in masks])
 
 
-def when_present(masks: list[Node], schedule: Schedule) -> Node | None:
-    """An answer without which none of some masks holds anywhere; None if none is known."""
-    bits = _element_bits(schedule)
-    return _Needs(schedule, bits, _times(schedule, bits)).asked(masks) if bits else None
-
-
 def asked_ids(schedule: Schedule) -> int:
     """All ids whose presence a schedule tests."""
     nodes = ordered(filter(None, [*schedule.values, schedule.when]))
@@ -195,7 +189,6 @@ class _Needs:
         exact = together and all(arg.exact for arg in args)
         times = [ALWAYS, *(arg.time for arg in args if together and arg.cell != self.everything)]
         cell: int = self.everything
-        cell = self.everything
         needs: Sets = ()
         match node.op:
             case "load" if node.attr in self.bits:

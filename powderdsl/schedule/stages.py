@@ -10,14 +10,14 @@ from typing import Literal
 from powderdsl.ir.ops import PassGraph
 from powderdsl.schedule.costs import Costs, conditions, thresholds
 from powderdsl.schedule.cut import cut
-from powderdsl.schedule.floats import chosen, late, led
+from powderdsl.schedule.floats import late, led
 from powderdsl.schedule.join import ask_regions, join, narrow
 from powderdsl.schedule.lifetimes import release, swaps
 from powderdsl.schedule.lower import lower
 from powderdsl.schedule.presence import presence
 from powderdsl.schedule.types import Schedule, without_unread
 from powderdsl.schedule.verify import verify
-from powderdsl.schedule.words import early, empty, updates
+from powderdsl.schedule.words import empty, updates
 
 
 @dataclass(frozen=True)
@@ -36,13 +36,10 @@ _CPU_COSTS, _CUDA_COSTS = Costs(gates=6, floats=2, by_rows=True), Costs(gates=24
 _STAGES = (
     Stage("thresholds", thresholds, "which draws are compared with a parameter"),
     Stage("late", late, "floats are computed where they are used"),
-    Stage("chosen", chosen, "which floats at neighbors follow from a flag; before `cut`, which would store them", "cpu"),
     Stage("led", led, "which comparisons are computed only where another one holds"),
     Stage("conditions", conditions, "where the result of each draw matters"),
     Stage("presence", presence,
           "which elements must be present for work to be done; before `cut`, which takes masks apart", "cpu"),
-    Stage("early", early,
-          "which parts of masks are computed once for several; after `presence`, which reads whole masks", "cpu"),
     Stage("cut", partial(cut, costs=_CPU_COSTS),
           "where loops over rows begin and end, and which movements happen in place", "cpu"),
     Stage("cut", partial(cut, costs=_CUDA_COSTS),

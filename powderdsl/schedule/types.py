@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise
 from typing import Any, Literal, Self, TypeVar
 
 from powderdsl.ir.ops import FLAG, REAL, Graph, Item, Node, Type, ordered, walk
@@ -338,14 +337,6 @@ def variables(schedule: Schedule) -> dict[str, Var]:
     """All variables by name."""
     found = {var.name: var for _, var in schedule.finds}
     return found | made_in(schedule.body)
-
-
-def asked_masks(body: Block) -> Iterator[tuple[int, list[Out]]]:
-    """Guards with masks in the statement before them: the position of that statement, and these masks."""
-    for i, (masks, guard) in enumerate(pairwise(body)):
-        if isinstance(masks, Compute) and isinstance(guard, Guard):
-            asked = {node.attr for node in guard.when.args}
-            yield i, [out for out in masks.outs if out.var.name in asked]
 
 
 def map_blocks(schedule: Schedule, change: Callable[[Block], Block]) -> Schedule:

@@ -1,129 +1,33 @@
-"""Loops over words: parts of masks that are shared, planes that are empty, and planes that change in few words."""
+"""Loops over words: planes that are empty, and planes that change in few words."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
 from powderdsl.ir.bits import simpler
-from powderdsl.ir.ops import FLAG, OPS, Graph, Node, conjuncts, ordered, taken
-from powderdsl.schedule.costs import DRAWS, LOGIC, UNIFORM
-from powderdsl.schedule.floats import is_comparison
-from powderdsl.schedule.presence import when_present
+from powderdsl.ir.ops import FLAG, OPS, Graph, Node, conjuncts, ordered
+from powderdsl.schedule.costs import LOGIC, UNIFORM
 from powderdsl.schedule.types import (
     ANSWER,
     Compute,
     Guard,
     Move,
-    Namer,
     Out,
     Schedule,
     Statement,
     Var,
-    asked_masks,
     combined,
     in_order,
-    is_movement,
     is_zero,
-    load,
     loaded,
     made_in,
     map_each,
     read_by,
     read_elsewhere,
     rewritten,
-    with_values,
 )
-
-WORTH = 3
-"""How many gates of a mask must be shared with others for a plane of their own, and how many masks must share gates."""
-
-
-Mask = tuple[int, Node, list[Node]]
-"""The number of a statement, a mask that it computes, and conjuncts of the mask that are known early."""
-
-
-def early(schedule: Schedule) -> Schedule:
-    """Masks that share gates, which no statement between them changes, get planes with those gates, from one loop.
-
-    `m = a & b & c; if any m: a' = …; n = a' & ~b & c` → `s = b & c, t = ~b & c; m = a & s; …; n = a' & t`.
-    """
-    graph, namer = schedule.graph, Namer(schedule)
-    known: dict[str, int] = {}
-    users: dict[Node, int] = {}
-    """The first statement that computes each value."""
-    for i, statement in enumerate(schedule.body):
-        known |= dict.fromkeys(statement.vars, i)
-        users = dict.fromkeys(ordered(statement.values), i) | users
-    groups: dict[int, list[Mask]] = {}
-    """Masks with the conjuncts that depend on the same statement last."""
-    for i, masks in asked_masks(schedule.body):
-        for out in masks:
-            parts: dict[int, list[Node]] = {}
-            for part in conjuncts(out.value):
-                since = -1
-                for node in ordered([part]):
-                    if node.op in DRAWS or is_movement(node):
-                        break
-                    since = max(since, known.get(node.attr, -1))
-                else:
-                    parts.setdefault(since, []).append(part)
-            for since, nodes in parts.items():
-                groups.setdefault(since, []).append((i, out.value, nodes))
-    before: dict[int, list[Out]] = {}
-    planes: dict[Node, dict[Node, Node]] = {}
-    """By mask: the loads of planes, by the parts that they replace."""
-    for group in filter(None, map(_shared, groups.values())):
-        outs: dict[frozenset[Node], Out] = {}
-        for _, mask, nodes in group:
-            if (key := frozenset(nodes)) not in outs:
-                outs[key] = Out(namer.var(FLAG), combined("and", nodes, graph))
-            planes.setdefault(mask, {}).update(dict.fromkeys(nodes, load(graph, outs[key].var)))
-        before.setdefault(min(users[mask] for _, mask, _ in group), []).extend(outs.values())
-    if not planes:
-        return schedule
-    new: dict[Node, Node] = {}
-    for node in ordered(schedule.values):
-        new[node] = graph.node(node.op, node.type, tuple([new[arg] for arg in node.args]), node.attr)
-        if node in planes:
-            rest = [new[part] for part in conjuncts(node) if part not in planes[node]]
-            new[node] = combined("and", dict.fromkeys([*planes[node].values(), *rest]), graph)
-    changed = with_values(schedule, new.__getitem__)
-    body: list[Statement] = []
-    for i, statement in enumerate(changed.body):
-        if i in before:
-            loop = Compute(tuple(before[i]))
-            body.append(replace(loop, when=when_present(loop.results, schedule)))
-        body.append(statement)
-    return replace(changed, body=tuple(body))
-
-
-def _gates(parts: Iterable[Node]) -> Iterator[Node]:
-    """The operations on flags in the cell itself, and comparisons. What is read at neighbors is stored anyway."""
-    stack = [*parts]
-    for node in taken(stack):
-        if is_comparison(node):
-            yield node
-        elif node.op in LOGIC:
-            yield node
-            stack += node.args
-
-
-def _shared(group: Sequence[Mask]) -> list[Mask]:
-    """The masks of a group with the parts that share gates with other masks, if these are worth a plane."""
-    count: Counter[Node] = Counter()
-    for _, _, parts in group:
-        count.update(_gates(parts))
-    shared = {gate for gate, masks in count.items() if masks > 1}
-    worthy: list[Mask] = []
-    for place, mask, parts in group:
-        parts = [part for part in parts if not shared.isdisjoint(_gates([part]))]
-        if len(shared.intersection(_gates(parts))) >= WORTH:
-            worthy.append((place, mask, parts))
-    return worthy if len({place for place, _, _ in worthy}) >= WORTH else []
-
 
 MAX_CONDITIONS = 4
 """More sets of planes than this are not worth testing."""
