@@ -35,6 +35,7 @@ from powderdsl.schedule.types import (
     planes_at_neighbors,
     read_elsewhere,
     reads_of,
+    rewritten,
     without_unread,
 )
 
@@ -44,6 +45,7 @@ def release(schedule: Schedule) -> Schedule:
 
     `swap by m: b = a`, where `a` is not read again → `b = a into a`; the same where a loop over words changes some words.
     """
+    namer, graph = Namer(schedule), schedule.graph
 
     def change(statement: Statement, after: set[str]) -> list[Statement]:
         used = statement.reads | {name for name, var in statement.vars.items() if var.type != ANSWER}
@@ -58,7 +60,7 @@ def release(schedule: Schedule) -> Schedule:
         elif isinstance(statement, Sweeps) and keeps(statement.body[0]):
             statement = replace(statement, body=(_updated(statement.body[0], after),))
         elif isinstance(statement, Sweeps):
-            statement = _overtaken(statement, after)
+            statement = _overtaken(_put_off(statement, after, namer, graph), after)
         gone = used - after - statement.ended
         return [statement, Release(frees=tuple(in_order(gone)))] if gone else [statement]
 
@@ -91,22 +93,55 @@ def _updated(loop: Compute, after: set[str]) -> Compute:
     return replace(loop, outs=tuple(outs))
 
 
-def _overtaken(sweeps: Sweeps, after: set[str]) -> Sweeps:
-    """Loops with fields that overwrite a field which earlier loops of the part have read in all rows so far."""
+def _put_off(sweeps: Sweeps, after: set[str], namer: Namer, graph: Graph) -> Sweeps:
+    """Choices whose result waits for a loop that stores it over their old fields, when no row is missing any more.
+
+    `loop choices: b = m ? f(a[-1,0]) : a` → `b'` in its place, and `loop cells, 2 behind: b = b' into a`.
+    """
+    loop = sweeps.body[0]
+    lasting = [out for out in loop.outs if out.var.name not in sweeps.frees]
+    free = [lag for lag, reader in _last_reads(sweeps, after).values() if reader == 0]
+    choices = loop.over == "choices" and loop.region is not None and not sweeps.body[-1].part
+    if not choices or not lasting or len(free) < len(lasting):
+        return sweeps
+    waiting = {out.var.name: namer.var(REAL) for out in lasting}
+    olds = {name: load(graph, var) for name, var in waiting.items()}
+    loops = []
+    for one in sweeps.body:
+        new = rewritten(one.values, graph, lambda node: olds.get(node.attr))
+        loops.append(one.with_values(new))
+    outs = tuple(replace(out, var=waiting.get(out.var.name, out.var)) for out in loop.outs)
+    zero = graph.real(0.0)
+    region = combined("or", [graph.node("live", FLAG, (old,), (0, 0)) for old in olds.values()], graph)
+    stored = tuple(Out(out.var, olds[out.var.name], zero) for out in lasting)
+    last = Compute(stored, loop.place, region, over="cells", lag=max(free))
+    return Sweeps(
+        frees=(*sweeps.frees, *(var.name for var in waiting.values())),
+        body=(replace(loops[0], outs=outs), *loops[1:], last),
+    )
+
+
+def _last_reads(sweeps: Sweeps, after: set[str]) -> dict[str, tuple[int, int]]:
+    """By field that may be written over: the least lag with which that can be done to a row, and its last reader."""
     reads: dict[str, tuple[int, int]] = {}
-    """By field: the least lag with which a row of it may be written over, and its last reader."""
-    needed = after.union(sweeps.vars)
+    kept = after.union(sweeps.vars)
     for number, loop in enumerate(sweeps.body):
         for read in field_reads(loop):
             if loop.part > 0 or (read.live and read.dy):
-                needed.add(read.name)
+                kept.add(read.name)
             reads[read.name] = max(reads.get(read.name, (0, 0))[0], loop.lag - read.dy + 1), number
+    return {name: last for name, last in reads.items() if name not in kept}
+
+
+def _overtaken(sweeps: Sweeps, after: set[str]) -> Sweeps:
+    """Loops with fields that overwrite a field which earlier loops of the part have read in all rows so far."""
+    reads = _last_reads(sweeps, after)
     loops = []
     for number, loop in enumerate(sweeps.body):
         free = [
             name
-            for name, (lag, reader) in reads.items()
-            if name not in needed and lag <= loop.lag and reader < number and loop.part == 0
+            for name, (least, reader) in reads.items()
+            if least <= loop.lag and reader < number and loop.part == 0
         ]
         outs = []
         for out in loop.outs:

@@ -240,7 +240,9 @@ def order_passes(names: Names, reporter: Reporter) -> dict[str, PassDecl]:
     try:
         TopologicalSorter(earlier).prepare()
     except CycleError as error:
-        _report_cycle(error.args[1][::-1], earlier, reporter)
+        cycle = error.args[1][:0:-1]
+        start = cycle.index(max(cycle, key=[*passes].index))  # likely in the file that is being written
+        _report_cycle([*cycle[start:], *cycle[: start + 1]], earlier, reporter)
     return {name: passes[name] for name in in_order(passes, earlier)}
 
 
