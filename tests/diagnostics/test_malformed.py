@@ -194,7 +194,7 @@ SECTIONS: list[tuple[str, str, str, str | None]] = [
     ("a chain of 1,000 sets", "sets:\n" + "".join(f"  s{i}: s{i + 1}\n" for i in range(1000)) + "  s1000: weed\n", "PD508", None),
     # Passes
     ("a pass after itself", "passes:\n  g: {after: g, do: soil -> weed}\n", "PD307", "g"),
-    ("passes after each other", "passes:\n  a: {after: b, do: soil -> weed}\n  b: {after: a, do: weed -> soil}\n", "PD307", "b"),
+    ("passes after each other", "passes:\n  a: {after: b, do: soil -> weed}\n  b: {after: a, do: weed -> soil}\n", "PD307", "a"),
     ("a pass after nobody", "passes:\n  g: {after: fro, do: soil -> weed}\n", "PD301", "fro"),
     ("an unknown symmetry", "passes:\n  g: {symmetry: spin, do: soil -> weed}\n", "PD110", "spin"),
     ("an unknown policy", "passes:\n  g: {conflicts: toss, do: soil -> weed}\n", "PD110", "toss"),
