@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Container, Iterator
 from dataclasses import replace
 
-from powderdsl.ir.ops import FLAG, REAL, Node, conjuncts, ordered, taken
+from powderdsl.ir.ops import FLAG, REAL, Graph, Node, conjuncts, ordered, taken
 from powderdsl.schedule.types import (
     Compute,
     Facts,
@@ -77,6 +77,35 @@ def _only_moves(value: Node, slot: str) -> bool:
             case _:
                 return False
     return again
+
+
+def chosen(schedule: Schedule) -> Schedule:
+    """A choice between constants at a neighbor asks for the neighbor's flag, so that it is not stored as a field.
+
+    `(m ? 22 : 2)[0,1]` → `m[0,1] ? 22 : 2`, where edges wrap.
+    """
+
+    def rule(node: Node) -> Node | None:
+        at_neighbor = node.op == "shift" and node.type == REAL and node.attr[2]
+        return _at_neighbor(node.args[0], node.attr, schedule.graph) if at_neighbor else None
+
+    return map_values(schedule, rule)
+
+
+def _at_neighbor(value: Node, where: tuple[int, int, bool], graph: Graph) -> Node | None:
+    """A float at a neighbor, if it is a constant or a choice between such floats, up to its sign."""
+    if value.op == "const":
+        return value
+    if value.op not in ("neg", "select") or value.args[0].op in ("param", "const"):
+        return None
+    args = []
+    for arg in value.args:
+        flag = arg.type == FLAG
+        new = graph.node("shift", FLAG, (arg,), where) if flag else _at_neighbor(arg, where, graph)
+        if new is None:
+            return None
+        args.append(new)
+    return graph.node(value.op, REAL, tuple(args))
 
 
 def led(schedule: Schedule) -> Schedule:

@@ -10,7 +10,7 @@ from typing import Literal
 from powderdsl.ir.ops import PassGraph
 from powderdsl.schedule.costs import Costs, conditions, thresholds
 from powderdsl.schedule.cut import cut
-from powderdsl.schedule.floats import late, led
+from powderdsl.schedule.floats import chosen, late, led
 from powderdsl.schedule.join import ask_regions, join, narrow
 from powderdsl.schedule.lifetimes import release, swaps
 from powderdsl.schedule.lower import lower
@@ -36,6 +36,7 @@ _CPU_COSTS, _CUDA_COSTS = Costs(gates=6, floats=2, by_rows=True), Costs(gates=24
 _STAGES = (
     Stage("thresholds", thresholds, "which draws are compared with a parameter"),
     Stage("late", late, "floats are computed where they are used"),
+    Stage("chosen", chosen, "which floats at neighbors follow from a flag; before `cut`, which would store them", "cpu"),
     Stage("led", led, "which comparisons are computed only where another one holds"),
     Stage("conditions", conditions, "where the result of each draw matters"),
     Stage("presence", presence,
