@@ -121,6 +121,10 @@ class Original:
         )
 
     @cached_property
+    def meaning(self) -> str:
+        return meaning(self.ruleset)
+
+    @cached_property
     def lowered(self) -> str:
         return lowered(self.ruleset)
 
@@ -221,7 +225,7 @@ def judge(original: Original, mutant: Mutant) -> Verdict:
     new = warnings - original.warnings
     if new:
         return Verdict("killed", "check", min(new))
-    if meaning(ruleset) == meaning(original.ruleset):
+    if meaning(ruleset) == original.meaning:
         return Verdict("equivalent", "the same model")
     sim = compile(ruleset, backend=AT_ONCE)
     differs = True
