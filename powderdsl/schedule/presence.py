@@ -51,7 +51,9 @@ def presence(schedule: Schedule) -> Schedule:
         return replace(schedule, body=(*schedule.body, Forget())) if writes else schedule
     body: list[Statement] = []
     needs = _Needs(schedule, bits, _times(schedule, bits))
-    for statement, after in zip(schedule.body, (*schedule.body[1:], None), strict=False):  # a body may be empty
+    for statement, after in zip(
+        schedule.body, (*schedule.body[1:], None), strict=False
+    ):  # a body may be empty
         if isinstance(statement, Guard):
             swaps = _only_swaps(statement, bits)
             body.append(statement if swaps else replace(statement, body=(Forget(), *statement.body)))

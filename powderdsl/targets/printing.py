@@ -118,14 +118,24 @@ def drawn_where(draw: Node) -> Node | None:
     return args[0] if args else None
 
 
+MAX_PRINTED = 1000
+"""With more repeated choices, each is computed once, before those that need it, whether its cells are chosen or not."""
+
+
 class CellValues(Values[Named]):
     """Floats, and flags that compare them: the values `nodes` of a loop."""
 
-    direct = ("select", "led", "shift")
+    direct: tuple[str, ...] = ("select", "led", "shift")
 
     def __init__(self, nodes: Iterable[Node]) -> None:
         super().__init__()
         self.nodes = [*nodes]
+        if _printed_choices(self.nodes) > MAX_PRINTED:
+            self.direct = ("led", "shift")
+
+    def below(self, node: Node) -> Sequence[Node]:
+        args = super().below(node)
+        return args[1:] if node.op == "select" else args  # the plane of a mask has no name
 
     def variable(self, value: Named) -> Named:
         """A new variable, which choices change."""
@@ -170,6 +180,20 @@ class CellValues(Values[Named]):
             if same and not any(_depends(other, one[0]) or _depends(one[0], other) for one in chains):
                 chains.append(chain)
         return chains
+
+
+def _printed_choices(nodes: Iterable[Node]) -> int:
+    """The number of choices in the text of a loop, beyond one each: those that a choice computes only where its mask
+    holds are printed again for every other choice that needs them."""
+    below: dict[Node, frozenset[Node]] = {}
+    size: dict[Node, int] = {}
+    for node in nodes:
+        nearest = frozenset[Node]().union(*(below[arg] for arg in node.args))
+        below[node] = nearest
+        if node.op == "select":
+            size[node] = 1 + sum(size[choice] for choice in nearest)
+            below[node] = frozenset((node,))
+    return max(size.values(), default=0) - len(size)
 
 
 def _depends(value: Node, on: Node) -> bool:

@@ -138,7 +138,7 @@ class CellLoop(Loop):
                         word.set(columns if full else 0)
             body.jump(self.skip)
 
-    def copy(self, place: int, source: Local) -> None:
+    def copy(self, place: int, source: Value) -> None:
         """A line as it is in another field."""
         self.set_live(place, self.live(source))
         with body.when(self.live(source)):

@@ -65,6 +65,9 @@ MOST_BITS = 64
 AHEAD = 4
 """Bits of a draw that are made together, since the multiplications of one wait for each other."""
 
+MAX_PARAMS = 1000
+"""What engines take of a function; more are passed in variables of the module."""
+
 UNROLLED = 4
 """Words of a row up to which they are looked at without a loop."""
 
@@ -210,6 +213,7 @@ class Library:
 
     def __init__(self, memory: Memory, module: Module):
         self.memory, self.module = memory, module
+        self._more: list[Global] = []
         variable, define = module.variable, module.define
         self.top = variable("i32", memory.top)
         """Where memory that was never used begins."""
@@ -238,6 +242,12 @@ class Library:
         self.mix = define(self._mix)
         self.draw_below, self.draw_below_planes = define(self._draw_below), define(self._draw_below_planes)
         self.coin = define(self._coin)
+
+    def more_params(self, count: int) -> list[Global]:
+        """Variables for what a function takes beyond MAX_PARAMS."""
+        while len(self._more) < count:
+            self._more.append(self.module.variable("i32"))
+        return self._more[: max(count, 0)]
 
     @property
     def present(self) -> Place:

@@ -26,7 +26,7 @@ from powderdsl.schedule.words import difference, is_cleared, moved, targets
 from powderdsl.targets.printing import Printer
 from powderdsl.targets.wasm.binary import Callee, Local, Value, body, const, op
 from powderdsl.targets.wasm.cells import CellLoop
-from powderdsl.targets.wasm.library import SOME, ZERO, Library, word
+from powderdsl.targets.wasm.library import MAX_PARAMS, SOME, ZERO, Library, word
 from powderdsl.targets.wasm.moves import exchanger, groups_in_place, move_groups
 from powderdsl.targets.wasm.words import WordLoop
 
@@ -185,8 +185,11 @@ class Pass(Printer):
         for name in made.haloed:
             body.do(self.library.edges(self.vars[name]))
         function = made.made()
-        outs = (self.vars[out.var.name] for out in made.loop.outs)
-        body.do(function(*map(self.read, made.reads), *outs))
+        args = [*map(self.read, made.reads), *(self.vars[out.var.name] for out in made.loop.outs)]
+        more = self.library.more_params(len(args) - MAX_PARAMS)
+        for variable, value in zip(more, args[MAX_PARAMS:], strict=True):
+            variable.set(value)
+        body.do(function(*args[:MAX_PARAMS]))
 
     def read(self, name: str | tuple[str, int]) -> Value:
         if isinstance(name, str):

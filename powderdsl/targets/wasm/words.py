@@ -14,7 +14,7 @@ from powderdsl.schedule.types import Compute, alternatives, loaded, reads_of
 from powderdsl.targets.layout import Layout, fixed_key, param_key
 from powderdsl.targets.printing import Values, drawn_where, limited_draw
 from powderdsl.targets.wasm.binary import Callee, Function, Local, Value, body, const, load, op
-from powderdsl.targets.wasm.library import SOME, WORD, ZERO, Library, choose, some
+from powderdsl.targets.wasm.library import MAX_PARAMS, SOME, WORD, ZERO, Library, choose, some
 
 
 def plane_name(node: Node, layout: Layout) -> tuple[str, int] | None:
@@ -37,9 +37,11 @@ class Loop:
     def __init__(self, library: Library, loop: Compute, reads: Iterable[str | tuple[str, int]]):
         self.library, self.loop, self.memory = library, loop, library.memory
         self.reads = list(dict.fromkeys(reads))
-        self.f = Function(["i32"] * (len(self.reads) + len(loop.outs)))
-        self.held = dict(zip(self.reads, self.f.params, strict=False))
-        self.outs = self.f.params[len(self.reads) :]
+        count = len(self.reads) + len(loop.outs)
+        self.f = Function(["i32"] * min(count, MAX_PARAMS))
+        params = [*self.f.params, *library.more_params(count - MAX_PARAMS)]
+        self.held = dict(zip(self.reads, params, strict=False))
+        self.outs = params[len(self.reads) :]
         self.nodes = ordered(out.value for out in loop.outs)
         self.haloed: list[str] = []
         """The planes of which other rows are read."""
