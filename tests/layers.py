@@ -50,6 +50,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "ir": ("diagnostics",),
     "ir.stages": ("diagnostics", "ir"),  # never the model: by now all that is needed is in the IR
     "ir.lower": (*_FRONT, "analysis", "ir"),  # the one door from the model into the IR
+    "analysis.costs": ("ir",),  # of passes, as they will run
     "schedule": ("diagnostics", "ir"),
     "targets": ("arrays", "diagnostics", "system", "ir", "schedule"),  # what targets share; never the model
     "targets.torch": ("diagnostics", "system", "ir", "schedule", "targets"),
@@ -104,6 +105,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "web.bridge": (*_SCREEN, "simulation.standalone", *_TESTING, "web.worlds"),
     "cli": (
         *_SCREEN,
+        "analysis.costs",
         "simulation.standalone",
         "web",
         "web.worlds",

@@ -23,7 +23,7 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.envs import env_id
 from powderdsl.envs.actions import KINDS, ActionForm, action_form
 from powderdsl.envs.tensor_env import TensorEnv
-from powderdsl.model.fingerprint import fingerprint
+from powderdsl.system.fingerprint import fingerprint
 from powderdsl.system.packages import require
 from powderdsl.system.writing import failure, scratch_folder, writing
 from powderdsl.tasks.episodes import TaskProgram

@@ -41,11 +41,11 @@ from powderdsl.experiments.runs import (
     open_run,
     write_json,
 )
-from powderdsl.model.fingerprint import fingerprint
 from powderdsl.rl.config import TrainConfig, check_config, check_task
 from powderdsl.rl.evaluation import play
 from powderdsl.rl.policies import TrainedPolicy, policy_of
 from powderdsl.simulation.observe import Observer
+from powderdsl.system.fingerprint import fingerprint
 from powderdsl.system.writing import failure
 from powderdsl.tasks.episodes import TaskProgram, compile_task
 from powderdsl.tasks.shipped import load_task

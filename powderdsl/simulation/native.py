@@ -28,8 +28,8 @@ import torch
 from powderdsl.diagnostics import CompileError
 from powderdsl.ir.ops import Program
 from powderdsl.ir.segments import segments
-from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
+from powderdsl.system.fingerprint import fingerprint
 from powderdsl.targets.array_kind import Array
 from powderdsl.targets.cache import turn
 from powderdsl.targets.cpp.build import (

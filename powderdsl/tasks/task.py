@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from powderdsl.diagnostics import Span
-from powderdsl.model.fingerprint import UNMEANING
 from powderdsl.model.types import Expr, Ruleset
+from powderdsl.system.fingerprint import UNMEANING
 from powderdsl.worlds.raster import Shape, Size
 
 BLOW = -1

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from powderdsl.datasets.manifest import changed_params, choice_names
 from powderdsl.experiments.runs import differences
-from powderdsl.model.fingerprint import fingerprint
+from powderdsl.system.fingerprint import fingerprint
 from powderdsl.system.writing import failure
 from powderdsl.tasks.shipped import load_task, shipped_tasks
 from powderdsl.tasks.task import BLOW, Task

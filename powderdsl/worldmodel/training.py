@@ -32,8 +32,8 @@ from powderdsl.experiments.runs import (
     recorded_palette,
 )
 from powderdsl.model.composition.compose import Palette
-from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
+from powderdsl.system.fingerprint import fingerprint
 from powderdsl.system.interrupts import held_back
 from powderdsl.system.random import base_keys, mix
 from powderdsl.system.writing import failure

@@ -12,10 +12,10 @@ from torch import Tensor
 from powderdsl.compiler import load
 from powderdsl.diagnostics import CompileError, Reporter, Span, suggest
 from powderdsl.model.composition.compose import Palette
-from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.programs import starting_backend
 from powderdsl.simulation.simulator import World
+from powderdsl.system.fingerprint import fingerprint
 from powderdsl.system.writing import failure
 from powderdsl.tasks.episodes import TaskProgram, compile_task
 from powderdsl.tasks.shipped import check_split, load_task

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from powderdsl.analysis.costs import PassCost, costs
 from powderdsl.compiler import lower
 from powderdsl.ir import bits
-from powderdsl.ir.segments import PassCost, costs
 from powderdsl.testing.generators.cases import load_text
 from tests.cli.commands import powderdsl
 

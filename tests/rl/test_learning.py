@@ -15,9 +15,9 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.envs.acting import FrameStack
 from powderdsl.envs.sb3 import PowderVecEnv
 from powderdsl.envs.tensor_env import TensorEnv
-from powderdsl.model.fingerprint import fingerprint
 from powderdsl.rl import evaluate, load_policy, train
 from powderdsl.rl.fcn import BinPolicy, fcn_policy
+from powderdsl.system.fingerprint import fingerprint
 from powderdsl.tasks.episodes import compile_task
 from powderdsl.tasks.shipped import load_task, shipped_tasks
 from tests.rl.tiny_tasks import DIG, PLACE, quick, write_task

@@ -22,12 +22,12 @@ import powderdsl
 from powderdsl.cli.dispatch import plain_warning
 from powderdsl.compiler import lower
 from powderdsl.ir.text import print_program
-from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation import native
 from powderdsl.simulation.native import AutoProgram, start_key
 from powderdsl.simulation.programs import BackendProgram
 from powderdsl.simulation.simulator import Simulator, World
+from powderdsl.system.fingerprint import fingerprint
 from powderdsl.targets import cache
 from powderdsl.targets.cpp.build import Building, NoCompiler, NoCompilerWarning, building
 from powderdsl.targets.job import Clock, Job
@@ -462,7 +462,7 @@ def test_values_of_parameters_take_no_part_in_what_is_compiled(
 
 def test_fingerprints_are_the_same_in_every_process() -> None:
     program = (
-        "import powderdsl; from powderdsl.model.fingerprint import fingerprint;"
+        "import powderdsl; from powderdsl.system.fingerprint import fingerprint;"
         "print(fingerprint(powderdsl.load('powderworld')))"
     )
     found = {

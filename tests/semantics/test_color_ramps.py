@@ -13,9 +13,9 @@ import pytest
 
 import powderdsl
 from powderdsl.cli.pictures import LiveView, render_frame
-from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.draw import palette, ramps, rgb
+from powderdsl.system.fingerprint import fingerprint
 from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.cli.commands import powderdsl as run_command

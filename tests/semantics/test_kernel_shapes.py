@@ -77,8 +77,8 @@ def test_larger_than_life(tmp_path, backend):
 
 def test_a_large_kernel_stays_on_planes(tmp_path):
     """Rows are counted once and shifted: 961 neighbors take about a thousand gates."""
+    from powderdsl.analysis.costs import costs
     from powderdsl.compiler import lower
-    from powderdsl.ir.segments import costs
 
     path = tmp_path / "bosco.yaml"
     path.write_text(

@@ -13,9 +13,9 @@ import powderdsl
 from powderdsl.cli.pictures import LiveView, first_world, pictures, render_frame
 from powderdsl.compiler import load_with_diagnostics
 from powderdsl.diagnostics import CompileError
-from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.draw import palette, ramps, rgb, tints
+from powderdsl.system.fingerprint import fingerprint
 from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.compilers import skip_without_compiler

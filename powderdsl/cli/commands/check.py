@@ -23,7 +23,7 @@ from powderdsl.system.reports import table
 from powderdsl.tasks.shipped import is_task
 
 if TYPE_CHECKING:
-    from powderdsl.ir.segments import PassCost
+    from powderdsl.analysis.costs import PassCost
     from powderdsl.tasks.task import Task
 
 
@@ -128,7 +128,7 @@ def _check(name: str, quick: bool, cost: bool, ledger: bool) -> Checked:
         diagnostics = (*diagnostics, *refuted(ruleset, book))
     expenses = None
     if cost:
-        from powderdsl.ir.segments import costs
+        from powderdsl.analysis.costs import costs
 
         expenses = costs(lower(ruleset))
     return Checked(name, diagnostics, ruleset, expenses, (book or make_ledger(ruleset)) if ledger else None)

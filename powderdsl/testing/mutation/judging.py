@@ -27,13 +27,13 @@ from powderdsl.ir.text import print_program
 from powderdsl.model.check import check
 from powderdsl.model.declarations import PackDecl, RulesetDecl
 from powderdsl.model.definitions import set_params
-from powderdsl.model.fingerprint import fingerprint
 from powderdsl.model.packs import read_file
 from powderdsl.model.state import slots
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Example, Invariant, Local, Ruleset, Symmetric
 from powderdsl.simulation.programs import starting_backend
 from powderdsl.simulation.simulator import Simulator, compile
+from powderdsl.system.fingerprint import fingerprint
 from powderdsl.system.interrupts import held_back
 from powderdsl.testing.generators.cases import Array, Start
 from powderdsl.testing.mutation.equivalence import proven_equal
