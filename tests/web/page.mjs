@@ -175,7 +175,7 @@ await page.locator("#status code").waitFor();
 seen.command = await page.locator("#status code").textContent();
 await downloaded(page, "own/rules.zip", () => page.locator("#status button", { hasText: "rules.zip" }).click());
 await page.locator("#save summary").click();
-await page.waitForFunction(() => document.getElementById("save-rules").textContent.includes("(.zip)"));
+await page.locator("#save-rules", { hasText: "(.zip)" }).waitFor({ state: "visible" });
 seen.entries = await page.locator("#save div").innerText();
 await page.keyboard.press("Escape");
 for (let i = 0; i < 5; i++) await page.locator("#step").click();

@@ -109,9 +109,8 @@ async function saveRules() {
 /** Says what the entries of the menu save now. */
 async function showEntries() {
   $("save-pack").textContent = `Rule file (${rules.shown})`;
-  $("save-rules").hidden = true;
-  if (!rules.edited) return;
-  const { files } = await rules.compiler.call("command");
+  // The entry changes once, after the compiler's answer: hiding it until then makes an open menu jump.
+  const files = rules.edited ? (await rules.compiler.call("command")).files : [];
   $("save-rules").hidden = files.length === 0 || (files.length === 1 && files[0] === rules.shown);
   $("save-rules").textContent = files.length === 1 ? `Edited rule file (${files[0]})` : `All ${files.length} edited rule files (.zip)`;
 }
