@@ -85,15 +85,19 @@ def program_of(name: str, folder: Path) -> Program:
 
 @pytest.mark.golden
 @pytest.mark.parametrize("name", list(PACKS))
-@pytest.mark.parametrize("stage", ["lower", *(stage.name for stage in PIPELINE), "bits"])
-def test_golden_ir(name: str, stage: str, tmp_path: Path, golden) -> None:  # type: ignore[no-untyped-def]
+def test_golden_ir(name: str, tmp_path: Path, golden) -> None:  # type: ignore[no-untyped-def]
     program = program_of(name, tmp_path)
-    if stage == "bits":
-        program = lower_bits(run_passes(program))
-        verify(program, "bits")
-    elif stage != "lower":
-        program = run_passes(program, until=stage)
-    golden(GOLDEN / f"{name}.{stage}.ir", print_program(program))
+    planes = lower_bits(run_passes(program))
+    verify(planes, "bits")
+    stages = {"lower": program}
+    stages |= {stage.name: run_passes(program, until=stage.name) for stage in PIPELINE}
+    stages["bits"] = planes
+    text = before = ""
+    for stage, after in stages.items():
+        printed = print_program(after)
+        text += f"== {stage}\n" + ("as before\n" if printed == before else printed)
+        before = printed
+    golden(GOLDEN / f"{name}.ir", text)
 
 
 def test_densities_become_sets_of_elements(tmp_path: Path) -> None:
