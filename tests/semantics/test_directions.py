@@ -1,30 +1,33 @@
-"""Stored directions: their opposites, and what they are compared with."""
+"""Directions and places: comparing, turning and picking them, in fields and in conditions; sines of angles."""
 
 from __future__ import annotations
 
-import contextlib
+import math
 
 import numpy as np
 import pytest
+import torch
 
-import powderdsl as package
-from powderdsl.diagnostics import CompileError, Reporter, Source
-from powderdsl.model.check import check
-from powderdsl.model.declarations import PackDecl
-from powderdsl.model.packs import read_file
 from powderdsl.simulation.draw import to_numpy
-from tests.compilers import skip_without_compiler
+from tests.semantics.texts import BACKENDS, codes, diagnosed, simulator
 
 HEAD = """\
 pack: compass
 elements:
   air: {id: 0, color: "#101010"}
   bug: {id: 1, color: "#909090"}
+  ant: {id: 2, color: "#707070"}
 fields:
   aim: {type: direction, at: place}
-  back: {type: direction, at: place}
   heading: {type: direction, at: place}
-  found: {type: flag, at: place}
+  turned: {type: direction, at: place}
+  number: {type: 0..9, at: place}
+  angle: {type: real(-1000000..1000000), at: place}
+  sine: {type: real(-2..2), at: place}
+  cosine: {type: real(-2..2), at: place}
+  named: {type: element, at: place}
+  mark: {type: flag, at: place}
+streams: {luck: {bits: 32}}
 passes:
   look:
 """
@@ -32,63 +35,43 @@ passes:
 RIGHT, BELOW, LEFT, ABOVE_RIGHT = 0, 2, 4, 7
 HEADINGS, AIMS = np.indices((8, 8))
 """Every heading with every aim: 0 to 7 from the right clockwise, as in saved worlds."""
+OPPOSITE = (np.arange(8) + 4) % 8
 
 
-def opposite(direction: np.ndarray) -> np.ndarray:
-    """The direction with both of its steps reversed."""
-    rows = np.array([0, 1, 1, 1, 0, -1, -1, -1])
-    columns = np.array([1, 1, 0, -1, -1, -1, 0, 1])
-    steps = {(y, x): octant for octant, (y, x) in enumerate(zip(rows, columns, strict=True))}
-    return np.vectorize(lambda octant: steps[-rows[octant], -columns[octant]])(direction)
+def stepped(body: str, backend: str = "reference", ids=None, random=None, **fields):  # type: ignore[no-untyped-def]
+    sim = simulator(HEAD + body, backend)
+    shape = next(iter(fields.values())).shape if fields else (8, 8)
+    world = sim.world(np.zeros((1, *shape[-2:]), np.uint8) if ids is None else ids)
+    return sim.step(sim.replace(world, **fields), random=random)
 
 
-def reported(condition: str) -> list[str]:
-    """Codes and messages for a rule with this condition."""
-    reporter = Reporter()
-    pack = read_file(Source("yard.yaml", f"{HEAD}    do: bug -> air if {condition}\n"), reporter)
-    assert isinstance(pack, PackDecl)
-    with contextlib.suppress(CompileError):
-        check([pack], None, reporter)
-    wanted = ("PD401", "PD503")
-    return [f"{one.code}: {one.message}" for one in reporter.diagnostics if one.code in wanted]
-
-
-@pytest.mark.parametrize("backend", ["reference", "torch", "native", "wasm"])
-def test_the_opposite_points_the_other_way(tmp_path, backend):
-    skip_without_compiler(backend)
-    path = tmp_path / "compass.yaml"
-    path.write_text(f"{HEAD}    do: ['back := opposite(heading)', 'aim := opposite(opposite(right.aim))']\n")
-    sim = package.compile(package.load(path), backend=backend)
-    world = sim.world(np.zeros((1, 8, 8), np.uint8))
-    world = sim.step(sim.replace(world, heading=HEADINGS, aim=AIMS))
-    np.testing.assert_array_equal(to_numpy(world["back"])[0], opposite(HEADINGS))
-    np.testing.assert_array_equal(to_numpy(world["aim"])[0], np.roll(AIMS, -1, 1))
+# Comparisons
 
 
 @pytest.mark.parametrize(
     ("condition", "expected"),
     [
         ("heading is aim", HEADINGS == AIMS),
-        ("heading is not opposite(aim)", HEADINGS != opposite(AIMS)),
+        ("heading is not opposite(aim)", HEADINGS != OPPOSITE[AIMS]),
         ("left is heading", HEADINGS == LEFT),
-        ("above.right is not opposite(heading)", HEADINGS != opposite(np.array(ABOVE_RIGHT))),
-        ("opposite(heading) is left", HEADINGS == RIGHT),
+        ("above.right is not opposite(heading)", HEADINGS != OPPOSITE[ABOVE_RIGHT]),
         ("heading in (aim, below)", (HEADINGS == AIMS) | (HEADINGS == BELOW)),
-        ("below in (aim, opposite(heading))", (AIMS == BELOW) | (opposite(HEADINGS) == BELOW)),
-        ("any(side is aim and side is opposite(heading) for side in octants)", AIMS == opposite(HEADINGS)),
-        ("(right if aim is left else heading) is right", (AIMS == LEFT) | (HEADINGS == RIGHT)),
+        ("below in (aim, opposite(heading))", (AIMS == BELOW) | (OPPOSITE[HEADINGS] == BELOW)),
+        ("any(side is aim and side is opposite(heading) for side in octants)", AIMS == OPPOSITE[HEADINGS]),
         ("(heading if aim is not left else right) is right", (AIMS == LEFT) | (HEADINGS == RIGHT)),
         ("opposite(right if aim is left else heading) is left", (AIMS == LEFT) | (HEADINGS == RIGHT)),
     ],
 )
-def test_directions_are_compared_with_places_and_each_other(tmp_path, condition, expected):
-    path = tmp_path / "compass.yaml"
-    path.write_text(f"{HEAD}    do: found := {condition}\n")
+def test_directions_are_compared_with_places_and_each_other(condition: str, expected: np.ndarray) -> None:
     for backend in ("reference", "wasm"):
-        sim = package.compile(package.load(path), backend=backend)
-        world = sim.world(np.zeros((1, 8, 8), np.uint8))
-        world = sim.step(sim.replace(world, heading=HEADINGS, aim=AIMS))
-        np.testing.assert_array_equal(to_numpy(world["found"])[0], expected)
+        world = stepped(f"    do: mark := {condition}\n", backend, heading=HEADINGS, aim=AIMS)
+        np.testing.assert_array_equal(to_numpy(world["mark"])[0], expected)
+
+
+def reported(condition: str) -> list[str]:
+    """Codes and messages for a rule with this condition."""
+    found = diagnosed(f"{HEAD}    do: bug -> air if {condition}\n")
+    return [f"{one.code}: {one.message}" for one in found if one.code in ("PD401", "PD503")]
 
 
 def test_the_checker_knows_what_opposites_exclude() -> None:
@@ -114,3 +97,102 @@ def test_the_checker_knows_what_opposites_exclude() -> None:
 )
 def test_other_things_are_refused(condition: str, message: str) -> None:
     assert reported(condition) == [f"PD401: {message}"]
+
+
+# Turns
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(("word", "eighths"), [("clockwise", 2), ("counterclockwise", 6), ("opposite", 4)])
+def test_directions_turn(backend: str, word: str, eighths: int) -> None:
+    world = stepped(f"    do: turned := {word}(right.heading)\n", backend, heading=HEADINGS.T)
+    np.testing.assert_array_equal(to_numpy(world["turned"])[0], np.roll(HEADINGS.T + eighths, -1, 1) % 8)
+
+
+@pytest.mark.parametrize(
+    ("place", "expected"),
+    [
+        ("clockwise(right)", "below"),
+        ("counterclockwise(right)", "above"),
+        ("clockwise(clockwise(above.left))", "below.right"),
+        ("clockwise(at(-1, 2))", "at(2, 1)"),
+        ("opposite(clockwise(above))", "left"),
+    ],
+)
+def test_places_turn(place: str, expected: str) -> None:
+    ids = np.random.default_rng(3).integers(0, 3, (1, 7, 8)).astype(np.uint8)
+    world = stepped(f"    do: mark := ({place} is bug) == ({expected} is bug)\n", ids=ids)
+    assert to_numpy(world["mark"]).all()
+
+
+def test_mirrored_copies_turn_the_other_way() -> None:
+    body = "    symmetry: mirror\n    do: air -> bug if right is ant and clockwise(right) is ant\n"
+    world = stepped(body, ids=[[[0, 0, 0, 0, 0], [0, 0, 2, 0, 0], [0, 2, 0, 2, 0]]])
+    assert to_numpy(world.ids)[0].tolist() == [[0, 0, 0, 0, 0], [0, 1, 2, 1, 0], [0, 2, 0, 2, 0]]
+
+
+# Draws
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("count", [2, 3, 16])
+def test_each_value_stands_for_a_part_of_the_draws(backend: str, count: int) -> None:
+    values = [(3 * number) % 10 for number in range(count)]
+    draws = (np.arange(240, dtype=np.float64).reshape(1, 12, 20) + 0.5) / 240
+    body = f"    do: number := pick(luck, {', '.join(map(str, values))})\n"
+    given = draws if backend == "reference" else torch.from_numpy(draws)
+    world = stepped(body, backend, np.zeros((1, 12, 20), np.uint8), {"luck": given})
+    expected = np.array(values)[np.floor(count * draws).astype(int)]
+    np.testing.assert_array_equal(to_numpy(world["number"]), expected)
+
+
+@pytest.mark.parametrize(
+    ("rule", "field", "expected"),
+    [
+        ("heading := pick(luck, right, below, left, above)", "heading", [0, 2, 4, 6]),
+        ("heading := left if luck < 50% else above.right", "heading", [4, 4, 7, 7]),
+        ("named := pick(luck, bug, ant)", "named", [1, 1, 2, 2]),
+        ("mark := right is pick(luck, left, right)", "mark", [0, 0, 1, 1]),
+        ("mark := pick(luck, left, right) is pick(luck, left, above, below, right)", "mark", [1, 0, 0, 1]),
+        ("heading := opposite(pick(luck, left, right))", "heading", [0, 0, 4, 4]),
+        ("heading := clockwise(above if luck < 50% else below)", "heading", [0, 0, 4, 4]),
+        ("mark := pick(luck, right, here) is ant", "mark", [1, 0, 0, 0]),
+    ],
+)
+def test_places_are_directions_where_directions_are_expected(
+    rule: str, field: str, expected: list[int]
+) -> None:
+    draws = {"luck": np.array([[[0.125, 0.375, 0.625, 0.875]]])}
+    world = stepped(f'    do: "{rule}"\n', ids=[[[1, 2, 1, 1]]], random=draws)
+    assert to_numpy(world[field])[0, 0].tolist() == expected
+
+
+@pytest.mark.parametrize(
+    ("rule", "code"),
+    [
+        ("number := pick(3, 1, 2)", "PD401"),
+        ("number := pick(luck, 1)", "PD406"),
+        ("number := pick(luck, 1, bug)", "PD401"),
+        ("heading := pick(luck, left, 3)", "PD401"),
+        ("number := pick(luck, left, right)", "PD401"),
+        ("heading := clockwise(3)", "PD401"),
+        ("angle := sin(bug)", "PD401"),
+        ("mark := (left if luck < 50% else right).mark", "PD401"),
+    ],
+)
+def test_what_cannot_be_picked_or_turned_is_reported(rule: str, code: str) -> None:
+    assert code in codes(f'{HEAD}    do: "{rule}"\n')
+
+
+# Sines
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_sines_are_close_and_those_of_the_oracle(backend: str) -> None:
+    body = "    do:\n      - sine := sin(angle)\n      - cosine := cos(angle)\n"
+    angles = np.concatenate([np.linspace(-1000, 1000, 3000), np.linspace(0, 2 * math.pi, 1040), np.zeros(8)])
+    angles = angles.astype(np.float32).reshape(1, 46, 88)
+    oracle, world = (stepped(body, name, angle=angles) for name in ("reference", backend))
+    for field, exact in (("sine", np.sin(angles.astype(float))), ("cosine", np.cos(angles.astype(float)))):
+        np.testing.assert_array_equal(to_numpy(world[field]), to_numpy(oracle[field]))
+        assert np.abs(to_numpy(world[field]) - exact).max() < 2.0**-22

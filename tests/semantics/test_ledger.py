@@ -13,16 +13,13 @@ import pytest
 from powderdsl.analysis.account import ledger_text
 from powderdsl.analysis.ledger import Ledger, NotProven, Proven, ledger
 from powderdsl.compiler import load
-from powderdsl.diagnostics import CompileError
 from powderdsl.model.state import slots
 from powderdsl.model.types import ELEMENT, Ruleset
 from powderdsl.simulation.simulator import World
 from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
-from powderdsl.testing.generators.rulemaker import random_ruleset_text
-from tests.semantics.ledger_watch import Watch
-from tests.semantics.test_differential import compositions
+from tests.semantics.test_differential import compositions, seeded_ruleset
 
 GOLDEN = Path(__file__).parent / "golden"
 
@@ -95,26 +92,6 @@ def test_moves_that_leave_and_overwrite() -> None:
     assert not book.unchanged("brick")
 
 
-def test_moves_that_follow_each_other() -> None:
-    """The first of a row leaves its element, the last one overwrites: of two rules here."""
-    rules = """\
-  go:
-    do:
-      - mud moves right leaving air if right is grass
-      - grass moves right leaving brick if right is air
-"""
-    book = ledger(small(rules))
-    assert ("air", "air") not in book.changes
-    assert not book.conserved({"air": 1})
-    ruleset = small(rules)
-    watch = Watch(ruleset, book)
-    simulator = compile_ruleset(ruleset, backend="reference")
-    with watch.running():
-        world = simulator.step(simulator.world([[2, 3, 0]]))
-    assert world.ids.tolist() == [[[0, 2, 3]]]
-    assert watch.denied == []
-
-
 def test_properties_that_cells_override_in_turn() -> None:
     """Only what was made light becomes loose, and only what is loose changes."""
     rules = """\
@@ -170,14 +147,6 @@ def test_writes_whose_order_decides() -> None:
         ("cut off", "age += 3", "age -= 1"),
         ("last writes", "age -= 1", "age := 5"),
     }
-
-
-def test_too_many_rules_are_said_to_be(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("powderdsl.analysis.ledger.BUDGET", 100)
-    book = ledger(load("core+water"))
-    assert not book.complete
-    assert "Not decided in full" in ledger_text(book)
-    assert not book.conserved({"wall": 1})
 
 
 # Samples that try to contradict it
@@ -241,58 +210,23 @@ def test_random_worlds_do_not_contradict_the_ledger_of_shipped_rules(name: str) 
     ruleset = load(name)
     batches = 10 if name == "powderworld" else 1
     assert sampled(ruleset, batches, worlds=100, side=16, steps=3, backend="wasm") == []
-    assert watched(ruleset, range(6)).denied == []
+
+
+@pytest.mark.parametrize("first", [0, 20])
+def test_random_worlds_do_not_contradict_the_ledger_of_random_rules(
+    first: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("powderdsl.analysis.ledger.BUDGET", 50_000)  # some exceed it: that is sound too
+    rulesets = [rules for seed in range(first, first + 20) if (rules := seeded_ruleset(seed)) is not None]
+    assert len(rulesets) > 15
+    for ruleset in rulesets:
+        assert sampled(ruleset, 2, worlds=20, side=6, steps=2, backend="reference") == [], ruleset.name
 
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("name", compositions())
 def test_thousands_of_worlds_do_not_contradict_the_ledger_of_shipped_rules(name: str) -> None:
     assert sampled(load(name), WORLDS // 100, worlds=100, side=16, steps=3, backend="wasm") == []
-
-
-def test_every_line_of_the_ledger_of_powderworld_is_seen() -> None:
-    """The ledger says what may happen at most. Here all of it does happen, and some world shows each part."""
-    ruleset = load("powderworld")
-    watch = Watch(ruleset, ledger(ruleset))
-    simulator = compile_ruleset(ruleset, backend="reference")
-    likely = {param.name: 0.5 for param in ruleset.params if param.kind.name == "chance"}
-    with watch.running():
-        simulator.step(
-            random_start(ruleset, Choices.seeded(0), (20, 16, 16)).world(simulator), 3, params=likely
-        )
-    entries = watch.ledger.rules
-    assert {(entry.rule, *pair) for entry in entries for pair in entry.changes} - watch.changed == set()
-    assert {(entry.rule, name) for entry in entries for name in entry.moves} - watch.moved == set()
-    assert {entry.rule for entry in entries} - watch.happened == set()
-    assert watch.denied == []
-
-
-def watched(ruleset: Ruleset, seeds: range, shape: tuple[int, int, int] | None = None) -> Watch:
-    """What the reference does with random worlds, held against the ledger rule by rule."""
-    watch = Watch(ruleset, ledger(ruleset))
-    simulator = compile_ruleset(ruleset, backend="reference")
-    for seed in seeds:
-        start = random_start(ruleset, Choices.seeded(seed), shape, max_side=9)
-        with watch.running():
-            simulator.step(start.world(simulator), 2, params=start.params or None)
-    return watch
-
-
-@pytest.mark.parametrize("first", range(0, 60, 10))
-def test_random_rules_keep_to_their_ledger(first: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "powderdsl.analysis.ledger.BUDGET", 50_000
-    )  # some are found too large: that is sound too
-    tried = 0
-    for seed in range(first, first + 10):
-        try:
-            ruleset = load_text(random_ruleset_text(seed), f"seed{seed}.yaml")
-        except CompileError:
-            continue
-        tried += 1
-        watch = watched(ruleset, range(4))
-        assert watch.denied == [], f"seed {seed}"
-    assert tried > 6
 
 
 def test_contradictions_are_seen() -> None:
@@ -306,16 +240,3 @@ def test_contradictions_are_seen() -> None:
     found = contradictions(hopeful, ruleset, before, after)
     assert {"the sum of ('ice',)", "water does not stay"} <= set(found)
     assert contradictions(book, ruleset, before, after) == []
-
-
-def test_the_watch_sees_what_a_ledger_lacks() -> None:
-    """A ledger of other rules is contradicted, so silence means something."""
-    ruleset = load("core+water")
-    book = ledger(ruleset)
-    less = [replace(entry, changes=(), moves=()) for entry in book.rules]
-    watch = Watch(ruleset, replace(book, rules=tuple(less)))
-    simulator = compile_ruleset(ruleset, backend="reference")
-    with watch.running():
-        simulator.step(random_start(ruleset, Choices.seeded(1), (4, 16, 16)).world(simulator), 4)
-    assert any("turns ice into water" in one for one in watch.denied)
-    assert any("moves water" in one for one in watch.denied)
