@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import powderdsl as package
-from powderdsl.compiler import load_with_diagnostics
-from powderdsl.diagnostics import CompileError
 from powderdsl.simulation.draw import to_numpy
 from tests.cli.commands import powderdsl as command
+from tests.semantics.texts import BACKENDS, diagnosed, mistakes, simulator
 
 HEAD = """\
 pack: blocks
@@ -50,62 +48,57 @@ REFUSED = {
 }
 
 
-def codes(tmp_path, rules: str, multiple: int) -> list[str]:
-    path = tmp_path / "blocks.yaml"
+def pack(rules: str, multiple: int) -> str:
     text = rules if rules.startswith("passes") else f"passes: {{p: {{do: '{rules}'}}}}\n"
-    path.write_text(HEAD.format(multiple=multiple) + text)
-    try:
-        _, found = load_with_diagnostics(path)
-    except CompileError as error:
-        found = tuple(error.diagnostics)
-    return sorted({one.code for one in found if one.severity.value == "error"})
+    return HEAD.format(multiple=multiple) + text
 
 
-@pytest.mark.parametrize("rule", [rule for rule in PROVEN if "moves" not in rule])
-def test_worlds_without_a_seam_keep_swaps_apart(tmp_path, rule):
+def errors(rules: str, multiple: int) -> set[str]:
+    return {code for code, _ in mistakes(pack(rules, multiple))}
+
+
+@pytest.mark.parametrize("rule", PROVEN)
+def test_worlds_without_a_seam_keep_swaps_apart(rule):
     multiple = PROVEN[rule]
-    assert codes(tmp_path, rule, multiple) == []
-    assert codes(tmp_path, rule, 3 * multiple) == []
-    assert codes(tmp_path, rule, 1) == ["PD501"]
-    assert codes(tmp_path, rule, 3) == ["PD501"]
+    assert errors(rule, multiple) == errors(rule, 3 * multiple) == set()
+    if "moves" not in rule:
+        assert errors(rule, 1) == errors(rule, 3) == {"PD501"}
 
 
 @pytest.mark.parametrize("rule", REFUSED)
-def test_what_meets_anyway_is_refused(tmp_path, rule):
+def test_what_meets_anyway_is_refused(rule):
     for multiple in (1, REFUSED[rule], 4 * REFUSED[rule]):
-        assert codes(tmp_path, rule, multiple) == ["PD501"]
+        assert errors(rule, multiple) == {"PD501"}
 
 
-def test_the_fix_is_named_and_works(tmp_path):
-    path = tmp_path / "blocks.yaml"
-    path.write_text(HEAD.format(multiple=1) + MARGOLUS)
-    with pytest.raises(CompileError) as raised:
-        package.load(path)
-    assert [one.code for one in raised.value.diagnostics] == ["PD501", "PD501"]
-    assert all("`side_multiple: 2`" in one.helps[0] for one in raised.value.diagnostics)
-    assert codes(tmp_path, MARGOLUS, 2) == []
+def test_the_fix_is_named_and_works():
+    conflicts = [error for error in diagnosed(pack(MARGOLUS, 1)) if error.code == "PD501"]
+    assert len(conflicts) == 2
+    assert all("`side_multiple: 2`" in error.helps[0] for error in conflicts)
+    assert errors(MARGOLUS, 2) == set()
 
 
-@pytest.mark.parametrize("backend", ["reference", "torch", "native", "wasm"])
-def test_nothing_is_lost_or_doubled(tmp_path, backend):
-    path = tmp_path / "blocks.yaml"
-    path.write_text(HEAD.format(multiple=2) + MARGOLUS)
-    sim = package.compile(package.load(path), backend=backend)
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_nothing_is_lost_or_doubled(backend):
+    sim = simulator(pack(MARGOLUS, 2), backend)
     random = np.random.default_rng(0)
     for size in ((2, 2), (4, 6), (8, 34), (10, 66)):
         ids = random.integers(0, 3, (2, *size)).astype(np.uint8)
         world = sim.replace(sim.world(ids, seed=3), mark=random.integers(0, 100, (2, *size)))
-        start = [np.sort((to_numpy(world.ids).astype(int) * 100 + to_numpy(world["mark"])).reshape(2, -1))]
+        start = contents(world)
         for _ in range(4):
             world = sim.step(world, steps=3)
-            now = np.sort((to_numpy(world.ids).astype(int) * 100 + to_numpy(world["mark"])).reshape(2, -1))
-            assert np.array_equal(now, start[0])
+            assert np.array_equal(contents(world), start)
+
+
+def contents(world) -> np.ndarray:
+    return np.sort((to_numpy(world.ids).astype(int) * 100 + to_numpy(world["mark"])).reshape(2, -1))
 
 
 def test_other_sizes_are_refused_everywhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert codes(tmp_path, MARGOLUS, 2) == []
-    sim = package.compile(package.load("blocks.yaml"), backend="reference")
+    (tmp_path / "blocks.yaml").write_text(pack(MARGOLUS, 2))
+    sim = simulator(pack(MARGOLUS, 2))
     with pytest.raises(ValueError, match="rows and columns must be a multiple of 2"):
         sim.world(np.zeros((5, 4), np.uint8))
     for arguments in (["run", "blocks.yaml", "--size", "7x8"], ["bench", "blocks.yaml", "--size", "7x8"]):
@@ -120,16 +113,15 @@ def test_other_sizes_are_refused_everywhere(tmp_path, monkeypatch):
     result = command("check", "task.yaml")
     assert result.exit_code == 2
     assert "PD607" in result.output
-    text = (tmp_path / "blocks.yaml").read_text()
-    (tmp_path / "blocks.yaml").write_text(
-        text + "tests: [{odd: {given: b c b, after: 1 step, expect: b c b}}]\n"
-    )
+    test = "tests: [{odd: {given: b c b, after: 1 step, expect: b c b}}]\n"
+    (tmp_path / "blocks.yaml").write_text(pack(MARGOLUS, 2) + test)
     assert "multiples of 2" in command("check", "blocks.yaml").output
 
 
 def test_invariants_are_tried_on_worlds_that_fit(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert codes(tmp_path, MARGOLUS + "invariants: [count(b) is constant, b never changes]\n", 2) == []
+    invariants = "invariants: [count(b) is constant, b never changes]\n"
+    (tmp_path / "blocks.yaml").write_text(pack(MARGOLUS, 2) + invariants)
     result = command("check", "blocks.yaml")
     assert result.exit_code == 2
     assert result.output.count("error[PD512]") == 1

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import powderdsl as package
 from powderdsl.simulation.draw import to_numpy
 from powderdsl.simulation.simulator import compile
+from powderdsl.testing.generators.cases import load_text
 from powderdsl.testing.pack_tests.runner import run_examples
 
 FIELDS = """\
@@ -56,18 +56,16 @@ DRAWN = """\
 """
 
 
-def results(tmp_path, *, expected: str, drawn: str = DRAWN, rules: str = FIELDS):
-    path = tmp_path / "load.yaml"
+def results(*, expected: str, drawn: str = DRAWN, rules: str = FIELDS):
     body = (drawn + expected).replace("\n", "\n  ").rstrip()
-    path.write_text(f"{rules}tests:\n  - drawn:\n  {body}\n")
     worlds = []
-    rules = package.load(path)
+    rules = load_text(f"{rules}tests:\n  - drawn:\n  {body}\n")
     found = run_examples(rules, sim=compile(rules, "reference", tensors=False), seen=worlds.append)
     return found[0], worlds[0]
 
 
-def test_every_kind_of_field_starts_as_it_is_drawn(tmp_path):
-    result, world = results(tmp_path, expected="    expect_fields: {open: yes}\n")
+def test_every_kind_of_field_starts_as_it_is_drawn():
+    result, world = results(expected="    expect_fields: {open: yes}\n")
     assert result.passed
     state = {name: to_numpy(value)[0] for name, value in world.state.items()}
     assert state["load"].tolist() == [[2, 0, 1, 0], [0, 7, 0, 0]]
@@ -81,7 +79,7 @@ def test_every_kind_of_field_starts_as_it_is_drawn(tmp_path):
     assert state["open"].all()
 
 
-def test_what_is_expected_is_compared_in_every_cell(tmp_path):
+def test_what_is_expected_is_compared_in_every_cell():
     expected = """\
     expect_fields:
       load: |
@@ -101,7 +99,7 @@ def test_what_is_expected_is_compared_in_every_cell(tmp_path):
         . ? no .
         . yes . .
 """
-    assert results(tmp_path, expected=expected)[0].passed
+    assert results(expected=expected)[0].passed
 
 
 WRONG = {
@@ -115,33 +113,29 @@ WRONG = {
 
 
 @pytest.mark.parametrize("expected", WRONG)
-def test_a_cell_that_is_not_as_expected_fails_the_test(tmp_path, expected):
-    result, _ = results(tmp_path, expected=f"    expect_fields:\n      {expected}\n")
+def test_a_cell_that_is_not_as_expected_fails_the_test(expected):
+    result, _ = results(expected=f"    expect_fields:\n      {expected}\n")
     assert result.problem == WRONG[expected]
     assert result.field == expected.split(":")[0]
     assert len(result.field_after) == 2
 
 
-def test_one_word_counts_for_the_cells_that_can_have_the_field(tmp_path):
+def test_one_word_counts_for_the_cells_that_can_have_the_field():
     drawn = "    given: c . c\n    fields: {load: 3}\n    after: 0 steps\n"
-    result, world = results(tmp_path, drawn=drawn, expected="    expect_fields: {load: 3}\n")
+    result, world = results(drawn=drawn, expected="    expect_fields: {load: 3}\n")
     assert result.passed
     assert to_numpy(world["load"])[0].tolist() == [[3, 0, 3]]
 
 
-def test_tests_of_one_size_keep_their_fields_apart(tmp_path):
-    path = tmp_path / "load.yaml"
+def test_tests_of_one_size_keep_their_fields_apart():
     tests = "".join(
         f"  - load {load}:\n      given: c . c\n      fields: {{load: {load}}}\n      after: 0 steps\n"
         f"      expect_fields: {{load: {load}}}\n"
         for load in (".", 1, 9)
     )
-    path.write_text(f"{FIELDS}tests:\n{tests}")
-    assert all(result.passed for result in run_examples(package.load(path)))
+    assert all(result.passed for result in run_examples(load_text(f"{FIELDS}tests:\n{tests}")))
 
 
-def test_a_test_waits_for_the_pack_that_declares_its_field(tmp_path):
-    path = tmp_path / "load.yaml"
+def test_a_test_waits_for_the_pack_that_declares_its_field():
     test = "  - other:\n      given: c\n      fields: {elsewhere?: 3}\n      expect: c\n"
-    path.write_text(f"{FIELDS}tests:\n{test}")
-    assert package.load(path).tests == ()
+    assert load_text(f"{FIELDS}tests:\n{test}").tests == ()

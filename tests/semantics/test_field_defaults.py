@@ -5,11 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import powderdsl as package
+from powderdsl.analysis.ledger import ledger
 from powderdsl.diagnostics import CompileError
 from powderdsl.simulation.draw import to_numpy
 from powderdsl.simulation.simulator import compile
+from powderdsl.simulation.tracing import trace
+from powderdsl.tasks.episodes import TaskProgram, check_actions
+from powderdsl.tasks.shipped import load_task
+from powderdsl.testing.generators.cases import load_text
 from powderdsl.testing.pack_tests.runner import run_examples
+from tests.compilers import skip_without_compiler
+from tests.semantics.texts import BACKENDS, mistakes
 
 HEAD = """\
 pack: hunt
@@ -73,22 +79,19 @@ PACK = HEAD + FIELDS + REST
 
 
 @pytest.fixture(scope="module")
-def rules(tmp_path_factory):
-    path = tmp_path_factory.mktemp("packs") / "hunt.yaml"
-    path.write_text(PACK)
-    return package.load(path)
+def rules():
+    return load_text(PACK)
 
 
-@pytest.mark.parametrize("backend", ["reference", "torch", "native", "wasm"])
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_fresh_cells_have_their_elements_default(rules, backend):
-    assert [result.problem for result in run_examples(rules, sim=compile(rules, backend, tensors=False))] == [
-        "",
-        "",
-    ]
+    skip_without_compiler(backend)
+    results = run_examples(rules, sim=compile(rules, backend, tensors=False))
+    assert [result.problem for result in results] == ["", ""]
 
 
 def test_painted_cells_are_fresh(rules):
-    sim = package.compile(rules, backend="reference")
+    sim = compile(rules, backend="reference")
     world = sim.world(np.zeros((1, 2, 3), np.uint8))
     painted = sim.paint(world, where=np.eye(2, 3, dtype=bool), element="fox")
     assert to_numpy(painted["energy"])[0].tolist() == [[7, 1, 1], [1, 7, 1]]
@@ -98,12 +101,10 @@ def test_painted_cells_are_fresh(rules):
 
 
 def test_the_ledger_and_traces_know_them(rules):
-    from powderdsl.simulation.tracing import trace
-
-    fields = {entry.name: entry for entry in package.ledger(rules).fields}
+    fields = {entry.name: entry for entry in ledger(rules).fields}
     assert fields["energy"].fresh_bounds == (1, 7)
     assert "fox as 7" in fields["energy"].default
-    world = package.compile(rules, backend="reference").world(np.array([[[1, 0]]], np.uint8))
+    world = compile(rules, backend="reference").world(np.array([[[1, 0]]], np.uint8))
     found = trace(world, 0, 0, 1, of=["energy"])
     assert 7 in [write.after for write in found.writes]
 
@@ -121,31 +122,19 @@ def test_the_ledger_and_traces_know_them(rules):
         ("f: {type: 0..9, at: element, defualt: 3}", "PD108", "defualt"),
     ],
 )
-def test_bad_defaults(tmp_path, fields, code, under):
-    path = tmp_path / "hunt.yaml"
-    path.write_text(
-        f"{HEAD}fields:\n  mood: {{type: 0..9, at: element}}\n  energy: {{type: 0..9, at: element}}\n  {fields}\n"
-    )
-    with pytest.raises(CompileError) as raised:
-        package.load(path)
-    (found,) = raised.value.diagnostics
-    assert (found.code, found.primary.span.text) == (code, under)
+def test_bad_defaults(fields, code, under):
+    known = "fields:\n  mood: {type: 0..9, at: element}\n  energy: {type: 0..9, at: element}\n"
+    assert mistakes(f"{HEAD}{known}  {fields}\n") == [(code, under)]
 
 
-def test_an_invariant_meets_every_fresh_cell(tmp_path):
-    path = tmp_path / "hunt.yaml"
-    path.write_text(PACK + "invariants: [energy stays in 0..6]\n")
+def test_an_invariant_meets_every_fresh_cell():
     with pytest.raises(CompileError, match="a fresh cell has 7"):
-        package.load(path)
+        load_text(PACK + "invariants: [energy stays in 0..6]\n")
 
 
 @pytest.mark.parametrize("backend", ["reference", "wasm"])
 def test_tasks_make_fresh_cells(tmp_path, torch, backend, monkeypatch):
     """Worlds of tasks are drawn and acted on by code of their own."""
-    from powderdsl.simulation.simulator import compile as compile_rules
-    from powderdsl.tasks.episodes import TaskProgram, check_actions
-    from powderdsl.tasks.shipped import load_task
-
     monkeypatch.chdir(tmp_path)
     (tmp_path / "hunt.yaml").write_text(PACK.replace("energy > 4", "energy > 9"))
     (tmp_path / "task.yaml").write_text(
@@ -154,7 +143,7 @@ def test_tasks_make_fresh_cells(tmp_path, torch, backend, monkeypatch):
         "reward: {each: count(rabbit)}\n"
     )
     task = load_task("task.yaml")
-    program = TaskProgram(task, "train", compile_rules(task.ruleset, backend=backend))
+    program = TaskProgram(task, "train", compile(task.ruleset, backend=backend))
     episodes = program.start(torch.arange(2))
     energy = to_numpy(episodes.world["energy"])
     assert (energy[:, :4] == 7).all()

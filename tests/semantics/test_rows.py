@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-import powderdsl
 from powderdsl.analysis.ledger import ledger
-from powderdsl.compiler import load_with_diagnostics
-from powderdsl.diagnostics import CompileError
 from powderdsl.simulation.draw import to_numpy
-from tests.compilers import skip_without_compiler
+from powderdsl.testing.generators.cases import load_text
+from tests.semantics.texts import BACKENDS, codes, mistakes, simulator
 
 HEAD = """\
 pack: road
@@ -29,95 +25,78 @@ fields:
 passes:
   drive:
 """
-BACKENDS = ["reference", "torch", "native", "wasm"]
 
 
-def rules(tmp_path: Path, body: str) -> Path:
-    path = tmp_path / "road.yaml"
-    path.write_text(HEAD + body)
-    return path
-
-
-def driven(path: Path, backend: str, ids: list[list[int]], drives: list[list[int]]) -> tuple[list, list]:  # type: ignore[type-arg]
-    """Elements and loads after a step; at first each cell's load is its number."""
-    skip_without_compiler(backend)
-    sim = powderdsl.compile(powderdsl.load(path), backend=backend)
-    cells = np.array(ids)
-    numbers = np.arange(1, cells.size + 1).reshape(cells.shape)
-    speed = np.stack([numbers, -numbers])[None].astype(np.float32) / 4
-    world = sim.replace(
-        sim.world(cells[None].astype(np.uint8)), drives=np.array([drives]), load=numbers[None], speed=speed
-    )
+def driven(body: str, backend: str, ids: list[int], drives: list[int]) -> tuple[list[int], list[int]]:
+    """Elements and loads of a row of cells after a step; at first each cell's load is its number."""
+    sim = simulator(HEAD + body, backend)
+    numbers = np.arange(1, len(ids) + 1)[None, None]
+    speed = np.stack([numbers[0], -numbers[0]])[None].astype(np.float32) / 4
+    world = sim.replace(sim.world([[ids]]), drives=np.array([[drives]]), load=numbers, speed=speed)
     world = sim.step(world)
     loads = to_numpy(world["load"])[0]
     np.testing.assert_array_equal(to_numpy(world["speed"])[0, 0] * 4, loads)  # vectors travel as numbers do
-    return to_numpy(world.ids)[0].tolist(), loads.tolist()
+    return to_numpy(world.ids)[0, 0].tolist(), loads[0].tolist()
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_one_alone_trades_places(tmp_path: Path, backend: str) -> None:
-    path = rules(tmp_path, "    do: any moves right leaving right if drives and not right.drives\n")
-    found = driven(path, backend, [[1, 2, 0]], [[1, 0, 0]])
-    assert found == ([[2, 1, 0]], [[2, 1, 3]])
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_row_advances_and_the_last_keeps_a_copy_of_its_target(tmp_path: Path, backend: str) -> None:
-    path = rules(tmp_path, "    do: any moves right leaving right if drives\n")
-    found = driven(path, backend, [[1, 2, 3, 0, 0]], [[1, 1, 1, 0, 0]])
-    assert found == ([[2, 1, 2, 3, 0]], [[2, 1, 2, 3, 5]])
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_ring_turns(tmp_path: Path, backend: str) -> None:
-    path = rules(tmp_path, "    do: any moves right leaving right\n")
-    assert driven(path, backend, [[1, 2, 3]], [[0, 0, 0]]) == ([[3, 1, 2]], [[3, 1, 2]])
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_rows_of_one_rule_do_not_compete_and_other_rules_do(tmp_path: Path, backend: str) -> None:
-    path = rules(
-        tmp_path,
+MOVES = {
+    "one alone trades places": (
+        "    do: any moves right leaving right if drives and not right.drives\n",
+        ([1, 2, 0], [1, 0, 0]),
+        ([2, 1, 0], [2, 1, 3]),
+    ),
+    "a row advances, and the last keeps a copy of its target": (
+        "    do: any moves right leaving right if drives\n",
+        ([1, 2, 3, 0, 0], [1, 1, 1, 0, 0]),
+        ([2, 1, 2, 3, 0], [2, 1, 2, 3, 5]),
+    ),
+    "a ring turns": (
+        "    do: any moves right leaving right\n",
+        ([1, 2, 3], [0, 0, 0]),
+        ([3, 1, 2], [3, 1, 2]),
+    ),
+    "rows of one rule do not compete, and other rules do": (
         "    conflicts: first_wins\n    do:\n"
         "      - car moves right leaving right if drives\n      - bus moves left leaving left if drives\n",
-    )
-    assert driven(path, backend, [[1, 1, 0, 2]], [[1, 1, 0, 1]]) == ([[1, 1, 1, 2]], [[2, 1, 2, 4]])
+        ([1, 1, 0, 2], [1, 1, 0, 1]),
+        ([1, 1, 1, 2], [2, 1, 2, 4]),
+    ),
+    # Both go into the pit's place. The bus is written last, the car is lost, and the pit is there twice.
+    "later rules overwrite earlier ones": (
+        "    conflicts: overwrite\n    do:\n      - car swaps right if drives\n      - bus swaps left if drives\n",
+        ([1, 3, 2], [1, 0, 1]),
+        ([3, 2, 3], [2, 3, 2]),
+    ),
+}
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_later_rules_overwrite_earlier_ones(tmp_path: Path, backend: str) -> None:
-    path = rules(
-        tmp_path,
-        "    conflicts: overwrite\n    do:\n      - car swaps right if drives\n      - bus swaps left if drives\n",
-    )
-    # Both go into the pit's place. The bus is written last, the car is lost, and the pit is there twice.
-    assert driven(path, backend, [[1, 3, 2]], [[1, 0, 1]]) == ([[3, 2, 3]], [[2, 3, 2]])
+@pytest.mark.parametrize("name", MOVES)
+def test_rows_move(name: str, backend: str) -> None:
+    body, start, end = MOVES[name]
+    assert driven(body, backend, *start) == end
 
 
-def test_what_is_left_is_what_the_target_held(tmp_path: Path) -> None:
-    path = rules(tmp_path, "    do: car moves right leaving left if right is air\n")
-    with pytest.raises(CompileError, match="what is left behind") as caught:
-        powderdsl.load(path)
-    assert [one.code for one in caught.value.diagnostics] == ["PD405"]
+def test_only_the_target_can_be_left_behind() -> None:
+    text = f"{HEAD}    do: car moves right leaving left if right is air\n"
+    assert [code for code, _ in mistakes(text)] == ["PD405"]
 
 
-def test_the_ledger_knows_that_rows_over_one_element_lose_nothing(tmp_path: Path) -> None:
-    one = powderdsl.load(
-        rules(tmp_path, "    do: car moves right leaving right if drives and right is air\n")
-    )
-    assert ("car",) in ledger(one).constant_sums
-    any_ = powderdsl.load(
-        rules(tmp_path, "    do: car moves right leaving right if drives and right is not car\n")
-    )
-    assert ("car",) in ledger(any_).constant_sums
-    assert ("pit",) not in ledger(any_).constant_sums
-
-
-def test_the_ledger_knows_that_overwriting_loses_things(tmp_path: Path) -> None:
-    body = "    conflicts: overwrite\n    do:\n      - car swaps right if right is pit\n      - bus swaps left if left is pit\n"
-    found = ledger(powderdsl.load(rules(tmp_path, body)))
-    assert ("car",) not in found.constant_sums
-    assert ("pit",) not in found.constant_sums
+@pytest.mark.parametrize(
+    ("body", "constant"),
+    [
+        ("    do: car moves right leaving right if drives and right is air\n", {"car", "pit"}),
+        ("    do: car moves right leaving right if drives and right is not car\n", {"car"}),
+        (
+            "    conflicts: overwrite\n    do:\n      - car swaps right if right is pit\n"
+            "      - bus swaps left if left is pit\n",
+            set(),
+        ),
+    ],
+)
+def test_the_ledger_knows_what_rows_and_overwriting_lose(body: str, constant: set[str]) -> None:
+    sums = ledger(load_text(HEAD + body)).constant_sums
+    assert {name for name in ("car", "pit") if (name,) in sums} == constant
 
 
 @pytest.mark.parametrize(
@@ -133,12 +112,7 @@ def test_the_ledger_knows_that_overwriting_loses_things(tmp_path: Path) -> None:
     ],
 )
 def test_a_value_that_one_rule_needs_and_the_other_denies_keeps_them_apart(
-    tmp_path: Path, rule: str, is_proven: bool
+    rule: str, is_proven: bool
 ) -> None:
     let = "    let: {wants: count(car in box(3)) > 5 and length(speed) > 1 or drives and load > 3}\n"
-    path = rules(tmp_path, f"{let}    do: {rule}\n")
-    try:
-        found = [one.code for one in load_with_diagnostics(path)[1]]
-    except CompileError as error:
-        found = [one.code for one in error.diagnostics]
-    assert ("PD501" not in found) == is_proven
+    assert ("PD501" not in codes(f"{HEAD}{let}    do: {rule}\n")) == is_proven
