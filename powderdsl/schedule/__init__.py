@@ -1,1 +1,1 @@
-"""What is computed where: bit planes become loops, guards, movements and buffers. The only planner of all targets."""
+"""The planner of all targets: bit planes become loops, guards, movements and buffers."""

@@ -1,4 +1,4 @@
-"""What values cost, and draws: where the result of each matters."""
+"""The cost of recomputing values, and the conditions of draws."""
 
 from __future__ import annotations
 
@@ -27,18 +27,17 @@ UNIFORM = ("const", "param", "coordinate", "inside")
 LOGIC = ("not", "and", "or", "xor", "select", "when")
 ARITHMETIC = ("add", "sub", "mul", "neg")
 
-Have = Callable[[Node], bool]
+IsStored = Callable[[Node], bool]
 
 
 @dataclass(frozen=True)
 class Costs:
-    """Limits of recomputation on a target: `gates` for a flag, summed over all neighbors that read it; operations
-    (`floats`) for a float."""
+    """Limits of recomputation on a target: gates for a flag, summed over its readers, and operations for a float."""
 
     gates: int
     floats: int
     by_rows: bool = False
-    """Whether whole planes are processed, row by row, and it is known which of them are empty."""
+    """True if the target processes whole planes row by row, and tracks which of them are empty."""
 
 
 def sources_of(node: Node) -> list[tuple[Node, Offset]]:
@@ -52,65 +51,65 @@ def sources_of(node: Node) -> list[tuple[Node, Offset]]:
     return []
 
 
-def movable(node: Node, have: Have, most: int) -> bool:
-    """Whether a flag can be recomputed at a neighbor with at most `most` gates."""
+def is_recomputable(node: Node, is_stored: IsStored, most: int) -> bool:
+    """True if a flag can be recomputed at a neighbor with at most `most` gates."""
     stack = [(node, 0, 0)]
     for top, dy, dx in taken(stack):
         if is_constant(top):
             continue
         most -= 1
         shifted, plain = top.op == "shift" and top.attr[2], top.op in LOGIC and not of_floats(top)
-        if most < 0 or not (have(top) or shifted or plain):
+        if most < 0 or not (is_stored(top) or shifted or plain):
             return False
-        if not have(top):
+        if not is_stored(top):
             y, x = top.attr[:2] if shifted else (0, 0)
             stack += [(arg, dy + y, dx + x) for arg in top.args]
     return True
 
 
 def is_constant(node: Node) -> bool:
-    """Whether a value is the same in all cells of a world."""
+    """True if a value is the same in all cells of a world."""
     return node.op in ("const", "param") or (node.op == "coordinate" and node.attr[0] == "step")
 
 
-def gate_cost(node: Node, have: Have, limit: int) -> int:
-    """The number of gates that recompute a flag in another row; `limit` if they are as many or that is impossible."""
-    if have(node) or is_constant(node):
+def gate_cost(node: Node, is_stored: IsStored, limit: int) -> int:
+    """The number of gates that recompute a flag in another row, at most `limit`; `limit` if that is impossible."""
+    if is_stored(node) or is_constant(node):
         return 0
     if node.op in (*UNIFORM, *DRAWS) or is_movement(node) or of_floats(node):
         return limit
     if node.op == "shift":
         _, dx, wraps = node.attr
-        return gate_cost(node.args[0], have, limit) if wraps and not dx else limit
+        return gate_cost(node.args[0], is_stored, limit) if wraps and not dx else limit
     total = 2 if node.op == "select" else 1
     for arg in node.args:
-        total += gate_cost(arg, have, limit)
+        total += gate_cost(arg, is_stored, limit)
         if total >= limit:
             return limit
     return total
 
 
-def float_cost(node: Node, have: Have) -> int:
+def float_cost(node: Node, is_stored: IsStored) -> int:
     """The number of operations that recompute a float at a neighbor; FAR if that is impossible."""
-    if have(node) or node.op in ("const", "param"):
+    if is_stored(node) or node.op in ("const", "param"):
         return 0
     if node.op in ARITHMETIC:
         total = 1
         for arg in node.args:
-            total += float_cost(arg, have)
+            total += float_cost(arg, is_stored)
             if total >= FAR:  # graphs share nodes: counting all paths would take forever
                 return FAR
         return total
-    return float_cost(node.args[0], have) if node.op == "shift" and node.attr[2] else FAR
+    return float_cost(node.args[0], is_stored) if node.op == "shift" and node.attr[2] else FAR
 
 
-def stored_parts(source: Node, have: Have, most: int) -> list[Node]:
-    """The nodes to store so that a float can be recomputed at a neighbor: itself, or its costly parts."""
-    if float_cost(source, have) <= most:
+def stored_parts(source: Node, is_stored: IsStored, most: int) -> list[Node]:
+    """The nodes to store so that a float can be recomputed at a neighbor: the float, or its costly parts."""
+    if float_cost(source, is_stored) <= most:
         return []
     if source.op in ARITHMETIC:
-        parts = [part for arg in source.args for part in stored_parts(arg, have, most)]
-        if float_cost(source, lambda node: have(node) or node in parts) <= most:
+        parts = [part for arg in source.args for part in stored_parts(arg, is_stored, most)]
+        if float_cost(source, lambda node: is_stored(node) or node in parts) <= most:
             return parts
     return [source]
 
@@ -125,8 +124,8 @@ DRAWS = ("chance", "below_planes", "below_param")
 _POINTWISE = ("and", "or", "xor", "not", "select")
 
 
-def thresholds(schedule: Schedule) -> Schedule:
-    """A draw below all planes of one parameter becomes a draw below the parameter, usually one number for all worlds.
+def compare_parameters(schedule: Schedule) -> Schedule:
+    """Replace draws below all planes of one parameter by draws below the parameter, usually one number for all worlds.
 
     `below_planes(p:16, p:15, …, p:0)` → `below_param(p)`.
     """
@@ -142,8 +141,8 @@ def thresholds(schedule: Schedule) -> Schedule:
     return map_values(schedule, rule)
 
 
-def conditions(schedule: Schedule) -> Schedule:
-    """Draws get a last argument: the condition under which their result is read. Elsewhere the result is undefined.
+def condition_draws(schedule: Schedule) -> Schedule:
+    """Add a last argument to draws: the condition under which their result is read. Elsewhere the result is undefined.
 
     `busy & chance(s)` → `busy & chance(s, busy)`; `busy ? chance(s) : a` → `busy ? chance(s, busy) : a`.
     """
@@ -157,13 +156,13 @@ def conditions(schedule: Schedule) -> Schedule:
                 random.add(node)
 
         def below(node: Node, facts: Facts) -> Iterator[tuple[Node, Facts]]:
-            """What a node reads that depends on draws, and the flags that hold where it does."""
+            """The random arguments of a node, each with the flags that hold where the node reads it."""
             for arg in node.args:
                 if arg in random:
                     flags = facts if node.op in _POINTWISE else {}
                     others = [other for other in node.args if other not in random] if node.op == "and" else []
                     if node.op == "select" and node.args[0] not in random:
-                        others = [_chosen(node, arg, graph)]
+                        others = [_choice_condition(node, arg, graph)]
                     yield arg, flags | dict.fromkeys(others[: MAX_CONDITIONS - len(flags)])
 
         where = on_all_paths(roots, below)  # a variable's value is read everywhere
@@ -178,27 +177,27 @@ def conditions(schedule: Schedule) -> Schedule:
     return map_each(schedule, Compute, change)
 
 
-def _chosen(node: Node, arg: Node, graph: Graph) -> Node:
-    """Where a choice reads one of its two values: its condition or the opposite; everywhere, if both are that value."""
+def _choice_condition(node: Node, arg: Node, graph: Graph) -> Node:
+    """The flag under which a choice reads `arg`: its condition or the opposite, or true if both values are `arg`."""
     condition, yes, no = node.args
     if yes is no:
         return graph.flag(True)
     return condition if arg is yes else graph.node("not", FLAG, (condition,))
 
 
-def asked_for(draw: Node, where: Node, graph: Graph) -> Node:
+def draw_under(draw: Node, condition: Node, graph: Graph) -> Node:
     """The same draw under another condition."""
     count = draw.attr[1] + 1 if draw.op == "below_planes" else 0
-    return graph.node(draw.op, FLAG, (*draw.args[:count], where), draw.attr)
+    return graph.node(draw.op, FLAG, (*draw.args[:count], condition), draw.attr)
 
 
 def is_coin(node: Node) -> bool:
-    """Whether a node is a draw that its highest bit decides."""
+    """True if a node is a draw that its highest bit decides."""
     return node.op == "chance" and node.attr[2] == 1 << node.attr[1] - 1
 
 
 def takes_bits(node: Node) -> bool:
-    """Whether a node is a draw of more than FEW_BITS random bits."""
+    """True if a node is a draw of more than FEW_BITS random bits."""
     if node.op == "chance":
         _, bits, limit = node.attr
         return bits - ((limit & -limit).bit_length() - 1) > FEW_BITS

@@ -13,23 +13,23 @@ from powderdsl.schedule.types import (
     Out,
     Schedule,
     choices,
+    drop_unread,
     flat,
     load,
     map_values,
     on_all_paths,
     rewritten,
-    without_unread,
 )
 
 COMPARISONS = ("eq", "lt", "le")
 AT_NEIGHBORS = ("shift", "swap", "arrive")
 
 
-def late(schedule: Schedule) -> Schedule:
-    """Floats that substeps write are not stored: their users compute them from the pass's inputs and the masks.
+def inline_floats(schedule: Schedule) -> Schedule:
+    """Compute floats that substeps write where they are used, from the pass's inputs and the masks, without storing them.
 
     Where a guard's masks fail, the choices in the value give the old one, so the value is right outside the guard too.
-    What only moves, more than once, needs not be clamped again.
+    Floats that only move, more than once, need no second clamp.
     `if any m: v2 = select(m, a, v1); … v3 = select(n, b, v2)` → `v3 = select(n, b, select(m, a, v1))`.
     """
     known: dict[str, Node] = {}
@@ -43,22 +43,22 @@ def late(schedule: Schedule) -> Schedule:
             if out.var.type == REAL:
                 known[out.var.name] = new(out.value)
     schedule = map_values(schedule, rule)
-    namer, slots = Namer(schedule), dict(schedule.finds)
+    namer, slots = Namer(schedule), dict(schedule.inputs)
     outs: dict[Node, Out] = {}
-    leaves = []
-    for slot, value in schedule.leaves:
+    outputs = []
+    for slot, value in schedule.outputs:
         if value.op == "settle" and slot in slots and _only_moves(value.args[0], slots[slot].name):
             value = value.args[0]
         if value.type == REAL and value.op != "load":
             out = outs.setdefault(value, Out(namer.var(REAL), value))
             value = load(schedule.graph, out.var)
-        leaves.append((slot, value))
+        outputs.append((slot, value))
     end = (Compute(tuple(outs.values())),) if outs else ()
-    return without_unread(replace(schedule, body=(*schedule.body, *end), leaves=tuple(leaves)))
+    return drop_unread(replace(schedule, body=(*schedule.body, *end), outputs=tuple(outputs)))
 
 
 def _only_moves(value: Node, slot: str) -> bool:
-    """Whether a float is zero or a slot's value from another cell, after several movements: it is within its bounds already.
+    """True if a float is zero or a slot's value from another cell, after several movements: it is within its bounds.
 
     After one movement, `narrow` limits the loop to rows in which something moves.
     """
@@ -79,8 +79,8 @@ def _only_moves(value: Node, slot: str) -> bool:
     return again
 
 
-def chosen(schedule: Schedule) -> Schedule:
-    """A choice between constants at a neighbor asks for the neighbor's flag, so that it is not stored as a field.
+def shift_choices(schedule: Schedule) -> Schedule:
+    """Replace a choice between constants at a neighbor by a choice on the neighbor's flag, so that no field is stored.
 
     `(m ? 22 : 2)[0,1]` → `m[0,1] ? 22 : 2`, where edges wrap.
     """
@@ -108,8 +108,8 @@ def _at_neighbor(value: Node, where: tuple[int, int, bool], graph: Graph) -> Nod
     return graph.node(value.op, REAL, tuple(args))
 
 
-def led(schedule: Schedule) -> Schedule:
-    """A comparison that matters only where another one holds is computed only there.
+def lead_comparisons(schedule: Schedule) -> Schedule:
+    """Compute comparisons that matter only where another comparison holds only there.
 
     `w & (a | b)` → `w & (led(w, a) | led(w, b))`: every path from a value to `a` goes through a conjunction with `w`.
     Draws as floats are costly, so their comparisons follow the condition of a choice, too: `c ? (draw < x ? 1 : 2) : 3`
@@ -123,6 +123,7 @@ def led(schedule: Schedule) -> Schedule:
         free = (flag for flag in choices[node] if flag.op != "param" and not _is_drawn(flag))
         if leader := next(free, None):
             leaders[node] = leader
+    # A comparison with a leader leads no other: chains of leaders would be tested one by one.
     leading = set(ordered(leaders.values()))
     for node in comparisons:
         for leader in sorted(conjunctions[node], key=comparisons.__getitem__):
@@ -143,14 +144,14 @@ def _is_drawn(node: Node) -> bool:
 
 
 def _choices(node: Node, facts: Facts) -> Iterator[tuple[Node, Facts]]:
-    """The conditions of choices on the way to what a node reads. What holds in a cell need not hold at its neighbors."""
+    """The arguments of a node, with the conditions of choices on the path; a neighbor does not inherit them."""
     here = {} if node.op in AT_NEIGHBORS else facts
     for number, arg in enumerate(node.args):
         yield arg, here | {node.args[0]: None} if node.op == "select" and number == 1 else here
 
 
 def _conjunctions(node: Node, facts: Facts) -> Iterator[tuple[Node, Facts]]:
-    """The comparisons with which a conjunction joins what it reads. A path leads to each conjunct at once."""
+    """The conjuncts or arguments of a node, each with the comparisons that a conjunction joins with it."""
     here = {} if node.op in AT_NEIGHBORS else facts
     parts = conjuncts(node) if node.op == "and" else node.args
     joined = dict.fromkeys(filter(is_comparison, parts)) if node.op == "and" else {}
@@ -158,21 +159,21 @@ def _conjunctions(node: Node, facts: Facts) -> Iterator[tuple[Node, Facts]]:
         yield part, here | {other: None for other in joined if other is not part}
 
 
-def unchanged(value: Node, names: Container[str]) -> tuple[Node, list[Node]] | None:
-    """For a clamped slot under choices: its old value, and the masks without which it keeps it (it was clamped)."""
+def match_slot_choices(value: Node, names: Container[str]) -> tuple[Node, list[Node]] | None:
+    """Match choices on a clamped slot: its old value, and the masks without which it keeps that value."""
     if value.op not in ("settle", "select"):
         return None
     chain, node = choices(value.args[0] if value.op == "settle" else value)
     masks = [choice.args[0] for choice in chain]
-    known = node.op == "load" and node.attr in names and all(mask.op != "param" for mask in masks)
-    return (node, masks) if known else None
+    matches = node.op == "load" and node.attr in names and all(mask.op != "param" for mask in masks)
+    return (node, masks) if matches else None
 
 
 def is_comparison(node: Node) -> bool:
-    """Whether a flag compares floats."""
+    """True if a flag compares floats."""
     return node.op in COMPARISONS and node.args[0].type == REAL
 
 
 def of_floats(node: Node) -> bool:
-    """Whether a node needs a loop over cells: floats, and flags that compare them."""
+    """True if a node needs a loop over cells: floats, and flags that compare them."""
     return node.type == REAL or node.op == "led" or is_comparison(node)

@@ -9,7 +9,7 @@ from typing import Any
 
 from powderdsl.ir.ops import FLAG, OPS, REAL, Graph, Node, ordered, taken
 from powderdsl.ir.single import single
-from powderdsl.schedule.floats import unchanged
+from powderdsl.schedule.floats import match_slot_choices
 from powderdsl.schedule.types import (
     ANSWER,
     Block,
@@ -39,18 +39,18 @@ from powderdsl.schedule.types import (
 
 
 def narrow(schedule: Schedule) -> Schedule:
-    """Loops over cells get a region and their values outside it.
+    """Add a region, and the values outside it, to loops over cells.
 
     `v' = settle(m ? a : v)`, where v was clamped → over `m`, else `v`; `w = 0.1 < v*v` → over `live(v)`, else 0.
     """
-    schedule = _where_read(schedule)
-    found = {slot: var.name for slot, var in schedule.finds}
-    olds = {node.attr: (found[slot],) for slot, node in schedule.leaves if slot in found}
-    return map_each(schedule, Compute, lambda loop: [_narrowed(loop, schedule.graph, olds)])
+    schedule = _mask_fields(schedule)
+    inputs = {slot: var.name for slot, var in schedule.inputs}
+    olds = {node.attr: (inputs[slot],) for slot, node in schedule.outputs if slot in inputs}
+    return map_each(schedule, Compute, lambda loop: [_with_region(loop, schedule.graph, olds)])
 
 
-def _where_read(schedule: Schedule) -> Schedule:
-    """Fields that are only read where a flag holds, there or at the neighbor that reads them, are zero elsewhere.
+def _mask_fields(schedule: Schedule) -> Schedule:
+    """Set fields to zero where no flag holds without which nothing reads them, there or at a neighbor.
 
     `b = f(a)`, `c = m[0,1] ? x + b[0,1] : x` → `b = m ? f(a) : 0`.
     """
@@ -66,25 +66,25 @@ def _where_read(schedule: Schedule) -> Schedule:
             chosen = node.op == "select" and number == 1 and node.args[0].op == "load"
             yield arg, masks | {node.args[0]: None} if chosen else masks
 
-    asking: dict[str, set[str]] = {}
+    masks_of: dict[str, set[str]] = {}
     """By field: the flags that hold wherever it is read."""
     for node, masks in on_all_paths(schedule.values, below).items():
         if field := field_of(node):
             names, where = {mask.attr for mask in masks}, node.attr if node.op == "shift" else HERE
             flags = {shifted[name][0] for name in names if name in shifted and shifted[name][1] == where}
             flags |= names if where == HERE else set()
-            asking[field.attr] = asking.get(field.attr, flags) & flags
-    there = set(schedule.found)
+            masks_of[field.attr] = masks_of.get(field.attr, flags) & flags
+    defined = set(schedule.input_slots)
 
     def change(loop: Compute) -> list[Statement]:
         outs = []
         for out in loop.outs:
-            flags = in_order(asking.get(out.var.name, set()) & there)
+            flags = in_order(masks_of.get(out.var.name, set()) & defined)
             if loop.over == "cells" and out.var.type == REAL and out.var.means is None and flags:
                 args = graph.node("load", FLAG, (), flags[0]), out.value, graph.real(0.0)
                 out = replace(out, value=graph.node("select", REAL, args))
             outs.append(out)
-        there.update(loop.vars)
+        defined.update(loop.vars)
         return [replace(loop, outs=tuple(outs))]
 
     return map_each(schedule, Compute, change)
@@ -93,15 +93,15 @@ def _where_read(schedule: Schedule) -> Schedule:
 HERE = (0, 0, True)
 
 
-def ask_regions(schedule: Schedule) -> Schedule:
-    """Loops with a region are put into guards that test whether the region holds anywhere.
+def guard_regions(schedule: Schedule) -> Schedule:
+    """Put loops with a region into guards that test whether the region holds anywhere.
 
     `loop over m: x = …, else 0` → `if any m: loop over m: x = …, else x = 0`.
     """
     namer, graph = Namer(schedule), schedule.graph
 
     def anywhere(node: Node) -> Node | None:
-        """A field is tested in the cell itself only: a region holds somewhere if it does anywhere."""
+        """Test a field in the cell itself only: neighbors of live cells cannot be live if no cell is."""
         return graph.node("live", FLAG, node.args, (0, 0)) if node.op == "live" else None
 
     def change(loop: Compute) -> list[Statement]:
@@ -116,27 +116,27 @@ def ask_regions(schedule: Schedule) -> Schedule:
     return map_each(schedule, Compute, change)
 
 
-def _narrowed(loop: Compute, graph: Graph, slots: Mapping[str, tuple[str]]) -> Compute:
-    """A loop with its region, if it has one. `slots`: the variable that a slot's new value replaces, by the new one's name.
+def _with_region(loop: Compute, graph: Graph, slots: Mapping[str, tuple[str]]) -> Compute:
+    """The loop with its region, if it has one.
 
-    Only a slot's own old value has been clamped to the bounds of that slot.
+    `slots` maps the new variable of a slot to the old one: only that has been clamped to the bounds of the slot.
     """
     if loop.over == "words":
         return loop
     rest: list[Node] = []
     flags: list[Node] = []
     for out in loop.outs:
-        if kept := unchanged(out.value, slots.get(out.var.name, ())):
-            rest.append(kept[0])
-            flags += kept[1]
+        if match := match_slot_choices(out.value, slots.get(out.var.name, ())):
+            rest.append(match[0])
+            flags += match[1]
+    # Unless all outputs keep old values outside their masks, they must be constant where nothing is live.
     if loop.over != "cells" or len(rest) < len(loop.outs):
-        calm = _calm(loop.results)
-        if calm is None:
+        at_rest = _values_at_rest(loop.results)
+        if at_rest is None:
             return loop
-        numbers, flags = calm
-        flags += [
-            graph.node("live", FLAG, (field,), (dy, reach)) for field, dy, reach in _reads(loop.results)
-        ]
+        numbers, flags = at_rest
+        reads = _reads_at_rest(loop.results)
+        flags += [graph.node("live", FLAG, (field,), (dy, reach)) for field, dy, reach in reads]
         rest = [
             graph.const(bool(number) and out.var.type == FLAG, out.var.type)
             for out, number in zip(loop.outs, numbers, strict=True)
@@ -145,9 +145,11 @@ def _narrowed(loop: Compute, graph: Graph, slots: Mapping[str, tuple[str]]) -> C
     return replace(loop, outs=outs, region=combined("or", dict.fromkeys(flags), graph))
 
 
-def _calm(values: list[Node]) -> tuple[list[float | bool], list[Node]] | None:
-    """The values where all floats are zero and no mask holds, and the masks. None if a float is not zero there, or if
-    values depend on draws or parameters."""
+def _values_at_rest(values: list[Node]) -> tuple[list[float | bool], list[Node]] | None:
+    """The values where all fields are zero and no mask holds, and the masks.
+
+    None if a float is not zero there, or if values depend on draws or parameters.
+    """
     memo: dict[Node, Any] = {}
     masks: Facts = {}
 
@@ -188,8 +190,8 @@ def _calm(values: list[Node]) -> tuple[list[float | bool], list[Node]] | None:
     return numbers, list(masks)
 
 
-def _reads(values: list[Node]) -> list[tuple[Node, int, int]]:
-    """Fields that values read where no mask holds: field, rows down, and the largest distance in columns."""
+def _reads_at_rest(values: list[Node]) -> list[tuple[Node, int, int]]:
+    """The fields that values read where no mask holds: field, rows down, and the largest distance in columns."""
     reach: dict[tuple[Node, int], int] = {}
     stack = [(value, 0, 0) for value in values]
     for node, dy, dx in taken(stack):
@@ -209,10 +211,10 @@ FEW = 8
 
 
 def join(schedule: Schedule) -> Schedule:
-    """Every run of consecutive loops over cells, also a single one, becomes a `Sweeps`.
+    """Replace every run of consecutive loops over cells, also a single loop, by a `Sweeps`.
 
     `loop cells: a = …`, `loop cells: b = a[0,1|0] + …` → one loop over the rows of a world, in which `b` follows `a`
-    one row behind. Where a loop only continues the choices before it, it becomes one with them.
+    one row behind. A loop that only continues the choices before it is fused with them.
     """
     reads = Counter(loaded(schedule.values))
 
@@ -221,13 +223,15 @@ def join(schedule: Schedule) -> Schedule:
         run: list[Compute] = []
         for statement in (*block, None):
             loop = statement if isinstance(statement, Compute) and statement.over != "words" else None
-            if run and (loop is None or _asks_masks_of(loop, run) or keeps(loop) or keeps(run[-1])):
-                result += [_joined(loops, reads) for loops in _components(run)]
+            if run and (
+                loop is None or _needs_masks_of(loop, run) or keeps_values(loop) or keeps_values(run[-1])
+            ):
+                result += [_sweeps(loops, reads) for loops in _components(run)]
                 run = []
             if loop is None:
                 result += [] if statement is None else [statement]
-            elif run and (continued := _continued(run[-1], loop, reads, schedule.graph)):
-                run[-1] = continued
+            elif run and (fused := _fuse(run[-1], loop, reads, schedule.graph)):
+                run[-1] = fused
             else:
                 run.append(loop)
         return tuple(result)
@@ -235,18 +239,18 @@ def join(schedule: Schedule) -> Schedule:
     return map_blocks(schedule, change)
 
 
-def keeps(loop: Compute) -> bool:
-    """Whether values outside the region are old ones. Such a loop runs alone, so that rows outside cost nothing."""
+def keeps_values(loop: Compute) -> bool:
+    """True if values outside the region are old ones. Such a loop runs alone, so that rows outside cost nothing."""
     return any(out.otherwise is not None and out.otherwise.op == "load" for out in loop.outs)
 
 
-def _asks_masks_of(loop: Compute, run: Sequence[Compute]) -> bool:
-    """Whether choices are made by flags of a run, which must be there in all rows before."""
-    flags = {out.var.name for one in run for out in one.outs if out.var.type == FLAG}
+def _needs_masks_of(loop: Compute, run: Sequence[Compute]) -> bool:
+    """True if choices are made by flags of a run, which must be complete before."""
+    flags = {name for part in run for name, var in part.vars.items() if var.type == FLAG}
     return loop.over == "choices" and not flags.isdisjoint(loop.reads)
 
 
-def _continued(first: Compute, second: Compute, reads: Counter[str], graph: Graph) -> Compute | None:
+def _fuse(first: Compute, second: Compute, reads: Counter[str], graph: Graph) -> Compute | None:
     """Choices and a few operations on their results as one loop, if nothing else reads these results.
 
     `loop choices: a = m ? x : y`, `loop cells: b = 0.9 * a` → `loop choices: b = 0.9 * (m ? x : y)`.
@@ -272,12 +276,12 @@ CONTINUING = ("load", "const", "param", "add", "sub", "mul", "neg", "abs")
 
 
 def _components(run: Sequence[Compute]) -> list[list[Compute]]:
-    """The loops of a run, apart where none reads what another one of them computes."""
+    """The loops of a run in groups that do not read each other's results."""
     made = made_in(run).keys()
     return connected(run, lambda loop: made & (loop.reads | loop.vars.keys()))
 
 
-def _joined(run: Sequence[Compute], reads: Counter[str]) -> Sweeps:
+def _sweeps(run: Sequence[Compute], reads: Counter[str]) -> Sweeps:
     """The loops with their parts and lags, and the fields that only loops of the same part read.
 
     A row that is read at other columns was stored a row earlier: a processor waits for what it has just stored if a load

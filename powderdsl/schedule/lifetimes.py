@@ -1,4 +1,4 @@
-"""Memory of variables: when they are released, what is written in place, numbered buffers, and barriers between threads."""
+"""Memory of variables: when they are released, what is written in place, numbered buffers, and insert_barriers between threads."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from powderdsl.ir.ops import FLAG, REAL, Graph, Node, Offset
-from powderdsl.schedule.join import keeps
+from powderdsl.schedule.join import keeps_values
 from powderdsl.schedule.types import (
     ANSWER,
     Block,
@@ -24,6 +24,7 @@ from powderdsl.schedule.types import (
     Var,
     backwards,
     combined,
+    drop_unread,
     field_reads,
     flat,
     in_order,
@@ -36,12 +37,11 @@ from powderdsl.schedule.types import (
     read_elsewhere,
     reads_of,
     rewritten,
-    without_unread,
 )
 
 
 def release(schedule: Schedule) -> Schedule:
-    """Every variable is released exactly once, even if nothing reads it; planes overwrite old ones that end.
+    """Release every variable exactly once, even if nothing reads it; planes overwrite old planes that end.
 
     `swap by m: b = a`, where `a` is not read again → `b = a into a`; the same where a loop over words changes some words.
     """
@@ -54,13 +54,13 @@ def release(schedule: Schedule) -> Schedule:
             body, _ = backwards(statement.body, after | used, change)
             statement = replace(statement, body=body)
         elif isinstance(statement, Move):
-            statement = _in_place(statement, after)
+            statement = _overwrite_planes(statement, after)
         elif isinstance(statement, Compute) and statement.region is not None:
-            statement = _updated(statement, after)
-        elif isinstance(statement, Sweeps) and keeps(statement.body[0]):
-            statement = replace(statement, body=(_updated(statement.body[0], after),))
+            statement = _update_in_place(statement, after)
+        elif isinstance(statement, Sweeps) and keeps_values(statement.body[0]):
+            statement = replace(statement, body=(_update_in_place(statement.body[0], after),))
         elif isinstance(statement, Sweeps):
-            statement = _overtaken(_put_off(statement, after, namer, graph), after)
+            statement = _overwrite_fields(_postpone_stores(statement, after, namer, graph), after)
         gone = used - after - statement.ended
         return [statement, Release(frees=tuple(in_order(gone)))] if gone else [statement]
 
@@ -68,8 +68,8 @@ def release(schedule: Schedule) -> Schedule:
     return replace(schedule, body=body)
 
 
-def _in_place(move: Move, after: set[str]) -> Move:
-    """A movement that overwrites what ends with it: the old plane, or the one whose flags stay where none arrives."""
+def _overwrite_planes(move: Move, after: set[str]) -> Move:
+    """A movement that overwrites a plane that ends with it: the old plane, or the plane where no mover arrives."""
     reads = Counter(loaded([move.region]))
     for out in move.outs:
         reads.update(set(loaded([out.value, move.olds[out.var.name]])))
@@ -81,8 +81,8 @@ def _in_place(move: Move, after: set[str]) -> Move:
     return replace(move, outs=tuple(outs))
 
 
-def _updated(loop: Compute, after: set[str]) -> Compute:
-    """A loop that changes some words or rows in place, where nothing reads the old ones later or elsewhere."""
+def _update_in_place(loop: Compute, after: set[str]) -> Compute:
+    """A loop that changes some words or rows in place, if nothing reads the old values later or elsewhere."""
     needed = after | {read.name for read in reads_of(loop.values) if read.far and not read.live}
     olds = Counter(old.attr for old in loop.olds.values() if old.op == "load")
     ended = {name for name, count in olds.items() if count == 1} - needed
@@ -93,8 +93,8 @@ def _updated(loop: Compute, after: set[str]) -> Compute:
     return replace(loop, outs=tuple(outs))
 
 
-def _put_off(sweeps: Sweeps, after: set[str], namer: Namer, graph: Graph) -> Sweeps:
-    """Choices whose result waits for a loop that stores it over their old fields, when no row is missing any more.
+def _postpone_stores(sweeps: Sweeps, after: set[str], namer: Namer, graph: Graph) -> Sweeps:
+    """Add a loop that stores the result of choices over their old fields, once no loop reads those rows any more.
 
     `loop choices: b = m ? f(a[-1,0]) : a` → `b'` in its place, and `loop cells, 2 behind: b = b' into a`.
     """
@@ -107,9 +107,9 @@ def _put_off(sweeps: Sweeps, after: set[str], namer: Namer, graph: Graph) -> Swe
     waiting = {out.var.name: namer.var(REAL) for out in lasting}
     olds = {name: load(graph, var) for name, var in waiting.items()}
     loops = []
-    for one in sweeps.body:
-        new = rewritten(one.values, graph, lambda node: olds.get(node.attr))
-        loops.append(one.with_values(new))
+    for part in sweeps.body:
+        new = rewritten(part.values, graph, lambda node: olds.get(node.attr))
+        loops.append(part.with_values(new))
     outs = tuple(replace(out, var=waiting.get(out.var.name, out.var)) for out in loop.outs)
     zero = graph.real(0.0)
     region = combined("or", [graph.node("live", FLAG, (old,), (0, 0)) for old in olds.values()], graph)
@@ -122,19 +122,19 @@ def _put_off(sweeps: Sweeps, after: set[str], namer: Namer, graph: Graph) -> Swe
 
 
 def _last_reads(sweeps: Sweeps, after: set[str]) -> dict[str, tuple[int, int]]:
-    """By field that may be written over: the least lag with which that can be done to a row, and its last reader."""
+    """By field that may be overwritten: the least lag at which a loop may overwrite a row, and its last reader."""
     reads: dict[str, tuple[int, int]] = {}
-    kept = after.union(sweeps.vars)
+    needed = after.union(sweeps.vars)
     for number, loop in enumerate(sweeps.body):
         for read in field_reads(loop):
             if loop.part > 0 or (read.live and read.dy):
-                kept.add(read.name)
+                needed.add(read.name)
             reads[read.name] = max(reads.get(read.name, (0, 0))[0], loop.lag - read.dy + 1), number
-    return {name: last for name, last in reads.items() if name not in kept}
+    return {name: last for name, last in reads.items() if name not in needed}
 
 
-def _overtaken(sweeps: Sweeps, after: set[str]) -> Sweeps:
-    """Loops with fields that overwrite a field which earlier loops of the part have read in all rows so far."""
+def _overwrite_fields(sweeps: Sweeps, after: set[str]) -> Sweeps:
+    """Let fields overwrite fields that earlier loops of the part have read in all rows so far."""
     reads = _last_reads(sweeps, after)
     loops = []
     for number, loop in enumerate(sweeps.body):
@@ -153,11 +153,11 @@ def _overtaken(sweeps: Sweeps, after: set[str]) -> Sweeps:
     return replace(sweeps, body=tuple(loops))
 
 
-def swaps(schedule: Schedule) -> Schedule:
-    """Loops over cells that exchange values of fields, by the movers of a swap of planes, become swaps themselves.
+def swap_fields(schedule: Schedule) -> Schedule:
+    """Replace loops over cells that exchange values of fields, by the movers of a swap of planes, by swaps of fields.
 
-    `swap by m [+1,+0]: …`, `b = settle(m ? a[1,0] : (m[-1,0] ? a[-1,0] : a))` → `swap by m [+1,+0]: b = a`. Values of a
-    slot stay within its bounds wherever they are. What becomes zero afterwards does so in a loop over rows where it does.
+    `swap by m [+1,+0]: …`, `b = settle(m ? a[1,0] : (m[-1,0] ? a[-1,0] : a))` → `swap by m [+1,+0]: b = a`. Moved values of
+    a slot stay within its bounds. If some become zero afterwards, a loop over their rows follows.
     """
     offsets = {
         statement.region.attr: statement.offset
@@ -167,26 +167,25 @@ def swaps(schedule: Schedule) -> Schedule:
     if not offsets:
         return schedule
     shifted = planes_at_neighbors(schedule)
-    slots = {node.attr: slot for slot, node in schedule.leaves if node.op == "load"}
-    settled = {var.name: slot for slot, var in schedule.finds if var.type == REAL}
-    """Fields that hold values of a slot, with the slot."""
-
+    slots = {node.attr: slot for slot, node in schedule.outputs if node.op == "load"}
+    clamped = {var.name: slot for slot, var in schedule.inputs if var.type == REAL}
+    """The slot to whose bounds the values of a field have been clamped."""
     namer, graph = Namer(schedule), schedule.graph
 
     def change(loop: Compute) -> list[Statement]:
-        swaps = [_swap(out.value, offsets, shifted) for out in loop.outs]
+        swaps = [_match_swap(out.value, offsets, shifted) for out in loop.outs]
         ways = dict.fromkeys(swap and swap[0] for swap in swaps)
         if loop.over == "words" or len(ways) != 1 or swaps[0] is None:
             return [loop]
         movers, offset, fresh = swaps[0][0]
         planes, outs = [], []
         for out, (_, old) in zip(loop.outs, filter(None, swaps), strict=True):
-            slot = settled.get(old.attr)
+            slot = clamped.get(old.attr)
             if out.value.op == "settle" and (slot is None or slots.get(out.var.name) != slot):
                 return [loop]
             moved = namer.var(REAL) if fresh else out.var
             if slot is not None:
-                settled[moved.name] = settled[out.var.name] = slot
+                clamped[moved.name] = clamped[out.var.name] = slot
             planes.append(Out(moved, old, old))
             value = last = load(graph, moved)
             for mask in fresh:
@@ -196,19 +195,19 @@ def swaps(schedule: Schedule) -> Schedule:
         region = combined("or", fresh, graph)
         return [move, Compute(tuple(outs), loop.place, region, over="cells")] if fresh else [move]
 
-    return without_unread(map_each(schedule, Compute, change))
+    return drop_unread(map_each(schedule, Compute, change))
 
 
 Way = tuple[Node, Offset, tuple[Node, ...]]
-"""The movers of a swap, where they go, and the flags under which values are zero afterwards, the last to be asked first."""
+"""The movers of a swap, their offset, and the flags under which values are zero afterwards, innermost first."""
 
 
-def _swap(
+def _match_swap(
     value: Node, offsets: Mapping[str, Offset], shifted: Mapping[str, tuple[str, tuple[int, int, bool]]]
 ) -> tuple[Way, Node] | None:
-    """The swap whose result a value is, and the field whose values it exchanges.
+    """Match the result of a swap: the swap, and the field whose values it exchanges.
 
-    Movers come before or after their targets: no cell is both.
+    Choices on movers and on targets may come in either order: no cell is both.
     """
     value = value.args[0] if value.op == "settle" else value
     fresh: tuple[Node, ...] = ()
@@ -237,25 +236,25 @@ Buffer = tuple[str, int]
 
 @dataclass
 class Pool:
-    """Numbers of buffers by kind: those that belong to slots, and all."""
+    """The number of buffers by kind: those that belong to slots, and all."""
 
     slots: dict[str, int]
     size: dict[str, int]
 
 
-def buffers(schedule: Schedule, homes: Mapping[str, int], pool: Pool, *, in_place: bool) -> Schedule:
-    """The schedule with a buffer for every variable; `leaves` are loads from the slots' own buffers.
+def assign_buffers(schedule: Schedule, homes: Mapping[str, int], pool: Pool, *, in_place: bool) -> Schedule:
+    """Assign a buffer to every variable; outputs become loads from the slots' own buffers.
 
     Args:
         homes: the number of each slot's own buffer.
         pool: shared by all passes; it grows.
-        in_place: whether a loop may overwrite planes that it reads at neighbors, by storing only after all reads.
+        in_place: if true, a loop may overwrite planes that it reads at neighbors, by storing only after all reads.
     """
-    numbers = _Plan(schedule, homes, pool, in_place).assigned()
+    numbers = _Assignment(schedule, homes, pool, in_place).assign()
     graph, namer = schedule.graph, Namer(schedule)
 
     def moves(name: str, old: Node) -> bool:
-        """Whether the value that a variable has where nothing happens lies in another buffer."""
+        """True if the old value of a variable lies in another buffer, so that it must be copied."""
         return old.op == "load" and numbers[old.attr] != numbers[name]
 
     def change(body: Block) -> Block:
@@ -271,37 +270,39 @@ def buffers(schedule: Schedule, homes: Mapping[str, int], pool: Pool, *, in_plac
                 statement = replace(statement, otherwise=tuple(copies(pairs, graph)))
             elif isinstance(statement, Compute):
                 across = {numbers[name] for name in read_elsewhere(statement.values)}
-                held = any(numbers.get(name) in across for name in statement.vars)
+                stores_last = any(numbers.get(name) in across for name in statement.vars)
                 moved = any(moves(*pair) for pair in statement.olds.items())
-                statement = replace(statement, held=held, region=None if moved else statement.region)
+                statement = replace(
+                    statement, stores_last=stores_last, region=None if moved else statement.region
+                )
             result.append(statement)
         return tuple(result)
 
     schedule = map_blocks(schedule, change)
-    leaves, pairs = [], []
-    for slot, node in schedule.leaves:
+    outputs, pairs = [], []
+    for slot, node in schedule.outputs:
         home = (node.type.name, homes[slot])
         if node.op != "load" or numbers[node.attr] != home:
             var = namer.var(node.type)
             numbers[var.name] = home
             pairs.append((var, node))
             node = load(graph, var)
-        leaves.append((slot, node))
+        outputs.append((slot, node))
     body = (*schedule.body, *copies(pairs, graph))
-    return replace(schedule, body=body, leaves=tuple(leaves), buffers=tuple(sorted(numbers.items())))
+    return replace(schedule, body=body, outputs=tuple(outputs), buffers=tuple(sorted(numbers.items())))
 
 
-class _Plan:
+class _Assignment:
     """Assigns buffers in the order of the statements; a guard comes after its body."""
 
     def __init__(self, schedule: Schedule, homes: Mapping[str, int], pool: Pool, in_place: bool):
         self.pool, self.in_place = pool, in_place
         self.buffer: dict[str, Buffer] = {
-            var.name: (var.type.name, homes[slot]) for slot, var in schedule.finds
+            var.name: (var.type.name, homes[slot]) for slot, var in schedule.inputs
         }
-        self.open = {(node.type.name, homes[slot]) for slot, node in schedule.leaves}
+        self.open = {(node.type.name, homes[slot]) for slot, node in schedule.outputs}
         """Buffers of the slots that the pass changes; until its end they may hold other values."""
-        self.wanted: dict[str, int] = {}
+        self.home_of: dict[str, int] = {}
         """The slot's buffer in which a variable must end up."""
         self.last: dict[str, int] = {}
         """The position at which each variable is last read."""
@@ -309,7 +310,7 @@ class _Plan:
         """The variable whose value each variable has if its statement is skipped."""
         self.ends: dict[str, int] = {}
         """The position at which that value must be in place."""
-        self.order = list(_in_order(schedule.body))
+        self.order = list(_inner_first(schedule.body))
         defined: dict[str, int] = {}
         for position, statement in enumerate(self.order):
             if isinstance(statement, Compute):
@@ -320,11 +321,11 @@ class _Plan:
                 self.ends[name] = position
                 if old.op == "load":
                     self.follows[name] = old.attr
-        changed = {slot for slot, _ in schedule.leaves}
-        self.read(FOREVER, *(var.name for slot, var in schedule.finds if slot not in changed))
-        for slot, node in schedule.leaves:
+        changed = {slot for slot, _ in schedule.outputs}
+        self.read(FOREVER, *(var.name for slot, var in schedule.inputs if slot not in changed))
+        for slot, node in schedule.outputs:
             if node.op == "load":
-                self.wanted.setdefault(node.attr, homes[slot])
+                self.home_of.setdefault(node.attr, homes[slot])
                 self.read(len(self.order), node.attr)
         for name, before in self.follows.items():
             self.read(defined[name], before)
@@ -332,7 +333,7 @@ class _Plan:
     def read(self, position: int, *names: str) -> None:
         self.last |= {name: max(self.last.get(name, -1), position) for name in names}
 
-    def assigned(self) -> dict[str, Buffer]:
+    def assign(self) -> dict[str, Buffer]:
         """The buffer of each variable."""
         busy = {number: name for name, number in self.buffer.items()}
         for position, statement in enumerate(self.order):
@@ -340,10 +341,10 @@ class _Plan:
             if not isinstance(statement, Compute):
                 continue
             for var in (var for var in statement.vars.values() if var.type != ANSWER):
-                number = self.taken_over(var, statement, position, busy)
+                number = self.reusable(var, statement, position, busy)
                 if number is None:
                     number = self.free(var, busy)
-                    if old := self.follows.get(var.name):  # it is copied there, so it must still exist
+                    if old := self.follows.get(var.name):  # the old value is copied, so it must still exist
                         self.read(self.ends[var.name], old)
                 kind, count = number
                 self.pool.size[kind] = max(self.pool.size[kind], count + 1)
@@ -351,10 +352,10 @@ class _Plan:
                 busy[number] = var.name
         return self.buffer
 
-    def taken_over(self, var: Var, loop: Compute, position: int, busy: Mapping[Buffer, str]) -> Buffer | None:
-        """The buffer to reuse: that of the variable it replaces, or its slot's, if nothing reads it after this loop."""
+    def reusable(self, var: Var, loop: Compute, position: int, busy: Mapping[Buffer, str]) -> Buffer | None:
+        """The buffer to reuse: that of the replaced variable, or the slot's, if nothing reads it after this loop."""
         near, far = loop.reads, read_elsewhere(loop.values)
-        home = busy.get((var.type.name, self.wanted.get(var.name, -1)))
+        home = busy.get((var.type.name, self.home_of.get(var.name, -1)))
         for old in filter(None, (self.follows.get(var.name), home)):
             if self.last.get(old, -1) > position or busy.get(self.buffer[old]) != old:
                 continue
@@ -367,16 +368,16 @@ class _Plan:
     def free(self, var: Var, busy: Mapping[Buffer, str]) -> Buffer:
         """The buffer of the slot in which the variable ends up, or the first free one."""
         kind = var.type.name
-        home = self.wanted.get(var.name)
+        home = self.home_of.get(var.name)
         if home is not None and (kind, home) not in busy:
             return kind, home
         slots = {number for number in range(self.pool.slots[kind]) if (kind, number) not in self.open}
         return kind, next(n for n in range(FOREVER) if (kind, n) not in busy and n not in slots)
 
 
-def _in_order(body: Sequence[Statement]) -> Iterator[Statement]:
+def _inner_first(body: Sequence[Statement]) -> Iterator[Statement]:
     for statement in body:
-        yield from _in_order(statement.body)
+        yield from _inner_first(statement.body)
         yield statement
 
 
@@ -393,7 +394,7 @@ def copies(pairs: Sequence[tuple[Var, Node]], graph: Graph) -> Iterator[Compute]
 
 
 Access = tuple[bool, bool]
-"""Whether an access is in a loop over words, of the thread's own word only; whether it is a write."""
+"""Two flags of an access: it is in a loop over words, to the thread's own word only; it is a write."""
 
 
 @dataclass
@@ -403,7 +404,8 @@ class Pending:
     done: dict[Buffer, set[Access]] = field(default_factory=dict)
 
     def add(self, accesses: Sequence[tuple[Buffer, Access]]) -> bool:
-        """Note the accesses of a loop. True if it needs a barrier before it: a thread has the same words in all loops."""
+        """Record the accesses of a loop. True if the loop needs a barrier before it."""
+        # A thread computes the same words in all loops, so it need not wait for itself.
         wait = any(
             (written or before_written) and not (own and before_own)
             for buffer, (own, written) in accesses
@@ -416,8 +418,8 @@ class Pending:
         return wait
 
 
-def barriers(schedule: Schedule, pending: Pending) -> Schedule:
-    """The schedule with barriers. `pending` is handed from pass to pass; computing an answer is a barrier too."""
+def insert_barriers(schedule: Schedule, pending: Pending) -> Schedule:
+    """Insert barriers. `pending` is passed from pass to pass; computing an answer is a barrier too."""
     numbers = dict(schedule.buffers)
 
     def block(body: Block) -> Block:
@@ -437,9 +439,9 @@ def barriers(schedule: Schedule, pending: Pending) -> Schedule:
                 reads = [(numbers[read.name], (words and not read.far, False)) for read in accesses]
                 stored = [var for var in statement.vars.values() if var.type != ANSWER]
                 writes = [(numbers[var.name], (words, True)) for var in stored]
-                if pending.add(reads if statement.held else [*reads, *writes]):
+                if pending.add(reads if statement.stores_last else [*reads, *writes]):
                     result.append(Sync())
-                if statement.held:  # it has a barrier of its own between reading and storing
+                if statement.stores_last:  # it contains a barrier between reading and storing
                     pending.done.clear()
                     pending.add(writes)
                 if len(stored) < len(statement.outs):

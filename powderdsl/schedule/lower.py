@@ -21,28 +21,28 @@ from powderdsl.schedule.types import (
 def lower(pass_: PassGraph) -> Schedule:
     """The schedule of a pass on bit planes.
 
-    A substep changes nothing if its masks hold nowhere, so its writes stand in a guard that keeps the old values.
+    A substep changes nothing if its masks hold nowhere, so a guard contains its writes and keeps the old values.
     Writes without an old value (the first one of a scratch field) are computed unconditionally.
     """
     lowering = _Lowering(pass_)
     for step in pass_.substeps:
         lowering.substep(step)
     lowering.compute(dict(pass_.outputs).values())
-    leaves = tuple((slot, lowering.value(node)) for slot, node in pass_.outputs)
-    return Schedule(pass_.name, tuple(lowering.finds.items()), tuple(lowering.body), leaves, lowering.graph)
+    outputs = tuple((slot, lowering.value(node)) for slot, node in pass_.outputs)
+    return Schedule(pass_.name, tuple(lowering.inputs.items()), tuple(lowering.body), outputs, lowering.graph)
 
 
 class _Lowering:
     def __init__(self, pass_: PassGraph):
         self.graph, self.namer = Graph(), Namer()
         self.body: list[Statement] = []
-        self.finds: dict[str, Var] = {}
+        self.inputs: dict[str, Var] = {}
         self.stored: dict[Node, Var] = {}
         """The variable of each node of the pass that has one."""
         self.current: dict[str, Node] = {}
         """The last node that was written to each slot."""
         self.alive = set(nodes_of(pass_, substeps=False))
-        self.kept = dict(pass_.outputs)
+        self.outputs = dict(pass_.outputs)
         """Slots of the state that the pass changes; the other slots that it writes are scratch."""
 
     def substep(self, step: SubstepGraph) -> None:
@@ -77,14 +77,14 @@ class _Lowering:
     def old(self, slot: str) -> Node | None:
         """The value of a slot before a substep, if a variable holds it."""
         if (node := self.current.get(slot)) is None:
-            return self.found(slot, self.kept[slot].type) if slot in self.kept else None
+            return self.input(slot, self.outputs[slot].type) if slot in self.outputs else None
         return self.value(node) if node in self.alive and not self.missing(node) else None
 
-    def found(self, slot: str, type: Type) -> Node:
-        """What the pass finds in a slot."""
-        if slot not in self.finds:
-            self.finds[slot] = self.namer.var(type)
-        return load(self.graph, self.finds[slot])
+    def input(self, slot: str, type: Type) -> Node:
+        """The value of a slot at the beginning of the pass."""
+        if slot not in self.inputs:
+            self.inputs[slot] = self.namer.var(type)
+        return load(self.graph, self.inputs[slot])
 
     def compute(self, nodes: Iterable[Node], place: str = "") -> None:
         """Store nodes in variables."""
@@ -105,7 +105,7 @@ class _Lowering:
             if node in self.stored:
                 done[node] = load(self.graph, self.stored[node])
             elif node.op == "input":
-                done[node] = self.found(node.attr, node.type)
+                done[node] = self.input(node.attr, node.type)
             else:
                 args = tuple([done[arg] for arg in parts])
                 done[node] = self.graph.node(node.op, node.type, args, node.attr)

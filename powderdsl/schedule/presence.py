@@ -1,4 +1,4 @@
-"""Which elements must be present for a pass or a mask to do anything. Without them no cell is looked at."""
+"""The elements that must be present for a pass or a mask to do anything. Without them no cell is visited."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from itertools import product, starmap
 from operator import or_
 
 from powderdsl.ir.ops import FLAG, REAL, Node, ordered
-from powderdsl.schedule.floats import unchanged
+from powderdsl.schedule.floats import match_slot_choices
 from powderdsl.schedule.types import (
     ANSWER,
     Compute,
@@ -37,16 +37,15 @@ Sets = tuple[int, ...]
 """Sets of ids (bits of a word): at least one id of each must be present."""
 
 
-def presence(schedule: Schedule) -> Schedule:
-    """Masks and the whole pass test which elements are present; writes of elements discard that knowledge.
+def check_presence(schedule: Schedule) -> Schedule:
+    """Make masks and the whole pass test which elements are present; writes of elements discard that knowledge.
 
-    `m = is_a & b[0,1]`, where b is an element too → the loop of `m` runs only when `present(a) & present(b)`. Comes
-    before `cut`, which takes masks apart.
+    `m = is_a & b[0,1]`, where b is an element too → the loop of `m` runs only when `present(a) & present(b)`.
     """
     bits = _element_bits(schedule)
-    planes = {name: slot for name, slot in schedule.found.items() if name in bits}
-    writes = [node.op == "load" for slot, node in schedule.leaves if slot.startswith(_ELEMENT)]
-    # Else constants, or planes of other slots, become the element.
+    planes = {name: slot for name, slot in schedule.input_slots.items() if name in bits}
+    writes = [node.op == "load" for slot, node in schedule.outputs if slot.startswith(_ELEMENT)]
+    # Unless all bits come from their own slots, constants or planes of other slots become the element.
     if not bits or any(slot != f"{_ELEMENT}{bits[name]}" for name, slot in planes.items()):
         return replace(schedule, body=(*schedule.body, Forget())) if writes else schedule
     body: list[Statement] = []
@@ -55,43 +54,43 @@ def presence(schedule: Schedule) -> Schedule:
         schedule.body, (*schedule.body[1:], None), strict=False
     ):  # a body may be empty
         if isinstance(statement, Guard):
-            swaps = _only_swaps(statement, bits)
+            swaps = _preserves_counts(statement, bits)
             body.append(statement if swaps else replace(statement, body=(Forget(), *statement.body)))
         elif isinstance(after, Guard):
-            asked = statement.vars.keys() == {mask.attr for mask in after.when.args}
-            body.append(replace(statement, when=needs.asked(statement.results) if asked else None))
+            only_masks = statement.vars.keys() == {mask.attr for mask in after.when.args}
+            body.append(replace(statement, when=needs.condition(statement.results) if only_masks else None))
         else:
             body += [statement] if bits.keys().isdisjoint(statement.vars) else [statement, Forget()]
     if not all(writes):
         body.append(Forget())
-    return replace(schedule, body=tuple(body), when=_pass_asks(schedule, bits))
+    return replace(schedule, body=tuple(body), when=_pass_condition(schedule, bits))
 
 
 def _element_bits(schedule: Schedule) -> dict[str, int]:
-    """For each variable that holds a bit of the element: which bit. Empty if there are more than MAX_PLANES."""
+    """The bit of the element that each variable holds. Empty if there are more than MAX_PLANES bits."""
     bits: dict[str, int] = {}
-    ends = [(node.attr, slot) for slot, node in schedule.leaves if node.op == "load"]
-    for name, slot in (*schedule.found.items(), *ends):
+    ends = [(node.attr, slot) for slot, node in schedule.outputs if node.op == "load"]
+    for name, slot in (*schedule.input_slots.items(), *ends):
         if slot.startswith(_ELEMENT):
             bits[name] = int(slot.removeprefix(_ELEMENT))
     pairs = [pair for statement in flat(schedule.body) for pair in statement.olds.items()]
     for new, old in (*pairs, *reversed(pairs)):  # forward from the inputs, backward from the outputs
         if old.op == "load":
-            for known, other in ((old.attr, new), (new, old.attr)):
-                if known in bits:
-                    bits.setdefault(other, bits[known])
+            for source, target in ((old.attr, new), (new, old.attr)):
+                if source in bits:
+                    bits.setdefault(target, bits[source])
     return bits if max(bits.values(), default=MAX_PLANES) < MAX_PLANES else {}
 
 
 def _times(schedule: Schedule, bits: dict[str, int]) -> dict[str, Time]:
-    """From when until when each variable of `bits` holds the current bit, counted in changes of the element.
+    """The period in which each variable of `bits` holds the current bit, counted in changes of the element.
 
-    Bits that change one after the other are one change, until one of them changes again.
+    Consecutive changes of different bits count as one change.
     """
     change, changed = 0, set[int]()
     current: dict[int, str] = {}
     times: dict[str, Time] = {}
-    for name in (*schedule.found, *_computed(flat(schedule.body))):
+    for name in (*schedule.input_slots, *_values_of(flat(schedule.body))):
         if (bit := bits.get(name)) is not None:
             if bit in changed:
                 change, changed = change + 1, set()
@@ -103,15 +102,15 @@ def _times(schedule: Schedule, bits: dict[str, int]) -> dict[str, Time]:
     return times
 
 
-def _computed(body: Iterable[Statement]) -> dict[str, Node]:
+def _values_of(body: Iterable[Statement]) -> dict[str, Node]:
     """The values of variables that loops compute."""
     loops = [loop for loop in body if isinstance(loop, Compute)]
     return {out.var.name: out.value for loop in loops for out in loop.outs}
 
 
-def _only_swaps(guard: Guard, bits: Container[str]) -> bool:
-    """Whether a guard preserves the count of each element: it swaps cells, or writes no elements."""
-    values = _computed(guard.body)
+def _preserves_counts(guard: Guard, bits: Container[str]) -> bool:
+    """True if a guard preserves the count of each element: it swaps cells, or writes no elements."""
+    values = _values_of(guard.body)
     return all(
         values[name].op == "swap" and values[name].args[0] is old is values[name].args[2]
         for name, old in guard.olds.items()
@@ -119,22 +118,21 @@ def _only_swaps(guard: Guard, bits: Container[str]) -> bool:
     )
 
 
-def _pass_asks(schedule: Schedule, bits: dict[str, int]) -> Node | None:
+def _pass_condition(schedule: Schedule, bits: dict[str, int]) -> Node | None:
     """The condition under which the pass can change anything; None if none is known.
 
-    Until something changes, slots hold their values from the beginning of the pass, so every mask is judged as if it
-    were the first.
+    Until something changes, slots hold their initial values, so every mask is treated as if it were the first.
     """
-    values = _computed(schedule.body)
+    values = _values_of(schedule.body)
     guards = {name: part for part in schedule.body if isinstance(part, Guard) for name in part.vars}
-    slots = schedule.found
+    slots = schedule.input_slots
     masks: list[Node] = []
-    for slot, node in schedule.leaves:
+    for slot, node in schedule.outputs:
         if node.type == REAL and node.op == "load":
-            kept = unchanged(values[node.attr], slots) if node.attr in values else None
-            if kept is None:
+            match = match_slot_choices(values[node.attr], slots) if node.attr in values else None
+            if match is None:
                 return None
-            node, choices = kept
+            node, choices = match
             masks += choices
         while node.op == "load" and node.attr in guards:
             guard = guards[node.attr]
@@ -142,10 +140,10 @@ def _pass_asks(schedule: Schedule, bits: dict[str, int]) -> Node | None:
             node = guard.olds[node.attr]
         if node.op != "load" or slots.get(node.attr) != slot:
             return None
-    return _Needs(schedule, bits, {}).asked([values.get(mask.attr, mask) for mask in masks])
+    return _Needs(schedule, bits, {}).condition([values.get(mask.attr, mask) for mask in masks])
 
 
-def asked_ids(schedule: Schedule) -> int:
+def tested_ids(schedule: Schedule) -> int:
     """All ids whose presence a schedule tests."""
     nodes = ordered(filter(None, [*schedule.values, schedule.when]))
     return reduce(or_, (node.attr for node in nodes if node.op == "present"), 0)
@@ -153,9 +151,10 @@ def asked_ids(schedule: Schedule) -> int:
 
 @dataclass(frozen=True)
 class _Ids:
-    """The ids that a cell can have where a flag holds, at some time; `exact`, if it holds in all cells with these ids.
+    """The ids that a cell can have where a flag holds, at some time.
 
-    Of each of `sets` one id must be present somewhere for the flag to hold anywhere.
+    `exact`: the flag holds in all cells with these ids. `sets`: at least one id of each must be present somewhere for the
+    flag to hold anywhere.
     """
 
     cell: int
@@ -165,7 +164,7 @@ class _Ids:
 
 
 class _Needs:
-    """What flags say about ids. A cell has an id at a time: bits from before and after a change say nothing together."""
+    """The ids that flags imply. Bits from before and after a change of the element imply nothing together."""
 
     def __init__(self, schedule: Schedule, bits: dict[str, int], times: dict[str, Time]):
         self.graph, self.bits, self.times = schedule.graph, bits, times
@@ -173,7 +172,7 @@ class _Needs:
         self.codes = range(1 << 1 + max(bits.values()))
         self.everything = (1 << len(self.codes)) - 1
 
-    def asked(self, masks: list[Node]) -> Node | None:
+    def condition(self, masks: list[Node]) -> Node | None:
         """An answer that is true whenever one of some masks holds anywhere; None if none is known."""
         for node in ordered(masks):
             if node not in self.known:
@@ -185,7 +184,7 @@ class _Needs:
         return combined("or", [combined("and", nodes, self.graph) for nodes in present], self.graph)
 
     def ids(self, node: Node, args: list[_Ids]) -> _Ids:
-        """What a flag says, from what its arguments say."""
+        """The ids that a flag implies, from those of its arguments."""
         cells, sets = [arg.cell for arg in args], [arg.sets for arg in args]
         together = node.op in ("and", "or", "xor", "not", "select")
         exact = together and all(arg.exact for arg in args)
@@ -214,7 +213,7 @@ class _Needs:
                 needs = sets[0]
         begins, ends = zip(*times, strict=True)
         time = max(begins), min(ends)
-        if time[0] >= time[1]:  # they never are together
+        if time[0] >= time[1]:  # the arguments are never current at the same time
             cell, exact, time = self.everything, False, ALWAYS
         own = () if cell == self.everything else (cell,)
         return _Ids(cell, exact, time, own if exact else _least(needs + own))

@@ -1,4 +1,4 @@
-"""Plans of loops over cells: in which rows each one runs, and where the rows that it reads and writes are. Targets print them."""
+"""Plans of loops over cells, which targets print: the rows in which each loop runs, and the rows that it reads and writes."""
 
 from __future__ import annotations
 
@@ -6,21 +6,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from powderdsl.ir.ops import REAL, Node, ordered
-from powderdsl.schedule.join import keeps
+from powderdsl.schedule.join import keeps_values
 from powderdsl.schedule.types import Compute, Out, Schedule, Sweeps, alternatives, choices, field_reads, flat
 
 ANY_PASS = 1 << 30
-"""A field is read as far as any pass reads its slot."""
+"""The reach of a field that ends up in a slot: any pass may read it."""
 
 TURNED = 16
-"""The masks of a loop begin at a multiple of this many words: the most that a vector has."""
+"""The turned masks of a loop begin at a multiple of this many words: the most that a vector has."""
 
 
 @dataclass(frozen=True)
 class Ring:
-    """The rows of a passing field: `depth` of them wait, a power of two, from row `first` of all that wait.
+    """The buffer of a passing field: `depth` rows, a power of two, from row `first` of all buffered rows.
 
-    `bare`: the columns beyond the edges that hold zeros, since no loop reads this field around them; None if one does.
+    `bare`: the columns beyond the edges that hold zeros, since no loop reads the field around the edge; None if one does.
     """
 
     first: int
@@ -32,8 +32,8 @@ class Ring:
 class RowLoop:
     """A loop over cells in a run of loops.
 
-    `marked` are the planes whose rows are marked before the run, to find those in which the loop has work. `chains` and
-    `masks` are those of a loop over choices; its masks begin at `first_mask` of all that are turned.
+    Before the run, the rows in which the planes `marked` hold a flag are marked: there the loop has work. A loop over
+    choices has `chains` and `masks`; its masks begin at word `first_mask` of all turned masks.
     """
 
     loop: Compute
@@ -53,16 +53,18 @@ class Rows:
 
     loops: tuple[RowLoop, ...]
     rings: Mapping[str, Ring]
-    """The fields whose rows wait only until later loops have read them."""
+    """The passing fields: their rows are buffered until later loops have read them."""
     saved: Mapping[str, tuple[int, int]]
-    """Fields that are written over while later rows still read their first rows, around the edge: the number of rows that are
-    saved, and the first of them among all that wait."""
+    """Fields that are overwritten while later rows still read their first rows, around the edge: the number of saved rows,
+    and the position of the first among all buffered rows."""
     waiting: int
+    """The number of buffered rows."""
     turned: int
+    """The number of words of turned masks."""
     places: Mapping[str, str]
-    """The variables that hold the old values of others, in a loop that changes fields in place."""
+    """In a loop that changes fields in place: the variable that holds the old values of another."""
     reaches: Mapping[str, int]
-    """The columns of each field that are read beyond the edges, see `reaches_of`."""
+    """The columns of each field that are read beyond the edges (`reaches_of`)."""
 
     @property
     def outs(self) -> list[Out]:
@@ -72,7 +74,7 @@ class Rows:
 
 def rows_of(sweeps: Sweeps, reaches: Mapping[str, int]) -> Rows:
     """The plan of loops that run together."""
-    rings, saved, waiting = _waiting(sweeps)
+    rings, saved, waiting = _buffer_rows(sweeps)
     made = sweeps.vars
     loops = []
     turned = 0
@@ -84,12 +86,15 @@ def rows_of(sweeps: Sweeps, reaches: Mapping[str, int]) -> Rows:
         loops.append(RowLoop(loop, tuple(marked), tuple(map(tuple, chains)), turned))
         turned += -(-len(loops[-1].masks) // TURNED) * TURNED
     first = sweeps.body[0]
-    places = {out.into: out.var.name for out in first.outs if out.into is not None} if keeps(first) else {}
+    places = (
+        {out.into: out.var.name for out in first.outs if out.into is not None} if keeps_values(first) else {}
+    )
     return Rows(tuple(loops), rings, saved, waiting, turned, places, reaches)
 
 
-def _waiting(sweeps: Sweeps) -> tuple[dict[str, Ring], dict[str, tuple[int, int]], int]:
-    """The rings of passing fields, the rows that are saved of others, and the number of rows that wait in all."""
+def _buffer_rows(sweeps: Sweeps) -> tuple[dict[str, Ring], dict[str, tuple[int, int]], int]:
+    """The rings of passing fields, the saved rows of other fields, and the number of all buffered rows."""
+    # A reader `d` rows behind its writer, which reads `dy` rows down, needs the last `d - dy + 1` rows.
     lags = {name: loop.lag for loop in sweeps.body for name in loop.vars}
     depths = dict.fromkeys(sweeps.frees, 1)
     bare: dict[str, int | None] = dict.fromkeys(sweeps.frees, 0)
@@ -121,21 +126,21 @@ def region_of(loop: Compute) -> tuple[list[Node], list[str]]:
 
 
 def is_copy(loop: Compute) -> bool:
-    """Tell whether a loop only copies fields."""
+    """True if a loop only copies fields."""
     return all(out.value.op == "load" and out.var.type == REAL for out in loop.outs)
 
 
 def reaches_of(schedule: Schedule) -> dict[str, int]:
-    """The columns of each field that are read beyond the edges; ANY_PASS for fields that slots may get."""
+    """The columns of each field that are read beyond the edges; ANY_PASS for fields that may end up in slots."""
     reaches = {node.attr: ANY_PASS for node in schedule.results if node.op == "load"}
-    copies: list[tuple[str, Node]] = []  # a field whose rows may be those of another one
+    copies: list[tuple[str, Node]] = []  # a field may hold rows of another field, which needs the same reach
     for statement in flat(schedule.body):
         for node in ordered(statement.values):
             if node.op == "shift" and node.type == REAL and node.attr[2]:
                 name = node.args[0].attr
                 reaches[name] = max(reaches.get(name, 0), abs(node.attr[1]))
         copies += statement.olds.items()
-    for _ in copies:
+    for _ in copies:  # until nothing changes: copies may form chains
         before = dict(reaches)
         for name, old in copies:
             if old.op == "load" and old.type == REAL:

@@ -8,16 +8,16 @@ from functools import partial
 from typing import Literal
 
 from powderdsl.ir.ops import PassGraph
-from powderdsl.schedule.costs import Costs, conditions, thresholds
+from powderdsl.schedule.costs import Costs, compare_parameters, condition_draws
 from powderdsl.schedule.cut import cut
-from powderdsl.schedule.floats import chosen, late, led
-from powderdsl.schedule.join import ask_regions, join, narrow
-from powderdsl.schedule.lifetimes import release, swaps
+from powderdsl.schedule.floats import inline_floats, lead_comparisons, shift_choices
+from powderdsl.schedule.join import guard_regions, join, narrow
+from powderdsl.schedule.lifetimes import release, swap_fields
 from powderdsl.schedule.lower import lower
-from powderdsl.schedule.presence import presence
-from powderdsl.schedule.types import Schedule, without_unread
+from powderdsl.schedule.presence import check_presence
+from powderdsl.schedule.types import Schedule, drop_unread
 from powderdsl.schedule.verify import verify
-from powderdsl.schedule.words import empty, updates
+from powderdsl.schedule.words import extract_updates, skip_empty
 
 
 @dataclass(frozen=True)
@@ -34,24 +34,25 @@ _CPU_COSTS, _CUDA_COSTS = Costs(gates=6, floats=2, by_rows=True), Costs(gates=24
 
 # fmt: off
 _STAGES = (
-    Stage("thresholds", thresholds, "which draws are compared with a parameter"),
-    Stage("late", late, "floats are computed where they are used"),
-    Stage("chosen", chosen, "which floats at neighbors follow from a flag; before `cut`, which would store them", "cpu"),
-    Stage("led", led, "which comparisons are computed only where another one holds"),
-    Stage("conditions", conditions, "where the result of each draw matters"),
-    Stage("presence", presence,
+    Stage("compare_parameters", compare_parameters, "which draws are compared with a parameter"),
+    Stage("inline_floats", inline_floats, "floats are computed where they are used"),
+    Stage("shift_choices", shift_choices, "which floats at neighbors follow from a flag; before `cut`, which would store them", "cpu"),
+    Stage("lead_comparisons", lead_comparisons, "which comparisons are computed only where another one holds"),
+    Stage("condition_draws", condition_draws, "where the result of each draw matters"),
+    Stage("check_presence", check_presence,
           "which elements must be present for work to be done; before `cut`, which takes masks apart", "cpu"),
     Stage("cut", partial(cut, costs=_CPU_COSTS),
           "where loops over rows begin and end, and which movements happen in place", "cpu"),
     Stage("cut", partial(cut, costs=_CUDA_COSTS),
           "where loops begin and end; a barrier costs about as much as 24 gates", "cuda"),
-    Stage("unread", without_unread, "variables that nothing reads after `cut` are removed"),
-    Stage("updates", updates,
-          "which planes change only where a mask holds; before `empty`, which takes loops apart", "cpu"),
-    Stage("empty", empty, "which loops over words give nothing because a plane is empty", "cpu"),
+    Stage("drop_unread", drop_unread, "variables that nothing reads after `cut` are removed"),
+    Stage("extract_updates", extract_updates,
+          "which planes change only where a mask holds; before `skip_empty`, which takes loops apart", "cpu"),
+    Stage("skip_empty", skip_empty, "which loops over words give nothing because a plane is empty", "cpu"),
     Stage("narrow", narrow, "in which cells a loop has anything to do"),
-    Stage("regions", ask_regions, "loops that have nothing to do anywhere are skipped", "cuda"),
-    Stage("swaps", swaps, "which fields exchange values in place; after `cut`, which decides by which planes", "cpu"),
+    Stage("guard_regions", guard_regions, "loops that have nothing to do anywhere are skipped", "cuda"),
+    Stage("swap_fields", swap_fields,
+          "which fields exchange values in place; after `cut`, which decides by which planes", "cpu"),
     Stage("join", join, "which loops over cells run as one; after `narrow`, which decides what they read", "cpu"),
     Stage("release", release, "when a plane is no longer needed; last, after all reads have their place", "cpu"),
 )

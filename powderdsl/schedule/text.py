@@ -32,13 +32,13 @@ def print_schedule(schedule: Schedule) -> str:
     """A schedule as text."""
     names = _Names()
     lines = [f"schedule {schedule.name}"]
-    if schedule.finds:
-        found = ", ".join(f"{names.of(var.name)} = {slot}" for slot, var in schedule.finds)
-        lines.append(f"  find {found}")
+    if schedule.inputs:
+        inputs = ", ".join(f"{names.of(var.name)} = {slot}" for slot, var in schedule.inputs)
+        lines.append(f"  find {inputs}")
     if schedule.when is not None:
         lines.append(f"  when {_Values([schedule.when], names).text(schedule.when)}")
     lines += _block(schedule.body, "  ", names)
-    for slot, node in schedule.leaves:
+    for slot, node in schedule.outputs:
         lines.append(f"  leave {slot} = {_Values([node], names).text(node)}")
     return "\n".join(lines)
 
@@ -65,9 +65,9 @@ def _block(body: Sequence[Statement], indent: str, names: _Names) -> Iterator[st
 def _statement(statement: Statement, indent: str, names: _Names) -> Iterator[str]:
     values, outs = _Values(statement.values, names), statement.outs
 
-    def given(out: Out, value: Node, word: str, rest: Node | None) -> Iterator[str]:
+    def assignment(out: Out, value: Node, word: str, rest: Node | None) -> Iterator[str]:
         text, other = values.text(value), f" {word} {values.text(rest)}" if rest is not None else ""
-        yield from values.taken(indent)
+        yield from values.pop_lines(indent)
         into = f" into {names.of(out.into)}" if out.into else ""
         yield f"{indent}{names.of(out.var.name)} = {text}{other}{into}"
 
@@ -76,11 +76,11 @@ def _statement(statement: Statement, indent: str, names: _Names) -> Iterator[str
             if over:
                 where = f" over {values.text(region)}" if region is not None else ""
                 where += f" when {values.text(when)}" if when is not None else ""
-                yield from values.taken(indent)
+                yield from values.pop_lines(indent)
                 yield f"{indent}loop {over}{where}"
                 indent += "  "
             for out in outs:
-                yield from given(out, out.value, "else", out.otherwise)
+                yield from assignment(out, out.value, "else", out.otherwise)
         case Sweeps(body=(loop,)):
             yield from _statement(loop, indent, names)
         case Sweeps(body=loops):
@@ -94,15 +94,15 @@ def _statement(statement: Statement, indent: str, names: _Names) -> Iterator[str
             indent += "  "
             for out in outs:
                 old = olds[out.var.name]
-                yield from given(out, old, "leaving", None if out.value is old else out.value)
+                yield from assignment(out, old, "leaving", None if out.value is old else out.value)
         case Guard(when=when, body=inner):
-            asked = " | ".join(map(values.text, when.args or (when,)))
-            yield from values.taken(indent)
-            yield f"{indent}if any {asked}"
+            flags = " | ".join(map(values.text, when.args or (when,)))
+            yield from values.pop_lines(indent)
+            yield f"{indent}if any {flags}"
             yield from _block(inner, indent + "  ", names)
             if outs:
-                kept = (f"{names.of(out.var.name)} = {values.text(out.value)}" for out in outs)
-                yield f"{indent}else {', '.join(kept)}"
+                skipped = (f"{names.of(out.var.name)} = {values.text(out.value)}" for out in outs)
+                yield f"{indent}else {', '.join(skipped)}"
         case Release(frees=released):
             yield f"{indent}release {', '.join(map(names.of, released))}"
         case Forget():
@@ -110,7 +110,7 @@ def _statement(statement: Statement, indent: str, names: _Names) -> Iterator[str
 
 
 class _Values:
-    """The values of one statement; a value that is used twice gets a line of its own."""
+    """The values of one statement; a value that is used twice gets its own line."""
 
     def __init__(self, roots: Iterable[Node], names: _Names):
         roots = list(roots)
@@ -121,7 +121,7 @@ class _Values:
         self.lines: list[str] = []
         self.count = 0
 
-    def taken(self, indent: str) -> list[str]:
+    def pop_lines(self, indent: str) -> list[str]:
         """The lines added since the last call."""
         lines, self.lines = self.lines, []
         return [f"{indent}{line}" for line in lines]

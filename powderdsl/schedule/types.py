@@ -20,7 +20,7 @@ ANSWER = Type("answer")
 _PREFIX = {"flag": "p", "real": "f", "answer": "q"}
 
 Rule = Callable[[Node], Node | None]
-"""Gives a node to put in another one's place, or None."""
+"""Returns the node that replaces a node, or None."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class Var:
 
 @dataclass(frozen=True)
 class Out:
-    """A variable and its value. `into` names the variable whose memory it reuses (set by `buffers` and `release`).
+    """A variable and its value. `into` names the variable whose memory it reuses (set by `release`).
 
     `otherwise` is its value where the statement does nothing, such as outside its `region`: a constant or a load.
     """
@@ -50,7 +50,7 @@ Block = tuple["Statement", ...]
 
 @dataclass(frozen=True)
 class Statement:
-    """A statement says in the same fields what it makes, reads, contains and frees; all walks over schedules follow.
+    """A statement. All kinds define, read, contain and free variables by the same fields, which walks over schedules use.
 
     Words or rows in which `region` holds nowhere are skipped.
     """
@@ -64,13 +64,13 @@ class Statement:
     """An answer: if it is false, every variable is its `otherwise` everywhere."""
     body: Block = ()
     otherwise: Block = ()
-    """Statements that give variables their values if the body is skipped (set by `buffers`)."""
+    """Statements that give variables their values if the body is skipped (set by `assign_buffers`)."""
     frees: tuple[str, ...] = ()
     """Variables whose memory it frees."""
 
     @property
     def loops(self) -> Sequence[Statement]:
-        """The statements that have its variables: itself, unless it only places others."""
+        """The statements that define its variables: the statement itself, unless it only groups others."""
         return (self,)
 
     @cached_property
@@ -127,8 +127,9 @@ class Compute(Statement):
     part: int = 0
     lag: int = 0
     """Where it runs in a `Sweeps`."""
-    held: bool = False
-    """Whether all values are computed before any is stored, since it overwrites what it reads at neighbors (`buffers`)."""
+    stores_last: bool = False
+    """True if all values are computed before any is stored, since the loop overwrites planes that it reads at neighbors
+    (set by `assign_buffers`)."""
 
 
 Leftover = Literal["same", "nothing", "everything"]
@@ -173,7 +174,7 @@ class Move(Statement):
 class Guard(Statement):
     """Statements that run only `when` one of some flags holds in some cell.
 
-    Its variables are those of the body that are read after it, with the values that they have if the body is skipped.
+    Its variables are those of the body that are read after the guard, with their values if the body is skipped.
     """
 
     when: Node
@@ -187,9 +188,9 @@ class Release(Statement):
 class Sweeps(Statement):
     """Consecutive loops over cells that run together, world by world and row by row, so that data stay in the cache.
 
-    Each loop runs `lag` rows behind the first of its part: then the rows that it reads of earlier loops are there. A
-    loop that reads an earlier one around the edge is in a later part, which begins when all rows are done. It frees
-    fields that only loops of one part read: they need memory for a few rows. Stages change it as a whole.
+    Each loop runs `lag` rows behind the first of its part, when earlier loops have computed the rows that it reads. A
+    loop that reads an earlier one around the edge is in a later part, which begins when all rows are done. The statement
+    frees fields that only loops of one part read: they need memory for a few rows. Stages change it as a whole.
     """
 
     body: tuple[Compute, ...]
@@ -200,7 +201,7 @@ class Sweeps(Statement):
 
 
 class Forget(Statement):
-    """Discards what is known about which elements occur (`presence`)."""
+    """Discards the known presence of elements (`check_presence`)."""
 
 
 class Sync(Statement):
@@ -209,12 +210,12 @@ class Sync(Statement):
 
 @dataclass(frozen=True)
 class Schedule:
-    """One pass. `finds`: the slots that it reads; `leaves`: the slots that it changes. Nothing else outlives the pass."""
+    """One pass. `inputs`: the slots that it reads; `outputs`: the slots that it changes. Nothing else outlives the pass."""
 
     name: str
-    finds: tuple[tuple[str, Var], ...]
+    inputs: tuple[tuple[str, Var], ...]
     body: Block
-    leaves: tuple[tuple[str, Node], ...]
+    outputs: tuple[tuple[str, Node], ...]
     graph: Graph = field(compare=False, repr=False)
     """Interns values: equal ones are one object in all stages."""
     when: Node | None = None
@@ -223,14 +224,14 @@ class Schedule:
     """The kind and number of each variable's buffer, for targets that number buffers."""
 
     @cached_property
-    def found(self) -> dict[str, str]:
+    def input_slots(self) -> dict[str, str]:
         """The slots whose values variables hold from the beginning."""
-        return {var.name: slot for slot, var in self.finds}
+        return {var.name: slot for slot, var in self.inputs}
 
     @property
     def results(self) -> list[Node]:
-        """The values that the pass leaves in slots."""
-        return [node for _, node in self.leaves]
+        """The new values of slots."""
+        return [node for _, node in self.outputs]
 
     @property
     def values(self) -> list[Node]:
@@ -247,7 +248,7 @@ def load(graph: Graph, var: Var) -> Node:
 
 
 def is_zero(value: Node) -> bool:
-    """Whether a value is the constant 0."""
+    """True if a value is the constant 0."""
     return value.op == "const" and not value.attr
 
 
@@ -260,7 +261,7 @@ def loaded(nodes: Iterable[Node]) -> Iterator[str]:
 
 
 def rewritten(roots: Iterable[Node], graph: Graph, rule: Rule) -> Callable[[Node], Node]:
-    """Values rebuilt bottom-up, as a function of the old ones. `rule` maps nodes that have their new arguments already."""
+    """Rebuild values bottom-up; return a function of the old values. `rule` maps nodes that have their new arguments."""
     done: dict[Node, Node] = {}
     for node in ordered(roots):
         args = tuple([done[arg] for arg in node.args])
@@ -278,7 +279,7 @@ def combined(op: str, nodes: Iterable[Node], graph: Graph, type: Type = FLAG) ->
 
 
 def choices(value: Node) -> tuple[list[Node], Node]:
-    """The choices of a chain, the last one to be applied first, and the value that they begin with."""
+    """The choices of a chain, outermost first, and the value below them."""
     chain = []
     while value.op == "select":
         chain.append(value)
@@ -287,19 +288,19 @@ def choices(value: Node) -> tuple[list[Node], Node]:
 
 
 def is_movement(node: Node) -> bool:
-    """Whether a node is a plane in which cells move."""
+    """True if a node is a plane in which cells move."""
     return node.op in ("swap", "arrive") and node.type == FLAG
 
 
 def alternatives(region: Node | None) -> list[Node]:
-    """The flags of which one must hold for a region to hold."""
+    """The flags whose disjunction a region is."""
     if region is None or region.op == "const":
         return []
     return [part for arg in region.args for part in alternatives(arg)] if region.op == "or" else [region]
 
 
 Facts = dict[Node, None]
-"""Flags, in the order in which they are found."""
+"""Flags, in the order of discovery."""
 
 
 def on_all_paths(
@@ -307,7 +308,7 @@ def on_all_paths(
 ) -> dict[Node, Facts]:
     """For each node, the facts that all paths from the roots to it have in common.
 
-    `below` gives the nodes that a node reads, each with the facts of a path there, from those at the node itself.
+    `below` returns the nodes that a node reads, each with the facts of the path through that node.
     """
     facts: dict[Node, Facts] = {root: {} for root in roots}
     for node in reversed(ordered([*facts])):  # users first
@@ -335,8 +336,7 @@ def in_order(names: Iterable[str]) -> list[str]:
 
 def variables(schedule: Schedule) -> dict[str, Var]:
     """All variables by name."""
-    found = {var.name: var for _, var in schedule.finds}
-    return found | made_in(schedule.body)
+    return {var.name: var for _, var in schedule.inputs} | made_in(schedule.body)
 
 
 def map_blocks(schedule: Schedule, change: Callable[[Block], Block]) -> Schedule:
@@ -375,15 +375,15 @@ def map_values(schedule: Schedule, rule: Rule) -> Schedule:
 def with_values(schedule: Schedule, new: Callable[[Node], Node]) -> Schedule:
     """The schedule with every value replaced by another."""
     changed = map_each(schedule, Statement, lambda statement: [statement.with_values(new)])
-    return replace(changed, leaves=tuple((slot, new(node)) for slot, node in schedule.leaves))
+    return replace(changed, outputs=tuple((slot, new(node)) for slot, node in schedule.outputs))
 
 
-# What is read where, and until when
+# Reads and lifetimes
 
 
 @dataclass(frozen=True)
 class Read:
-    """A variable that is read at an offset in rows and columns, or asked whether it is zero near there (`live`)."""
+    """A read of a variable at an offset in rows and columns, or a test that it is zero near there (`live`)."""
 
     name: str
     type: Type
@@ -392,11 +392,11 @@ class Read:
     wraps: bool = True
     live: bool = False
     far: bool = False
-    """Whether other cells are read or asked."""
+    """True if other cells are read or tested."""
 
 
 def reads_of(values: Iterable[Node]) -> Iterator[Read]:
-    """Where values read variables. What is read at neighbors is also read in the cell itself."""
+    """The reads of variables in values. A plane that is read at a neighbor is also read in the cell itself."""
     for node in ordered(values):
         if node.op == "load":
             yield Read(node.attr, node.type)
@@ -417,7 +417,7 @@ def read_elsewhere(values: Iterable[Node]) -> set[str]:
 
 
 def planes_at_neighbors(schedule: Schedule) -> dict[str, tuple[str, tuple[int, int, bool]]]:
-    """Map each variable that is another one, read at a neighbor, to that one and where it is read."""
+    """Map each variable that is just a shifted copy to its source and offset."""
     return {
         out.var.name: (out.value.args[0].attr, out.value.attr)
         for statement in flat(schedule.body)
@@ -440,9 +440,9 @@ def read_by(body: Block) -> set[str]:
 def backwards(
     body: Block, live: set[str], change: Callable[[Statement, set[str]], Sequence[Statement]]
 ) -> tuple[Block, set[str]]:
-    """A block in which other statements replace each, given the variables that are read after it; and what the block reads.
+    """Replace the statements of a block, last first; return the block and the variables that it reads.
 
-    `live`: the variables that are read after the block.
+    `live`: the variables that are read after the block. `change` gets a statement and the variables read after it.
     """
     result: list[Statement] = []
     for statement in reversed(body):
@@ -452,8 +452,8 @@ def backwards(
     return tuple(reversed(result)), live
 
 
-def without_unread(schedule: Schedule) -> Schedule:
-    """The schedule without unread variables; guards keep only what is read after them."""
+def drop_unread(schedule: Schedule) -> Schedule:
+    """Remove unread variables; guards keep only variables that are read after them."""
 
     def change(statement: Statement, live: set[str]) -> list[Statement]:
         outs = tuple([out for out in statement.outs if out.var.name in live])
@@ -462,12 +462,12 @@ def without_unread(schedule: Schedule) -> Schedule:
         return [replace(statement, outs=outs, body=inner)] if used else []
 
     body, live = backwards(schedule.body, set(loaded(schedule.results)), change)
-    finds = tuple((slot, var) for slot, var in schedule.finds if var.name in live)
-    return replace(schedule, body=body, finds=finds)
+    finds = tuple((slot, var) for slot, var in schedule.inputs if var.name in live)
+    return replace(schedule, body=body, inputs=finds)
 
 
 def connected(items: Sequence[Item], keys: Callable[[Item], set[Any]]) -> list[list[Item]]:
-    """Items in groups, all in order: those that share keys, or are connected through others that do, are together."""
+    """Group items that share keys, directly or through other items; groups and items stay in order."""
     groups: list[tuple[set[Any], list[int]]] = []
     for number, item in enumerate(items):
         group, apart = (keys(item), [number]), []

@@ -31,7 +31,7 @@ def verify(schedule: Schedule, after: str) -> None:
     release. A guard keeps variables of its body, with alternatives of the same type. Values contain no slots.
     """
     try:
-        checker = _Checker({var.name: var for _, var in schedule.finds})
+        checker = _Checker({var.name: var for _, var in schedule.inputs})
         checker.values(schedule.results, checker.block(schedule.body, set(checker.vars)))
     except InvalidIR as error:
         raise InvalidIR(f"after {after}, pass {schedule.name}: {error}") from None
@@ -116,7 +116,10 @@ def _check_order(sweeps: Sweeps) -> None:
 
 
 SCHEDULE_OPS = frozenset({"load", "below_param", "any", "some", "when", "led", "live", "present"})
-"""Operations that only schedules have: `load` → what a variable holds; `below_param` → a draw below a parameter; `any`
-(flag) → whether it holds in some cell; `some` (flags) → whether one of them does; `when` (flag, flag) → both, the second computed only in words where the first
-holds somewhere; `led` (comparison, comparison) → the same in cells; `live` (floats), attribute (rows, reach) → whether
-the field may be other than zero so many rows down, at most so many columns to either side."""
+"""Operations that only schedules have.
+
+`load`: the value of a variable. `below_param`: a draw below a parameter. `any` (flag): true if the flag holds in some
+cell; `some` (flags): true if any of them does. `when` (flag, flag): both, the second computed only in words where the
+first holds somewhere; `led` (comparison, comparison): the same in cells. `live` (field), attribute (rows, reach): true if
+the field may be nonzero that many rows down, within `reach` columns. `present`, attribute ids: true if one of them is
+present."""

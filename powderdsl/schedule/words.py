@@ -33,8 +33,8 @@ MAX_CONDITIONS = 4
 """More sets of planes than this are not worth testing."""
 
 
-def empty(schedule: Schedule) -> Schedule:
-    """Loops over words get a condition without which all their values are 0; operations on whole planes stand alone.
+def skip_empty(schedule: Schedule) -> Schedule:
+    """Add a condition to loops over words without which all their values are 0; separate operations on whole planes.
 
     `m = a & (b | c[0,1])` → when `any a`; `n = a | b` needs no loop, since it tests its planes itself.
     """
@@ -55,7 +55,7 @@ def empty(schedule: Schedule) -> Schedule:
 
 
 def is_whole(value: Node) -> bool:
-    """Whether a value is one operation on whole planes: `a`, `0`, `a[dy,dx]`, `a & ~b`, `a | b`."""
+    """True if a value is one operation on whole planes: `a`, `0`, `a[dy,dx]`, `a & ~b`, `a | b`."""
     ops = sorted([arg.op for arg in value.args])
     match value.op:
         case "load":
@@ -80,7 +80,7 @@ def difference(value: Node) -> tuple[Node, Node]:
 def _with_condition(loop: Compute, graph: Graph) -> Compute:
     """The loop with a condition: of some sets of planes, one plane must be non-empty for a value to hold anywhere."""
     holders: dict[Node, frozenset[str]] = {}
-    """For flags of which such a set is known: planes such that it holds nowhere if all of them are empty."""
+    """By flag: planes such that the flag holds nowhere if all of them are empty, if such a set is known."""
     loads: dict[str, Node] = {}
     for node in ordered(loop.results):
         args = node.args[node.op == "select" :]
@@ -102,6 +102,7 @@ def _with_condition(loop: Compute, graph: Graph) -> Compute:
         if not needs:
             return loop
         conditions = sorted(needs, key=len)[:MAX_CONDITIONS]
+        # A way with fewer conditions makes a stricter one redundant.
         if not any(set(way) <= set(conditions) for way in ways):
             ways = [*[way for way in ways if not set(conditions) < set(way)], conditions]
     answers = []
@@ -114,19 +115,19 @@ def _with_condition(loop: Compute, graph: Graph) -> Compute:
 
 
 IN_A_WORD = (*LOGIC, *UNIFORM, "load")
-"""Operations that read the word itself."""
+"""Operations that read no other word."""
 
 
-def updates(schedule: Schedule) -> Schedule:
-    """Planes that a guard's masks change leave the guard: a loop over the words where a mask holds tests for that itself.
+def extract_updates(schedule: Schedule) -> Schedule:
+    """Move planes that a guard's masks change out of the guard: a loop over the words where a mask holds needs no guard.
 
-    Outside the guard, `release` finds out that most old planes end there, so that the words are changed in place.
+    Outside the guard, most old planes end with the loop, so `release` changes their words in place.
     `if any m: b = a & ~m, else b = a` → `loop words over m: b = a & ~m, else a`.
     """
-    return map_each(schedule, Guard, partial(_taken_out, graph=schedule.graph))
+    return map_each(schedule, Guard, partial(_extract, graph=schedule.graph))
 
 
-def _taken_out(guard: Guard, graph: Graph, *, near: bool = True) -> list[Statement]:
+def _extract(guard: Guard, graph: Graph, *, near: bool = True) -> list[Statement]:
     """The loops that leave a guard, and what remains of it. `near`: also loops that read other planes at neighbors."""
     when, olds, inside = guard.when.args, guard.olds, made_in(guard.body).keys()
     if {node.op for node in when} != {"load"}:
@@ -134,7 +135,7 @@ def _taken_out(guard: Guard, graph: Graph, *, near: bool = True) -> list[Stateme
     masks = {node.attr for node in when}
     body: list[Statement] = []
     leaving: dict[bool, list[Out]] = {True: [], False: []}
-    """Values by whether they read neighbors; those come first, before these change."""
+    """Values by whether they read neighbors; those that do come first, before their neighbors change."""
     for statement in guard.body:
         if not isinstance(statement, Compute) or statement.over != "words" or statement.when is not None:
             body.append(statement)
@@ -147,12 +148,12 @@ def _taken_out(guard: Guard, graph: Graph, *, near: bool = True) -> list[Stateme
                 rest.append(out)
             else:
                 leaving[far].append(replace(out, otherwise=old))
-        body += _partly(replace(statement, outs=tuple(rest)), when, graph)
+        body += _limit(replace(statement, outs=tuple(rest)), when, graph)
     region = combined("or", when, graph)
     loops = [Compute(tuple(outs), guard.place, region, over="words") for outs in leaving.values()]
     overwritten = {old.attr for old in loops[0].olds.values()}
     if not overwritten.isdisjoint(read_elsewhere(loops[0].results)):
-        return _taken_out(guard, graph, near=False)  # in place, such a loop would read what it has changed
+        return _extract(guard, graph, near=False)  # in place, such a loop would read what it has changed
     loops = [loop for loop in loops if loop.outs]
     names = made_in(loops).keys()
     outs = tuple([out for out in guard.outs if out.var.name not in names])
@@ -160,8 +161,8 @@ def _taken_out(guard: Guard, graph: Graph, *, near: bool = True) -> list[Stateme
     return [*left, *loops] if names.isdisjoint(read_by(tuple(body))) else [*loops, *left]
 
 
-def _partly(loop: Compute, when: Sequence[Node], graph: Graph) -> list[Compute]:
-    """A loop in a guard, of which values that are those of another plane where no mask holds are computed only elsewhere.
+def _limit(loop: Compute, when: Sequence[Node], graph: Graph) -> list[Compute]:
+    """Limit a loop in a guard: values that equal another plane where no mask holds are computed only over the masks.
 
     `if any m: loop words: b = m ? a[0,1] : a` → `if any m: loop words over m: b = m ? a[0,1] : a, else a`.
     """
@@ -169,7 +170,7 @@ def _partly(loop: Compute, when: Sequence[Node], graph: Graph) -> list[Compute]:
     whole: list[Out] = []
     partly: list[Out] = []
     for out in loop.outs:
-        old = without(out.value, masks, graph)
+        old = with_zeros(out.value, masks, graph)
         if out.value.op != "load" and _is_update(out.value, masks, old, graph):
             partly.append(replace(out, otherwise=old))
         else:
@@ -180,22 +181,22 @@ def _partly(loop: Compute, when: Sequence[Node], graph: Graph) -> list[Compute]:
 
 
 def _is_update(value: Node, masks: set[str], old: Node, graph: Graph) -> bool:
-    """Whether a flag is computed from stored planes, and is the old one where no mask holds."""
+    """True if a flag is computed from stored planes, and equals the old plane where no mask holds."""
     if value.type != FLAG or old.op != "load" or old.attr in masks:
         return False
     for node in ordered([value]):
         at_neighbor = node.op == "shift" and node.args[0].op == "load" and node.attr[2]
         if node.op not in IN_A_WORD and not at_neighbor:
             return False
-    return without(value, masks, graph) is old
+    return with_zeros(value, masks, graph) is old
 
 
-def is_cleared(out: Out, graph: Graph) -> bool:
-    """Whether an updated plane can only lose flags."""
-    return out.otherwise is not None and is_zero(without(out.value, {out.otherwise.attr}, graph))
+def only_clears(out: Out, graph: Graph) -> bool:
+    """True if an updated plane can only lose flags."""
+    return out.otherwise is not None and is_zero(with_zeros(out.value, {out.otherwise.attr}, graph))
 
 
-def without(value: Node, planes: set[str], graph: Graph) -> Node:
+def with_zeros(value: Node, planes: set[str], graph: Graph) -> Node:
     """A flag where some planes are zero."""
 
     def rule(node: Node) -> Node | None:
@@ -206,7 +207,7 @@ def without(value: Node, planes: set[str], graph: Graph) -> Node:
     return rewritten([value], graph, rule)(value)
 
 
-def moved(move: Move, graph: Graph) -> Compute:
+def movement_loop(move: Move, graph: Graph) -> Compute:
     """A movement as a loop over words."""
     dy, dx = move.offset
     outs = []
@@ -221,8 +222,8 @@ def moved(move: Move, graph: Graph) -> Compute:
     return Compute(tuple(outs), move.place, over="words")
 
 
-def targets(move: Move, graph: Graph) -> Compute:
-    """A loop that computes the cells which movers enter."""
+def target_loop(move: Move, graph: Graph) -> Compute:
+    """A loop that computes the cells that movers enter."""
     dy, dx = move.offset
     return Compute((Out(Var("targets", FLAG), _at_neighbor(move.region, -dy, -dx, graph)),), over="words")
 

@@ -57,10 +57,10 @@ def run_graph(pass_: PassGraph, world: World) -> dict[int, Array]:
 
 def run_schedule(schedule: Schedule, world: World, truth: Mapping[int, Array]) -> dict[str, Array]:
     """What a schedule leaves in the slots. Every variable is compared with what it means, in `truth`."""
-    state = _State(world, truth, {var.name: world.slots[slot] for slot, var in schedule.finds})
+    state = _State(world, truth, {var.name: world.slots[slot] for slot, var in schedule.inputs})
     state.buffers = dict(schedule.buffers)
     state.block(schedule.body)
-    return {slot: np.array(_evaluate([node], world, state.held)[id(node)]) for slot, node in schedule.leaves}
+    return {slot: np.array(_evaluate([node], world, state.held)[id(node)]) for slot, node in schedule.outputs}
 
 
 @dataclass

@@ -14,7 +14,7 @@ from powderdsl.ir.ops import PassGraph, Program, plane_name
 from powderdsl.ir.segments import segments
 from powderdsl.model.state import slots as state_slots
 from powderdsl.model.types import Ruleset
-from powderdsl.schedule.lifetimes import Pending, Pool, barriers, buffers
+from powderdsl.schedule.lifetimes import Pending, Pool, assign_buffers, insert_barriers
 from powderdsl.schedule.stages import CPU, CUDA, Stage, steps
 from powderdsl.schedule.types import Schedule
 from powderdsl.schedule.verify import verify
@@ -153,10 +153,10 @@ def test_buffers(rules: str, in_place: bool) -> None:
         own = {kind: sum(1 for one in kinds.values() if one == kind) for kind in ("flag", "real")}
         pool = pool or Pool(own, dict(own))
         *_, (_, schedule) = steps(pass_, CUDA)
-        schedule = barriers(buffers(schedule, homes, pool, in_place=in_place), Pending())
+        schedule = insert_barriers(assign_buffers(schedule, homes, pool, in_place=in_place), Pending())
         verify(schedule, "buffers")
         ends = dict(schedule.buffers)
-        assert all(ends[node.attr][1] == homes[slot] for slot, node in schedule.leaves)
+        assert all(ends[node.attr][1] == homes[slot] for slot, node in schedule.outputs)
         for seed in range(WORLDS):
             world = random_world(loaded, program, seed)
             compare(pass_, schedule, world, run_graph(pass_, world))

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from powderdsl.ir.ops import FLAG, REAL, Node, ordered
 from powderdsl.ir.single import all_ones, single
-from powderdsl.schedule.join import keeps
+from powderdsl.schedule.join import keeps_values
 from powderdsl.schedule.rows import ANY_PASS, RowLoop, Rows, region_of, rows_of
 from powderdsl.schedule.types import Sweeps, alternatives, is_zero
 from powderdsl.targets.layout import NativeLayout, braced, literal, param_key
@@ -42,7 +42,7 @@ def sweeps_text(sweeps: Sweeps, layout: NativeLayout, reaches: Mapping[str, int]
     """The text of one loop over worlds, see EACH_WORLD in fields.hpp."""
     rows = rows_of(sweeps, reaches)
     loops = [_Loop(number, plan, rows, layout) for number, plan in enumerate(rows.loops)]
-    if keeps(sweeps.body[0]):
+    if keeps_values(sweeps.body[0]):
         return _in_place(loops[0])
     layout.cover(turned=rows.turned, waiting=rows.waiting)
     pointers = " ".join(

@@ -7,7 +7,7 @@ from importlib.resources import files
 from typing import NamedTuple
 
 from powderdsl.ir.ops import SNAP, Program
-from powderdsl.schedule.presence import asked_ids
+from powderdsl.schedule.presence import tested_ids
 from powderdsl.schedule.stages import CPU, plan
 from powderdsl.system.memo import collection_paused
 from powderdsl.targets.cpp.text import pass_text
@@ -56,7 +56,7 @@ def native_source(program: Program, width: int = 0) -> NativeSource:
     passes, calls = [], []
     for number, pass_ in enumerate(program.passes):
         schedule = plan(pass_, CPU)
-        asked |= asked_ids(schedule)
+        asked |= tested_ids(schedule)
         passes.append(pass_text(schedule, number, layout))
         calls.append(f"  pass_{number}(c); TICK({number})")
     sizes: dict[str, object] = {

@@ -20,7 +20,7 @@ from powderdsl.schedule.types import (
     alternatives,
     variables,
 )
-from powderdsl.schedule.words import difference, is_cleared
+from powderdsl.schedule.words import difference, only_clears
 from powderdsl.targets.cpp.cells import held, on_all, sweeps_text
 from powderdsl.targets.layout import NativeLayout, fixed_key, number, param_key
 from powderdsl.targets.printing import GATES, Printer, WordText, drawn_where, limited_draw
@@ -34,7 +34,7 @@ LOOP = (
 def pass_text(schedule: Schedule, number: int, layout: NativeLayout) -> str:
     """The function of a pass."""
     printer = _Printer(layout, schedule)
-    changed = dict(schedule.leaves)
+    changed = dict(schedule.outputs)
     lines = [f"// pass {number}\n__attribute__((noinline)) void pass_{number}(Context& c) {{"]
     if schedule.when is not None:
         lines.append(f"if (!{answer(schedule.when)}) return;")
@@ -43,7 +43,7 @@ def pass_text(schedule: Schedule, number: int, layout: NativeLayout) -> str:
         "*rows = c.rows(); (void)words; (void)height; (void)width; (void)strips; (void)rows;"
     )
     rest = variables(schedule)
-    for slot, var in schedule.finds:
+    for slot, var in schedule.inputs:
         del rest[var.name]
         place = printer.slot(slot, var)
         if slot in changed:  # nothing else refers to it while the pass runs, so it may be overwritten
@@ -54,7 +54,7 @@ def pass_text(schedule: Schedule, number: int, layout: NativeLayout) -> str:
         lines.append(f"{KINDS[var.type.name]}* {var.name};")
     lines += printer.block(schedule.body)
     places, names = [], {}
-    for i, (slot, node) in enumerate(schedule.leaves):
+    for i, (slot, node) in enumerate(schedule.outputs):
         var = Var(held(node), node.type)
         lines.append(f"{KINDS[var.type.name]}* s{i} = keep({var.name});")
         places.append(printer.slot(slot, var))
@@ -176,7 +176,7 @@ class _Printer(Printer):
             assert out.otherwise is not None
             name, value = out.var.name, values.clean(out.value)
             words = values.plane(name)
-            if is_cleared(out, self.graph):
+            if only_clears(out, self.graph):
                 before.append(f"if (!{name}->zero) own(c, {name});")
                 stores.append(f"{words}[i] = {value};")
             else:  # one that was empty may stay so

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from importlib.resources import files
 
 from powderdsl.ir.ops import SNAP, Program
-from powderdsl.schedule.lifetimes import Pending, Pool, barriers, buffers
+from powderdsl.schedule.lifetimes import Pending, Pool, assign_buffers, insert_barriers
 from powderdsl.schedule.stages import CUDA, plan
 from powderdsl.system.memo import collection_paused
 from powderdsl.targets.cuda.text import pass_text
@@ -68,8 +68,8 @@ def cuda_source(program: Program, height: int, width: int, shared_limit: int) ->
     in_place = -(-group * words // threads) <= HELD
     passes = []
     for number, pass_ in enumerate(program.passes):
-        schedule = buffers(plan(pass_, CUDA), homes, pool, in_place=in_place)
-        body = pass_text(barriers(schedule, pending), layout)
+        schedule = assign_buffers(plan(pass_, CUDA), homes, pool, in_place=in_place)
+        body = pass_text(insert_barriers(schedule, pending), layout)
         passes.append(f"DEVICE void pass_{number}(const Block& c) {{\n(void)c;\n{body}\n}}")
     numbers = len(layout.step_planes) + len(layout.param_planes) + len(layout.param_reals)
     uniform = 4 * group * (2 + 2 * len(layout.streams) + numbers)

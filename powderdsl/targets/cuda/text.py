@@ -64,12 +64,14 @@ class _Printer(Printer):
                 asks.append(f"{name} |= ({values.of(out.value.args[0])} & valid) != 0;")
                 continue
             held.append(f"o_{name}[ROUNDS]")
-            own = f"o_{name}[k]" if loop.held else f"o_{name}"
-            stores.append(f"{'' if loop.held else 'const u32 '}{own} = {values.of(out.value)} & valid;")
+            own = f"o_{name}[k]" if loop.stores_last else f"o_{name}"
+            stores.append(
+                f"{'' if loop.stores_last else 'const u32 '}{own} = {values.of(out.value)} & valid;"
+            )
             back.append(f"P({self.numbers[name]})[i] = {own};")
         yield from (f"bool {name} = false;" for name in answers)
         body = ["FOR_WORDS(k, i) { PLACE(i);", *values.lines, *asks, *stores]
-        if loop.held:
+        if loop.stores_last:
             yield f"{{ u32 {', '.join(held)};"
             yield "\n".join([*body, "}"])
             yield f"SYNC();\nFOR_WORDS(k, i) {{ {' '.join(back)} }} }}"

@@ -22,7 +22,7 @@ from powderdsl.schedule.types import (
     Var,
     alternatives,
 )
-from powderdsl.schedule.words import difference, is_cleared, moved, targets
+from powderdsl.schedule.words import difference, movement_loop, only_clears, target_loop
 from powderdsl.targets.printing import Printer
 from powderdsl.targets.wasm.binary import Callee, Local, Value, body, const, op
 from powderdsl.targets.wasm.cells import CellLoop
@@ -54,11 +54,11 @@ class Pass(Printer):
     def write(self) -> None:
         library, schedule = self.library, self.schedule
         memory, group = library.memory, library.group
-        changed = {slot for slot, _ in schedule.leaves}
+        changed = {slot for slot, _ in schedule.outputs}
         if schedule.when is not None:
             with body.when(op("i32.eqz", self.answer(schedule.when))):
                 body.leave()
-        for slot, var in schedule.finds:
+        for slot, var in schedule.inputs:
             at = memory.slot(slot, var.type)
             if slot in changed:  # nothing else refers to it while the pass runs, so it may be overwritten
                 self.define(var, group[at])
@@ -66,14 +66,14 @@ class Pass(Printer):
             else:
                 self.define(var, library.keep(group[at]))
         self.block(schedule.body)
-        values = [body.let(self.kept(node)) for _, node in schedule.leaves]
-        for (slot, node), value in zip(schedule.leaves, values, strict=True):
+        values = [body.let(self.kept(node)) for _, node in schedule.outputs]
+        for (slot, node), value in zip(schedule.outputs, values, strict=True):
             at = memory.slot(slot, node.type)
             old = body.let(group[at])
             with body.when(old):
                 body.do(library.give(old))
             group[at] = value
-        self.give(dict.fromkeys(str(node.attr) for _, node in schedule.leaves if node.op == "load"))
+        self.give(dict.fromkeys(str(node.attr) for _, node in schedule.outputs if node.op == "load"))
 
     # Variables
 
@@ -210,7 +210,7 @@ class Pass(Printer):
         with body.when(reduce(or_, (self.vars[name][SOME] for name in made.mask_names), ZERO)):
             for out in loop.outs:
                 plane = self.vars[out.var.name]
-                needed = plane[SOME] if is_cleared(out, self.schedule.graph) else ONE  # 0 stays 0
+                needed = plane[SOME] if only_clears(out, self.schedule.graph) else ONE  # 0 stays 0
                 with body.when(needed):
                     plane.set(library.own(plane))
             self.call(made)
@@ -242,7 +242,7 @@ class Pass(Printer):
         movers, fields = self.of(move.region), move.outs[0].var.type == REAL
         groups = None if fields else groups_in_place(move)
         if groups is None and not fields:
-            self.run(WordLoop(library, moved(move, graph)))
+            self.run(WordLoop(library, movement_loop(move, graph)))
             for out in move.outs:
                 if out.into is not None:
                     body.do(library.give(self.vars[out.into]))
@@ -256,6 +256,6 @@ class Pass(Printer):
                     body.do(exchanger(library, move.offset)(movers, held))
         if groups is not None:
             with body.when(movers[SOME]), body.scope():
-                entered = WordLoop(library, targets(move, graph)).made()
+                entered = WordLoop(library, target_loop(move, graph)).made()
                 planes = {kind: [self.vars[out.var.name] for out in group] for kind, group in groups.items()}
                 move_groups(library, move, movers, planes, entered)

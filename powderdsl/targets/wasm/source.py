@@ -8,7 +8,7 @@ from operator import or_
 
 from powderdsl.ir.ops import PassGraph, Program
 from powderdsl.ir.text import structure
-from powderdsl.schedule.presence import asked_ids
+from powderdsl.schedule.presence import tested_ids
 from powderdsl.schedule.stages import CPU, plan
 from powderdsl.schedule.types import Schedule
 from powderdsl.system.memo import Memo, collection_paused
@@ -38,7 +38,7 @@ def wasm_module(
     module = Module(memory.top // PAGE + 1, PAGES)
     library = Library(memory, module)
     passes = [pass_function(schedule, library) for schedule in schedules]
-    asked = reduce(or_, map(asked_ids, schedules), 0)
+    asked = reduce(or_, map(tested_ids, schedules), 0)
     calls = Driver(library, program, passes, asked).add(export=face is None)
     if face is not None:
         Standalone(library, face, calls).add()
