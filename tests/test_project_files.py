@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import re
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -95,8 +97,67 @@ def test_pre_commit_runs_the_ruff_of_make_lint() -> None:
     lint = re.search(r"^lint:.*\n((?:\t.*\n)+)", _text("Makefile"), re.MULTILINE)
     assert lint
     of_make = re.findall(r"\$\(BIN\)/(ruff .+) \.$", lint[1], re.MULTILINE)
-    hooks = [hook["entry"].replace(" --force-exclude", "") for hook in repo["hooks"]]
+    hooks = [hook["entry"].replace(" --force-exclude", "") for hook in repo["hooks"] if "types_or" in hook]
     assert hooks == [f".venv/bin/{command}" for command in of_make]
+
+
+def test_pre_commit_checks_messages() -> None:
+    config = _read(".pre-commit-config.yaml")
+    assert config["default_install_hook_types"] == ["pre-commit", "commit-msg"]
+    assert config["default_stages"] == ["pre-commit"], "ruff does not read messages"
+    (hook,) = (hook for hook in config["repos"][0]["hooks"] if "stages" in hook)
+    assert hook["stages"] == ["commit-msg"]
+    assert os.access(ROOT / hook["entry"], os.X_OK)
+
+
+def _message_faults(message: str, folder: Path) -> str:
+    """What `.ci/commit-msg` prints about a message; "" if it accepts it."""
+    path = folder / "COMMIT_EDITMSG"
+    path.write_text(message, encoding="utf-8")
+    script = subprocess.run(
+        [sys.executable, ROOT / ".ci/commit-msg", path], capture_output=True, text=True, check=False
+    )
+    assert script.returncode == bool(script.stderr)
+    return script.stderr
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        "ir: fold shifts of constants\n\nThe printers did this twice.\n",
+        "analysis, system: process `PD301` once\n\nIt took two passes.\n",
+        "docs/worlds: bring the table up to date\n\nA column was missing.\n",
+        "web: " + "a" * 55 + "\n\nThe longest subject.\n",
+        "ir: fold shifts\n# a comment of git's\n\nWhy.\n# ------------------------ >8 ------------------------\ndiff\n",
+        "Merge branch 'main' into topic\n",
+        'Revert "ir: fold shifts"\n\nThis reverts commit 0123456.\n',
+        "fixup! ir: fold shifts\n",
+    ],
+)
+def test_good_commit_messages_pass(message: str, tmp_path: Path) -> None:
+    assert _message_faults(message, tmp_path) == ""
+
+
+@pytest.mark.parametrize(
+    ("message", "fault"),
+    [
+        ("", "The subject is not `area"),
+        ("Fold shifts\n\nWhy.\n", "The subject is not `area"),
+        ("ir: Fold shifts\n\nWhy.\n", "The subject is not `area"),
+        ("IR: fold shifts\n\nWhy.\n", "The subject is not `area"),
+        ("ir:fold shifts\n\nWhy.\n", "The subject is not `area"),
+        ("ir: folded shifts\n\nWhy.\n", "`folded` is not an imperative"),
+        ("ir: folding shifts\n\nWhy.\n", "`folding` is not an imperative"),
+        ("ir: folds shifts\n\nWhy.\n", "`folds` is not an imperative"),
+        ("ir: fold shifts.\n\nWhy.\n", "The subject ends with a period"),
+        ("web: " + "a" * 56 + "\n\nWhy.\n", "The subject has 61 characters"),
+        ("ir: fold shifts\n", "The subject is not followed by"),
+        ("ir: fold shifts\nWhy.\n", "The subject is not followed by"),
+        ("ir: fold shifts\n\n# Only a comment.\n", "The subject is not followed by"),
+    ],
+)
+def test_bad_commit_messages_are_refused(message: str, fault: str, tmp_path: Path) -> None:
+    assert fault in _message_faults(message, tmp_path)
 
 
 def test_the_citation_agrees_with_the_project() -> None:
