@@ -13,7 +13,7 @@ import re
 import subprocess
 import sys
 import tokenize
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -26,6 +26,8 @@ from tests.layers import LAYERS, THIRD_PARTIES
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "powderdsl"
 MAX_LINES = 800
+LINE_BUDGET = 53_500
+"""Lines of Python that powderdsl/ may have."""
 
 SLOW_IMPORTS = ("torch", "gymnasium", "stable_baselines3", "matplotlib", "tensorboard")
 """What the front end, `powderdsl check` and `powderdsl --help` must do without."""
@@ -152,6 +154,16 @@ def size_faults(module: str, source: str) -> Iterator[str]:
     lines = source.count("\n")
     if lines > MAX_LINES:
         yield f"{module} has {lines} lines, more than {MAX_LINES}: split it by responsibility"
+
+
+def budget_faults(sources: Mapping[str, str], budget: int = LINE_BUDGET) -> Iterator[str]:
+    """A package of more lines than its budget."""
+    lines = sum(source.count("\n") for source in sources.values())
+    if lines > budget:
+        yield (
+            f"powderdsl/ has {lines:,} lines of Python, more than LINE_BUDGET = {budget:,}: simplify or delete code; "
+            "raising the budget takes a decision record in docs/decisions/"
+        )
 
 
 def module_name_faults(modules: Iterable[str]) -> Iterator[str]:
@@ -337,6 +349,18 @@ def test_each_rule_can_fail(
 )
 def test_each_rule_can_pass(rule: Callable[[str, str], Iterable[str]], module: str, source: str) -> None:
     assert list(rule(module, source)) == []
+
+
+def test_the_package_stays_within_its_line_budget(sources: dict[str, str]) -> None:
+    expect_none(budget_faults(sources))
+
+
+def test_the_line_budget_can_fail() -> None:
+    sources = {"draw": "x = 1\n" * 2, "worlds": "x = 1\n"}
+    assert list(budget_faults(sources, 3)) == []
+    (fault,) = budget_faults(sources, 2)
+    assert "3 lines of Python" in fault
+    assert "docs/decisions/" in fault
 
 
 def test_layers_only_look_left() -> None:
