@@ -385,21 +385,6 @@ def test_a_page_without_an_optional_dependency_is_skipped_visibly(folder: Path) 
     assert Path("ran").exists()
 
 
-def test_a_wrong_test_of_a_pack_fails(folder: Path) -> None:
-    text = "tests:\n  - stays:\n      given: '# .'\n      after: 1 step\n      expect: '# {}'\n"
-    run_block(Block("yaml", "# with: core\n" + text.replace("{}", "."), 1), {})
-    run_block(Block("yaml", "# with: core\n" + text.replace("{}", "'?'").replace("'# '?''", "'# ?'"), 1), {})
-    with pytest.raises(AssertionError, match="stays"):
-        run_block(Block("yaml", "# with: core\n" + text.replace("{}", "#"), 1), {})
-
-
 def test_links_can_fail() -> None:
     text = "# Two words\n[a](gone.md) [b](#two-words) [c](#three) [d](https://x.org) [e](README.md#gone)\n"
     assert list(dead_links(text, ROOT / "README.md")) == ["gone.md", "#three", "README.md#gone"]
-
-
-def test_blocks_are_found() -> None:
-    page = "a\n```yaml\n# with: core\nx: y\n```\n```\nplain\n```\n"
-    assert blocks_of(page) == [Block("yaml", "# with: core\nx: y\n", 2), Block("", "plain\n", 6)]
-    assert blocks_of(page)[0].expected("with") == "core"
-    assert blocks_of(page)[0].expected("error") == ""

@@ -104,33 +104,3 @@ def check(seeds: Mapping[str, range], valid: Path, place: Path) -> None:
     print(f"{', '.join(seeds)}: exit codes {codes}, at most {slowest:.1f} s and {largest:.0f} MB more")
     shutil.rmtree(place, ignore_errors=True)
     assert not wrong, "\n\n".join(wrong[:20])
-
-
-def test_each_fault_is_told() -> None:
-    good = {
-        "status": 2,
-        "output": b"error[PD101]: x\n".hex(),
-        "seconds": 1.0,
-        "usual_seconds": 0.5,
-        "megabytes": 400.0,
-        "usual_megabytes": 300.0,
-        "hung": False,
-        "escaped": [],
-    }
-    assert problems(good) == []
-    faults: list[dict[str, Any]] = [
-        {"hung": True},
-        {"status": 70},
-        {"status": -11},
-        {"status": 130},
-        {"output": b"Traceback (most recent call last):\n".hex()},
-        {"output": b"x\nerror[PD901]: a mistake\n".hex()},
-        {"output": b"\x1b[2J".hex()},
-        {"output": "\x9b".encode().hex()},
-        {"output": "\u202e".encode().hex()},
-        {"seconds": 6.0},
-        {"megabytes": 601.0},
-        {"escaped": ["outside/victim.json"]},
-    ]
-    for fault in faults:
-        assert len(problems(good | fault)) == 1, fault

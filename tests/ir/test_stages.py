@@ -12,7 +12,6 @@ from powderdsl.ir.bits import lower_bits
 from powderdsl.ir.lower import lower_ruleset
 from powderdsl.ir.ops import (
     FLAG,
-    OPS,
     REAL,
     Graph,
     InvalidIR,
@@ -160,10 +159,3 @@ def test_the_verifier_refuses(output: tuple[str, Node], message: str) -> None:
 
 def test_the_verifier_accepts() -> None:
     verify(a_program(("f", BUILD.not_(F)), ("n", N), ("r", R)), "a test")
-
-
-def test_every_operation_has_a_row_and_a_reason() -> None:
-    assert all(op.name == name for name, op in OPS.items())
-    assert all(
-        op.attr for op in OPS.values() if op.name in ("input", "const", "shift", "count", "mod", "swap")
-    )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from typing import Any
 
 import gymnasium
@@ -272,24 +271,6 @@ def test_damaged_levels_are_refused(tmp_path: Any) -> None:
     path.write_text("{")
     with pytest.raises(ValueError, match=r"mine\.json"):
         read_level(path)
-
-
-def test_names_of_whole_actions(easy: LevelProgram) -> None:
-    env = PowderworldEnv(easy)
-    env.reset()
-    drawn = set()
-    for _ in range(40):
-        element, x, y = env.sample_semantic_action()
-        assert (env.sample_action(),) == ((easy.level.elements.index(element), x, y)[env.episodes.stage[0]],)
-        drawn.add((element, x, y))
-        env.step(env.sample_action())
-    assert len(drawn) > 20
-
-
-def test_pickled_environments_start_alike(torch: Any) -> None:
-    env = PowderworldEnv("easy", seed=4, backend="wasm")
-    other = pickle.loads(pickle.dumps(env))
-    assert (env.reset()[0] == other.reset()[0]).all()
 
 
 def test_ids_are_registered(torch: Any) -> None:

@@ -9,7 +9,7 @@ import pytest
 from powderdsl.compiler import load
 from powderdsl.ir.ops import InvalidIR
 from powderdsl.schedule.stages import CPU, plan
-from powderdsl.schedule.types import Compute, Read, Schedule, Sweeps, field_reads, flat
+from powderdsl.schedule.types import Compute, Schedule, Sweeps, field_reads, flat
 from powderdsl.schedule.verify import verify
 from tests.schedule.test_stages import packed_passes
 
@@ -31,21 +31,6 @@ def test_box_sums_follow_choices() -> None:
     read = {read.name for read in field_reads(last.loops[0])}
     assert {out.into for out in last.loops[2].outs} == read
     assert not any(out.into for loop in last.loops[:2] for out in loop.outs)
-
-
-def test_no_field_is_there_twice() -> None:
-    """Also where choices read the rows around: their result waits until these rows are no longer read."""
-    *_, first, last = (one for one in flat(planned("wind").body) if isinstance(one, Sweeps))
-    assert first.loops[0].over == "choices"
-    assert first.body[0].lag == 0
-    assert first.body[-1].lag == 2
-    assert [out.into for out in first.loops[-1].outs] == [read.name for read in _old(first)]
-    assert {out.into for out in last.loops[-1].outs} == {out.var.name for out in first.loops[-1].outs}
-
-
-def _old(sweeps: Sweeps) -> list[Read]:
-    reads = {read.name: read for read in field_reads(sweeps.loops[0])}
-    return list(reads.values())
 
 
 def test_a_row_is_not_read_before_it_is_there() -> None:

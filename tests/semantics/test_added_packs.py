@@ -13,7 +13,6 @@ import pytest
 import powderdsl as library
 from powderdsl.analysis.ledger import ledger
 from powderdsl.diagnostics import Severity
-from powderdsl.model.check import restricted
 from powderdsl.model.text import place_of
 from powderdsl.testing.generators.cases import Start
 from powderdsl.testing.pack_tests.runner import run_examples
@@ -22,10 +21,6 @@ from powderdsl.testing.properties.refute import refuted
 from powderdsl.testing.properties.running import Runner
 from powderdsl.testing.properties.search import InvariantSearch, SearchPlan
 from tests.cli.commands import ROOT, powderdsl
-
-KERNEL = ", ".join(
-    ['"1 1 1 1 1 1 1 1 1 1 1"'] * 5 + ['"1 1 1 1 1 0 1 1 1 1 1"'] + ['"1 1 1 1 1 1 1 1 1 1 1"'] * 5
-)
 
 
 @dataclass(frozen=True)
@@ -92,36 +87,6 @@ also:
         (("wall never changes", 5),),
     ),
     Added(
-        "rot",
-        """pack: rot
-about: Wood and ice come down.
-needs: core
-also:
-  wood?: {gravity: yes, density: 4}
-  ice?: {gravity: yes}
-""",
-        (("never (wood and gravity)", 5),),
-    ),
-    Added(
-        "bug",
-        """pack: bug
-about: A creature that eats plants.
-needs: core
-fields:
-  hunger: {type: 0..9, at: element, of: bug}
-elements:
-  bug: {id: 122, density: 4, gravity: yes, color: "#264653"}
-passes:
-  walk:
-    after: flow
-    do:
-      - plant? -> bug if count(bug) > 0 with chance 30%
-      - hunger += 1 where bug
-    then: bug -> empty if hunger == 9
-""",
-        (("count(plant?) never falls without (fire?, lava?, acid?)", 12),),
-    ),
-    Added(
         "kiln",
         """pack: kiln
 about: Heat is a field; hot sand melts.
@@ -139,23 +104,6 @@ passes:
     then: sand -> glass if heat > 80
 """,
         (("count(sand?) is constant without (acid?, cloner?)", 14),),
-    ),
-    Added(
-        "blob",
-        f"""pack: blob
-about: An automaton that sees five cells far.
-needs: core
-kernels:
-  wide: [{KERNEL}]
-elements:
-  blob: {{id: 124, density: 5, color: "#80ED99"}}
-passes:
-  grow:
-    do:
-      - any but (wall, blob) -> blob if count(blob in wide) in 3..45
-      - blob -> empty if count(blob in wide) not in 33..57
-""",
-        (("count(lava?, stone?) is constant without (acid?, cloner?)", 11),),
     ),
 )
 
@@ -231,14 +179,6 @@ def test_a_packs_own_claims_may_be_broken_by_packs_that_it_does_not_know() -> No
     assert found["pole never changes"].startswith(str(ROOT / "rules/acid.yaml"))
 
 
-def test_a_claim_that_names_a_pack_speaks_of_it() -> None:
-    text = ADDED[2].text + "invariants: [count(sand?) is constant without acid?]\n"
-    (own,) = (
-        one for one in library.load(f"powderworld+{write('quake', text)}").invariants if one.pack == "quake"
-    )
-    assert own.scope == ("core", "sand", "acid", "quake")
-
-
 def test_of_two_added_packs_the_one_that_matters_is_named() -> None:
     moss, quake = write("moss", ADDED[0].text), write("quake", ADDED[2].text)
     ruleset = library.load(f"powderworld+{moss}+{quake}")
@@ -302,11 +242,3 @@ def test_a_test_that_fails_in_its_scope_fails_with_more_packs_too() -> None:
     result = powderdsl("test", f"core+water+stone+sand+{write('moss', text)}", "--examples", "0", "--no-keep")
     assert result.exit_code == 1
     assert "FAIL  moss: nothing grows" in result.output
-
-
-def test_the_model_of_a_scope_keeps_parameters() -> None:
-    ruleset = library.load(f"powderworld+{write('moss', ADDED[0].text)}", params={"water.melt": 0.5})
-    alone = restricted(ruleset, ("core", "water"))
-    assert alone is not None
-    assert alone.packs == ("core", "water")
-    assert next(one for one in alone.params if one.name == "water.melt").default == 0.5

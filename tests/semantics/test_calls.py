@@ -131,14 +131,6 @@ def test_parameters_change_from_call_to_call(sims: Pair) -> None:
     assert_equal(*found)
 
 
-def test_defaults_cannot_be_changed_through_a_copy(sims: Pair) -> None:
-    native, plain = sims
-    world = native.step(start(native))
-    for value in native.parameters({}, 1).values():
-        value.zero_()
-    assert_equal(native.step(world, 3), plain.step(start(plain), 4))
-
-
 def test_batch_sizes_alternate(sims: Pair) -> None:
     """More of them than are kept, in strips and in lanes."""
     native, plain = sims
@@ -163,16 +155,6 @@ def test_one_world_in_two_simulators(sims: Pair) -> None:
         assert right.sim is sim
     assert_equal(left, right)
     assert_equal(world, plain.step(start(plain, 2), 2))
-
-
-def test_chosen_worlds_and_strided_numbers(sims: Pair) -> None:
-    found = []
-    for sim in sims:
-        world = sim.step(start(sim, 6)).select(slice(None, None, 2))
-        assert not world.seed.is_contiguous()
-        assert not world.index.is_contiguous()
-        found.append(sim.step(sim.step(world)))
-    assert_equal(*found)
 
 
 def test_edited_worlds(sims: Pair) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from fractions import Fraction
 from functools import cache
 from math import floor
@@ -12,7 +11,6 @@ import numpy as np
 import pytest
 
 import powderdsl
-from powderdsl.cli.pictures import LiveView, render_frame
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.draw import palette, ramps, rgb
 from powderdsl.system.fingerprint import fingerprint
@@ -21,6 +19,7 @@ from powderdsl.testing.generators.choices import Choices
 from tests.cli.commands import powderdsl as run_command
 from tests.compilers import skip_without_compiler
 from tests.fuzz import TARGETS
+from tests.semantics.texts import codes
 
 BACKENDS = ("reference", *TARGETS)
 SIZES = [(1, 1), (3, 33), (2, 64), (5, 65), (1, 130), (16, 70)]
@@ -90,32 +89,6 @@ def test_pictures_of_worlds(backend: str, torch) -> None:  # type: ignore[no-unt
             assert bool((buffer[0] == 77).all() & (buffer[4] == 77).all())
 
 
-@pytest.mark.parametrize("backend", ["native"])
-def test_large_worlds_in_strips(backend: str, torch) -> None:  # type: ignore[no-untyped-def]
-    """Packed worlds that lie in strips are drawn as those that do not."""
-    skip_without_compiler(backend)
-    ruleset = kiln()
-    native, plain = (powderdsl.compile(ruleset, backend=one) for one in (backend, "torch"))
-    start = random_start(ruleset, Choices.seeded(1), (1, 128, 256))
-    assert torch.equal(native.step(start.world(native)).rgb(), plain.step(start.world(plain)).rgb())
-
-
-@pytest.mark.parametrize("kind", ["array", "tensor"])
-def test_pictures_of_arrays(kind: str, torch) -> None:  # type: ignore[no-untyped-def]
-    sim = powderdsl.compile(kiln(), backend="reference")
-    world = random_start(sim.ruleset, Choices.seeded(7), (2, 9, 40)).world(sim)
-    fields = {name: world[name].numpy() for name in ("heat", "glow", "depth", "wet", "tilt")}
-    wanted = slow(kiln(), world.ids.numpy(), fields.__getitem__)
-    ids, given = world.ids, dict(fields)
-    if kind == "array":
-        ids = ids.numpy()
-    else:
-        given = {name: torch.from_numpy(value) for name, value in fields.items()}
-    elements = kiln().elements
-    image = rgb(ids, palette(elements), ramps=ramps(elements), fields=given)
-    assert np.array_equal(np.asarray(image), wanted)
-
-
 @pytest.mark.parametrize(
     ("start", "end", "lo", "hi"),
     [
@@ -155,27 +128,6 @@ def test_colors_have_no_meaning() -> None:
 
 
 # Commands
-
-
-class Terminal(io.StringIO):
-    encoding = "utf-8"
-
-    def isatty(self) -> bool:
-        return True
-
-
-def test_a_terminal_shows_ramps(torch, monkeypatch) -> None:  # type: ignore[no-untyped-def]
-    from powderdsl.cli.pictures import first_world
-
-    monkeypatch.delenv("NO_COLOR", raising=False)
-    monkeypatch.setenv("TERM", "xterm")
-    sim = powderdsl.compile(kiln(), backend="reference")
-    world = random_start(sim.ruleset, Choices.seeded(2), (2, 6, 20)).world(sim)
-    stream = Terminal()
-    with LiveView(kiln().elements, stream) as view:
-        view.show(**first_world(world))
-    for line in render_frame(world.rgb()[0]).split("\n"):
-        assert line in stream.getvalue()
 
 
 STOVE = """\
@@ -248,17 +200,6 @@ def test_show_prints_ramps(stove: Path) -> None:
     )
 
 
-def test_a_counterexample_is_drawn_with_ramps(stove: Path) -> None:
-    stove.write_text(
-        STOVE.replace("do: heat += 1 where stove", "do: [heat += 1 where stove, stove -> empty if heat == 4]")
-        + "invariants: count(stove) is constant\n"
-    )
-    result = run_command("test", "core+stove.yaml", "--no-keep", "--picture", "broken.png")
-    assert result.exit_code == 1, result.output
-    red = {pixel[0] for pixel in pixels(Path("broken.png")) if pixel[1] == 48}
-    assert red & {floor(48 + 207 * Fraction(heat, 9) + Fraction(1, 2)) for heat in range(1, 10)}
-
-
 # Packs
 
 
@@ -278,32 +219,5 @@ def test_other_packs_color_elements(stove: Path) -> None:
     assert [one.code for one in found if one.code.startswith("PD3")] == ["PD317"]
 
 
-def test_strangers_contest_a_ramp(stove: Path) -> None:
-    for name in ("one", "two"):
-        color = {"one": "#0000FF", "two": "#00FF00"}[name]
-        Path(f"{name}.yaml").write_text(
-            f'pack: {name}\nneeds: [core, stove]\nalso: {{wall: {{color_by: {{field: heat, to: "{color}"}}}}}}\n'
-        )
-    ruleset, found = powderdsl.compiler.load_with_diagnostics("core+stove.yaml+one.yaml+two.yaml")
-    wall = ruleset.element("wall")
-    assert wall is not None
-    assert wall.ramp is not None
-    assert wall.ramp.end == "#00FF00"
-    (warning,) = [one for one in found if one.code == "PD316"]
-    assert "two.yaml" in str(warning.primary.span.source.name)
-
-
 def test_a_field_that_a_color_follows_is_used() -> None:
-    _, found = powderdsl.compiler.load_with_diagnostics(
-        _written(KILN.replace("      - wet := coin > 30%\n", ""))
-    )
-    assert "PD507" not in [one.code for one in found]
-
-
-@cache
-def _written(text: str) -> Path:
-    import tempfile
-
-    path = Path(tempfile.mkdtemp()) / "kiln.yaml"
-    path.write_text(text)
-    return path
+    assert "PD507" not in codes(KILN.replace("      - wet := coin > 30%\n", ""))

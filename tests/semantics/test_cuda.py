@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -89,38 +88,6 @@ def test_worlds_with_more_words_than_threads_can_hold(folder: Path, monkeypatch:
     assert_same(ruleset, start, steps=3, simulators=simulators)
     assert " o_p" in (text := kernels(ruleset, 9, 40)[0].text)
     assert "[ROUNDS]" not in text
-
-
-def test_many_steps_a_launch(folder: Path, torch) -> None:  # type: ignore[no-untyped-def]
-    """Twenty steps in one launch are twenty launches, and the state stays packed in between."""
-    simulator = EmulatedSimulator(load("core+sand+water"), folder)
-    ids = torch.randint(4, (3, 9, 40), generator=torch.Generator().manual_seed(1))
-    world = simulator.world(ids)
-    one_by_one = world
-    for _ in range(20):
-        one_by_one = simulator.step(one_by_one)
-    at_once = simulator.step(world, 20)
-    assert (at_once.ids == one_by_one.ids).all()
-    assert (at_once.ids != world.ids).any()
-
-
-def test_a_missing_barrier_would_be_seen(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import powderdsl.targets.cuda.program as torch_cuda
-
-    def careless(*arguments: object) -> KernelSource:
-        source = cuda_source(*arguments)  # type: ignore[arg-type]
-        before, passes = source.text.split("void pass_0", 1)
-        passes, after = passes.split("void reset_slots", 1)
-        text = f"{before}void pass_0{passes.replace('SYNC();', '')}void reset_slots{after}"
-        return replace(source, text=text)
-
-    ruleset = load("core+sand+water")
-    oracle = compile_ruleset(ruleset, backend="reference")
-    start = random_start(ruleset, Choices.seeded(2), (2, 9, 40))
-    assert_same(ruleset, start, steps=3, simulators=[oracle, EmulatedSimulator(ruleset, folder)])
-    monkeypatch.setattr(torch_cuda, "cuda_source", careless)
-    with pytest.raises(AssertionError, match="differ in step"):
-        assert_same(ruleset, start, steps=3, simulators=[oracle, EmulatedSimulator(ruleset, folder)])
 
 
 def test_what_does_not_fit_leaves_the_chip() -> None:

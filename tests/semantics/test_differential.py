@@ -9,7 +9,7 @@ takes the first of them, `make test-all` all. `python -m tests.fuzz` tries other
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from powderdsl.compiler import BACKENDS as powderdsl_backends
-from powderdsl.compiler import load, shipped, shipped_rules
+from powderdsl.compiler import load, shipped, shipped_rules, shipped_tests, shipped_variants
 from powderdsl.diagnostics import CompileError
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import compile as compile_ruleset
@@ -81,13 +81,69 @@ def compositions() -> list[str]:
 
 @pytest.mark.parametrize("name", compositions())
 def test_shipped_rulesets(name: str) -> None:
-    ruleset = load(name)
-    simulators = [compile_ruleset(ruleset, backend=backend) for backend in BACKENDS]
+    compare_shipped(load(name), BACKENDS)
+
+
+@pytest.mark.parametrize("name", sorted(set(shipped_tests()) - shipped_variants()))
+def test_shipped_rulesets_as_native_code(name: str) -> None:
+    skip_without_compiler()
+    compare_shipped(load(name), ("reference", "native"))
+
+
+def compare_shipped(ruleset: Ruleset, backends: Sequence[str]) -> None:
+    simulators = [compile_ruleset(ruleset, backend=backend) for backend in backends]
     for seed, shape in enumerate(
         [(2, 9, 33), (3, 4, 5), (2, 1, 64), (2, 65, 1), (1, 1, 1), (1, 2, 31), (1, 20, 97)]
     ):
         start = random_start(ruleset, Choices.seeded(seed), shape)
         assert_same(ruleset, start, steps=3, simulators=simulators)
+
+
+def test_parameters_may_differ_by_world(torch) -> None:  # type: ignore[no-untyped-def]
+    """A batch with a value for each world equals the worlds alone with theirs, on cells, planes and native code."""
+    rules = load("powderworld")
+    rates = torch.tensor([0.0, 0.3, 1.0], dtype=torch.float64)
+    ids = torch.randint(14, (3, 8, 40), generator=torch.Generator().manual_seed(1))
+    oracle = compile_ruleset(rules, backend="reference")
+    for backend in ("torch", "native", "wasm"):
+        skip_without_compiler(backend)
+        sim = compile_ruleset(rules, backend=backend)
+        together = sim.step(sim.world(ids, seed=4), 3, params={"water.melt": rates, "fire.spread": rates})
+        for i, rate in enumerate(rates.tolist()):
+            alone = oracle.world(ids[i : i + 1], seed=4, index=[i])
+            alone = oracle.step(alone, 3, params={"water.melt": rate, "fire.spread": rate})
+            assert find_difference(alone.state, together.select([i]).state) is None, backend
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_is_skipped_changes_nothing(seed: int, torch) -> None:  # type: ignore[no-untyped-def]
+    """Full worlds and nearly empty ones, with wind and without: the same worlds."""
+    rules = load("powderworld")
+    oracle, other = compile_ruleset(rules, backend="torch"), compile_ruleset(rules, backend="wasm")
+    generator = torch.Generator().manual_seed(seed)
+    ids = torch.randint(14, (5, 30, 64), generator=generator)
+    ids[torch.rand(ids.shape, generator=generator) < (0.2, 0.2, 0.9, 0.9)[seed]] = 0
+    velocity = torch.randn((5, 2, 30, 64), generator=generator) * 5
+    velocity[:, :, :, 40:] = 0
+    for wind in (velocity, 0 * velocity):
+        worlds = [sim.replace(sim.world(ids, seed=seed), velocity=wind) for sim in (oracle, other)]
+        for _ in range(6):
+            worlds = [world.sim.step(world, 2) for world in worlds]
+            assert find_difference(worlds[0].state, worlds[1].state) is None
+
+
+def test_elements_that_appear_are_found_by_later_passes(torch) -> None:  # type: ignore[no-untyped-def]
+    rules = load_text(
+        "pack: appearing\nelements:\n  zero: {id: 0, color: '#000000'}\n  one: {id: 1, color: '#808080'}\n"
+        "  two: {id: 2, color: '#F0F0F0'}\npasses:\n  first: {do: any -> one}\n  second: {do: '(zero, one) -> zero'}\n"
+    )
+    for shape in ((1, 8, 64), (2, 3, 5)):
+        for start in range(3):
+            ids = torch.full(shape, start)
+            for backend in ("reference", "wasm", "native"):
+                skip_without_compiler(backend)
+                sim = compile_ruleset(rules, backend=backend)
+                assert not sim.step(sim.world(ids)).ids.any(), (backend, shape, start)
 
 
 # Random rulesets

@@ -189,16 +189,6 @@ def test_channels_of_a_ruleset_stay_in_place() -> None:
     assert compact[2][: len(compact[1])] == compact[1]
 
 
-def test_channels_of_packs_without_a_ruleset_stay_in_place_too() -> None:
-    names = ["core", "water", "stone", "wind"]
-    for count in range(1, len(names)):
-        few, more = (powderdsl.load(*names[:n]) for n in (count, count + 1))
-        here, there = ([channel.name for channel in rules.matrix] for rules in (few, more))
-        assert there[: len(here)] == here
-        old, new = (powderdsl.compile(rules, "torch").observer.compact_names for rules in (few, more))
-        assert new[: len(old)] == old
-
-
 def test_worlds_carry_their_palette_to_other_ids() -> None:
     here = powderdsl.compile(powderdsl.load("core", "one.yaml", "two.yaml"), "torch")
     there = powderdsl.compile(powderdsl.load("core", "two.yaml", "one.yaml"), "torch")
@@ -241,19 +231,6 @@ def test_the_palette_of_a_model_has_no_gaps_for_packs_that_are_added() -> None:
     assert palette[14] == "far.glow"
 
 
-def test_names_of_strangers_hide_nothing() -> None:
-    """A parameter, a loop variable and a value under `let` of one pack, all of which another pack defines."""
-    mine = pack("mine", '  reed: {color: "#306030"}', "params: {pace: 10%}\n"
-                "passes:\n  grow:\n    let: {wet: count(reed) > 1}\n    for damp in 1..2:\n"
-                "      - empty -> reed if wet and count(reed) == damp with chance pace\n")  # fmt: skip
-    theirs = pack(
-        "theirs", '  pace: {color: "#306030"}\n  damp: {color: "#306030"}\n  wet: {color: "#306030"}'
-    )
-    rules = powderdsl.load("core", mine, theirs)
-    assert [element.name for element in rules.elements] == ["empty", "wall", "reed", "pace", "damp", "wet"]
-    assert powderdsl.load("core", theirs, mine).element("reed")
-
-
 def test_names_after_a_dot_may_be_absent() -> None:
     mine = pack("mine", '  bee: {color: "#306030"}', "passes:\n  buzz:\n    do:\n"
                 "      - bee -> one.slime? if below is one.slime? and below.wet? > 1\n"
@@ -267,12 +244,6 @@ def test_names_after_a_dot_may_be_absent() -> None:
     rules, notes = load_with_diagnostics("core", "one.yaml", mine)
     buzz = next(one for one in rules.passes if one.name == "buzz")
     assert [len(moment.rules) for moment in buzz.moments] == [1, 1]
-
-
-def test_shapes_of_kernels_are_names_like_others() -> None:
-    gem = pack("gem", '  diamond: {color: "#AAFFFF"}', "passes:\n"
-               "  grow: {do: empty -> diamond if count(diamond in diamond(2)) > 3}\n")  # fmt: skip
-    assert powderdsl.load("core", gem).element("diamond")
 
 
 NAMESAKE = """
@@ -314,21 +285,6 @@ def test_a_pack_that_has_an_element_of_its_name() -> None:
     world = sim.step(sim.world(np.array([[[snail], [snail], [1]]], np.uint8)), steps=1)
     assert world.ids[0, :, 0].tolist() == [snail, bird, 1]
     assert world["trail"][0, :, 0].tolist() == [0, 9, 0]
-
-
-def test_names_of_a_block_come_before_packs() -> None:
-    """A pack may be called as somebody's loop variable is: there it stays the variable."""
-    Path("snail.yaml").write_text(NAMESAKE)
-    Path("looper.yaml").write_text(
-        "pack: looper\nneeds: core\nelements: {loop: {color: '#402060'}}\nfields: {trail: {type: 0..9, at: place}}\n"
-        "passes:\n  p:\n    for snail in sides:\n      - snail.trail += 1 where loop\n"
-    )
-    rules = powderdsl.load("core", "looper.yaml", "snail.yaml")
-    sim = powderdsl.compile(rules, "reference")
-    loop = rules.element("loop").id
-    world = sim.step(sim.world(np.array([[[0, 0, 0], [0, loop, 0], [0, 0, 0]]], np.uint8)))
-    assert world["trail"].tolist() == [[[0, 1, 0], [1, 0, 1], [0, 1, 0]]]
-    assert not world["snail.trail"].any()
 
 
 BOTH = """

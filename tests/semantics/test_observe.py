@@ -95,20 +95,6 @@ def test_the_same_on_every_backend(name: str, backend: str, torch) -> None:  # t
             assert torch.equal(look(), wanted), (way, height, width)  # type: ignore[operator]
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_worlds_may_lie_apart(backend: str, torch) -> None:  # type: ignore[no-untyped-def]
-    """One step's column of a buffer [worlds, steps, …]."""
-    sim = simulator_or_skip("kinds", backend)
-    batches = [random_start(sim.ruleset, Choices.seeded(3), (3, height, 70)) for height in (4, 8)]
-    looks = [pair for start in batches for pair in ways_out(sim.step(start.world(sim))).items()]
-    for way, look in looks:
-        wanted = look()  # type: ignore[operator]
-        steps = torch.zeros((3, 4, *wanted.shape[1:]), dtype=wanted.dtype)
-        look(steps[:, 2])  # type: ignore[operator]
-        assert torch.equal(steps[:, 2], wanted), way
-        assert not steps[:, [0, 1, 3]].any(), way
-
-
 def test_meaning(torch) -> None:  # type: ignore[no-untyped-def]
     """What the numbers are: palette colors, one-hot channels in the declared order, columns from the lowest bit."""
     sim = simulator("kinds", "torch")

@@ -35,9 +35,6 @@ STEADY = Manner(draws=False, borders=False, symmetry=False)
 """Nothing random, nothing that knows where the grid ends."""
 SWAPS = Manner(forms=("swap",), overwrites=False)
 
-MOVEMENT = ("stone", "gravity", "piling", "flow", "wind")
-"""The passes of powderworld that move elements and make none."""
-
 
 @cache
 def simulators(manner: Manner, seeds: range, backend: str = "wasm") -> tuple[Simulator, ...]:
@@ -267,26 +264,6 @@ def cells(world: World, names: list[str]) -> list[list[tuple[float, ...]]]:
     flat = [plane for value in planes for plane in (value.unbind(1) if value.ndim == 4 else (value,))]
     stacked = torch.stack(flat, -1).reshape(len(world), -1, len(flat))
     return [sorted(map(tuple, cells.tolist())) for cells in stacked]
-
-
-@pytest.mark.parametrize("walled", [False, True])
-@pytest.mark.parametrize("shape", [(4, 16, 24), (3, 1, 40), (3, 40, 1), (2, 33, 5)])
-def test_movement_of_powderworld_conserves_every_element(shape: tuple[int, int, int], walled: bool) -> None:
-    simulator = compile_ruleset(load("powderworld"), backend="wasm")
-    for seed in range(3):
-        world = random_world(simulator, seed, shape)
-        if walled:
-            border = torch.ones(shape[1:], dtype=torch.bool)
-            border[1:-1, 1:-1] = False
-            world = simulator.paint(world, element="wall", where=border)
-        for _ in range(3):
-            for name in MOVEMENT:
-                after = simulator.step(world, passes=[name])
-                for one, other in zip(world.ids, after.ids, strict=True):
-                    assert torch.equal(
-                        one.flatten().bincount(minlength=14), other.flatten().bincount(minlength=14)
-                    ), name
-                world = after
 
 
 # Ranges

@@ -14,7 +14,7 @@ from powderdsl.cli.pictures import LiveView, first_world, pictures, render_frame
 from powderdsl.compiler import load_with_diagnostics
 from powderdsl.diagnostics import CompileError
 from powderdsl.model.types import Ruleset
-from powderdsl.simulation.draw import palette, ramps, rgb, tints
+from powderdsl.simulation.draw import palette, ramps, rgb
 from powderdsl.system.fingerprint import fingerprint
 from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
@@ -112,14 +112,6 @@ def test_commands_and_the_terminal_draw_what_worlds_show(monkeypatch: pytest.Mon
         view.show(**first_world(world))
     for line in render_frame(image).split("\n"):
         assert line in stream.getvalue()
-
-
-@pytest.mark.parametrize(
-    ("rules", "full"), [("powderworld", 2), ("powderworld2", 5), ("powderworld2_ogbench", 5)]
-)
-def test_both_worlds_declare_their_tint(rules: str, full: int) -> None:
-    (tint,) = tints(powderdsl.load(rules).fields)
-    assert (tint.field, tint.full, tint.most) == ("velocity", full, 0.5)
 
 
 def test_tints_have_no_meaning() -> None:

@@ -99,14 +99,6 @@ def test_content_that_moves_brings_its_fields_as_assignments_left_them():
     assert [(one.how, int(one.after)) for one in left.writes] == [("assign", 7), ("leave", 0)]
 
 
-def test_writes_stand_in_order_across_moments_and_passes():
-    body = "do: void -> rock\nthen:\n  do: rock -> bomb\n  then: bomb -> moth"
-    found = traced(body, ".", 0, 0)
-    ids = [(int(one.before), int(one.after)) for one in found.writes]
-    assert ids == [(0, 1), (1, 2), (2, 3)]
-    assert [one.asked.rule.moment for one in found.writes if one.asked] == [1, 2, 3]
-
-
 def test_a_push_and_an_effect_name_the_cell_whose_condition_held():
     found = traced("do: push gale by 3 away from bomb", ".b.", 0, 0, "gale")
     (write,) = found.writes
@@ -174,14 +166,6 @@ def test_a_let_is_taken_apart_as_it_was_fixed():
     assert part.expr.span.line == line_of(lab(body), "let:")
 
 
-def test_a_target_learns_why_nothing_came():
-    miss = only_miss(
-        traced("do: swap below if rock and weight > below.weight and below is void", "o/m", 1, 0)
-    )
-    assert miss.cell == (0, 0)
-    assert values(miss.failed) == {"below": "moth"}
-
-
 def test_a_rule_about_other_elements_is_no_near_miss_unless_all_are_asked_for():
     body = "do:\n  - rock -> bomb if below is void\n  - moth -> bomb if below is rock and right is rock"
     world = world_of(lab(body), "m./..")
@@ -194,22 +178,6 @@ def test_a_rule_that_gave_way_says_so():
     body = "conflicts: drop_both\ndo:\n  - rock -> bomb\n  - swap right if rock"
     miss = trace(world_of(lab(body), "o.."), 0, 0, of=["element"]).misses
     assert [(one.failed, one.gave_way) for one in miss] == [((), "drop_both")] * 2
-
-
-def test_a_sleeping_name_wakes_with_its_pack():
-    """The rule is written with names of another pack: without that pack it is nowhere, with it it nearly happens."""
-    found = {}
-    for packs, cell in (("core+fire", 1), ("core+water+fire", 6)):
-        ruleset = load(packs)
-        world = compile(ruleset, backend="reference").world([[cell, 7], [1, 1]])
-        misses = trace(world, 0, 0, every_rule=True).misses
-        found[packs] = [one for one in misses if one.rule.span.text.startswith("ice? -> water?")]
-    assert found["core+fire"] == []
-    (miss,) = found["core+water+fire"]
-    assert {read.text for part in miss.held + miss.failed for read in part.reads} >= {
-        "draw(interact)",
-        "fire.thaw",
-    }
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pytest
 import wasmtime
 
 import powderdsl
-from powderdsl.compiler import load
+from powderdsl.compiler import load, shipped_tests, shipped_variants
 from powderdsl.diagnostics import CompileError
 from powderdsl.model.state import fitting
 from powderdsl.model.types import Ruleset
@@ -23,7 +23,6 @@ from powderdsl.testing.generators.choices import Choices
 from powderdsl.testing.generators.rulemaker import random_ruleset_text
 from tests.cli.commands import powderdsl as command
 from tests.compilers import skip_without_compiler
-from tests.semantics.test_long_runs import RULESETS
 from tests.semantics.test_mixed import spread
 from tests.tiers import tiered
 from tests.wasm.standalone_world import (
@@ -39,6 +38,7 @@ from tests.wasm.standalone_world import (
 
 DOCS = Path(__file__).parents[2] / "docs" / "export.md"
 SIZES = [(9, 70), (16, 64)]
+RULESETS = sorted(set(shipped_tests()) - shipped_variants())
 
 HOLDERS = """
 pack: holders
@@ -155,24 +155,6 @@ def test_fields_hold_only_what_rules_allow() -> None:
         alone.call("step", 3)
         world = sim.step(world, 3, params=params)
         compare(alone, world)
-
-
-def test_parameters_of_powderworld() -> None:
-    ruleset = load("powderworld")
-    sim, world, state = states(ruleset, (12, 64), 5)
-    alone = StandaloneWorld(ruleset, (12, 64))
-    alone.begin(state["element"], 7)
-    for slot in alone.slots:
-        alone.take(slot, state[slot])
-    generator = np.random.default_rng(1)
-    params = {}
-    for number, param in enumerate(ruleset.params):
-        lo, hi = (0, 1) if param.kind.name in ("chance", "flag") else (param.kind.lo, param.kind.hi)
-        value = lo + (min(hi, 9) - lo) * float(generator.random())
-        params[param.name] = float(round(value)) if param.kind.name in ("int", "flag") else value
-        alone.parameter(number, params[param.name])
-    alone.call("step", 12)
-    compare(alone, sim.step(world, 12, params=params))
 
 
 def test_the_clock_continues_a_world() -> None:
