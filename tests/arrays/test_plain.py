@@ -16,55 +16,12 @@ from hypothesis import strategies as st
 from powderdsl.arrays import plain
 from powderdsl.arrays.numbers import promoted
 
-KINDS = (
-    "bool",
-    "int8",
-    "uint8",
-    "int16",
-    "uint16",
-    "int32",
-    "uint32",
-    "int64",
-    "uint64",
-    "float32",
-    "float64",
-)
-SHAPES = (
-    (),
-    (1,),
-    (3,),
-    (0,),
-    (7,),
-    (1, 1),
-    (2, 3),
-    (3, 1),
-    (4, 5),
-    (2, 3, 4),
-    (2, 1, 5),
-    (1, 1, 3),
-    (3, 2, 2, 2),
-    (9, 3),
-    (8, 2, 3),
-    (7, 2, 3, 2),
-)
+INTEGERS = tuple(f"{sign}int{bits}" for bits in (8, 16, 32, 64) for sign in ("", "u"))
+KINDS = ("bool", *INTEGERS, "float32", "float64")
+SHAPES = ((), (1,), (3,), (0,), (1, 1), (2, 3), (4, 5), (2, 3, 4), (2, 1, 5), (3, 2, 2, 2), (8, 2, 3))
 COMMON = ((3, 4, 5), (4, 5), (1, 5), (3, 1, 1), (4, 1), (5,), (1,), (), (1, 4, 5))
 """Shapes that fit together."""
-FLOATS = (
-    0.0,
-    -0.0,
-    1.0,
-    -1.0,
-    0.1,
-    -0.3,
-    1e-30,
-    1e30,
-    2.5,
-    7.0,
-    float("inf"),
-    float("-inf"),
-    float("nan"),
-    255.0,
-)
+FLOATS = (0.0, -0.0, 1.0, 0.1, -0.3, 1e-30, 1e30, 7.0, float("inf"), float("-inf"), float("nan"), 255.0)
 UNSUPPORTED = "without NumPy"
 
 
@@ -250,37 +207,26 @@ KEYS: tuple[Callable[..., Any], ...] = (
     lambda np: -1,
     lambda np: 9,
     lambda np: slice(None),
-    lambda np: slice(None, None, -1),
     lambda np: slice(1, -1),
-    lambda np: (slice(None), 0),
     lambda np: (slice(None), slice(None, None, 2)),
     lambda np: (0, 1),
-    lambda np: (1, 2, 3),
     lambda np: (..., 0),
     lambda np: (..., slice(None, None, -1)),
     lambda np: (0, ..., 1),
     lambda np: ...,
-    lambda np: (),
     lambda np: None,
-    lambda np: (slice(None), None),
     lambda np: (slice(None), None, None),
     lambda np: (..., None, 0),
-    lambda np: [0, 1, 0],
     lambda np: np.array([0, -1, 0]),
     lambda np: np.array([[0, 1], [1, 0]]),
-    lambda np: (slice(None), [0, -1]),
     lambda np: (slice(None), [0, -1], slice(None)),
-    lambda np: (np.array([0, 1]), np.array([1, 0])),
     lambda np: (np.array([[0], [1]]), np.array([1, 0])),
     lambda np: ([0, 1], slice(None), [0, 1]),
-    lambda np: (0, slice(None), [0, 1]),
     lambda np: (slice(None), 1, [0, 1]),
-    lambda np: (np.array([True, False]),),
     lambda np: (slice(None), np.array([True, False, True])),
     lambda np: np.array([[True, False, True], [False, False, True]]),
     lambda np: (np.array([[True, False, True], [False, False, True]]), 0),
     lambda np: np.array([True, False, True, True]),
-    lambda np: np.array(1),
     lambda np: np.int64(1),
     lambda np: (slice(None), [1, 0], None),
     lambda np: [],

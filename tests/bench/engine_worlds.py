@@ -16,8 +16,8 @@ import torch
 from powderdsl.experiments.bench import Plan, start_worlds
 from tests.bench.beside_engine import State, load, stepped
 from tests.bench.rounds import microseconds
-from tests.recordings import STREAMS
-from tests.semantics.test_second_recordings import RECORDINGS, Runner, compiled, read_recording
+from tests.recordings import STREAMS, given, read_recording
+from tests.semantics.test_second_recordings import RECORDINGS, Runner, compiled
 
 WORLDS, STEPS, ROUNDS = 32, 16, 5
 """Worlds at once, steps of a call, and rounds in which all backends run one after the other."""
@@ -56,10 +56,12 @@ def differing(like: Runner, state: State) -> int:
     random = np.random.default_rng(1)
     shape = state["element"].shape
     draws = {name: ((random.integers(0, 256, shape) + 0.5) / 256).astype(np.float32) for name in STREAMS}
-    world = like.simulator.world(like.given(state["element"]))
-    fields = {name: like.given(values) for name, values in state.items() if name != "element"}
+    world = like.simulator.world(given(state["element"], like.backend))
+    fields = {name: given(values, like.backend) for name, values in state.items() if name != "element"}
     world = like.simulator.replace(world, **fields)
-    after = like.simulator.step(world, random={name: like.given(draw) for name, draw in draws.items()})
+    after = like.simulator.step(
+        world, random={name: given(draw, like.backend) for name, draw in draws.items()}
+    )
     found = int((stepped(state, draws)[:, 0] != after.ids).sum())
     assert found <= ROUNDED * state["element"].size, f"{found} of {state['element'].size} ids differ"
     return found

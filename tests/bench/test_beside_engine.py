@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from tests.bench.beside_engine import numbers
-from tests.semantics.test_second_recordings import RECORDINGS, compiled, read_recording
+from tests.recordings import read_recording
+from tests.semantics.test_second_recordings import RECORDINGS, compiled
 
 CHANNELS = ("velocity", "custom1", "custom2", "custom3")
 

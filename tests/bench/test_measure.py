@@ -9,7 +9,6 @@ import pytest
 
 import powderdsl
 from powderdsl.experiments.bench import (
-    CellFigures,
     Plan,
     Program,
     Report,
@@ -87,18 +86,6 @@ def test_worlds_have_the_elements_that_were_chosen(rules):
     water = rules.element("water").id
     assert set(worlds(rules, "shapes", only=["water"]).ids.unique().tolist()) == {0, water}
     assert set(worlds(rules, "shapes", only=["empty"]).ids.unique().tolist()) == {0}
-
-
-def test_larger_worlds_are_as_full(rules):
-    full = [
-        float((worlds(rules, "shapes", sizes=[(side, side)]).ids != 0).float().mean()) for side in (64, 256)
-    ]
-    assert full[1] == pytest.approx(full[0], abs=0.1)
-    assert 0.1 < full[1] < 0.5
-
-
-def test_rules_without_fields_have_worlds_too():
-    assert worlds(powderdsl.load("life"), "gusts").ids.any()
 
 
 # The order
@@ -188,15 +175,6 @@ def test_numbers_have_three_figures(value, shown):
     assert number(value) == shown
 
 
-def test_half_a_measurement_is_reported(rules):
-    plan = Plan(rules, rounds=3)
-    figures = CellFigures(plan.cells[0], 1.0, 1.0, 2, 5, [2.0], [1.0])
-    assert figures.rates == [5 * plan.cells[0].batch]
-    assert figures.processor_microseconds == figures.world_step_microseconds / 2
-    text = report_text(Report(plan, this_machine("cpu"), (figures,)))
-    assert "medians of 3 interleaved rounds" in text
-
-
 # What passes cost
 
 
@@ -210,23 +188,3 @@ def test_every_backend_profiles_every_pass(backend, tmp_path, torch):
         seconds = sim.profile(world, 3)
     assert tuple(seconds) == sim.passes
     assert all(value > 0 for value in seconds.values())
-
-
-def test_profiling_runs_what_running_runs(rules, torch):
-    """The watched program is the program: the same worlds come out of it."""
-    sim = powderdsl.compile(rules, "torch")
-    plan = Plan(rules, **TINY)
-    world = start_worlds(sim, plan, plan.cells[1])
-    seen = []
-    job_seen, whole = [], sim._program.whole
-
-    class Watched:
-        def run(self, job):
-            job_seen.append(whole.run(job))
-            return job_seen[-1]
-
-    sim._program = sim._program._replace(whole=Watched())
-    sim.profile(world, 2)
-    seen.append(sim.step(world, 2).ids)
-    assert len(job_seen) == 2
-    assert (job_seen[0]["element"] == seen[0]).all()

@@ -1,8 +1,7 @@
-"""Fuzzing at length: many seeds in several processes, what fails made small and saved, and where to continue."""
+"""Fuzzing at length: many seeds in several processes; what fails is made small and saved."""
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections import Counter, deque
@@ -15,12 +14,10 @@ from tempfile import gettempdir
 
 import torch
 
-from powderdsl.system.reading import parse_json, read_bytes
-from powderdsl.system.writing import failure, replacing, scratch_folder
+from powderdsl.system.writing import scratch_folder
 from powderdsl.testing.generators.cases import load_text
 from powderdsl.testing.generators.rulemaker import random_ruleset_text
-from tests.fuzz.case_files import write_case
-from tests.fuzz.cases import Case
+from tests.fuzz.cases import Case, write_case
 from tests.fuzz.crew import Done, Lost, Tell, work_through
 from tests.fuzz.differential import Finding, Outcome, Plan, run_seed, seeded_starts, still_fails
 from tests.fuzz.reducer import reduce_case
@@ -32,23 +29,16 @@ REDUCE_SECONDS = 120.0
 MOST_FINDINGS = 20
 """So many are enough: they have one cause, more often than not."""
 
-STATE_FILE = "state.json"
-
 
 @dataclass
 class Tally:
-    """What has been done. `next`: all seeds from the first one to before this are done."""
+    """What has been done. `files`: names of the files with what failed."""
 
-    plan: str
-    first: int
-    next: int
     rulesets: int = 0
     refused: int = 0
     worlds: int = 0
     used: Counter[tuple[str, str]] = field(default_factory=Counter)
     files: list[str] = field(default_factory=list)
-    """Names of the files with what failed."""
-    _ahead: set[int] = field(default_factory=set)
 
     def count(self, outcome: Outcome) -> None:
         """Add the outcome of a seed."""
@@ -56,47 +46,6 @@ class Tally:
         self.rulesets += not outcome.refused
         self.worlds += outcome.worlds
         self.used.update(outcome.used)
-        self.pass_over(outcome.seed)
-
-    def pass_over(self, seed: int) -> None:
-        """Note that a seed is done."""
-        self._ahead.add(seed)
-        while self.next in self._ahead:
-            self._ahead.remove(self.next)
-            self.next += 1
-
-
-def describe(plan: Plan) -> str:
-    """The plan in a line; a campaign continues only under the same one."""
-    return f"{','.join(plan.backends)} worlds {plan.worlds} steps {plan.steps} {plan.building.level}"
-
-
-def save_tally(tally: Tally, folder: Path) -> None:
-    """Write the state file, whole or not at all. Raises CompileError (PD613) if it cannot be written."""
-    rows = {key: value for key, value in vars(tally).items() if not key.startswith("_")}
-    rows["used"] = [[group, name, count] for (group, name), count in sorted(tally.used.items())]
-    with replacing(folder / STATE_FILE) as temporary:
-        temporary.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
-
-
-def load_tally(folder: Path, plan: Plan) -> Tally:
-    """The state file of a folder. Raises CompileError: PD101 there is none, PD602 it is of another plan, or none."""
-    path = folder / STATE_FILE
-    try:
-        rows = parse_json(read_bytes(path, 1 << 22))
-        used = Counter({(str(group), str(name)): int(count) for group, name, count in rows.pop("used")})
-        tally = Tally(**rows, used=used)
-    except OSError as error:
-        raise failure("PD101", f"cannot read {path}", notes=(str(error.strerror),)) from None
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise failure(
-            "PD602", f"{path} is not a state of `python -m tests.fuzz`", notes=(str(error),)
-        ) from None
-    if tally.plan != describe(plan):
-        notes = (f"there: {tally.plan}", f"here: {describe(plan)}")
-        helps = ("give the options that it began with, or another folder",)
-        raise failure("PD602", f"{path} belongs to another plan", notes=notes, helps=helps)
-    return tally
 
 
 def run_campaign(
@@ -104,8 +53,7 @@ def run_campaign(
 ) -> Generator[Outcome | Path, None, None]:
     """Compare on seeds until they or the time are over; each outcome of a seed, and each file with a finding.
 
-    The state file is kept up to date, also when the caller stops early. Findings are saved as they are found, and
-    again when they have been made smaller.
+    Findings are saved as they are found, and again when they have been made smaller.
 
     Args:
         seeds: the seeds that are left.
@@ -113,39 +61,30 @@ def run_campaign(
     """
     folder.mkdir(parents=True, exist_ok=True)
     tasks: deque[int | Finding] = deque(islice(seeds, 2 * jobs))
-    saved = time.monotonic()
     with scratch_folder(Path(gettempdir())) as scratch:
         work = partial(perform, plan, scratch)
-        try:
-            for heard in work_through(tasks, work, jobs, SEED_LIMIT):
-                findings: tuple[Finding, ...] = ()
-                if isinstance(heard, Lost):
-                    findings = () if isinstance(heard.task, Finding) else (_lost(plan, heard),)
-                    if not isinstance(heard.task, Finding):
-                        tally.pass_over(heard.task)
-                elif isinstance(heard.result, Outcome):
-                    tally.count(heard.result)
-                    findings = heard.result.findings
-                    yield heard.result
-                else:
-                    write_case(folder / file_name(heard.result), heard.result.case, heard.result.problem)
-                for finding in findings:
-                    path = folder / file_name(finding)
-                    write_case(path, finding.case, finding.problem)
-                    tally.files.append(path.name)
-                    if isinstance(heard, Done):
-                        tasks.appendleft(finding)
-                    yield path
-                if time.monotonic() < until and len(tally.files) < MOST_FINDINGS:
-                    tasks.extend(islice(seeds, max(0, 2 * jobs - len(tasks))))
-                else:
-                    for task in [task for task in tasks if not isinstance(task, Finding)]:
-                        tasks.remove(task)
-                if time.monotonic() > saved + 10:
-                    saved = time.monotonic()
-                    save_tally(tally, folder)
-        finally:
-            save_tally(tally, folder)
+        for heard in work_through(tasks, work, jobs, SEED_LIMIT):
+            findings: tuple[Finding, ...] = ()
+            if isinstance(heard, Lost):
+                findings = () if isinstance(heard.task, Finding) else (_lost(plan, heard),)
+            elif isinstance(heard.result, Outcome):
+                tally.count(heard.result)
+                findings = heard.result.findings
+                yield heard.result
+            else:
+                write_case(folder / file_name(heard.result), heard.result.case, heard.result.problem)
+            for finding in findings:
+                path = folder / file_name(finding)
+                write_case(path, finding.case, finding.problem)
+                tally.files.append(path.name)
+                if isinstance(heard, Done):
+                    tasks.appendleft(finding)
+                yield path
+            if time.monotonic() < until and len(tally.files) < MOST_FINDINGS:
+                tasks.extend(islice(seeds, max(0, 2 * jobs - len(tasks))))
+            else:
+                for task in [task for task in tasks if not isinstance(task, Finding)]:
+                    tasks.remove(task)
 
 
 def file_name(finding: Finding) -> str:

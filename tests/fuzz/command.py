@@ -85,9 +85,8 @@ class BackendsType(click.ParamType):
     type=click.Path(path_type=Path, file_okay=False),
     default=Path("fuzz"),
     show_default=True,
-    help="Folder for what failed, and for how far it came.",
+    help="Folder for what failed.",
 )
-@click.option("--resume", is_flag=True, help="Continue where the run in that folder ended.")
 @click.option("--front-end", is_flag=True, help="Damage rule files instead, and load them.")
 @opt.option("--jobs", (1, 256), "Processes.  [default: one per processor]")
 @click.option(
@@ -104,7 +103,6 @@ def command(
     steps: int,
     level: str,
     folder: Path,
-    resume: bool,
     front_end: bool,
     jobs: int | None,
     replay: Path | None,
@@ -113,8 +111,8 @@ def command(
 
     cuda-emulated: the kernels of the backend cuda, compiled for the CPU. It and native take seconds a ruleset.
 
-    What differs is made small and saved as a file that `--replay` runs again. Ctrl-C ends a run with its report;
-    `--resume` continues. Exit code: 0 if all agree, 1 if something was found.
+    What differs is made small and saved as a file that `--replay` runs again. Ctrl-C ends a run with its report.
+    Exit code: 0 if all agree, 1 if something was found.
 
     \b
         python -m tests.fuzz --seconds 60
@@ -133,7 +131,7 @@ def command(
     if replay is not None:
         return _replay(replay, building)
     plan = Plan(_there(backends), worlds, steps, building)
-    return _campaign(plan, seeds, seconds, folder, resume, jobs or os.cpu_count() or 1)
+    return _campaign(plan, seeds, seconds, folder, jobs or os.cpu_count() or 1)
 
 
 def _there(asked: tuple[str, ...] | None) -> tuple[str, ...]:
@@ -162,7 +160,7 @@ def _replay(path: Path, building: Any) -> int:
     from tempfile import gettempdir
 
     from powderdsl.system.writing import scratch_folder
-    from tests.fuzz.case_files import read_case
+    from tests.fuzz.cases import read_case
     from tests.fuzz.differential import check_case
 
     case = read_case(path)
@@ -179,20 +177,16 @@ def _replay(path: Path, building: Any) -> int:
     return FAILED
 
 
-def _campaign(
-    plan: Plan, seeds: range | None, seconds: int | None, folder: Path, resume: bool, jobs: int
-) -> int:
-    from tests.fuzz.campaign import Tally, describe, load_tally, run_campaign
+def _campaign(plan: Plan, seeds: range | None, seconds: int | None, folder: Path, jobs: int) -> int:
+    from tests.fuzz.campaign import Tally, run_campaign
 
-    wanted = seeds or (range(200) if seconds is None else range(MAX_SEED))
-    tally = load_tally(folder, plan) if resume else Tally(describe(plan), wanted.start, wanted.start)
-    left = range(max(wanted.start, tally.next) if resume else wanted.start, wanted.stop)
+    wanted, tally = seeds or (range(200) if seconds is None else range(MAX_SEED)), Tally()
     began = time.monotonic()
     until = began + (seconds if seconds is not None else float("inf"))
-    events = run_campaign(plan, tally, iter(left), jobs, folder, until)
+    events = run_campaign(plan, tally, iter(wanted), jobs, folder, until)
     interrupt: KeyboardInterrupt | None = None
     done = 0
-    with progress(_title(seconds), len(left)) as show:
+    with progress(_title(seconds), len(wanted)) as show:
         try:
             for event in events:
                 if isinstance(event, Path):
@@ -203,7 +197,7 @@ def _campaign(
         except KeyboardInterrupt as caught:
             interrupt = caught
         finally:
-            events.close()  # its processes end, its state is saved
+            events.close()  # its processes end
     _report(plan, tally, folder, time.monotonic() - began, interrupt is not None)
     if isinstance(interrupt, Terminated):
         raise interrupt
@@ -215,7 +209,7 @@ def _report(plan: Plan, tally: Tally, folder: Path, seconds: float, interrupted:
 
     names = " and ".join(filter(None, (", ".join(plan.backends[:-1]), plan.backends[-1])))
     if interrupted:
-        click.echo(f"interrupted; `--resume` continues from seed {tally.next}")
+        click.echo("interrupted")
     click.echo(
         f"{tally.rulesets:,} rulesets and {tally.worlds:,} worlds, {counted(plan.steps, 'step')} each, in {seconds:.0f} s: "
         f"{names} against the reference"

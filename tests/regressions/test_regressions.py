@@ -10,7 +10,7 @@ import pytest
 from powderdsl.targets.cpp.build import Building
 from tests.compilers import skip_without_compiler
 from tests.fuzz import COMPARED
-from tests.fuzz.case_files import read_case
+from tests.fuzz.cases import read_case
 from tests.fuzz.differential import check_case
 
 FOLDER = Path(__file__).parent

@@ -10,7 +10,9 @@ import pytest
 import powderdsl
 from powderdsl.compiler import load_with_diagnostics, whole_palette
 from powderdsl.diagnostics import CompileError
+from powderdsl.simulation.tracing import trace
 from powderdsl.testing.pack_tests.runner import run_examples
+from powderdsl.worlds.scene import load_start
 from powderdsl.worlds.store import load_world, save
 
 SLIME = """
@@ -127,13 +129,6 @@ def test_a_ruleset_renames_without_editing_anyones_file() -> None:
     assert [one.code for one in error.value.diagnostics] == ["PD310"]
 
 
-def test_packs_that_know_each_other_may_not_redefine() -> None:
-    name = pack("mine", '  wall: {color: "#000000"}')
-    with pytest.raises(CompileError) as error:
-        powderdsl.load("core", name)
-    assert [one.code for one in error.value.diagnostics] == ["PD302"]
-
-
 def test_ids_are_optional_and_adding_packs_moves_none() -> None:
     first = pack("aa", '  moss: {color: "#306030"}\n  fern: {id: 50, color: "#306030"}')
     second = pack("bb", '  crab: {id: 14, color: "#306030"}\n  fish: {color: "#306030"}')
@@ -154,23 +149,25 @@ def test_ids_of_packs_that_a_ruleset_leaves_out_stay_reserved() -> None:
     whole, less = powderdsl.load("shore.yaml"), powderdsl.load("shore.yaml+core-aa")
     assert whole.element("crab").id == less.element("crab").id == 3
     assert [channel.name for channel in less.matrix[:4]] == ["empty", "wall", "", "crab"]
-
-
-def test_an_id_that_a_left_out_pack_reserves_is_not_given_again() -> None:
-    pack("aa", '  moss: {id: 5, color: "#306030"}')
-    pack("bb", '  crab: {id: 5, color: "#306030"}')
-    Path("shore.yaml").write_text("ruleset: shore\npacks: [core, aa]\n")
+    pack("bb", '  crab: {id: 2, color: "#306030"}')
     rules, notes = load_with_diagnostics("shore.yaml-aa+bb.yaml")
-    assert rules.element("crab").id != 5
+    assert rules.element("crab").id == 3
     (note,) = [note for note in notes if note.code == "PD313"]
-    assert note.primary.text == "`aa.moss` has id 5"
+    assert note.primary.text == "`aa.moss` has id 2"
 
 
-def test_a_full_palette_is_refused() -> None:
-    name = pack("many", "\n".join(f'  e{n}: {{color: "#306030"}}' for n in range(255)))
+@pytest.mark.parametrize(
+    ("elements", "code"),
+    [
+        ('  wall: {color: "#000000"}', "PD302"),  # of a pack that it needs
+        ("\n".join(f'  e{number}: {{color: "#306030"}}' for number in range(255)), "PD508"),
+    ],
+    ids=["known", "full"],
+)
+def test_taken_names_and_full_palettes_are_refused(elements: str, code: str) -> None:
     with pytest.raises(CompileError) as error:
-        powderdsl.load("core", name)
-    assert [one.code for one in error.value.diagnostics] == ["PD508"]
+        powderdsl.load("core", pack("mine", elements))
+    assert [one.code for one in error.value.diagnostics] == [code]
 
 
 def test_channels_of_a_ruleset_stay_in_place() -> None:
@@ -376,9 +373,6 @@ def test_scenes_and_traces_take_qualified_fields() -> None:
         "scene: both\nsize: [2, 2]\nfill: one.slime\n"
         "draw: [one.wet := 4 in box rows 0:1 columns 0:2, two.wet := 6 in box rows 1:2 columns 0:2]\n"
     )
-    from powderdsl.simulation.tracing import trace
-    from powderdsl.worlds.scene import load_start
-
     for order in (("one", "two"), ("two", "one")):
         rules = powderdsl.load("core", *(f"{name}.yaml" for name in order))
         start = load_start("scene.yaml", rules)

@@ -57,15 +57,6 @@ def test_shipped_rules_on_all_backends(name):
     assert (assert_alike(ruleset, SHAPES, 1) == 0) == (name in ("core", "core2", "core+bird"))
 
 
-@pytest.mark.parametrize("first", [0, 8])
-def test_random_rules_on_all_backends(first):
-    rulesets = [one for seed in range(first, first + 8) if (one := seeded_ruleset(seed)) is not None]
-    assert (
-        sum(assert_alike(one, ((2, 3, 33), (1, 1, 2)), first, ("reference", "torch")) for one in rulesets)
-        > 100
-    )
-
-
 @pytest.mark.parametrize("name", ["powderworld", "langtons_ant", "cyclic"])
 def test_the_writers_of_shipped_rules_are_those_of_the_trace(name):
     assert_traced_alike(load(name))

@@ -49,7 +49,7 @@ def assert_fair(signs: Planes) -> None:
 
 
 @pytest.mark.parametrize("bits", [16, 32])
-@pytest.mark.parametrize("ident", IDENTS)
+@pytest.mark.parametrize("ident", IDENTS[:3])
 def test_every_bit_is_fair_and_alone(bits: int, ident: int) -> None:
     signs = planes(draws(ident=ident, bits=bits), bits)
     assert_fair(signs)
@@ -63,12 +63,9 @@ def test_every_bit_is_fair_and_alone(bits: int, ident: int) -> None:
     ("one", "other"),
     [
         ({"step": 0}, {"step": 1}),
-        ({"step": 7}, {"step": 1 << 20}),
-        ({"seed": 0}, {"seed": 1}),
         ({"seed": 5}, {"seed": 5 + (1 << 32)}),
         ({"seed": 3}, {"seed": (1 << 63) - 1}),
         ({"index": 0}, {"index": 1}),
-        ({"index": 1, "step": 0}, {"index": 0, "step": 1}),
         ({"seed": 1, "index": 0}, {"seed": 0, "index": 1}),
         ({"ident": IDENTS[0]}, {"ident": IDENTS[1]}),
         ({"ident": 0, "step": 1}, {"ident": 1, "step": 0}),
@@ -82,19 +79,6 @@ def test_draws_of_other_clocks_have_nothing_in_common(one: dict[str, int], other
     for dy, dx in ((0, 1), (1, 0), (0, 32), (1, 1)):
         assert_fair(planes(first) * np.roll(planes(second), (dy, dx), (1, 2)))
     assert len(np.intersect1d(first, second)) < 5  # 20,480 of 2^32 twice: 0.1 are expected in common
-
-
-def test_a_cell_over_time_is_as_fair_as_a_grid() -> None:
-    """One cell of many steps, worlds and seeds: what a single-cell world sees."""
-    count = 4096
-    for fixed in ("step", "index", "seed"):
-        values = {name: np.full(count, 9) for name in ("seed", "index", "step")} | {fixed: np.arange(count)}
-        numbers = (draw(Clock(**values), IDENTS[1], 32, 1, 1)[:, 0, 0] * 2.0**32).astype(np.uint64)
-        assert len(np.unique(numbers)) >= count - 2
-        signs = planes(numbers)
-        assert_fair(signs)
-        for lag in (1, 2, 3, 4, 8, 16, 64):
-            assert_fair(signs[:, lag:] * signs[:, :-lag])
 
 
 @pytest.mark.parametrize("bits", [16, 32])
@@ -162,27 +146,19 @@ VINES = """pack: vines
 elements:
   soil: {{id: 0, color: "#6F4E37"}}
   vine: {{id: 1, color: "#2A9D8F"}}
-passes:
-  grow:
-{block}
+passes: {{grow: {{{block}}}}}
 """
+ABOVE, SIDE = "soil -> vine if above is vine with chance 30%", "soil -> vine if side is vine with chance 30%"
 
 
 @pytest.mark.parametrize(
     ("block", "independent"),
     [
-        ("    symmetry: rotations\n    do: soil -> vine if above is vine with chance 30%", 1),
-        ("    for side in sides:\n      - soil -> vine if side is vine with chance 30%", 4),
-        ("    repeat 4:\n      - soil -> vine if above is vine with chance 30%", 4),
-        (
-            "    symmetry: mirror\n    for side in (above, left):\n      - soil -> vine if side is vine with chance 30%",
-            2,
-        ),
-        (
-            "    do:\n      - soil -> vine if above is vine with chance 30%\n"
-            "      - soil -> vine if left is vine with chance 30%",
-            2,
-        ),
+        (f"symmetry: rotations, do: {ABOVE}", 1),
+        (f"for side in sides: [{SIDE}]", 4),
+        (f"repeat 4: [{ABOVE}]", 4),
+        (f'symmetry: mirror, "for side in (above, left)": [{SIDE}]', 2),
+        (f"do: [{ABOVE}, {ABOVE.replace('above', 'left')}]", 2),
     ],
 )
 def test_rounds_draw_for_themselves_and_copies_of_a_symmetry_share(block: str, independent: int) -> None:

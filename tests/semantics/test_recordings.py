@@ -31,7 +31,7 @@ import numpy.typing as npt
 import pytest
 
 import powderdsl
-from tests.recordings import draws_of, recording_paths
+from tests.recordings import Recording, State, given, read_recording, recording_paths, where_first
 
 DATA = Path(__file__).parents[1] / "data"
 RECORDINGS = recording_paths("POWDERDSL_RECORDINGS", DATA, "before_ids")
@@ -52,43 +52,6 @@ Mask = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class State:
-    """A state of B worlds, recorded or computed: velocity float32 [B, 2, H, W], others integer [B, H, W]."""
-
-    ids: np.ndarray
-    gravity: np.ndarray
-    momentum: np.ndarray
-    clone: np.ndarray
-    velocity: np.ndarray
-
-
-@dataclass(frozen=True)
-class Recording:
-    """n recorded steps: `states[k]` is the state after k passes, `random` the draws, float32 [n, H, W]."""
-
-    elements: tuple[str, ...]
-    passes: tuple[str, ...]
-    random: dict[str, np.ndarray]
-    states: tuple[State, ...]
-
-
-@cache
-def read_recording(path: Path) -> Recording:
-    """Read one recording."""
-    with np.load(path, allow_pickle=False) as archive:
-        arrays = {name: archive[name] for name in archive.files}
-    names = ("ids", *FIELDS)
-    before = State(*(arrays[f"before_{name}"] for name in names))
-    after = [State(*(arrays[f"after_{name}"][k] for name in names)) for k in range(len(arrays["passes"]))]
-    return Recording(
-        elements=tuple(arrays["elements"].tolist()),
-        passes=tuple(arrays["passes"].tolist()),
-        random=draws_of(arrays["random"]),
-        states=(before, *after),
-    )
-
-
-@dataclass(frozen=True)
 class Runner:
     """The compiled ruleset on one backend, taking and giving NumPy arrays."""
 
@@ -97,19 +60,11 @@ class Runner:
 
     def run(self, state: State, random: dict[str, np.ndarray], passes: tuple[str, ...]) -> State:
         """The state after one step that runs only `passes`."""
-        world = self.simulator.world(self.given(state.ids))
-        world = self.simulator.replace(world, **{name: self.given(getattr(state, name)) for name in FIELDS})
-        draws = {stream: self.given(draw) for stream, draw in random.items()}
+        fields = {name: given(state[name], self.backend) for name in FIELDS}
+        world = self.simulator.replace(self.simulator.world(given(state["ids"], self.backend)), **fields)
+        draws = {stream: given(draw, self.backend) for stream, draw in random.items()}
         world = self.simulator.step(world, random=draws, passes=list(passes))
-        return State(np.asarray(world.ids), *(np.asarray(world[name]) for name in FIELDS))
-
-    def given(self, array: np.ndarray) -> Any:
-        """The array as the backend's own type."""
-        if self.backend == "reference":
-            return array
-        import torch
-
-        return torch.from_numpy(array.copy())
+        return {"ids": np.asarray(world.ids), **{name: np.asarray(world[name]) for name in FIELDS}}
 
 
 @cache
@@ -152,8 +107,8 @@ def may_be_overrun(before_wind: State) -> Mask:
 
     The pass moves everything twice: wind beside a cell in the first round may be on it in the second.
     """
-    windy = np.hypot(before_wind.velocity[:, 0], before_wind.velocity[:, 1]) > MOVING_SPEED
-    may: Mask = (before_wind.ids == EMPTY) & (before_wind.momentum != 0) & near(windy, 1)
+    windy = np.hypot(before_wind["velocity"][:, 0], before_wind["velocity"][:, 1]) > MOVING_SPEED
+    may: Mask = (before_wind["ids"] == EMPTY) & (before_wind["momentum"] != 0) & near(windy, 1)
     return may
 
 
@@ -167,17 +122,11 @@ def quirk_can_explain(before_wind: State) -> Mask:
     return near(may_be_overrun(before_wind), QUIRK_REACH)
 
 
-def where_first(mask: Mask) -> str:
-    """How many cells a mask [B, H, W] has, and the first few of them, for a message."""
-    cells = [tuple(cell) for cell in np.argwhere(mask)[:5].tolist()]
-    return f"{np.count_nonzero(mask)} of {mask.size} cells, the first (world, row, column): {cells}"
-
-
 def assert_same(ours: State, recording: Recording, passes_done: int) -> None:
     """Fail unless a state is the recorded one after so many passes, within what the module's head allows."""
     engine = recording.states[passes_done]
-    other_ids = ours.ids != engine.ids
-    other_momentum = ours.momentum != engine.momentum
+    other_ids = ours["ids"] != engine["ids"]
+    other_momentum = ours["momentum"] != engine["momentum"]
     if recording.passes[passes_done - 1] == "wind":
         before = recording.states[passes_done - 1]
         assert other_ids.mean() <= 1 - IDS_AFTER_WIND, f"ids: {where_first(other_ids)}"
@@ -192,10 +141,12 @@ def assert_same(ours: State, recording: Recording, passes_done: int) -> None:
         assert not other_ids.any(), f"ids: {where_first(other_ids)}"
         assert not other_momentum.any(), f"momentum: {where_first(other_momentum)}"
     for name in ("gravity", "clone"):
-        other = (getattr(ours, name) != getattr(engine, name)) & ~other_ids
+        other = (ours[name] != engine[name]) & ~other_ids
         assert not other.any(), f"{name}: {where_first(other)}"
-    assert ours.velocity.dtype == np.float32
-    close = (np.abs(ours.velocity - engine.velocity) <= VELOCITY_TOLERANCE).all(axis=1)  # NaN is not close
+    assert ours["velocity"].dtype == np.float32
+    close = (np.abs(ours["velocity"] - engine["velocity"]) <= VELOCITY_TOLERANCE).all(
+        axis=1
+    )  # NaN is not close
     assert close.all(), f"velocity: {where_first(~close)}"
 
 
@@ -217,12 +168,14 @@ def test_wind_carries_what_a_cell_holds(runner: Runner, path: Path) -> None:
     """
 
     def cells(state: State, world: int) -> np.ndarray:
-        held = np.stack([state.ids, state.gravity, state.momentum, state.clone]).astype(int)[:, world]
+        held = np.stack([state["ids"], state["gravity"], state["momentum"], state["clone"]]).astype(int)[
+            :, world
+        ]
         solid = held[:, held[0] != EMPTY]
         return solid[:, np.lexsort(solid)]
 
     recording = read_recording(path)
     before = recording.states[-2]
     after = runner.run(before, recording.random, ("wind",))
-    for world in range(len(before.ids)):
+    for world in range(len(before["ids"])):
         np.testing.assert_array_equal(cells(after, world), cells(before, world))

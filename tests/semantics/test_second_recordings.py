@@ -31,7 +31,7 @@ import pytest
 import powderdsl
 from powderdsl.model.state import slots
 from powderdsl.model.types import Ruleset
-from tests.recordings import draws_of, recording_paths
+from tests.recordings import Recording, State, given, read_recording, recording_paths, where_first
 
 DATA = Path(__file__).parents[1] / "data" / "second"
 RECORDINGS = recording_paths("POWDERDSL_SECOND_RECORDINGS", DATA, "before_custom1")
@@ -44,32 +44,6 @@ FLOWING = ("empty", "water", "gas", "lava", "acid", "kangaroo", "lemming")
 CLOSE = {"velocity": 1e-3, "flying": 1e-4, "leap": 1e-4, "energy": 1e-4}
 """How far floats may be from the recorded ones."""
 
-State = dict[str, np.ndarray]
-"""A recorded state: ``ids`` [n, H, W], ``velocity`` [n, 2, H, W], and the engine's other numbers."""
-
-
-@dataclass(frozen=True)
-class Recording:
-    """n recorded steps: `states[k]` is the state after k passes; `defect` is bool [18, n, H, W]."""
-
-    elements: tuple[str, ...]
-    passes: tuple[str, ...]
-    random: dict[str, np.ndarray]
-    states: tuple[State, ...]
-    defect: np.ndarray
-
-
-@cache
-def read_recording(path: Path) -> Recording:
-    with np.load(path, allow_pickle=False) as archive:
-        arrays = {name: archive[name] for name in archive.files}
-    names = [name.removeprefix("before_") for name in arrays if name.startswith("before_")]
-    before = {name: arrays[f"before_{name}"] for name in names}
-    passes = tuple(arrays["passes"].tolist())
-    after = [{name: arrays[f"after_{name}"][k] for name in names} for k in range(len(passes))]
-    random = draws_of(arrays["random"])
-    return Recording(tuple(arrays["elements"].tolist()), passes, random, (before, *after), arrays["defect"])
-
 
 @dataclass(frozen=True)
 class Runner:
@@ -81,7 +55,7 @@ class Runner:
 
     def world(self, state: State) -> Any:
         """A recorded state as worlds."""
-        world = self.simulator.world(self.given(state["ids"]))
+        world = self.simulator.world(given(state["ids"], self.backend))
         fields = {slot.name: slot for slot in slots(self.ruleset)}
         found = {name: value for name, value in self.fields_of(state).items() if name in fields}
         for name, value in found.items():
@@ -90,11 +64,13 @@ class Runner:
                 usual = np.array([float(number) for number in prop.values])[state["ids"]]
                 own = np.isin(state["ids"], sorted(prop.stored))
                 found[name] = np.where(own, value, usual).astype(fields[name].dtype)
-        return self.simulator.replace(world, **{name: self.given(value) for name, value in found.items()})
+        return self.simulator.replace(
+            world, **{name: given(value, self.backend) for name, value in found.items()}
+        )
 
     def run(self, state: State, random: State, passes: tuple[str, ...]) -> Any:
         """The world after one step that runs only `passes`."""
-        draws = {stream: self.given(draw) for stream, draw in random.items()}
+        draws = {stream: given(draw, self.backend) for stream, draw in random.items()}
         return self.simulator.step(self.world(state), random=draws, passes=list(passes))
 
     def fields_of(self, state: State) -> State:
@@ -118,14 +94,6 @@ class Runner:
             "flying": np.stack([only(first, "bird"), only(second, "bird")], 1).astype(np.float32),
         }
         return found | ({"density": state["density"].astype(np.int8)} if "density" in state else {})
-
-    def given(self, array: np.ndarray) -> Any:
-        """The array as the backend's own type."""
-        if self.backend == "reference":
-            return array
-        import torch
-
-        return torch.from_numpy(array.copy())
 
     def differing(self, world: Any, recorded: State) -> dict[str, np.ndarray]:
         """Where a world differs from a recorded state, bool [n, H, W], by field. The same without a field: no entry."""
@@ -157,10 +125,9 @@ def recording(request: pytest.FixtureRequest) -> Recording:
     return read_recording(request.param)
 
 
-def where_first(mask: np.ndarray) -> str:
-    """How many cells a mask [n, H, W] has, and the first few of them, for a message."""
-    cells = [tuple(cell) for cell in np.argwhere(mask)[:5].tolist()]
-    return f"{np.count_nonzero(mask)} of {mask.size} cells, the first (world, row, column): {cells}"
+def defects(recording: Recording) -> np.ndarray:
+    assert recording.defect is not None
+    return recording.defect
 
 
 def assert_none(differing: dict[str, np.ndarray], but: np.ndarray) -> None:
@@ -181,7 +148,7 @@ def test_single_pass(runner: Runner, recording: Recording, alone: str) -> None:
     k = PASSES.index(alone)
     world = runner.run(recording.states[k], recording.random, (alone,))
     conserving = runner.ruleset.name == "powderworld2"
-    but = recording.defect[k] if conserving else np.zeros_like(recording.defect[k])
+    but = defects(recording)[k] if conserving else np.zeros_like(defects(recording)[k])
     before = recording.states[k]
     if conserving and "density" in before:  # sums that a defect left behind are no cells of these rules
         usual = np.array([float(number) for number in runner.ruleset.property("density").values])  # type: ignore[union-attr]
@@ -192,7 +159,7 @@ def test_single_pass(runner: Runner, recording: Recording, alone: str) -> None:
 
 def test_whole_step(runner: Runner, recording: Recording) -> None:
     world = runner.run(recording.states[0], recording.random, PASSES)
-    worlds = recording.defect.any(axis=(0, -2, -1))[:, None, None]
+    worlds = defects(recording).any(axis=(0, -2, -1))[:, None, None]
     before = recording.states[0]
     worlds = worlds | (before["gravity"] > 1).any(axis=(-2, -1), keepdims=True)
     but = worlds if runner.ruleset.name == "powderworld2" else np.zeros_like(worlds)

@@ -76,16 +76,16 @@ def test_elements_keep_the_name_of_the_pack_that_defines_them() -> None:
     assert powderdsl.load("moor.yaml+seed.yaml").palette == ("moor.sky", "moor.soil", "seed.seed")
 
 
-def test_what_is_needed_itself_comes_first() -> None:
-    assert "PD306" in codes("ground.yaml+moor.yaml+seed.yaml")
-
-
-def test_two_packs_that_provide_one_clash() -> None:
-    assert "PD306" in codes("moor.yaml+dune.yaml+seed.yaml")
-
-
-def test_without_a_provider_the_pack_is_missing() -> None:
-    assert codes("seed.yaml") == ["PD305"]
+@pytest.mark.parametrize(
+    ("names", "code"),
+    [
+        (("ground.yaml+moor.yaml+seed.yaml",), "PD306"),  # the pack itself comes first
+        (("moor.yaml+dune.yaml+seed.yaml",), "PD306"),
+        (("seed.yaml",), "PD305"),
+    ],
+)
+def test_exactly_one_pack_provides_another(names: tuple[str, ...], code: str) -> None:
+    assert code in codes(*names)
 
 
 # Passes that override
@@ -117,27 +117,31 @@ def test_the_place_in_the_order_is_that_of_both() -> None:
     assert [one.name for one in rules.passes] == ["sprout2", "settle", "dawn", "sprout"]
 
 
-def test_what_overrides_must_have_something_to_override() -> None:
-    Path("lone.yaml").write_text(
-        "pack: lone\nneeds: ground\npasses:\n  dusk: {override: yes, do: soil -> sky}\n"
-    )
-    assert "PD301" in codes("ground.yaml+lone.yaml")
-
-
-def test_a_pass_of_the_same_name_says_that_it_overrides() -> None:
-    Path("again.yaml").write_text("pack: again\nneeds: ground\npasses:\n  settle: {do: soil -> sky}\n")
-    with pytest.raises(CompileError, match="override: yes"):
-        powderdsl.load("ground.yaml+again.yaml")
+@pytest.mark.parametrize(
+    ("passes", "code"),
+    [
+        ("dusk: {override: yes, do: soil -> sky}", "PD301"),  # there is nothing to override
+        ("settle: {do: soil -> sky}", "PD302"),  # it does not say that it overrides
+    ],
+)
+def test_a_pass_overrides_what_exists_and_says_so(passes: str, code: str) -> None:
+    Path("again.yaml").write_text(f"pack: again\nneeds: ground\npasses: {{{passes}}}\n")
+    assert code in codes("ground.yaml+again.yaml")
 
 
 # What rulesets say
 
 
-def ruleset(also: str, more: str = "") -> str:
-    Path("field.yaml").write_text(
-        f"ruleset: field\npacks: [ground, seed, ditch]\n{more}also:\n{also}\n".replace(", ditch", "")
-    )
+def ruleset(also: str) -> str:
+    Path("field.yaml").write_text(f"ruleset: field\npacks: [ground, seed]\nalso:\n{also}\n")
     return "field.yaml"
+
+
+def weights(*names: str) -> tuple[object, ...]:
+    """The weight of each element, by id."""
+    prop = powderdsl.load(*names).property("weight")
+    assert prop is not None
+    return prop.values
 
 
 def test_a_ruleset_gives_values_tags_and_colors_without_a_warning() -> None:
@@ -146,37 +150,21 @@ def test_a_ruleset_gives_values_tags_and_colors_without_a_warning() -> None:
     )
     name = ruleset('  seed: {weight: 5, tags: dry, color: "#102030"}\n  soil: {weight: 1}')
     rules, remarks = load_with_diagnostics(name)
-    weight, seed = rules.property("weight"), rules.element("seed")
-    assert weight is not None
+    seed = rules.element("seed")
     assert seed is not None
-    assert weight.values == (0, 1, 5)
+    assert weights(name) == (0, 1, 5)
     assert (seed.color, seed.tags) == ("#102030", frozenset({"dry"}))
     assert not {one.code for one in remarks} & {"PD316", "PD317"}
 
 
-def test_added_packs_have_the_last_word() -> None:
-    name = ruleset("  soil: {weight: 1}")
+def test_whoever_is_loaded_last_has_the_last_word() -> None:
+    name = ruleset("  soil: {weight: 1}\n  seed: {weight: 6}")
+    assert weights(f"{name}-seed")[1] == 1
     Path("lead.yaml").write_text("pack: lead\nneeds: ground\nalso: {soil: {weight: 9}}\n")
-    rules, remarks = load_with_diagnostics(f"{name}+lead.yaml")
-    weight = rules.property("weight")
-    assert weight is not None
-    assert weight.values[1] == 9
-    assert "PD317" in [one.code for one in remarks]
-
-
-def test_a_ruleset_that_extends_another_has_the_last_word() -> None:
-    ruleset("  soil: {weight: 1}\n  seed: {weight: 6}")
+    assert weights(f"{name}+lead.yaml")[1] == 9
+    assert "PD317" in codes(f"{name}+lead.yaml")
     Path("meadow.yaml").write_text("ruleset: meadow\nextends: field\nalso: {soil: {weight: 3}}\n")
-    weight = powderdsl.load("meadow.yaml").property("weight")
-    assert weight is not None
-    assert weight.values == (0, 3, 6)
-
-
-def test_entries_for_packs_that_are_left_out_wait() -> None:
-    name = ruleset("  seed: {weight: 5}\n  soil: {weight: 1}")
-    weight = powderdsl.load(f"{name}-seed").property("weight")
-    assert weight is not None
-    assert weight.values[1] == 1
+    assert weights("meadow.yaml") == (0, 3, 6)
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,7 @@ import pytest
 from powderdsl.diagnostics import CompileError
 from powderdsl.testing.generators.cases import load_text
 from powderdsl.testing.generators.rulemaker import random_ruleset_text
-from tests.fuzz.case_files import read_case, write_case
-from tests.fuzz.cases import Case
+from tests.fuzz.cases import Case, read_case, write_case
 from tests.fuzz.compare import find_difference
 from tests.fuzz.differential import seeded_starts
 

@@ -25,14 +25,6 @@ from powderdsl.testing.generators.cases import Start
 
 JOBS = Path(__file__).with_name("alone.mjs")
 
-PAGE = """<!doctype html><meta charset="utf-8"><pre id="out">none</pre>
-<script>
-%s
-try { document.getElementById("out").textContent = JSON.stringify(runJobs(%s)); }
-catch (error) { document.getElementById("out").textContent = String(error); }
-</script>
-"""
-
 
 class StandaloneWorld:
     """A module in wasmtime, with its fields by name."""
@@ -125,25 +117,6 @@ def in_node(jobs: list[dict[str, Any]], folder: Path) -> list[dict[str, Any]]:
     found: list[dict[str, Any]] = json.loads(
         subprocess.run(command, capture_output=True, text=True, check=True).stdout
     )
-    return found
-
-
-def in_chromium(jobs: list[dict[str, Any]], folder: Path) -> list[dict[str, Any]]:
-    """The same in a page."""
-    file = folder / "page.html"
-    script = JOBS.read_text().partition("\nif (typeof process")[0].replace("export ", "")
-    file.write_text(PAGE % (script, json.dumps(jobs)))
-    command = [
-        str(chromium()),
-        "--no-sandbox",
-        "--disable-gpu",
-        "--dump-dom",
-        "--timeout=120000",
-        file.as_uri(),
-    ]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
-    shown = done.stdout.partition('<pre id="out">')[2].partition("</pre>")[0]
-    found: list[dict[str, Any]] = json.loads(shown)
     return found
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -22,7 +21,6 @@ from powderdsl.targets.wasm.binary import Module
 from powderdsl.targets.wasm.program import Instance, WasmProgram, WasmState
 from powderdsl.targets.wasm.source import wasm_module
 from powderdsl.testing.generators.rulemaker import random_ruleset_text
-from tests.wasm.jobs import hashes, hashes_in_v8, write_job
 
 
 def module_of(name: str, width: int) -> Module:
@@ -139,19 +137,3 @@ def test_too_many_worlds_are_refused(torch) -> None:  # type: ignore[no-untyped-
 def _programs(name: str) -> tuple[Any, Any]:
     (segment,) = segments(lower(powderdsl.load(name)))
     return segment.program, segment.planes
-
-
-@pytest.mark.parametrize(("batch", "rows", "width"), [(1, 32, 64), (3, 9, 70)])
-def test_v8_computes_the_same_worlds(batch: int, rows: int, width: int, tmp_path: Path, torch) -> None:  # type: ignore[no-untyped-def]
-    """The module alone, with its inputs in files, in Node.js."""
-    node = shutil.which("node")
-    if node is None:
-        pytest.skip("no Node.js")
-    sim = powderdsl.compile("powderworld", backend="wasm")
-    generator = torch.Generator().manual_seed(1)
-    ids = torch.randint(0, 14, (batch, rows, width), generator=generator)
-    speed = 8 * torch.randn((batch, 2, rows, width), generator=generator)
-    world = sim.step(sim.replace(sim.world(ids, seed=3), velocity=speed))
-    write_job(tmp_path, sim, world, 20)
-    (tmp_path / "module.wasm").write_bytes(module_of("powderworld", width).code)
-    assert hashes_in_v8(node, tmp_path) == hashes(sim.step(world, 20))

@@ -29,7 +29,6 @@ from tests.wasm.standalone_world import (
     StandaloneWorld,
     chromium,
     fnv,
-    in_chromium,
     in_node,
     job,
     node,
@@ -175,18 +174,10 @@ def test_the_clock_continues_a_world() -> None:
     assert np.array_equal(one.ids(), two.ids())
 
 
-def hosts() -> list[Any]:
-    return [
-        pytest.param(in_node, id="node", marks=pytest.mark.skipif(node() is None, reason="no Node.js")),
-        pytest.param(
-            in_chromium, id="chromium", marks=pytest.mark.skipif(chromium() is None, reason="no Chromium")
-        ),
-    ]
+needs_node = pytest.mark.skipif(node() is None, reason="no Node.js")
 
 
-def same_in(
-    host: Any, cases: list[tuple[Ruleset, Start]], steps: int, folder: Path, backends: list[str]
-) -> None:
+def same_in_v8(cases: list[tuple[Ruleset, Start]], steps: int, folder: Path, backends: list[str]) -> None:
     """Worlds in JavaScript are those of the backends: ids, fields and velocity, by hash."""
     jobs, expected = [], []
     for ruleset, start in cases:
@@ -199,19 +190,19 @@ def same_in(
             found.append({slot: fnv(value[0].numpy().tobytes()) for slot, value in later.state.items()})
         assert found == found[:1] * len(found)
         expected.append(found[0])
-    assert [one["hashes"] for one in host(jobs, folder)] == expected
+    assert [one["hashes"] for one in in_node(jobs, folder)] == expected
 
 
-@pytest.mark.parametrize("host", hosts())
-def test_shipped_rulesets(host: Any, tmp_path: Path) -> None:
+@needs_node
+def test_shipped_rulesets(tmp_path: Path) -> None:
     """200 steps of each, as native code has them; the campaign asks the reference, too."""
-    same_in(host, shipped_cases(), 200, tmp_path, ["native"])
+    same_in_v8(shipped_cases(), 200, tmp_path, ["native"])
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize("host", hosts())
-def test_shipped_rulesets_everywhere(host: Any, tmp_path: Path) -> None:
-    same_in(host, shipped_cases(), 200, tmp_path, ["reference", "torch", "native", "wasm"])
+@needs_node
+def test_shipped_rulesets_everywhere(tmp_path: Path) -> None:
+    same_in_v8(shipped_cases(), 200, tmp_path, ["reference", "torch", "native", "wasm"])
 
 
 def shipped_cases() -> list[tuple[Ruleset, Start]]:
@@ -222,9 +213,9 @@ def shipped_cases() -> list[tuple[Ruleset, Start]]:
     return cases
 
 
-@pytest.mark.parametrize("host", hosts())
+@needs_node
 @pytest.mark.parametrize("seeds", tiered([range(2), range(2, 60)], [range(2)]))
-def test_random_rulesets(host: Any, seeds: range, tmp_path: Path) -> None:
+def test_random_rulesets(seeds: range, tmp_path: Path) -> None:
     cases = []
     for seed in seeds:
         try:
@@ -235,7 +226,7 @@ def test_random_rulesets(host: Any, seeds: range, tmp_path: Path) -> None:
         except CompileError:  # refused, or too large for planes
             continue
     assert len(cases) >= 0.6 * len(seeds)
-    same_in(host, cases, 5, tmp_path, ["torch"])
+    same_in_v8(cases, 5, tmp_path, ["torch"])
 
 
 @pytest.mark.skipif(chromium() is None, reason="no Chromium")

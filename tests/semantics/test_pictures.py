@@ -1,7 +1,9 @@
-"""Colors that follow fields: each way of drawing against a slow one that takes exact fractions, cell by cell."""
+"""Pictures: colors that follow fields, and tints by vectors, against slow drawings cell by cell; what files may say."""
 
 from __future__ import annotations
 
+import io
+import json
 from fractions import Fraction
 from functools import cache
 from math import floor
@@ -9,29 +11,34 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import powderdsl
+from powderdsl.cli.pictures import LiveView, first_world, pictures, render_frame
+from powderdsl.diagnostics import CompileError
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.draw import palette, ramps, rgb
 from powderdsl.system.fingerprint import fingerprint
 from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
+from powderdsl.worlds.store import load_world
 from tests.cli.commands import powderdsl as run_command
-from tests.compilers import skip_without_compiler
 from tests.fuzz import TARGETS
-from tests.semantics.texts import codes
+from tests.semantics.texts import codes, diagnosed, simulator
 
 BACKENDS = ("reference", *TARGETS)
-SIZES = [(1, 1), (3, 33), (2, 64), (5, 65), (1, 130), (16, 70)]
+SIZES = [(1, 1), (3, 33), (5, 65), (16, 70)]
 
 KILN = """\
 pack: kiln
 fields:
+  wind: {type: vec2(-9..9), at: place, tint: {to: "#C86464", full: 5, most: 50%}}
   heat: {type: 0..255, at: place}
   glow: {type: real(-3..5), at: element}
   depth: {type: -100000..200000, default: -100000, at: place}
   wet: {type: flag, default: yes, at: place}
   tilt: {type: -7..6, at: element, of: vane}
+  drift: {type: vec2(-3..3), at: element, of: vane, tint: {to: "#0040FF", full: 3}}
 elements:
   air: {id: 0, color: "#102030", color_by: {field: heat, to: "#ff8000"}}
   iron: {id: 1, color: "#102030", color_by: {field: glow, from: "#FF8040", to: "#00A0FF", over: -1..2}}
@@ -48,6 +55,8 @@ passes:
       - depth -= 1000 where coin > 50%
       - wet := coin > 30%
       - tilt += 1 where vane and coin < 50%
+      - wind += vector(coin, 0 - coin) where coin < 60%
+      - drift := vector(coin, coin) where vane
 """
 
 
@@ -56,7 +65,7 @@ def kiln() -> Ruleset:
     return load_text(KILN)
 
 
-def slow(ruleset: Ruleset, ids: np.ndarray, read) -> np.ndarray:  # type: ignore[no-untyped-def]
+def ramped(ruleset: Ruleset, ids: np.ndarray, read) -> np.ndarray:  # type: ignore[no-untyped-def]
     """Pictures uint8 [..., 3]: what docs/language.md says, word by word."""
     picture = np.zeros((*ids.shape, 3), np.uint8)
     by_id = {element.id: element for element in ruleset.elements}
@@ -73,20 +82,40 @@ def slow(ruleset: Ruleset, ids: np.ndarray, read) -> np.ndarray:  # type: ignore
     return picture
 
 
+def tinted(ruleset: Ruleset, base: np.ndarray, read) -> np.ndarray:  # type: ignore[no-untyped-def]
+    """Untinted pictures uint8 [B, H, W, 3] with the tints, cell by cell, as docs/language.md says."""
+    one, top = np.float32(1), np.float32(255)
+    picture = base.copy()
+    for field in ruleset.fields:
+        if field.tint is None:
+            continue
+        full, most = np.float32(field.tint.full), np.float32(field.tint.most)
+        color = [np.float32(part) / top for part in bytes.fromhex(field.tint.color[1:])]
+        vectors = read(field.name)
+        for world, y, x in np.ndindex(base.shape[:3]):
+            row, column = vectors[world, :, y, x]
+            share = min(np.sqrt(row * row + column * column) / full, most)
+            for channel in range(3):
+                own = np.float32(picture[world, y, x, channel]) / top
+                picture[world, y, x, channel] = int((own * (one - share) + share * color[channel]) * top)
+    return picture
+
+
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_pictures_of_worlds(backend: str, torch) -> None:  # type: ignore[no-untyped-def]
-    skip_without_compiler(backend)
-    sim = powderdsl.compile(kiln(), backend=backend)
+def test_worlds_are_drawn_alike_everywhere(backend: str, torch) -> None:  # type: ignore[no-untyped-def]
+    sim = simulator(KILN, backend)
     for number, (height, width) in enumerate(SIZES):
         world = random_start(sim.ruleset, Choices.seeded(number), (3, height, width)).world(sim)
         for now in (world, sim.step(world, steps=2)):
-            drawn = now.rgb()
-            wanted = slow(sim.ruleset, now.ids.numpy(), lambda name, now=now: now[name].numpy())
-            assert np.array_equal(drawn.numpy(), wanted), (height, width)
-            buffer = torch.full((5, *drawn.shape[1:]), 77, dtype=torch.uint8)
+            fields = {field.name: now[field.name].numpy() for field in sim.ruleset.fields}
+            plain = ramped(sim.ruleset, now.ids.numpy(), fields.__getitem__)
+            picture = tinted(sim.ruleset, plain, fields.__getitem__)
+            assert np.array_equal(now.rgb().numpy(), picture), (height, width)
+            buffer = torch.full((5, *picture.shape[1:]), 77, dtype=torch.uint8)
             now.rgb(buffer[1:4])
-            assert torch.equal(buffer[1:4], drawn)
+            assert np.array_equal(buffer[1:4].numpy(), picture)
             assert bool((buffer[0] == 77).all() & (buffer[4] == 77).all())
+    assert (picture != plain).any()
 
 
 @pytest.mark.parametrize(
@@ -94,8 +123,6 @@ def test_pictures_of_worlds(backend: str, torch) -> None:  # type: ignore[no-unt
     [
         ("#000000", "#FF0102", 0, 1),
         ("#FF00FF", "#00FF00", -5, 6),
-        ("#000000", "#FFFFFF", 0, 510),
-        ("#FFFFFF", "#000000", 0, 510),
         ("#102030", "#102030", 0, 9),
         ("#010203", "#FEFDFC", -1_000_000, 1_000_000),
     ],
@@ -112,22 +139,38 @@ def test_floats_change_color_at_the_next_float(start: str, end: str, lo: int, hi
     )
     ids, values = np.zeros((1, len(values)), np.uint8), values.astype(np.float32)[None]
     image = rgb(ids, palette(ruleset.elements), ramps=[ramp], fields={"power": values})
-    assert np.array_equal(image, slow(ruleset, ids, {"power": values}.__getitem__))
+    assert np.array_equal(image, ramped(ruleset, ids, {"power": values}.__getitem__))
 
 
 def test_colors_have_no_meaning() -> None:
     plain = load_text(
-        "\n".join(
-            line.partition(", color_by")[0] + "}" if ", color_by" in line else line
-            for line in KILN.split("\n")
+        KILN.replace('color_by: {field: wet, to: "#0000FF"}', "").replace(
+            ', tint: {to: "#0040FF", full: 3}', ""
         )
     )
-    assert all(element.ramp is None for element in plain.elements)
-    assert ramps(plain.elements) == ()
+    assert plain != kiln()
     assert fingerprint(plain) == fingerprint(kiln())
 
 
-# Commands
+def test_commands_and_the_terminal_draw_what_worlds_show(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setenv("TERM", "xterm")
+    sim = simulator(KILN)
+    world = random_start(sim.ruleset, Choices.seeded(5), (1, 6, 20)).world(sim)
+    image = world.rgb()[0]
+    assert np.array_equal(pictures(world, most=1, factor=1), image.numpy())
+
+    class Terminal(io.StringIO):
+        encoding = "utf-8"
+
+        def isatty(self) -> bool:
+            return True
+
+    stream = Terminal()
+    with LiveView(sim.ruleset.elements, stream, fields=sim.ruleset.fields) as view:
+        view.show(**first_world(world))
+    for line in render_frame(image).split("\n"):
+        assert line in stream.getvalue()
 
 
 STOVE = """\
@@ -152,8 +195,6 @@ def stove(tmp_path: Path, monkeypatch) -> Path:  # type: ignore[no-untyped-def]
 
 
 def pixels(path: Path) -> set[tuple[int, ...]]:
-    from PIL import Image
-
     with Image.open(path) as image:
         return {tuple(pixel) for row in np.asarray(image.convert("RGB")).tolist() for pixel in row}
 
@@ -175,22 +216,15 @@ def test_pictures_of_commands(stove: Path) -> None:
     assert pixels(Path("b.png")) == pixels(Path("a.png"))
     done(f"{run} a.gif --scale 1")
     done("run core+stove.yaml --world b.png --steps 0 --out c.npz")  # a color of a ramp means its element
-    from powderdsl.worlds.store import load_world
-
     sim = powderdsl.compile("core+stove.yaml", backend="reference")
-
-    assert np.array_equal(*(load_world(one, sim).ids.numpy() for one in ("c.npz", "a.npz")))
+    assert np.array_equal(*(load_world(name, sim).ids.numpy() for name in ("c.npz", "a.npz")))
 
 
 def test_show_prints_ramps(stove: Path) -> None:
     text = run_command("show", "core+stove.yaml").stdout
     assert "#303030  #303030 -> #FF3000 by heat 0..9" in text
-    import json
-
-    data = {
-        one["name"]: one
-        for one in json.loads(run_command("show", "core+stove.yaml", "--json").stdout)["elements"]
-    }
+    shown = json.loads(run_command("show", "core+stove.yaml", "--json").stdout)
+    data = {element["name"]: element for element in shown["elements"]}
     ramp = {"field": "heat", "from": "#303030", "to": "#FF3000", "over": [0, 9]}
     assert data["stove"]["color_by"] == ramp
     assert data["wall"]["color_by"] is None
@@ -198,9 +232,6 @@ def test_show_prints_ramps(stove: Path) -> None:
         "#303030 #303030 -> #FF3000 by heat 0..9"
         in run_command("compile", "core+stove.yaml", "--emit", "model").stdout
     )
-
-
-# Packs
 
 
 def test_other_packs_color_elements(stove: Path) -> None:
@@ -221,3 +252,22 @@ def test_other_packs_color_elements(stove: Path) -> None:
 
 def test_a_field_that_a_color_follows_is_used() -> None:
     assert "PD507" not in codes(KILN.replace("      - wet := coin > 30%\n", ""))
+
+
+@pytest.mark.parametrize(
+    ("text", "code", "says"),
+    [
+        ("type: 0..9, at: place, tint: {to: '#FF0000', full: 5}", "PD401", "only vectors do"),
+        ("type: vec2(-1..1), at: place, tint: {to: red, full: 5}", "PD110", "`red` is not a color"),
+        ("type: vec2(-1..1), at: place, tint: {to: '#FF0000'}", "PD109", "`full`"),
+        ("type: vec2(-1..1), at: place, tint: {full: 3}", "PD109", "`to`"),
+        ("type: vec2(-1..1), at: place, tint: {to: '#FF0000', full: 0}", "PD402", "full"),
+        ("type: vec2(-1..1), at: place, tint: {to: '#FF0000', full: 5, most: 150%}", "PD403", "150"),
+        ("type: vec2(-1..1), at: place, tint: {to: '#FF0000', full: 5, least: 1}", "PD108", "least"),
+        ("type: vec2(-1..1), at: place, tint: red", "PD107", "tint"),
+    ],
+)
+def test_what_a_tint_cannot_be(text: str, code: str, says: str) -> None:
+    pack = f"pack: odd\nfields:\n  flow: {{{text}}}\nelements: {{air: {{color: '#FFFFFF'}}}}\n"
+    (error,) = [diagnostic for diagnostic in diagnosed(pack) if diagnostic.code == code]
+    assert says in str(CompileError([error]))
