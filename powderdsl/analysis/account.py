@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from powderdsl.analysis.changes import RuleLine
-from powderdsl.analysis.ledger import AGAINST, FieldEntry, Ledger, RuleEntry
-from powderdsl.analysis.overlaps import OUTCOMES
+from powderdsl.analysis.changes import OUTCOMES, RuleLine
+from powderdsl.analysis.ledger import TREND_BREAKS, FieldEntry, Ledger, RuleEntry
 
 SCHEMA = 1
 """The version of the JSON form. It changes when a key changes its meaning or goes; new keys may come without."""
@@ -36,7 +35,7 @@ def _sums(ledger: Ledger) -> Iterator[str]:
 
 
 def _sum(names: tuple[str, ...], ledger: Ledger) -> str:
-    """`a + b`; the larger half of all elements the other way round."""
+    """The sum as `a + b`, or as `all but c` where that is shorter."""
     others = [name for name in ledger.elements if name not in names]
     if not others:
         return "all cells"
@@ -74,7 +73,7 @@ def _element(ledger: Ledger, name: str) -> Iterator[str]:
 
 def _number(ledger: Ledger, name: str) -> str:
     """The trend of an element's number of cells."""
-    return next((trend for trend in AGAINST if ledger.keeps([name], trend)), "not decided")
+    return next((trend for trend in TREND_BREAKS if ledger.keeps([name], trend)), "not decided")
 
 
 def _place(rule: RuleLine) -> str:
@@ -95,7 +94,8 @@ def _rules(ledger: Ledger) -> Iterator[str]:
 def _fields(ledger: Ledger) -> Iterator[str]:
     yield "fields" if ledger.fields else "fields: none"
     for entry in ledger.fields:
-        place, bounds = "travels with its element" if entry.travels else "stays in its place", ""
+        place = "travels with its element" if entry.travels else "stays in its place"
+        bounds = ""
         if entry.fresh_bounds is not None and entry.fresh_bounds != entry.bounds:
             bounds = f", within {entry.fresh_bounds[0]:g}..{entry.fresh_bounds[1]:g} unless set by hand"
         yield f"  {entry.name}: {entry.kind}{bounds}, starts as {entry.default}, {place}"
@@ -105,13 +105,13 @@ def _fields(ledger: Ledger) -> Iterator[str]:
 def _overlaps(ledger: Ledger) -> Iterator[str]:
     yield "lines that may meet" if ledger.overlaps else "lines that may meet: none"
     for outcome, words in OUTCOMES.items():
-        found = [one for one in ledger.overlaps if one.outcome == outcome]
-        if found:
+        overlaps = [overlap for overlap in ledger.overlaps if overlap.outcome == outcome]
+        if overlaps:
             yield f"  {words}"
-        for one in found:
-            what = f"{one.field}: " if one.field else ""
-            other = _place(one.second) if one.second != one.first else "another copy of it"
-            yield f"    {what}{_place(one.first)} and {other}"
+        for overlap in overlaps:
+            what = f"{overlap.field}: " if overlap.field else ""
+            other = _place(overlap.second) if overlap.second != overlap.first else "another copy of it"
+            yield f"    {what}{_place(overlap.first)} and {other}"
 
 
 # JSON

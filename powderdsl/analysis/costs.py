@@ -1,4 +1,4 @@
-"""What each pass costs, counted in its form: nothing runs, and nothing counts as skipped."""
+"""The cost of each pass, counted in its graph. No world is run; skipping is not considered."""
 
 from __future__ import annotations
 
@@ -9,18 +9,19 @@ from powderdsl.ir.ops import OPS, REAL, Offset, PassGraph, Program, nodes_of
 from powderdsl.ir.segments import Carried, carry
 
 WEIGHTS = {"gates": 1.0, "shifts": 4.0, "moves": 8.0, "random_bits": 8.0, "reals": 32.0, "dense": 200.0}
-"""About what one of each takes, in vector operations on 512 cells: sixteen floats fill the vector that holds 512 flags,
-a random bit is a hash, what runs on cells goes through memory. Chosen so that the shares of the shipped rulesets come
-out as native code needs them on worlds full of everything: most do to a factor of two."""
+"""The cost of one of each, in vector operations on 512 cells: sixteen floats fill the vector that holds 512 flags, a
+random bit is a hash, passes on cells go through memory. The shares of the shipped rulesets agree with measurements of
+native code on worlds full of everything, mostly within a factor of two."""
 
 
 @dataclass(frozen=True)
 class PassCost:
-    """One pass. Counts are for every cell and step.
+    """The cost of one pass. Counts are per cell and step.
 
-    `gates` are those of flags and integers on bit planes, `shifts` the planes read at a neighbor, `moves` those
-    exchanged with one, `random_bits` what its draws take at most, `reals` operations on float32. A pass on cells has
-    `dense` operations instead, with the reason and the rule (``file:line``) that is why. `share` is an estimate.
+    `gates` counts gates of flags and integers on bit planes, `shifts` the planes read at a neighbor, `moves` the planes
+    exchanged with one, `random_bits` the most bits that draws take, `reals` operations on float32. A pass on cells has
+    `dense` operations instead, with the reason (`why`) and the rule that causes it (`place`, ``file:line``). `share` is
+    an estimate.
     """
 
     name: str

@@ -10,14 +10,23 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import product
+from itertools import chain, product
 from math import inf
 from operator import gt, lt, ne
 from typing import Any
 
-from powderdsl.analysis.absent import Wants, find_wants, named_by_fields
-from powderdsl.analysis.changes import MAX_QUESTION, Found, RuleLine, facts_of, find_changes
-from powderdsl.analysis.overlaps import Overlap, find_overlaps
+from powderdsl.analysis.changes import (
+    MAX_QUESTION,
+    LineEffects,
+    Overlap,
+    Requirements,
+    RuleLine,
+    facts_of,
+    find_changes,
+    find_overlaps,
+    find_requirements,
+    named_by_fields,
+)
 from powderdsl.model.logic.satisfy import Budget
 from powderdsl.model.text import element_name, show_value
 from powderdsl.model.types import Assign, Field, Property, Ruleset
@@ -28,13 +37,13 @@ BUDGET = 2_000_000
 """Nodes evaluated for each part of a ledger: some seconds. The largest shipped ruleset needs most of it."""
 
 
-AGAINST: dict[str, Callable[..., Any]] = {"constant": ne, "never rises": gt, "never falls": lt}
-"""The trends of a number, with how a later value and an earlier one compare where the trend is broken."""
+TREND_BREAKS: dict[str, Callable[..., Any]] = {"constant": ne, "never rises": gt, "never falls": lt}
+"""The trends of a number, each with the comparison of a later value and an earlier one that breaks it."""
 
 
 @dataclass(frozen=True)
 class Proven:
-    """It holds in every world, at every step. `given` says what a world must fulfill once, at the start, if anything."""
+    """A statement that holds in every world, at every step. `given` is a condition on the start world, if any."""
 
     reason: str
     given: str = ""
@@ -45,7 +54,7 @@ class Proven:
 
 @dataclass(frozen=True)
 class NotProven:
-    """Not decided: these lines may break it."""
+    """A statement that is not decided: some lines of rules may break it."""
 
     reason: str
     rules: tuple[RuleLine, ...] = ()
@@ -101,7 +110,7 @@ class FieldEntry:
 class Ledger:
     """The effects of a ruleset's rules, line by line, and conclusions from them. Elements are given by name.
 
-    `complete` is False if the rules were too many to be asked about everything: then more is taken for possible.
+    `complete` is False if the search ran out of budget: more effects are then considered possible.
     `named` are the elements that fields may name although no cell ever held them.
     """
 
@@ -116,11 +125,11 @@ class Ledger:
     @cached_property
     def changes(self) -> dict[tuple[str, str], tuple[RuleLine, ...]]:
         """Every pair (before, after) that some rule may bring about, and the lines that may."""
-        found: dict[tuple[str, str], tuple[RuleLine, ...]] = {}
+        changes: dict[tuple[str, str], tuple[RuleLine, ...]] = {}
         for entry in self.rules:
             for pair in entry.changes:
-                found[pair] = (*found.get(pair, ()), entry.rule)
-        return found
+                changes[pair] = (*changes.get(pair, ()), entry.rule)
+        return changes
 
     @cached_property
     def constant_sums(self) -> tuple[tuple[str, ...], ...]:
@@ -153,7 +162,7 @@ class Ledger:
 
     @property
     def sums(self) -> dict[str, tuple[tuple[str, ...], ...]]:
-        """All of these sums by what holds for them."""
+        """All sums by trend."""
         return {
             "constant": self.constant_sums,
             "never falls": self.rising_sums,
@@ -173,30 +182,30 @@ class Ledger:
 
     def _in_order(self, chosen: Iterable[str]) -> tuple[str, ...]:
         """Some elements in the order of their ids."""
-        kept = set(chosen)
-        return tuple(name for name in self.elements if name in kept)
+        names = set(chosen)
+        return tuple(name for name in self.elements if name in names)
 
     def conserved(self, weights: Mapping[str, int]) -> Verdict:
-        """Whether the weighted number of cells is constant: ``{"a": 1, "b": 1}`` is the sum of two elements.
+        """Decide if the weighted number of cells is constant: ``{"a": 1, "b": 1}`` is the sum of two elements.
 
-        Elements that are not named count 0. Raises KeyError for a name that is not an element.
+        Elements without a weight count 0. Raises KeyError for a name that is not an element.
         """
         return self.keeps(weights, "constant")
 
     def never_rises(self, what: Mapping[str, int] | Iterable[str]) -> Verdict:
-        """Whether the (weighted) number of cells with these elements never rises. Raises KeyError as `conserved`."""
+        """Decide if the (weighted) number of cells with these elements never rises. Raises KeyError as `conserved`."""
         return self.keeps(what, "never rises")
 
     def never_falls(self, what: Mapping[str, int] | Iterable[str]) -> Verdict:
-        """Whether the (weighted) number of cells with these elements never falls. Raises KeyError as `conserved`."""
+        """Decide if the (weighted) number of cells with these elements never falls. Raises KeyError as `conserved`."""
         return self.keeps(what, "never falls")
 
     def unchanged(self, element: str) -> Verdict:
-        """Whether a cell with this element keeps it permanently. Others may still become it: see `never_rises`.
+        """Decide if a cell with this element keeps it permanently. Others may still become it: see `never_rises`.
 
         Raises KeyError for a name that is not an element.
         """
-        self._known([element])
+        self._check_names([element])
         lines = [
             entry.rule
             for entry in self.rules
@@ -207,11 +216,11 @@ class Ledger:
         return NotProven(f"`{element}` may be moved or become something else", tuple(lines))
 
     def never_appears(self, element: str) -> Verdict:
-        """Whether a world that starts without this element, in cells and in fields, stays without it.
+        """Decide if a world that starts without this element, in cells and in fields, stays without it.
 
         Raises KeyError for a name that is not an element.
         """
-        self._known([element])
+        self._check_names([element])
         makers = [
             entry.rule
             for entry in self.rules
@@ -232,7 +241,7 @@ class Ledger:
         Raises KeyError for a name that is not an element.
         """
         start = dict.fromkeys(start)
-        self._known(start)
+        self._check_names(start)
         cells = set(start)
         while True:
             more = {after for _, _, after in self.possible(cells)}
@@ -250,11 +259,11 @@ class Ledger:
                         yield entry.rule, before, after
 
     def within(self, field: str, low: float, high: float) -> Verdict:
-        """Whether a field's numbers stay within two bounds, in every cell. Both parts of a vector are numbers.
+        """Decide if a field's numbers stay within two bounds, in every cell. Both parts of a vector are numbers.
 
         Raises KeyError for a name that is not a field.
         """
-        entry = next((one for one in self.fields if one.name == field), None)
+        entry = next((f for f in self.fields if f.name == field), None)
         if entry is None:
             raise KeyError(f"no field `{field}` in {self.name}")
         if entry.bounds is None:
@@ -271,13 +280,13 @@ class Ledger:
         return NotProven(f"`{field}` may be written beyond {low:g}..{high:g}", tuple(lines))
 
     def keeps(self, what: Mapping[str, int] | Iterable[str], trend: str) -> Verdict:
-        """Whether a (weighted) number of cells keeps to a trend of AGAINST."""
+        """Decide if a (weighted) number of cells keeps to a trend of TREND_BREAKS. Raises KeyError as `conserved`."""
         weights = what if isinstance(what, Mapping) else dict.fromkeys(what, 1)
-        self._known(weights)
+        self._check_names(weights)
         broken = {
             (a, b): lines
             for (a, b), lines in self.changes.items()
-            if AGAINST[trend](weights.get(b, 0), weights.get(a, 0))
+            if TREND_BREAKS[trend](weights.get(b, 0), weights.get(a, 0))
         }
         if not broken:
             parts = [
@@ -286,44 +295,44 @@ class Ledger:
             verb = {"constant": "alone changes", "never rises": "adds to", "never falls": "takes from"}[trend]
             return Proven(f"no rule {verb} " + (f"`{' + '.join(parts)}`" if parts else "nothing"))
         (before, after), _ = next(iter(broken.items()))
-        lines = tuple(dict.fromkeys(line for found in broken.values() for line in found))
+        lines = tuple(dict.fromkeys(chain.from_iterable(broken.values())))
         more = f", and {len(broken) - 1} changes more" if len(broken) > 1 else ""
         return NotProven(f"`{before}` may become `{after}`{more}", lines)
 
-    def _known(self, names: Iterable[str]) -> None:
+    def _check_names(self, names: Iterable[str]) -> None:
         for name in names:
             if name not in self.elements:
                 raise KeyError(f"no element `{name}` in {self.name}")
 
 
 def ledger(ruleset: Ruleset) -> Ledger:
-    """The ledger of a checked ruleset: decided from its rules, no world is run. Raises TypeError for anything else."""
+    """The ledger of a checked ruleset, decided from its rules without running a world. Raises TypeError for other values."""
     if not isinstance(ruleset, Ruleset):
         raise TypeError(f"ledger takes a Ruleset, from powderdsl.load; found {type(ruleset).__name__}")
     parts = [replace(facts_of(ruleset), budget=Budget(BUDGET, MAX_QUESTION)) for _ in range(3)]
     names = {element.id: element.name for element in ruleset.elements}
-    found = find_changes(ruleset, parts[0])
-    wants = find_wants(ruleset, parts[1])
+    effects = find_changes(ruleset, parts[0])
+    requirements = find_requirements(ruleset, parts[1])
     return Ledger(
         ruleset.name,
         tuple(names.values()),
-        tuple(_entry(one, wants.get(one.line), names) for one in found),
-        find_fields(ruleset, found),
+        tuple(_entry(line, requirements.get(line.line), names) for line in effects),
+        find_fields(ruleset, effects),
         find_overlaps(ruleset, parts[2]),
         tuple(_named(named_by_fields(ruleset), names)),
         all(facts.budget.left > 0 for facts in parts),
     )
 
 
-def _entry(found: Found, wants: Wants | None, names: Mapping[int, str]) -> RuleEntry:
-    wants = wants or Wants((), frozenset())
+def _entry(effects: LineEffects, requirements: Requirements | None, names: Mapping[int, str]) -> RuleEntry:
+    requirements = requirements or Requirements((), frozenset())
     return RuleEntry(
-        found.line,
-        found.fires,
-        tuple((names[a], names[b]) for a, b in sorted(found.pairs)),
-        tuple(_named(found.moves, names)),
-        tuple(tuple(_named(ids, names)) for ids in wants.needs),
-        tuple(_named(wants.copies & {after for _, after in found.pairs}, names)),
+        effects.line,
+        effects.fires,
+        tuple((names[a], names[b]) for a, b in sorted(effects.pairs)),
+        tuple(_named(effects.moves, names)),
+        tuple(tuple(_named(ids, names)) for ids in requirements.needs),
+        tuple(_named(requirements.copies & {after for _, after in effects.pairs}, names)),
     )
 
 
@@ -334,9 +343,9 @@ def _named(ids: Iterable[int], names: Mapping[int, str]) -> Iterator[str]:
 # Fields
 
 
-def find_fields(ruleset: Ruleset, found: Iterable[Found]) -> tuple[FieldEntry, ...]:
+def find_fields(ruleset: Ruleset, effects: Iterable[LineEffects]) -> tuple[FieldEntry, ...]:
     """All of them: fields in load order, scratch fields by pass, then properties."""
-    writes = [(effects.line, assign) for effects in found for assign in effects.writes]
+    writes = [(line.line, assign) for line in effects for assign in line.writes]
     entries = []
     for item in (*ruleset.fields, *(item for pass_ in ruleset.passes for item in pass_.scratch)):
         default = show_value(ruleset, item.kind, item.default)
@@ -372,7 +381,7 @@ def _field_entry(
 
 
 def reach(assign: Assign, declared: Bounds) -> Bounds:
-    """How low and how high an assignment may bring an integer; ∞ if it never lowers it, -∞ if it never raises it."""
+    """The lowest and highest integer that an assignment may lead to; ∞ if it never lowers it, -∞ if it never raises it."""
     low, high = assign.change
     if assign.op == ":=":
         return min(max(low, declared[0]), declared[1]), min(max(high, declared[0]), declared[1])

@@ -1,11 +1,11 @@
-"""Claims that need no test: the ledger decides them, or what rules can see, or the claim's own words."""
+"""Proofs of claims without a test: from the ledger, from how far rules see, or from the claim itself."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
 from powderdsl.analysis.changes import facts_of
-from powderdsl.analysis.ledger import AGAINST, Ledger, NotProven, Proven, Verdict
+from powderdsl.analysis.ledger import TREND_BREAKS, Ledger, NotProven, Proven, Verdict
 from powderdsl.model.logic.satisfy import satisfiable
 from powderdsl.model.types import (
     Assign,
@@ -26,9 +26,9 @@ from powderdsl.model.types import (
 
 
 def prove(claim: Claim, ruleset: Ruleset, ledger: Ledger, without: frozenset[int] = frozenset()) -> Verdict:
-    """Whether the claim holds in all worlds, or in those that start without some elements.
+    """Decide if the claim holds in all worlds, or in worlds that start without some elements.
 
-    `NotProven` says nothing against it.
+    `NotProven` does not disprove it.
     """
     verdict = _prove(claim, ruleset, ledger)
     if verdict or not without or not isinstance(claim, Total) or claim.ids is None:
@@ -42,7 +42,7 @@ def _conserved(trend: str, counted: set[str], ledger: Ledger, without: list[str]
     lines = [
         line
         for line, before, after in ledger.possible(cells)
-        if AGAINST[trend](after in counted, before in counted)
+        if TREND_BREAKS[trend](after in counted, before in counted)
     ]
     if lines:
         return NotProven("some rule may change the number", tuple(dict.fromkeys(lines)))
@@ -53,7 +53,7 @@ def _prove(claim: Claim, ruleset: Ruleset, ledger: Ledger) -> Verdict:
     match claim:
         case Unchanging():
             verdicts = [ledger.unchanged(name) for name in _names(ruleset, claim.ids)]
-            return next((one for one in verdicts if isinstance(one, NotProven)), verdicts[0])
+            return next((v for v in verdicts if isinstance(v, NotProven)), verdicts[0])
         case Total() if claim.ids is not None:
             return ledger.keeps(_names(ruleset, claim.ids), claim.trend)
         case Bounded():
@@ -73,15 +73,15 @@ def _prove(claim: Claim, ruleset: Ruleset, ledger: Ledger) -> Verdict:
 
 
 def _names(ruleset: Ruleset, ids: Iterable[int]) -> list[str]:
-    kept = set(ids)
-    return [element.name for element in ruleset.elements if element.id in kept]
+    wanted = set(ids)
+    return [element.name for element in ruleset.elements if element.id in wanted]
 
 
 # How far a step sees
 
 
 def horizon(ruleset: Ruleset) -> int:
-    """How many rows and columns away a cell may affect another one within a step: an upper bound.
+    """An upper bound on the rows and columns away at which a cell may affect another one within a step.
 
     Each substep sees what the substeps before it saw around each cell that it reads. `step` and `row` are not cells.
     """
@@ -91,11 +91,11 @@ def horizon(ruleset: Ruleset) -> int:
         for moment in pass_.moments:
             for let in moment.lets:
                 lets[let.name] = _sight(let.value, seen, lets)
-            seen = _moment(moment, seen, lets)
+            seen = _substep_reach(moment, seen, lets)
     return seen
 
 
-def _moment(moment: Moment, seen: int, lets: Mapping[str, int]) -> int:
+def _substep_reach(moment: Moment, seen: int, lets: Mapping[str, int]) -> int:
     claims = [rule for rule in moment.rules if not isinstance(rule, Assign)]
     masks = {id(rule): _sight(rule.mask, seen, lets) for rule in moment.rules}
     reaches = [_length(rule.offset) for rule in claims if not isinstance(rule, Transform)]
@@ -105,27 +105,27 @@ def _moment(moment: Moment, seen: int, lets: Mapping[str, int]) -> int:
         widest = max(masks[id(rule)] for rule in claims)
         wide = widest + 2 * max(reaches, default=0) * rounds
         masks |= {id(rule): wide for rule in claims}
-    found = [seen]
+    distances = [seen]
     for rule in moment.rules:
         mask = masks[id(rule)]
         match rule:
             case Assign():
-                found.append(_length(rule.offset) + max(mask, _sight(rule.value, seen, lets)))
+                distances.append(_length(rule.offset) + max(mask, _sight(rule.value, seen, lets)))
                 continue
             case Transform():
-                found.append(max(mask, _sight(rule.target, seen, lets)))
+                distances.append(max(mask, _sight(rule.target, seen, lets)))
             case Swap() | Move(leaving=None):
-                found.append(_length(rule.offset) + max(mask, seen))
+                distances.append(_length(rule.offset) + max(mask, seen))
             case _:
                 assert rule.leaving is not None
-                found.append(_length(rule.offset) + max(mask, seen, _sight(rule.leaving, seen, lets)))
+                distances.append(_length(rule.offset) + max(mask, seen, _sight(rule.leaving, seen, lets)))
         for effect in rule.effects:
-            found.append(_length(effect.offset) + max(mask, _sight(effect.value, seen, lets)))
-    return max(found)
+            distances.append(_length(effect.offset) + max(mask, _sight(effect.value, seen, lets)))
+    return max(distances)
 
 
 def _sight(expr: Expr, seen: int, lets: Mapping[str, int]) -> int:
-    """How far an expression sees, where a cell itself depends on what is `seen` cells away."""
+    """The distance at which an expression sees cells, where a cell itself depends on cells `seen` away."""
     inner = max((_sight(arg, seen, lets) for arg in expr.args), default=0)
     match expr.op:
         case "element" | "property" | "field":

@@ -55,12 +55,12 @@ class Type:
     __hash__ = object.__hash__
 
 
-def dtype(given: Any) -> Type:
+def dtype(name_or_type: Any) -> Type:
     """A type by its name, or Python's."""
-    name = given.__name__ if isinstance(given, type) else str(given)
+    name = name_or_type.__name__ if isinstance(name_or_type, type) else str(name_or_type)
     name = {"int": "int64", "float": "float64"}.get(name, name)
     if name not in _TYPES:
-        raise TypeError(f"{given!r} is not a type of numbers that is known without NumPy")
+        raise TypeError(f"{name_or_type!r} is not a type of numbers that is known without NumPy")
     return _TYPES[name]
 
 
@@ -78,14 +78,14 @@ bool_, float32, float64 = _TYPES["bool"], _TYPES["float32"], _TYPES["float64"]
 
 
 @cache
-def promoted(a: Type, b: Type) -> Type:
+def promote(a: Type, b: Type) -> Type:
     """The smallest type that holds the values of both."""
     if a is b or b is bool_:
         return a
     if a is bool_:
         return b
     if "f" in (a.kind, b.kind):
-        narrow = all(one is float32 or (one.kind != "f" and one.itemsize <= 2) for one in (a, b))
+        narrow = all(kind is float32 or (kind.kind != "f" and kind.itemsize <= 2) for kind in (a, b))
         return float32 if narrow else float64
     large, small = (a, b) if a.itemsize >= b.itemsize else (b, a)
     if large.kind != small.kind and (large.kind == "u" or large.itemsize == small.itemsize):
@@ -96,7 +96,7 @@ def promoted(a: Type, b: Type) -> Type:
 # Values
 
 
-def packed(numbers: list[Any], kind: Type) -> Values:
+def pack(numbers: list[Any], kind: Type) -> Values:
     """Numbers as values; integers wrap around, floats are rounded once."""
     if kind.kind == "f":
         return array(kind.code, numbers)
@@ -113,32 +113,32 @@ def packed(numbers: list[Any], kind: Type) -> Values:
     return values.tobytes() if kind.code == "B" else values
 
 
-def checked(numbers: Iterable[Any], kind: Type) -> Values:
+def pack_exactly(numbers: Iterable[Any], kind: Type) -> Values:
     """Numbers that must fit. Raises OverflowError or TypeError."""
-    listed = list(numbers)
+    items = list(numbers)
     if kind.kind == "f":
-        if kind is float32 and any(type(number) is int and abs(number) > 1 << 53 for number in listed):
+        if kind is float32 and any(type(number) is int and abs(number) > 1 << 53 for number in items):
             raise OverflowError("integers that would be rounded twice are not there without NumPy")
-        return array(kind.code, map(float, listed))
+        return array(kind.code, map(float, items))
     if kind is bool_:
-        return bytes(map(bool, listed))
-    whole = [*map(index, listed)]
-    if whole and not kind.low <= min(whole) <= max(whole) <= kind.high:
-        raise OverflowError(f"{min(whole)} to {max(whole)} are out of bounds for {kind}")
-    return packed(whole, kind)
+        return bytes(map(bool, items))
+    integers = [*map(index, items)]
+    if integers and not kind.low <= min(integers) <= max(integers) <= kind.high:
+        raise OverflowError(f"{min(integers)} to {max(integers)} are out of bounds for {kind}")
+    return pack(integers, kind)
 
 
-def converted(values: Values, old: Type, new: Type) -> Values:
+def convert(values: Values, old: Type, new: Type) -> Values:
     """Values of another type. Raises OverflowError or ValueError for floats that no integer of the type stands for."""
     if old is new or (isinstance(values, bytes) and new.kind in "iu" and new.high > 254):
         return values
     if new is bool_:
         return values.translate(_NONZERO) if isinstance(values, bytes) else bytes(map(bool, values))
     if old.kind == "f":
-        return array(new.code, values) if new.kind == "f" else checked(map(int, values), new)
+        return array(new.code, values) if new.kind == "f" else pack_exactly(map(int, values), new)
     if new.kind != "f":
-        return packed(list(values), new)
-    return checked(values, new)
+        return pack(list(values), new)
+    return pack_exactly(values, new)
 
 
 def raw_of(values: Values, kind: Type) -> bytes:
@@ -150,7 +150,7 @@ def raw_of(values: Values, kind: Type) -> bytes:
     return values if isinstance(values, bytes) else values.tobytes()
 
 
-def unpacked(raw: bytes | bytearray, code: str) -> Values:
+def unpack(raw: bytes | bytearray, code: str) -> Values:
     """The values whose bytes these are, by the code of `array.array`."""
     if code == "B":
         return bytes(raw)
@@ -159,18 +159,20 @@ def unpacked(raw: bytes | bytearray, code: str) -> Values:
     return values
 
 
-def alike(several: Sequence[Values], kind: Type) -> list[Values]:
+def unify(several: Sequence[Values], kind: Type) -> list[Values]:
     """Values of one type, all as bytes or all as an `array.array`."""
     if len({type(values) for values in several}) == 1:
         return list(several)
-    return [unpacked(raw_of(one, kind), kind.code) if isinstance(one, bytes) else one for one in several]
+    return [
+        unpack(raw_of(values, kind), kind.code) if isinstance(values, bytes) else values for values in several
+    ]
 
 
 _NONZERO = bytes([0]) + bytes([1]) * 255
 _ZERO = bytes([1]) + bytes(255)
 
 
-def _streamed(values: Values, count: int) -> Iterable[Any]:
+def _repeat(values: Values, count: int) -> Iterable[Any]:
     return repeat(values[0], count) if len(values) == 1 else values
 
 
@@ -203,30 +205,30 @@ def arithmetic(op: str, a: Values, b: Values, kind: Type, count: int) -> Values:
     if len(a) == len(b) == 1:
         count = 1
     if op in (*_OF_FLAGS, "add") and isinstance(a, bytes) and isinstance(b, bytes):
-        x, y = (int.from_bytes(one * count if len(one) == 1 else one, "little") for one in (a, b))
+        x, y = (int.from_bytes(values * count if len(values) == 1 else values, "little") for values in (a, b))
         if op != "add" or not (x | y) & int.from_bytes(b"\x80" * count, "little"):  # no byte carries
             return int(_OPERATIONS[op](x, y)).to_bytes(count, "little")
     try:
-        numbers = [*map(_OPERATIONS[op], _streamed(a, count), _streamed(b, count))]
+        numbers = [*map(_OPERATIONS[op], _repeat(a, count), _repeat(b, count))]
     except ZeroDivisionError:
         if op != "truediv":
             raise
-        numbers = [*map(_quotient, _streamed(a, count), _streamed(b, count))]
-    return packed(numbers, kind)
+        numbers = [*map(_quotient, _repeat(a, count), _repeat(b, count))]
+    return pack(numbers, kind)
 
 
-def compared(op: str, a: Values, b: Values, count: int) -> bytes:
+def compare(op: str, a: Values, b: Values, count: int) -> bytes:
     """A byte of 0 or 1 for each pair of values."""
     if len(a) == len(b) == 1:
         count = 1
     if isinstance(a, bytes) and isinstance(b, bytes) and count > 1:
         if len(a) == 1 or len(b) == 1:
-            many, one, swapped = (b, a, True) if len(a) == 1 else (a, b, False)
-            return many.translate(_comparison(op, one[0], swapped))
+            many, single, swapped = (b, a, True) if len(a) == 1 else (a, b, False)
+            return many.translate(_comparison(op, single[0], swapped))
         if op in ("eq", "ne"):
             unequal = int.from_bytes(a, "little") ^ int.from_bytes(b, "little")
             return unequal.to_bytes(count, "little").translate(_ZERO if op == "eq" else _NONZERO)
-    return bytes(map(_COMPARISONS[op], _streamed(a, count), _streamed(b, count)))
+    return bytes(map(_COMPARISONS[op], _repeat(a, count), _repeat(b, count)))
 
 
 @lru_cache(maxsize=1 << 11)
@@ -235,20 +237,20 @@ def _comparison(op: str, number: int, swapped: bool) -> bytes:
     return bytes(call(number, byte) if swapped else call(byte, number) for byte in range(256))
 
 
-def chosen(flags: bytes, a: Values, b: Values, kind: Type, count: int) -> Values:
+def choose(flags: bytes, a: Values, b: Values, kind: Type, count: int) -> Values:
     """Those of `a` where a flag is 1, those of `b` elsewhere."""
     if len(flags) == 1:
         return a if flags[0] else b
     if isinstance(a, bytes) and isinstance(b, bytes) and len(a) == len(b) == 1:
         return flags.translate(bytes([b[0], a[0]]) + bytes(254))
-    a, b = (one * count if len(one) == 1 else one for one in alike((a, b), kind))
+    a, b = (values * count if len(values) == 1 else values for values in unify((a, b), kind))
     size = 1 if isinstance(a, bytes) else kind.itemsize
     wide = bytearray(count * size)
     for place in range(size):
         wide[place::size] = flags
     mask = int.from_bytes(wide, "little") * 255
     x, y = int.from_bytes(memoryview(a), "little"), int.from_bytes(memoryview(b), "little")
-    return unpacked((y ^ ((x ^ y) & mask)).to_bytes(count * size, "little"), getattr(a, "typecode", "B"))
+    return unpack((y ^ ((x ^ y) & mask)).to_bytes(count * size, "little"), getattr(a, "typecode", "B"))
 
 
 # Values elsewhere
@@ -275,7 +277,7 @@ def _runs(axes: Sequence[Offsets]) -> tuple[list[int], int]:
     return starts, length
 
 
-def gathered(values: Values, axes: Sequence[Offsets]) -> Values:
+def gather(values: Values, axes: Sequence[Offsets]) -> Values:
     """The values at the sums of one offset from each axis."""
     if not all(map(len, axes)):
         return values[:0]
@@ -291,10 +293,10 @@ def gathered(values: Values, axes: Sequence[Offsets]) -> Values:
         return b"".join([values[start : start + length] for start in starts])
     raw, size = values.tobytes(), values.itemsize
     parts = [raw[start * size : (start + length) * size] for start in starts]
-    return unpacked(b"".join(parts), values.typecode)
+    return unpack(b"".join(parts), values.typecode)
 
 
-def replaced(values: Values, axes: Sequence[Offsets], new: Values) -> Values:
+def scatter(values: Values, axes: Sequence[Offsets], new: Values) -> Values:
     """The values with others at the sums of one offset from each axis, alike and as many."""
     if not all(map(len, axes)):
         return values
@@ -305,15 +307,15 @@ def replaced(values: Values, axes: Sequence[Offsets], new: Values) -> Values:
     return bytes(changed) if isinstance(values, bytes) else changed
 
 
-def rolled(values: Values, outer: int, count: int, inner: int, shift: int) -> Values:
+def roll(values: Values, outer: int, count: int, inner: int, shift: int) -> Values:
     """Values [outer, count, inner] in which number i of the middle axis comes from i - shift; it wraps around."""
     if len(values) == 1 or not values or shift % count == 0:
         return values
     block, cut = count * inner, shift % count * inner
     cut -= block if 2 * cut > block else 0
     # All move at once; then those that leave their block return at its other end.
-    held: Any = values
-    moved = held[-cut:] + held[:-cut]
+    circular: Any = values
+    moved = circular[-cut:] + circular[:-cut]
     changed: Any = bytearray(moved) if isinstance(values, bytes) else moved
     for place in range(cut) if cut > 0 else range(block + cut, block):
         changed[place::block] = values[(place - cut) % block :: block]

@@ -41,15 +41,15 @@ def _reduction(call: Callable[[Values], Any], result: Type | None = None) -> Any
         if (call is sum and self.dtype.kind not in "bi") or (real and any(value != value for value in full)):
             raise TypeError("sums of such numbers and extremes of NaN are not there without NumPy")
         axes = range(self.ndim)
-        gone = [axes[one] for one in (axes if axis is None else [axis] if isinstance(axis, int) else axis)]
-        rest = [one for one in axes if one not in gone]
-        shape = tuple(self.shape[one] for one in rest)
-        if rest and rest[-1] > gone[0]:
+        reduced = [axes[i] for i in (axes if axis is None else [axis] if isinstance(axis, int) else axis)]
+        rest = [i for i in axes if i not in reduced]
+        shape = tuple(self.shape[i] for i in rest)
+        if rest and rest[-1] > reduced[0]:
             offsets = self.offsets()
-            full = numbers.gathered(full, [offsets[one] for one in (*rest, *gone)])
-        length = prod(self.shape[one] for one in gone)
+            full = numbers.gather(full, [offsets[i] for i in (*rest, *reduced)])
+        length = prod(self.shape[i] for i in reduced)
         rows = [full[at * length : (at + 1) * length] for at in range(prod(shape))]
-        return ndarray(shape, kind, numbers.packed([*map(call, rows)], kind))
+        return ndarray(shape, kind, numbers.pack([*map(call, rows)], kind))
 
     return method
 
@@ -138,7 +138,7 @@ class ndarray:
 
     def astype(self, kind: Any) -> ndarray:
         wanted = dtype(kind)
-        return ndarray(self.shape, wanted, numbers.converted(self.values, self.dtype, wanted))
+        return ndarray(self.shape, wanted, numbers.convert(self.values, self.dtype, wanted))
 
     def reshape(self, *shape: Any) -> ndarray:
         sides = list(shape[0] if len(shape) == 1 and not isinstance(shape[0], int) else shape)
@@ -162,28 +162,28 @@ class ndarray:
             places, there = key.values, bytes(range(min(len(values), 256)))
             if key.dtype is not bool_ and isinstance(places, bytes) and not places.translate(None, there):
                 return ndarray(key.shape, self.dtype, places.translate(values[:256].ljust(256, b"\0")))
-        axes, shape, picked = self._selected(key)
+        axes, shape, picked = self._select(key)
         base = None if picked or not shape else self
-        return ndarray(shape, self.dtype, numbers.gathered(values, axes), base)
+        return ndarray(shape, self.dtype, numbers.gather(values, axes), base)
 
     def __setitem__(self, key: Any, value: Any) -> None:
         if self._base is not None:
             raise ValueError("writing to a view is not there without NumPy: copy it first")
-        given = asarray(value, self.dtype)
-        axes, shape, _ = self._selected(key)
-        old, new = numbers.alike([self.full, broadcast_to(given, shape).full], self.dtype)
-        self._values = numbers.replaced(old, axes, new)
+        new_values = asarray(value, self.dtype)
+        axes, shape, _ = self._select(key)
+        old, new = numbers.unify([self.full, broadcast_to(new_values, shape).full], self.dtype)
+        self._values = numbers.scatter(old, axes, new)
         self._written += 1
 
-    def _selected(self, key: Any) -> tuple[list[Offsets], Shape, bool]:
+    def _select(self, key: Any) -> tuple[list[Offsets], Shape, bool]:
         """Where the values are that a key selects, their shape, and whether arrays select them."""
-        items = [_part(one) for one in (key if isinstance(key, tuple) else (key,))]
+        items = [_part(item) for item in (key if isinstance(key, tuple) else (key,))]
         rest = [slice(None)] * (self.ndim - sum(map(_axes_taken, items)))
-        dots = next((place for place, one in enumerate(items) if one is ...), None)
+        dots = next((place for place, item in enumerate(items) if item is ...), None)
         items = items + rest if dots is None else items[:dots] + rest + items[dots + 1 :]
         arrays = []
-        if any(isinstance(one, ndarray) for one in items):  # integers beside arrays are like them
-            arrays = [at for at, one in enumerate(items) if isinstance(one, (ndarray, int))]
+        if any(isinstance(item, ndarray) for item in items):  # integers beside arrays are like them
+            arrays = [at for at, item in enumerate(items) if isinstance(item, (ndarray, int))]
             if arrays != [*range(arrays[0], arrays[-1] + 1)]:
                 raise IndexError("arrays that are apart in an index are not there without NumPy")
         axes: list[Offsets] = []
@@ -211,19 +211,19 @@ class ndarray:
     # Operations
 
     def __neg__(self) -> ndarray:
-        return _mapped(operator.neg, self, "iuf")
+        return _map(operator.neg, self, "iuf")
 
     def __invert__(self) -> ndarray:
         return _binary("xor", self, True if self.dtype is bool_ else -1)
 
     def __abs__(self) -> ndarray:
-        return _mapped(operator.abs, self, "if")
+        return _map(operator.abs, self, "if")
 
 
-def _mapped(call: Callable[[Any], Any], array: ndarray, kinds: str) -> ndarray:
+def _map(call: Callable[[Any], Any], array: ndarray, kinds: str) -> ndarray:
     if array.dtype.kind not in kinds:
         raise TypeError(f"{call} of {array.dtype} is not there without NumPy")
-    return ndarray(array.shape, array.dtype, numbers.packed([*map(call, array.values)], array.dtype))
+    return ndarray(array.shape, array.dtype, numbers.pack([*map(call, array.values)], array.dtype))
 
 
 def _part(item: Any) -> Any:
@@ -249,10 +249,10 @@ def _places(item: int | ndarray, sides: Shape, steps: Sequence[int]) -> ndarray:
             raise IndexError(f"flags of the shape {item.shape} in an index of {sides}")
         step = steps[item.ndim - 1]
         flagged = [*compress(range(0, item.size * step, step), item.full)]
-        return ndarray((len(flagged),), int64, numbers.packed(flagged, int64))
+        return ndarray((len(flagged),), int64, numbers.pack(flagged, int64))
     shape, listed = ((), [item]) if isinstance(item, int) else (item.shape, item.full)
     places = [place * steps[0] for place in _within(listed, sides[0])]
-    return ndarray(shape, int64, numbers.packed(places, int64))
+    return ndarray(shape, int64, numbers.pack(places, int64))
 
 
 def _within(places: Sequence[int], side: int) -> Sequence[int]:
@@ -271,15 +271,17 @@ def asarray(values: Any, dtype: Any = None) -> ndarray:
         return values if dtype is None or dtype is values.dtype else values.astype(dtype)
     shape, leaves = _nested(values)
     types = dict.fromkeys(map(type, leaves))
-    arrays = [one for one in leaves if isinstance(one, ndarray)] if ndarray in types else []
+    arrays = [leaf for leaf in leaves if isinstance(leaf, ndarray)] if ndarray in types else []
     if dtype is None:
-        kinds = [one.dtype for one in arrays] + [_dtype(one) for one in types if one is not ndarray]
-        kind = reduce(numbers.promoted, kinds) if kinds else float64
+        kinds = [leaf.dtype for leaf in arrays] + [_dtype(leaf) for leaf in types if leaf is not ndarray]
+        kind = reduce(numbers.promote, kinds) if kinds else float64
     else:
         kind = _dtype(dtype)
     if arrays:
-        leaves = [number for one in leaves for number in (one.full if isinstance(one, ndarray) else (one,))]
-    return ndarray(shape, kind, numbers.checked(leaves, kind))
+        leaves = [
+            number for leaf in leaves for number in (leaf.full if isinstance(leaf, ndarray) else (leaf,))
+        ]
+    return ndarray(shape, kind, numbers.pack_exactly(leaves, kind))
 
 
 def _nested(values: Any) -> tuple[Shape, list[Any]]:
@@ -292,7 +294,7 @@ def _nested(values: Any) -> tuple[Shape, list[Any]]:
         return (), [values]
     if not {*map(type, values)} & {list, tuple, range, ndarray}:
         return (len(values),), list(values)
-    parts = [_nested(one) for one in values]
+    parts = [_nested(part) for part in values]
     if len({shape for shape, _ in parts}) > 1:
         raise ValueError("lists of different lengths are no array")
     return (len(values), *parts[0][0]), [leaf for _, leaves in parts for leaf in leaves]
@@ -333,7 +335,7 @@ def arange(start: int, stop: int | None = None, *, dtype: Any = int64) -> ndarra
 def frombuffer(buffer: Any, dtype: Any) -> ndarray:
     """A copy, which cannot be written to."""
     kind = _dtype(dtype)
-    values = numbers.unpacked(bytes(buffer), kind.code)
+    values = numbers.unpack(bytes(buffer), kind.code)
     return ndarray((len(values),), kind, values)[:]
 
 
@@ -356,7 +358,7 @@ def broadcast_to(values: Any, shape: Any) -> ndarray:
         [0] * wanted if side == 1 != wanted else offset
         for side, wanted, offset in zip(sides, target, offsets, strict=True)
     ]
-    return ndarray(target, array.dtype, numbers.gathered(array.values, axes), array)
+    return ndarray(target, array.dtype, numbers.gather(array.values, axes), array)
 
 
 def moveaxis(values: ndarray, source: int, destination: int) -> ndarray:
@@ -364,37 +366,35 @@ def moveaxis(values: ndarray, source: int, destination: int) -> ndarray:
     order = [axis for axis in range(values.ndim) if axis != moved]
     order.insert(range(values.ndim)[destination], moved)
     axes, shape = values.offsets(), tuple(values.shape[axis] for axis in order)
-    return ndarray(
-        shape, values.dtype, numbers.gathered(values.values, [axes[axis] for axis in order]), values
-    )
+    return ndarray(shape, values.dtype, numbers.gather(values.values, [axes[axis] for axis in order]), values)
 
 
 def roll(values: ndarray, shift: Any, axis: Any) -> ndarray:
-    found, shape = values.values, values.shape
-    for places, one in [(shift, axis)] if isinstance(axis, int) else zip(shift, axis, strict=True):
-        at = range(len(shape))[one]
-        found = numbers.rolled(found, prod(shape[:at]), shape[at], prod(shape[at + 1 :]), places)
-    return ndarray(shape, values.dtype, found)
+    rolled, shape = values.values, values.shape
+    for places, axis_number in [(shift, axis)] if isinstance(axis, int) else zip(shift, axis, strict=True):
+        at = range(len(shape))[axis_number]
+        rolled = numbers.roll(rolled, prod(shape[:at]), shape[at], prod(shape[at + 1 :]), places)
+    return ndarray(shape, values.dtype, rolled)
 
 
 def concatenate(arrays: Sequence[ndarray], axis: int = 0) -> ndarray:
-    kind = reduce(numbers.promoted, [one.dtype for one in arrays])
+    kind = reduce(numbers.promote, [a.dtype for a in arrays])
     at = range(arrays[0].ndim)[axis]
-    ((before, after),) = dict.fromkeys((one.shape[:at], one.shape[at + 1 :]) for one in arrays)
-    parts = numbers.alike([numbers.converted(one.full, one.dtype, kind) for one in arrays], kind)
-    lengths = [prod(one.shape[at:]) for one in arrays]
+    ((before, after),) = dict.fromkeys((a.shape[:at], a.shape[at + 1 :]) for a in arrays)
+    parts = numbers.unify([numbers.convert(a.full, a.dtype, kind) for a in arrays], kind)
+    lengths = [prod(a.shape[at:]) for a in arrays]
     blocks = [
         part[row * length : (row + 1) * length]
         for row in range(prod(before))
         for part, length in zip(parts, lengths, strict=True)
     ]
-    shape = (*before, sum(one.shape[at] for one in arrays), *after)
-    return ndarray(shape, kind, numbers.unpacked(b"".join(blocks), getattr(parts[0], "typecode", "B")))
+    shape = (*before, sum(a.shape[at] for a in arrays), *after)
+    return ndarray(shape, kind, numbers.unpack(b"".join(blocks), getattr(parts[0], "typecode", "B")))
 
 
 def stack(arrays: Sequence[ndarray], axis: int = 0) -> ndarray:
     at = range(arrays[0].ndim + 1)[axis]
-    return concatenate([one.reshape(*one.shape[:at], 1, *one.shape[at:]) for one in arrays], at)
+    return concatenate([a.reshape(*a.shape[:at], 1, *a.shape[at:]) for a in arrays], at)
 
 
 def repeat(values: ndarray, repeats: int, axis: int) -> ndarray:
@@ -402,7 +402,7 @@ def repeat(values: ndarray, repeats: int, axis: int) -> ndarray:
     axes: list[Offsets] = [*values.offsets()]
     axes[at] = [offset for offset in axes[at] for _ in range(repeats)]
     shape[at] *= repeats
-    return ndarray(tuple(shape), values.dtype, numbers.gathered(values.values, axes))
+    return ndarray(tuple(shape), values.dtype, numbers.gather(values.values, axes))
 
 
 # Operations on values
@@ -415,7 +415,7 @@ def _together(first: Shape, second: Shape) -> Shape:
     return tuple(b if a == 1 else a for a, b in pairs)
 
 
-def _matched(x: Any, y: Any) -> tuple[Values, Values, Type, Shape]:
+def _match(x: Any, y: Any) -> tuple[Values, Values, Type, Shape]:
     """Two arrays or numbers as values of one type, and their shape. Numbers of Python adapt to the type of the other.
 
     Raises OverflowError for an integer that the type cannot hold.
@@ -425,7 +425,7 @@ def _matched(x: Any, y: Any) -> tuple[Values, Values, Type, Shape]:
     if type(x) is type(y) is ndarray:
         if x.shape == y.shape and x.dtype is y.dtype:
             return x.values, y.values, x.dtype, x.shape
-        kind, shape = numbers.promoted(x.dtype, y.dtype), _together(x.shape, y.shape)
+        kind, shape = numbers.promote(x.dtype, y.dtype), _together(x.shape, y.shape)
     else:
         array, number = (x, y) if type(x) is ndarray else (y, x)
         kind, shape, own = array.dtype, array.shape, dtype(type(number))
@@ -433,21 +433,21 @@ def _matched(x: Any, y: Any) -> tuple[Values, Values, Type, Shape]:
     return _operand(x, kind, shape), _operand(y, kind, shape), kind, shape
 
 
-def _operand(one: Any, kind: Type, shape: Shape) -> Values:
-    if type(one) is not ndarray:
-        return numbers.checked([one], kind)
-    values = one.values if one.shape == shape else broadcast_to(one, shape).values
-    return numbers.converted(values, one.dtype, kind)
+def _operand(number: Any, kind: Type, shape: Shape) -> Values:
+    if type(number) is not ndarray:
+        return numbers.pack_exactly([number], kind)
+    values = number.values if number.shape == shape else broadcast_to(number, shape).values
+    return numbers.convert(values, number.dtype, kind)
 
 
 def _binary(op: str, x: Any, y: Any) -> ndarray:
-    a, b, kind, shape = _matched(x, y)
+    a, b, kind, shape = _match(x, y)
     return ndarray(shape, kind, numbers.arithmetic(op, a, b, kind, prod(shape)))
 
 
 def _compare(op: str, x: Any, y: Any) -> ndarray:
-    a, b, _, shape = _matched(x, y)
-    return ndarray(shape, bool_, numbers.compared(op, a, b, prod(shape)))
+    a, b, _, shape = _match(x, y)
+    return ndarray(shape, bool_, numbers.compare(op, a, b, prod(shape)))
 
 
 def _operator(call: Callable[[str, Any, Any], ndarray], op: str, swapped: bool = False) -> Any:
@@ -467,20 +467,21 @@ for _op in ("eq", "ne", "lt", "le", "gt", "ge"):
 
 def where(condition: Any, yes: Any, no: Any) -> ndarray:
     flags = asarray(condition, bool_)
-    a, b, kind, shape = _matched(yes, no)
+    a, b, kind, shape = _match(yes, no)
     whole = _together(flags.shape, shape)
     held, yes, no = (
-        broadcast_to(one, whole).values for one in (flags, ndarray(shape, kind, a), ndarray(shape, kind, b))
+        broadcast_to(operand, whole).values
+        for operand in (flags, ndarray(shape, kind, a), ndarray(shape, kind, b))
     )
-    return ndarray(whole, kind, numbers.chosen(bytes(held), yes, no, kind, prod(whole)))
+    return ndarray(whole, kind, numbers.choose(bytes(held), yes, no, kind, prod(whole)))
 
 
 def isin(values: ndarray, test_elements: Sequence[int]) -> ndarray:
-    wanted, found = frozenset(test_elements), values.values
-    if isinstance(found, bytes):
+    wanted, numbers_ = frozenset(test_elements), values.values
+    if isinstance(numbers_, bytes):
         table = bytes(number in wanted for number in range(256))
-        return ndarray(values.shape, bool_, found.translate(table))
-    return ndarray(values.shape, bool_, bytes(map(wanted.__contains__, found)))
+        return ndarray(values.shape, bool_, numbers_.translate(table))
+    return ndarray(values.shape, bool_, bytes(map(wanted.__contains__, numbers_)))
 
 
 minimum, maximum = partial(_binary, "minimum"), partial(_binary, "maximum")
@@ -493,13 +494,11 @@ def clip(values: Any, low: Any, high: Any) -> ndarray:
 
 def sqrt(x: ndarray) -> ndarray:
     """NaN below 0."""
-    return _mapped(lambda value: math.sqrt(value) if value >= 0 else math.nan, x, "f")
+    return _map(lambda value: math.sqrt(value) if value >= 0 else math.nan, x, "f")
 
 
 def floor(x: ndarray) -> ndarray:
-    return _mapped(
-        lambda value: float(math.floor(value)) if value and math.isfinite(value) else value, x, "f"
-    )
+    return _map(lambda value: float(math.floor(value)) if value and math.isfinite(value) else value, x, "f")
 
 
 def isnan(x: ndarray) -> ndarray:
@@ -524,17 +523,17 @@ def array_equal(x: Any, y: Any) -> bool:
 
 
 def nonzero(values: ndarray) -> tuple[ndarray, ...]:
-    places, found = [*compress(range(values.size), values.full)], []
+    places, coordinates = [*compress(range(values.size), values.full)], []
     for side in reversed(values.shape):
-        found.append(asarray([place % side for place in places], int64))
+        coordinates.append(asarray([place % side for place in places], int64))
         places = [place // side for place in places]
-    return tuple(reversed(found))
+    return tuple(reversed(coordinates))
 
 
 def unique(values: Any) -> ndarray:
     """The different numbers, in ascending order."""
-    found = asarray(values)
-    return asarray(sorted(set(found.values)), found.dtype)
+    array = asarray(values)
+    return asarray(sorted(set(array.values)), array.dtype)
 
 
 def searchsorted(values: ndarray, wanted: ndarray, side: str = "left") -> ndarray:
@@ -542,4 +541,6 @@ def searchsorted(values: ndarray, wanted: ndarray, side: str = "left") -> ndarra
     call, listed = bisect_left if side == "left" else bisect_right, values.tolist()
     if bool(isnan(wanted).any()):
         raise TypeError("searchsorted of NaN is not there without NumPy")
-    return ndarray(wanted.shape, int64, numbers.checked([call(listed, one) for one in wanted.values], int64))
+    return ndarray(
+        wanted.shape, int64, numbers.pack_exactly([call(listed, number) for number in wanted.values], int64)
+    )

@@ -32,7 +32,7 @@ class Reporter:
     """Collects diagnostics. Every stage reports all it can; `raise_if_errors` ends the stage."""
 
     def __init__(self) -> None:
-        self._found: dict[Diagnostic, None] = {}
+        self._diagnostics: dict[Diagnostic, None] = {}
         self._errors = 0
 
     def report(
@@ -59,20 +59,20 @@ class Reporter:
 
     def add(self, diagnostic: Diagnostic) -> None:
         """Add what another reporter has found. Raises CompileError as `report` does."""
-        if diagnostic in self._found:
+        if diagnostic in self._diagnostics:
             return
         if diagnostic.severity is Severity.ERROR:
             self._errors += 1
-        elif len(self._found) > 10 * MAX_ERRORS:
+        elif len(self._diagnostics) > 10 * MAX_ERRORS:
             return
-        self._found[diagnostic] = None
+        self._diagnostics[diagnostic] = None
         if self._errors >= MAX_ERRORS:
             self.raise_if_errors()
 
     @property
     def diagnostics(self) -> tuple[Diagnostic, ...]:
         """Everything found so far, in source order, without repetitions."""
-        return tuple(sorted(self._found, key=lambda diagnostic: diagnostic.sort_key))
+        return tuple(sorted(self._diagnostics, key=lambda diagnostic: diagnostic.sort_key))
 
     @property
     def has_errors(self) -> bool:

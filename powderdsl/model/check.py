@@ -72,7 +72,7 @@ def check(
         elsewhere: words that packs define which are not loaded, with the pack.
         alone: no pack counts as added to others: rules that meet are errors.
     """
-    typer, given = resolve_names(packs, ruleset, reporter, palette)
+    typer, values = resolve_names(packs, ruleset, reporter, palette)
     composition = typer.symbols
     elaborated = Elaborator(typer)
     elaborated.run(composition.passes)
@@ -98,7 +98,7 @@ def check(
     order, matrix = lay_out(composition, passes, reporter)
     reporter.raise_if_errors()
     undecided += report_needless(passes, composition.fields, facts, reporter)
-    found = Ruleset(
+    ruleset_model = Ruleset(
         name=title(composition.packs, composition.ruleset),
         about=ruleset.about if ruleset else (packs[0].about if len(packs) == 1 else ""),
         packs=tuple(composition.packs),
@@ -116,9 +116,9 @@ def check(
         invariants=invariants,
         declared=Declared(tuple(packs), ruleset),
     )
-    undecided += report_undrawn(found, given, facts, reporter)
+    undecided += report_undrawn(ruleset_model, values, facts, reporter)
     report_undecided(undecided, reporter)
-    return found
+    return ruleset_model
 
 
 def _streams(symbols: Composition, elaborated: Elaborator, reporter: Reporter) -> tuple[Stream, ...]:
@@ -160,27 +160,29 @@ def _check_some(
     gone = {pack.name.text for pack in declared.packs} - set(packs)
     chosen = [pack for pack in declared.packs if pack.name.text not in gone]
     try:
-        return check(chosen, _bare(declared.ruleset, gone), reporter, alone=alone)
+        return check(chosen, _without_packs(declared.ruleset, gone), reporter, alone=alone)
     except CompileError:
         return None
 
 
-def _bare(decl: RulesetDecl | None, gone: set[str]) -> RulesetDecl | None:
+def _without_packs(decl: RulesetDecl | None, gone: set[str]) -> RulesetDecl | None:
     """A ruleset that names nothing of packs that are gone: no channels, and no invariants if some of them are its own."""
     if decl is None:
         return None
     invariants = decl.invariants if gone.isdisjoint(decl.members) else ()
-    beside = tuple(bare for one in decl.beside if (bare := _bare(one, gone)))
-    base = _bare(decl.base, gone)
+    beside = tuple(bare for other in decl.beside if (bare := _without_packs(other, gone)))
+    base = _without_packs(decl.base, gone)
     return replace(decl, matrix=(), slots=None, invariants=invariants, base=base, beside=beside)
 
 
 def with_outgrown(ruleset: Ruleset, remarks: tuple[Diagnostic, ...]) -> tuple[Diagnostic, ...]:
     """The same remarks, where warnings that nobody would get without the added packs are notes (PD515)."""
     warnings = {
-        one: span
-        for one in remarks
-        if one.severity is Severity.WARNING and (span := one.primary.span) and one.code not in OF_COMPOSITIONS
+        remark: span
+        for remark in remarks
+        if remark.severity is Severity.WARNING
+        and (span := remark.primary.span)
+        and remark.code not in OF_COMPOSITIONS
     }
     if not warnings or ruleset.declared is None or len(ruleset.packs) < 2:
         return remarks
@@ -188,7 +190,7 @@ def with_outgrown(ruleset: Ruleset, remarks: tuple[Diagnostic, ...]) -> tuple[Di
     notes: dict[Diagnostic, Diagnostic] = {}
     authors: list[PackDecl | RulesetDecl] = [*composition.packs.values(), *composition.ruleset.lineage]
     for author in authors:
-        own = {one: span for one, span in warnings.items() if span.source == author.source}
+        own = {remark: span for remark, span in warnings.items() if span.source == author.source}
         if not own:
             continue
         words = _known_words(author)
@@ -196,12 +198,12 @@ def with_outgrown(ruleset: Ruleset, remarks: tuple[Diagnostic, ...]) -> tuple[Di
         added, reporter = ruleset.added_to(scope), Reporter()
         if not added or _check_some(ruleset.declared, scope, reporter) is None:
             continue
-        known = {(one.code, one.primary.span) for one in reporter.diagnostics}
-        for one, span in own.items():
-            if (one.code, span) not in known:
-                message = f"{Difference(added).with_packs}, {one.message}: {place_of(span)}"
-                notes[one] = replace(one, code="PD515", message=message, helps=())
-    return tuple(notes.get(one, one) for one in remarks)
+        known = {(remark.code, remark.primary.span) for remark in reporter.diagnostics}
+        for remark, span in own.items():
+            if (remark.code, span) not in known:
+                message = f"{Difference(added).with_packs}, {remark.message}: {place_of(span)}"
+                notes[remark] = replace(remark, code="PD515", message=message, helps=())
+    return tuple(notes.get(remark, remark) for remark in remarks)
 
 
 def _known_words(author: PackDecl | RulesetDecl) -> list[str]:

@@ -281,7 +281,7 @@ class PackDecl(Record, noun="a pack"):
     @property
     def lines(self) -> Iterator[Syntax]:
         """The lines of its passes."""
-        return (line for one in self.passes for block in one.walk() for line in block.lines)
+        return (line for pass_ in self.passes for block in pass_.walk() for line in block.lines)
 
 
 class RulesetDecl(Record, noun="a ruleset"):
@@ -329,8 +329,8 @@ class RulesetDecl(Record, noun="a ruleset"):
         """This ruleset, all that it extends and all beside it, each once, bases first."""
         lineage: dict[str, RulesetDecl] = {}
         for start in filter(None, (*self.beside, self.base)):
-            for one in start.lineage:
-                lineage[one.source.name] = one
+            for ruleset in start.lineage:
+                lineage[ruleset.source.name] = ruleset
         lineage.pop(self.source.name, None)
         return (*lineage.values(), self)
 
@@ -343,13 +343,15 @@ class RulesetDecl(Record, noun="a ruleset"):
     def placed(self) -> list[str]:
         """The packs of that ruleset, except packs that others of the same name replace."""
         members = self.members
-        return [name for name, one in self.placing.members.items() if members.get(name, one) is one]
+        return [
+            name for name, ruleset in self.placing.members.items() if members.get(name, ruleset) is ruleset
+        ]
 
     @property
     def renames(self) -> dict[str, tuple[Scalar, Scalar]]:
         """Its own renames and the inherited ones, by qualified name."""
         renames = {}
-        for one in self.lineage:
-            for old, new in one.rename:
+        for ruleset in self.lineage:
+            for old, new in ruleset.rename:
                 renames[old.text] = old, new
         return renames

@@ -82,7 +82,7 @@ def define_symbols(typer: Typer) -> list[tuple[str, int, Span]]:
             if param.default is not None:
                 value = typer.constant(param.default, kind, Scope(param.pack, {}))
                 symbols.params[name] = Param(name, kind, value, param.about, param.span)
-    _set_by_rulesets(typer)
+    _set_params_of_rulesets(typer)
     properties = names.declared(PropertyDecl)
     for name, prop in properties.items():
         with suppress(Poisoned):
@@ -93,17 +93,17 @@ def define_symbols(typer: Typer) -> list[tuple[str, int, Span]]:
     for name, decl in names.declared(FieldDecl).items():
         with suppress(Poisoned):
             symbols.fields[name] = _field(name, decl, typer)
-    given = _element_values(typer)
+    values_of = _element_values(typer)
     for name, known in symbols.properties.items():
         prop = properties[name]
         usual = _value(known, prop.default, prop.pack, typer) if prop.default else default_of(known.kind)
         values = [usual] * symbols.slots
-        for word, (pack, _, syntax) in given[name].items():
+        for word, (pack, _, syntax) in values_of[name].items():
             values[elements[word].id] = _value(known, syntax, pack, typer)
         symbols.properties[name] = replace(known, values=tuple(values))
     for name, field in symbols.fields.items():
         own: dict[int, Value] = {}
-        for word, (pack, span, syntax) in given[name].items():
+        for word, (pack, span, syntax) in values_of[name].items():
             number = elements[word].id
             with suppress(Poisoned):
                 _check_may_have(field, number, word, span, typer)
@@ -122,7 +122,7 @@ def define_symbols(typer: Typer) -> list[tuple[str, int, Span]]:
     return [
         (name, elements[word].id, syntax.span)
         for name in properties
-        for word, (_, _, syntax) in given[name].items()
+        for word, (_, _, syntax) in values_of[name].items()
     ]
 
 
@@ -165,13 +165,13 @@ def _kind(noun: str, decl: TypedDecl, typer: Typer) -> Kind:
     )  # fmt: skip
 
 
-def _set_by_rulesets(typer: Typer) -> None:
+def _set_params_of_rulesets(typer: Typer) -> None:
     """Give parameters the values of rulesets, bases first; values for packs that are left out are skipped."""
     params = typer.symbols.params
     for ruleset in typer.symbols.ruleset.lineage:
         for key, syntax in ruleset.params:
             pack, known = key.text.partition(".")[0], params.get(key.text)
-            if pack not in typer.symbols.packs and any(pack in one.members for one in ruleset.lineage):
+            if pack not in typer.symbols.packs and any(pack in member.members for member in ruleset.lineage):
                 continue
             if known is None:
                 helps = suggest(key.text, params, "parameters")
@@ -221,16 +221,16 @@ def _element_values(typer: Typer) -> dict[str, dict[str, tuple[str, Span, Syntax
         **names.declared(PropertyDecl),
         **names.declared(FieldDecl),
     }
-    given: dict[str, dict[str, tuple[str, Span, Syntax]]] = defaultdict(dict)
+    values_of: dict[str, dict[str, tuple[str, Span, Syntax]]] = defaultdict(dict)
     for pack, name, word, key, syntax in symbols.given_values():
         if name not in declared:
             keys = (own for own in keys_of(ElementDecl) if own != "override")
             report_unknown("property", key, (*declared, *keys), typer.reporter, "PD108")
         elif word in symbols.elements:
-            held = pack, key.span, syntax
-            if word in given[name]:
-                report_replaced(name, word, given[name][word], held, symbols, typer.reporter)
-            given[name][word] = held
+            value = pack, key.span, syntax
+            if word in values_of[name]:
+                report_replaced(name, word, values_of[name][word], value, symbols, typer.reporter)
+            values_of[name][word] = value
     for name, decl in declared.items():
         for key, _ in decl.values:
             if key.is_optional or symbols.element(key.word, decl.pack) is not None:
@@ -243,7 +243,7 @@ def _element_values(typer: Typer) -> dict[str, dict[str, tuple[str, Span, Syntax
                 typer.reporter.error("PD108", f"unknown key `{key.text}`", key.span, label, helps=helps)
             else:
                 report_unknown("element", key, symbols.elements, typer.reporter)
-    return given
+    return values_of
 
 
 def _check_may_have(field: Field, number: int, element: str, span: Span, typer: Typer) -> None:
@@ -290,7 +290,7 @@ def element_ramps(typer: Typer) -> dict[str, ColorRamp]:
     symbols = typer.symbols
     properties = symbols.names.declared(PropertyDecl)
     fields = symbols.names.declared(FieldDecl)
-    given: dict[str, tuple[str, Span, ColorRamp]] = {}
+    ramps: dict[str, tuple[str, Span, ColorRamp]] = {}
     for name, entry in symbols.entries:
         if entry.ramp is None:
             continue
@@ -307,11 +307,11 @@ def element_ramps(typer: Typer) -> dict[str, ColorRamp]:
                 report_unknown("field", word, symbols.fields, typer.reporter)
             if field is None or element is None:
                 continue
-            held = pack, entry.ramp.name.span, _ramp(field, element, entry.ramp, typer)
-            if name in given:
-                report_replaced("color_by", name, given[name], held, symbols, typer.reporter)
-            given[name] = held
-    return {name: ramp for name, (_, _, ramp) in given.items()}
+            value = pack, entry.ramp.name.span, _ramp(field, element, entry.ramp, typer)
+            if name in ramps:
+                report_replaced("color_by", name, ramps[name], value, symbols, typer.reporter)
+            ramps[name] = value
+    return {name: ramp for name, (_, _, ramp) in ramps.items()}
 
 
 def _ramp(field: Field, element: Element, decl: RampDecl, typer: Typer) -> ColorRamp:
@@ -348,7 +348,7 @@ def set_params(ruleset: Ruleset, values: Mapping[str, Any], reporter: Reporter) 
     if not isinstance(values, Mapping):
         raise TypeError(f"params takes a mapping from names to values, found {type(values).__name__}")
     known = {param.name: param for param in ruleset.params}
-    found: dict[str, Value] = {}
+    checked_values: dict[str, Value] = {}
     for name, value in values.items():
         if name not in known:
             names = ", ".join(sorted(known)) or "none"
@@ -361,8 +361,8 @@ def set_params(ruleset: Ruleset, values: Mapping[str, Any], reporter: Reporter) 
             helps = (f"write {in_words(kind)}",)
             reporter.error("PD402", f"parameter `{name}` cannot be `{value}`", None, helps=helps)
         else:
-            found[name] = number
-    return ruleset.with_params(found)
+            checked_values[name] = number
+    return ruleset.with_params(checked_values)
 
 
 def in_words(kind: Kind) -> str:

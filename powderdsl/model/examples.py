@@ -200,8 +200,8 @@ class _ExampleReader:
             if decl.pack == self.pack and decl.glyph:
                 legend[decl.glyph] = name
         for key, value in self.decl.legend:
-            found = composition.element(value.word, self.pack)
-            if found is None:
+            element = composition.element(value.word, self.pack)
+            if element is None:
                 if value.is_optional:
                     raise Unresolved(
                         value.word
@@ -212,7 +212,7 @@ class _ExampleReader:
                 raise self.typer.fail(
                     "PD110", "a legend explains single characters", key.span, "not one character"
                 )
-            legend[key.text] = found
+            legend[key.text] = element
         return legend
 
     def _check_sides(self, drawing: Scalar) -> None:
@@ -318,11 +318,11 @@ class _ExampleReader:
 
     def _kind(self, key: Scalar, name: str) -> Kind:
         symbols = self.typer.symbols
-        found = symbols.fields.get(name) or symbols.properties.get(name)
-        if found is not None:
-            if found.kind.name in FORMS:
-                return found.kind
-            label = f"no cell has {found.kind} of its own"
+        symbol = symbols.fields.get(name) or symbols.properties.get(name)
+        if symbol is not None:
+            if symbol.kind.name in FORMS:
+                return symbol.kind
+            label = f"no cell has {symbol.kind} of its own"
             raise self.typer.fail("PD407", f"`{name}` is not a field", key.span, label)
         if symbols.is_declared(name, self.pack):
             raise Poisoned  # what is wrong with its declaration has been reported

@@ -60,14 +60,14 @@ def check_invariants(
     for ruleset in composition.ruleset.lineage:
         for line in ruleset.invariants:
             written.append((ruleset.name.text, with_optional(line, composition.left_out), ruleset))
-    found = []
+    invariants = []
     reporter = typer.reporter
     for pack, line, author in written:
         scope = composition.scope(author or pack, words_of(line))
         typer.reporter = Reporter()
         try:
             claim, without = _claim(typer, line, pack)
-            found.append(Invariant(claim, without, pack, line.span, scope))
+            invariants.append(Invariant(claim, without, pack, line.span, scope))
         except Poisoned:
             pass
         except Unresolved as missing:
@@ -84,7 +84,7 @@ def check_invariants(
             else:
                 reporter.add(remark)
     typer.reporter = reporter
-    return tuple(found)
+    return tuple(invariants)
 
 
 def _claim(typer: Typer, line: Syntax, pack: str) -> tuple[Claim, frozenset[int]]:
@@ -207,8 +207,8 @@ class _Statement:
         ]
         beyond = [value for value, part in parts if not lo <= part <= hi]
         if outside or beyond:
-            found = f"`{name}` holds {kind}" if outside else f"a fresh cell has {beyond[0]}"
-            raise typer.fail("PD511", "this invariant cannot hold", bounds.span, found, "widen the bounds")
+            label = f"`{name}` holds {kind}" if outside else f"a fresh cell has {beyond[0]}"
+            raise typer.fail("PD511", "this invariant cannot hold", bounds.span, label, "widen the bounds")
         return Bounded(name, lo, hi)
 
     def asked(self, condition: Expr, span: Span) -> Expr:

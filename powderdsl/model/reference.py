@@ -334,7 +334,9 @@ def run_moment(moment: Moment, at: Context, table: Mapping[str, Slot]) -> State:
     claims = [rule for rule in moment.rules if not isinstance(rule, Assign)]
     assigns = [rule for rule in moment.rules if isinstance(rule, Assign)]
     effects = [(rule, effect) for rule in claims for effect in rule.effects]
-    values = {id(one): evaluate(one.value, at) for one in (*assigns, *(effect for _, effect in effects))}
+    values = {
+        id(write): evaluate(write.value, at) for write in (*assigns, *(effect for _, effect in effects))
+    }
     travelling = [slot for slot in table.values() if slot.travels]
     state = dict(at.state)
 
@@ -344,10 +346,10 @@ def run_moment(moment: Moment, at: Context, table: Mapping[str, Slot]) -> State:
         if at.watch is not None:
             at.watch.wrote(change, old, state[name], mask)
 
-    def assign(how: str, rule: Rule, assigned: Assign) -> None:
+    def assign(how: str, rule: Rule, assignment: Assign) -> None:
         """`field op value` at the cell `offset` away from each cell where the rule happens."""
-        slot, place = table[assigned.field], back(assigned.offset)
-        value = _assigned(assigned, slot.kind, state[slot.name], look(values[id(assigned)], place))
+        slot, place = table[assignment.field], back(assignment.offset)
+        value = _apply_write(assignment, slot.kind, state[slot.name], look(values[id(assignment)], place))
         write(Change(how, slot, rule, place), value, look(masks[id(rule)], place))
 
     def become(how: str, rule: Rule, target: Expr) -> None:
@@ -361,8 +363,8 @@ def run_moment(moment: Moment, at: Context, table: Mapping[str, Slot]) -> State:
         for slot in travelling:
             write(Change("arrive", slot, rule, asked, source), look(before[slot.name], source), mask)
 
-    for assigned in assigns:
-        assign("assign", assigned, assigned)
+    for assignment in assigns:
+        assign("assign", assignment, assignment)
     before = dict(state)
     for rule in claims:
         if isinstance(rule, Transform):
@@ -418,7 +420,7 @@ def _in_fresh_cells(slot: Slot, ids: Array, at: Context) -> Array:
     return fresh
 
 
-def _assigned(assign: Assign, kind: Kind, old: Array, value: Array) -> Array:
+def _apply_write(assign: Assign, kind: Kind, old: Array, value: Array) -> Array:
     """`old op value`; integers are cut off."""
     new = value if assign.op == ":=" else old + value if assign.op == "+=" else old - value
     return np.clip(new, int(kind.lo), int(kind.hi)) if kind.name == "int" else new
@@ -493,11 +495,11 @@ def widened(ruleset: Ruleset, state: Mapping[str, Array]) -> State:
     return {name: value.astype(WIDE[kinds[name]]) for name, value in state.items()}
 
 
-def parameters(ruleset: Ruleset, batch: int, given: Mapping[str, Any]) -> dict[str, Array]:
+def parameters(ruleset: Ruleset, batch: int, values: Mapping[str, Any]) -> dict[str, Array]:
     """All parameters as arrays [B]: numbers or arrays [B] that are given, and the defaults of the others."""
     return {
         param.name: np.broadcast_to(
-            np.asarray(given.get(param.name, float(param.default)), np.float64), (batch,)
+            np.asarray(values.get(param.name, float(param.default)), np.float64), (batch,)
         ).astype(WIDE[param.kind.name])
         for param in ruleset.params
     }

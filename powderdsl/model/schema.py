@@ -221,15 +221,15 @@ class Reader:
 
     def values(self, kind: type[Record], entries: Entries) -> dict[str, Any]:
         """The values of entries by field. What is wrong is reported and left out."""
-        keys, found, others = keys_of(kind), {}, []
+        keys, values, others = keys_of(kind), {}, []
         for name, (key, node) in entries.items():
             if name in keys:
                 value = self.value(keys[name], key, node)
                 if value is not None:
-                    found[keys[name].field] = value
+                    values[keys[name].field] = value
             elif not name.startswith(kind.PREFIXES) and (line := self.line(node)):
                 others.append((key, line))
-        return found | {"values": tuple(others)} if kind.OTHERS else found
+        return values | {"values": tuple(others)} if kind.OTHERS else values
 
     def value(self, row: Key, key: Scalar, node: Node) -> Any:
         """The value of a key as its row says, None after a report."""
@@ -348,10 +348,14 @@ class Reader:
 
     def shape(self, node: Node, wanted: str, help_text: str = "") -> None:
         """Report a node of the wrong shape."""
-        found = {Scalar: "a single value", Sequence: "a list", Mapping: "a mapping"}[type(node)]
+        description = {Scalar: "a single value", Sequence: "a list", Mapping: "a mapping"}[type(node)]
         helps = [help_text] if help_text else []
         self.reporter.error(
-            "PD107", f"expected {wanted}, found {found}", first_line(node), f"this is {found}", helps=helps
+            "PD107",
+            f"expected {wanted}, found {description}",
+            first_line(node),
+            f"this is {description}",
+            helps=helps,
         )
 
     def line(self, node: Node, start: str = "expression") -> Syntax | None:

@@ -65,14 +65,14 @@ def stored_range(kind: Kind) -> tuple[float, float]:
 
 def slots(ruleset: Ruleset) -> tuple[Slot, ...]:
     """All slots of a ruleset's worlds: the element, then stored properties and fields in the order of the ruleset."""
-    found = [Slot("element", ELEMENT, 0, travels=True)]
-    found += [Slot(prop.name, prop.kind, 0, travels=True) for prop in ruleset.properties if prop.stored]
-    found += [
-        Slot(one.name, one.kind, one.default, one.at == "element", one.resets, one.of, one.own)
-        for one in ruleset.fields
+    slots_ = [Slot("element", ELEMENT, 0, travels=True)]
+    slots_ += [Slot(prop.name, prop.kind, 0, travels=True) for prop in ruleset.properties if prop.stored]
+    slots_ += [
+        Slot(field.name, field.kind, field.default, field.at == "element", field.resets, field.of, field.own)
+        for field in ruleset.fields
     ]
     place = {name: number for number, name in enumerate(ruleset.order)}
-    return tuple(sorted(found, key=lambda slot: place.get(slot.name, -1)))
+    return tuple(sorted(slots_, key=lambda slot: place.get(slot.name, -1)))
 
 
 def property_dtype(prop: Property) -> str:
@@ -106,14 +106,15 @@ def fresh_values(ruleset: Ruleset, slot: Slot) -> list[Any]:
 def scratch_slots(pass_: Pass) -> dict[str, Slot]:
     """The slots of a pass's scratch fields by name. They live in the pass and are not stored."""
     return {
-        one.name: Slot(one.name, one.kind, one.default, travels=False, resets=True) for one in pass_.scratch
+        field.name: Slot(field.name, field.kind, field.default, travels=False, resets=True)
+        for field in pass_.scratch
     }
 
 
 def qualified_slots(ruleset: Ruleset) -> dict[str, str]:
     """The name of each field and property that it has whatever else is loaded."""
-    held: list[Field | Property] = [*ruleset.fields, *ruleset.properties]
-    return {one.name: f"{one.pack}.{one.word or one.name}" for one in held}
+    slots_: list[Field | Property] = [*ruleset.fields, *ruleset.properties]
+    return {slot.name: f"{slot.pack}.{slot.word or slot.name}" for slot in slots_}
 
 
 def slot_name(ruleset: Ruleset, name: str) -> str:

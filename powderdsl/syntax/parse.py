@@ -54,9 +54,9 @@ def parser(language: Language = RULES) -> Lark:
     """The parser of a language. Its tables are kept in the user's cache: making them takes 0.2 s."""
     grammar = Path(__file__).with_name("grammar.lark").read_text(encoding="utf-8")
     try:
-        kept: str | bool = str(cache_folder("syntax") / f"{language.starts[0]}-{lark_version}.lark")
+        cache_file: str | bool = str(cache_folder("syntax") / f"{language.starts[0]}-{lark_version}.lark")
     except (OSError, RuntimeError):  # no home folder, or one that cannot be written
-        kept = False
+        cache_file = False
     return Lark(
         grammar,
         parser="lalr",
@@ -64,7 +64,7 @@ def parser(language: Language = RULES) -> Lark:
         start=list(language.starts),
         propagate_positions=True,
         maybe_placeholders=False,
-        cache=kept,
+        cache=cache_file,
     )
 
 
@@ -116,7 +116,7 @@ def parse_text(line: Span, start: str, reporter: Reporter, usage: Sequence[str] 
         notes = ["a long chain of `and`, `or` or `+` nests as well"]
         reporter.error(language.size, message, first, notes=notes, helps=helps)
         return None
-    return _convert(tree, line.source, Span(line.source, line.start, max(line.end, line.start + 1)))
+    return _to_syntax(tree, line.source, Span(line.source, line.start, max(line.end, line.start + 1)))
 
 
 def depth(tree: Tree) -> int:
@@ -128,14 +128,14 @@ def depth(tree: Tree) -> int:
     return count
 
 
-def _convert(tree: Tree | Token, source: Source, fallback: Span) -> Syntax:
+def _to_syntax(tree: Tree | Token, source: Source, fallback: Span) -> Syntax:
     if isinstance(tree, Token):
         start = tree.start_pos if tree.start_pos is not None else fallback.start
         stop = tree.end_pos if tree.end_pos is not None else fallback.end
         return Syntax("token", (), str(tree), Span(source, start, stop))
     meta = tree.meta
     span = fallback if meta.empty else Span(source, meta.start_pos, meta.end_pos)
-    children = [_convert(child, source, span) for child in tree.children]
+    children = [_to_syntax(child, source, span) for child in tree.children]
     text = " ".join(child.text for child in children if child.kind == "token")
     nodes = tuple(child for child in children if child.kind != "token")
     return Syntax(str(tree.data), nodes, text, span)

@@ -70,63 +70,63 @@ def report_yaml(error: yaml.YAMLError, source: Source, reporter: Reporter) -> No
     mark = error.problem_mark or error.context_mark
     at = mark.index if mark else 0
     since = error.context_mark.index if error.context_mark else at
-    reporter.add(_explained(Place(source, at, since), f"{error.context}: {error.problem}"))
+    reporter.add(_explain(Place(source, at, since), f"{error.context}: {error.problem}"))
 
 
-def _explained(place: Place, words: str) -> Diagnostic:
+def _explain(place: Place, words: str) -> Diagnostic:
     """What people usually did where PyYAML or libyaml reports something in these words."""
 
-    def says(pattern: str) -> bool:
+    def matches(pattern: str) -> bool:
         return re.search(pattern, words) is not None
 
     here, start = place.span(place.at), place.span(place.since)
-    if says("directive|YAML document|duplicate tag"):
+    if matches("directive|YAML document|duplicate tag"):
         label, fix = "a line that starts with `%`", "remove the line"
         return _problem("a YAML directive", place.rest(place.since), label, fix)
-    if says("an? (tag|anchor|alias):|tag handle"):
+    if matches("an? (tag|anchor|alias):|tag handle"):
         return _problem(_STARTS.format(start.text), start, _MEANING, place.quoted(place.since))
-    if says("mapping keys are not allowed"):
+    if matches("mapping keys are not allowed"):
         return _problem(_STARTS.format(here.text), here, "begins a key, to YAML", place.quoted(place.at))
-    if says("mapping values are not allowed"):
+    if matches("mapping values are not allowed"):
         return _second_colon(place)
-    if says("found a tab character") or (place.char == "\t" and says("cannot start any token")):
+    if matches("found a tab character") or (place.char == "\t" and matches("cannot start any token")):
         return _problem("a tab in the indentation", here, "a tab", "indent with spaces")
-    if says("cannot start any token"):
+    if matches("cannot start any token"):
         return _problem(_STARTS.format(here.text), here, _MEANING, place.quoted(place.at))
-    if says("unexpected ':'"):
+    if matches("unexpected ':'"):
         return _problem("a `:` inside a value", here, "only a key ends with `:`", QUOTE)
-    if says("expected ',' or '[]}]'"):
-        return _unclosed(place)
-    if says("unexpected (end of stream|document indicator|document separator)"):
+    if matches("expected ',' or '[]}]'"):
+        return _unclosed_bracket(place)
+    if matches("unexpected (end of stream|document indicator|document separator)"):
         if place.text[place.since : place.since + 1] not in "\"'":
             return _problem("the file ends too early", here, "something is not finished")
         return _problem("a quote that is never closed", start, "no closing quote", "write the closing quote")
-    if says("unknown escape character|hexa?decimal number|invalid Unicode"):
+    if matches("unknown escape character|hexa?decimal number|invalid Unicode"):
         label, fix = 'in "…" a backslash starts an escape', "use '…' quotes, or no quotes"
         backslash = place.text.rfind("\\", 0, place.at + 1)
         return _problem("an unknown escape", place.span(backslash, 2), label, fix)
-    if says("could not find expected ':'"):
+    if matches("could not find expected ':'"):
         span, fix = (
             place.rest(place.since),
             "a key ends with `:`; text that continues is indented deeper than its key",
         )
         return _problem("a line that is neither a key nor a value", span, "no `:` after it", fix)
-    if says("sequence entries are not allowed"):
+    if matches("sequence entries are not allowed"):
         quoted, fix = place.quoted(place.at), "put `- …` on a line of its own"
         fix += "" if quoted == QUOTE else f"; if it is not a list, {quoted}"
         return _problem("a list on the line of its key", here, "a list starts on the next line", fix)
-    if says("expected (a )?comment or (a )?line break|chomping or indentation"):
+    if matches("expected (a )?comment or (a )?line break|chomping or indentation"):
         char = place.text[place.since : place.since + 1]
         fix = f"put the text on the next lines, indented; or {place.quoted(place.since)}"
         label = f"`{char}` starts a block on the next lines"
         return _problem(f"text after `{char}`", place.rest(place.at), label, fix)
-    if says("while parsing a block collection"):
+    if matches("while parsing a block collection"):
         return _indentation(place, "expected `- `, as far in as the items above")
-    if says("while parsing a block mapping"):
-        return _key(place)
-    if says("expected (the )?node content"):
-        return _nothing(place)
-    if says("expected '?<document start>"):
+    if matches("while parsing a block mapping"):
+        return _broken_key(place)
+    if matches("expected (the )?node content"):
+        return _missing_value(place)
+    if matches("expected '?<document start>"):
         label, fix = "not part of it", "remove it, or the line before it"
         return _problem("text after the end of the document", place.rest(place.at), label, fix)
     return _problem("not readable", here, words)
@@ -150,7 +150,7 @@ def _second_colon(place: Place) -> Diagnostic:
     return _problem("a key that cannot stand here", place.span(start, place.at - start), label, fix)
 
 
-def _key(place: Place) -> Diagnostic:
+def _broken_key(place: Place) -> Diagnostic:
     if place.before(place.at).rstrip().endswith(('"', "'")):
         label = "does not belong to the value"
         return _problem("text after a closing quote", place.rest(place.at), label, QUOTE)
@@ -165,7 +165,7 @@ def _indentation(place: Place, label: str) -> Diagnostic:
     return _problem("a line that does not line up", place.rest(place.at), label, fix, other)
 
 
-def _unclosed(place: Place) -> Diagnostic:
+def _unclosed_bracket(place: Place) -> Diagnostic:
     opener, opened = place.text[place.since : place.since + 1], place.span(place.since)
     closer = {"{": "}", "[": "]"}.get(opener, "}")
     comment = _comment(place)
@@ -203,11 +203,11 @@ def _comment(place: Place) -> int | None:
     return None
 
 
-def _nothing(place: Place) -> Diagnostic:
+def _missing_value(place: Place) -> Diagnostic:
     at = min(place.at, len(place.text.rstrip()))
     before = place.before(at)
     if "{" in before and _comment(Place(place.source, at, at - len(before))) is not None:
-        return _unclosed(Place(place.source, at, at - len(before) + before.rindex("{")))
+        return _unclosed_bracket(Place(place.source, at, at - len(before) + before.rindex("{")))
     span = place.span(place.at)
     if place.char in ("}", "]"):
         label = "nothing is open, or a value is missing"

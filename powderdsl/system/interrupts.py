@@ -100,8 +100,8 @@ def _once(handler: Handler) -> Handler:
 def _handled(handler: Handler, replaces: Callable[[Any], bool]) -> Iterator[dict[int, Any]]:
     """Handle signals in place of the handlers that are to be replaced; yields these."""
     in_main = threading.current_thread() is threading.main_thread()
-    before = {number: signal.getsignal(number) for number in SIGNALS if in_main}
-    replaced = {number: usual for number, usual in before.items() if replaces(usual)}
+    handlers = {number: signal.getsignal(number) for number in SIGNALS if in_main}
+    replaced = {number: usual for number, usual in handlers.items() if replaces(usual)}
     for number in replaced:
         signal.signal(number, handler)
     try:

@@ -25,23 +25,23 @@ class Memo:
 
     def __init__(self, versions: int = 4, things: int = 4000):
         self.versions, self.things = versions, things
-        self._kept: dict[Hashable, dict[Hashable, Any]] = {}
+        self._results: dict[Hashable, dict[Hashable, Any]] = {}
 
     def of(self, thing: Hashable, version: Hashable, make: Callable[[], T]) -> T:
         """The result for a version of a thing, which is made if it is not known. An exception is not kept."""
         # Each line below is one operation on a dict, which threads see done or not done. There is no lock, which a
         # fork could copy while another thread holds it.
-        found = self._kept.setdefault(thing, {})
-        result: T = found.pop(version, _MISSING)
+        results = self._results.setdefault(thing, {})
+        result: T = results.pop(version, _MISSING)
         if result is _MISSING:
             result = make()
-        found[version] = result
-        self._kept.pop(thing, None)
-        self._kept[thing] = found
-        for kept, limit in ((found, self.versions), (self._kept, self.things)):
-            if len(kept) > limit:
+        results[version] = result
+        self._results.pop(thing, None)
+        self._results[thing] = results
+        for table, limit in ((results, self.versions), (self._results, self.things)):
+            if len(table) > limit:
                 with suppress(StopIteration, RuntimeError):  # another thread has changed it meanwhile
-                    kept.pop(next(iter(kept)), None)
+                    table.pop(next(iter(table)), None)
         return result
 
 

@@ -16,10 +16,10 @@ START_0, START_1 = 0x243F6A88, 0x85A308D3
 
 def name_number(name: str) -> int:
     """The number under which a name enters the hash: FNV-1a, 32 bits. It is the same wherever the name stands."""
-    found = 0x811C9DC5
+    number = 0x811C9DC5
     for byte in name.encode():
-        found = (found ^ byte) * 0x01000193 & MASK
-    return found
+        number = (number ^ byte) * 0x01000193 & MASK
+    return number
 
 
 def mix(x: Any) -> Any:

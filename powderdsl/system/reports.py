@@ -43,10 +43,10 @@ def as_json(value: Any) -> str:
     """Indented JSON. A dataclass is an object: a key for each field, without the `_` that ends a field such as `from_`."""
     import json
 
-    return json.dumps(value, indent=2, ensure_ascii=False, default=_plain)
+    return json.dumps(value, indent=2, ensure_ascii=False, default=_json_value)
 
 
-def _plain(value: Any) -> Any:
+def _json_value(value: Any) -> Any:
     if is_dataclass(value):
         return {field.name.rstrip("_"): getattr(value, field.name) for field in fields(value)}
     if isinstance(value, frozenset):

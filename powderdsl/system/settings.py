@@ -145,7 +145,7 @@ def _read(kind: Any, value: Any, path: str, problems: list[str]) -> Any:
         return read_record(kind, value, problems, path)  # type: ignore[arg-type]  # it is a type, not an instance
     if kind is int and hasattr(value, "__index__") and not isinstance(value, bool):
         value = index(value)  # also of NumPy's integers
-    fits, wanted = _compared(kind, value, limits)
+    fits, wanted = _check(kind, value, limits)
     if not fits:
         problems.append(f"`{path}` must be {wanted}, found {value!r:.80}")
         return None
@@ -162,7 +162,7 @@ def _read(kind: Any, value: Any, path: str, problems: list[str]) -> Any:
     return value
 
 
-def _compared(kind: Any, value: Any, limits: Limits) -> tuple[bool, str]:
+def _check(kind: Any, value: Any, limits: Limits) -> tuple[bool, str]:
     """Whether a value is one of a type, and what such values are. Those in lists and mappings are not looked at."""
     names = getattr(kind, "_fields", ())
     low, high = (len(names), len(names)) if names else limits.length

@@ -28,8 +28,8 @@ def check_private(folder: Path) -> None:
     if not hasattr(os, "getuid"):
         return
     # A link is looked at too: whoever owns it decides where it leads.
-    for found in (folder.lstat(), folder.stat()):
-        if found.st_uid != os.getuid():
+    for status in (folder.lstat(), folder.stat()):
+        if status.st_uid != os.getuid():
             raise PermissionError(f"{folder} belongs to another user")
     if folder.stat().st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         raise PermissionError(f"others may write to {folder}: empty it, then `chmod 700` it")

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from powderdsl.arrays import plain
-from powderdsl.arrays.numbers import promoted
+from powderdsl.arrays.numbers import promote
 
 INTEGERS = tuple(f"{sign}int{bits}" for bits in (8, 16, 32, 64) for sign in ("", "u"))
 KINDS = ("bool", *INTEGERS, "float32", "float64")
@@ -262,9 +262,9 @@ def test_types_of_results() -> None:
         types = plain.dtype(a), plain.dtype(b)
         if {"i", "u"} == {one.kind for one in types} and name not in (a, b):
             with pytest.raises(TypeError, match=UNSUPPORTED):
-                promoted(*types)
+                promote(*types)
         else:
-            assert str(promoted(*types)) == name, (a, b)
+            assert str(promote(*types)) == name, (a, b)
     for kind, number in product(KINDS[1:], (True, 1, 0.5)):
         assert str((plain.zeros(2, kind) * number).dtype) == str((numpy.zeros(2, kind) * number).dtype)
         assert plain.dtype(kind) == kind

@@ -71,12 +71,12 @@ def pack_words(pack: PackDecl) -> Iterator[str]:
 # Values
 
 
-Given = tuple[str, Span, Syntax | ColorRamp]
+GivenValue = tuple[str, Span, Syntax | ColorRamp]
 """What a pack gives an element: the pack, where, the value."""
 
 
 def report_replaced(
-    what: str, element: str, lost: Given, held: Given, composition: Composition, reporter: Reporter
+    what: str, element: str, lost: GivenValue, held: GivenValue, composition: Composition, reporter: Reporter
 ) -> None:
     """Report that a pack replaces what another one gives an element: a note if it needs that pack, else a warning.
 
@@ -140,18 +140,20 @@ class AddedPacks:
             return ()
         names = self.composition.names_by_id
         elements = [names[number] for number in dict.fromkeys(ids) if number in names]
-        return tuple(given for name in elements for given in self._given(name, scope, words))
+        return tuple(cause for name in elements for cause in self._additions(name, scope, words))
 
     def _conflicts_alone(self, scope: tuple[str, ...]) -> frozenset[Span] | None:
         """Where rules of some packs alone meet; None if something else is wrong with them."""
         reporter = Reporter()
         self.check_alone(scope, reporter)
-        errors = [one for one in reporter.diagnostics if one.severity.value == "error"]
-        if any(one.code not in CODES for one in errors):
+        errors = [diagnostic for diagnostic in reporter.diagnostics if diagnostic.severity.value == "error"]
+        if any(diagnostic.code not in CODES for diagnostic in errors):
             return None
-        return frozenset(one.primary.span for one in errors if one.primary.span is not None)
+        return frozenset(
+            diagnostic.primary.span for diagnostic in errors if diagnostic.primary.span is not None
+        )
 
-    def _given(self, element: str, scope: tuple[str, ...], words: frozenset[str]) -> list[Cause]:
+    def _additions(self, element: str, scope: tuple[str, ...], words: frozenset[str]) -> list[Cause]:
         """The tags among some words that packs outside a scope give an element, else such values, else the element itself."""
         composition = self.composition
         tags: list[Cause] = []
@@ -160,14 +162,14 @@ class AddedPacks:
             pack = entry.pack
             if name != element or pack in scope or pack not in composition.names.needs:
                 continue
-            for noun, given, scalars in (
+            for noun, causes, scalars in (
                 ("tag", tags, entry.tags),
                 ("value", values, tuple(key for key, _ in entry.values)),
             ):
                 for scalar in scalars:
                     word = composition.names.of(pack, scalar.word)
                     if word.rpartition(".")[2] in words:
-                        given.append(Cause(pack, scalar.span, f"gives `{element}` the {noun} `{word}`"))
-        made = composition.elements[element]
-        brings = [] if made.pack in scope else [Cause(made.pack, made.span, f"adds `{element}`")]
-        return tags or values or brings
+                        causes.append(Cause(pack, scalar.span, f"gives `{element}` the {noun} `{word}`"))
+        owner = composition.elements[element]
+        added = [] if owner.pack in scope else [Cause(owner.pack, owner.span, f"adds `{element}`")]
+        return tags or values or added

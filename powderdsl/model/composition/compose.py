@@ -122,9 +122,9 @@ class Composition:
             known, speaker = [*author.members], ""
         else:
             known, speaker = [author], author
-            for one in self.ruleset.lineage:
-                if author in one.members:
-                    known += one.members[author].members
+            for ruleset in self.ruleset.lineage:
+                if author in ruleset.members:
+                    known += ruleset.members[author].members
                     break
         for word in words:
             pack = self.names.pack(self.names.of(speaker, word))
@@ -142,10 +142,10 @@ class Composition:
         own: list[AlsoDecl] = []
         added: list[AlsoDecl] = []
         for pack in needed_first(self.packs):
-            is_own = any(pack in one.members for one in self.ruleset.lineage)
+            is_own = any(pack in ruleset.members for ruleset in self.ruleset.lineage)
             (own if is_own else added).extend(self.packs[pack].also)
-        for one in self.ruleset.lineage:
-            own += [_waiting(decl, self.left_out) for decl in one.also]
+        for ruleset in self.ruleset.lineage:
+            own += [_waiting(decl, self.left_out) for decl in ruleset.also]
         entries: list[tuple[str, ElementDecl | AlsoDecl]] = [*self.names.declared(ElementDecl).items()]
         for decl in (*own, *added):
             entries.append((self.names.of(decl.pack, decl.name.word), decl))
@@ -231,14 +231,14 @@ def compose(
             helps=["define `elements:`, or load `core` too"],
         )  # fmt: skip
     groups = _groups(loaded, ruleset)
-    wishes = [_wishes(group, names, reporter) for group in groups]
-    natural = _ids(wishes, names, ruleset is not NO_RULESET)
-    asking = [*chain.from_iterable(wishes)]
-    ids = _ids(wishes, names, ruleset is not NO_RULESET, palette) if palette else natural
-    _report_ids(asking, ids, names, reporter, recorded=palette is not None)
+    requests = [_id_requests(group, names, reporter) for group in groups]
+    natural = _ids(requests, names, ruleset is not NO_RULESET)
+    all_requests = [*chain.from_iterable(requests)]
+    ids = _ids(requests, names, ruleset is not NO_RULESET, palette) if palette else natural
+    _report_ids(all_requests, ids, names, reporter, recorded=palette is not None)
     elements = _elements(declared, ids, reporter)
     wanted = ruleset.placing.slots or 0
-    own = max((ids.get(decl.qualified, -1) for decl in wishes[0]), default=-1) + 1 if wishes else 0
+    own = max((ids.get(decl.qualified, -1) for decl in requests[0]), default=-1) + 1 if requests else 0
     # The packs of the ruleset that declares `slots` must fit; packs loaded on top of them add slots.
     beyond = [e for e in elements.values() if 0 < wanted <= e.id and e.pack in ruleset.placed]
     if palette is None and beyond:
@@ -325,19 +325,19 @@ def _groups(packs: Mapping[str, PackDecl], ruleset: RulesetDecl) -> list[list[Pa
     return groups if groups[0] else groups[1:]
 
 
-def _wishes(group: Sequence[PackDecl], names: Names, reporter: Reporter) -> list[ElementDecl]:
+def _id_requests(group: Sequence[PackDecl], names: Names, reporter: Reporter) -> list[ElementDecl]:
     """The elements of some packs in the order in which ids are decided: elements that ask for an id come first.
 
     An element that overrides another one asks for the same id unless it says another one, with a warning. Elements of
     packs that are left out keep their ids reserved.
     """
-    wishes: list[ElementDecl] = []
+    requests: list[ElementDecl] = []
     others: list[ElementDecl] = []
     for decl in chain.from_iterable(pack.elements for pack in group):
         versions = names.versions.get(names.known.get(decl.qualified, ""), [decl])
         if versions[-1] is not decl or (decl.override and decl.qualified not in names.known):
             continue
-        asking = [one for one in versions if one.id]
+        asking = [decl_ for decl_ in versions if decl_.id]
         for new, old in pairwise(asking):
             if new.number != old.number:
                 reporter.report(
@@ -346,10 +346,10 @@ def _wishes(group: Sequence[PackDecl], names: Names, reporter: Reporter) -> list
                     helps=["leave out `id`: an element that overrides another keeps its id"],
                 )  # fmt: skip
         if asking:
-            wishes.append(replace(versions[0], id=asking[0].id))
+            requests.append(replace(versions[0], id=asking[0].id))
         else:
             others.append(versions[0])
-    return wishes + others
+    return requests + others
 
 
 def _ids(
@@ -368,7 +368,9 @@ def _ids(
     for place, group in enumerate(groups):
         for decl in group:
             versions = names.versions.get(names.known.get(decl.qualified, ""), [decl])
-            number = next((recorded[one.qualified] for one in versions if one.qualified in recorded), None)
+            number = next(
+                (recorded[version.qualified] for version in versions if version.qualified in recorded), None
+            )
             if number is None and free:
                 number = decl.number
                 if number not in free or 0 < len(palette) <= number:
@@ -382,10 +384,15 @@ def _ids(
 
 
 def _report_ids(
-    wishes: Sequence[ElementDecl], ids: Mapping[str, int], names: Names, reporter: Reporter, *, recorded: bool
+    requests: Sequence[ElementDecl],
+    ids: Mapping[str, int],
+    names: Names,
+    reporter: Reporter,
+    *,
+    recorded: bool,
 ) -> None:
     """Report elements without an id, two elements of one pack with the same id, and ids that differ from the file."""
-    loaded = [decl for decl in wishes if decl.qualified in names.known]
+    loaded = [decl for decl in requests if decl.qualified in names.known]
     for decl in loaded:
         if decl.qualified not in ids:
             label = f"the limit is {MAX_ELEMENTS}"
@@ -466,13 +473,15 @@ def _add_entries(composition: Composition, reporter: Reporter) -> None:
         element = elements.get(name)
         if isinstance(entry, AlsoDecl) and element is None:
             report_unknown("element", entry.name, elements, reporter)
-        given = set()
+        known_tags = set()
         for scalar in entry.tags:
             tag = composition.names.of(entry.pack, scalar.word)
             if tag in tags:
-                given.add(tag)
+                known_tags.add(tag)
             else:
                 more = "; to make a tag, declare it under `tags:`"
                 report_unknown("tag", scalar, tags, reporter, more=more)
         if element is not None:
-            elements[name] = replace(element, color=entry.color or element.color, tags=element.tags | given)
+            elements[name] = replace(
+                element, color=entry.color or element.color, tags=element.tags | known_tags
+            )

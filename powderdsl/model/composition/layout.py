@@ -42,7 +42,7 @@ def lay_out(
                 parts[2 * group + 1] += known[name]
     written = composition.ruleset.placing.matrix
     if written:
-        own = [_written(scalar, known, composition, reporter) for scalar in written]
+        own = [_named_channels(scalar, known, composition, reporter) for scalar in written]
         shown = [parts[0] if channels is None else channels for channels in own]
         # A ruleset that shows no elements shows none of further packs either.
         parts = [*shown, *parts[2:]] if None in own else shown
@@ -67,7 +67,7 @@ def _blocks(composition: Composition, passes: tuple[Pass, ...]) -> list[list[str
     return blocks
 
 
-def _written(
+def _named_channels(
     scalar: Scalar, known: Channels, composition: Composition, reporter: Reporter
 ) -> list[MatrixChannel] | None:
     """The channels that a name under `matrix:` stands for: of a field, a property or a component, plain or qualified.
@@ -80,7 +80,7 @@ def _written(
     base, _, part = word.rpartition(".")
     name, component = (base, part) if part in COMPONENTS and base else (word, "")
     name = composition.names.known.get(name, name)
-    channels = [one for one in known.get(name, ()) if not component or one.part == component]
+    channels = [channel for channel in known.get(name, ()) if not component or channel.part == component]
     if not channels and not scalar.is_optional and composition.left_out.isdisjoint(word.split(".")):
         helps = suggest(word.partition(".")[0], ["elements", *known], "channels")
         reporter.error(

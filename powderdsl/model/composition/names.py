@@ -283,12 +283,12 @@ def report_misspelled(
             known.update(field.name.text for field in decl.scratch)
             for block in decl.walk():
                 known.update(name.text for name, _ in block.lets)
-    asked: dict[str, dict[Span, None]] = {}
+    unknown: dict[str, dict[Span, None]] = {}
     for word, span in _optional_names((*packs, ruleset)):
         if word not in known:
-            asked.setdefault(word, {})[span] = None
-    others = elsewhere() if asked else {}
-    for word, places in asked.items():
+            unknown.setdefault(word, {})[span] = None
+    others = elsewhere() if unknown else {}
+    for word, places in unknown.items():
         meant = None if word in others else _meant(word, (*sorted(known), *others))
         if meant is None:
             continue

@@ -168,25 +168,25 @@ def negation(value: Expr, span: Span | None = None) -> Expr:
     return value.args[0] if value.op == "not" else Expr("not", FLAG, (value,), span=span)
 
 
-def _folded(op: str, neutral: Expr, absorbing: Expr, values: list[Expr], span: Span | None = None) -> Expr:
+def _fold(op: str, neutral: Expr, absorbing: Expr, values: list[Expr], span: Span | None = None) -> Expr:
     if absorbing in values:
         return absorbing
-    kept = [value for value in values if value != neutral]
-    return _joined(op, kept, span) if kept else neutral
+    others = [value for value in values if value != neutral]
+    return _join(op, others, span) if others else neutral
 
 
-conjunction = partial(_folded, "and", TRUE, FALSE)
+conjunction = partial(_fold, "and", TRUE, FALSE)
 """All of some conditions, constants folded."""
 
-disjunction = partial(_folded, "or", FALSE, TRUE)
+disjunction = partial(_fold, "or", FALSE, TRUE)
 """Any of some conditions, constants folded."""
 
 
-def _joined(op: str, values: list[Expr], span: Span | None) -> Expr:
+def _join(op: str, values: list[Expr], span: Span | None) -> Expr:
     """All values under one operation, pair by pair from the left; long lists as a balanced tree."""
     if len(values) > MAX_CHAIN:
         middle = len(values) // 2
-        halves = (_joined(op, values[:middle], span), _joined(op, values[middle:], span))
+        halves = (_join(op, values[:middle], span), _join(op, values[middle:], span))
         return Expr(op, FLAG, halves, span=span)
     result = values[0]
     for value in values[1:]:
@@ -194,7 +194,7 @@ def _joined(op: str, values: list[Expr], span: Span | None) -> Expr:
     return result
 
 
-Placed = tuple[Expr, Span]
+PlacedValue = tuple[Expr, Span]
 """A value and where it stands."""
 
 MAX_MODULUS = 64
@@ -220,7 +220,7 @@ def whole(
     raise typer.fail("PD405", message, syntax.span, label or f"expected {lo} to {hi}", *helps)
 
 
-def arithmetic(typer: Typer, op: str, values: Sequence[Placed], span: Span) -> Expr:
+def arithmetic(typer: Typer, op: str, values: Sequence[PlacedValue], span: Span) -> Expr:
     """An operation on numbers: constants are folded, integers stay integers, all else becomes floats.
 
     An integer added to a draw, or subtracted from it, shifts its range.
@@ -250,7 +250,7 @@ _COMPARABLE = {
 """Kinds that are compared with their own kind only: in words, and what to write instead."""
 
 
-def compare(typer: Typer, sign: str, left: Placed, right: Placed, span: Span) -> Expr:
+def compare(typer: Typer, sign: str, left: PlacedValue, right: PlacedValue, span: Span) -> Expr:
     """A comparison as `eq`, `lt` or `le`, maybe negated."""
     if sign == "!=":
         return negation(compare(typer, "==", left, right, span), span)
@@ -278,7 +278,7 @@ def compare(typer: Typer, sign: str, left: Placed, right: Placed, span: Span) ->
     return Expr(op, FLAG, (typer.of_kind(a, kind, span), typer.of_kind(b, kind, span)), span=span)
 
 
-def _compare_discrete(typer: Typer, op: str, left: Placed, right: Placed, span: Span) -> Expr:
+def _compare_discrete(typer: Typer, op: str, left: PlacedValue, right: PlacedValue, span: Span) -> Expr:
     for (value, _), (other, place) in ((left, right), (right, left)):
         if value.kind in _COMPARABLE:
             words, fix = _COMPARABLE[value.kind]
@@ -292,7 +292,7 @@ def _compare_discrete(typer: Typer, op: str, left: Placed, right: Placed, span: 
     raise typer.fail("PD401", "vectors are not compared", span, "one side is a vector", fix)
 
 
-def _compare_draw(typer: Typer, op: str, left: Placed, right: Placed, span: Span) -> Expr:
+def _compare_draw(typer: Typer, op: str, left: PlacedValue, right: PlacedValue, span: Span) -> Expr:
     if op == "eq":
         message, fix = "a draw never equals anything exactly", "compare with `<` or `>`"
         raise typer.fail("PD401", message, span, "always false", fix)
@@ -351,8 +351,8 @@ def holds(typer: Typer, left: Operand, right: Operand, syntax: Syntax) -> Expr:
         case SetOf(), SetOf() if left.name is not None:
             return TRUE if left.ids[0] in right.ids else FALSE
         case (Expr() | Place() | PlaceChoice(), Place() | PlaceChoice()) | (_, Expr(kind=Kind("direction"))):
-            one, other = typer.of_kind(left, DIRECTION, first), typer.of_kind(right, DIRECTION, second)
-            return compare(typer, "==", (one, span), (other, span), span)
+            direction, other = typer.of_kind(left, DIRECTION, first), typer.of_kind(right, DIRECTION, second)
+            return compare(typer, "==", (direction, span), (other, span), span)
         case _, Bounds():
             value = (typer.value(left, first), span)
             low, high = (number(right.lo), span), (number(right.hi), span)
@@ -396,7 +396,7 @@ def calculation(typer: Typer, syntax: Syntax, scope: Scope, modulus: int = 0) ->
     `a div b` divides integers, rounded down; 0 where b is 0.
     """
     op, span = syntax.kind, syntax.span
-    values: list[Placed] = []
+    values: list[PlacedValue] = []
     for child in syntax.children:
         value = _coordinate_sum(typer, child, modulus, scope) if modulus else typer.value_of(child, scope)
         if value.kind in _COMPARABLE:
@@ -419,7 +419,7 @@ def calculation(typer: Typer, syntax: Syntax, scope: Scope, modulus: int = 0) ->
     return result
 
 
-def _on_vectors(typer: Typer, op: str, values: Sequence[Placed], span: Span) -> Expr:
+def _on_vectors(typer: Typer, op: str, values: Sequence[PlacedValue], span: Span) -> Expr:
     vectors = [value.kind.name == "vec2" for value, _ in values]
     if op in ("add", "sub") and not all(vectors):
         message, fix = "a vector adds up with vectors only", "write `vector(rows, columns)`"
@@ -516,11 +516,11 @@ def call(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
         return CALLS[name](typer, syntax, scope)
     operands = [(typer.evaluate(child, scope), child.span) for child in syntax.children]
     if function.meaning:
-        return _meant(typer, function, operands, syntax.span)
-    return _applied(typer, function, operands, syntax.span)
+        return _expand(typer, function, operands, syntax.span)
+    return _apply(typer, function, operands, syntax.span)
 
 
-def _applied(typer: Typer, function: Operation, operands: list[tuple[Operand, Span]], span: Span) -> Operand:
+def _apply(typer: Typer, function: Operation, operands: list[tuple[Operand, Span]], span: Span) -> Operand:
     """An operation on arguments of the kinds that it takes."""
     if NUMBER in function.takes:
         values = [(typer.value(*operand), operand[1]) for operand in operands]
@@ -547,17 +547,17 @@ def _meaning(function: Operation) -> Syntax:
     return syntax
 
 
-def _meant(
+def _expand(
     typer: Typer, function: Operation, operands: Sequence[tuple[Operand, Span]], span: Span
 ) -> Operand:
     """What a call stands for. Mistakes are shown at the arguments, or at the call."""
-    given = dict(zip(function.parameters, operands, strict=True))
+    arguments = dict(zip(function.parameters, operands, strict=True))
 
     def placed(node: Syntax) -> Syntax:
-        place = given[node.text][1] if node.text in given else span
+        place = arguments[node.text][1] if node.text in arguments else span
         return replace(node, children=tuple(map(placed, node.children)), span=place)
 
-    names = {name: operand for name, (operand, _) in given.items()}
+    names = {name: operand for name, (operand, _) in arguments.items()}
     result = typer.evaluate(placed(_meaning(function)), Scope("", names))
     # An argument that the meaning repeats is copied, which doubles from call to call.
     typer.spend(sum(1 for _ in result.walk()) if isinstance(result, Expr) else 1, span)
@@ -569,10 +569,10 @@ def _meant(
 
 def _kernel(typer: Typer, syntax: Syntax, scope: Scope) -> Kernel | None:
     """The kernel that stands after `in`, if it is one."""
-    found = typer.find(syntax.text, syntax.span, scope) if syntax.kind == "name" else None
-    if found is None and syntax.text in KERNEL_SHAPES:
-        found = typer.evaluate(syntax, scope)
-    return found if isinstance(found, Kernel) else None
+    operand = typer.find(syntax.text, syntax.span, scope) if syntax.kind == "name" else None
+    if operand is None and syntax.text in KERNEL_SHAPES:
+        operand = typer.evaluate(syntax, scope)
+    return operand if isinstance(operand, Kernel) else None
 
 
 def _shaped(typer: Typer, syntax: Syntax, scope: Scope) -> Kernel:
@@ -631,7 +631,7 @@ def _at(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
 _QUARTERS = {"clockwise": 1, "opposite": 2, "counterclockwise": 3}
 
 
-def _turned(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
+def _turn(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
     """A neighbor or a direction turned clockwise; a mirrored copy of a rule turns it the other way."""
     (child,) = syntax.children
     operand = typer.evaluate(child, scope)
@@ -671,7 +671,7 @@ def _pick(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
 CALLS: dict[str, Call] = {
     **dict.fromkeys(("count", "sum"), _neighborhood),
     "at": _at,
-    **dict.fromkeys(_QUARTERS, _turned),
+    **dict.fromkeys(_QUARTERS, _turn),
     "pick": _pick,
 }
 """Functions whose arguments need more than to be of a kind."""

@@ -146,8 +146,8 @@ def clamped(default: Value, kind: Kind) -> Value:
 
 
 def clamped_number(value: float | Fraction, kind: Kind) -> float:
-    kept = min(max(float(value), kind.lo), kind.hi)
-    return kept if abs(kept) >= SNAP else 0.0
+    number = min(max(float(value), kind.lo), kind.hi)
+    return number if abs(number) >= SNAP else 0.0
 
 
 # Unknown names

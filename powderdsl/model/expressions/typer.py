@@ -220,8 +220,8 @@ class Typer:
                 return Poisoned()  # one value of the wrong kind is one mistake, however often it is used
             self._misused.add((operand.span, wanted))
             secondary = (Label(operand.span, "its value, set here"),)
-        found = describe(operand)
-        message, label = f"expected {wanted}, found {found}", f"this is {found}"
+        description = describe(operand)
+        message, label = f"expected {wanted}, found {description}", f"this is {description}"
         return self.fail("PD401", message, span, label, *helps, secondary=secondary)
 
     def flag(self, operand: Operand, span: Span) -> Expr:
@@ -355,9 +355,9 @@ class Typer:
 
     def lookup(self, name: str, span: Span, scope: Scope, *, after_dot: bool = False) -> Operand:
         """The operand of a name. An unknown one is reported once, with all its places, by `report_unknown_names`."""
-        found = self.find(name, span, scope)
-        if found is not None:
-            return found
+        operand = self.find(name, span, scope)
+        if operand is not None:
+            return operand
         if self.symbols.is_declared(name, scope.pack):
             raise Poisoned  # what is wrong with its declaration has been reported
         self.unknown.setdefault((name, after_dot), {})[span] = scope.locals
@@ -389,8 +389,8 @@ class Typer:
     def is_new(self, name: Scalar | Syntax, scope: Scope) -> bool:
         """Whether a local name is new; reports one that hides another which its pack knows."""
         names, word = self.symbols.names, name.text
-        found = scope.locals.get(word) or self.find(word, name.span, Scope(scope.pack, {}))
-        if found is None or (
+        other = scope.locals.get(word) or self.find(word, name.span, Scope(scope.pack, {}))
+        if other is None or (
             word not in scope.locals and not names.knows(scope.pack, names.of(scope.pack, word))
         ):
             return True
@@ -405,7 +405,9 @@ class Typer:
 
     def resolve_set(self, name: str, span: Span) -> Operand:
         if name in self.resolving:
-            path = " -> ".join(f"`{one}`" for one in [*self.resolving[self.resolving.index(name) :], name])
+            path = " -> ".join(
+                f"`{set_name}`" for set_name in [*self.resolving[self.resolving.index(name) :], name]
+            )
             message = f"the set `{name}` is defined by itself"
             raise self.fail("PD307", message, span, path, "list elements or tags")
         if len(self.resolving) >= MAX_SET_DEPTH:
@@ -458,11 +460,11 @@ class Typer:
         return self.lookup(word, span, scope)
 
     def optional_name(self, syntax: Syntax, scope: Scope) -> Operand:
-        found = self.find(syntax.text, syntax.span, scope)
-        if found is None:
+        operand = self.find(syntax.text, syntax.span, scope)
+        if operand is None:
             self.absent.add(syntax.text)
             return Absent(syntax.text)
-        return found
+        return operand
 
     def attribute(self, syntax: Syntax, scope: Scope) -> Operand:
         """``place.name``, ``vector.row``, ``pack.name`` or ``place.pack.name``: what one pack defines has its name with it."""
@@ -509,8 +511,8 @@ class Typer:
 
         Elements, tags and numbers have nothing after a dot: `salt.salt` is the element of the pack `salt`.
         """
-        found = self.find(word.text, word.span, Scope("", scope.locals, scope.orientation))
-        return word.text in scope.locals or isinstance(found, Place) or kind_name(found) == "vec2"
+        operand = self.find(word.text, word.span, Scope("", scope.locals, scope.orientation))
+        return word.text in scope.locals or isinstance(operand, Place) or kind_name(operand) == "vec2"
 
     def optional_attribute(self, syntax: Syntax, scope: Scope) -> Operand:
         """``pack.name?``, ``below.name?``: absent unless a loaded pack defines it."""
@@ -526,8 +528,8 @@ class Typer:
         span = syntax.span
         if self._global_name(syntax) is None:
             if before.kind in ("name", "attribute"):
-                found = self.find(before.text, before.span, scope)
-                if found is None or isinstance(found, SetOf):  # a pack that has an element of its name
+                operand = self.find(before.text, before.span, scope)
+                if operand is None or isinstance(operand, SetOf):  # a pack that has an element of its name
                     raise Unresolved(f"{before.text}.{syntax.text}")
             if self.find(syntax.text, span, scope) is None:
                 raise Unresolved(syntax.text)
@@ -610,7 +612,9 @@ class Typer:
         rounds = prod(len(domain) for domain in domains.values())
         if rounds > MAX_ROUNDS:
             raise self._too_long(rounds, bindings[0].span.to(bindings[-1].span), f"{MAX_ROUNDS:,}")
-        return [scope.bind(**dict(zip(domains, one, strict=True))) for one in product(*domains.values())]
+        return [
+            scope.bind(**dict(zip(domains, values, strict=True))) for values in product(*domains.values())
+        ]
 
     def _too_long(self, rounds: int, span: Span, limit: str) -> Poisoned:
         label, fix = f"the limit is {limit}", "loop over fewer things"

@@ -86,10 +86,10 @@ class Conflict:
         if len(labels) > 1:
             more = "1 more copy" if len(labels) == 2 else f"{len(labels) - 1} more copies"
             notes.append(f"the same in {more} of the rule that its loop or symmetry makes")
-        one = self.first == self.second
+        is_same = self.first == self.second
         reporter.error(
-            self.code, self.message + where, self.second, "two of these can overlap" if one else "claims it too",
-            secondary=[] if one else [Label(self.first, "claims a cell")], notes=notes, helps=self.helps,
+            self.code, self.message + where, self.second, "two of these can overlap" if is_same else "claims it too",
+            secondary=[] if is_same else [Label(self.first, "claims a cell")], notes=notes, helps=self.helps,
         )  # fmt: skip
 
     def report_added(
@@ -126,7 +126,7 @@ def _claim(rule: Rule) -> Span:
     return Span(span.source, span.start, span.start + rest.start()) if rest and rest.start() else span
 
 
-Found = dict[Conflict, tuple[dict[Offset, int], list[tuple[int, int]]]]
+Conflicts = dict[Conflict, tuple[dict[Offset, int], list[tuple[int, int]]]]
 """Conflicts with an example of each, and where they were met: passes and substeps by number."""
 
 
@@ -148,9 +148,9 @@ def check_logic(
     fires: Answers[Span] = Answers()
     useful: Answers[Span] = Answers()
     silent: dict[Span, list[tuple[Expr, Lets]]] = {}
-    conflicts: Found = {}
+    conflicts: Conflicts = {}
     lists: list[tuple[int, Pass]] = []
-    asked = replace(facts, budget=Budget(COMPARISONS))
+    limited = replace(facts, budget=Budget(COMPARISONS))
     for at, pass_ in enumerate(passes):
         earlier: Lets = {}
         for number, moment in enumerate(pass_.moments):
@@ -171,9 +171,9 @@ def check_logic(
                     live.append(rule)
             if moment.policy == "prove":
                 lists.append((len(live), pass_))
-                for conflict, elements in _check_substep(live, asked, lets):
+                for conflict, elements in _check_substep(live, limited, lets):
                     conflicts.setdefault(conflict, (elements, []))[1].append((at, number))
-    if asked.budget.left < 0:
+    if limited.budget.left < 0:
         count, longest = max(lists, key=lambda rules: rules[0])
         message = f"comparing the rules of `{longest.name}` with each other takes too much work"
         label = f"{count:,} rules in one list are {count * (count + 1) // 2:,} pairs"
@@ -216,11 +216,11 @@ def _report_silent(
 
 
 def _report_conflicts(
-    found: Found, passes: tuple[Pass, ...], facts: Facts, added: AddedPacks | None, reporter: Reporter
+    conflicts: Conflicts, passes: tuple[Pass, ...], facts: Facts, added: AddedPacks | None, reporter: Reporter
 ) -> tuple[Pass, ...]:
     """Report conflicts; the passes with those resolved that added packs bring about."""
     resolved: set[tuple[int, int]] = set()
-    for conflict, (elements, places) in found.items():
+    for conflict, (elements, places) in conflicts.items():
         words = _in_words(facts, elements)
         pass_, moments = passes[places[0][0]], [passes[at].moments[number] for at, number in places]
         causes = (
@@ -267,21 +267,21 @@ def _check_substep(
         elif rule.op == ":=":
             writes.append((rule, rule.mask))
     for claims in (movers, writes, effects):
-        yield from _meetings(claims, facts, lets)
+        yield from _conflicts_of(claims, facts, lets)
 
 
-def _meetings(
+def _conflicts_of(
     rules: Sequence[tuple[Rule, Expr]], facts: Facts, lets: Lets
 ) -> Iterator[tuple[Conflict, dict[Offset, int]]]:
     """For each rule, given with its condition, the first one, maybe itself, with which it may claim one cell."""
-    asked = list(_asked((mask for _, mask in rules), facts, lets))
+    domains = list(_domains((mask for _, mask in rules), facts, lets))
     for i, (second, mask) in enumerate(rules):
         undecided = None
         pairs = (
             (rules[j][0], ((rules[j][1], HERE), (mask, at)))
             for j in (i, *range(i))
             for at in _claims(rules[j][0], second)
-            if not _are_apart(asked[j], asked[i], at, facts.budget)
+            if not _are_apart(domains[j], domains[i], at, facts.budget)
         )
         for first, question in pairs:
             if facts.budget.left < 0:
@@ -309,10 +309,10 @@ _PLACES = {(0, 0): "here", (-1, 0): "above", (1, 0): "below", (0, -1): "on the l
 
 def _in_words(facts: Facts, elements: dict[Offset, int]) -> str:
     """An example of elements where two rules meet, such as `x` here and `y` below."""
-    found = [(at, facts.names[number]) for at, number in sorted(elements.items()) if number in facts.names]
-    if not found or len(elements) > 4:
+    names = [(at, facts.names[number]) for at, number in sorted(elements.items()) if number in facts.names]
+    if not names or len(elements) > 4:
         return ""
-    *places, last = [f"`{name}` {_PLACES.get(at) or f'at({at[0]}, {at[1]})'}" for at, name in found]
+    *places, last = [f"`{name}` {_PLACES.get(at) or f'at({at[0]}, {at[1]})'}" for at, name in names]
     return "for example with " + " and ".join(filter(None, [", ".join(places), last]))
 
 
@@ -364,8 +364,8 @@ def _conflict(first: Rule, second: Rule) -> Conflict:
 
 def _parity(conflict: Conflict, question: Conditions, facts: Facts, lets: Lets) -> Conflict:
     """The conflict with the fix for rules that alternate by row or column: worlds without a seam keep them apart."""
-    asked = [*(condition for condition, _ in question), *lets.values()]
-    nodes = [node for one in asked for node in one.walk()]
+    exprs = [*(condition for condition, _ in question), *lets.values()]
+    nodes = [node for expr in exprs for node in expr.walk()]
     moduli = [node.value[1] for node in nodes if node.op == "coordinate" and node.value[0] != "step"]
     multiple = lcm(facts.side_multiple, *moduli)
     if multiple in (1, facts.side_multiple) or multiple > MAX_SIDE_MULTIPLE:
@@ -378,21 +378,21 @@ def _parity(conflict: Conflict, question: Conditions, facts: Facts, lets: Lets) 
     return replace(conflict, notes=(*conflict.notes, note), helps=(fix, *conflict.helps[1:]))
 
 
-Asked = dict[tuple[int, Offset], frozenset[object]]
+Domains = dict[tuple[int, Offset], frozenset[object]]
 """What a condition leaves of single variables, each with a number and its place: elements, fields and counts."""
 
 
-def _asked(masks: Iterable[Expr], facts: Facts, lets: Lets) -> Iterator[Asked]:
+def _domains(masks: Iterable[Expr], facts: Facts, lets: Lets) -> Iterator[Domains]:
     numbers: dict[tuple[str, object], int] = {}
     for mask in masks:
-        asked = alone(facts, mask, lets)
+        domains = alone(facts, mask, lets)
         yield {
             (numbers.setdefault((what, name), len(numbers)), at): values
-            for (what, name, at), values in asked.items()
+            for (what, name, at), values in domains.items()
         }
 
 
-def _are_apart(first: Asked, second: Asked, at: Offset, budget: Budget) -> bool:
+def _are_apart(first: Domains, second: Domains, at: Offset, budget: Budget) -> bool:
     """Whether some variable cannot be as the first condition and, `at` away from it, the second ask for."""
     budget.left -= GLANCE
     for (number, place), values in second.items():
@@ -407,16 +407,16 @@ def lasting(lets: Lets) -> Lets:
 
     Each is itself, as something unknown, and the condition on coordinates that follows from it.
     """
-    found: Lets = {}
+    lasting_lets: Lets = {}
     follow: Lets = {}
     for name, value in lets.items():
         if value.kind != FLAG:
             continue
-        asked = _follows(value, follow)
-        if asked != TRUE and sum(1 for _ in islice(asked.walk(), MAX_PARTS + 1)) <= MAX_PARTS:
-            follow[name] = asked
-            found[name] = conjunction([Expr("let", FLAG, value=f"{name} before"), asked])
-    return found
+        condition = _follows(value, follow)
+        if condition != TRUE and sum(1 for _ in islice(condition.walk(), MAX_PARTS + 1)) <= MAX_PARTS:
+            follow[name] = condition
+            lasting_lets[name] = conjunction([Expr("let", FLAG, value=f"{name} before"), condition])
+    return lasting_lets
 
 
 def _follows(expr: Expr, follow: Lets) -> Expr:

@@ -65,13 +65,17 @@ def report_needless(
     Returns:
         The rules and writes that may have no effect, which takes too much work to decide.
     """
-    silent = [one.primary.span for one in reporter.diagnostics if one.code in SILENT and one.primary.span]
+    silent = [
+        diagnostic.primary.span
+        for diagnostic in reporter.diagnostics
+        if diagnostic.code in SILENT and diagnostic.primary.span
+    ]
     _report_decided(passes, silent, reporter)
-    undecided = _report_overruled(passes, _quick(facts), silent, reporter)
-    return undecided + _report_lost_writes(passes, fields, _quick(facts), silent, reporter)
+    undecided = _report_overruled(passes, _limited(facts), silent, reporter)
+    return undecided + _report_lost_writes(passes, fields, _limited(facts), silent, reporter)
 
 
-def _quick(facts: Facts) -> Facts:
+def _limited(facts: Facts) -> Facts:
     return replace(facts, budget=Budget(BUDGET, BUDGET // 4))
 
 
@@ -194,14 +198,14 @@ def report_undrawn(
     Returns:
         The chances that perhaps no rule draws, which takes too much work to decide.
     """
-    quick = _quick(facts)
+    quick = _limited(facts)
     undecided = []
     shown = {channel.source for channel in ruleset.matrix}
     for name, number, span in given:
         prop = facts.properties[name]
         if prop.kind != CHANCE or name in shown or prop.values[number] == 0:
             continue
-        drawn = some(_drawn(name, number, ruleset, quick))
+        drawn = some(_may_draw(name, number, ruleset, quick))
         if drawn is None:
             undecided.append(span)
         elif not drawn:
@@ -213,7 +217,7 @@ def report_undrawn(
     return undecided
 
 
-def _drawn(name: str, number: int, ruleset: Ruleset, facts: Facts) -> Iterator[bool | None]:
+def _may_draw(name: str, number: int, ruleset: Ruleset, facts: Facts) -> Iterator[bool | None]:
     """For each rule that reads the property: may it happen where this element stands?"""
     for pass_ in ruleset.passes:
         everywhere = {let.name: let.value for moment in pass_.moments for let in moment.lets}
@@ -283,7 +287,7 @@ def _arrives(write: Assign, rule: Rule, ids: tuple[int, ...], moment: Moment, fa
     elif brought is not None and not (isinstance(rule, Move) and write.offset == HERE):
         landing = [(rule.mask, brought)]
     else:  # other rules may bring something there, also to the place that a move leaves
-        landing = [(one.mask, what) for one in moment.rules for what in _brings(one).values()]
+        landing = [(other.mask, what) for other in moment.rules for what in _brings(other).values()]
         landing += [stays] if brought is None else []
     return some(
         decide(facts, [(mask, HERE), (member(what, ids), HERE)], moment.values) for mask, what in landing
@@ -374,9 +378,9 @@ def _report_unwritten(composition: Composition, reporter: Reporter) -> None:
         if name not in words and field.name.text not in words:
             _unused("field", name, field.span, reporter)
     for block in (
-        block for pack in composition.packs.values() for one in pack.passes for block in one.walk()
+        block for pack in composition.packs.values() for pass_ in pack.passes for block in pass_.walk()
     ):
-        inner = [line for one in block.walk() if one is not block for line in one.lines]
+        inner = [line for pass_ in block.walk() if pass_ is not block for line in pass_.lines]
         later = {word for line in (*block.lines[len(block.lets) :], *inner) for word in words_of(line)}
         for scalar, value in reversed(block.lets):
             if scalar.text not in later:
@@ -396,18 +400,18 @@ def overridden_ids(passes: tuple[Pass, ...], names: Sequence[str], facts: Facts)
     for _, moment in substeps(passes):
         for rule in moment.rules:
             writes += [(write, moment.values) for write in writes_of(rule) if write.field in names]
-    found: dict[str, frozenset[int]] = {}
+    ids_of: dict[str, frozenset[int]] = {}
     more: dict[str, frozenset[int]] = {name: frozenset() for name in names}
-    while more != found:
-        found = more.copy()
-        stored = {name: replace(facts.properties[name], stored=ids) for name, ids in found.items()}
+    while more != ids_of:
+        ids_of = more.copy()
+        stored = {name: replace(facts.properties[name], stored=ids) for name, ids in ids_of.items()}
         now = replace(facts, properties={**facts.properties, **stored})
         for write, lets in writes:
             for number in facts.ids:
                 question = (member(ELEMENT_HERE, (number,)), write.offset), (write.mask, HERE)
                 if number not in more[write.field] and satisfiable(now, question, lets):
                     more[write.field] |= {number}
-    return found
+    return ids_of
 
 
 def without_dead_overrides(passes: tuple[Pass, ...], dead: frozenset[str]) -> tuple[Pass, ...]:
@@ -426,10 +430,10 @@ def without_dead_overrides(passes: tuple[Pass, ...], dead: frozenset[str]) -> tu
 
 def produced_ids(passes: tuple[Pass, ...], facts: Facts) -> frozenset[int]:
     """The ids that some rule may bring about."""
-    found: set[int] = set()
+    ids: set[int] = set()
     for _, moment in substeps(passes):
         for rule in moment.rules:
             match rule:
-                case Transform(target=made) | Move(leaving=Expr() as made):
-                    found |= {made.value} if made.op == "const" else set(facts.ids)
-    return frozenset(found)
+                case Transform(target=target) | Move(leaving=Expr() as target):
+                    ids |= {target.value} if target.op == "const" else set(facts.ids)
+    return frozenset(ids)

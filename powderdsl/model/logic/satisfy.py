@@ -266,7 +266,7 @@ class _Search:
                 return _Term("const", node)
             case "look":
                 return self._term(node.args[0], plus(at, node.value))
-            case "let" if node.value in self.lets and (opened := self._open(node, at)):
+            case "let" if node.value in self.lets and (opened := self._open_let(node, at)):
                 return opened
             case "element":
                 return self._variable(node, "element", None, at)
@@ -312,7 +312,7 @@ class _Search:
                     cuts.update(float(number) % 1 for number in numbers)
         return _Term(node.op, node, tuple(dict.fromkeys([key for arg in args for key in arg.keys])), args)
 
-    def _open(self, let: Expr, at: Offset) -> _Term | None:
+    def _open_let(self, let: Expr, at: Offset) -> _Term | None:
         """The value of a let at a place, if it is not too large."""
         if (let.value, at) not in self._opened:
             before = self.budget.left
@@ -340,19 +340,19 @@ class _Search:
             case "const":
                 return node.value, node.value
             case "property":
-                found = [about.values[element] for element in values if element not in about.stored]
-                if len(found) < len(values):
-                    found += own[0], own[-1]
-                return min(found), max(found)
+                numbers = [about.values[element] for element in values if element not in about.stored]
+                if len(numbers) < len(values):
+                    numbers += own[0], own[-1]
+                return min(numbers), max(numbers)
             case "field":
                 elements, default = about
-                found = [] if elements.isdisjoint(values) else [own[0], own[-1]]
+                numbers = [] if elements.isdisjoint(values) else [own[0], own[-1]]
                 if not elements.issuperset(values):
-                    found.append(default)
-                return min(found), max(found)
+                    numbers.append(default)
+                return min(numbers), max(numbers)
             case "coordinate":
-                found = [(side + about) % node.value[1] for side in values]
-                return min(found), max(found)
+                numbers = [(side + about) % node.value[1] for side in values]
+                return min(numbers), max(numbers)
         if args:
             row, bounds = OPERATIONS[op], list(map(self._bounds, args))
             assert row.evaluate is not None

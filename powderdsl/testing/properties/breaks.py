@@ -8,7 +8,7 @@ from itertools import pairwise
 from operator import or_
 from random import Random
 
-from powderdsl.analysis.ledger import AGAINST
+from powderdsl.analysis.ledger import TREND_BREAKS
 from powderdsl.arrays import np
 from powderdsl.model import reference
 from powderdsl.model.state import slots
@@ -108,7 +108,7 @@ def look(claim: Tested, ruleset: Ruleset, sample: Start, states: list[State]) ->
             held = sorted(claim.ids)
             return _breaks_of([np.isin(old, held) & (old != new) for old, new in pairwise(ids)])
         case Total():
-            wrong, masks = AGAINST[claim.trend], []
+            wrong, masks = TREND_BREAKS[claim.trend], []
             for old, new in pairwise(values.astype(np.int64) for values in evaluated(claim.value)):
                 masks.append(wrong((new - old).sum((1, 2)), 0)[:, None, None] & wrong(new, old))
             return _breaks_of(masks)
