@@ -13,7 +13,7 @@ import re
 import subprocess
 import sys
 import tokenize
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -25,6 +25,9 @@ from tests.layers import LAYERS, THIRD_PARTIES
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "powderdsl"
+MAP = ROOT / "docs" / "architecture.md"
+MADE_FOLDERS = ("web/made", "web/parts")
+"""Folders that `make web` and `make wheel` write, and git ignores."""
 MAX_LINES = 800
 LINE_BUDGET = 53_500
 """Lines of Python that powderdsl/ may have."""
@@ -195,6 +198,28 @@ def path_faults(markdown: str, exists: Callable[[str], bool]) -> Iterator[str]:
 def path_exists(name: str) -> bool:
     """Whether a path or a glob exists, seen from the repository, the package or docs/."""
     return any(any(start.glob(name.strip("/"))) for start in (ROOT, PACKAGE, ROOT / "docs"))
+
+
+# --- the map
+
+
+def folders_on_map(markdown: str) -> dict[str, str]:
+    """The rows of the table of folders: the folder in the first column, and what the second says."""
+    return dict(re.findall(r"^\| `(\w+)/` \| (.*) \|$", markdown, re.MULTILINE))
+
+
+def on_map(folder: str, rows: Mapping[str, str]) -> bool:
+    """True if a folder has a row, or is named in the row of the folder that it is in."""
+    return folder in rows or f"`{folder}/`" in rows.get(folder.partition("/")[0], "")
+
+
+def later_imports(folders: Sequence[str]) -> Iterator[str]:
+    """Rows of LAYERS that may import from a folder further down the table than their own."""
+    for row, allowed in LAYERS.items():
+        own = row.partition(".")[0]
+        for other in dict.fromkeys(name.partition(".")[0] for name in allowed):
+            if own in folders and other in folders and folders.index(other) > folders.index(own):
+                yield f"{row} imports {other}"
 
 
 # --- words of the rules
@@ -395,13 +420,47 @@ def test_tests_and_native_code_stay_short() -> None:
         expect_none(size_faults(path.name, path.read_text(encoding="utf-8")))
 
 
-def test_architecture_names_paths_that_exist() -> None:
-    page = ROOT / "docs" / "architecture.md"
-    assert page.exists(), "docs/architecture.md is missing"
-    text = page.read_text(encoding="utf-8")
+@pytest.mark.parametrize("name", ["architecture.md", "compiler.md"])
+def test_pages_about_the_code_name_paths_that_exist(name: str) -> None:
+    text = (ROOT / "docs" / name).read_text(encoding="utf-8")
     expect_none(path_faults(text, path_exists))
     # Seen from nowhere, every one of its paths is missing: so the page does name some.
     assert len(list(path_faults(text, lambda _: False))) >= 10
+
+
+def test_the_map_is_short() -> None:
+    assert len(MAP.read_text(encoding="utf-8").split()) <= 1_500, f"move details out of {MAP.name}"
+
+
+def test_the_map_has_every_folder() -> None:
+    rows = folders_on_map(MAP.read_text(encoding="utf-8"))
+    files = (path for kind in ("py", "md", "js") for path in PACKAGE.rglob(f"*.{kind}"))
+    folders = {path.parent.relative_to(PACKAGE).as_posix() for path in files} - {"."}
+    expect_none(
+        f"{folder}/ is not on the map"
+        for folder in sorted(folders)
+        if not folder.startswith(MADE_FOLDERS) and not on_map(folder, rows)
+    )
+
+
+def test_the_map_has_the_layers_in_order() -> None:
+    text = MAP.read_text(encoding="utf-8")
+    rows = folders_on_map(text)
+    later = list(later_imports(list(rows)))
+    assert later == ["analysis.costs imports ir"], (
+        "the map says which module imports from a folder below its own"
+    )
+    assert "exception is `analysis/costs.py`" in text
+
+
+def test_the_map_can_fail() -> None:
+    rows = folders_on_map("| `ir/` | stages |\n| `model/` | rules; `model/logic/` |\n")
+    assert list(rows) == ["ir", "model"]
+    assert [folder for folder in ("ir", "model/logic", "model/text", "web") if not on_map(folder, rows)] == [
+        "model/text",
+        "web",
+    ]
+    assert "ir.lower imports model" in later_imports(["ir", "model"])
 
 
 def test_paths_can_fail() -> None:

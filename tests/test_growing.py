@@ -1,4 +1,4 @@
-"""What docs/architecture.md promises of new operations: rows written into a copy of the sources, which backends run."""
+"""What docs/compiler.md promises of new operations: rows written into a copy of the sources, which backends run."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Targets: each prints a program as code and runs it. How to add one: docs/architecture.md, "Adding a target"."""
+"""Targets: each prints a program as code and runs it. How to add one: docs/compiler.md, "A target"."""
