@@ -165,23 +165,23 @@ def settings_of(config: type, *, only: Sequence[str] = ()) -> Option:
 
     The settings themselves report values out of range, all mistakes together. `only`: names of fields; unless given, all.
     """
-    return several(*(_setting(one) for one in fields(config) if not only or one.name in only))
+    return several(*(_setting(field) for field in fields(config) if not only or field.name in only))
 
 
-def _setting(one: Field[Any]) -> Option:
-    about = one.metadata.get("about")
+def _setting(field: Field[Any]) -> Option:
+    about = field.metadata.get("about")
     if not about:
         return several()
-    name = one.metadata["option"] or one.name.replace("_", "-")
-    limits = one.metadata["limits"]
+    name = field.metadata["option"] or field.name.replace("_", "-")
+    limits = field.metadata["limits"]
     kind: Any = name.upper()
     if limits.choices:
         kind = limits.choices
-    elif isinstance(one.default, int):
+    elif isinstance(field.default, int):
         kind = COUNT
-    elif isinstance(one.default, float):
+    elif isinstance(field.default, float):
         kind = float
-    return option(f"--{name}", kind, about, to=one.name, multiple=isinstance(one.default, tuple))
+    return option(f"--{name}", kind, about, to=field.name, multiple=isinstance(field.default, tuple))
 
 
 def given(values: Mapping[str, Any], names: Iterable[str]) -> dict[str, Any]:
@@ -212,16 +212,16 @@ class ManyWords(click.Command):
     MANY = ("--packs", "--held-out", "--only")
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        found: list[str] = []
+        words: list[str] = []
         option, first = "", False
         for word in args:
             if word.startswith("-"):
                 option, first = word if word in self.MANY else "", True
-                found.append(word)
+                words.append(word)
             else:
-                found += [word] if first or not option else [option, word]
+                words += [word] if first or not option else [option, word]
                 first = False
-        return super().parse_args(ctx, found)
+        return super().parse_args(ctx, words)
 
 
 def _places(ctx: click.Context, param: click.Parameter, words: tuple[str, ...]) -> tuple[str, ...]:
@@ -249,7 +249,7 @@ def backend(default: str | None, about: str = "Backend that runs the rules.") ->
 def load_rules(rules: str, settings: dict[str, str]) -> Ruleset:
     """The checked model of RULES with `--set` values. The number of warnings is printed on stderr."""
     ruleset, remarks = load_with_diagnostics(rules, params=settings)
-    warnings = sum(one.severity is Severity.WARNING for one in remarks)
+    warnings = sum(remark.severity is Severity.WARNING for remark in remarks)
     if warnings:
         click.echo(f"{counted(warnings, 'warning')}: powderdsl check {rules}", err=True)
     return ruleset

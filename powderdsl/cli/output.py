@@ -30,7 +30,9 @@ def write_diagnostics(diagnostics: Iterable[Diagnostic], stream: IO[str]) -> Non
     from powderdsl.diagnostics.render import render_text
 
     color = color_wanted(stream)
-    write_styled(stream, "\n\n".join(render_text(one, color=color) for one in diagnostics) + "\n")
+    write_styled(
+        stream, "\n\n".join(render_text(diagnostic, color=color) for diagnostic in diagnostics) + "\n"
+    )
 
 
 def print_json(value: Any) -> None:

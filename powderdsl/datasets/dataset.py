@@ -137,7 +137,7 @@ class Dataset:
         Raises:
             CompileError: PD630, one for each shard that is damaged.
         """
-        found: list[Diagnostic] = []
+        errors: list[Diagnostic] = []
         for number, row in enumerate(self.manifest.shards):
             self._shards.pop(number, None)
             try:
@@ -147,9 +147,9 @@ class Dataset:
                         f"the shard {self.folder / row.file} is damaged", "it has ids that its palette lacks"
                     )
             except CompileError as error:
-                found.extend(error.diagnostics)
-        if found:
-            raise CompileError(found)
+                errors.extend(error.diagnostics)
+        if errors:
+            raise CompileError(errors)
 
     def episode(self, number: int) -> Episode:
         """One episode. Raises IndexError."""
@@ -185,9 +185,9 @@ class Dataset:
             for name, of in stored.items()
         }
         number, place = episode // self.recipe.shard, episode % self.recipe.shard
-        for one in np.unique(number).tolist():
-            rows = np.flatnonzero(number == one)
-            shard = self._shard(one)
+        for shard_number in np.unique(number).tolist():
+            rows = np.flatnonzero(number == shard_number)
+            shard = self._shard(shard_number)
             at = (shard.starts[place[rows]] + first[rows])[:, None] + np.arange(length)
             shown = at + place[rows][:, None]  # each episode before has one observation more than actions
             for name, of in stored.items():
@@ -198,7 +198,7 @@ class Dataset:
     def lengths_and_worlds(self) -> tuple[Array, Array]:
         """The number of actions and the world of every episode: int64 [episodes] each. Reads little of each shard."""
         parts = [read_episodes(self.folder, self.recipe, row) for row in self.manifest.shards]
-        length, world = (np.concatenate(one).astype(np.int64) for one in zip(*parts, strict=True))
+        length, world = (np.concatenate(part).astype(np.int64) for part in zip(*parts, strict=True))
         return length, world
 
     def _shard(self, number: int) -> Shard:
@@ -245,7 +245,7 @@ class Transitions(torch.utils.data.Dataset[Batch]):
         for one in self.datasets[1:]:
             one.require_equal(self.datasets[0].recipe, MEANING, self.datasets[0].folder)
         if length is not None:
-            check_count("length", length, max(one.recipe.actions for one in self.datasets))
+            check_count("length", length, max(dataset.recipe.actions for dataset in self.datasets))
         self.length = length
         parts = []
         for number, one in enumerate(self.datasets):
@@ -278,8 +278,8 @@ class Transitions(torch.utils.data.Dataset[Batch]):
 
     def __getitems__(self, numbers: Sequence[int]) -> list[Batch]:
         """Several transitions, read together. `DataLoader` calls it for each minibatch."""
-        found = self._batch(_integers(numbers))
-        return [Batch(*row) for row in zip(*(value.unbind() for value in found), strict=True)]
+        batch = self._batch(_integers(numbers))
+        return [Batch(*row) for row in zip(*(value.unbind() for value in batch), strict=True)]
 
     def _batch(self, numbers: Array) -> Batch:
         count = len(self)
@@ -349,10 +349,10 @@ def drawn(seed: int, number: int, count: int, below: int) -> Array:
 
 def _integers(numbers: Any) -> Array:
     """A sequence of integers as an array, int64 [n]. Raises TypeError for other values, masks among them."""
-    found = np.asarray(numbers)
-    if found.ndim != 1 or (len(found) and found.dtype.kind not in "iu"):
-        raise TypeError(f"transitions are numbered by integers, found {found.dtype} {list(found.shape)}")
-    return found.astype(np.int64)
+    array = np.asarray(numbers)
+    if array.ndim != 1 or (len(array) and array.dtype.kind not in "iu"):
+        raise TypeError(f"transitions are numbered by integers, found {array.dtype} {list(array.shape)}")
+    return array.astype(np.int64)
 
 
 def split(
@@ -373,7 +373,11 @@ def split(
     """
     check_choice("by", by, UNITS)
     check_count("seed", seed, (1 << 62) - 1, least=0)
-    if not fractions or not all(one > 0 for one in fractions) or not math.isclose(sum(fractions), 1):
+    if (
+        not fractions
+        or not all(fraction > 0 for fraction in fractions)
+        or not math.isclose(sum(fractions), 1)
+    ):
         raise ValueError(f"fractions must be positive and sum to 1, found {list(fractions)}")
     episodes = rows.episodes
     numbers = torch.from_numpy(np.zeros_like(episodes.number) if by == "world" else episodes.number + 1)

@@ -31,9 +31,13 @@ def flat(dataset: Dataset, layout: str = "d4rl") -> dict[str, NDArray[Any]]:
 
 
 def _episode(dataset: Dataset, number: int, layout: str) -> dict[str, NDArray[Any]]:
-    one = dataset.episode(number)
-    shown, action, reward = one.observation.numpy(), one.action.numpy().astype(np.int32), one.reward.numpy()
-    terminated, truncated = one.terminated.numpy(), one.truncated.numpy()
+    episode = dataset.episode(number)
+    shown, action, reward = (
+        episode.observation.numpy(),
+        episode.action.numpy().astype(np.int32),
+        episode.reward.numpy(),
+    )
+    terminated, truncated = episode.terminated.numpy(), episode.truncated.numpy()
     if layout == "d4rl":
         return {
             "observations": shown[:-1],

@@ -181,10 +181,10 @@ def check_place(folder: Path) -> None:
         if folder.exists() or not folder.parent.is_dir():
             raise failure("PD613", f"cannot write {folder}", notes=(reason,))
         return
-    found = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
-    if found and FILE not in found:
+    names = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
+    if names and FILE not in names:
         raise damaged(
-            f"{folder} is not a dataset", f"it holds {found[0]} and no {FILE}", "take an empty folder"
+            f"{folder} is not a dataset", f"it holds {names[0]} and no {FILE}", "take an empty folder"
         )
 
 
@@ -207,7 +207,10 @@ def reported(message: str, *helps: str) -> Iterator[None]:
 def many_damaged(path: Path, problems: list[str]) -> CompileError:
     """PD630, one for each problem, 20 at most."""
     return CompileError(
-        [Diagnostic("PD630", f"{path} is damaged", Label(None), notes=(one,)) for one in problems[:20]]
+        [
+            Diagnostic("PD630", f"{path} is damaged", Label(None), notes=(problem,))
+            for problem in problems[:20]
+        ]
     )
 
 
@@ -260,7 +263,7 @@ def recipe_of(
         compress=compress,
         observation=env.observation.kind,
         channels=tuple(env.observation.channels),
-        shape=tuple(int(one) for one in env.observation.space.shape),
+        shape=tuple(int(side) for side in env.observation.space.shape),
         palette={str(element.id): element.qualified for element in ruleset.elements},
         action_nvec=env.program.action_nvec,  # data have all five numbers, whatever form the environment takes
         choices=choice_names(task),
@@ -290,23 +293,25 @@ def episode_bytes(recipe: Recipe) -> int:
 
 def _misfits(recipe: Recipe, shards: Sequence[ShardRow]) -> list[str]:
     """Contradictions between the values of a recipe, and with the rows of shards."""
-    found, numbers = [], set()
+    problems, numbers = [], set()
     if len(recipe.channels) != recipe.shape[0]:
-        found.append(f"{len(recipe.channels)} channels, but observations of the shape {list(recipe.shape)}")
+        problems.append(
+            f"{len(recipe.channels)} channels, but observations of the shape {list(recipe.shape)}"
+        )
     if len(recipe.choices) != recipe.action_nvec[2]:
-        found.append(
+        problems.append(
             f"{len(recipe.choices)} choices, but {recipe.action_nvec[2]} values of an action for them"
         )
     if recipe.shards > MAX_SHARDS:
-        found.append(f"{recipe.shards:,} shards, more than {MAX_SHARDS:,}")
+        problems.append(f"{recipe.shards:,} shards, more than {MAX_SHARDS:,}")
     for place, row in enumerate(shards):
         count = len(recipe.episodes_of(row.number))
         unpacked = (row.transitions + count) * prod(recipe.shape)
         if row.number in numbers or row.number >= recipe.shards:
-            found.append(f"`shards[{place}]`: there is no shard {row.number}, or it comes twice")
+            problems.append(f"`shards[{place}]`: there is no shard {row.number}, or it comes twice")
         elif not count <= row.transitions <= count * recipe.actions:
-            found.append(f"`shards[{place}]`: {count} episodes cannot have {row.transitions} transitions")
+            problems.append(f"`shards[{place}]`: {count} episodes cannot have {row.transitions} transitions")
         elif unpacked > MAX_SHARD_BYTES:
-            found.append(f"`shards[{place}]`: {unpacked:,} bytes, more than {MAX_SHARD_BYTES:,}")
+            problems.append(f"`shards[{place}]`: {unpacked:,} bytes, more than {MAX_SHARD_BYTES:,}")
         numbers.add(row.number)
-    return found
+    return problems

@@ -121,18 +121,18 @@ def _buffers(dataset: Dataset) -> Iterator[Any]:
     from minari.data_collector.episode_buffer import EpisodeBuffer
 
     for number in range(len(dataset)):
-        one = dataset.episode(number)
+        episode = dataset.episode(number)
         yield EpisodeBuffer(
             id=number,
-            seed=one.world,
-            observations=one.observation.numpy(),
-            actions=one.action.numpy().astype(np.int64),
-            rewards=one.reward.numpy(),
-            terminations=one.terminated.numpy(),
-            truncations=one.truncated.numpy(),
+            seed=episode.world,
+            observations=episode.observation.numpy(),
+            actions=episode.action.numpy().astype(np.int64),
+            rewards=episode.reward.numpy(),
+            terminations=episode.terminated.numpy(),
+            truncations=episode.truncated.numpy(),
             infos={
-                "success": np.append(False, one.success.numpy()),
-                "world": np.full(len(one.action) + 1, one.world),
+                "success": np.append(False, episode.success.numpy()),
+                "world": np.full(len(episode.action) + 1, episode.world),
             },
         )
 

@@ -126,9 +126,9 @@ def read_episodes(folder: Path, recipe: Recipe, row: ShardRow) -> tuple[Array, A
     """
     path = folder / row.file
     with _damage(path):
-        found = _read(path, shapes(recipe, row.number, row.transitions), only=("length", "world")).arrays
-        _check_lengths(found["length"].astype(np.int64), recipe, row.transitions)
-    return found["length"], found["world"]
+        arrays = _read(path, shapes(recipe, row.number, row.transitions), only=("length", "world")).arrays
+        _check_lengths(arrays["length"].astype(np.int64), recipe, row.transitions)
+    return arrays["length"], arrays["world"]
 
 
 def _damage(path: Path) -> AbstractContextManager[None]:

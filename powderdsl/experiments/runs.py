@@ -337,7 +337,7 @@ def find_run(text: str | Path | RunFolder, kind: str | None = None) -> RunFolder
     if not folder.exists() and folder.name == str(text) and kept.is_dir():
         if (kept / text / ABOUT).exists():
             return read_run(kept / text, kind)
-        names = sorted(one.parent.name for one in kept.glob(f"*/{ABOUT}"))
+        names = sorted(about.parent.name for about in kept.glob(f"*/{ABOUT}"))
         raise no_run(folder, "there is no such folder", suggest(str(text), names, "runs"))
     return read_run(folder, kind)
 

@@ -133,16 +133,16 @@ def collect(
 
 def _write(program: LevelProgram, path: Path, recipe: Recipe, report: Callable[[float], None]) -> None:
     about, parts = path.with_suffix(".json"), path.with_suffix(".parts")
-    found = read_json(about)
-    if found is not None and found != asdict(recipe):
+    written = read_json(about)
+    if written is not None and written != asdict(recipe):
         given = asdict(recipe)
-        changed = next((key for key in given if found.get(key) != given[key]), "form")
+        changed = next((key for key in given if written.get(key) != given[key]), "form")
         changed = {"count": "number of episodes", "rows": "number of rows"}.get(changed, changed)
         raise ValueError(
             f"{path} was collected with another {changed}: choose another folder, or remove it and {about.name}"
         )
     if path.exists():
-        if found is None:
+        if written is None:
             raise ValueError(f"{path} is there already, and {about.name} is not: choose another folder")
         report(recipe.count)
         return
@@ -204,13 +204,13 @@ def _played(program: LevelProgram, recipe: Recipe, numbers: Numbers) -> Frames:
 def rows_of(program: LevelProgram, frames: Frames, actions: NDArray[np.int16], rows: int) -> Frames:
     """Observations before each action of episodes: uint8 [n, rows, H, W, 6]."""
     level = program.level
-    found = np.zeros((len(frames), rows, level.side, level.side, 6), dtype=np.uint8)
+    frame_rows = np.zeros((len(frames), rows, level.side, level.side, 6), dtype=np.uint8)
     paints: Array = program.paints.cpu().numpy()
     chosen = paints[actions[:, :, 0]]
     first = actions[:, :, 1, None].astype(np.int64) * level.grid
     columns = np.tile(np.arange(level.side), level.side)
     inside = (columns >= first) & (columns < first + level.brush)
-    pixels = found.reshape(len(frames), rows, -1, 6)
+    pixels = frame_rows.reshape(len(frames), rows, -1, 6)
     pictures = frames.reshape(len(frames), frames.shape[1], -1, 3)
     for stage in range(3):
         at = pixels[:, stage::3]
@@ -221,7 +221,7 @@ def rows_of(program: LevelProgram, frames: Frames, actions: NDArray[np.int16], r
                 at[..., 3 + channel] = chosen[:, :count, None, channel]
             elif stage == 2:
                 at[..., 3 + channel] = inside[:, :count] * chosen[:, :count, None, channel]
-    return found
+    return frame_rows
 
 
 def _read_part(file: Path, recipe: Recipe, level: Level, count: int) -> Frames | None:
@@ -243,12 +243,12 @@ def play(level: Level, seed: int, episodes: Numbers, count: int) -> NDArray[np.i
     rows = np.repeat(episodes, count), np.tile(np.arange(count), len(episodes))
     drawn = keyed((np.full(len(rows[0]), seed), *rows), "ogbench play", 4).reshape(len(episodes), count, 4)
     choices = np.array([level.choices(stage) for stage in range(3)])
-    found = (drawn[:, :, 1:] * choices).astype(np.int16)
+    actions = (drawn[:, :, 1:] * choices).astype(np.int16)
     for number, episode in enumerate(episodes):
         script = scripted(level, seed, int(episode))
         for at in np.flatnonzero(drawn[number, :, 0] >= RANDOM):
-            found[number, at] = next(script)
-    return found
+            actions[number, at] = next(script)
+    return actions
 
 
 def scripted(level: Level, seed: int, episode: int) -> Iterator[tuple[int, int, int]]:
@@ -265,14 +265,14 @@ def scripted(level: Level, seed: int, episode: int) -> Iterator[tuple[int, int, 
 
 def _fill(places: int, drawn: list[float]) -> list[Place]:
     """All places, row by row; mirrored in x, in y, and with x and y exchanged, each with probability ½."""
-    mirror_x, mirror_y, exchange = (one < 0.5 for one in drawn[:3])
+    mirror_x, mirror_y, exchange = (number < 0.5 for number in drawn[:3])
     last = places - 1
-    found = [
+    corners = [
         (last - x if mirror_x else x, last - y if mirror_y else y)
         for y in range(places)
         for x in range(places)
     ]
-    return [(y, x) for x, y in found] if exchange else found
+    return [(y, x) for x, y in corners] if exchange else corners
 
 
 def _line(places: int, drawn: list[float]) -> list[Place]:
@@ -284,7 +284,7 @@ def _line(places: int, drawn: list[float]) -> list[Place]:
 def _square(places: int, drawn: list[float]) -> list[Place]:
     """The four sides of a square in any order, each in either direction; corners belong to two sides."""
     length = 1 + int(drawn[0] * (places - 1))
-    left, top = (int(one * (places - length)) for one in drawn[1:3])
+    left, top = (int(number * (places - length)) for number in drawn[1:3])
     right, bottom = left + length, top + length
     sides = [
         [(x, top) for x in range(left, right + 1)],
@@ -292,7 +292,7 @@ def _square(places: int, drawn: list[float]) -> list[Place]:
         [(left, y) for y in range(top, bottom + 1)],
         [(right, y) for y in range(top, bottom + 1)],
     ]
-    turned = [side[::-1] if one < 0.5 else side for side, one in zip(sides, drawn[3:7], strict=True)]
+    turned = [side[::-1] if number < 0.5 else side for side, number in zip(sides, drawn[3:7], strict=True)]
     return [place for at in np.argsort(drawn[7:11], kind="stable") for place in turned[at]]
 
 

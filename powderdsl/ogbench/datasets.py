@@ -70,15 +70,15 @@ def make_env_and_datasets(
     train = Path(dataset_dir).expanduser() / f"{dataset_name}.npz"
     if dataset_path is not None:
         train = Path(dataset_path).expanduser()
-    found = []
+    datasets = []
     for path in (train, train.with_name(f"{train.stem}-val.npz")):
         if not path.is_file():
             raise FileNotFoundError(
                 f"{path} does not exist, and nothing is downloaded. To collect it: "
                 f"powderdsl ogbench {level} --out {path.parent}"
             )
-        found.append(load_dataset(path, np.uint8, np.int32, compact_dataset=compact_dataset))
-    return (found[0], found[1]) if dataset_only else (env, found[0], found[1])
+        datasets.append(load_dataset(path, np.uint8, np.int32, compact_dataset=compact_dataset))
+    return (datasets[0], datasets[1]) if dataset_only else (env, datasets[0], datasets[1])
 
 
 def load_dataset(

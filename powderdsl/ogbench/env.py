@@ -186,7 +186,7 @@ class PowderworldEnv(_Face, gymnasium.Env[Array, Any], EzPickle):
         at = self.episodes
         key = (at.seeds, at.episode.clip(0), at.elapsed)
         drawn = [float(keyed(key, f"{what} sample", 1)[0, 0]) for what in FIRST]
-        element, x, y = (int(one * self.level.choices(stage)) for stage, one in enumerate(drawn))
+        element, x, y = (int(number * self.level.choices(stage)) for stage, number in enumerate(drawn))
         return self.level.elements[element], x, y
 
     def semantic_action_to_action(self, elem_name: str, x: int, y: int) -> int:

@@ -61,7 +61,7 @@ class LevelProgram:
         self.level = level
         if as_ogbench:
             ruleset = load(level.rounded)
-            ruleset = replace(ruleset, streams=tuple(replace(one, bits=32) for one in ruleset.streams))
+            ruleset = replace(ruleset, streams=tuple(replace(stream, bits=32) for stream in ruleset.streams))
             self.simulator: Simulator = _WithoutSnap(ruleset, device)
         else:
             ruleset = load(level.rules)
@@ -118,16 +118,16 @@ class LevelProgram:
         for axis in (1, 2):
             for by in (1, -1):
                 matched |= ids.roll(by, axis) == goals
-        found: Numbers = (~matched).sum((1, 2)).cpu().numpy()
-        return found
+        counts: Numbers = (~matched).sum((1, 2)).cpu().numpy()
+        return counts
 
 
 def _number(ruleset: Ruleset, name: str) -> int:
-    found = ruleset.element(name)
-    if found is None:
+    element = ruleset.element(name)
+    if element is None:
         helps = suggest(name, [one.name for one in ruleset.elements], "elements")
         raise ValueError("; ".join([f"no element {name!r} in {ruleset.name}", *helps]))
-    return found.id
+    return element.id
 
 
 MODES = ("task", "data_collection")
@@ -197,11 +197,11 @@ class LegacyDraws(Draws):
         self._states[which] = np.random.RandomState(seed & MASK)
 
     def integers(self, which: Numbers, what: str, episode: Numbers, time: Numbers, count: int) -> Numbers:
-        return np.array([self._states[one].randint(count) for one in which], dtype=np.int64)
+        return np.array([self._states[number].randint(count) for number in which], dtype=np.int64)
 
     def planes(self, which: Numbers) -> NDArray[np.float64]:
         shape = (self._streams, self._side, self._side)
-        drawn = np.stack([self._states[one].rand(*shape) for one in which], 1)
+        drawn = np.stack([self._states[number].rand(*shape) for number in which], 1)
         # In single precision, as the engine has them; what rounds to 1 stays below.
         single = drawn.astype(np.float32).astype(np.float64)
         return np.minimum(single, np.nextafter(1.0, 0.0))
@@ -397,7 +397,8 @@ class Episodes:
         """Write channels 3 to 5: what has been chosen of the action that is being given."""
         level, device = self.level, self.program.device
         stage, element, x = (
-            torch.from_numpy(one).to(device) for one in (self.stage, self._chosen[:, 0], self._chosen[:, 1])
+            torch.from_numpy(array).to(device)
+            for array in (self.stage, self._chosen[:, 0], self._chosen[:, 1])
         )
         first = (x * level.grid)[:, None]
         inside = (self._columns >= first) & (self._columns < first + level.brush)

@@ -99,7 +99,7 @@ class Level:
 
     def numbers(self, task: GoalTask) -> list[tuple[int, int, int]]:
         """A task's actions as (index of the element, x, y). Raises ValueError for what the level does not have."""
-        found = []
+        triples = []
         for at, (element, x, y) in enumerate(task.actions):
             if element not in self.elements:
                 helps = "; ".join(suggest(element, self.elements, "elements here"))
@@ -109,8 +109,8 @@ class Level:
                 raise ValueError(
                     f"action {at} of `{task.name}`: the place ({x}, {y}) is not within 0..{most}"
                 )
-            found.append((self.elements.index(element), x, y))
-        return found
+            triples.append((self.elements.index(element), x, y))
+        return triples
 
 
 def shipped_levels() -> list[str]:
@@ -147,5 +147,5 @@ def read_level(path: Path) -> Level:
 
 def read_task(info: Any) -> GoalTask:
     """The task of ``options["task_info"]``. Raises ValueError."""
-    found = checked_record(TaskInfo, info, "task_info")
-    return GoalTask(found.task_name, found.tol, found.action_seq)
+    record = checked_record(TaskInfo, info, "task_info")
+    return GoalTask(record.task_name, record.tol, record.action_seq)

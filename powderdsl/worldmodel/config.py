@@ -116,7 +116,7 @@ class TrainConfig(Checked):
     @staticmethod
     def of(values: Mapping[str, Any]) -> TrainConfig:
         """The configuration in a run's JSON, without its palette and what is no setting. Raises ValueError."""
-        names = {one.name for one in fields(TrainConfig)} - {"palette"}
+        names = {field.name for field in fields(TrainConfig)} - {"palette"}
         return checked_record(TrainConfig, {name: values[name] for name in values if name in names})
 
 

@@ -50,12 +50,12 @@ class Tested:
 
     def mean(self, predictor: str) -> float:
         """The mean of the worlds' losses, each counted once."""
-        return sum(one[predictor].loss for one in self.scores.values()) / len(self.scores)
+        return sum(scores[predictor].loss for scores in self.scores.values()) / len(self.scores)
 
     def plain(self) -> dict[str, Any]:
         """For JSON."""
         names = list(next(iter(self.scores.values())))
-        total = {name: reduce(add, [one[name] for one in self.scores.values()]) for name in names}
+        total = {name: reduce(add, [scores[name] for scores in self.scores.values()]) for name in names}
         return {
             "rules": self.rules,
             "task": self.task,
@@ -64,7 +64,9 @@ class Tested:
             "worlds_each": self.worlds,
             "iterations": self.trained.checkpoint.step,
             "mean": {name: {**total[name].plain(), "loss": self.mean(name)} for name in names},
-            "tests": {test: {name: one[name].plain() for name in names} for test, one in self.scores.items()},
+            "tests": {
+                test: {name: scores[name].plain() for name in names} for test, scores in self.scores.items()
+            },
             "elements": elements_of(total[MODEL], self.trained.palette),
             "reliability": total[MODEL].reliability(),
             "left_out": {name: list(lacking) for name, lacking in self.missing.items()},
@@ -122,7 +124,7 @@ def evaluate_recording(trained: Trained, recording: Recording, *, machine: Machi
         raise does_not_fit(trained.run.path, "it learned from worlds, without actions")
     check_slots(trained.run.path, trained.palette, recording.rules)
     seen, shown = (
-        {name: getattr(one, name) for name in ("channels", "steps", "speed")} for one in (known, here)
+        {name: getattr(meaning, name) for name in ("channels", "steps", "speed")} for meaning in (known, here)
     )
     if why := differences(seen, shown):
         raise does_not_fit(trained.run.path, *why)
@@ -138,7 +140,9 @@ def evaluate_recording(trained: Trained, recording: Recording, *, machine: Machi
         split=recording.dataset.recipe.split,
         only=(),
         worlds=sum(len(ends) for _, ends in pairs),
-        scores={"transitions": {name: score(one, pairs, slots) for name, one in predictors.items()}},
+        scores={
+            "transitions": {name: score(predictor, pairs, slots) for name, predictor in predictors.items()}
+        },
         missing={},
         trained=trained,
     )
@@ -238,22 +242,22 @@ def strips(predict: Network, worlds: TaskWorlds, *, step: int, times: int = 1, a
 @torch.no_grad()
 def recorded_strips(predict: Network, recording: Recording, count: int = 8) -> list[Strip]:
     """Strips of transitions of test worlds, evenly spread."""
-    found: list[Strip] = []
+    strips: list[Strip] = []
     for inputs, ends in recording.spread(recording.parts[2], count):
         predicted = predict(inputs).argmax(1).to(torch.uint8)
         for three in zip(inputs[:, 0], ends, predicted, strict=True):
-            found.append(Strip(f"transition {len(found) + 1}", *(ids.cpu().numpy() for ids in three)))
-    return found
+            strips.append(Strip(f"transition {len(strips) + 1}", *(ids.cpu().numpy() for ids in three)))
+    return strips
 
 
-def sheet(found: list[Strip], rules: Ruleset, *, factor: int = 2) -> NDArray[np.uint8]:
+def sheet(strips: list[Strip], rules: Ruleset, *, factor: int = 2) -> NDArray[np.uint8]:
     """Strips one below the other, uint8 [H', W', 3]: start, truth, prediction, error. A cell has `factor`² pixels.
 
     Colors do not follow fields here: networks predict elements alone.
     """
     colors = palette(rules.elements)
     pictures = []
-    for strip in found:
+    for strip in strips:
         pictures += [rgb(ids, colors) for ids in (strip.start, strip.truth, strip.predicted)]
         pictures.append(
             np.where(strip.wrong[..., None], *(np.array(color, dtype=np.uint8) for color in (WRONG, RIGHT)))

@@ -71,9 +71,9 @@ class ActionChannels:
 
 def without_actions(inputs: Tensor) -> Tensor:
     """Inputs in which nothing was done: uint8 [B, C + 3, H, W]."""
-    found = inputs.clone()
-    found[:, -3], found[:, -2:] = NO_ELEMENT, 0
-    return found
+    blanked = inputs.clone()
+    blanked[:, -3], blanked[:, -2:] = NO_ELEMENT, 0
+    return blanked
 
 
 class Encoded(nn.Module):
@@ -198,14 +198,14 @@ class CustomNetwork:
         expected = [2, encoder.slots, *size]
         with torch.random.fork_rng(devices=[]), _told(self.name, "cannot be trained"):
             logits: Any = network(inputs)
-            found = (
+            shape = (
                 f"{list(logits.shape)} of {logits.dtype}"
                 if isinstance(logits, Tensor)
                 else type(logits).__name__
             )
-            if not (found.startswith(str(expected)) and logits.is_floating_point()):
+            if not (shape.startswith(str(expected)) and logits.is_floating_point()):
                 given = [2, encoder.channels, *size]
-                raise ValueError(f"it must give logits {expected}, found {found}, for channels {given}")
+                raise ValueError(f"it must give logits {expected}, found {shape}, for channels {given}")
             weights = [weight for weight in network.parameters() if weight.requires_grad]
             if logits.requires_grad and weights:
                 F.cross_entropy(logits.float(), torch.zeros(2, *size, dtype=torch.int64)).backward()

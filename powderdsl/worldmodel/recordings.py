@@ -90,9 +90,9 @@ class Recording:
 
     def pairs(self, rows: Transitions, numbers: Tensor, device: str | torch.device = "cpu") -> Pairs:
         """Inputs and next ids, uint8 [B, C + 3, H, W] and [B, H, W], of transitions by number, int64 [B]."""
-        found = rows[numbers]
-        inputs = torch.cat([found.observation, self.painted(found.action)], 1)
-        return inputs.to(device), found.next_observation[:, 0].to(device)
+        transitions = rows[numbers]
+        inputs = torch.cat([transitions.observation, self.painted(transitions.action)], 1)
+        return inputs.to(device), transitions.next_observation[:, 0].to(device)
 
     def painted(self, actions: Tensor) -> Tensor:
         """What actions, integers [B, 5], do to each cell: uint8 [B, 3, H, W]."""
@@ -146,18 +146,18 @@ def open_recording(folder: str | Path, task: str | None = None) -> Recording:
     ids = {int(number): element for number, element in recipe.palette.items()}
     palette = tuple(ids.get(number) for number in range(max(ids) + 1))
     params = changed_params(recipe, load_task(name))
-    found = load_task(name, knobs=recipe.knobs, params=params, palette=palette)
-    notes = _differences(recipe, found)
+    played = load_task(name, knobs=recipe.knobs, params=params, palette=palette)
+    notes = _differences(recipe, played)
     if notes:
-        raise failure("PD631", f"{folder} does not fit the task {found.name}", notes=notes)
-    return Recording(dataset, name, found, palette)
+        raise failure("PD631", f"{folder} does not fit the task {played.name}", notes=notes)
+    return Recording(dataset, name, played, palette)
 
 
 def _differences(recipe: Recipe, task: Task) -> tuple[str, ...]:
     """Why a recipe is not one of a task."""
     there = {"size": recipe.shape[1:], "actions": recipe.action_nvec, "choices": recipe.choices}
     here = {"size": task.size, "actions": task.agent.action_nvec, "choices": choice_names(task)}
-    if found := differences(there, here):
-        return found
+    if changes := differences(there, here):
+        return changes
     same = recipe.task_fingerprint == fingerprint(task)
     return () if same else ("the task, its knobs or its rules have changed since, or it had more packs",)

@@ -105,8 +105,8 @@ class Replay:
         many = -(-self.size // pairs)
         for first in range(0, many, together):
             count = min(together, many - first)
-            found = pairs_of(self.worlds, self._seeds(first, count), self.config.steps, pairs)
-            for moment, pair in enumerate(found):
+            rollout = pairs_of(self.worlds, self._seeds(first, count), self.config.steps, pairs)
+            for moment, pair in enumerate(rollout):
                 place = (first + torch.arange(count)) * pairs + moment
                 inside = place < self.size
                 self._write(place[inside], (pair[0][inside], pair[1][inside]))

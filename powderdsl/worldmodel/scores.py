@@ -119,7 +119,7 @@ class Score:
         }
 
     def __add__(self, other: Score) -> Score:
-        return Score(*(getattr(self, one.name) + getattr(other, one.name) for one in fields(self)))
+        return Score(*(getattr(self, field.name) + getattr(other, field.name) for field in fields(self)))
 
 
 MEASURES = (

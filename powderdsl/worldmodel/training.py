@@ -176,15 +176,15 @@ class _Trainer:
 
     def restore(self, parent: Checkpoint | None) -> None:
         """Continue from the run's newest checkpoint; a new run starts with the weights of `parent`."""
-        found = self.run.latest_checkpoint()
-        if found is None:
+        checkpoint = self.run.latest_checkpoint()
+        if checkpoint is None:
             if parent is not None:
                 fit_weights(self.model, parent, grow=True)
             return
-        fit_weights(self.model, found)
-        with fitting(found.path, "its state is that of another run"):
-            self.optimizer.load_state_dict(found.state["optimizer"])
-            self.done, self.recent = found.step, [float(one) for one in found.state["recent"]]
+        fit_weights(self.model, checkpoint)
+        with fitting(checkpoint.path, "its state is that of another run"):
+            self.optimizer.load_state_dict(checkpoint.state["optimizer"])
+            self.done, self.recent = checkpoint.step, [float(loss) for loss in checkpoint.state["recent"]]
 
     def train(self, tell: Tell, save_seconds: float) -> None:
         """Train to the end. A signal is raised once a checkpoint is written, a second one at once."""
@@ -287,9 +287,11 @@ def palette_of(config: DataConfig, slots: int = 0) -> tuple[str | None, ...]:
     Packs that are left out have slots too, so those that come later need no others. `slots` is how many there are at
     least. Raises CompileError.
     """
-    found = list(whole_palette(*load_task(config.task, knobs=config.knobs).rules))
-    found += [name for name in whole_palette(config.rules) if name not in found] if config.rules else []
-    return (*found, *[None] * (slots - len(found)))
+    names_by_slot = list(whole_palette(*load_task(config.task, knobs=config.knobs).rules))
+    names_by_slot += (
+        [name for name in whole_palette(config.rules) if name not in names_by_slot] if config.rules else []
+    )
+    return (*names_by_slot, *[None] * (slots - len(names_by_slot)))
 
 
 def _palette_for(config: TrainConfig, folder: Path, worlds: Worlds | None) -> tuple[str | None, ...]:
@@ -297,8 +299,8 @@ def _palette_for(config: TrainConfig, folder: Path, worlds: Worlds | None) -> tu
     if config.palette:
         return config.palette
     if worlds is not None:
-        found = worlds.rules.palette
-        return (*found, *[None] * (config.slots - len(found)))
+        names = worlds.rules.palette
+        return (*names, *[None] * (config.slots - len(names)))
     palette = palette_of(config.data, config.slots)
     if not (folder / ABOUT).exists():
         return palette
@@ -399,10 +401,10 @@ def with_packs(data: DataConfig, own: str, packs: Sequence[str]) -> DataConfig:
 def extended_palette(palette: Palette, rules: Ruleset) -> tuple[str | None, ...]:
     """A palette with the elements of rules that were loaded with it: in its free slots, then behind its end."""
     ids = [element.id for element in rules.elements]
-    found = [*palette, *[None] * (max(ids) + 1 - len(palette))]
+    slots = [*palette, *[None] * (max(ids) + 1 - len(palette))]
     for element in rules.elements:
-        found[element.id] = element.qualified
-    return tuple(found)
+        slots[element.id] = element.qualified
+    return tuple(slots)
 
 
 # Rules with packs added and left out
@@ -414,10 +416,10 @@ def pack_names(rules: str, words: Iterable[str]) -> tuple[str, ...]:
     A name of a pack of the rules, left out or not, stands for that pack.
     """
     known = _known(rules)
-    found: dict[str, None] = {}
+    packs: dict[str, None] = {}
     for word in words:
-        found |= dict.fromkeys([word] if word in known else _names_of(word))
-    return tuple(found)
+        packs |= dict.fromkeys([word] if word in known else _names_of(word))
+    return tuple(packs)
 
 
 def leave_out(rules: str, packs: Iterable[str]) -> str:

@@ -269,9 +269,13 @@ class _Narrowing:
         self.names = {element.id: element.name for element in own.elements}
         packs = {element.pack for element in rules.elements}
         chosen = (packs & {*only}) or packs
-        self.drawn = {one.id for one in own.elements if one.id in self.ids and one.pack in chosen}
+        self.drawn = {
+            element.id for element in own.elements if element.id in self.ids and element.pack in chosen
+        }
         self.added = tuple(
-            one.id for one in rules.elements if one.pack not in own.packs and one.pack in chosen
+            element.id
+            for element in rules.elements
+            if element.pack not in own.packs and element.pack in chosen
         )
         self.missing: list[str] = []
         self.span: Span | None = None
@@ -284,33 +288,35 @@ class _Narrowing:
             groups=tuple(
                 replace(group, drawings=tuple(map(self.drawing, group.drawings))) for group in given.groups
             ),
-            stamps=tuple(self.stamp(one) for one in given.stamps if one.name in drawn),
+            stamps=tuple(self.stamp(stamp) for stamp in given.stamps if stamp.name in drawn),
             targets=(),
         )
 
     def drawing(self, drawing: Drawing) -> Drawing:
         if len(drawing.ids) > 1:
-            ids = tuple(self.ids[one] for one in drawing.ids if one in self.drawn) + self.added
+            ids = tuple(self.ids[number] for number in drawing.ids if number in self.drawn) + self.added
             if not ids:
                 self.lack(drawing.ids, drawing.span)
         else:
-            ids = tuple(self.id(one, drawing.span) for one in drawing.ids)
+            ids = tuple(self.id(number, drawing.span) for number in drawing.ids)
         over = drawing.over
         if over is not None:
-            over = frozenset(self.ids[one] for one in over if one in self.ids)
+            over = frozenset(self.ids[number] for number in over if number in self.ids)
         return replace(drawing, ids=ids, over=over)
 
     def stamp(self, stamp: Stamp) -> Stamp:
-        rows = tuple(tuple(one if one == NOTHING else self.id(one) for one in row) for row in stamp.rows)
+        rows = tuple(
+            tuple(number if number == NOTHING else self.id(number) for number in row) for row in stamp.rows
+        )
         return replace(stamp, rows=rows)
 
-    def id(self, one: int, span: Span | None = None) -> int:
-        if one not in self.ids:
-            self.lack((one,), span)
-        return self.ids.get(one, 0)
+    def id(self, number: int, span: Span | None = None) -> int:
+        if number not in self.ids:
+            self.lack((number,), span)
+        return self.ids.get(number, 0)
 
     def lack(self, ids: Sequence[int], span: Span | None) -> None:
-        self.missing += [self.names[one] for one in ids]
+        self.missing += [self.names[number] for number in ids]
         self.span = self.span or span
 
 

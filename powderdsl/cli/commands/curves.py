@@ -23,17 +23,19 @@ def command(runs: tuple[str, ...], metric: str, out: Path | None) -> None:
     from powderdsl.experiments.runs import find_run, read_metrics
     from powderdsl.experiments.studies.results import as_table, baselines_of, curves_of, write_curves
 
-    found = [find_run(name) for name in runs]
-    curves = curves_of(found, metric)
+    folders = [find_run(name) for name in runs]
+    curves = curves_of(folders, metric)
     if not curves:
-        known = sorted({name for run in found for line in read_metrics(run.path) for name in line} - {"step"})
+        known = sorted(
+            {name for run in folders for line in read_metrics(run.path) for name in line} - {"step"}
+        )
         there = f"there are {', '.join(known)}" if known else "nothing has been written yet"
         raise BadInput(f"no run has the metric {metric}; {there}")
     if out is None:
         click.echo(as_table(curves), nl=False)
         return
-    title = str(found[0].config.get("task", ""))
+    title = str(folders[0].config.get("task", ""))
     write_curves(
-        out, curves, metric, baselines_of(found) if metric == "held_out/return" else {}, Path(title).stem
+        out, curves, metric, baselines_of(folders) if metric == "held_out/return" else {}, Path(title).stem
     )
     click.echo(str(out))

@@ -56,36 +56,36 @@ def command(
     from powderdsl.rl.evaluation import evaluate
 
     with user_values():
-        found = evaluate(played, packs=packs, **asked)
+        evaluation = evaluate(played, packs=packs, **asked)
     if out is not None:
-        write_json(out, found.as_json(), follow=True)
+        write_json(out, evaluation.as_json(), follow=True)
     if as_json:
-        print_json(found.as_json())
+        print_json(evaluation.as_json())
     else:
-        click.echo("\n".join(_text(found)))
+        click.echo("\n".join(_text(evaluation)))
 
 
-def _text(found: Evaluation) -> list[str]:
+def _text(evaluation: Evaluation) -> list[str]:
     from powderdsl.experiments.runs import Estimate
     from powderdsl.rl.config import BASELINES
 
-    after = "" if found.step is None else f", after {found.step:,} interactions"
+    after = "" if evaluation.step is None else f", after {evaluation.step:,} interactions"
     rows = [["split", "policy", "return", "above random", "above nothing", "of expert", "success", "actions"]]
-    for score in found.scores:
+    for score in evaluation.scores:
         above = [str(score.above.get(other, "")) for other in BASELINES]
         success = "" if score.success is None else f"{score.success:.0%}"
         means = [str(Estimate(score.mean, score.interval)), *above, str(score.normalized or "")]
         rows.append([score.split, score.policy, *means, success, f"{score.length:.1f}"])
-    worlds = {score.split: score.episodes for score in found.scores}
+    worlds = {score.split: score.episodes for score in evaluation.scores}
     same = [
         f"{name}: all policies got the same return in {count} of {worlds[name]} worlds"
-        for name, count in found.unchanged.items()
+        for name, count in evaluation.unchanged.items()
         if count
     ]
     same += [
-        f"{name}: {one.worlds} of {worlds[name]} worlds start as a training world does; returns without them: "
-        + ", ".join(f"{policy} {estimate}" for policy, estimate in one.without.items())
-        for name, one in found.seen.items()
-        if one.worlds
+        f"{name}: {overlap.worlds} of {worlds[name]} worlds start as a training world does; returns without them: "
+        + ", ".join(f"{policy} {estimate}" for policy, estimate in overlap.without.items())
+        for name, overlap in evaluation.seen.items()
+        if overlap.worlds
     ]
-    return [f"{found.task}{after}", *same, *table(rows)]
+    return [f"{evaluation.task}{after}", *same, *table(rows)]

@@ -25,12 +25,12 @@ def command(code: str | None) -> None:
         for row in CODES.values():
             click.echo(f"{row.code}  {row.severity.value:<7}  {row.slug}")
         return
-    found = find_code(code)
-    if found is None:
+    entry = find_code(code)
+    if entry is None:
         close = similar(code)
         fix = f"did you mean {', '.join(close)}?" if close else "`powderdsl explain` lists all codes"
         raise BadInput(f"no code `{code}`; {fix}")
-    text = page(found)
+    text = page(entry)
     if not color_wanted(sys.stdout):
         click.echo(text.rstrip("\n"))
         return

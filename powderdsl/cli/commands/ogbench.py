@@ -42,16 +42,16 @@ def command(
     from powderdsl.ogbench.levels import find_level
 
     with user_values():
-        found = find_level(level)
+        chosen = find_level(level)
     from powderdsl.ogbench.collect import collect
     from powderdsl.ogbench.episodes import LevelProgram
 
     with (
         user_values(),
-        progress(found.name, how["episodes"] or found.play.episodes, lines=True, resumes=out) as show,
+        progress(chosen.name, how["episodes"] or chosen.play.episodes, lines=True, resumes=out) as show,
     ):
         files = collect(
-            LevelProgram(found, backend=backend, device=device, threads=threads),
+            LevelProgram(chosen, backend=backend, device=device, threads=threads),
             out,
             **how,
             progress=lambda done, total: show(done, "episodes"),

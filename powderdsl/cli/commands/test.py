@@ -140,8 +140,8 @@ class _Report:
             outcome = "ok  " if test.passed else "FAIL" if test.failed else "differs"
             self.say(f"{outcome}  {test.example.pack}: {test.example.name}")
             if not test.passed:
-                found = difference_of_test(test, runner)
-                words = [found.with_packs, *difference_lines(found)] if found else []
+                difference = difference_of_test(test, runner)
+                words = [difference.with_packs, *difference_lines(difference)] if difference else []
                 self.say(*(f"      {line}".rstrip() for line in [*words, *_failure_lines(test)]))
         results = self._properties(name, runner)
         missed = [span for span in runner.lines if span not in runner.happened]
@@ -186,15 +186,15 @@ class _Report:
         if result.prop.owner == "automatic" and result.holds:
             return
         self.say(result_line(result))
-        found = result.counterexample
+        counterexample = result.counterexample
         if result.difference is not None:
             self.say(*(f"      {line}" for line in difference_lines(result.difference)))
-        if found is not None:
-            self.say(*(f"      {line}" for line in counterexample_lines(found, ruleset)))
+        if counterexample is not None:
+            self.say(*(f"      {line}" for line in counterexample_lines(counterexample, ruleset)))
             if self.picture is not None:
                 from powderdsl.simulation.media import write_png  # brings Pillow
 
-                write_png(self.picture, picture(found, ruleset))
+                write_png(self.picture, picture(counterexample, ruleset))
                 self.say(f"      drawn: {self.picture}")
                 self.picture = None
 
@@ -223,16 +223,16 @@ def _data(
     return {
         "tests": [
             {
-                "test": one.example.name,
-                "pack": one.example.pack,
-                "place": place_of(one.example.span),
-                "passed": one.passed,
-                "added": list(one.added),
-                "problem": one.problem,
-                "seed": one.seed,
-                "steps": one.step,
+                "test": test.example.name,
+                "pack": test.example.pack,
+                "place": place_of(test.example.span),
+                "passed": test.passed,
+                "added": list(test.added),
+                "problem": test.problem,
+                "seed": test.seed,
+                "steps": test.step,
             }
-            for one in tests
+            for test in tests
         ],
         "properties": [result_data(result) for result in results],
         "rules": {"all": len(lines), "never": [place_of(span) for span in missed]},
@@ -264,7 +264,7 @@ def _mutate(names: Iterable[str], as_json: bool, **how: Any) -> int:
     finally:
         if as_json:
             print_json(data)
-    return FAILED if any(one["survived"] for one in data.values()) else OK
+    return FAILED if any(totals["survived"] for totals in data.values()) else OK
 
 
 def _mutated(
@@ -296,7 +296,7 @@ def _mutated(
         try:
             for number, verdict in events:
                 verdicts[number] = verdict
-                alive = sum(one.status == "survived" for one in verdicts.values())
+                alive = sum(verdict.status == "survived" for verdict in verdicts.values())
                 show(len(verdicts), f"{alive} survived")
         except KeyboardInterrupt as caught:
             interrupt = caught

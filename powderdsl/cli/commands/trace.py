@@ -63,9 +63,9 @@ def command(
 
     begun = start(ruleset, world, size, None, seed, backend=backend)
     with user_values():
-        found = trace(begun, *cell, step, every_rule=every_rule, of=of or None, **how)
+        history = trace(begun, *cell, step, every_rule=every_rule, of=of or None, **how)
     if as_json:
-        print_json(trace_data(found))
+        print_json(trace_data(history))
     else:
-        text = trace_text(found, color=color_wanted(sys.stdout))
+        text = trace_text(history, color=color_wanted(sys.stdout))
         write_styled(sys.stdout, f"{text}\n")

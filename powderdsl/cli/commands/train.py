@@ -57,8 +57,8 @@ def command(task: str | None, folder: Path | None, resume: Path | None, **values
             show(min(step, config.steps), "" if mean is None else f"return {mean:.3f}")
 
         run = train(config, folder, progress=tell)
-    found = run.checkpoint()
-    click.echo(f"{folder}: {found.step:,} interactions")
+    checkpoint = run.checkpoint()
+    click.echo(f"{folder}: {checkpoint.step:,} interactions")
     click.echo(f"powderdsl evaluate {folder}; powderdsl watch {folder}", err=True)
 
 

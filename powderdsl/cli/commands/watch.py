@@ -57,7 +57,7 @@ def command(
     from powderdsl.rl.evaluation import film, player, subject
 
     own, config, task = subject(played, changes["packs"])
-    names = [one.name for one in task.splits]
+    names = [split.name for split in task.splits]
     split = split or ("test" if "test" in names else names[0])
     if out is None:
         out = own.path / "watch.gif" if own else Path("watch.gif")
@@ -77,5 +77,5 @@ def command(
     episodes, pictures = film(program, acts, numbers, observation=observation, seed=seed, factor=scale)
     write = write_gif if out.suffix.lower() == ".gif" else write_mp4
     write(out, pictures, fps=fps)
-    returns = ", ".join(f"{one:.2f}" for one in episodes.returns.tolist())
+    returns = ", ".join(f"{total:.2f}" for total in episodes.returns.tolist())
     click.echo(f"wrote {out}: {task.name}, {policy}, worlds 0 to {worlds - 1} of {split}: {returns}")

@@ -253,13 +253,13 @@ def show_command(run: str, out: Path, curve: bool, scale: int, **values: Any) ->
         click.echo(f"left out: {variant.name}, which needs {', '.join(variant.elements)}", err=True)
 
 
-def _show(found: list[Strip], rules: Ruleset, out: Path, scale: int) -> None:
+def _show(strips: list[Strip], rules: Ruleset, out: Path, scale: int) -> None:
     """Draw strips, and count what is wrong in each."""
     from powderdsl.simulation.media import write_png
     from powderdsl.worldmodel.evaluation import sheet
 
-    write_png(out, sheet(found, rules, factor=scale))
-    for number, strip in enumerate(found, 1):
+    write_png(out, sheet(strips, rules, factor=scale))
+    for number, strip in enumerate(strips, 1):
         click.echo(f"{number}  {strip.name}: {strip.wrong.sum():,} of {strip.truth.size:,} cells wrong")
 
 
@@ -348,7 +348,7 @@ def _run(config: TrainConfig, folder: Path, values: dict[str, Any], **more: Any)
 
         def tell(now: TrainingProgress) -> None:
             said = [("loss", now.loss), ("held out", now.validation)]
-            show(now.done, ", ".join(f"{name} {one:.4f}" for name, one in said if one is not None))
+            show(now.done, ", ".join(f"{name} {loss:.4f}" for name, loss in said if loss is not None))
 
         run = train(
             config,

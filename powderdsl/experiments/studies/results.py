@@ -71,7 +71,7 @@ def findings(study: Study, outcomes: Sequence[Outcome]) -> list[Finding]:
     """The findings from finished points. Combinations are in the order in which values were written."""
     finished = [outcome for outcome in outcomes if outcome.problem is None]
     finished.sort(key=lambda outcome: outcome.point.seed)
-    all_findings = []
+    measured = []
     for measure in study.measures:
         by_values: dict[tuple[tuple[str, str], ...], dict[int, float]] = {}
         for outcome in finished:
@@ -83,8 +83,8 @@ def findings(study: Study, outcomes: Sequence[Outcome]) -> list[Finding]:
             for values, by_seed in by_values.items()
         )
         verdicts = [_verdict(measure, label, line) for label, line in _lines(cells).items()]
-        all_findings.append(Finding(measure, cells, tuple(filter(None, verdicts))))
-    return all_findings
+        measured.append(Finding(measure, cells, tuple(filter(None, verdicts))))
+    return measured
 
 
 def _verdict(measure: Measure, label: str, cells: Sequence[Cell]) -> str:
@@ -142,14 +142,16 @@ def as_data(study: Study, size: str, outcomes: Sequence[Outcome]) -> dict[str, A
 
 def as_markdown(study: Study, size: str, outcomes: Sequence[Outcome]) -> str:
     """A table of means and intervals, and the verdicts."""
-    found = findings(study, outcomes)
-    rows = [[*(axis.name for axis in study.axes), *(finding.measure.about for finding in found), "seeds"]]
-    for cells in zip(*(finding.cells for finding in found), strict=True):
+    measured = findings(study, outcomes)
+    rows = [[*(axis.name for axis in study.axes), *(finding.measure.about for finding in measured), "seeds"]]
+    for cells in zip(*(finding.cells for finding in measured), strict=True):
         numbers = [
             shown(cell.over_seeds, measure.scale) for cell, measure in zip(cells, study.measures, strict=True)
         ]
         rows.append([*cells[0].values.values(), *numbers, str(len(cells[0].by_seed))])
-    verdicts = [f"- {finding.measure.about}: {verdict}" for finding in found for verdict in finding.verdicts]
+    verdicts = [
+        f"- {finding.measure.about}: {verdict}" for finding in measured for verdict in finding.verdicts
+    ]
     failed = [f"- {outcome.point.name}: {outcome.problem}" for outcome in outcomes if outcome.problem]
     parts = [f"{study.about} Size: {size}.", markdown(rows).rstrip(), "\n".join(verdicts)]
     parts += ["Not finished:", "\n".join(failed)] if failed else []
@@ -226,7 +228,7 @@ def draw(path: Path, panels: Sequence[Panel], title: str, *, follow: bool = Fals
     for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
         for line in panel.lines:
             intervals = [interval(samples, panel.scale) for samples in line.samples]
-            means = [found.mean for found in intervals]
+            means = [interval.mean for interval in intervals]
             # A single value has no interval.
             bars = [(i.mean - i.low, i.high - i.mean) if i.high < math.inf else (0, 0) for i in intervals]
             axes.errorbar(
