@@ -1,4 +1,4 @@
-"""How commands end: exit codes, and messages about failures."""
+"""Endings of commands: exit codes, and messages about failures."""
 
 from __future__ import annotations
 

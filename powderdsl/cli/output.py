@@ -1,4 +1,4 @@
-"""What commands print: diagnostics, JSON, and progress."""
+"""Output of commands: diagnostics, JSON, and progress."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def color_wanted(stream: IO[Any]) -> bool:
-    """Whether to use color: on a terminal that supports it, and without NO_COLOR (https://no-color.org)."""
+    """True if output should be colored: on a terminal that supports it, and without NO_COLOR (https://no-color.org)."""
     return stream.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
 
 

@@ -1,4 +1,4 @@
-"""Where a run starts: a saved world, a picture, a drawing, a scene, or shapes scattered at random."""
+"""Start worlds of a run: a saved world, a picture, a drawing, a scene, or shapes scattered at random."""
 
 from __future__ import annotations
 

@@ -83,7 +83,7 @@ class Recipe:
 
     @property
     def shards(self) -> int:
-        """How many shards a complete dataset has."""
+        """The number of shards of a complete dataset."""
         return -(-self.episodes // self.shard)
 
     def episodes_of(self, shard: int) -> range:
@@ -93,7 +93,7 @@ class Recipe:
 
 @dataclass(frozen=True)
 class ShardRow:
-    """What the manifest says of a shard's file. The number decides the file's name, so none can lead elsewhere."""
+    """A shard's row in the manifest. The number decides the file's name, so no name can lead out of the folder."""
 
     number: Annotated[int, Limits(0, MAX_SHARDS - 1)]
     sha256: Digest
@@ -215,7 +215,7 @@ def many_damaged(path: Path, problems: list[str]) -> CompileError:
 
 
 def choice_names(task: Task) -> tuple[str, ...]:
-    """What the values of an action's third number are."""
+    """Return the names of the values of an action's third number."""
     names = {element.id: element.qualified for element in task.ruleset.elements}
     names |= {BLOW: "blow", NO_CHANGE: "nothing"}
     return tuple(names[choice] for choice in task.agent.choices)
@@ -240,7 +240,7 @@ def recipe_of(
     compress: bool = False,
     shard: int | None = None,
 ) -> Recipe:
-    """What is recorded of an environment's task, split, rules and observations. `shard` as in `record`.
+    """Describe an environment's task, split, rules and observations for a manifest. `shard` as in `record`.
 
     Raises:
         ValueError: a value out of range, or a shard may become too large.

@@ -93,7 +93,7 @@ class Shard:
 
 
 def is_whole(folder: Path, row: ShardRow) -> bool:
-    """Whether a shard's file exists and has the size and digest of the manifest."""
+    """True if a shard's file exists and has the size and digest of the manifest."""
     try:
         with open_regular(folder / row.file) as file:
             if os.fstat(file.fileno()).st_size != row.bytes:
@@ -171,7 +171,7 @@ def _check_lengths(length: Array, recipe: Recipe, transitions: int) -> None:
 
 
 def knows_ids(recipe: Recipe, observation: Array) -> bool:
-    """Whether the palette has all ids of observations, uint8 [n, C, H, W]."""
+    """True if the palette has all ids of observations, uint8 [n, C, H, W]."""
     known = np.zeros(256, bool)
     known[[int(number) for number in recipe.palette]] = True
     where = recipe.channels.index("element") if "element" in recipe.channels else 0

@@ -1,4 +1,4 @@
-"""How fast rules run: the plan of a measurement, its worlds, rounds of measuring, and reports as text and JSON.
+"""Benchmarks of rules: the plan of a measurement, its worlds, rounds of measuring, and reports as text and JSON.
 
 Worlds are made from a ruleset's tables alone: no element has a name here. Rounds are interleaved, so that a machine that
 is slow for a while is slow for all combinations alike.
@@ -235,7 +235,7 @@ def _located(path: Path) -> Iterator[None]:
 
 @dataclass
 class CellFigures:
-    """What was measured of a cell. `round_seconds` and `round_processor_seconds` get one value a round.
+    """The measurements of a cell. `round_seconds` and `round_processor_seconds` get one value a round.
 
     `compile_seconds` are its backend's, shared by all cells that have it. `passes` has the microseconds a world and step
     of each pass, in the order they run; it is empty if passes were not profiled. Processor times count all threads
@@ -335,7 +335,7 @@ def measuring(plan: Plan, cells: list[CellFigures]) -> Iterator[tuple[str, Cell]
 
 @dataclass
 class _Subject:
-    """What a cell measures: a simulator, or a program that loads the simulator's worlds.
+    """The subject of a measurement: a simulator, or a program that loads the simulator's worlds.
 
     A round makes some calls of some steps, each from the same worlds.
     """

@@ -45,7 +45,7 @@ MAX_BYTES = 1 << 33
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """What was saved after `step` steps: nested dicts, lists and tuples of tensors, numbers, text and None."""
+    """The state saved after `step` steps: nested dicts, lists and tuples of tensors, numbers, text and None."""
 
     step: int
     state: Any
@@ -88,7 +88,7 @@ def _packed(value: Any, tensors: dict[str, Tensor]) -> Any:
 
 
 def _unpacked(value: dict[str, Any], tensors: Mapping[str, Tensor]) -> Any:
-    """What a pair of a kind and contents stands for, whose contents are unpacked already."""
+    """Rebuild a value from its kind and its contents, which are unpacked already."""
     match value:
         case {"tensor": name}:
             return tensors[name]

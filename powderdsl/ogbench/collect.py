@@ -57,7 +57,7 @@ PLAYED = 0.6
 
 @dataclass(frozen=True)
 class Recipe:
-    """What decides the bytes of one file: `count` episodes of `rows` rows from the number `first`."""
+    """Everything that decides the bytes of one file: `count` episodes of `rows` rows from the number `first`."""
 
     level: str
     rules: str

@@ -32,7 +32,7 @@ BATCH_OPTIONS = ("task_id", "task_info", "reset_mask")
 
 @dataclass(frozen=True)
 class EnvOptions:
-    """What single and batched environments of a level take.
+    """Options of single and batched environments of a level.
 
     Args:
         mode: ``task``, or ``data_collection``: no goals and no rewards.
@@ -136,7 +136,7 @@ class PowderworldEnv(_Face, gymnasium.Env[Array, Any], EzPickle):
 
     @property
     def num_tasks(self) -> int:
-        """How many tasks the level has."""
+        """The number of tasks of the level."""
         return len(self.task_infos)
 
     def reset(
@@ -190,7 +190,7 @@ class PowderworldEnv(_Face, gymnasium.Env[Array, Any], EzPickle):
         return self.level.elements[element], x, y
 
     def semantic_action_to_action(self, elem_name: str, x: int, y: int) -> int:
-        """What of a whole action is to be given to `step` at the present stage."""
+        """Return the part of a whole action that `step` takes at the present stage."""
         return (self.level.elements.index(str(elem_name)), x, y)[self.episodes.stage[0]]
 
     def sample_action(self) -> int:
@@ -311,7 +311,7 @@ class PowderworldVectorEnv(_Face, VectorEnv[Any, Any, Any]):
         return self._observations(), success.astype(np.float64), success, truncated, info
 
     def _begun(self, mask: NDArray[np.bool_]) -> dict[str, Any]:
-        """What is known of episodes that begin where `mask` is set."""
+        """Return the infos of the episodes that begin where `mask` is set."""
         if self.episodes.mode != "task":
             return {}
         goals = array(self.episodes.goals())

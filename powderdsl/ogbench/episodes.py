@@ -371,7 +371,7 @@ class Episodes:
 
     @property
     def success(self) -> NDArray[np.bool_]:
-        """Whether the worlds match their goals: bool [B]."""
+        """True where a world matches its goal: bool [B]."""
         return (self.errors < self.tolerance) & (self.mode == "task")
 
     @property

@@ -85,7 +85,7 @@ class Level:
 
     @property
     def places(self) -> int:
-        """How many values x has, and y."""
+        """The number of values of x, and of y."""
         return (self.side - self.brush) // self.grid + 1
 
     @property
@@ -94,7 +94,7 @@ class Level:
         return max(len(self.elements), self.places, FEWEST_ACTIONS)
 
     def choices(self, stage: int) -> int:
-        """How many actions are valid at a stage: 0 chooses the element, 1 x, 2 y."""
+        """The number of valid actions at a stage: 0 chooses the element, 1 x, 2 y."""
         return self.places if stage else len(self.elements)
 
     def numbers(self, task: GoalTask) -> list[tuple[int, int, int]]:

@@ -1,4 +1,4 @@
-"""What decides a run: configurations, presets, and the machine that computes it."""
+"""Settings of a run: configurations, presets, and the machine that computes it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Checked:
 
 @dataclass(frozen=True)
 class Variety(Checked):
-    """How rulesets differ from the one that they are drawn around.
+    """The ways in which random rulesets differ from the ruleset of a run.
 
     `chances`: parameters that are chances are multiplied by a factor between 1/chances and chances, uniform in its
     logarithm, up to 1. `swaps`: for each of these properties, two elements exchange their values. `leave_out`: how
@@ -42,7 +42,7 @@ class Variety(Checked):
 
 @dataclass(frozen=True)
 class DataConfig(Checked):
-    """Which pairs a network learns from. Plain values: ``dataclasses.asdict`` gives what a run's file keeps.
+    """The pairs that a network learns from. Plain values: ``dataclasses.asdict`` gives what a run's file keeps.
 
     The worlds are those of seeds 0 to `states` − 1. Each is run for `steps`·`pairs` steps and gives `pairs` pairs: the
     paper's 16 of 8 steps. `only` names packs: worlds draw no other pack's elements. The replay buffer holds `capacity`
@@ -131,7 +131,7 @@ PRESETS = {
 
 @dataclass(frozen=True)
 class Machine(Checked):
-    """Where a run is computed. A run may continue on another machine.
+    """The device and storage of a run. A run may continue on another machine.
 
     `store` is that of `Replay`.
     """

@@ -180,7 +180,7 @@ def unseen_data(
     knobs: Mapping[str, int] | None = None,
     rulesets: int = 0,
 ) -> DataConfig:
-    """Which worlds to test on, where `data` are those of the training.
+    """Return the worlds to test a network on that was trained on `data`.
 
     Args:
         task, rules, only, knobs: those of the training data unless others are given; with another task, its own knobs.

@@ -233,7 +233,7 @@ def custom_network(name: str) -> CustomNetwork:
 
 
 def is_network_name(text: str) -> bool:
-    """Whether a text has the form ``package.module:Class``. Nothing is imported."""
+    """True if a text has the form ``package.module:Class``. Nothing is imported."""
     return text.count(":") == 1 and all(part.isidentifier() for part in text.replace(":", ".").split("."))
 
 
@@ -259,7 +259,7 @@ def _told(name: str, what: str) -> Iterator[None]:
 
 
 def encoder_of(config: TrainConfig, slots: int) -> ActionChannels:
-    """What makes channels of the inputs."""
+    """Return the encoder that turns inputs into channels."""
     if config.recorded is None:
         return ActionChannels(slots)
     return ActionChannels(slots, len(config.recorded.channels), config.recorded.actions)

@@ -59,7 +59,7 @@ class Recording:
 
     @cached_property
     def recorded(self) -> Recorded:
-        """What a run keeps of it."""
+        """The facts about this recording that a run's file keeps."""
         agent, recipe = self.task.agent, self.dataset.recipe
         rows = [row.sha256 for row in self.dataset.manifest.shards]
         text = json.dumps([asdict(recipe), rows], sort_keys=True)
@@ -95,7 +95,7 @@ class Recording:
         return inputs.to(device), transitions.next_observation[:, 0].to(device)
 
     def painted(self, actions: Tensor) -> Tensor:
-        """What actions, integers [B, 5], do to each cell: uint8 [B, 3, H, W]."""
+        """Return the channels that show actions, integers [B, 5], cell by cell: uint8 [B, 3, H, W]."""
         agent, actions = self.task.agent, actions.long()
         block = cells_of(agent, self.size, actions[:, 1], actions[:, 0])
         choice = torch.tensor(agent.choices)[actions[:, 2]][:, None, None]

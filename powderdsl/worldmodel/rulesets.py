@@ -43,7 +43,7 @@ class Drawn:
 
     @property
     def structure(self) -> tuple[Any, ...]:
-        """What decides the compiled code; parameters are inputs of each world."""
+        """The part that decides the compiled code; parameters are inputs of each world."""
         return self.left_out, self.swapped
 
 

@@ -198,7 +198,7 @@ def baseline(chances: Tensor) -> Network:
 
 
 def outcomes(pairs: Iterable[Pairs], slots: int) -> Tensor:
-    """How many cells went from each element to each: int64 [slots, slots]."""
+    """Count the cells that went from each element to each: int64 [slots, slots]."""
     counts = torch.zeros(slots, slots, dtype=torch.int64)
     for starts, ends in pairs:
         counts += _counts(ids_of(starts).long(), ends.long(), slots)
@@ -206,7 +206,7 @@ def outcomes(pairs: Iterable[Pairs], slots: int) -> Tensor:
 
 
 def _counts(rows: Tensor, columns: Tensor, slots: int) -> Tensor:
-    """How often each pair of numbers below `slots` occurs: int64 [slots, slots]."""
+    """Count each pair of numbers below `slots`: int64 [slots, slots]."""
     both = (rows * slots + columns).flatten()
     return torch.bincount(both, minlength=slots * slots).view(slots, slots).cpu()
 

@@ -42,7 +42,7 @@ class Checked:
     ledger: Ledger | None = None
 
     def number(self, severity: Severity) -> int:
-        """How many diagnostics have this severity."""
+        """Count the diagnostics of this severity."""
         return sum(diagnostic.severity is severity for diagnostic in self.diagnostics)
 
 

@@ -27,7 +27,7 @@ MOST_PICTURES = 64
 
 @dataclass(frozen=True)
 class Playback:
-    """What a run shows and writes, and how often."""
+    """The outputs of a run and their intervals."""
 
     steps: int
     every: int

@@ -240,7 +240,7 @@ def _data(
 
 
 def _failure_lines(result: ExampleResult) -> Iterator[str]:
-    """What is wrong, and the worlds side by side."""
+    """Describe a failure, with the worlds side by side."""
     example = result.example
     steps = f"{result.step} step{'' if result.step == 1 else 's'}"
     yield f"{place_of(example.span)}: {result.problem} (seed {result.seed}, after {steps})"

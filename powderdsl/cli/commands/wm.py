@@ -264,7 +264,7 @@ def _show(strips: list[Strip], rules: Ruleset, out: Path, scale: int) -> None:
 
 
 def tested_on(values: Mapping[str, Any]) -> dict[str, Any]:
-    """What the options of a test say about its worlds."""
+    """Return the options that choose the worlds of a test."""
     return opt.given(values, ("task", "split", "rules", "only", "knobs", "rulesets"))
 
 
@@ -274,7 +274,7 @@ def given_settings(values: Mapping[str, Any], config: type) -> dict[str, Any]:
 
 
 def _machine(values: dict[str, Any]) -> Machine:
-    """Where to compute, taken out of the options of a command."""
+    """Take the device and storage out of the options of a command."""
     import torch
 
     from powderdsl.simulation.programs import find_device

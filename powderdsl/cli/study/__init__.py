@@ -1,1 +1,1 @@
-"""What a study is checked for before it runs, where that takes the commands that it calls."""
+"""Checks of a study before it runs that need the commands that it calls."""

@@ -76,7 +76,7 @@ class _StudyCheck:
         self.changed_rules = cache(lambda rules, *more: wm.rules_of(rules or _rules_of(more[0]), *more))
 
     def result(self, step: StudyStep, point: Point) -> Any:
-        """What a step makes: the settings of its run, or patterns of keys of its results; None if that is not known."""
+        """Return the settings of a step's run, or patterns of keys of its results; None if they are not known."""
         maker = self.study.works_on(step)
         run = None if maker is None else self.result(maker, point)
         if step.is_wrong or (run is None and maker is not None):
@@ -174,7 +174,7 @@ class _StudyCheck:
         return self.made(step.command, context, run)
 
     def made(self, command: tuple[str, ...], context: click.Context, run: Any) -> Any:
-        """What a command makes of options that it takes. Raises what it would raise before it begins to work."""
+        """Return what a command would make with these options. Raises the errors that it raises before it works."""
         values = context.params
         match command:
             case ("train",):

@@ -88,7 +88,7 @@ def findings(study: Study, outcomes: Sequence[Outcome]) -> list[Finding]:
 
 
 def _verdict(measure: Measure, label: str, cells: Sequence[Cell]) -> str:
-    """Whether a measure changes along some cells as expected; empty if nothing is expected, or no seed has both ends.
+    """Tell whether a measure changes along cells as expected; empty if nothing is expected or no seed has both ends.
 
     The last value is compared with the first, seed by seed: by their difference, on the scale ``log`` by their ratio.
     """

@@ -276,7 +276,7 @@ def _read(folder: Path, commands: Commands) -> StudyRun:
 
 
 def resources(study: Study, point: Point, threads: int) -> dict[str, float]:
-    """What Ray reserves for a point: a CPU core per thread, and a GPU if a step's `device` is a CUDA device."""
+    """The resources that Ray reserves for a point: a CPU core per thread, and a GPU if a step's `device` is a CUDA device."""
     devices = [point.filled(word) for step in study.steps for name, word in step.words if name == "device"]
     return {"num_cpus": threads, "num_gpus": int(any(name.startswith("cuda") for name in devices))}
 

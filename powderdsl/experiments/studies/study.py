@@ -102,7 +102,7 @@ class StudyStep:
 
     @property
     def makes_run(self) -> bool:
-        """Whether its command writes a run, which it is given the folder of."""
+        """True if the command writes a run, into a folder that it is given."""
         return "run" in self.means
 
     @property
@@ -205,7 +205,7 @@ class Study:
         return [*words, "--run", str(place / step.name)] if step.makes_run else words
 
     def identity(self, size: str) -> dict[str, Any]:
-        """What makes results those of one study, as JSON: values, seeds and measures may be added later."""
+        """The identity of a study's results, as JSON: values, seeds and measures may be added later."""
         steps = [
             [step.name, " ".join(step.command), *([name, word.text] for name, word in step.words)]
             for step in self.steps
@@ -329,7 +329,7 @@ class _StudyReader:
         return Axis(key, decl.about or key.text, values, sets)
 
     def sets(self, node: Node, values: list[Scalar]) -> dict[str, dict[str, Scalar]]:
-        """What each value sets: the same names for all of them."""
+        """Return the settings of each value: the same names for all values."""
         sets: dict[str, dict[str, Scalar]] = {}
         names: dict[str, Scalar] = {}
         entries = self.reader.pairs(node, "a mapping", "write `VALUE: {NAME: VALUE, …}`")
