@@ -123,7 +123,7 @@ def action_form(kind: str, agent: Agent, device: torch.device) -> ActionForm:
                 part[:] = torch.arange(len(part)) == value
     tensors = (torch.tensor(chosen, dtype=torch.int64), table, weights)
     return ActionForm(
-        kind, space, names, nvec, mask.to(device), full_nvec, *(one.to(device) for one in tensors)
+        kind, space, names, nvec, mask.to(device), full_nvec, *(tensor.to(device) for tensor in tensors)
     )
 
 
@@ -147,7 +147,7 @@ def _discrete(agent: Agent) -> tuple[Tensor, Tensor]:
     what = torch.tensor(done, dtype=torch.int64).view(-1, 3).repeat_interleave(places, 0)
     table, weights = torch.cat([where, what], 1), []
     for number, choice in enumerate(agent.choices):
-        first = next((place for place, one in enumerate(done) if one[0] == number), 0) * places
+        first = next((place for place, pair in enumerate(done) if pair[0] == number), 0) * places
         motion = (places, 3 * places) if choice == BLOW else (0, 0)
         weights.append((0, 0, count - 1, 0, 0) if choice == NO_CHANGE else (1, columns, first, *motion))
     if idle:

@@ -50,9 +50,10 @@ class MatrixPatches(nn.Module):
         self.places = [torch.arange(side) * count // side for side, count in zip(size, patches, strict=True)]
         """The row (and column) of patches that each row (and column) of cells lies in."""
         shares = [
-            nn.functional.one_hot(one, count).float() for one, count in zip(self.places, patches, strict=True)
+            nn.functional.one_hot(places, count).float()
+            for places, count in zip(self.places, patches, strict=True)
         ]
-        rows, columns = (one / one.sum(0) for one in shares)
+        rows, columns = (share / share.sum(0) for share in shares)
         self.register_buffer("rows", rows.T.contiguous())
         self.register_buffer("columns", columns)
 
@@ -95,7 +96,7 @@ class Patches(MatrixPatches):
 
 
 class Frames(nn.Module):
-    """What `see` makes of each of several observations that are stacked, oldest first: [B, frames · channels, …]."""
+    """The features that `see` extracts from each of several stacked observations, oldest first: [B, frames · channels, …]."""
 
     def __init__(self, see: Any, frames: int):
         super().__init__()

@@ -35,21 +35,21 @@ RENDER_MODES = ("rgb_array", "ansi")
 
 def array(tensor: Tensor) -> Array:
     """A tensor as an array; from a device it is copied."""
-    found: Array = tensor.cpu().numpy()
-    return found
+    values: Array = tensor.cpu().numpy()
+    return values
 
 
 def arrays(info: Info) -> dict[str, Any]:
     """Infos in arrays."""
-    return {name: arrays(one) if isinstance(one, dict) else array(one) for name, one in info.items()}
+    return {name: arrays(value) if isinstance(value, dict) else array(value) for name, value in info.items()}
 
 
 def objects(rows: Array, mask: Array) -> Array:
     """Rows [n, …] as an array of objects [B]: None where `mask` is not set."""
-    found = np.full(len(mask), None, dtype=object)
+    column = np.full(len(mask), None, dtype=object)
     for place, row in zip(np.flatnonzero(mask), rows, strict=True):
-        found[place] = row
-    return found
+        column[place] = row
+    return column
 
 
 class Face:
@@ -78,7 +78,7 @@ class Face:
 
     @property
     def spec(self) -> EnvSpec | None:
-        """How `gymnasium.make` makes it. No limit is set from outside, but the spec says how many actions an episode has."""
+        """The spec of `gymnasium.make`. `max_episode_steps` tells the actions of an episode; no wrapper enforces it."""
         return self._spec
 
     @spec.setter
@@ -144,13 +144,13 @@ class PowderVectorEnv(Face, VectorEnv[Any, Any, Any]):
     def step(self, actions: Any) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """`TensorEnv.step` with arrays. ``final_obs`` is an array of objects: None unless the episode ended."""
         observed, reward, terminated, truncated, info = self.tensors.step(actions)
-        found = arrays(info)
-        if "final_obs" in found:
-            found["final_obs"] = objects(found["final_obs"], found["_final_obs"])
-        return array(observed), array(reward), array(terminated), array(truncated), found
+        infos = arrays(info)
+        if "final_obs" in infos:
+            infos["final_obs"] = objects(infos["final_obs"], infos["_final_obs"])
+        return array(observed), array(reward), array(terminated), array(truncated), infos
 
     def action_masks(self) -> Array:
-        """Which actions are allowed: bool [B, n], the values of the first number of an action, then of the next."""
+        """Return the mask of allowed actions: bool [B, n], the values of the first number of an action, then of the next."""
         return array(self.tensors.action_masks())
 
     def render(self) -> tuple[Any, ...] | None:
@@ -193,16 +193,16 @@ class PowderEnv(Face, gymnasium.Env[Array, Any], EzPickle):
     def _info(self, info: Info) -> dict[str, Any]:
         """The infos of the one world there is."""
         assert self.tensors.episodes is not None
-        found = {
+        infos = {
             "success": bool(info["success"][0]),
             "world": int(info["world"][0]),
             "episode_return": float(self.tensors.returns[0]),
             "episode_length": int(self.tensors.episodes.acted[0]),
         }
-        return found | ({"action_mask": array(info["action_mask"][0])} if "action_mask" in info else {})
+        return infos | ({"action_mask": array(info["action_mask"][0])} if "action_mask" in info else {})
 
     def action_masks(self) -> Array:
-        """Which actions are allowed: bool [n], the values of the first number of an action, then of the next."""
+        """Return the mask of allowed actions: bool [n], the values of the first number of an action, then of the next."""
         return array(self.tensors.action_masks()[0])
 
     def render(self) -> Any:
@@ -270,10 +270,10 @@ class GoalEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def step(self, action: Any) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
         """One action; ``is_success`` in the infos says whether the goal is met, ``task_reward`` what the task gives."""
         observed, task_reward, terminated, truncated, info = self.env.step(action)
-        found = self._with_goals(observed)
-        reward = float(self.compute_reward(found["achieved_goal"], found["desired_goal"], info))
+        observation = self._with_goals(observed)
+        reward = float(self.compute_reward(observation["achieved_goal"], observation["desired_goal"], info))
         info |= {"is_success": reward == 0, "task_reward": task_reward}
-        return found, reward, terminated, truncated, info
+        return observation, reward, terminated, truncated, info
 
     def compute_reward(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Any:
         """0 or −1, float32 [...], of goals [..., n]."""

@@ -60,7 +60,7 @@ def observation_of(kind: str, simulator: Simulator, size: Size) -> Observation:
     if kind != "matrix":
         # Bytes, 0..255 whatever occurs: what Stable-Baselines3 takes for pictures, and stores as such.
         return Observation(kind, Box(0, 255, shape, np.uint8), channels)
-    bounds = [abs(one) for slot in observer.slots.values() for one in (slot.kind.lo, slot.kind.hi)]
+    bounds = [abs(bound) for slot in observer.slots.values() for bound in (slot.kind.lo, slot.kind.hi)]
     bounds += [max(map(abs, property_values(ruleset, prop.name))) for prop in ruleset.properties]
     limit = max(ruleset.slots, *bounds)
     return Observation(kind, Box(-limit, limit, shape, np.float32), channels)

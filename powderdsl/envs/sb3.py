@@ -72,7 +72,7 @@ class PowderVecEnv(Face, VecEnv):
         return array(observed), array(reward), done, infos
 
     def action_masks(self) -> Array:
-        """Which actions are allowed, as `MaskablePPO` asks for them: bool [B, n]."""
+        """Return the mask of allowed actions, for `MaskablePPO`: bool [B, n]."""
         return array(self.tensors.action_masks())
 
     def state(self) -> dict[str, Any]:
@@ -116,7 +116,7 @@ class PowderVecEnv(Face, VecEnv):
         return [result] * len(self._chosen(indices))
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """Whether infos are those of a wrapper: true for `Monitor`."""
+        """True if infos come from a wrapper such as `Monitor`."""
         return [wrapper_class is Monitor] * len(self._chosen(indices))
 
     def _chosen(self, indices: Any) -> list[int]:

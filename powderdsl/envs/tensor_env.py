@@ -185,7 +185,7 @@ class TensorEnv:
             info["action_mask"], info["_action_mask"] = self.action_masks().to(torch.int8), mask.clone()
 
     def action_masks(self) -> Tensor:
-        """Which actions are allowed: bool [B, n], the `ActionForm.mask` in each world."""
+        """Return the mask of allowed actions: bool [B, n], the `ActionForm.mask` in each world."""
         return self.action_form.mask.expand(self.num_envs, -1).clone()
 
     @property
@@ -200,8 +200,8 @@ class TensorEnv:
             first = int(np.random.SeedSequence().generate_state(1, np.uint32)[0])
             old = torch.arange(first, first + self.num_envs, device=self.device)
         seeds = seeds_of(seed, self.num_envs)
-        new = torch.tensor([one or 0 for one in seeds], device=self.device)
-        given = torch.tensor([one is not None for one in seeds], device=self.device)
+        new = torch.tensor([number or 0 for number in seeds], device=self.device)
+        given = torch.tensor([number is not None for number in seeds], device=self.device)
         return torch.where(given, new, old), given
 
     def _new_params(self, given: Any, mask: Tensor) -> dict[str, Tensor]:
@@ -286,7 +286,7 @@ class TensorEnv:
         truncated = last & ~terminated
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             reward = reward.masked_fill(waiting, 0)
-            terminated, truncated, success = (one & ~waiting for one in (terminated, truncated, success))
+            terminated, truncated, success = (flags & ~waiting for flags in (terminated, truncated, success))
         self._returned = self._returned + reward
         ended = terminated | truncated
         info: Info = {"success": success, "_success": ~waiting}
@@ -343,9 +343,9 @@ def seeds_of(seed: Any, count: int) -> list[int | None]:
         raise TypeError(f"seed takes an integer, a list of them, or None; found {seed!r}")
     if len(seeds) != count:
         raise ValueError(f"seed has {len(seeds)} numbers for {count} environments")
-    for one in seeds:
-        if one is not None:
-            check_count("seed", one, MAX_SEED, least=0)
+    for value in seeds:
+        if value is not None:
+            check_count("seed", value, MAX_SEED, least=0)
     return seeds
 
 
@@ -356,13 +356,13 @@ def check_options(options: Mapping[str, Any], known: Sequence[str]) -> None:
 
 
 def reset_mask(value: Any, count: int, begun: bool, device: torch.device) -> Tensor:
-    """Which of `count` environments an option of `reset` says, bool [B]; None: all. Raises ValueError or ResetNeeded."""
+    """Read the option `reset_mask`: the environments to reset, bool [B]; None: all. Raises ValueError or ResetNeeded."""
     if value is None:
         return torch.ones(count, dtype=torch.bool, device=device)
     mask = torch.as_tensor(value, device=device)
     if mask.dtype != torch.bool or mask.shape != (count,) or not bool(mask.any()):
-        found = f"{mask.dtype} {list(mask.shape)}"
-        raise ValueError(f"reset_mask must be bool [{count}], True for some environments; found {found}")
+        shape = f"{mask.dtype} {list(mask.shape)}"
+        raise ValueError(f"reset_mask must be bool [{count}], True for some environments; found {shape}")
     if not begun and not bool(mask.all()):
         raise ResetNeeded("the first reset begins all episodes: reset_mask must be True everywhere")
     return mask

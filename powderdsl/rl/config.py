@@ -112,7 +112,7 @@ class TrainConfig:
         return kept if self.schedule == "constant" else {**kept, "steps": self.steps}
 
 
-HOW = tuple(one.name for one in fields(TrainConfig) if one.metadata.get("may_change"))
+HOW = tuple(field.name for field in fields(TrainConfig) if field.metadata.get("may_change"))
 """Settings that may change when a run is resumed: how long and on which machine it trains, not what it trains."""
 
 PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(

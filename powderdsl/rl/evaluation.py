@@ -179,7 +179,7 @@ def evaluate(
         CompileError: PD620 for a run that is not there, PD801 for a split. ValueError: another argument is wrong.
     """
     run, config, task = subject(run_or_task, packs)
-    names = [one.name for one in task.splits] if splits is None else list(dict.fromkeys(splits))
+    names = [split.name for split in task.splits] if splits is None else list(dict.fromkeys(splits))
     for name in names:
         check_split(task, name)
     if episodes < 1 or not names:
@@ -187,7 +187,7 @@ def evaluate(
     chosen = chosen_policies(policies, task, trained=run is not None)
     backend, device = backend or config.backend, device or config.device
     first = compile_task(task, split=names[0], backend=backend, device=device, threads=config.threads)
-    players = {one: player(one, first, run, deterministic=deterministic) for one in chosen}
+    players = {name: player(name, first, run, deterministic=deterministic) for name in chosen}
     trained = players.get("trained")
     step = trained.step if isinstance(trained, TrainedPolicy) else None
     own = TaskProgram(task, config.split, first.simulator)
@@ -201,21 +201,23 @@ def evaluate(
         worlds = torch.arange(episodes) % count
         if "expert" in chosen:
             players["expert"] = ExpertPlayer(program)
-        played = {one: _play_all(program, players[one], worlds, config.observation, seed) for one in chosen}
+        played = {
+            name: _play_all(program, players[name], worlds, config.observation, seed) for name in chosen
+        }
         if len(chosen) > 1:
-            returns = torch.stack([one.returns for one in played.values()])
+            returns = torch.stack([play.returns for play in played.values()])
             unchanged[name] = int((returns == returns[0]).all(0).sum())
         if name != config.split:
             new = torch.tensor([start not in training for start in _starts(program, worlds)])
             without = {
-                one: mean_and_interval(of.returns[new].tolist()) for one, of in played.items() if new.any()
+                name: mean_and_interval(of.returns[new].tolist()) for name, of in played.items() if new.any()
             }
             seen[name] = Seen(int((~new).sum()), without)
         scores += [_score(name, policy, played, task) for policy in chosen]
-    found = Evaluation(task.name, step, deterministic, seed, tuple(scores), unchanged, seen)
+    evaluation = Evaluation(task.name, step, deterministic, seed, tuple(scores), unchanged, seen)
     if run is not None:
-        write_json(run.path / EVALUATION, found.as_json())
-    return found
+        write_json(run.path / EVALUATION, evaluation.as_json())
+    return evaluation
 
 
 def subject(
@@ -361,7 +363,7 @@ class Film:
         self.scenes.append(FilmScene(ids, fields, self.actions, self._returns, self._over))
 
     def acted(self, returns: Tensor, over: Tensor) -> None:
-        """What the last scene shows besides, and those that follow."""
+        """Add the returns and ends of episodes to the last scene and to those that follow."""
         self._returns, self._over = returns.cpu().clone(), over.cpu().clone()
         self.scenes[-1] = self.scenes[-1]._replace(returns=self._returns, over=self._over)
 
@@ -405,7 +407,7 @@ def _words(task: Task, choice: int, blow: list[int]) -> str:
     """An action in a word or two; an empty string if it changes nothing."""
     number = task.agent.choices[choice]
     if number >= 0:
-        return next(one.name for one in task.ruleset.elements if one.id == number)
+        return next(element.name for element in task.ruleset.elements if element.id == number)
     if number != BLOW:
         return ""
     parts = ("left", "", "right")[blow[0]], ("up", "", "down")[blow[1]]

@@ -44,10 +44,10 @@ class Trunk(nn.Module):
         self.means = nn.ModuleList(nn.Linear(width, width) for _ in DILATIONS)
 
     def forward(self, patches: Tensor) -> Tensor:
-        found = self.first(patches).relu()
+        features = self.first(patches).relu()
         for block, mean in zip(self.blocks, self.means, strict=True):
-            found = found + (block(found) + mean(found.mean((2, 3)))[:, :, None, None]).relu()
-        return found
+            features = features + (block(features) + mean(features.mean((2, 3)))[:, :, None, None]).relu()
+        return features
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,8 @@ class BinDistribution:
         return self.form.decode(values).to(values.device)
 
     def log_prob(self, actions: Tensor) -> Tensor:
-        found: Tensor = self.distribution.log_prob(self.form.encode(actions.long()).to(actions.device))
-        return found
+        log_prob: Tensor = self.distribution.log_prob(self.form.encode(actions.long()).to(actions.device))
+        return log_prob
 
     def mode(self) -> Tensor:
         return self.action(self.distribution.probs.argmax(1))
@@ -135,10 +135,10 @@ class BinPolicy(ActorCriticPolicy):
             return torch.cat([patches, self.get_buffer("places").expand(len(patches), -1, -1, -1)], 1)
 
     def _distribution(self, seen: Tensor) -> BinDistribution:
-        found = self.trunk(seen)
-        scores = self.scores(found).flatten(1)
+        features = self.trunk(seen)
+        scores = self.scores(features).flatten(1)
         if self.idle is not None:
-            scores = torch.cat([scores, self.idle(found.mean((2, 3)))], 1)
+            scores = torch.cat([scores, self.idle(features.mean((2, 3)))], 1)
         return BinDistribution(self.form, Categorical(logits=scores))
 
     def _value(self, seen: Tensor) -> Tensor:

@@ -63,19 +63,20 @@ class TrainedPolicy:
     def __call__(self, observed: Tensor, keys: Tensor) -> Tensor:
         frames = observed.unflatten(1, (self.frames, -1))[:, :, : self.channels].flatten(1, 2)
         with torch.no_grad():
-            found: Any = self.network.get_distribution(frames)
+            distribution: Any = self.network.get_distribution(frames)
         # One for each number of an action, or one for all of them.
-        joint = isinstance(found, BinDistribution)
-        choices = [found.distribution] if joint else found.distribution
+        joint = isinstance(distribution, BinDistribution)
+        choices = [distribution.distribution] if joint else distribution.distribution
         if self.deterministic:
-            picked = [one.probs.argmax(1) for one in choices]
+            picked = [choice.probs.argmax(1) for choice in choices]
         else:
             drawn = uniforms(keys, len(choices))
-            below = [one.probs.double().cumsum(1) for one in choices]
+            below = [choice.probs.double().cumsum(1) for choice in choices]
             picked = [
-                (drawn[:, column, None] * one[:, -1:] >= one).sum(1) for column, one in enumerate(below)
+                (drawn[:, column, None] * bounds[:, -1:] >= bounds).sum(1)
+                for column, bounds in enumerate(below)
             ]
-        actions: Tensor = found.action(picked[0]) if joint else torch.stack(picked, 1)
+        actions: Tensor = distribution.action(picked[0]) if joint else torch.stack(picked, 1)
         return actions
 
 
@@ -94,13 +95,13 @@ def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: b
     Raises:
         CompileError: PD620 if there is no such run or checkpoint; PD623 if the environment does not fit the run.
     """
-    found = find_run(run, "ppo")
-    config = config_of(found)
+    folder = find_run(run, "ppo")
+    config = config_of(folder)
     if env.observation.kind != config.observation:
         why = f"it sees `{config.observation}`; the environment shows `{env.observation.kind}`"
-        raise does_not_fit(found.path, why)
-    own = _own_env(found, config, env)
-    checkpoint = found.checkpoint()
+        raise does_not_fit(folder.path, why)
+    own = _own_env(folder, config, env)
+    checkpoint = folder.checkpoint()
     kind, how = policy_of(config, own)
     space = own.observation.space
     if config.frames > 1:
@@ -109,7 +110,7 @@ def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: b
         )
     actions, rate = MultiDiscrete(np.array(own.action_nvec)), config.learning_rate
     network = kind(space, actions, lambda _: rate, **how | {"optimizer_class": _NoOptimizer})
-    with fitting(found.path, "its network is another"):
+    with fitting(folder.path, "its network is another"):
         network.load_state_dict(checkpoint.state["policy"])
     network.to(env.device).set_training_mode(False)
     channels = len(own.observation.channels)

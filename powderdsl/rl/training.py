@@ -180,8 +180,10 @@ class _Learner:
             "optimizer": model.policy.optimizer.state_dict(),
             "env": self.worlds.state(),
             "starts": torch.as_tensor(np.asarray(model._last_episode_starts)),
-            "episodes": [[one["r"], one["l"], one["t"]] for one in model.ep_info_buffer or ()],
-            "successes": [bool(one) for one in model.ep_success_buffer or ()],
+            "episodes": [
+                [episode["r"], episode["l"], episode["t"]] for episode in model.ep_info_buffer or ()
+            ],
+            "successes": [bool(success) for success in model.ep_success_buffer or ()],
             "updates": model._n_updates,
             "logged": _numbers(
                 model.logger.name_to_value
@@ -208,7 +210,7 @@ class _Learner:
             model._last_obs = self.stack.stacked_obs.stacked_obs.copy()
         if self.normal is not None:
             spread: Any = self.normal.ret_rms
-            spread.mean, spread.var, spread.count = (np.float64(one) for one in state["rewards"])
+            spread.mean, spread.var, spread.count = (np.float64(value) for value in state["rewards"])
             self.normal.returns[...] = state["returns"].numpy()
         model._last_episode_starts = state["starts"].numpy()
         size = model._stats_window_size
@@ -300,11 +302,11 @@ def _returns(dataset: Dataset, gamma: float) -> NDArray[np.float32]:
     parts = []
     for number in range(len(dataset)):
         reward = dataset.episode(number).reward.double().numpy()
-        total, found = 0.0, np.empty(len(reward), np.float32)
+        total, returns = 0.0, np.empty(len(reward), np.float32)
         for step in reversed(range(len(reward))):
             total = reward[step] + gamma * total
-            found[step] = total
-        parts.append(found)
+            returns[step] = total
+        parts.append(returns)
     return np.concatenate(parts)
 
 
@@ -340,7 +342,7 @@ class _Keeper(BaseCallback):
             self.saved_at, self.latest = time.monotonic(), None
         else:
             self.latest = step, deepcopy(state)
-        recent = [one["r"] for one in self.learner.model.ep_info_buffer or ()]
+        recent = [episode["r"] for episode in self.learner.model.ep_info_buffer or ()]
         self.mean = sum(recent) / len(recent) if recent else None
 
     def _on_step(self) -> bool:
@@ -398,14 +400,14 @@ def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
 def _random_state() -> dict[str, Any]:
     """The global generators, which Stable-Baselines3 draws from."""
     name, keys, *rest = np.random.get_state(legacy=True)
-    found = {
+    state = {
         "python": random.getstate(),
         "numpy": [name, torch.from_numpy(np.asarray(keys).astype(np.int64)), *rest],
         "torch": torch.get_rng_state(),
     }
     if torch.cuda.is_available() and torch.cuda.is_initialized():
-        found["cuda"] = torch.cuda.get_rng_state_all()
-    return found
+        state["cuda"] = torch.cuda.get_rng_state_all()
+    return state
 
 
 def _set_random_state(state: Mapping[str, Any]) -> None:

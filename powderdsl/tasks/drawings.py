@@ -123,7 +123,7 @@ def _repeat(key: yaml_tree.Scalar, body: yaml_tree.Node, reader: Reader) -> Repe
     for item in body.items if isinstance(body, yaml_tree.Sequence) else ():
         if isinstance(item, yaml_tree.Mapping) and _is_let(item):
             lets += read_lets(item.entries[0][1], reader)
-    statements = tuple(one for one in read_items(body, reader, nested=True) if isinstance(one, Statement))
+    statements = tuple(item for item in read_items(body, reader, nested=True) if isinstance(item, Statement))
     return Repeat(count.children[0], lets, statements, key.span) if count is not None else None
 
 
@@ -209,27 +209,27 @@ class Drawer:
         return tuple(lets)
 
     def region(self, name: str, shapes: Sequence[Statement]) -> Region:
-        drawings = tuple(filter(None, (self.drawing(one, self.names) for one in shapes)))
-        return Region(name, drawings, any(constants(one.amounts) is None for one in drawings))
+        drawings = tuple(filter(None, (self.drawing(shape, self.names) for shape in shapes)))
+        return Region(name, drawings, any(constants(drawing.amounts) is None for drawing in drawings))
 
     def groups(self, items: Sequence[Item], inside: tuple[str, ...] = ()) -> tuple[Group, ...]:
         """The groups of a list of statements: each repetition is one, and each statement between them."""
-        found: list[Group] = []
+        groups: list[Group] = []
         for item in items:
             if isinstance(item, Repeat):
-                found += self.repeated(item)
+                groups += self.repeated(item)
             elif item.kind == "part" and item.name is not None:
-                found += self.part(item.name, inside)
+                groups += self.part(item.name, inside)
             else:
                 self.count += 1
                 self.cells += 1
                 drawing = self.drawing(item, self.names)
-                found += [Group(self.count, number(1), 1, (), (drawing,))] if drawing else []
+                groups += [Group(self.count, number(1), 1, (), (drawing,))] if drawing else []
             if self.cells > MAX_DRAWINGS:
                 message = f"a world of more than {MAX_DRAWINGS:,} drawings"
                 self.reporter.error("PD508", message, item.span, "over the limit", helps=["draw less"])
                 break
-        return tuple(found)
+        return tuple(groups)
 
     def part(self, name: Syntax, inside: tuple[str, ...]) -> tuple[Group, ...]:
         if name.text not in self.plan.parts:
@@ -334,9 +334,11 @@ def element_ids(word: Written, ruleset: Ruleset, reporter: Reporter) -> tuple[in
     element = ruleset.element(word.text)
     if element is not None:
         return (element.id,)
-    tagged = tuple(one.id for one in ruleset.elements if word.text in one.tags)
+    tagged = tuple(element.id for element in ruleset.elements if word.text in element.tags)
     if not tagged:
-        known = {one.name for one in ruleset.elements} | {tag for one in ruleset.elements for tag in one.tags}
+        known = {element.name for element in ruleset.elements} | {
+            tag for element in ruleset.elements for tag in element.tags
+        }
         helps = suggest(word.text, known, "its elements")
         label = "neither an element nor a tag of these rules"
         reporter.error("PD604", f"unknown element `{word.text}`", word.span, label, helps=helps)
@@ -386,7 +388,7 @@ def _drawn(
             reader.reporter.error("PD110", "a legend has single characters", key.span, "not one character")
     legend = {key.text: value.text for key, value in decl.legend if len(key.text) == 1}
     hole = replace(ruleset.elements[0], name="?", pack="?", id=LEAVE, glyph="?")
-    elements: list[Element] = [one for one in ruleset.elements if one.id != LEAVE]
+    elements: list[Element] = [element for element in ruleset.elements if element.id != LEAVE]
     if art.style == "quoted" and art.content.text.split() != art.text.split():
         helps = ["write `art: |`, and the rows below it"]
         reader.reporter.error("PD107", "art with escapes", art.span, "quoted, on one line", helps=helps)
@@ -398,7 +400,7 @@ def _named(word: yaml_tree.Scalar, reader: Reader, ruleset: Ruleset) -> NDArray[
     """A shipped scene, or a file beside the task's: .yaml, .png or .txt."""
     file, sign, name = word.text.partition("#")
     suffix = Path(file).suffix.lower()
-    known = [one.name for one in shipped_scenes()]
+    known = [scene.name for scene in shipped_scenes()]
     if word.text not in known and suffix not in (".png", ".txt", ".yaml", ".yml"):
         helps = suggest(word.text, known) or ("shipped: " + ", ".join(known),)
         reader.reporter.error("PD601", f"unknown scene `{word.text[:80]}`", word.span, helps=helps)
@@ -409,7 +411,7 @@ def _named(word: yaml_tree.Scalar, reader: Reader, ruleset: Ruleset) -> NDArray[
     if suffix in (".png", ".txt"):
         return (read_image if suffix == ".png" else load_ascii)(f"{path}{sign}{name}", ruleset.elements)
     scene = find_scene(f"{path}{sign}{name}")
-    setting = next((one for one in scene.paints if isinstance(one, Setting)), None)
+    setting = next((statement for statement in scene.paints if isinstance(statement, Setting)), None)
     if setting is not None:
         message = f"the scene `{scene.name}` sets `{setting.name}`"
         reader.reporter.error("PD605", message, word.span, "a picture is made of elements only")

@@ -130,7 +130,7 @@ class TaskProgram:
         maps = {"state": episodes.world.state, "regions": episodes.regions, "targets": episodes.targets}
         return {
             **{name: _copy(getattr(episodes, name)) for name in ROWS},
-            **{name: {key: _copy(value) for key, value in one.items()} for name, one in maps.items()},
+            **{name: {key: _copy(value) for key, value in values.items()} for name, values in maps.items()},
             "clock": [_copy(getattr(episodes.world, name)) for name in CLOCK],
         }
 
@@ -138,14 +138,14 @@ class TaskProgram:
         """The episodes that `saved` was given. Raises KeyError and ValueError for those of other rules or sizes."""
         device = self.simulator.device
 
-        def tensors(one: Mapping[str, Tensor]) -> dict[str, Tensor]:
-            return {name: _copy(value, device) for name, value in one.items()}
+        def tensors(values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+            return {name: _copy(value, device) for name, value in values.items()}
 
         state = tensors(saved["state"])
         names = {slot.name for slot in self.simulator.slots}
         if set(state) != names or tuple(state["element"].shape[1:]) != self.task.size:
             raise ValueError(f"these episodes are not of {self.task.name}: another state, or another size")
-        seed, index, step = (_copy(one, device) for one in saved["clock"])
+        seed, index, step = (_copy(part, device) for part in saved["clock"])
         return Episodes(
             world=World(self.simulator, state, seed, index, step),
             regions={**tensors(saved["regions"]), **self._fixed},
@@ -199,12 +199,12 @@ class TaskProgram:
             action["left"] = agent.actions - acted
         facts = Facts(self._places, now, episodes.start, episodes.before, action)
         success, failed = (
-            torch.zeros_like(last) if one is None else scalar_value(one, facts) != 0
-            for one in (goal.success, goal.failure)
+            torch.zeros_like(last) if scalar is None else scalar_value(scalar, facts) != 0
+            for scalar in (goal.success, goal.failure)
         )
         over = last
-        for one, holds in ((goal.success, success), (goal.failure, failed)):
-            over = over if one is None else over | holds
+        for scalar, holds in ((goal.success, success), (goal.failure, failed)):
+            over = over if scalar is None else over | holds
         if goal.each is None:
             reward = torch.zeros_like(acted, dtype=torch.float64)
         else:
@@ -270,10 +270,10 @@ def compile_task(
     Raises:
         CompileError: PD801 for a split that the task does not have, PD701 for a backend or device that is not available.
     """
-    found = task if isinstance(task, Task) else load_task(task)
-    check_split(found, split)
-    simulator = compile_rules(found.ruleset, backend, str(device), threads)
-    return TaskProgram(found, split, simulator)
+    loaded = task if isinstance(task, Task) else load_task(task)
+    check_split(loaded, split)
+    simulator = compile_rules(loaded.ruleset, backend, str(device), threads)
+    return TaskProgram(loaded, split, simulator)
 
 
 def integer_tensor(name: str, values: Any, device: torch.device | None = None) -> Tensor:

@@ -232,7 +232,7 @@ class _TaskReader:
         if node is None:
             return 64, 64
         size = two_integers(node)
-        if size is None or not all(1 <= one <= MAX_SIDE for one in size):
+        if size is None or not all(1 <= side <= MAX_SIDE for side in size):
             label = f"two integers from 1 to {MAX_SIDE}"
             helps = ["size: [64, 64]"]
             self.reporter.error("PD607", "a size is [rows, columns]", first_line(node), label, helps=helps)
@@ -260,25 +260,25 @@ class _TaskReader:
         self.taken.add(word.text)
 
     def is_name(self, word: str) -> bool:
-        """Whether a word means something in the task's own rules."""
+        """True if a word means something in the task's own rules."""
         symbols = self.typer.symbols
         pack = symbols.names.pack(word)
         return pack in (None, *self.own) and bool(self.ruleset.element(word) or symbols.constants.get(word))
 
     def knobs(self) -> tuple[Knob, ...]:
-        found: dict[str, Knob] = {}
+        knobs: dict[str, Knob] = {}
         for decl in self.decl.knobs:
             self.take(decl.name)
             self.broken.add(decl.name.text)
-            knob = self.knob(decl, found)
+            knob = self.knob(decl, knobs)
             if knob is not None:
                 self.broken.discard(knob.name)
-                found[knob.name] = knob
+                knobs[knob.name] = knob
         for name in self.given:
             if name not in self.taken:
-                helps = suggest(name, found, "knobs") or ("the task has no knobs",)
+                helps = suggest(name, knobs, "knobs") or ("the task has no knobs",)
                 self.reporter.error("PD803", f"no knob `{name}`", None, helps=helps)
-        return tuple(found.values())
+        return tuple(knobs.values())
 
     def knob(self, decl: KnobDecl, above: Mapping[str, Knob]) -> Knob | None:
         key = decl.name
@@ -349,12 +349,12 @@ class _TaskReader:
             return [base]
         if not limited(node, MAX_VARIANTS, "{} stands", self.reporter):
             return [base]
-        found = []
+        plans = []
         for item in node.items:
             decl = self.reader.record(StandDecl, item, "a stand")
             if decl is not None:
-                found.append(self.varied(base, decl, decl.stand.text if decl.stand else "?"))
-        return found
+                plans.append(self.varied(base, decl, decl.stand.text if decl.stand else "?"))
+        return plans
 
     def varied(self, plan: DrawingPlan, decl: Variant, name: str) -> DrawingPlan:
         """The plan with what a split or stand changes."""

@@ -55,24 +55,24 @@ class GoalChecker:
 
     def number(self, syntax: Syntax) -> Expr | None:
         """A reward, or None after reporting what is wrong with it."""
-        found = self._checked(syntax)
-        if found is not None and not any(one.op in ("measure", "action") for one in parts_of(found)):
+        scalar = self._checked(syntax)
+        if scalar is not None and not any(part.op in ("measure", "action") for part in parts_of(scalar)):
             label = "it has the same value in every world"
             self.typer.reporter.report("PD805", "this never changes", syntax.span, label)
-        return found
+        return scalar
 
     def condition(self, syntax: Syntax) -> Expr | None:
         """A condition that ends an episode, or None after a report."""
-        found = self.number(syntax)
-        if found is None or found.kind == FLAG:
-            return found
+        scalar = self.number(syntax)
+        if scalar is None or scalar.kind == FLAG:
+            return scalar
         self._not_a_condition(syntax)
         return None
 
     def measured(self, how: str, cells: Syntax) -> Measure | None:
         """A measure of the cells of an expression, or None after a report."""
-        found = self._checked(cells, lambda: Expr("measure", REAL, value=self.measure(how, cells)))
-        return None if found is None else found.value
+        scalar = self._checked(cells, lambda: Expr("measure", REAL, value=self.measure(how, cells)))
+        return None if scalar is None else scalar.value
 
     def _checked(self, syntax: Syntax, check: Callable[[], Expr] | None = None) -> Expr | None:
         self.typer.start_rule(syntax.span)
@@ -113,10 +113,10 @@ class GoalChecker:
         raise self._needs_measure(syntax)
 
     def truth(self, syntax: Syntax) -> Expr:
-        found = self.scalar(syntax)
-        if found.kind != FLAG:
+        scalar = self.scalar(syntax)
+        if scalar.kind != FLAG:
             raise self._not_a_condition(syntax)
-        return found
+        return scalar
 
     def _not_a_condition(self, syntax: Syntax) -> Poisoned:
         message = "expected a condition, found a number"
@@ -124,13 +124,13 @@ class GoalChecker:
 
     def compare(self, syntax: Syntax) -> Expr:
         values = [self.scalar(part) for part in syntax.children]
-        found = []
+        tests = []
         for sign, (left, right) in zip(syntax.text.split(), pairwise(values), strict=True):
             if sign in (">", ">="):
                 left, right, sign = right, left, sign.replace(">", "<")
-            one = Expr(COMPARISONS.get(sign, "eq"), FLAG, (left, right))
-            found.append(Expr("not", FLAG, (one,)) if sign == "!=" else one)
-        return reduce(lambda a, b: Expr("and", FLAG, (a, b)), found)
+            test = Expr(COMPARISONS.get(sign, "eq"), FLAG, (left, right))
+            tests.append(Expr("not", FLAG, (test,)) if sign == "!=" else test)
+        return reduce(lambda a, b: Expr("and", FLAG, (a, b)), tests)
 
     def name(self, syntax: Syntax) -> Expr:
         if syntax.text in self.knobs:
@@ -178,7 +178,7 @@ class GoalChecker:
             return reduce(lambda a, b: Expr(name, REAL, (a, b)), values)
         if name in MEMORIES:
             inner = self.scalar(parts[0])
-            if any(one.op in ("start", "before", "action") for one in parts_of(inner)):
+            if any(part.op in ("start", "before", "action") for part in parts_of(inner)):
                 raise self.typer.fail("PD406", f"`{name}` of what is not a number of a world", parts[0].span)
             if name == "start":
                 return Expr("start", REAL, (inner,))
@@ -207,18 +207,18 @@ class GoalChecker:
         """The expression of each cell that a measure is taken of."""
         operand = self.typer.evaluate(self.within(syntax), self.scope)
         if how in ("count", "share", "highest"):
-            found = self.typer.flag(operand, syntax.span)
+            condition = self.typer.flag(operand, syntax.span)
         else:
             value = self.typer.value(operand, syntax.span)
             if value.kind.name not in ("int", "flag", "real"):
                 raise self.typer.wrong(value, "a number of each cell", syntax.span, "such as a field")
-            found = value
-        if any(part.op == "draw" for part in found.walk()):
+            condition = value
+        if any(part.op == "draw" for part in condition.walk()):
             raise self.typer.fail("PD406", "a reward draws no random numbers", syntax.span, "a draw")
-        if found.op == "const" or (isinstance(operand, SetOf) and not operand.ids):
-            label = "every cell fulfills this" if found.value else "no cell can fulfill this"
+        if condition.op == "const" or (isinstance(operand, SetOf) and not operand.ids):
+            label = "every cell fulfills this" if condition.value else "no cell can fulfill this"
             self.typer.reporter.report("PD805", "this never changes", syntax.span, label)
-        return found
+        return condition
 
     def within(self, syntax: Syntax) -> Syntax:
         """The syntax with `CELLS in REGION` written as `CELLS and REGION`."""
@@ -233,9 +233,9 @@ class GoalChecker:
 
 def parts_of(scalar: Expr) -> list[Expr]:
     """The expression and everything in it, in the order in which measures are kept."""
-    found, stack = [], [scalar]
+    parts, stack = [], [scalar]
     while stack:
-        one = stack.pop()
-        found.append(one)
-        stack += one.args
-    return found
+        part = stack.pop()
+        parts.append(part)
+        stack += part.args
+    return parts

@@ -55,10 +55,10 @@ class ExpertPlayer:
                 applies &= scalar_value(move.condition, facts) != 0
             if not bool(applies.any()):
                 continue
-            found, cells = self._action(move, episodes)
+            targets, cells = self._action(move, episodes)
             if number + 1 < len(self.expert.moves):
                 applies &= cells >= move.least
-            actions[applies] = found[applies]
+            actions[applies] = targets[applies]
             waiting &= ~applies
         return actions
 
@@ -125,9 +125,9 @@ def best_plans(program: TaskProgram, worlds: Tensor, count: int) -> Tensor:
             ],
             1,
         )
-        found = _returns(program, seeds, plans).view(len(numbers), len(worlds))
-        top = found.argmax(0)
-        better = found.gather(0, top[None])[0]
+        plan_returns = _returns(program, seeds, plans).view(len(numbers), len(worlds))
+        top = plan_returns.argmax(0)
+        better = plan_returns.gather(0, top[None])[0]
         chosen = plans.view(len(numbers), len(worlds), agent.actions, 5)[
             top, torch.arange(len(worlds), device=device)
         ]

@@ -26,7 +26,7 @@ def shipped_tasks() -> list[str]:
 
 
 def is_task(name: str) -> bool:
-    """Whether a name or path means a task: a shipped one, or a file that begins with ``task:``."""
+    """True if a name or path means a task: a shipped one, or a file that begins with ``task:``."""
     if name in shipped_tasks():
         return True
     if not name.lower().endswith((".yaml", ".yml")):
@@ -75,12 +75,14 @@ def load_task_with_diagnostics(name_or_path: str | Path, **how: Any) -> tuple[Ta
     """Like `load_task`; the second value has the warnings and notes."""
     reporter = Reporter()
     task = load_task(name_or_path, reporter=reporter, **how)
-    return task, tuple(one for one in reporter.diagnostics if one.severity is not Severity.ERROR)
+    return task, tuple(
+        diagnostic for diagnostic in reporter.diagnostics if diagnostic.severity is not Severity.ERROR
+    )
 
 
 def check_split(task: Task, split: str) -> None:
     """Raises CompileError (PD801) for a split that the task does not have."""
-    names = [one.name for one in task.splits]
+    names = [split.name for split in task.splits]
     if split not in names:
         helps = suggest(split, names, "splits") or ("splits: " + ", ".join(names),)
         raise failure("PD801", f"the task {task.name} has no split `{str(split)[:80]}`", helps=helps)

@@ -101,7 +101,7 @@ class Target:
 
 @dataclass(frozen=True)
 class Generator:
-    """How a world starts: `fill` everywhere, then all groups in order. `lets` are draws that everything shares."""
+    """A recipe for start worlds: `fill` everywhere, then all groups in order. `lets` are draws that everything shares."""
 
     name: str
     fill: int
@@ -145,7 +145,7 @@ class Agent:
 
     @property
     def action_nvec(self) -> tuple[int, int, int, int, int]:
-        """How many values x, y, choice, vx and vy have."""
+        """The number of values of x, y, choice, vx and vy."""
         rows, columns = self.bins
         return columns, rows, len(self.choices), 3, 3
 
@@ -209,7 +209,7 @@ class ExpertMove:
 
 @dataclass(frozen=True)
 class Expert:
-    """How a good player acts. Before each action the first move that applies is played; a move applies if its condition
+    """A scripted player. Before each action the first move that applies is played; a move applies if its condition
     holds and enough cells of `most` exist. The last move always applies.
 
     If `search` is not 0, there are no moves: that number of random plans is simulated in each world, and the best is played.
@@ -258,7 +258,7 @@ def still_action(task: Task) -> tuple[int, int, int, int, int]:
         ValueError: the task has neither.
     """
     choices = task.agent.choices
-    choice = next((one for one in (NO_CHANGE, BLOW) if one in choices), None)
+    choice = next((number for number in (NO_CHANGE, BLOW) if number in choices), None)
     if choice is None:
         raise ValueError(
             f"the policy `nothing`: the agent of {task.name} may neither `blow` nor do `nothing`"

@@ -66,8 +66,8 @@ def home_of(path: Path) -> str:
 
 def _listed(key: str, text: str) -> list[str]:
     """The names after a key that stand on its line."""
-    found = re.search(rf"^{key}:[ \t]*\[?([^\]\n]*)", text, re.MULTILINE)
-    return re.findall(r"\w+", found[1]) if found else []
+    match = re.search(rf"^{key}:[ \t]*\[?([^\]\n]*)", text, re.MULTILINE)
+    return re.findall(r"\w+", match[1]) if match else []
 
 
 @cache
@@ -97,13 +97,13 @@ class PackFile(pytest.File):
         ruleset = loaded(*home)
         names: dict[str, int] = {}
         subjects: list[Example | Invariant] = [*ruleset.tests, *ruleset.invariants]
-        for one in subjects:
-            if Path(one.span.source.name).resolve() != self.path.resolve():
+        for subject in subjects:
+            if Path(subject.span.source.name).resolve() != self.path.resolve():
                 continue
-            name = printable(getattr(one, "name", "") or " ".join(one.span.text.split()))
+            name = printable(getattr(subject, "name", "") or " ".join(subject.span.text.split()))
             names[name] = names.get(name, 0) + 1
             unique = name if names[name] == 1 else f"{name} ({names[name]})"
-            yield PackItem.from_parent(self, name=unique, home=home, subject=one)
+            yield PackItem.from_parent(self, name=unique, home=home, subject=subject)
 
 
 class PackItem(pytest.Item):

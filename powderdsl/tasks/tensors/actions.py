@@ -73,7 +73,7 @@ class Blocks:
         self._edges = [axis.cpu().numpy() for axis in edges]
 
     def fresh_cells(self, state: Mapping[str, Tensor], ids: Numbers) -> dict[str, Any]:
-        """What new cells of elements hold: arrays [B, …] for a packed state, tensors for others."""
+        """Return the state of new cells of elements: arrays [B, …] for a packed state, tensors for others."""
         tables: Mapping[str, Any] = self._arrays if isinstance(state, PackedState) else self.fresh
         return {name: table[ids] for name, table in tables.items()}
 
@@ -99,7 +99,7 @@ class Blocks:
                 for name, value in values.items()
             }
             return state.fill(torch.from_numpy(cells * where[:, None]), numbers, reuse=reuse)
-        found = dict(state)
+        state_after = dict(state)
         for name, value in values.items():
             slot = state[name] if reuse else state[name].clone()
             flat = slot.flatten(-2)
@@ -107,8 +107,8 @@ class Blocks:
             before = flat.gather(-1, index)
             filled = where.view(-1, *[1] * (before.ndim - 1))
             flat.scatter_(-1, index, torch.where(filled, value.to(slot.dtype)[..., None], before))
-            found[name] = flat.view(slot.shape)
-        return found
+            state_after[name] = flat.view(slot.shape)
+        return state_after
 
 
 class Hands:

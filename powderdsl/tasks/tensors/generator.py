@@ -90,10 +90,10 @@ def joined(kind: ArrayKind, parts: Sequence[Made], fixed: Mapping[str, Array]) -
     """The worlds of all parts in a row. Regions of `fixed` are the same in all worlds."""
     xp, regions = kind.xp, dict(fixed)
     for name in (name for name in parts[0].regions if name not in fixed):
-        cells = [xp.broadcast_to(one.regions[name], one.ids.shape) for one in parts]
+        cells = [xp.broadcast_to(part.regions[name], part.ids.shape) for part in parts]
         regions[name] = xp.concatenate(cells)
-    targets = {name: xp.concatenate([one.targets[name] for one in parts]) for name in parts[0].targets}
-    return Made(xp.concatenate([one.ids for one in parts]), regions, targets)
+    targets = {name: xp.concatenate([part.targets[name] for part in parts]) for name in parts[0].targets}
+    return Made(xp.concatenate([part.ids for part in parts]), regions, targets)
 
 
 class Hashes:
@@ -254,7 +254,7 @@ class WorldMaker:
                 continue
             active = xp.broadcast_to(self.kind.arange(repeats) < count, (batch, repeats))
             local = self._lets(group.lets, hashes, repeats, names)
-            painters = [_Painter(self, one, hashes, local, active) for one in group.drawings]
+            painters = [_Painter(self, drawing, hashes, local, active) for drawing in group.drawings]
             for repeat in range(repeats):
                 for painter in painters:
                     ids = painter.painted(ids, repeat, regions)
@@ -272,7 +272,9 @@ class _Painter:
         kind, shape = maker.kind, tuple(active.shape)
         self.active = kind.xp.asarray(active, dtype=kind.xp.uint8)
         draws = _Draws(hashes, drawing.number, shape[1], names, drawing.amounts, len(drawing.ids))
-        self.numbers = [None if one is None else kind.xp.broadcast_to(one, shape) for one in draws.arrays]
+        self.numbers = [
+            None if array is None else kind.xp.broadcast_to(array, shape) for array in draws.arrays
+        ]
         ids = kind.put(list(drawing.ids) or [0], "uint8")
         self.ids = kind.xp.broadcast_to(ids if draws.choice is None else ids[draws.choice], shape)
         self.is_fixed = constants(drawing.amounts) is not None
@@ -298,7 +300,7 @@ class _Painter:
         if drawing.where is not None:
             cells = cells & regions[drawing.where]
         if drawing.over is not None:
-            cells = cells & reduce(or_, [ids == one for one in sorted(drawing.over)])
+            cells = cells & reduce(or_, [ids == number for number in sorted(drawing.over)])
         # Bits of bytes, which are changed many at a time; `where` takes 15 times as long.
         changed = (ids ^ painted) * cells
         if drawing.kind in _WITHOUT_ROWS or self.is_fixed:
@@ -350,12 +352,12 @@ class StartWorlds:
 
     def __init__(self, task: Task, split: str, kind: ArrayKind):
         self.kind = kind
-        self._makers = [WorldMaker(one, task.size, kind) for one in task.split(split).variants]
+        self._makers = [WorldMaker(variant, task.size, kind) for variant in task.split(split).variants]
         cells = [maker.fixed_cells for maker in self._makers]
         self.fixed: Mapping[str, Array] = {
             name: value
             for name, value in cells[0].items()
-            if all(name in one and bool((value == one[name]).all()) for one in cells)
+            if all(name in named and bool((value == named[name]).all()) for named in cells)
         }
         """Regions that are the same in all worlds of the split, bool [1, H, W]."""
 
@@ -371,5 +373,7 @@ class StartWorlds:
         # Back from the order of variants to that of the seeds.
         worlds = sorted(range(len(variants)), key=variants.__getitem__)
         order = self.kind.put(sorted(worlds, key=worlds.__getitem__), "int64")
-        regions = {name: one if name in self.fixed else one[order] for name, one in made.regions.items()}
-        return Made(made.ids[order], regions, {name: one[order] for name, one in made.targets.items()})
+        regions = {
+            name: cells if name in self.fixed else cells[order] for name, cells in made.regions.items()
+        }
+        return Made(made.ids[order], regions, {name: target[order] for name, target in made.targets.items()})

@@ -29,8 +29,8 @@ from powderdsl.worlds.raster import Size
 
 def scalars_of(goal: Goal) -> list[Expr]:
     """Every part of a goal's expressions."""
-    scalars = [one for one in (goal.each, goal.final, goal.success, goal.failure) if one is not None]
-    return [part for one in scalars for part in parts_of(one)]
+    scalars = [scalar for scalar in (goal.each, goal.final, goal.success, goal.failure) if scalar is not None]
+    return [part for scalar in scalars for part in parts_of(scalar)]
 
 
 def measures_in(scalars: Iterable[Expr]) -> tuple[Measure, ...]:
@@ -89,22 +89,28 @@ class Meter:
         return torch.stack([column.expand(batch) for column in columns], 1)
 
     def _cell_counts(self, program: NativeProgram) -> CellCounts | None:
-        """What counts all measures in packed worlds, if they are numbers of cells that bit planes show."""
-        values = [(i, one) for i, one in enumerate(self.measures) if one.how in ("count", "share", "highest")]
-        regions = {one.region for one in self.measures if one.region is not None}
+        """Return a counter of all measures in packed worlds, if bit planes show all cells that are counted."""
+        values = [
+            (i, measure)
+            for i, measure in enumerate(self.measures)
+            if measure.how in ("count", "share", "highest")
+        ]
+        regions = {measure.region for measure in self.measures if measure.region is not None}
         if not values or len(values) < len(self.measures) or not regions <= self._fixed.keys():
             return None
         try:
             (pass_,) = lower_bits(_lowered(self.ruleset, values)).passes
             flags = dict(pass_.outputs)
             counted = [
-                Counted(flags[f"measure {i}"], one.region, one.how == "highest", self._cells_of(one))
-                for i, one in values
+                Counted(
+                    flags[f"measure {i}"], measure.region, measure.how == "highest", self._cells_of(measure)
+                )
+                for i, measure in values
             ]
             masks = {name: pack(cells[0]) for name, cells in self._fixed.items()}
             masks |= {REGION_LET + name: words for name, words in masks.items()}
             everywhere = torch.ones(1, *self.size, dtype=torch.bool, device=self.device)
-            cells = torch.cat([self._fixed.get(str(one.region), everywhere) for _, one in values])
+            cells = torch.cat([self._fixed.get(str(measure.region), everywhere) for _, measure in values])
             counted_rows = cells.any(2).any(0).nonzero()[:, 0].tolist() or [0]
             rows = counted_rows[0], counted_rows[-1] + 1
             return CellCounts(counted, program.layout.planes, masks, rows)
@@ -112,7 +118,7 @@ class Meter:
             return None  # floats, neighbors, other regions: tensors show them
 
     def _cells_of(self, measure: Measure) -> float:
-        """What a number of cells is divided by."""
+        """Return the divisor of a number of cells."""
         if measure.how != "share":
             return 1.0
         region = measure.region
@@ -187,7 +193,7 @@ class _Cells:
         self.numbers = [number for number, _ in measures]
         source, name, constants = pass_source(_lowered(ruleset, measures).passes[0], 0)
         self.types = _types(ruleset)
-        self.slots = [one for one in self.types if f"state[{one!r}]" in source]
+        self.slots = [name for name in self.types if f"state[{name!r}]" in source]
         self.regions = _lets([measure for _, measure in measures])
         self.run: PassFunction = compiled(source, name, constants, device)
 
@@ -195,7 +201,9 @@ class _Cells:
         self, world: World, regions: Mapping[str, Tensor], params: Mapping[str, Any] | None
     ) -> dict[int, Tensor]:
         """The value of each cell, [B, H, W], by the measure's number. `params` are those that differ from the rules' own."""
-        values = {one.name: (params or {}).get(one.name, float(one.default)) for one in self.ruleset.params}
+        values = {
+            param.name: (params or {}).get(param.name, float(param.default)) for param in self.ruleset.params
+        }
         every = {
             name: torch.as_tensor(value, dtype=torch.float64, device=self.device).expand(len(world))
             for name, value in values.items()
@@ -218,7 +226,7 @@ _WORKING = {"flag": torch.bool, "int": torch.int32, "real": torch.float32}
 
 @dataclass(frozen=True)
 class Facts:
-    """What a scalar is calculated from: measures now, at the start and before the action, float64 [B, n]; and the action."""
+    """The inputs of a scalar: measures now, at the start and before the action, float64 [B, n]; and the action."""
 
     measures: Mapping[Measure, int]
     now: Tensor
@@ -229,8 +237,8 @@ class Facts:
 
 def scalar_value(scalar: Expr, facts: Facts) -> Tensor:
     """float64 [B]; conditions are 0 or 1."""
-    found = _value(scalar, facts)
-    return found if found.ndim else found.expand(len(facts.now)).clone()
+    value = _value(scalar, facts)
+    return value if value.ndim else value.expand(len(facts.now)).clone()
 
 
 def _value(scalar: Expr, facts: Facts) -> Tensor:
@@ -246,12 +254,12 @@ def _value(scalar: Expr, facts: Facts) -> Tensor:
             then = facts.start if scalar.op == "start" else facts.before
             return _value(scalar.args[0], replace(facts, now=then))
     args = [_value(arg, facts) for arg in scalar.args]
-    found = _VALUES[scalar.op](*args)
+    value = _VALUES[scalar.op](*args)
     if scalar.op in ("div", "quotient", "mod") and not (
         scalar.args[1].op == "const" and scalar.args[1].value
     ):
-        return found.masked_fill(args[1] == 0, 0)
-    return found
+        return value.masked_fill(args[1] == 0, 0)
+    return value
 
 
 _VALUES: Mapping[str, Callable[..., Tensor]] = {

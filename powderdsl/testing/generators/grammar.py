@@ -48,7 +48,7 @@ class Production:
 
     @cached_property
     def nests(self) -> bool:
-        """Whether the phrase contains expressions, and not one alone: its parts nest one level deeper."""
+        """True if the phrase contains more than a single expression: its parts nest one level deeper."""
         texts, parts = self.pieces
         return any(texts) and any(kind in EXPRESSIONS for _, kind in parts)
 

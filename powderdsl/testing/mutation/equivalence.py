@@ -16,7 +16,7 @@ from powderdsl.model.types import Pass, Ruleset, minus, plus
 
 
 def proven_equal(first: Ruleset, second: Ruleset) -> bool:
-    """Whether two compositions turn every world into the same one. False proves nothing.
+    """True if two compositions provably turn every world into the same world. False proves nothing.
 
     Worlds must hold the same, so that a changed range, default or kind of a field is a difference by itself.
     """
@@ -24,10 +24,10 @@ def proven_equal(first: Ruleset, second: Ruleset) -> bool:
         return False
     same_tables = first.properties == second.properties
     cells = _cells(first)
-    for one, other in zip(first.passes, second.passes, strict=True):
-        if same_tables and one == other:
+    for mine, theirs in zip(first.passes, second.passes, strict=True):
+        if same_tables and mine == theirs:
             continue
-        if not _same_pass(first, one, second, other, cells):
+        if not _same_pass(first, mine, second, theirs, cells):
             return False
     return True
 
@@ -65,37 +65,39 @@ def _cells(ruleset: Ruleset) -> Cells:
     return Cells(domains, holders)
 
 
-def _same_pass(first: Ruleset, one: Pass, second: Ruleset, other: Pass, cells: Cells) -> bool:
+def _same_pass(first: Ruleset, mine: Pass, second: Ruleset, theirs: Pass, cells: Cells) -> bool:
     """Substep by substep, each from whatever the one before may have left; if that does not do, as a whole."""
-    if one.scratch != other.scratch:
+    if mine.scratch != theirs.scratch:
         return False
-    numbers = range(len(one.moments))
-    if len(one.moments) == len(other.moments) and all(
-        _same_substep(first, one, second, other, number, cells) for number in numbers
+    numbers = range(len(mine.moments))
+    if len(mine.moments) == len(theirs.moments) and all(
+        _same_substep(first, mine, second, theirs, number, cells) for number in numbers
     ):
         return True
     graph = Graph()
-    return _same_writes(lower_pass(first, one, graph), lower_pass(second, other, graph), graph, cells)
+    return _same_writes(lower_pass(first, mine, graph), lower_pass(second, theirs, graph), graph, cells)
 
 
-def _same_substep(first: Ruleset, one: Pass, second: Ruleset, other: Pass, number: int, cells: Cells) -> bool:
+def _same_substep(
+    first: Ruleset, mine: Pass, second: Ruleset, theirs: Pass, number: int, cells: Cells
+) -> bool:
     graph = Graph()
     return _same_writes(
-        lower_substep(first, one, number, graph), lower_substep(second, other, number, graph), graph, cells
+        lower_substep(first, mine, number, graph), lower_substep(second, theirs, number, graph), graph, cells
     )
 
 
 def _same_writes(first: dict[str, Node], second: dict[str, Node], graph: Graph, cells: Cells) -> bool:
-    """Whether both write the same; a slot that one of them does not write keeps its value."""
+    """True if both passes write the same values; a slot that a pass does not write keeps its value."""
     compare = Comparison(cells)
     for name in dict.fromkeys([*first, *second]):
-        one, other = first.get(name), second.get(name)
-        written = one or other
+        mine, theirs = first.get(name), second.get(name)
+        written = mine or theirs
         assert written is not None
-        if name.startswith("let ") and (one is None or other is None):
+        if name.startswith("let ") and (mine is None or theirs is None):
             continue  # no other rule reads a value that the other does not have
         kept = graph.node("input", written.type, (), name)
-        if not compare.equal(one or kept, other or kept):
+        if not compare.equal(mine or kept, theirs or kept):
             return False
     return True
 
@@ -177,7 +179,7 @@ class Comparison:
         return False
 
     def is_always(self, flag: Node, value: int) -> bool:
-        """Whether a flag is this, 0 or 1, everywhere."""
+        """True if a flag has this value, 0 or 1, in every cell."""
         return self._decided(
             (flag,), lambda case: bool((case.value(flag, (0, 0)) == value)[case.valid].all())
         )
@@ -191,7 +193,7 @@ class Comparison:
         )
 
     def _decided(self, roots: tuple[Node, ...], question: Callable[[_Cases], bool]) -> bool:
-        """Whether something holds in every case. If there are too many, counts of other cells may be any number."""
+        """True if the question holds in every case. If there are too many cases, counts of other cells may be any number."""
         for counted in (False, True):
             try:
                 return question(_Cases(roots, self.cells, self, counted))
@@ -224,7 +226,7 @@ def _reads(node: Node, at: Offset) -> list[tuple[Node, Offset]]:
 
 
 def _is_free(node: Node) -> bool:
-    """Whether a node that is not a float is a variable of its own: it depends on some, or on a parameter."""
+    """True if a node counts as a variable: it depends on floats or on a parameter, and is not a float itself."""
     chance = node.op == "below" and node.args[0].op != "const"
     return chance or node.op == "param" or any(arg.type == REAL for arg in node.args)
 
@@ -391,8 +393,8 @@ class _Cases:
         if node.op == "shift":  # nothing beyond the edge, unless it wraps
             return parts[0] * own[0] if own else parts[0]
         evaluate = _EVALUATE.get(node.op, OPS[node.op].value)
-        found: Array = evaluate(node.attr, *parts)
-        return found.astype(np.int32)
+        value: Array = evaluate(node.attr, *parts)
+        return value.astype(np.int32)
 
     def _count(self, node: Node, at: Offset) -> Array:
         weights, wraps = node.attr
@@ -415,7 +417,7 @@ def _others(node: Node, at: Offset) -> Variable:
 
 
 def _at(node: Node, at: Offset) -> Offset:
-    """Where a variable stands: numbers of the whole world stand nowhere."""
+    """Return the offset of a variable: (0, 0) for numbers of the whole world."""
     everywhere = node.op == "param" or (node.op == "coordinate" and node.attr[0] == "step")
     return (0, 0) if everywhere else at
 

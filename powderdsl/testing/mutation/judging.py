@@ -53,7 +53,7 @@ WORLDS = 1000
 
 
 def is_generated(example: Example) -> bool:
-    """Whether a test was written by the tool."""
+    """True if a test was written by the tool."""
     return example.name.startswith(GENERATED)
 
 
@@ -117,7 +117,7 @@ class Original:
     def failing(self) -> frozenset[str]:
         """Names of tests that fail without any mistake: their failing says nothing."""
         return frozenset(
-            one.example.name for one in run_examples(self.ruleset, sim=self.sim) if not one.passed
+            result.example.name for result in run_examples(self.ruleset, sim=self.sim) if not result.passed
         )
 
     @cached_property
@@ -131,7 +131,9 @@ class Original:
     @cached_property
     def withouts(self) -> tuple[frozenset[int], ...]:
         """The sets of elements that invariants leave out; the empty one comes first."""
-        return tuple(dict.fromkeys([frozenset[int](), *(one.without for one in self.ruleset.invariants)]))
+        return tuple(
+            dict.fromkeys([frozenset[int](), *(invariant.without for invariant in self.ruleset.invariants)])
+        )
 
     @cached_property
     def samples(self) -> list[Start]:
@@ -142,10 +144,10 @@ class Original:
     def broken(self) -> list[Invariant]:
         """Invariants that it breaks itself: what more packs change says nothing about a mutant."""
         return [
-            one
-            for one in self.ruleset.invariants
-            if _is_broken(one, self, self.sim)
-            or any(_broken_in(batch, self.ruleset, [one], batch.states) for batch in self.batches())
+            invariant
+            for invariant in self.ruleset.invariants
+            if _is_broken(invariant, self, self.sim)
+            or any(_broken_in(batch, self.ruleset, [invariant], batch.states) for batch in self.batches())
         ]
 
     def batches(self) -> Iterator[Batch]:
@@ -158,8 +160,8 @@ class Original:
 
 
 def warnings_of(diagnostics: tuple[Diagnostic, ...]) -> Counter[str]:
-    """How often each warning is given, by code."""
-    return Counter(one.code for one in diagnostics if one.severity is Severity.WARNING)
+    """Count the warnings of each code."""
+    return Counter(diagnostic.code for diagnostic in diagnostics if diagnostic.severity is Severity.WARNING)
 
 
 def meaning(ruleset: Ruleset) -> str:
@@ -279,8 +281,8 @@ def broken_invariant(original: Original, sim: Simulator) -> tuple[Invariant | No
     """
     ruleset = sim.ruleset
     alike = _declared(ruleset) == _declared(original.ruleset)
-    known = {one.span.text for one in original.broken}
-    kept = [one for one in ruleset.invariants if one.span.text not in known]
+    known = {invariant.span.text for invariant in original.broken}
+    kept = [invariant for invariant in ruleset.invariants if invariant.span.text not in known]
     any_differs = False
     params = [[param.name for param in rules.params] for rules in (original.ruleset, ruleset)]
     if slots(original.ruleset) == slots(ruleset) and params[0] == params[1]:  # worlds hold the same
@@ -293,7 +295,7 @@ def broken_invariant(original: Original, sim: Simulator) -> tuple[Invariant | No
                 return broken, True
             if any_differs and not kept:
                 break
-    broken = next((one for one in kept if _is_broken(one, original, sim)), None)
+    broken = next((invariant for invariant in kept if _is_broken(invariant, original, sim)), None)
     return broken, any_differs or broken is not None
 
 
@@ -306,7 +308,7 @@ def _declared(ruleset: Ruleset) -> tuple[object, ...]:
 
 
 def _is_broken(invariant: Invariant, original: Original, sim: Simulator) -> bool:
-    """Whether some world breaks an invariant that needs more than one run of it."""
+    """True if some world breaks an invariant that compares several runs."""
     ruleset, claim = sim.ruleset, invariant.claim
     if not is_paired(claim) or (isinstance(claim, Local) and horizon(ruleset) <= claim.radius):
         return False
@@ -329,10 +331,14 @@ def _broken_in(
     if asked is not None:
         sample = sample.select(asked)
         states = [{name: values[asked] for name, values in state.items()} for state in states]
-    for one in invariants if len(sample) else ():
-        fits = one.without == batch.without and steps_for(one.claim, batch.steps) <= batch.steps
-        if fits and not is_paired(one.claim) and look(one.claim, ruleset, sample, states).first.any():
-            return one
+    for invariant in invariants if len(sample) else ():
+        fits = invariant.without == batch.without and steps_for(invariant.claim, batch.steps) <= batch.steps
+        if (
+            fits
+            and not is_paired(invariant.claim)
+            and look(invariant.claim, ruleset, sample, states).first.any()
+        ):
+            return invariant
     return None
 
 

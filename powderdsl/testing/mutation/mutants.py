@@ -100,7 +100,7 @@ OPERATORS: dict[str, str] = {
 
 
 def unlike(old: list[str], new: list[str]) -> tuple[list[str], list[str], list[str]]:
-    """What two lists begin with, and what each has between that and what both end with."""
+    """Split two lists into their common beginning and the parts of each before their common end."""
     head = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(old, new, strict=False)))
     ends = zip(reversed(old[head:]), reversed(new[head:]), strict=False)
     tail = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], ends))
@@ -161,7 +161,7 @@ def inserted(operator: str, path: Path, entry: str) -> Change:
 
 
 def entry_spans(container: Container) -> list[Span]:
-    """Where each entry stands, key and value."""
+    """Return the span of each entry, from key to value."""
     if isinstance(container, Sequence):
         return [_whole(item) for item in container.items]
     return [key.span.to(_whole(value)) for key, value in container.entries]

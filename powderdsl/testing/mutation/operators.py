@@ -160,7 +160,7 @@ def syntax_changes(node: Syntax, names: Names) -> Changes:
 
 
 def extents(node: Syntax) -> list[Span]:
-    """Where operands stand with the parentheses around them, which their own spans leave out."""
+    """Return the spans of operands with the parentheses around them, which their own spans leave out."""
     text = node.span.source.text
     first, last = node.span.start, node.span.end
     if node.kind in ("call", "tuple"):
@@ -437,7 +437,7 @@ def _order(entry: Entry) -> Changes:
 
 
 def _action(entry: Entry) -> Changes:
-    """What a block does, or does then: a rule, a list of rules, or blocks."""
+    """Yield the changes of a block's `do` or `then`: a rule, a list of rules, or blocks."""
     key, items = entry.key, entry.items()
     if key.text == "then":
         yield entry.lost("rule")

@@ -46,19 +46,19 @@ class GeneratedTest:
 
 
 def written_test(
-    mutant: Mutant, found: Distinction, sim: Simulator, packs: Sequence[PackDecl]
+    mutant: Mutant, distinction: Distinction, sim: Simulator, packs: Sequence[PackDecl]
 ) -> GeneratedTest:
     """The test that the original passes and the mutant fails. `sim` runs the original.
 
     A test names no seed if the original does the same with all that a test runs with by itself.
     """
     ruleset = sim.ruleset
-    seed: int | None = int(found.sample.seed[0])
-    others = replace(found.sample.repeated(len(SEEDS)), seed=np.array(SEEDS, np.int64))
-    after = run_sample(sim, others, found.steps)[0][-1][found.slot]
-    if seed in SEEDS and (after == found.first[found.slot]).all():
+    seed: int | None = int(distinction.sample.seed[0])
+    others = replace(distinction.sample.repeated(len(SEEDS)), seed=np.array(SEEDS, np.int64))
+    after = run_sample(sim, others, distinction.steps)[0][-1][distinction.slot]
+    if seed in SEEDS and (after == distinction.first[distinction.slot]).all():
         seed = None
-    before, wanted = found.sample.ids[0], found.first["element"][0]
+    before, wanted = distinction.sample.ids[0], distinction.first["element"][0]
     there = [e for e in ruleset.elements if e.id in np.unique([*before.ravel(), *wanted.ravel()])]
     glyphs, legend = _legend(there, ruleset, packs, mutant.pack)
     digest = hashlib.sha256(re.sub(r":\d+", "", mutant.key).encode()).hexdigest()[:6]
@@ -70,22 +70,22 @@ def written_test(
         lines.append(f"    legend: {{{items}}}")
     lines += ["    given: |", *_drawn(before, glyphs)]
     needed = needs_of({decl.name.text: decl for decl in packs})[mutant.pack]
-    start = run_sample(sim, found.sample, 0)[1]
-    usual = sim.world(found.sample.ids)
-    for field in found.sample.fields:
+    start = run_sample(sim, distinction.sample, 0)[1]
+    usual = sim.world(distinction.sample.ids)
+    for field in distinction.sample.fields:
         same = _same(*(to_numpy(world.state[field][0]) for world in (start, usual)))
         words = _words(field, start, same, ".")
         if words:
             lines += ["    fields:"] if "    fields:" not in lines else []
             lines += [f"      {_known(field, ruleset, needed)}: |", *words]
-    lines.append(f"    after: {found.steps} step{'' if found.steps == 1 else 's'}")
-    if found.slot == "element":
+    lines.append(f"    after: {distinction.steps} step{'' if distinction.steps == 1 else 's'}")
+    if distinction.slot == "element":
         lines += ["    expect: |", *_drawn(wanted, glyphs)]
     else:
-        end = run_sample(sim, found.sample, found.steps)[1]
-        same = _same(found.first[found.slot][0], found.second[found.slot][0])
-        name_ = _known(found.slot, ruleset, needed)
-        lines += ["    expect_fields:", f"      {name_}: |", *_words(found.slot, end, same, ANYTHING)]
+        end = run_sample(sim, distinction.sample, distinction.steps)[1]
+        same = _same(distinction.first[distinction.slot][0], distinction.second[distinction.slot][0])
+        name_ = _known(distinction.slot, ruleset, needed)
+        lines += ["    expect_fields:", f"      {name_}: |", *_words(distinction.slot, end, same, ANYTHING)]
     if seed is not None:
         lines.append(f"    seed: {seed}")
     return GeneratedTest(mutant.pack, name, "\n".join(lines) + "\n")
@@ -133,7 +133,7 @@ def _legend(
     loaded. Elements of packs that this one does not need may be absent: the test then waits.
     """
     needed = needs_of({decl.name.text: decl for decl in packs})[pack]
-    chosen = {f"{one.name.text}.{decl.name.text}" for one in packs for decl in one.elements if decl.glyph}
+    chosen = {f"{pack.name.text}.{decl.name.text}" for pack in packs for decl in pack.elements if decl.glyph}
     known = {e.qualified: e.glyph for e in ruleset.elements if e.pack in needed and e.qualified in chosen}
     glyphs: dict[int, str] = {}
     legend = []
@@ -260,9 +260,9 @@ def distinguish(
             )
             if tries == 1:
                 small = replace(small, seed=np.zeros_like(small.seed))
-            one, other = (ran[-1] for ran in states(small, steps))
-            slot = next(name for name in compared if (one[name] != other[name]).any())
-            return Distinction(small, steps, slot, one, other)
+            mine, theirs = (ran[-1] for ran in states(small, steps))
+            slot = next(name for name in compared if (mine[name] != theirs[name]).any())
+            return Distinction(small, steps, slot, mine, theirs)
     return None
 
 

@@ -34,7 +34,7 @@ CHUNK = 1 << 19
 
 
 def divergence(share: float, chance: float) -> float:
-    """How unlike two chances are, D(share‖chance), in nats for each trial."""
+    """The Kullback-Leibler divergence D(share‖chance) of two chances, in nats for each trial."""
     total = 0.0
     for a, b in ((share, chance), (1 - share, 1 - chance)):
         if a > 0:
@@ -45,12 +45,12 @@ def divergence(share: float, chance: float) -> float:
 
 
 def is_unlikely(hits: int, trials: int, chance: float) -> bool:
-    """Whether chance alone gives a count like this, or one farther off, less than once in 1 / ERROR_RATE times."""
+    """True if chance alone gives a count like this, or one farther off, less than once in 1 / ERROR_RATE times."""
     return trials * divergence(hits / trials, chance) > log(2 / ERROR_RATE)
 
 
 def trials_for(chance: float) -> int:
-    """How many trials tell a chance from one that is off by OFF, in either direction, with ERROR_RATE both ways."""
+    """The number of trials that tell a chance from one that is off by OFF, in either direction, with ERROR_RATE both ways."""
     small = min(chance, 1 - chance)
     if small <= 0:
         return 1 << 16
@@ -88,11 +88,11 @@ def chance_problem(start: World, steps: int, claims: Sequence[Often], seed: int)
         at = world_context(world, *(claim.after for claim in claims))
         for number, (claim, cells) in enumerate(chosen):
             hits[number] += int(reference.evaluate(claim.after, at)[:, cells].sum())
-    for (claim, cells), found in zip(chosen, hits, strict=True):
+    for (claim, cells), hits_of_claim in zip(chosen, hits, strict=True):
         trials = copies * int(cells.sum())
-        if is_unlikely(found, trials, float(claim.chance)):
+        if is_unlikely(hits_of_claim, trials, float(claim.chance)):
             return (
-                f"`{one_line(claim.span)}` came true {found:,} times in {trials:,}, {100 * found / trials:.3g} %,"
+                f"`{one_line(claim.span)}` came true {hits_of_claim:,} times in {trials:,}, {100 * hits_of_claim / trials:.3g} %,"
                 f" not {100 * float(claim.chance):g} %: luck does that less than once in a million times"
             )
     return ""
@@ -101,7 +101,12 @@ def chance_problem(start: World, steps: int, claims: Sequence[Often], seed: int)
 def world_context(world: World, *conditions: Expr) -> reference.Context:
     """The values that some conditions read: a world's state as the oracle holds it, parameters, the clock."""
     ruleset, to_numpy = world.sim.ruleset, world.sim.kind.to_numpy
-    read = {part.value for one in conditions for part in one.walk() if part.op in ("field", "property")}
+    read = {
+        part.value
+        for condition in conditions
+        for part in condition.walk()
+        if part.op in ("field", "property")
+    }
     names = [name for name in world.state if name == "element" or name in read]
     state = reference.widened(ruleset, {name: to_numpy(world.state[name]) for name in names})
     clock = reference.Clock(to_numpy(world.seed), to_numpy(world.index), to_numpy(world.step))

@@ -52,12 +52,12 @@ class ExampleResult:
 
     @property
     def passed(self) -> bool:
-        """Whether it came out as it says, with all seeds."""
+        """True if the worlds end as the test says, with all seeds."""
         return not self.problem
 
     @property
     def failed(self) -> bool:
-        """Whether it did not, and no added pack is the reason."""
+        """True if the worlds end otherwise, and no added pack is the reason."""
         return bool(self.problem) and not self.added
 
 
@@ -91,9 +91,9 @@ def _added(result: ExampleResult, ruleset: Ruleset, sim: Simulator) -> tuple[str
 
 
 def _passes(example: Example, ruleset: Ruleset | None, sim: Simulator) -> bool:
-    """Whether a test passes with other rules, which may lack it."""
-    tests = [one for one in ruleset.tests if one.span == example.span] if ruleset is not None else []
-    return ruleset is not None and any(_result(one, sim.of(ruleset), None).passed for one in tests)
+    """True if a test passes with other rules; False if they lack the test."""
+    tests = [test for test in ruleset.tests if test.span == example.span] if ruleset is not None else []
+    return ruleset is not None and any(_result(test, sim.of(ruleset), None).passed for test in tests)
 
 
 def start_of(example: Example, sim: Simulator, *seeds: int) -> World:
@@ -122,7 +122,7 @@ def _ids(example: Example, ruleset: Ruleset) -> dict[str, int]:
 
 
 def _result(example: Example, sim: Simulator, seen: Callable[[Any], None] | None) -> ExampleResult:
-    """What comes of a test with its own seed, or with all SEEDS."""
+    """Run a test with its own seed, or with all SEEDS."""
     seeds = SEEDS if example.seed is None else (example.seed,)
     world = start = start_of(example, sim, *seeds)
     result = ExampleResult(example)
@@ -184,7 +184,7 @@ def field_problem(grid: FieldGrid, world: World) -> tuple[int, str] | None:
     """The first of some worlds that is not as the grid says: its number, and `row 1, column 2 is 3, not 4`."""
     slot = next(slot for slot in world.sim.slots if slot.name == grid.name)
     to_numpy = world.sim.kind.to_numpy
-    found, fresh = (to_numpy(one.state[grid.name]) for one in (world, world.sim.world(world.ids)))
+    values, fresh = (to_numpy(start.state[grid.name]) for start in (world, world.sim.world(world.ids)))
     low, high = fresh.copy(), fresh.copy()
     counts = holding(world.sim.ruleset, slot, to_numpy(world.ids))
     if not grid.everywhere:
@@ -195,9 +195,9 @@ def field_problem(grid: FieldGrid, world: World) -> tuple[int, str] | None:
                 counts[:, row, column] = False
             elif cell:
                 ends = np.moveaxis(np.array(cell, float), 0, -1)  # [2, components]
-                ends = ends if found.ndim == 4 else ends[:, 0]
+                ends = ends if values.ndim == 4 else ends[:, 0]
                 low[..., row, column], high[..., row, column] = ends
-    wrong = (found < low) | (found > high)
+    wrong = (values < low) | (values > high)
     wrong = (wrong.any(axis=1) if wrong.ndim == 4 else wrong) & counts
     if not wrong.any():
         return None
@@ -206,7 +206,7 @@ def field_problem(grid: FieldGrid, world: World) -> tuple[int, str] | None:
     wanted = _wanted(world.sim.ruleset, slot.kind, grid.cells[row][column], fresh[here])
     return (
         index,
-        f"row {row}, column {column} is {_word(world.sim.ruleset, slot.kind, found[here])}, not {wanted}",
+        f"row {row}, column {column} is {_word(world.sim.ruleset, slot.kind, values[here])}, not {wanted}",
     )
 
 

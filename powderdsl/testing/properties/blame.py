@@ -77,19 +77,23 @@ def translated(sample: Start, ruleset: Ruleset, target: Ruleset) -> Start | None
     return replace(sample, ids=table[sample.ids].astype(np.uint8), fields=fields, params=params)
 
 
-def difference(prop: Property, ruleset: Ruleset, found: Counterexample) -> Difference:
+def difference(prop: Property, ruleset: Ruleset, counterexample: Counterexample) -> Difference:
     """The added packs that break an invariant which holds in its scope, and how they do it."""
     packs = added = ruleset.added_to(prop.scope)
-    causes = _rules(ruleset, found.culprits, added)
+    causes = _rules(ruleset, counterexample.culprits, added)
     if not causes:  # only packs that matter: rules of others may have happened too
-        packs = tuple(pack for pack in added[:MOST] if not _still(prop, ruleset, found, pack)) or added
+        packs = (
+            tuple(pack for pack in added[:MOST] if not _still(prop, ruleset, counterexample, pack)) or added
+        )
         if not is_paired(prop.claim):
-            last = Oracle(marked(ruleset)).states(found.sample, found.steps)[-1]
+            last = Oracle(marked(ruleset)).states(counterexample.sample, counterexample.steps)[-1]
             causes = _rules(ruleset, _happened(ruleset, last), packs)
-    fields = (found.sample.fields.get(slot.name) for slot in slots(ruleset) if slot.kind.name == "element")
+    fields = (
+        counterexample.sample.fields.get(slot.name) for slot in slots(ruleset) if slot.kind.name == "element"
+    )
     grids = (
-        found.before["element"],
-        found.after["element"],
+        counterexample.before["element"],
+        counterexample.after["element"],
         *(cells for cells in fields if cells is not None),
     )
     there = {int(number) for cells in grids for number in np.unique(cells)}
@@ -100,7 +104,7 @@ def difference(prop: Property, ruleset: Ruleset, found: Counterexample) -> Diffe
 
 
 def difference_of_test(result: ExampleResult, runner: Runner) -> Difference | None:
-    """How added packs change a test: by their rules that happen, or else by what they change in other packs."""
+    """Explain how added packs change a test: by their own rules, or else by their changes to other packs."""
     if not result.added:
         return None
     ruleset, example, sim = runner.ruleset, result.example, runner.sim
@@ -127,17 +131,17 @@ def _rules(ruleset: Ruleset, lines: Iterable[Span], packs: tuple[str, ...]) -> l
     return [Cause(owners[span], span, one_line(span), True) for span in mine]
 
 
-def _still(prop: Property, ruleset: Ruleset, found: Counterexample, pack: str) -> bool:
-    """Whether the world still breaks the invariant without a pack."""
+def _still(prop: Property, ruleset: Ruleset, counterexample: Counterexample, pack: str) -> bool:
+    """True if the world still breaks the invariant without a pack."""
     fewer = without(ruleset, pack)
     if fewer is None:
         return True
     # The elements of other rules may have other ids: the claim is that of the same line there.
     claim = next((invariant.claim for invariant in fewer.invariants if invariant.span == prop.span), None)
-    sample = translated(found.sample, ruleset, fewer)
+    sample = translated(counterexample.sample, ruleset, fewer)
     if claim is None or sample is None:
         return False
-    return bool(breaks(claim, Oracle(fewer), sample, found.steps).first.any())
+    return bool(breaks(claim, Oracle(fewer), sample, counterexample.steps).first.any())
 
 
 def doings(pack: str, ruleset: Ruleset, near: frozenset[str]) -> list[Cause]:
@@ -150,7 +154,7 @@ def doings(pack: str, ruleset: Ruleset, near: frozenset[str]) -> list[Cause]:
 def _changes(pack: str, ruleset: Ruleset) -> Iterator[tuple[str, Cause]]:
     """The element that a pack does something to, or nothing; and what it does."""
     assert ruleset.declared is not None
-    decl: PackDecl = next(one for one in ruleset.declared.packs if one.name.text == pack)
+    decl: PackDecl = next(pack_decl for pack_decl in ruleset.declared.packs if pack_decl.name.text == pack)
     for element in decl.elements:
         name, does = element.name.text, "replaces" if element.override else "brings"
         yield name, Cause(pack, element.name.span, f"{does} `{name}`")

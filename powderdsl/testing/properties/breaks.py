@@ -1,4 +1,4 @@
-"""Whether worlds break a claim: after which step, and in which cell."""
+"""Violations of claims by worlds: after which step, and in which cell."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Breaks:
 
 
 def steps_for(claim: Tested, usual: int) -> int:
-    """How many steps a test of the claim runs."""
+    """Return the number of steps that a test of the claim runs."""
     match claim:
         case Never():
             return usual if claim.steps == 1 else claim.steps
@@ -74,7 +74,7 @@ def steps_for(claim: Tested, usual: int) -> int:
 
 
 def breaks(claim: Tested, runs: Runs, sample: Start, steps: int) -> Breaks:
-    """Run the worlds and look."""
+    """Run the worlds and return where they break the claim."""
     match claim:
         case Local():
             other, mask = touched(runs.ruleset, sample)
@@ -91,12 +91,12 @@ def breaks(claim: Tested, runs: Runs, sample: Start, steps: int) -> Breaks:
 
 
 def is_paired(claim: Tested) -> bool:
-    """Whether a test of the claim needs more than one run of the worlds."""
+    """True if a test of the claim compares several runs of the worlds."""
     return isinstance(claim, Local | Symmetric | Alike | Agreement)
 
 
 def look(claim: Tested, ruleset: Ruleset, sample: Start, states: list[State]) -> Breaks:
-    """Whether worlds, of which these are the states, break a claim that needs one run only."""
+    """Return where worlds with these states break a claim that needs one run only."""
     ids = [state["element"] for state in states]
 
     def evaluated(expr: Expr) -> list[Array]:
@@ -187,12 +187,12 @@ def near(mask: Array, radius: int) -> Array:
 def draws_for(ruleset: Ruleset, sample: Start) -> dict[str, Array]:
     """Draws for all streams, by the worlds' seeds: float64 [B, H, W]."""
     height, width = sample.shape
-    found = {}
+    draws = {}
     for number, stream in enumerate(ruleset.streams):
         random = [Random(f"{seed} {number}") for seed in sample.seed.tolist()]
-        cells = [[one.random() for _ in range(height * width)] for one in random]
-        found[stream.name] = np.array(cells).reshape(-1, height, width)
-    return found
+        cells = [[generator.random() for _ in range(height * width)] for generator in random]
+        draws[stream.name] = np.array(cells).reshape(-1, height, width)
+    return draws
 
 
 def _symmetric(claim: Symmetric, runs: Runs, sample: Start) -> Array:
@@ -206,10 +206,10 @@ def _symmetric(claim: Symmetric, runs: Runs, sample: Start) -> Array:
 def _alike(claim: Alike, runs: Runs, sample: Start) -> Array:
     masks = []
     for world in range(len(sample)):
-        one = sample.one(world).repeated(claim.copies)
+        start = sample.one(world).repeated(claim.copies)
         seeds = int(sample.seed[world]) + np.arange(claim.copies)
-        first = runs.states(replace(one, seed=seeds), 1)[-1]["element"]
-        turned = turned_sample(runs.ruleset, replace(one, seed=seeds + claim.copies), claim.turn)
+        first = runs.states(replace(start, seed=seeds), 1)[-1]["element"]
+        turned = turned_sample(runs.ruleset, replace(start, seed=seeds + claim.copies), claim.turn)
         second = runs.states(turned, 1)[-1]["element"]
         mask = np.zeros(second.shape[1:], bool)
         for element in runs.ruleset.elements:

@@ -110,7 +110,7 @@ class Result:
 
     @property
     def holds(self) -> bool:
-        """Whether nothing was found against what it speaks of."""
+        """True unless a world breaks the property."""
         return self.status != "broken"
 
 
@@ -127,43 +127,43 @@ def result_line(result: Result) -> str:
     return f"{status:<9} {result.prop.owner}: {result.prop.text} ({how})"
 
 
-def difference_words(found: Difference) -> str:
+def difference_words(difference: Difference) -> str:
     """``with `steam`: steam.yaml:17``: the packs, and where in their files the reason stands."""
-    places = dict.fromkeys(place_of(cause.span) for cause in found.causes)
-    return f"{found.with_packs}{': ' if places else ''}{', '.join(places)}"
+    places = dict.fromkeys(place_of(cause.span) for cause in difference.causes)
+    return f"{difference.with_packs}{': ' if places else ''}{', '.join(places)}"
 
 
-def difference_lines(found: Difference) -> Iterator[str]:
+def difference_lines(difference: Difference) -> Iterator[str]:
     """The places in the added packs that make the difference."""
-    for cause in found.causes:
+    for cause in difference.causes:
         yield f"{place_of(cause.span)}: {cause.does}"
 
 
-def counterexample_lines(found: Counterexample, ruleset: Ruleset) -> Iterator[str]:
+def counterexample_lines(counterexample: Counterexample, ruleset: Ruleset) -> Iterator[str]:
     """The rule that broke it, the world before and after, and what else the world holds."""
-    steps = "1 step" if found.steps == 1 else f"{found.steps} steps"
-    yield f"broken at row {found.cell[0]}, column {found.cell[1]}, after {steps} with seed {int(found.sample.seed[0])}"
-    for span in found.culprits:
+    steps = "1 step" if counterexample.steps == 1 else f"{counterexample.steps} steps"
+    yield f"broken at row {counterexample.cell[0]}, column {counterexample.cell[1]}, after {steps} with seed {int(counterexample.sample.seed[0])}"
+    for span in counterexample.culprits:
         yield f"by {place_of(span)}: {one_line(span)}"
     glyphs = {element.id: element.glyph for element in ruleset.elements}
     columns = [
         [title, *(" ".join(glyphs.get(number, "?") for number in row) for row in ids[:MAX_DRAWN, :MAX_DRAWN].tolist())]
-        for title, ids in (("before", found.before["element"]), ("after", found.after["element"]))
+        for title, ids in (("before", counterexample.before["element"]), ("after", counterexample.after["element"]))
     ]  # fmt: skip
     yield from side_by_side(columns)
     names = {element.id: element.name for element in ruleset.elements}
-    there = np.unique([found.before["element"], found.after["element"]]).tolist()
+    there = np.unique([counterexample.before["element"], counterexample.after["element"]]).tolist()
     yield ", ".join(f"{glyphs[number]} {names[number]}" for number in there if number in names)
     for slot in slots(ruleset):
-        values = found.sample.fields.get(slot.name)
-        if values is None or np.array_equal(values, fresh(ruleset, slot, found.sample.ids)):
+        values = counterexample.sample.fields.get(slot.name)
+        if values is None or np.array_equal(values, fresh(ruleset, slot, counterexample.sample.ids)):
             continue  # as in fresh cells
         text = " / ".join(" ".join(row) for row in field_words(ruleset, slot.kind, values[0]))
         yield f"{slot.name}: {text if len(text) <= MAX_TEXT else f'{text[:MAX_TEXT]} …'}"
-    for name, values in found.sample.params.items():
+    for name, values in counterexample.sample.params.items():
         yield f"{name} = {float(values[0]):g}"
-    if found.sample.step.any():
-        yield f"the clock says {int(found.sample.step[0])}"
+    if counterexample.sample.step.any():
+        yield f"the clock says {int(counterexample.sample.step[0])}"
 
 
 def side_by_side(columns: Sequence[Sequence[str]]) -> Iterator[str]:
@@ -173,12 +173,13 @@ def side_by_side(columns: Sequence[Sequence[str]]) -> Iterator[str]:
         yield "".join(line.ljust(width) for line in lines).rstrip()
 
 
-def picture(found: Counterexample, ruleset: Ruleset) -> Array:
+def picture(counterexample: Counterexample, ruleset: Ruleset) -> Array:
     """Before and after side by side, uint8 [H', W', 3]."""
     shown = looks(ruleset.elements, ruleset.fields)
-    factor = max(1, min(32, 512 // max(found.sample.shape)))
+    factor = max(1, min(32, 512 // max(counterexample.sample.shape)))
     images = [
-        scale(rgb(state["element"], fields=state, **shown), factor) for state in (found.before, found.after)
+        scale(rgb(state["element"], fields=state, **shown), factor)
+        for state in (counterexample.before, counterexample.after)
     ]
     return contact_sheet(images, columns=2, gap=8)
 
@@ -201,19 +202,19 @@ def result_data(result: Result) -> dict[str, Any]:
                 for cause in result.difference.causes
             ],
         }
-    found = result.counterexample
-    if found is not None:
+    counterexample = result.counterexample
+    if counterexample is not None:
         data["counterexample"] = {
-            "before": found.before["element"].tolist(),
-            "after": found.after["element"].tolist(),
-            "steps": found.steps,
-            "row": found.cell[0],
-            "column": found.cell[1],
-            "seed": int(found.sample.seed[0]),
-            "clock": int(found.sample.step[0]),
-            "fields": {name: values[0].tolist() for name, values in found.sample.fields.items()},
-            "params": {name: values[0].tolist() for name, values in found.sample.params.items()},
-            "rules": [{"place": place_of(span), "text": one_line(span)} for span in found.culprits],
+            "before": counterexample.before["element"].tolist(),
+            "after": counterexample.after["element"].tolist(),
+            "steps": counterexample.steps,
+            "row": counterexample.cell[0],
+            "column": counterexample.cell[1],
+            "seed": int(counterexample.sample.seed[0]),
+            "clock": int(counterexample.sample.step[0]),
+            "fields": {name: values[0].tolist() for name, values in counterexample.sample.fields.items()},
+            "params": {name: values[0].tolist() for name, values in counterexample.sample.params.items()},
+            "rules": [{"place": place_of(span), "text": one_line(span)} for span in counterexample.culprits],
         }
     return data
 
@@ -229,14 +230,14 @@ def file_of(rules: str, prop: Property) -> Path:
     return Path(FOLDER) / f"{words}-{digest}.yaml"
 
 
-def write_example(path: Path, rules: str, prop: Property, found: Counterexample) -> None:
+def write_example(path: Path, rules: str, prop: Property, counterexample: Counterexample) -> None:
     """Write a counterexample.
 
     Raises:
         CompileError: PD613, the file cannot be written.
     """
-    tree: dict[str, Tree] = {"rules": rules, "property": prop.text, "steps": str(found.steps)}
-    tree |= start_tree(found.sample)
+    tree: dict[str, Tree] = {"rules": rules, "property": prop.text, "steps": str(counterexample.steps)}
+    tree |= start_tree(counterexample.sample)
     head = f"# Breaks `{prop.text}` ({prop.place or prop.owner})\n"
     head += f"# Again: powderdsl test {rules} --replay {path}\n"
     if not path.resolve().is_relative_to(Path.cwd()) and not path.is_absolute():

@@ -43,45 +43,47 @@ def refuted(ruleset: Ruleset, ledger: Ledger) -> tuple[Diagnostic, ...]:
     The same rules give the same worlds.
     """
     reporter = Reporter()
-    for one in quick_results(ruleset, ledger):
-        if one.counterexample is None:
+    for result in quick_results(ruleset, ledger):
+        if result.counterexample is None:
             continue
-        world = [line for line in counterexample_lines(one.counterexample, ruleset) if line[:3] != "by "]
-        if one.difference is not None:
-            _report_difference(one, one.difference, world, reporter)
+        world = [line for line in counterexample_lines(result.counterexample, ruleset) if line[:3] != "by "]
+        if result.difference is not None:
+            _report_difference(result, result.difference, world, reporter)
             continue
-        steps = "1 step" if one.counterexample.steps == 1 else f"{one.counterexample.steps} steps"
+        steps = "1 step" if result.counterexample.steps == 1 else f"{result.counterexample.steps} steps"
         reporter.report(
             "PD512",
             f"this invariant is broken after {steps}",
-            one.prop.span,
+            result.prop.span,
             "does not hold",
-            secondary=[Label(span, "breaks it") for span in one.counterexample.culprits[:3]],
+            secondary=[Label(span, "breaks it") for span in result.counterexample.culprits[:3]],
             notes=world,
             helps=["fix the rule, or weaken the invariant: `without SET` excludes worlds"],
         )
     return reporter.diagnostics
 
 
-def _report_difference(one: Result, found: Difference, world: Sequence[str], reporter: Reporter) -> None:
-    assert one.counterexample is not None
-    first, *others = found.causes
-    culprits = one.counterexample.culprits
+def _report_difference(
+    result: Result, difference: Difference, world: Sequence[str], reporter: Reporter
+) -> None:
+    assert result.counterexample is not None
+    first, *others = difference.causes
+    culprits = result.counterexample.culprits
 
     def words(cause: Cause, breaks: str) -> str:
         return breaks if cause.span in culprits else "takes part" if cause.is_rule else cause.does
 
-    rules = [span for span in culprits if span not in {cause.span for cause in found.causes}]
+    rules = [span for span in culprits if span not in {cause.span for cause in difference.causes}]
     also = [Label(cause.span, words(cause, "and this")) for cause in others]
     reporter.report(
         "PD515",
-        f"{found.with_packs}, `{one.prop.text}` no longer holds: {place_of(first.span)}",
+        f"{difference.with_packs}, `{result.prop.text}` no longer holds: {place_of(first.span)}",
         first.span,
         words(first, "this breaks it"),
         secondary=[
             *also[:2],
             *(Label(span, "did it") for span in rules[:2]),
-            Label(one.prop.span, f"`{one.prop.owner}` says so"),
+            Label(result.prop.span, f"`{result.prop.owner}` says so"),
         ],
         notes=["the packs that it speaks of keep it, as far as was tried", *world],
     )
@@ -108,7 +110,7 @@ class QuickSearch(InvariantSearch):
 
 
 def quick_results(ruleset: Ruleset, ledger: Ledger) -> list[Result]:
-    """What a proof or a few worlds say of each invariant; a world that breaks one is made small."""
+    """Judge each invariant by a proof or a few worlds; a world that breaks an invariant is made small."""
     search = QuickSearch.of(Oracle(ruleset), SearchPlan(), declared_only=True, ledger=ledger)
     search.try_random()
     return search.finish()
@@ -121,4 +123,4 @@ def _concerned(search: InvariantSearch, lines: tuple[RuleLine, ...]) -> list[int
         if entry.rule in lines:
             names |= {name for some in entry.needs if len(some) < FEW for name in some}
             names |= {name for pair in entry.changes[:FEW] for name in pair}
-    return sorted(one.id for one in search.runner.ruleset.elements if one.name in names)
+    return sorted(element.id for element in search.runner.ruleset.elements if element.name in names)

@@ -53,10 +53,10 @@ class Runner:
 
     def states(self, sample: Start, steps: int, random: Mapping[str, Array] | None = None) -> list[State]:
         """The state at the start and after each step, in storage dtypes. `random`: draws for all streams."""
-        found, end = run_sample(self.sim, sample, steps, random, self.ruleset)
+        history, end = run_sample(self.sim, sample, steps, random, self.ruleset)
         self.worlds_run += len(sample)
         self.note(end.state)
-        return found
+        return history
 
     def note(self, state: Mapping[str, Any]) -> None:
         """Remember which lines happened on the way to this state of `sim`."""
@@ -82,11 +82,11 @@ def run_sample(
     given = {name: sim.kind.from_numpy(values.astype(dtypes[name])) for name, values in start.items()}
     clock = sim.kind.from_numpy(sample.step.copy())
     world = replace(world, state={**world.state, **given}, start=clock)
-    found = [start]
+    history = [start]
     for _ in range(steps):
         world = sim.step(world, random=random, params=dict(sample.params) or None)
-        found.append({name: sim.kind.to_numpy(world.state[name]) for name in start})
-    return found, world
+        history.append({name: sim.kind.to_numpy(world.state[name]) for name in start})
+    return history, world
 
 
 def first_difference(

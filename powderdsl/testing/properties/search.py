@@ -43,7 +43,7 @@ COPIES = 1024
 
 @dataclass(frozen=True)
 class SearchPlan:
-    """How much is tested: the number of random worlds, the time limit in seconds, the first seed."""
+    """The extent of a search: the number of random worlds, the time limit in seconds, the first seed."""
 
     examples: int = 1000
     seconds: float = 60.0
@@ -92,7 +92,7 @@ class InvariantSearch:
 
     @property
     def waiting(self) -> list[Result]:
-        """What is neither proven nor broken."""
+        """The trials of properties that are neither proven nor broken."""
         return [trial for trial in self.trials if not trial.is_proven and trial.sample is None]
 
     def only(self, texts: Collection[str]) -> Self:
@@ -137,20 +137,20 @@ class InvariantSearch:
             ran = steps_for(trial.prop.claim, min(steps, 3))
             self._note(trial, some, breaks(trial.prop.claim, self.runner, some, ran))
 
-    def _note(self, trial: Result, sample: Start, found: Breaks) -> None:
+    def _note(self, trial: Result, sample: Start, breaks: Breaks) -> None:
         trial.batches += 1
-        trial.worlds += int(found.counts.sum())
-        broken = np.nonzero(found.first)[0]
+        trial.worlds += int(breaks.counts.sum())
+        broken = np.nonzero(breaks.first)[0]
         if not len(broken):
             return
-        first = min(broken.tolist(), key=lambda world: int(found.first[world]))
+        first = min(broken.tolist(), key=lambda world: int(breaks.first[world]))
         if isinstance(trial.prop.claim, Symmetric) and self.runner.ruleset.streams:
             # The same numbers may be used in another way: then worlds agree in how often things happen.
             turn = trial.prop.claim.turn
             trial.prop = replace(trial.prop, claim=Alike(turn, COPIES))
             trial.reason, trial.batches, trial.worlds = "in how often things happen", 0, 0
             return
-        trial.sample, trial.steps = sample.one(first), int(found.first[first])
+        trial.sample, trial.steps = sample.one(first), int(breaks.first[first])
 
     def finish(self) -> list[Result]:
         """Make what was found small and name the rules; the results in the order of the properties."""
@@ -197,17 +197,17 @@ def counterexample(claim: Tested, runner: Runs, sample: Start, steps: int) -> Co
 
 def properties_of(ruleset: Ruleset, ledger: Ledger) -> list[Property]:
     """The declared invariants, then what every ruleset must fulfill."""
-    found = [
+    properties = [
         *map(Property.of, ruleset.invariants),
         Property(KnownIds(), "cells hold elements that the ruleset has", AUTOMATIC, None),
         Property(Agreement(), "the backend gives what the reference gives", AUTOMATIC, None),
     ]
-    found += [Property(claim, text, AUTOMATIC, None) for claim, text in _ledger_claims(ruleset, ledger)]
+    properties += [Property(claim, text, AUTOMATIC, None) for claim, text in _ledger_claims(ruleset, ledger)]
     unique: dict[str, Property] = {}
-    for one in found:  # of two that say the same, the one that says it of more packs
-        if one.text not in unique or len(one.scope) > len(unique[one.text].scope):
-            unique[one.text] = one
-    return [one for one in found if unique[one.text] is one]
+    for prop in properties:  # of two that say the same, the one that says it of more packs
+        if prop.text not in unique or len(prop.scope) > len(unique[prop.text].scope):
+            unique[prop.text] = prop
+    return [prop for prop in properties if unique[prop.text] is prop]
 
 
 def _ledger_claims(ruleset: Ruleset, ledger: Ledger) -> Iterator[tuple[Total, str]]:

@@ -38,7 +38,7 @@ class Work:
     left: int
 
     def spend(self, batch: Start, steps: int) -> None:
-        rules = 1 + sum(len(moment.rules) for one in self.ruleset.passes for moment in one.moments)
+        rules = 1 + sum(len(moment.rules) for decl in self.ruleset.passes for moment in decl.moments)
         self.left -= rules * steps * (RULE + batch.ids.size)
 
 
@@ -83,16 +83,16 @@ def shrink_while(judge: Judge, sample: Start, steps: int, tries: int, work: Work
 
     def find(candidates: list[Start]) -> Start | None:
         nonlocal steps
-        allowed = [one for one in candidates if all(side % multiple == 0 for side in one.shape)]
-        found = _first(judge, allowed, steps, tries, work) if work.left > 0 else None
-        if found is None:
+        allowed = [start for start in candidates if all(side % multiple == 0 for side in start.shape)]
+        judged = _first(judge, allowed, steps, tries, work) if work.left > 0 else None
+        if judged is None:
             return None
-        smaller, steps = found
+        smaller, steps = judged
         return smaller
 
     sample = smallest(sample, find)
-    found = _first(judge, _plain_seed(sample), steps, 1, work) if tries > 1 else None
-    return found or (sample, steps)
+    result = _first(judge, _plain_seed(sample), steps, 1, work) if tries > 1 else None
+    return result or (sample, steps)
 
 
 def smallest(start: Start, find: Callable[[list[Start]], Start | None]) -> Start:
@@ -104,8 +104,8 @@ def smallest(start: Start, find: Callable[[list[Start]], Start | None]) -> Start
     while True:
         smaller = start
         for group in _GROUPS:
-            while (found := find(group(smaller))) is not None:
-                smaller = found
+            while (candidate := find(group(smaller))) is not None:
+                smaller = candidate
         if smaller is start:
             return start
         start = smaller
@@ -132,8 +132,8 @@ def _first(
     most = max(MAX_BATCH // tries, 1)
     for at in range(0, len(candidates), most):
         some = [
-            replace(one, seed=np.array([number - 1])) if number else one
-            for one in candidates[at : at + most]
+            replace(start, seed=np.array([number - 1])) if number else start
+            for start in candidates[at : at + most]
             for number in range(tries)
         ]
         batch = joined(some, work.ruleset)
