@@ -18,7 +18,8 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # runs from a checkout that is not installed
 
-from powderdsl.compiler import shipped_tests, shipped_variants
+from powderdsl.compiler import read, shipped_tests, shipped_variants
+from powderdsl.diagnostics import Reporter
 
 DOCS = Path(__file__).resolve().parent
 RESULTS = DOCS / "mutation.json"
@@ -48,10 +49,9 @@ Counts = dict[str, dict[str, int]]
 
 def packs_of(rules: str) -> list[str]:
     """The packs of a composition that are mutated, in their order."""
-    from powderdsl.testing.mutation.judging import Original
-
     only = compositions()[rules]
-    return list(dict.fromkeys(mutant.pack for mutant in Original.of(rules).mutants(frozenset(only))))
+    packs, _ = read([rules], Reporter())
+    return [pack.name.text for pack in packs if not only or pack.name.text in only]
 
 
 def count(rules: str, packs: Sequence[str], jobs: int, worlds: bool = False) -> Iterator[Counts]:

@@ -82,13 +82,13 @@ def _shipped_sources() -> Iterator[Source]:
 
 def shipped_variants() -> set[str]:
     """The shipped rulesets that extend another one."""
-    found = [read_file(source, Reporter()) for source in _shipped_sources()]
+    found = [_read_once(source)[0] for source in _shipped_sources()]
     return {decl.name.text for decl in found if isinstance(decl, RulesetDecl) and decl.extends is not None}
 
 
 def shipped_tests() -> list[str]:
     """The shipped rules that stand by themselves: rulesets, and packs that need no other and belong to no ruleset."""
-    found = [decl for source in _shipped_sources() if (decl := read_file(source, Reporter()))]
+    found = [decl for source in _shipped_sources() if (decl := _read_once(source)[0])]
     inside = {scalar.text for decl in found if isinstance(decl, RulesetDecl) for scalar in decl.packs}
     return [
         decl.name.text

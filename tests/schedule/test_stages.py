@@ -21,6 +21,7 @@ from powderdsl.schedule.verify import verify
 from powderdsl.testing.generators.cases import load_text
 from powderdsl.testing.generators.rulemaker import random_ruleset_text
 from tests.schedule.interpreter import SNAP, World, run_graph, run_schedule
+from tests.tiers import tiered
 
 WORLDS = 4
 
@@ -85,6 +86,10 @@ RULES = (
 )
 
 
+FAULTY = (533, 5351)
+"""Seeds of random rulesets that found faults."""
+
+
 @pytest.mark.parametrize("stages", [CPU, CUDA], ids=("cpu", "cuda"))
 @pytest.mark.parametrize("rules", RULES)
 def test_every_stage(rules: str, stages: tuple[Stage, ...]) -> None:
@@ -92,7 +97,7 @@ def test_every_stage(rules: str, stages: tuple[Stage, ...]) -> None:
 
 
 @pytest.mark.parametrize("stages", [CPU, CUDA], ids=("cpu", "cuda"))
-@pytest.mark.parametrize("seed", [*range(12), 533, 5351])  # the last two found faults
+@pytest.mark.parametrize("seed", tiered([*range(12), *FAULTY], [*range(4), *FAULTY]))
 def test_random_rulesets(seed: int, stages: tuple[Stage, ...]) -> None:
     run_stages(load_text(random_ruleset_text(seed), f"seed{seed}.yaml"), stages)
 

@@ -20,12 +20,9 @@ from powderdsl.testing.generators.choices import Choices
 from powderdsl.testing.generators.rulemaker import random_ruleset_text
 from tests.fuzz.compare import assert_same
 from tests.fuzz.cuda_emulation import EmulatedSimulator
+from tests.tiers import tiered
 
-LARGE = ("powderworld", "powderworld2")
-RULESETS = [
-    pytest.param(name, marks=pytest.mark.slow) if name in LARGE else name
-    for name in sorted(set(shipped_tests()) - shipped_variants())
-]
+RULESETS = sorted(set(shipped_tests()) - shipped_variants())
 H200 = 232_448
 """Bytes of shared memory that a block may have there."""
 
@@ -51,7 +48,7 @@ def random_ruleset(seed: int) -> Ruleset:
     return load_text(random_ruleset_text(seed), f"seed{seed}.yaml")
 
 
-@pytest.mark.parametrize("name", RULESETS)
+@pytest.mark.parametrize("name", tiered(RULESETS, [name for name in RULESETS if name != "powderworld2"]))
 def test_emulated_kernels_give_the_same_worlds(name: str, folder: Path) -> None:
     """Whichever thread comes first: what lies between two barriers does not depend on it."""
     ruleset = load(name)
@@ -92,7 +89,7 @@ def test_worlds_with_more_words_than_threads_can_hold(folder: Path, monkeypatch:
 
 def test_what_does_not_fit_leaves_the_chip() -> None:
     """Fields first, then planes; a block never takes more shared memory than it may."""
-    ruleset = load(LARGE[0])
+    ruleset = load("powderworld")
     for shared, side in ((H200, 64), (H200, 256), (48 << 10, 64), (1 << 10, 64)):
         (source,) = kernels(ruleset, side, side, shared)
         assert source.shared <= shared
@@ -112,7 +109,7 @@ def test_without_a_gpu_it_is_refused(device: str, torch) -> None:  # type: ignor
 
 @pytest.mark.slow
 @pytest.mark.cuda
-@pytest.mark.parametrize("name", ["margolus", LARGE[0]])
+@pytest.mark.parametrize("name", ["margolus", "powderworld"])
 def test_kernels_compile_for_a_gpu(name: str, tmp_path: Path) -> None:
     compiler = shutil.which("nvcc")
     if compiler is None:
@@ -145,7 +142,7 @@ def gpu(torch) -> str:  # type: ignore[no-untyped-def]
 
 
 @pytest.mark.cuda
-@pytest.mark.parametrize("name", sorted(set(shipped_tests()) - shipped_variants()))
+@pytest.mark.parametrize("name", RULESETS)
 def test_same_worlds_on_a_gpu(name: str, gpu: str) -> None:
     """Small worlds against the oracle, large ones, for which it takes minutes, against `wasm`."""
     ruleset = load(name)
@@ -176,7 +173,7 @@ def test_random_rulesets_on_a_gpu(seed: int, gpu: str) -> None:
 @pytest.mark.cuda
 def test_thousands_of_worlds_and_steps_on_a_gpu(gpu: str, torch) -> None:  # type: ignore[no-untyped-def]
     """A thousand steps in one launch, on every multiprocessor; `torch` on the same device is the other side."""
-    ruleset = load(LARGE[0])
+    ruleset = load("powderworld")
     ids = torch.tensor([element.id for element in ruleset.elements])
     start = ids[torch.randint(len(ids), (600, 64, 64), generator=torch.Generator().manual_seed(3))]
     kernel = compile_ruleset(ruleset, backend="cuda", device=gpu)

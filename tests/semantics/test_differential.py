@@ -40,7 +40,7 @@ BACKENDS = ("reference", *STARTS_AT_ONCE)
 FIRST, LAST = (int(seed) for seed in os.environ.get("POWDERDSL_SEEDS", "0..1000").split(".."))
 CHUNK = 25
 CHUNKS = range(FIRST, LAST, CHUNK)
-SMOKE = CHUNKS[:4]
+SMOKE = CHUNKS[:2]
 MAX_REJECTED = 0.08
 """Share of random texts that the static checks may refuse: it is 0.014."""
 
@@ -79,7 +79,11 @@ def compositions() -> list[str]:
     return ["+".join(loaded(name)) for name in shipped_rules()]
 
 
-@pytest.mark.parametrize("name", compositions())
+BASES = [name for name in compositions() if not name.startswith("powderworld2_")]
+"""The compositions without the variants of a large ruleset."""
+
+
+@pytest.mark.parametrize("name", tiered(compositions(), BASES))
 def test_shipped_rulesets(name: str) -> None:
     compare_shipped(load(name), BACKENDS)
 

@@ -23,6 +23,7 @@ from powderdsl.testing.generators.choices import Choices
 from powderdsl.testing.generators.rulemaker import random_ruleset_text
 from tests.compilers import skip_without_compiler
 from tests.fuzz.compare import assert_same
+from tests.tiers import tiered
 
 LEVELS = {"x86-64-v2": "sse4_2", "x86-64-v3": "avx2", "x86-64-v4": "avx512bw"}
 """Levels of processors, and an instruction set that a machine needs for each."""
@@ -31,7 +32,7 @@ SHAPES = [(5, 8, 70), (2, 16, 64), (9, 7, 33), (1, 64, 130)]
 """Full groups of worlds and others, strips and none, words that are not full."""
 
 
-@pytest.fixture(params=LEVELS)
+@pytest.fixture(params=tiered(LEVELS, ["x86-64-v3"]))
 def level(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     skip_without_compiler()
     name = str(request.param)

@@ -58,7 +58,7 @@ def assert_equal(first: World, second: World) -> None:
     assert difference is None, f"{difference}\n{first.sim.ruleset.name}"
 
 
-CASES = [("wasm", range(30)), ("torch", range(30, 45)), ("reference", range(45, 51))]
+CASES = [("wasm", range(12)), ("torch", range(30, 36)), ("reference", range(45, 48))]
 
 
 # Batches and steps
@@ -97,7 +97,7 @@ def test_steps_add_up_and_leave_their_argument_alone(backend: str, seeds: range)
 
 
 def test_a_saved_world_goes_on_as_if_it_had_never_stopped(tmp_path: Path) -> None:
-    chosen = [compile_ruleset(load("powderworld"), backend="wasm"), *simulators(ANYTHING, range(60, 72))]
+    chosen = [compile_ruleset(load("powderworld"), backend="wasm"), *simulators(ANYTHING, range(60, 64))]
     for number, simulator in enumerate(chosen):
         middle = simulator.step(random_world(simulator, number, (2, 5, 33)), 2)
         path = tmp_path / f"world{number}.npz"
@@ -112,7 +112,7 @@ def test_a_saved_world_goes_on_as_if_it_had_never_stopped(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("shape", [(2, 5, 7), (1, 1, 40), (1, 33, 2)])
 def test_shifted_worlds_have_shifted_futures(shape: tuple[int, int, int]) -> None:
-    for number, simulator in enumerate(simulators(STEADY, range(40))):
+    for number, simulator in enumerate(simulators(STEADY, range(12))):
         world = random_world(simulator, number, shape)
         dy, dx = 1 + number % 4, 1 + number % 33
         after = simulator.step(world, 2)
@@ -269,7 +269,7 @@ def cells(world: World, names: list[str]) -> list[list[tuple[float, ...]]]:
 # Ranges
 
 
-@pytest.mark.parametrize(("backend", "seeds"), [("wasm", range(200, 260)), ("reference", range(260, 270))])
+@pytest.mark.parametrize(("backend", "seeds"), [("wasm", range(200, 220)), ("reference", range(260, 264))])
 def test_every_value_is_one_that_was_declared(backend: str, seeds: range) -> None:
     for number, simulator in enumerate(simulators(ANYTHING, seeds, backend)):
         ruleset = simulator.ruleset
@@ -333,7 +333,7 @@ def test_what_is_shown_to_be_impossible_never_happens(monkeypatch: pytest.Monkey
         return run_moment(moment, at, table)
 
     monkeypatch.setattr(reference, "run_moment", watched)
-    for seed in range(300, 420):
+    for seed in range(300, 360):
         reporter = Reporter()
         pack = read_file(Source(f"seed{seed}.yaml", random_ruleset_text(seed)), reporter)
         assert isinstance(pack, PackDecl)
@@ -346,9 +346,9 @@ def test_what_is_shown_to_be_impossible_never_happens(monkeypatch: pytest.Monkey
         simulator = compile_ruleset(ruleset, backend="reference")
         for part, shape in enumerate(((3, 4, 6), (2, 1, 3))):
             simulator.step(random_world(simulator, seed * 2 + part, shape), 2)
-    assert counts["moments"] > 300
-    assert counts["claims"] > 3000
-    assert counts["silent"] > 20
+    assert counts["moments"] > 150
+    assert counts["claims"] > 1500
+    assert counts["silent"] > 10
 
 
 def _sources(masks: list[tuple[Any, Any]]) -> Iterator[Any]:

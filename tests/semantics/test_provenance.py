@@ -14,10 +14,12 @@ from powderdsl.simulation.tracing import SLOT, Provenance, RecordedStep, Recorde
 from powderdsl.testing.generators.cases import Start, random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.fuzz import STARTS_AT_ONCE
-from tests.semantics.test_differential import compositions, seeded_ruleset
+from tests.semantics.test_differential import BASES, compositions, seeded_ruleset
+from tests.tiers import tiered
 
 SHAPES = ((2, 5, 33), (1, 2, 2))
 BACKENDS = ("reference", *STARTS_AT_ONCE)
+WHOLE = [name for name in BASES if "+" not in name]
 
 
 def recorded(ruleset: Ruleset, start: Start, backend: str, steps: int) -> Provenance:
@@ -50,7 +52,7 @@ def assert_alike(
     return written
 
 
-@pytest.mark.parametrize("name", compositions())
+@pytest.mark.parametrize("name", tiered(compositions(), ["core", "core2", "core+bird", *WHOLE]))
 def test_shipped_rules_on_all_backends(name):
     ruleset = load(name)
     # Of empty space and walls alone nothing moves.
