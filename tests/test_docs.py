@@ -352,18 +352,14 @@ def test_every_table_of_keys_is_shown(generate: Any) -> None:
 @pytest.mark.parametrize(
     ("language", "text"),
     [
-        ("yaml", "# with: core\nelements: {salt: {id: 20, color: red}}\n"),
         ("yaml", "# with: core\n# error: PD301\nelements: {salt: {id: 20, color: '#FFFFFF'}}\n"),
         ("yaml", "# with: core\nparams: {unused: 5%}\n"),
-        ("yaml", "# with: core\n# note: PD506\nparams: {}\n"),
         ("rules", "# with: core\nwall -> empty\nwall -> salt\n"),
         ("expressions", "# with: core\ncount(wall) > 1\ncount(wall) > wall\n"),
-        ("yaml", "task: bad\nrules: core\n"),
         ("yaml", "# with: core\nscene: bad\nsize: [3, 3]\nfill: empty\ndraw: [fill wal]\n"),
         ("statements", "fill wall\nfill wal\n"),
         ("rewards", "count(wall)\ncount(wal)\n"),
         ("console", "$ powderdsl explain PD999\n"),
-        ("console", "$ powderdsl explain PD301\nerror[PD301]\n"),
         ("console", "$ powderdsl --version\npowderdsl 77.0\n"),
         ("python", "assert False\n"),
         ("python", "import numpy\nnumpy.zeros(3)  # float32 [3]\n"),

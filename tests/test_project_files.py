@@ -44,19 +44,6 @@ def test_the_workflow_runs_all_checks_on_main_and_on_pull_requests() -> None:
     assert job["steps"][-1].keys() == {"name", "run"}, "no condition and no `continue-on-error`"
 
 
-def test_the_workflow_sets_up_the_machine_as_contributing_describes() -> None:
-    (job,) = _read(".github/workflows/checks.yml")["jobs"].values()
-    assert job["container"] == "debian:bookworm", "the Debian whose Python is 3.11"
-    named = re.search(r"apt install ([\w\d -]+)`", _text("CONTRIBUTING.md"))
-    assert named
-    assert set(named[1].split()) <= set(job["steps"][0]["run"].split())
-    assert f'TORCH_FLAGS="{job["env"]["TORCH_FLAGS"]}"' in _text("CONTRIBUTING.md")
-    (cache,) = (step["with"] for step in job["steps"] if step.get("uses", "").startswith("actions/cache@"))
-    assert cache["path"] == job["env"]["PIP_CACHE_DIR"]
-    for name in re.findall(r"'([^']+)'", cache["key"]):
-        assert (ROOT / name).is_file()
-
-
 def test_pre_commit_runs_the_ruff_of_make_lint() -> None:
     (repo,) = _read(".pre-commit-config.yaml")["repos"]
     assert repo["repo"] == "local", "a remote hook would have a version of its own"

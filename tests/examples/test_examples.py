@@ -113,20 +113,9 @@ def test_goals_help_to_predict_actions(torch: Any, tmp_path: Path) -> None:
     level = find_level("easy")
     collect(LevelProgram(level, backend="wasm"), tmp_path, episodes=2, validation=1)
     out = tmp_path / "curve.csv"
-    options = [
-        "--data",
-        str(tmp_path),
-        "--backend",
-        "wasm",
-        "--out",
-        str(out),
-        "--episodes",
-        "1",
-        "--steps",
-        "30",
-    ]
-    sizes = ["--updates", "120", "--every", "60", "--batch", "64", "--width", "16", "--lr", "0.003"]
-    found = script("ogbench_gcbc")([*options, *sizes])
+    options = ["--data", str(tmp_path), "--backend", "wasm", "--out", str(out), "--episodes", "1"]
+    sizes = "--steps 30 --updates 120 --every 60 --batch 64 --width 16 --lr 0.003"
+    found = script("ogbench_gcbc")([*options, *sizes.split()])
     assert found["random"] == 0
     assert 0 <= found["cloned"] <= 1
     curve = rows_of(out)

@@ -205,7 +205,7 @@ def _campaign(plan: Plan, seeds: range | None, seconds: int | None, folder: Path
 
 
 def _report(plan: Plan, tally: Tally, folder: Path, seconds: float, interrupted: bool) -> None:
-    from tests.fuzz.exercised import ON_CELLS, coverage_table
+    from tests.fuzz.exercised import ON_CELLS, missing
 
     names = " and ".join(filter(None, (", ".join(plan.backends[:-1]), plan.backends[-1])))
     if interrupted:
@@ -216,13 +216,8 @@ def _report(plan: Plan, tally: Tally, folder: Path, seconds: float, interrupted:
     )
     click.echo(f"{tally.refused:,} more texts were refused by the static checks")
     click.echo(f"{tally.used[ON_CELLS]:,} have passes that bit planes cannot carry")
-    rows = coverage_table(tally.used)
-    widths = [max(len(row[i]) for row in rows) for i in range(2)]
-    click.echo("\nexercised (the rarest, with the number of rulesets that have it)")
-    for group, share, rarest, lacking in rows:
-        click.echo(f"  {group:<{widths[0]}}  {share:>{widths[1]}}  {rarest}")
-        if lacking != "nothing":
-            click.echo(f"  {'':<{widths[0]}}  {'':>{widths[1]}}  never: {lacking}")
+    for group, lacking in missing(tally.used).items():
+        click.echo(f"never exercised, {group}: {', '.join(lacking)}")
     click.echo()
     for name in tally.files:
         click.echo(f"python -m tests.fuzz --replay {folder / name}")

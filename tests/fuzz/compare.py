@@ -1,21 +1,20 @@
-"""Do two backends agree? Bit by bit; where they do not, the first cell, slot, step, pass and moment is named."""
+"""Do two backends agree? Bit by bit; where they do not, the first cell, slot and step is named."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from powderdsl.model.types import Moment, Ruleset
+from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.testing.generators.cases import Start, load_text
 from tests.fuzz import STARTS_AT_ONCE
-from tests.fuzz.cuda_emulation import EmulatedSimulator
 
 if TYPE_CHECKING:
-    from powderdsl.simulation.simulator import Simulator, World
+    from powderdsl.simulation.simulator import Simulator
 
 BACKENDS = ("reference", *STARTS_AT_ONCE)
 """What random rulesets are compared on: native code and emulated kernels take seconds to compile."""
@@ -84,13 +83,11 @@ def assert_same(
         for world in worlds[1:]:
             difference = find_difference(worlds[0].state, world.state)
             if difference is not None:
-                raise AssertionError(_report(rules, start, sims, worlds, step, difference, options))
+                names = " and ".join(sim.backend for sim in sims)
+                problem = f"{names} differ after step {step}: {difference}"
+                raise AssertionError("\n".join([problem, str(start), source_text(rules)]))
         if step < steps:
-            previous = worlds
             worlds = [sim.step(world, **options) for sim, world in zip(sims, worlds, strict=True)]
-            found = (find_difference(worlds[0].state, world.state) for world in worlds[1:])
-            if difference := next((d for d in found if d is not None), None):
-                raise AssertionError(_report(rules, start, sims, previous, step, difference, options))
 
 
 def source_text(ruleset: Ruleset) -> str:
@@ -98,68 +95,6 @@ def source_text(ruleset: Ruleset) -> str:
     spans = [item.span for table in (ruleset.elements, ruleset.passes, ruleset.fields) for item in table]
     sources = dict.fromkeys(span.source for span in spans)
     return "\n".join(f"# {source.name}\n{source.text}" for source in sources)
-
-
-def _report(
-    rules: Ruleset,
-    start: Start,
-    sims: Sequence[Simulator],
-    before: Sequence[World],
-    step: int,
-    difference: Difference,
-    options: dict[str, Any],
-) -> str:
-    names = " and ".join(sim.backend for sim in sims)
-    lines = [f"{names} differ in step {step + 1}: {difference}"]
-    place = next(_places(rules, sims, before, options), None)
-    if place is not None:
-        lines += place
-    return "\n".join([*lines, str(start), source_text(rules)])
-
-
-def _places(
-    rules: Ruleset, sims: Sequence[Simulator], before: Sequence[World], options: dict[str, Any]
-) -> Iterator[list[str]]:
-    """The first pass, and in it the first moment, after which the backends differ: each time the step up to there."""
-    for i, pass_ in enumerate(rules.passes):
-        if (difference := _run_until(rules, i, len(pass_.moments), sims, before, options)) is None:
-            continue
-        lines = [f"first in pass `{pass_.name}`: {difference}"]
-        for count in range(1, len(pass_.moments) + 1):
-            if (difference := _run_until(rules, i, count, sims, before, options)) is not None:
-                moment = pass_.moments[count - 1]
-                lines.append(f"first in its moment {count} of {len(pass_.moments)}: {difference}")
-                yield lines + _tell(moment)
-        yield lines
-
-
-def _run_until(
-    rules: Ruleset,
-    last: int,
-    moments: int,
-    sims: Sequence[Simulator],
-    before: Sequence[World],
-    options: dict[str, Any],
-) -> Difference | None:
-    """What differs after some passes, of the last of which only some moments run."""
-    passes = [*rules.passes[:last], replace(rules.passes[last], moments=rules.passes[last].moments[:moments])]
-    cut = replace(rules, passes=tuple(passes))
-    states = []
-    for sim, world in zip(sims, before, strict=True):
-        part = (
-            sim.like(cut)
-            if isinstance(sim, EmulatedSimulator)
-            else compile_ruleset(cut, backend=sim.backend, device=str(sim.device))
-        )
-        states.append(part.step(replace(world, sim=part), **options).state)
-    return next((d for state in states[1:] if (d := find_difference(states[0], state)) is not None), None)
-
-
-def _tell(moment: Moment) -> list[str]:
-    rules = dict.fromkeys(rule.span.text for rule in moment.rules)
-    lets = [f"  let {let.name}: {let.span.text}" for let in moment.lets]
-    label = f" ({moment.label})" if moment.label else ""
-    return [f"conflicts: {moment.policy}{label}", *lets, *(f"  - {rule}" for rule in rules)]
 
 
 def _array(value: Any) -> np.ndarray:

@@ -67,7 +67,6 @@ class EmulatedSimulator(Simulator):
     def __init__(self, ruleset: Ruleset, folder: Path, order: int = 0, shared_limit: int = 232_448):
         super().__init__(ruleset, "reference", "cpu")
         self.backend = EMULATED
-        self._emulated = folder, order, shared_limit
         compile = compiler_for(folder, order)
         program = packed_program(
             lower(ruleset),
@@ -75,7 +74,3 @@ class EmulatedSimulator(Simulator):
             lambda cells, planes: CudaProgram(cells, planes, compile, shared_limit),
         )
         self._program = BackendProgram(EMULATED, program)
-
-    def like(self, ruleset: Ruleset) -> EmulatedSimulator:
-        """Another ruleset, emulated in the same way."""
-        return EmulatedSimulator(ruleset, *self._emulated)

@@ -127,7 +127,7 @@ def run_seed(seed: int, plan: Plan, tell: Callable[[tuple[str, int]], None] = la
         if len(expected) < len(starts):
             break
     worlds = sum(len(start.ids) for start in starts)
-    used = constructs(text, ruleset) | (frozenset() if findings else operations(ruleset))
+    used = frozenset(constructs(ruleset)) | (frozenset() if findings else operations(ruleset))
     return Outcome(seed, False, worlds, tuple(findings), used)
 
 

@@ -236,43 +236,29 @@ def png_damaged(data: bytes, random: Random) -> bytes:
 def checkpoint_damaged(data: bytes, random: Random) -> bytes:
     """States of other types, tensors that claim other sizes, a pickle in its place."""
     tensors = load(data)
-    match random.randrange(9):
-        case 0 | 1:
+    match random.randrange(7):
+        case 0:
             return bytes_damaged(data, random)
-        case 2:
+        case 1:
             return b"\x80\x02cposix\nsystem\nX\x0b\0\0\0touch owned\x85R."
-        case 3:
-            values = [
-                [],
-                {},
-                "x",
-                7,
-                {"dict": 7},
-                {"dict": [["policy", 1]]},
-                {"dict": [["model", {"dict": []}]]},
-            ]
-            text = json.dumps(random.choice(values)).encode()
-        case 4:
-            text = random.choice(
-                [b"[" * 200_000, b'{"tuple":[' * 5000 + b"]}" * 5000, b"[" + b"0," * (1 << 20) + b"0]"]
-            )
-        case 5:
-            text = bytes_damaged(bytes(tensors[STATE].numpy()), random)
-        case 6:
-            name = random.choice(sorted(tensors))
+        case 2:
             shape = random.choice([(), (0,), (3, 0, 1 << 40), (7,)])
-            return save(
-                tensors | {name: torch.zeros(shape, dtype=random.choice([torch.bool, torch.bfloat16]))}
-            )
-        case _:
+            zeros = torch.zeros(shape, dtype=random.choice([torch.bool, torch.bfloat16]))
+            return save(tensors | {random.choice(sorted(tensors)): zeros})
+        case 3 | 4:
             length = int.from_bytes(data[:8], "little")
             header = json.loads(data[8 : 8 + length])
             entry = header[random.choice(sorted(header))]
-            entry[random.choice(sorted(entry))] = random.choice(
-                [*VALUES, [10**9], [2**40, 2**40], [0, 10**12]]
-            )
+            sizes = [[10**9], [2**40, 2**40], [0, 10**12]]
+            entry[random.choice(sorted(entry))] = random.choice([*VALUES, *sizes])
             changed = json.dumps(header).encode()
             return len(changed).to_bytes(8, "little") + changed + data[8 + length :]
+        case 5:
+            text = bytes_damaged(bytes(tensors[STATE].numpy()), random)
+        case _:
+            pairs = {"dict": [["policy", 1]]}, {"dict": [["model", {"dict": []}]]}
+            values = [json.dumps(value).encode() for value in ([], {}, "x", 7, {"dict": 7}, *pairs)]
+            text = random.choice([*values, b"[" * 200_000, b'{"tuple":[' * 5000 + b"]}" * 5000])
     return save(tensors | {STATE: torch.frombuffer(bytearray(text), dtype=torch.uint8)})
 
 

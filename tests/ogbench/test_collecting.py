@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import zipfile
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from click.testing import CliRunner
 
 from powderdsl.cli.dispatch import main
 from powderdsl.ogbench import collect as collecting
-from powderdsl.ogbench.collect import collect, play, scripted
+from powderdsl.ogbench.collect import collect, play
 from powderdsl.ogbench.datasets import load_dataset, make_env_and_datasets
 from powderdsl.ogbench.env import PowderworldEnv
 from powderdsl.ogbench.episodes import LevelProgram
@@ -61,36 +60,6 @@ def test_scripts_and_random_actions_take_turns() -> None:
     same = np.diff(found[..., 0], axis=1) == 0
     assert abs((steps == 1).mean() - 0.2525) < 0.01
     assert abs(((steps == 1) & same).mean() - 0.2162) < 0.01
-
-
-def test_each_script_paints_its_shape() -> None:
-    level = find_level("easy")
-    kinds: Counter[str] = Counter()
-    for episode in range(400):
-        script = scripted(level, 0, episode)
-        first = next(script)
-        painted = [first]
-        for _ in range(63):
-            painted.append(next(script))
-        places = [(x, y) for _, x, y in painted]
-        if len({*places}) == 64 and len({element for element, *_ in painted}) == 1:
-            kinds["fill"] += 1
-            continue
-        if any({*places[: 4 * (n + 1)]} == outline(places[: 4 * (n + 1)], n) for n in range(1, 8)):
-            kinds["square"] += 1
-            continue
-        rows = [[(x, y) for x in range(8)] for y in range(8)]
-        assert places[:8] in rows + [[(x, y) for y in range(8)] for x in range(8)]
-        kinds["line"] += 1
-    assert abs(kinds["fill"] - 400 / 7) < 4 * np.sqrt(400 * 6 / 49)
-    assert abs(kinds["line"] - 1200 / 7) < 4 * np.sqrt(400 * 12 / 49)
-
-
-def outline(places: list[tuple[int, int]], length: int) -> set[tuple[int, int]]:
-    """The outline of the square of a length whose corner is that of the places."""
-    left, top = min(x for x, _ in places), min(y for _, y in places)
-    cells = {(left + a, top + b) for a in range(length + 1) for b in range(length + 1)}
-    return {(x, y) for x, y in cells if x in (left, left + length) or y in (top, top + length)}
 
 
 def test_the_file_is_what_an_environment_shows(data: Path, short: LevelProgram) -> None:

@@ -98,14 +98,6 @@ def test_other_worlds_run_as_before(torch) -> None:  # type: ignore[no-untyped-d
         assert found or passes is swaps
 
 
-def test_a_tag_for_an_element_of_the_pack_itself() -> None:
-    ruleset, (warning,) = load(CHANGE, "pack: kiln\nneeds: trees\nalso:\n  pond: hot\n")
-    assert under_caret(warning) == ("added.yaml", "hot")
-    assert "`kiln` gives `pond` the tag `hot`" in warning.message
-    assert any("leave out `hot`" in one for one in warning.helps)
-    assert ruleset.passes[0].moments[0].policy == "first_wins"
-
-
 def test_of_two_assignments_the_last_holds(torch) -> None:  # type: ignore[no-untyped-def]
     passes = "passes:\n  count:\n    do:\n      - age := 3 where wet\n      - age := 5 where hot\n"
     ruleset, (warning,) = load(passes, GEYSER)

@@ -27,7 +27,6 @@ from powderdsl.simulation import native
 from powderdsl.simulation.native import AutoProgram, start_key
 from powderdsl.simulation.programs import BackendProgram
 from powderdsl.simulation.simulator import Simulator, World
-from powderdsl.system.fingerprint import fingerprint
 from powderdsl.targets import cache
 from powderdsl.targets.cpp.build import Building, NoCompiler, NoCompilerWarning, building
 from powderdsl.targets.job import Clock, Job
@@ -36,7 +35,6 @@ from powderdsl.testing.generators.choices import Choices
 from tests.cli.commands import environment_with
 from tests.cli.commands import powderdsl as command
 from tests.fuzz.compare import find_difference
-from tests.processes import alive, waited
 
 RULES = """\
 pack: kettle
@@ -136,17 +134,6 @@ def test_long_calls_change_over_between_two_steps(monkeypatch: pytest.MonkeyPatc
     assert log[-1][2] > 4000
     assert program.notes[0].startswith(f"wasm for {5000 - log[-1][2]} steps while native was made ready")
     assert program.notes[0].endswith(f"then native for {log[-1][2]}")
-
-
-def test_many_short_calls_are_worth_it_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(native, "WORTH", 0.05)
-    program, compiler, _ = auto_program(0.005)
-    for start in range(30):
-        program.run(job(1, start))
-    assert compiler.asked == 1
-    assert "native is being made ready" in program.notes[0]
-    compiler.go.set()
-    assert waited(lambda: program.running == "native")
 
 
 class Full(Counter):
@@ -263,29 +250,6 @@ def start_of(sim: Simulator) -> World:
 
 needs_compiler = pytest.mark.skipif(not compilers(), reason="no C++ compiler")
 
-PRELUDE = """\
-import os, sys, time
-from pathlib import Path
-from powderdsl.simulation import native
-from powderdsl.simulation.simulator import compile
-from powderdsl.targets.cpp.build import Building, building
-from powderdsl.testing.generators.cases import load_text
-
-folder = Path(sys.argv[1])
-rules = load_text(sys.argv[2], 'kettle.yaml')
-with building(Building('-O0', folder)):
-"""
-
-
-def printed(program: str, folder: Path, **environment: str) -> str:
-    """The output of a program in a process of its own. It builds in a folder, and `rules` are RULES."""
-    command = [sys.executable, "-W", "ignore", "-c", PRELUDE + program, str(folder), RULES]
-    run = subprocess.run(
-        command, env=environment_with(**environment), capture_output=True, text=True, timeout=300, check=False
-    )
-    assert (run.returncode, run.stderr) == (0, "")
-    return run.stdout
-
 
 @pytest.mark.parametrize("cxx", compilers())
 def test_every_compiler_gives_the_oracles_worlds(
@@ -346,7 +310,6 @@ def compiled_natively(rules: Ruleset) -> None:
 def test_a_damaged_cache_is_mended(rules: Ruleset, tmp_path: Path) -> None:
     with building(Building("-O0", tmp_path)):
         compiled_natively(rules)
-        (library,) = libraries(tmp_path)
         starts = sorted(tmp_path.glob("*.layout"))  # of the width, and of the width compiled last
         assert len(starts) == 2
         whole = starts[0].read_bytes()
@@ -357,16 +320,6 @@ def test_a_damaged_cache_is_mended(rules: Ruleset, tmp_path: Path) -> None:
             compiled_natively(rules)
             assert [start.read_bytes() for start in starts] == [whole, whole]
             assert powderdsl.compile(rules).running == "native"
-        # Another file, tried in a process of its own: this one has the library in memory.
-        part = library.read_bytes()[:1000]
-        library.unlink()
-        library.write_bytes(part)
-        program = """\
-    first, native = compile(rules).running, compile(rules, backend='native')
-    native.step(native.world([[0] * 9]))
-    print(first, native.running, compile(rules).running)
-"""
-        assert printed(program, tmp_path) == "wasm native native\n"
 
 
 @needs_compiler
@@ -375,8 +328,16 @@ def test_forks_run_native_code_too(rules: Ruleset, tmp_path: Path) -> None:
     """With its parent's memory, but without its threads: a fork starts its own, and does not wait for a build that
     nobody does any more."""
     program = """\
-    native.WORTH = 0.0
-    auto = compile(rules, threads=2)
+import os, sys, time
+from pathlib import Path
+from powderdsl.simulation import native
+from powderdsl.simulation.simulator import compile
+from powderdsl.targets.cpp.build import Building, building
+from powderdsl.testing.generators.cases import load_text
+
+native.WORTH = 0.0
+with building(Building('-O0', Path(sys.argv[1]))):
+    auto = compile(load_text(sys.argv[2], 'kettle.yaml'), threads=2)
     old = auto.step(auto.step(auto.world([[[0, 1]] * 3] * 33), 2), 2)   # begins to compile
     print(auto.running, flush=True)
     pid = os.fork()
@@ -394,28 +355,10 @@ def test_forks_run_native_code_too(rules: Ruleset, tmp_path: Path) -> None:
     assert os.waitpid(pid, 0)[1] == 0
     print(auto.running)
 """
-    assert printed(program, tmp_path, OMP_NUM_THREADS="1") == "wasm\nnative\n"
-
-
-def test_the_end_does_not_wait_for_the_compiler(tmp_path: Path) -> None:
-    """An interpreter that ends takes its compiler along, and what that had begun."""
-    compiler = tmp_path / "cc"
-    compiler.write_text(
-        f'#!/bin/sh\n[ "$1" = --version ] && echo g++ 1 && exit\necho $$ > {tmp_path}/pid\nexec sleep 1000\n'
-    )
-    compiler.chmod(0o755)
-    program = f"""\
-    native.WORTH = 0.0
-    auto = compile(rules)
-    auto.step(auto.step(auto.world([[0, 1]] * 3)))
-while not Path('{tmp_path}/pid').exists():
-    time.sleep(0.02)
-"""
-    cache = tmp_path / "cache"
-    cache.mkdir()
-    assert printed(program, cache, CXX=str(compiler)) == ""
-    assert not list(cache.glob(".build-*"))
-    assert waited(lambda: not alive(int((tmp_path / "pid").read_text())))
+    command = [sys.executable, "-W", "ignore", "-c", program, str(tmp_path), RULES]
+    environment = environment_with(OMP_NUM_THREADS="1")
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    assert (run.returncode, run.stdout) == (0, "wasm\nnative\n"), run.stderr
 
 
 # --- what it depends on
@@ -428,24 +371,6 @@ def test_values_of_parameters_take_no_part_in_what_is_compiled(name: str) -> Non
     changed = ruleset.with_params({param.name: param.kind.hi or 1 for param in ruleset.params})
     assert start_key(changed) == start_key(ruleset)
     assert print_program(lower(changed)) == print_program(lower(ruleset))
-
-
-def test_fingerprints_are_the_same_in_every_process() -> None:
-    program = (
-        "import powderdsl; from powderdsl.system.fingerprint import fingerprint;"
-        "print(fingerprint(powderdsl.load('powderworld')))"
-    )
-    found = {
-        subprocess.run(
-            [sys.executable, "-c", program],
-            env=environment_with(PYTHONHASHSEED=seed),
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout
-        for seed in ("1", "2")
-    }
-    assert found == {fingerprint(powderdsl.load("powderworld")) + "\n"}
 
 
 def test_run_says_what_ran_and_why(tmp_path: Path) -> None:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import copy
-import gc
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -178,28 +175,3 @@ def test_reuse_takes_the_memory_and_nothing_else(sims: Pair) -> None:
     assert spent.step.tolist() == [2, 2]
     with pytest.raises(RuntimeError, match="reuse"):
         native.step(spent)
-
-
-def test_copies_own_their_memory(sims: Pair) -> None:
-    native, plain = sims
-    world = native.step(start(native))
-    shallow, deep = copy.copy(world.state), copy.deepcopy(world.state)
-    del world
-    gc.collect()
-    wanted = plain.step(start(plain), 1)
-    for state in (shallow, deep):
-        assert_equal(native.step(replace(wanted, sim=native, state=state), 2), plain.step(wanted, 2))
-
-
-def test_numbers_that_do_not_fit_are_refused(sims: Pair) -> None:
-    for sim in sims:
-        world = sim.step(start(sim, 2))
-        for wrong in (
-            {"seed": world.seed[:1]},
-            {"start": world.step.int()},
-            {"index": world.index.expand(2, 2)},
-        ):
-            with pytest.raises(ValueError, match=f"a world's {next(iter(wrong))} must be int64"):
-                sim.step(replace(world, **wrong))
-        with pytest.raises(AttributeError, match="steps"):
-            _ = world.steps  # type: ignore[attr-defined]

@@ -7,11 +7,11 @@ import pytest
 import powderdsl
 from powderdsl.compiler import lower
 from powderdsl.ir import bits
-from powderdsl.ir.ops import FLAG, Graph, PassGraph, Program, SlotType, integer
+from powderdsl.ir.ops import PassGraph, Program
 from powderdsl.ir.segments import Carried, carry, segments
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.programs import BackendProgram
-from powderdsl.simulation.simulator import Simulator, World
+from powderdsl.simulation.simulator import Simulator
 from powderdsl.targets.mixed import MixedProgram, mixed_program
 from powderdsl.targets.tensor_kind import Tensors
 from powderdsl.targets.torch.program import TorchProgram
@@ -107,20 +107,6 @@ def test_any_passes_on_cells(name: str, torch) -> None:  # type: ignore[no-untyp
             assert difference is None, (difference, refused, options.keys())
 
 
-def test_what_planes_refuse_and_rules_cannot_say() -> None:
-    """Sets of large numbers, and numbers that float32 rounds: rule files have neither, the IR could."""
-    build = Graph()
-    build.place = "made.yaml:7"
-    number = build.input("number", integer(0, 1 << 25))
-    slots = (SlotType("number", number.type, 0, False), SlotType("found", FLAG, 0, False))
-    rare = build.in_set(number, frozenset({3, 1 << 20}))
-    rounded = build.derive("lt", build.derive("to_real", number), build.real(2.5))
-    for node, why in ((rare, "a table over 26 planes"), (rounded, "an integer too large for float32")):
-        pass_ = PassGraph("made", "made", (), (("found", node),))
-        found = carry(Program("made", slots, (), (), (pass_,)), pass_)
-        assert (found.planes, found.why, found.place) == (None, why, "made.yaml:7")
-
-
 def with_refused(rules: Ruleset, program: Program, refused: list[str]) -> Simulator:
     """A simulator on planes that runs some passes on cells."""
 
@@ -137,15 +123,3 @@ def with_refused(rules: Ruleset, program: Program, refused: list[str]) -> Simula
     assert isinstance(mixed, MixedProgram)
     sim._program = BackendProgram("wasm", mixed, lambda: TorchProgram(program, sim.device))
     return sim
-
-
-def test_rules_without_passes(torch) -> None:  # type: ignore[no-untyped-def]
-    """Nothing happens, except that fields which reset do so."""
-    rules = load_text(HEAVY.split("streams:")[0])
-    worlds: list[World] = []
-    for backend in ("reference", "wasm"):
-        sim = powderdsl.compile(rules, backend=backend)
-        world = sim.replace(sim.world(torch.ones(1, 2, 3, dtype=torch.uint8)), marks=7)
-        worlds.append(sim.step(world, 2))
-    assert find_difference(worlds[0].state, worlds[1].state) is None
-    assert not worlds[1]["marks"].any()

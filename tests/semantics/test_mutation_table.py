@@ -1,4 +1,4 @@
-"""The table of mutants in docs/testing.md: no pack notices less than it says."""
+"""What notices a mutant, in one process or several; the table in docs/testing.md says no less than is noticed."""
 
 from __future__ import annotations
 
@@ -7,12 +7,22 @@ import json
 import os
 import sys
 from functools import cache
+from multiprocessing import active_children
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 
-from powderdsl.testing.mutation.judging import COUNTED, by_hand_share, noticed_share
+from powderdsl.simulation.simulator import compile
+from powderdsl.testing.generators.cases import load_text
+from powderdsl.testing.mutation.judging import (
+    COUNTED,
+    Original,
+    broken_invariant,
+    by_hand_share,
+    noticed_share,
+    run_campaign,
+)
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 
@@ -50,31 +60,6 @@ def test_every_pack_is_in_the_table():
     }
 
 
-def test_the_counts_of_a_pack_are_kept_when_others_are_counted_again():
-    old, new = {"mutants": 3}, {"mutants": 4}
-    measured = {"life": {"packs": {"life": old}}, "powderworld": {"packs": {"lava": old, "sand": old}}}
-    after = table().record(measured, "powderworld", {"water": new, "lava": new})
-    assert list(after) == ["life", "powderworld"]
-    assert list(after["powderworld"]["packs"].items()) == [("sand", old), ("water", new), ("lava", new)]
-    assert after["life"] == measured["life"]
-
-
-def test_each_pack_is_told_as_soon_as_it_is_counted(monkeypatch):
-    from powderdsl.testing.mutation import judging
-
-    def judged(rules, packs, numbers, jobs, seed, worlds):
-        for number in numbers:
-            if number > 12:  # in the middle of gas
-                raise KeyboardInterrupt
-            yield number, judging.Verdict("killed", "test")
-
-    monkeypatch.setattr(judging, "run_campaign", judged)
-    found = table().count("powderworld", ["sand", "gas"], 1)
-    assert next(found)["sand"]["killed"] == 10
-    with pytest.raises(KeyboardInterrupt):
-        next(found)
-
-
 @pytest.mark.campaign
 @pytest.mark.parametrize(
     "rules", [pytest.param(rules, id=rules.rpartition("/")[2]) for rules in table().compositions()]
@@ -87,3 +72,54 @@ def test_no_more_mutants_survive_than_the_table_says(rules, monkeypatch):
             if said is None:
                 pytest.skip(f"{pack} of {rules} is not in the table: make mutation")
             assert counts["survived"] <= said["survived"]
+
+
+ROCK = """\
+pack: rocks
+elements:
+  soil: {id: 0, color: "#101010"}
+  rock: {id: 1, color: "#202020", weight: 3, tags: hard}
+  seed: {id: 2, color: "#303030"}
+tags: {hard: stays whole}
+properties: {weight: 0..7}
+passes:
+  harden:
+    do: soil -> rock if left is seed
+invariants:
+  - never (rock and weight < 2)
+  - never (rock and not hard)
+"""
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "claim"),
+    [
+        ("weight: 3", "weight: 1", "never (rock and weight < 2)"),
+        (", tags: hard", "", "never (rock and not hard)"),
+    ],
+)
+def test_invariants_about_properties_and_tags_are_asked_where_no_world_differs(tmp_path, right, wrong, claim):
+    path = tmp_path / "rocks.yaml"
+    path.write_text(ROCK)
+    mutant = load_text(ROCK.replace(right, wrong))
+    broken, _ = broken_invariant(Original.of(str(path)), compile(mutant, backend="wasm"))
+    assert broken is not None
+    assert broken.span.text == claim
+
+
+def test_several_processes_change_no_outcome():
+    numbers = [0, 7, 14, 21, 28]
+    alone = dict(run_campaign("wireworld", (), numbers, jobs=1, seed=0))
+    together = dict(run_campaign("wireworld", (), numbers, jobs=2, seed=0))
+    assert together == alone
+    assert {verdict.status for verdict in alone.values()} - {"survived"}
+
+
+def test_a_process_that_is_killed_is_an_error():
+    campaign = run_campaign("wireworld", (), list(range(40)), jobs=2, seed=0)
+    next(campaign)
+    for process in active_children():
+        process.kill()
+    with pytest.raises(OSError, match="was killed"):
+        list(campaign)
+    assert active_children() == []

@@ -10,7 +10,6 @@ import pytest
 import powderdsl
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.draw import palette, rgb
-from powderdsl.simulation.observe import Observer
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
@@ -174,23 +173,6 @@ def test_buffers_that_do_not_fit(backend: str, torch) -> None:  # type: ignore[n
             look(good.numpy())  # type: ignore[operator]
     with pytest.raises(KeyError, match="no field or property `wieght`; did you mean `weight`"):
         world.read("wieght", torch.zeros(2, 3, 70))
-
-
-def test_no_value_is_asked_for(torch) -> None:  # type: ignore[no-untyped-def]
-    """Tensors of the device `meta` have shapes and no values: whoever waits for one of them fails."""
-    sim = simulator("powderworld", "torch")
-    observer = Observer(sim.ruleset, torch.device("meta"))
-    world = sim.world(torch.zeros(2, 3, 70, dtype=torch.uint8))
-    state = {name: value.to("meta") for name, value in world.state.items()}
-    for look, real in (
-        (observer.rgb, world.rgb),
-        (observer.matrix, world.matrix),
-        (observer.planes, world.planes),
-        (observer.compact, world.compact),
-    ):
-        found, wanted = look(state), real()
-        assert (found.shape, found.dtype, found.device.type) == (wanted.shape, wanted.dtype, "meta")
-    assert observer.read(state, "gravity").shape == (2, 3, 70)
 
 
 def test_packed_worlds_are_not_unpacked(torch) -> None:  # type: ignore[no-untyped-def]

@@ -22,7 +22,7 @@ from powderdsl.model import reference
 from powderdsl.model.check import check
 from powderdsl.model.packs import PackDecl, read_file
 from powderdsl.model.state import SNAP, slots
-from powderdsl.model.types import Assign, Expr, Kernel, Moment, Move, Ruleset, Swap, Transform
+from powderdsl.model.types import Assign, Moment, Move, Swap, Transform
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.testing.generators.cases import Start, load_text, random_start
@@ -171,68 +171,6 @@ def test_symmetric_rules_treat_all_orientations_alike(symmetry: str) -> None:
             result = simulator.step(World(simulator, turned, world.seed, world.index, world.step), 2)
             assert find_difference(result.state, {name: turn(v) for name, v in after.state.items()}) is None
     assert changed
-
-
-def test_changes_stay_within_reach() -> None:
-    side = 65
-    tried = 0
-    for number, simulator in enumerate(simulators(ANYTHING, range(100, 160))):
-        rows, columns = reach(simulator.ruleset)
-        if max(rows, columns) > side // 2 - 1:
-            continue
-        tried += 1
-        world = random_world(simulator, number, (1, side, side))
-        where = torch.zeros((side, side), dtype=torch.bool)
-        y, x = (number * 7) % side, (number * 11) % side
-        where[y, x] = True
-        names = [
-            name
-            for name in simulator.elements
-            if simulator.ruleset.element(name).id != int(world.ids[0, y, x])
-        ]  # type: ignore[union-attr]
-        other = simulator.paint(world, element=(names or simulator.elements)[0], where=where)
-        first, second = simulator.step(world), simulator.step(other)
-        for slot, value in first.state.items():
-            unequal = (value != second.state[slot]).reshape(-1, side, side).any(0).nonzero()
-            for row, column in unequal.tolist():
-                assert min((row - y) % side, (y - row) % side) <= rows, (slot, simulator.ruleset.name)
-                assert min((column - x) % side, (x - column) % side) <= columns, (
-                    slot,
-                    simulator.ruleset.name,
-                )
-    assert tried >= 20
-
-
-def reach(ruleset: Ruleset) -> tuple[int, int]:
-    """How many rows and columns away a step may look and write: the sum over its substeps."""
-    total = np.zeros(2, int)
-    for moment in (moment for pass_ in ruleset.passes for moment in pass_.moments):
-        seen = [np.zeros(2, int)]
-        claims = np.zeros(2, int)
-        for let in moment.lets:
-            seen.append(_seen(let.value))
-        for rule in moment.rules:
-            effects = () if isinstance(rule, Assign) else rule.effects
-            writes = [rule] if isinstance(rule, Assign) else list(effects)
-            own = np.zeros(2, int) if isinstance(rule, Assign) else np.abs(getattr(rule, "offset", (0, 0)))
-            claims += 2 * own if moment.policy != "prove" else 0
-            mask = _seen(rule.mask)
-            seen.append(mask + own)
-            seen += [np.maximum(_seen(write.value), mask) + np.abs(write.offset) + own for write in writes]
-            if hasattr(rule, "target"):
-                seen.append(_seen(rule.target))
-        total += np.max(seen, axis=0) + claims
-    return int(total[0]), int(total[1])
-
-
-def _seen(expr: Expr) -> Any:
-    """How far an expression looks: rows and columns."""
-    inside = np.max([np.zeros(2, int), *(_seen(arg) for arg in expr.args)], axis=0)
-    if expr.op == "look":
-        return inside + np.abs(expr.value)
-    if isinstance(expr.value, Kernel) and expr.value.weights:
-        return inside + np.max(np.abs([(dy, dx) for dy, dx, _ in expr.value.weights]), axis=0)
-    return inside
 
 
 # Conservation

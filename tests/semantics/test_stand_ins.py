@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import powderdsl
@@ -182,21 +181,3 @@ def test_mistakes_of_a_ruleset_are_reported(also: str, code: str) -> None:
 
 
 # Floats of some elements
-
-
-@pytest.mark.parametrize("kind", ["real(-9..9)", "vec2(-9..9)"])
-def test_floats_of_other_elements_are_refused(kind: str) -> None:
-    """As integers are: a cell without the field reads its default, on every backend."""
-    Path("drift.yaml").write_text(
-        f"pack: drift\nneeds: ground\nfields: {{drift: {{type: '{kind}', at: element, of: soil}}}}\n"
-        "passes: {fade: {do: drift := drift / 2 where soil}}\n"
-    )
-    sim = powderdsl.compile(powderdsl.load("ground.yaml+drift.yaml"), backend="reference")
-    world = sim.world([[[1, 0], [0, 0]]])
-    shape = (1, 2, 2, 2) if "vec2" in kind else (1, 2, 2)
-    held = np.zeros(shape, np.float32)
-    held[..., 0, 0] = 3
-    assert sim.step(sim.replace(world, drift=held))["drift"][..., 0, 0].max() == 1.5
-    held[..., 0, 1] = 3
-    with pytest.raises(ValueError, match="can only differ from its default in cells of: soil"):
-        sim.replace(world, drift=held)

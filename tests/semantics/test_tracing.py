@@ -180,22 +180,6 @@ def test_a_rule_that_gave_way_says_so():
     assert [(one.failed, one.gave_way) for one in miss] == [((), "drop_both")] * 2
 
 
-@pytest.mark.parametrize(
-    ("options", "error", "words"),
-    [
-        ({"row": 2}, IndexError, "no cell 2,0"),
-        ({"number": 1}, IndexError, "no world 1"),
-        ({"step": 0}, ValueError, "step 1"),
-        ({"of": ["heet"]}, KeyError, "did you mean `heat`"),
-        ({"of": ["weight"]}, KeyError, "follows from the element"),
-    ],
-)
-def test_bad_questions_are_refused(options, error, words):
-    question = {"row": 0, "column": 0, "step": 1, **options}
-    with pytest.raises(error, match=words):
-        trace(world_of(lab("do: rock -> bomb"), "o"), **question)
-
-
 # Random rules and worlds
 
 

@@ -42,14 +42,6 @@ def test_branches_use_the_variables_of_others_again(tmp_path: Path) -> None:
     wasmtime.Module.validate(wasmtime.Engine(), module_of(str(rules), 64).code)
 
 
-def test_modules_import_nothing_and_have_bounded_memory() -> None:
-    module = wasmtime.Module(wasmtime.Engine(), module_of("life", 64).code)
-    assert not module.imports
-    (memory,) = (one.type for one in module.exports if isinstance(one.type, wasmtime.MemoryType))
-    assert memory.limits.max is not None
-    assert memory.limits.max <= 1 << 15
-
-
 def packed(world: Any) -> tuple[Instance, int]:
     state = world.state
     assert isinstance(state, WasmState)
@@ -137,3 +129,30 @@ def test_too_many_worlds_are_refused(torch) -> None:  # type: ignore[no-untyped-
 def _programs(name: str) -> tuple[Any, Any]:
     (segment,) = segments(lower(powderdsl.load(name)))
     return segment.program, segment.planes
+
+
+ENDING = """
+import atexit
+from wasmtime import _ffi
+
+FREE = ("wasmtime_module_delete", "wasmtime_store_delete", "wasm_engine_delete")
+
+def take_apart():
+    for name in FREE:
+        getattr(_ffi, name)
+        setattr(_ffi, name, None)
+
+atexit.register(take_apart)  # what is registered first runs last
+from powderdsl.targets.wasm.wasmtime_host import WasmtimeModule
+
+module = WasmtimeModule(bytes.fromhex("0061736d01000000" "0503010001" "070a01066d656d6f72790200"))  # exports a memory
+running = module()
+assert running.memory_size() == 1 << 16
+"""
+
+
+def test_nothing_is_freed_after_python_has_taken_wasmtime_apart() -> None:
+    run = subprocess.run(
+        [sys.executable, "-c", ENDING], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert (run.returncode, run.stderr) == (0, "")

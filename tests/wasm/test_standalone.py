@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -177,7 +178,7 @@ def test_the_clock_continues_a_world() -> None:
 needs_node = pytest.mark.skipif(node() is None, reason="no Node.js")
 
 
-def same_in_v8(cases: list[tuple[Ruleset, Start]], steps: int, folder: Path, backends: list[str]) -> None:
+def same_in_v8(cases: list[tuple[Ruleset, Start]], steps: int, folder: Path, backends: Sequence[str]) -> None:
     """Worlds in JavaScript are those of the backends: ids, fields and velocity, by hash."""
     jobs, expected = [], []
     for ruleset, start in cases:
@@ -194,23 +195,16 @@ def same_in_v8(cases: list[tuple[Ruleset, Start]], steps: int, folder: Path, bac
 
 
 @needs_node
-def test_shipped_rulesets(tmp_path: Path) -> None:
-    """200 steps of each, as native code has them; the campaign asks the reference, too."""
-    same_in_v8(shipped_cases(), 200, tmp_path, ["native"])
-
-
-@pytest.mark.campaign
-@needs_node
-def test_shipped_rulesets_everywhere(tmp_path: Path) -> None:
-    same_in_v8(shipped_cases(), 200, tmp_path, ["reference", "torch", "native", "wasm"])
-
-
-def shipped_cases() -> list[tuple[Ruleset, Start]]:
+@pytest.mark.parametrize(
+    "backends", tiered([("native",), ("reference", "torch", "native", "wasm")], [("native",)]), ids="-".join
+)
+def test_shipped_rulesets(backends: tuple[str, ...], tmp_path: Path) -> None:
+    """200 steps of each, as native code has them; the campaign asks all backends."""
     cases = []
     for number, name in enumerate(RULESETS):
         ruleset = load(name)
         cases.append((ruleset, random_start(ruleset, Choices.seeded(number), (1, *SIZES[number % 2]))))
-    return cases
+    same_in_v8(cases, 200, tmp_path, backends)
 
 
 @needs_node

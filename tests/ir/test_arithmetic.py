@@ -1,13 +1,18 @@
-"""Circuits against Python's integers: every value of small ranges, by evaluating the gates."""
+"""Circuits against Python's integers, on every value of small ranges; float32 without NumPy against NumPy's."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from itertools import product
+from operator import and_, not_, or_, xor
 
+import numpy as np
 import pytest
 
+from powderdsl.ir import single
 from powderdsl.ir.bits import Bits, Gates
-from powderdsl.ir.ops import FLAG, Node, integer
+from powderdsl.ir.ops import FLAG, OPS, Node, integer
 
 RANGES = [(0, 1), (0, 5), (-3, 3), (-8, 7), (-2, 9), (3, 12)]
 
@@ -20,22 +25,18 @@ def value_of(node: Node, inputs: dict[str, bool], known: dict[int, bool] | None 
 
 
 def evaluate(node: Node, args: list[bool], inputs: dict[str, bool]) -> bool:
-    match node.op:
-        case "input":
-            return inputs[node.attr]
-        case "const":
-            return bool(node.attr)
-        case "not":
-            return not args[0]
-        case "and":
-            return args[0] and args[1]
-        case "or":
-            return args[0] or args[1]
-        case "xor":
-            return args[0] != args[1]
-        case "select":
-            return args[1] if args[0] else args[2]
-    raise AssertionError(node.op)
+    if node.op in ("input", "const"):
+        return inputs[node.attr] if node.op == "input" else bool(node.attr)
+    return bool(MEANING[node.op](*args))
+
+
+MEANING: dict[str, Callable[..., bool]] = {
+    "not": not_,
+    "and": and_,
+    "or": or_,
+    "xor": xor,
+    "select": lambda condition, yes, no: yes if condition else no,
+}
 
 
 def number_of(bits: Bits, inputs: dict[str, bool]) -> int:
@@ -117,3 +118,38 @@ def test_gates_fold() -> None:
     assert gates.not_(gates.not_(a)) is a
     assert gates.select(a, b, b) is b
     assert gates.and_(a, b) is gates.and_(b, a)
+
+
+RANDOM = np.random.default_rng(0).integers(0, 2**32, 4000, dtype=np.uint32).view(np.float32)
+SPECIAL = np.array([0, 1, -1, 2.0**-149, 2.0**-126, 3.4e38, -3.4e38, np.inf, -np.inf, np.nan], np.float32)
+A, B = (part.ravel() for part in np.meshgrid(np.concatenate([RANDOM[:60], SPECIAL]), SPECIAL))
+A, B = np.concatenate([A, RANDOM[:2000]]), np.concatenate([B, RANDOM[2000:]])
+
+
+@pytest.mark.parametrize(
+    ("numpy", "op"),
+    [
+        (np.add, "add"),
+        (np.subtract, "sub"),
+        (np.multiply, "mul"),
+        (lambda a, b: np.where(b == 0, np.float32(0), a / b), "div"),
+        (lambda a, b: np.sqrt(a), "sqrt"),
+        (np.minimum, "min"),
+        (np.maximum, "max"),
+    ],
+)
+def test_floats_are_those_of_numpy(numpy: Callable[..., np.ndarray], op: str) -> None:
+    with np.errstate(all="ignore"):
+        wanted = numpy(A, B)
+    row = OPS[op]
+    pairs = [(float(a), float(b)) for a, b in zip(A, B, strict=True)]
+    found = np.array([row.value(None, *pair[: len(row.args)]) for pair in pairs], np.float32)
+    np.testing.assert_array_equal(found, wanted)
+
+
+@pytest.mark.parametrize("value", [0.0, 2.0**-149, 1.0, 0.1, 3e38])
+def test_neighbors_of_floats(value: float) -> None:
+    value = single.single(value)
+    above = single.stepped(value, 1)
+    assert above == np.nextafter(np.float32(value), np.float32(math.inf))
+    assert single.stepped(above, -1) == value

@@ -1,4 +1,4 @@
-"""Loops over floats that run together row by row."""
+"""Loops over floats run together row by row, and swaps exchange floats in place if no cell belongs to two of them."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from dataclasses import replace
 import pytest
 
 from powderdsl.compiler import load
-from powderdsl.ir.ops import InvalidIR
+from powderdsl.ir.ops import REAL, InvalidIR
 from powderdsl.schedule.stages import CPU, plan
-from powderdsl.schedule.types import Compute, Schedule, Sweeps, field_reads, flat
+from powderdsl.schedule.types import Compute, Move, Schedule, Sweeps, field_reads, flat
 from powderdsl.schedule.verify import verify
-from tests.schedule.test_stages import packed_passes
+from powderdsl.testing.generators.cases import load_text
+from tests.schedule.test_stages import packed_passes, run_stages
 
 
 def planned(name: str) -> Schedule:
@@ -52,3 +53,41 @@ def test_fields_change_in_place() -> None:
     for out in loop.outs:
         assert out.otherwise is not None
         assert out.into == out.otherwise.attr
+
+
+SINKING = """
+pack: sinking
+fields:
+  heat: {type: real(-9..9), at: element}
+elements:
+  air: {id: 0, color: '#000000'}
+  oil: {id: 1, color: '#804000'}
+  water: {id: 2, color: '#0000FF'}
+passes:
+  fall:
+    conflicts: POLICY
+    do: water swaps below if below is oil
+    then: water swaps OFFSET if OFFSET is air
+"""
+
+
+@pytest.mark.parametrize("place", ["left", "above.right", "at(-2, 3)"])
+@pytest.mark.parametrize("policy", ["drop_both", "first_wins"])
+def test_fields_are_exchanged_where_planes_are(policy: str, place: str) -> None:
+    rules = load_text(SINKING.replace("POLICY", policy).replace("OFFSET", place), "sinking.yaml")
+    run_stages(rules, CPU)
+    ((_, fall),) = packed_passes(rules)
+    statements = list(flat(plan(fall, CPU).body))
+    moves = [(one.op, one.offset, one.outs[0].var.type) for one in statements if isinstance(one, Move)]
+    fields = [(op, offset) for op, offset, type in moves if type == REAL]
+    assert fields == [(op, offset) for op, offset, type in moves if type != REAL]
+    assert len(fields) == 2
+    assert not any(isinstance(one, Sweeps) for one in statements)
+    assert not any(out.var.type == REAL for one in statements if isinstance(one, Compute) for out in one.outs)
+
+
+def test_exchanges_that_share_cells_are_computed() -> None:
+    rules = load_text(SINKING.replace("POLICY", "overwrite").replace("OFFSET", "left"), "sinking.yaml")
+    run_stages(rules, CPU)
+    ((_, fall),) = packed_passes(rules)
+    assert not any(isinstance(one, Move) and one.op == "swap" for one in flat(plan(fall, CPU).body))
