@@ -1,4 +1,4 @@
-"""`TensorEnv` as environments of Gymnasium's: NumPy in, NumPy out; many worlds in one batched simulation, or one.
+"""Gymnasium environments over `TensorEnv`, with NumPy arrays: many worlds in one batched simulation, or one world.
 
 `GoalEnv` is for goal-conditioned use, as Gymnasium-Robotics and hindsight replay (HER) expect it.
 """
@@ -101,14 +101,19 @@ class Face:
 
 
 class PowderVectorEnv(Face, VectorEnv[Any, Any, Any]):
-    """Many worlds of a task, stepped together. Rewards are float32; arrays are never written to after they are returned.
+    """Many worlds of a task, stepped together. Returned arrays are never written to later.
 
     Args:
-        task, num_envs, and all others: those of `TensorEnv`.
-        autoreset_mode: Gymnasium's default, which its wrappers expect; Stable-Baselines3 and TorchRL take others.
-        actions: as in `TensorEnv`, but numbers that nothing reads are left out by default.
-        render_mode: ``rgb_array`` (uint8 pictures) or ``ansi`` (text), of each world.
-        render_scale: pixels along a cell's side.
+        task: as in `TensorEnv`.
+        num_envs: the number of worlds, B.
+        autoreset_mode: as in `TensorEnv`; the default is Gymnasium's, which its wrappers expect.
+        how: all other arguments of `TensorEnv`; ``actions`` is ``multidiscrete`` unless given, which leaves out the
+            numbers that the task does not read. ``render_mode``: ``rgb_array`` (uint8 pictures) or ``ansi`` (text), of
+            each world. ``render_scale``: pixels along a cell's side.
+
+    Raises:
+        CompileError: as in `TensorEnv`.
+        ValueError: as in `TensorEnv`, or an unknown render mode.
     """
 
     def __init__(
@@ -135,14 +140,19 @@ class PowderVectorEnv(Face, VectorEnv[Any, Any, Any]):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """`TensorEnv.reset` with arrays."""
+        """Begin episodes: `TensorEnv.reset` with arrays."""
         observed, info = self.tensors.reset(seed=seed, options=options)  # first: a bad seed changes nothing
         if isinstance(seed, int):
             super().reset(seed=seed)
         return array(observed), arrays(info)
 
     def step(self, actions: Any) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        """`TensorEnv.step` with arrays. ``final_obs`` is an array of objects: None unless the episode ended."""
+        """Act once in every world: `TensorEnv.step` with arrays.
+
+        Returns:
+            Observations [B, …], reward float32 [B], terminated and truncated bool [B], and infos; ``final_obs`` is an
+            array of objects [B]: None unless the episode ended.
+        """
         observed, reward, terminated, truncated, info = self.tensors.step(actions)
         infos = arrays(info)
         if "final_obs" in infos:
@@ -150,23 +160,26 @@ class PowderVectorEnv(Face, VectorEnv[Any, Any, Any]):
         return array(observed), array(reward), array(terminated), array(truncated), infos
 
     def action_masks(self) -> Array:
-        """Return the mask of allowed actions: bool [B, n], the values of the first number of an action, then of the next."""
+        """Return the mask of allowed actions: bool [B, n], the values of an action's first number, then of its second, …"""
         return array(self.tensors.action_masks())
 
     def render(self) -> tuple[Any, ...] | None:
-        """A picture or text of each world, in the mode that was chosen."""
+        """Draw each world: uint8 [H·scale, W·scale, 3], or text; None without `render_mode`."""
         return None if self.render_mode is None else self.frames(self.render_mode)
 
 
 class PowderEnv(Face, gymnasium.Env[Array, Any], EzPickle):
     """One world: the same episodes as environment 0 of a `PowderVectorEnv` with the same seed.
 
-    Pickling keeps what it was made with, not the world in it.
+    Pickling keeps the arguments of the environment, not its world.
 
     Args:
-        task, and all others: those of `TensorEnv`, without `num_envs` and `autoreset_mode`.
-        actions: as in `PowderVectorEnv`.
-        render_mode: ``rgb_array`` (a uint8 picture) or ``ansi`` (text). render_scale: pixels along a cell's side.
+        task: as in `TensorEnv`.
+        how: the other arguments of `PowderVectorEnv`, without ``num_envs`` and ``autoreset_mode``.
+
+    Raises:
+        CompileError: as in `TensorEnv`.
+        ValueError: as in `PowderVectorEnv`.
     """
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 15}  # noqa: RUF012 as Gymnasium declares it
@@ -186,12 +199,17 @@ class PowderEnv(Face, gymnasium.Env[Array, Any], EzPickle):
         return array(observed[0]), self._info(info)
 
     def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """One action. Infos: ``success``, ``world``; ``episode_return`` and ``episode_length``, so far."""
+        """Act once.
+
+        Returns:
+            The observation, the reward, terminated, truncated, and infos: ``success``, ``world``, and the
+            ``episode_return`` and ``episode_length`` so far.
+        """
         observed, reward, terminated, truncated, info = self.tensors.step(np.asarray(action)[None])
         return array(observed[0]), float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._info(info)
 
     def _info(self, info: Info) -> dict[str, Any]:
-        """The infos of the one world there is."""
+        """Return the infos of the single world."""
         assert self.tensors.episodes is not None
         infos = {
             "success": bool(info["success"][0]),
@@ -202,24 +220,25 @@ class PowderEnv(Face, gymnasium.Env[Array, Any], EzPickle):
         return infos | ({"action_mask": array(info["action_mask"][0])} if "action_mask" in info else {})
 
     def action_masks(self) -> Array:
-        """Return the mask of allowed actions: bool [n], the values of the first number of an action, then of the next."""
+        """Return the mask of allowed actions: bool [n], the values of an action's first number, then of its second, …"""
         return array(self.tensors.action_masks()[0])
 
     def render(self) -> Any:
-        """A picture uint8 [H, W, 3], or text, in the mode that was chosen."""
+        """Draw the world: uint8 [H·scale, W·scale, 3], or text; None without `render_mode`."""
         return None if self.render_mode is None else self.frames(self.render_mode)[0]
 
 
 class GoalEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Asks for values of what a task measures, such as a count in a region or the match with a target.
+    """A goal-conditioned wrapper. Goals are values of the task's measures, such as a count in a region.
 
-    Observations are a dict: ``observation``; ``achieved_goal``, float32 [n], the n measures that the task's reward and
-    `end` are made of, in the order they first stand there; ``desired_goal``, float32 [n], what they shall be. The
-    reward is 0 where each is as near as its tolerance, else −1. Episodes last as long as the task's.
+    Observations are a dict: ``observation``; ``achieved_goal``, float32 [n], the n measures in the task's reward and
+    `end`, in the order of their first use; ``desired_goal``, float32 [n]. The reward is 0 if
+    ``|achieved − desired| ≤ tolerance`` for every measure, else −1. Episodes last as long as the task's.
 
     Args:
-        env: the environment of one world, a `PowderEnv`; perhaps in wrappers, as `gymnasium.make` returns it.
-        low, high: [n], between which goals are drawn, once an episode, by the environment's seed.
+        env: a `PowderEnv`, perhaps in wrappers, as `gymnasium.make` returns it.
+        low: [n], the smallest goals. A goal is drawn once an episode, by the environment's seed.
+        high: [n], the largest goals.
         tolerance: [n], or one number.
 
     Raises:
@@ -257,7 +276,7 @@ class GoalEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Array], dict[str, Any]]:
-        """Begin an episode. ``options["goal"]``, [n], takes the place of a drawn goal."""
+        """Begin an episode. ``options["goal"]``, [n], replaces the drawn goal."""
         rest = dict(options or {})
         given = rest.pop("goal", None)
         if given is not None and np.shape(given) != self.low.shape:
@@ -268,7 +287,7 @@ class GoalEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return self._with_goals(observed), info
 
     def step(self, action: Any) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
-        """One action; ``is_success`` in the infos says whether the goal is met, ``task_reward`` what the task gives."""
+        """Act once. Infos add ``is_success``, true if the goal is met, and ``task_reward``, the reward of the task."""
         observed, task_reward, terminated, truncated, info = self.env.step(action)
         observation = self._with_goals(observed)
         reward = float(self.compute_reward(observation["achieved_goal"], observation["desired_goal"], info))
@@ -276,7 +295,7 @@ class GoalEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return observation, reward, terminated, truncated, info
 
     def compute_reward(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Any:
-        """0 or −1, float32 [...], of goals [..., n]."""
+        """Return the rewards, 0 or −1, float32 [...], for goals [..., n]."""
         near = np.abs(np.asarray(achieved_goal) - np.asarray(desired_goal)) <= self.tolerance
         return near.all(-1).astype(np.float32) - 1
 

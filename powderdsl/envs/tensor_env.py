@@ -1,4 +1,4 @@
-"""Batches of episodes that restart by themselves: torch in, torch out, on the simulator's device."""
+"""Batched episodes of a task that restart by themselves: tensors in and out, on the simulator's device."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from powderdsl.tasks.episodes import Episodes, TaskProgram, compile_task, load_t
 from powderdsl.tasks.task import Task
 
 Info = dict[str, Any]
-"""Of tensors [B]; where a key says something of some worlds only, ``_key``, bool [B], says of which."""
+"""Tensors [B] by name; if a key concerns only some of the worlds, ``_key``, bool [B], marks them."""
 
 OPTIONS = ("params", "worlds", "reset_mask")
 ROWS = ("base", "episode", "returned", "ended")
@@ -47,14 +47,16 @@ def world_seeds(base: Tensor, episode: Tensor, worlds: int) -> Tensor:
 
 
 class TensorEnv:
-    """`num_envs` episodes of a task at once. Nothing that it returns is written to later.
+    """`num_envs` episodes of a task at once. Returned tensors are never written to later.
 
     Args:
-        task: name of a shipped task, path of a file, a task, or a program of one, which several environments can share;
-            a program has its split, knobs, parameters, backend and device already.
-        split: which worlds: ``train``, ``test``, or another of the task's.
-        observation: a kind of `observations.KINDS`.
-        knobs: values for the task's knobs. params: values for parameters of its rules; `reset` may override them.
+        task: name of a shipped task, path of a task file, a `Task`, or a `TaskProgram`, which several environments can
+            share and which already has its split, knobs, parameters, backend and device.
+        num_envs: the number of environments, B.
+        split: the set of worlds: ``train``, ``test``, or another split of the task.
+        observation: the form of observations: ``ids``, ``compact``, ``matrix`` or ``rgb`` (docs/environments.md).
+        knobs: values for the task's knobs, by name.
+        params: values for parameters of the task's rules, by qualified name; `reset` may override them.
         worlds: later episodes draw from the worlds 0 … worlds − 1 of the split.
         autoreset_mode: what happens after an episode's last step, as Gymnasium defines it: ``SAME_STEP`` returns the
             next episode's first observation, and the last one in the infos; ``NEXT_STEP`` starts it with the following
@@ -62,12 +64,21 @@ class TensorEnv:
         last_action: whether the last action ``truncates`` or ``terminates`` an episode. ``auto``: it terminates if the task
             has a `final` reward, which has then been given, and truncates if rewards would continue.
         max_episode_steps: truncates earlier than the task does.
-        actions: a kind of `actions.KINDS`: the form of actions.
-        action_mask: whether infos have ``action_mask``, int8 [B, n]: see `action_masks`.
-        backend, device, threads: those of `powderdsl.compile`.
+        actions: the form of actions: ``multidiscrete``, ``discrete`` or ``full`` (docs/environments.md).
+        action_mask: adds ``action_mask``, int8 [B, n], to infos: see `action_masks`.
+        backend: as in `powderdsl.compile`.
+        device: as in `powderdsl.compile`.
+        threads: as in `powderdsl.compile`.
+
+    Attributes:
+        num_envs: the number of environments, B.
+        single_action_space: the Gymnasium space of the actions of one environment.
+        action_nvec: the number of values of each number of an action.
+        device: the torch device of all tensors.
 
     Raises:
-        CompileError: an unknown task, split, knob or parameter. ValueError: another argument is wrong.
+        CompileError: an unknown task, split, knob or parameter.
+        ValueError: another argument is wrong.
     """
 
     def __init__(
@@ -133,18 +144,19 @@ class TensorEnv:
 
         Args:
             seed: s gives environment i the seed s + i; a list gives each its own, or None. A seed decides the worlds of
-                this and all later episodes: see `world_seeds`. Without one, an environment continues with its next
+                this and all later episodes: see `world_seeds`. Without a seed, an environment continues with its next
                 episode.
             options: ``params``: parameters of the rules from now on, a number each or [B]; they stay until others are
-                given, ``{}`` brings back the defaults. ``worlds``: which worlds to play in these episodes, a number
-                or [B]. ``reset_mask``: bool [B]: only these environments are reset.
+                given, and ``{}`` restores the defaults. ``worlds``: numbers of the worlds to play in these episodes, a
+                number or [B]. ``reset_mask``: bool [B]: only these environments are reset.
 
         Returns:
-            observations [B, …], and infos as `step` gives them, without those of episodes that ended: ``world``, int64
-            [B], which worlds they play.
+            Observations [B, …], and the infos of `step` without those of ended episodes.
 
         Raises:
-            TypeError, ValueError, KeyError: something is wrong with a seed or an option. Nothing has changed then.
+            TypeError: a seed or an option has the wrong type. Nothing has changed then, nor in the other cases.
+            ValueError: a seed or an option is out of range, or has the wrong shape.
+            KeyError: there is no such option or parameter.
         """
         given = dict(options or {})
         check_options(given, OPTIONS)
@@ -185,7 +197,7 @@ class TensorEnv:
             info["action_mask"], info["_action_mask"] = self.action_masks().to(torch.int8), mask.clone()
 
     def action_masks(self) -> Tensor:
-        """Return the mask of allowed actions: bool [B, n], the `ActionForm.mask` in each world."""
+        """Return the mask of allowed actions: bool [B, n], where n is the sum of `action_nvec`."""
         return self.action_form.mask.expand(self.num_envs, -1).clone()
 
     @property
@@ -216,7 +228,7 @@ class TensorEnv:
     # Saving
 
     def state(self) -> dict[str, Any]:
-        """Everything that later steps depend on, as dicts of tensors on the CPU: worlds, seeds, episodes, returns, parameters.
+        """Return everything that later steps depend on, as dicts of tensors on the CPU.
 
         Raises:
             ResetNeeded: before the first reset.
@@ -230,13 +242,14 @@ class TensorEnv:
         }
 
     def restore(self, state: Mapping[str, Any]) -> Tensor:
-        """Continue from what `state` gave, in another process, or on another backend or device.
+        """Continue from a result of `state`, also in another process or on another backend or device.
 
         Returns:
-            the observations there, [B, …].
+            The observations of the restored worlds, [B, …].
 
         Raises:
-            ValueError: it is of another task or number of worlds. KeyError: it is not such a state. Nothing has changed then.
+            ValueError: the state is of another task or number of worlds. Nothing has changed then.
+            KeyError: `state` did not return it. Nothing has changed then.
         """
         if len(state["base"]) != self.num_envs:
             raise ValueError(f"{len(state['base'])} worlds were saved: {self.num_envs} are needed")
@@ -251,21 +264,23 @@ class TensorEnv:
     # Stepping
 
     def step(self, actions: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Info]:
-        """One action in every episode.
+        """Act once in every episode.
 
         Args:
-            actions: integers [B, k], or [B] if they are discrete, each from 0 to ``action_nvec − 1``. Of `full` actions
-                these are x, y, choice, vx, vy.
+            actions: integers [B, k], or [B] if they are discrete, each from 0 to ``action_nvec − 1``. The numbers of
+                ``full`` actions are x, y, choice, vx, vy.
 
         Returns:
-            observations [B, …]; reward float32 [B]; terminated and truncated, bool [B]; infos, which have the same keys
-            after every step: ``success``, whether the task's condition for it holds; ``world``, which worlds are shown;
-            where episodes ended ``episode_return`` and ``episode_length`` (zero elsewhere) and, under SAME_STEP,
-            ``final_obs`` (their last observations, [n, …] in the order of the environments) and ``final_info``.
+            Observations [B, …]; reward float32 [B]; terminated and truncated, bool [B]; and infos, which have the same
+            keys after every step: ``success``, bool [B], true if the task's condition for success holds; ``world``,
+            int64 [B], the numbers of the worlds that observations show; where episodes ended ``episode_return`` and
+            ``episode_length`` (zero elsewhere) and, under SAME_STEP, ``final_obs`` (the last observations, [n, …] in
+            the order of the environments) and ``final_info``.
 
         Raises:
-            ResetNeeded: before the first reset, or under DISABLED in an episode that has ended. TypeError, ValueError:
-            invalid actions. Nothing has changed then.
+            ResetNeeded: before the first reset, or under DISABLED in an episode that has ended.
+            TypeError: actions are not integers. Nothing has changed then.
+            ValueError: actions have a wrong shape or are out of range. Nothing has changed then.
         """
         if self.episodes is None:
             raise ResetNeeded("reset the environment before its first step")
