@@ -70,10 +70,10 @@ class Episode(NamedTuple):
 
 
 class Dataset:
-    """The episodes of a folder. Made by `Dataset.open`.
+    """The episodes recorded in a folder, opened by `Dataset.open`.
 
-    Shards are looked at when they are first needed: their size, their SHA-256, their arrays. Those that are not
-    compressed stay on disk, and the system keeps in memory what it has room for.
+    The size, SHA-256 and arrays of a shard are checked when it is first needed. Shards that are not compressed are mapped
+    into memory.
     """
 
     def __init__(self, folder: Path, manifest: Manifest, memory: int):
@@ -83,13 +83,14 @@ class Dataset:
 
     @classmethod
     def open(cls, folder: str | Path, *, memory: int = 1 << 30) -> Dataset:
-        """The dataset of a folder.
+        """Open the dataset of a folder.
 
         Args:
-            memory: bytes that unpacked shards may take, where the dataset is compressed. One shard is always kept.
+            folder: the folder that `record` wrote.
+            memory: bytes that unpacked shards of a compressed dataset may take. One shard always stays in memory.
 
         Raises:
-            CompileError: PD630: there is none, it is damaged, or not all of it has been recorded.
+            CompileError: PD630 if there is no dataset, or it is damaged or incomplete.
         """
         place = Path(folder)
         manifest = read_manifest(place)
@@ -152,7 +153,7 @@ class Dataset:
             raise CompileError(errors)
 
     def episode(self, number: int) -> Episode:
-        """One episode. Raises IndexError."""
+        """Read one episode, from 0. Raises IndexError; CompileError (PD630) if its shard is damaged."""
         if not 0 <= number < len(self):
             raise IndexError(f"no episode {number}: there are {len(self)}")
         shard, place = self._shard(number // self.recipe.shard), number % self.recipe.shard
@@ -164,11 +165,18 @@ class Dataset:
         return Episode(number, int(shard.arrays["world"][place]), **values)
 
     def transitions(self, batch: int, **how: Any) -> Batches:
-        """Endless minibatches of `batch` transitions, all equally likely, drawn with replacement. `how`: see `Batches`."""
+        """Yield minibatches of `batch` transitions without end, all equally likely, drawn with replacement.
+
+        Args:
+            how: `seed`, `start` (the number of the first minibatch) and `device`, as in `Batches`.
+        """
         return Batches(Transitions(self), batch, **how)
 
     def sequences(self, length: int, batch: int, **how: Any) -> Batches:
-        """Endless minibatches [B, L, …] of `length` transitions in a row of one episode, all equally likely.
+        """Yield minibatches [B, L, …] of `length` successive transitions of an episode without end, all equally likely.
+
+        Args:
+            how: as in `transitions`.
 
         Raises:
             ValueError: no episode is that long.
@@ -178,7 +186,7 @@ class Dataset:
     # Reading
 
     def gather(self, episode: Array, first: Array, length: int) -> list[Array]:
-        """The arrays of `Batch`, [n, length, …], of `length` transitions from action `first` of each episode, int64 [n]."""
+        """Read `length` transitions from action `first` of each episode, int64 [n]: the arrays of a `Batch`, [n, length, …]."""
         stored = {name: name.removeprefix("next_") for name in Batch._fields}
         out = {
             name: np.empty((len(episode), length, *row_shape(self.recipe, of)), DTYPES[of])
@@ -226,16 +234,17 @@ class _Episodes(NamedTuple):
 class Transitions(torch.utils.data.Dataset[Batch]):
     """All transitions of one or several datasets, by number: dataset by dataset, episode by episode, in order.
 
-    ``rows[i]`` is transition i, a `Batch` without the dimension B; ``rows[[3, 5]]`` and ``rows[2:9]`` are a `Batch`.
-    Nothing is read before it is asked for, and workers of a `DataLoader` open the folders themselves.
+    ``rows[i]`` is transition i, a `Batch` without the dimension B; ``rows[[3, 5]]`` and ``rows[2:9]`` are a `Batch`;
+    ``len(rows)`` counts them. Rows are read when they are indexed, and workers of a `DataLoader` open the folders
+    themselves.
 
     Args:
         data: a dataset, or several whose observations and actions mean the same.
-        length: sequences of that many transitions in a row of one episode, [L, …], instead of single ones.
+        length: read sequences of that many successive transitions of an episode, [L, …], instead of single ones.
 
     Raises:
-        CompileError: PD630: a shard is damaged; PD631: the datasets do not fit together. ValueError: there is no dataset,
-            or no episode of that length.
+        CompileError: PD630 if a shard is damaged; PD631 if the datasets do not fit together.
+        ValueError: there is no dataset, or no episode of that length.
     """
 
     def __init__(self, data: Dataset | Sequence[Dataset], *, length: int | None = None):
@@ -309,7 +318,11 @@ class Batches(IterableDataset[Batch]):
     minibatch from the w-th, so the loader yields the same minibatches in the same order with any number of workers.
 
     Args:
-        seed: minibatch n depends on it and on n alone. start: the first one's number, to continue where one stopped.
+        rows: the transitions to draw from.
+        batch: transitions in a minibatch.
+        seed: minibatch n depends on the seed and on n alone.
+        device: the torch device of the minibatches.
+        start: number of the first minibatch, to continue where an iterator stopped.
     """
 
     def __init__(
@@ -358,15 +371,20 @@ def _integers(numbers: Any) -> Array:
 def split(
     rows: Transitions, fractions: Sequence[float], *, by: str = "world", seed: int = 0
 ) -> tuple[Transitions, ...]:
-    """Parts of transitions such that no world, or no episode, has transitions in two of them.
+    """Split transitions into parts, such that no world, or no episode, has transitions in two parts.
 
     A hash of `seed` and of the world (and of the episode's number, by episode) decides the part. So it is the same in
-    every process, in other recordings of the world, and after episodes are added; and the sizes of parts come near the
-    fractions rather than equal them.
+    every process, in other recordings of the world, and after episodes are added; and the sizes of parts are close to the
+    fractions, not equal to them.
 
     Args:
-        fractions: of the worlds or episodes, one for each part: positive, 1 in all.
-        by: ``world``, or ``episode`` where held-out episodes may play worlds of the training set.
+        rows: the transitions.
+        fractions: the share of the worlds or episodes in each part: positive, with the sum 1.
+        by: ``world``, or ``episode`` if held-out episodes may play worlds of the training set.
+        seed: of the hash.
+
+    Returns:
+        The parts, in the order of `fractions`.
 
     Raises:
         ValueError: a wrong argument, or a part would be empty.

@@ -57,18 +57,22 @@ def to_minari(
     author: str | None = None,
     description: str | None = None,
 ) -> minari.MinariDataset:
-    """Write a dataset to Minari's folder, episode by episode, whole or not at all.
+    """Write a dataset to Minari's folder, episode by episode, completely or not at all.
 
     Actions are the five numbers, int64 [T, 5]; observations and rewards keep their dtypes. An episode's seed is its
     world; infos have `success` and `world`, [T + 1] each. If the task is a shipped one with the recorded rules,
     `recover_environment` makes it.
 
     Args:
+        dataset: the dataset to write.
         dataset_id: ``namespace/name-v0``.
+        author: of the dataset, for Minari's metadata.
+        description: of the dataset, for Minari's metadata.
 
     Raises:
-        CompileError: PD612: Minari is not installed; PD613: there is such a dataset, or the folder cannot be written;
-            PD630: a shard is damaged. ValueError: Minari does not take the id.
+        CompileError: PD612 if Minari is not installed; PD613 if there is such a dataset or the folder cannot be written;
+            PD630 if a shard is damaged.
+        ValueError: Minari rejects the id.
     """
     require_minari()
     import minari
@@ -179,19 +183,23 @@ def from_minari(
     compress: bool = False,
     **how: Any,
 ) -> Dataset:
-    """Read a Minari dataset into a folder. What `to_minari` wrote gives the same shards, byte for byte.
+    """Read a Minari dataset into a folder. A dataset that `to_minari` wrote gives the same shards, byte for byte.
 
     Other Minari datasets need `task`, in whose environment they must have been collected; its actions may be in any
     form of `envs.actions`. An episode's world is `world` of its infos, or its seed; `success` of the infos is kept.
 
     Args:
-        folder: it is made, but not the folder around it. An interrupted import is completed.
-        shard, compress: as in `record`; only with `task`.
-        how: split, observation, knobs, params, last_action and others of `TensorEnv`, with `task`.
+        dataset_id: ``namespace/name-v0``.
+        folder: the folder to write, which is made, but not its parent. An interrupted import is completed.
+        task: as in `TensorEnv`.
+        shard: as in `record`; only with `task`.
+        compress: as in `record`; only with `task`.
+        how: split, observation, knobs, params, last_action and others of `TensorEnv`; only with `task`.
 
     Raises:
-        CompileError: PD612: Minari is not installed; PD630: there is no such dataset, it is damaged, or its images are
-            JPEG; PD631: the folder has another one; PD613: the folder cannot be written. ValueError: another argument is wrong.
+        CompileError: PD612 if Minari is not installed; PD630 if there is no such dataset, it is damaged, or its images
+            are JPEG; PD631 if the folder has another dataset; PD613 if the folder cannot be written.
+        ValueError: another argument is wrong.
     """
     require_minari()
     if task is None and (shard is not None or compress or how):

@@ -79,22 +79,26 @@ def record(
     completed; a shard that is damaged is recorded again.
 
     Args:
-        policy: a name of `SCRIPTED`, or a function from observations and keys to actions: see `envs.acting.Policy`.
-            Keys follow from the seed, the episode and the action's number; a stochastic policy draws by them.
-        folder: it is made, but not the folder around it.
+        task: as in `TensorEnv`.
+        policy: ``random``, ``nothing`` or ``expert``, or a function from observations and keys to actions: see
+            `envs.acting.Policy`. Keys follow from the seed, the episode and the action's number; a stochastic policy
+            draws by them.
+        folder: the folder to write, which is made, but not its parent.
+        episodes: the number of episodes.
+        seed: the world of the first episode; keys of actions depend on it too.
         observation: ``ids`` or ``compact``.
-        shard: episodes a shard; by default 256, fewer where they take more than 256 MiB.
+        shard: episodes in a shard; by default 256, or fewer if these take more than 256 MiB.
         compress: a seventh of the disk space for ``ids``, a quarter for ``compact``, and slower to read.
-        envs: episodes that are played at once, at most; it changes nothing in what is recorded.
-        policy_name: what the manifest calls a function: other functions, other names.
-        sees: the kind of observation that the policy is given, where that is another than what is recorded.
-        progress: is called after every action.
+        envs: the largest number of episodes that are played at once; it does not change the recording.
+        policy_name: the name of a function in the manifest; give each function a name of its own.
+        sees: the form of observations for the policy, if it differs from the recorded form.
+        progress: called after every action.
         how: split, knobs, params, worlds, last_action, max_episode_steps, backend, device, threads: of `TensorEnv`.
 
     Raises:
-        CompileError: a task, split, knob or parameter that there is not; PD630: the folder has something else; PD631:
-            it has another dataset; PD613: it cannot be written; PD622: another process records there. ValueError: another
-            argument that is wrong.
+        CompileError: an unknown task, split, knob or parameter; PD630 if the folder has other files; PD631 if it has
+            another dataset; PD613 if it cannot be written; PD622 if another process records there.
+        ValueError: another argument is wrong.
     """
     check_count("envs", envs, 1 << 20)
     if isinstance(policy, str) and policy not in SCRIPTED:

@@ -36,15 +36,17 @@ def make_env_and_datasets(
     add_info: bool = False,
     **env_kwargs: Any,
 ) -> Any:
-    """An environment, and the data set of a name: what `ogbench.make_env_and_datasets` returns. Nothing is downloaded.
+    """Make an environment and load a data set, as `ogbench.make_env_and_datasets` does. Nothing is downloaded.
 
     Args:
         dataset_name: ``powderworld-easy-play-v0``, also ``medium`` and ``hard``.
         dataset_dir: the folder of ``NAME.npz`` and ``NAME-val.npz``, which `powderdsl ogbench` writes.
-        dataset_path: the first of these files, wherever it is; the other one lies beside it.
+        dataset_path: path of the first file; the second is expected in the same folder.
         compact_dataset: False: transitions with ``next_observations``. True: all rows, and ``valids``.
-        env_only, dataset_only: leave out the other; the first one counts.
-        cur_env, add_info: taken for compatibility; these environments have nothing to add.
+        env_only: load no data.
+        dataset_only: make no environment; `env_only` takes precedence.
+        cur_env: accepted as by OGBench, and ignored.
+        add_info: accepted as by OGBench, and ignored.
         env_kwargs: those of `PowderworldEnv`, and `max_episode_steps`.
 
     Returns:
@@ -52,7 +54,8 @@ def make_env_and_datasets(
         arrays by name, see `load_dataset`: observations uint8, actions int32, the others float32.
 
     Raises:
-        ValueError: an unknown name, or a file that is not such a data set. FileNotFoundError: there is no such file.
+        ValueError: an unknown name, or a file that is not such a data set.
+        FileNotFoundError: there is no such file.
     """
     levels = shipped_levels()
     named = re.fullmatch(rf"{FAMILY}-({'|'.join(levels)})-[^-]+-{VERSION}", dataset_name)
@@ -88,20 +91,24 @@ def load_dataset(
     compact_dataset: bool = False,
     add_info: bool = False,
 ) -> Dataset:
-    """A file of episodes one after the other, whose last row is marked in `terminals`, as arrays by name.
+    """Load a file of successive episodes, whose last rows are marked in `terminals`, as arrays by name.
 
     Args:
+        dataset_path: path of the file, .npz.
+        ob_dtype: dtype of observations.
+        action_dtype: dtype of actions.
         compact_dataset: False: the last row of each episode, whose action leads nowhere, is only the last row of
             ``next_observations``; ``terminals`` is 1 on the last transition of each. True: all rows stay; ``valids`` is 0
             on the last rows, and ``terminals`` is 1 there and on the rows before.
-        add_info: taken for compatibility.
+        add_info: accepted as by OGBench, and ignored.
 
     Returns:
         ``observations`` and, unless compact, ``next_observations``, of `ob_dtype` [N, H, W, C]; ``actions``, of
         `action_dtype` [N]; ``terminals`` and, if compact, ``valids``, float32 [N].
 
     Raises:
-        ValueError: the file is not such a data set; the text says why. OSError: it cannot be read.
+        ValueError: the file is not such a data set; the text says why.
+        OSError: it cannot be read.
     """
     path = Path(dataset_path)
     try:

@@ -112,12 +112,15 @@ class _Face:
 class PowderworldEnv(_Face, gymnasium.Env[Array, Any], EzPickle):
     """OGBench's Powderworld: an action chooses an element, the next x, the next y; then a step runs and a block is painted.
 
-    Observations are uint8 [H, W, 6]: the world's picture and the action frame. ``info["goal"]`` of `reset` is the goal as
-    an observation, ``info["success"]`` of `step` is 1.0 while the world matches it.
+    Observations are uint8 [H, W, 6]: the world's picture and the action frame. Actions are integers below
+    ``action_space.n``. The reward is 1 while the world matches the goal, else 0.
 
     Args:
-        level: a shipped level by name, a level's file, a `Level`, or its program to share.
+        level: name of a shipped level, path of a level's file, a `Level`, or a `LevelProgram` to share.
         options: those of `EnvOptions`.
+
+    Raises:
+        CompileError: an unknown level, or a mistake in its file.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 15}  # noqa: RUF012 as Gymnasium declares it
@@ -150,10 +153,12 @@ class PowderworldEnv(_Face, gymnasium.Env[Array, Any], EzPickle):
                 without them a task is drawn. ``render_goal``: adds ``goal_rendered``, uint8 [height, width, 3].
 
         Returns:
-            the observation, and infos: ``goal``, uint8 [H, W, 6]. None in data collection.
+            The observation, and infos: ``goal``, uint8 [H, W, 6], the goal as an observation; no infos in data collection.
 
         Raises:
-            KeyError, TypeError, ValueError: an unknown option, or one that the level does not have.
+            KeyError: an unknown option.
+            TypeError: an option has the wrong type.
+            ValueError: the level has no such task.
         """
         given = dict(options or {})
         check_options(given, OPTIONS)
@@ -170,19 +175,24 @@ class PowderworldEnv(_Face, gymnasium.Env[Array, Any], EzPickle):
         return self._observations()[0], info
 
     def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """One of the three choices of an action. One that is not valid is replaced by a random valid one."""
+        """Make one of the three choices of an action. An invalid choice is replaced by a random valid one.
+
+        Returns:
+            The observation, the reward (1.0 or 0.0), terminated, truncated (always False), and infos: ``success``, 1.0
+            while the world matches the goal.
+        """
         success = bool(self.episodes.step(np.array([action], dtype=np.int64).reshape(1))[0])
         info = {"success": float(success)} if self.episodes.mode == "task" else {}
         return self._observations()[0], float(success), success, False, info
 
     def render(self) -> Any:
-        """The world's picture, uint8 [height, width, 3]."""
+        """Draw the world: uint8 [height, width, 3]."""
         return self._pictures()[0]
 
     # For scripts that choose whole actions
 
     def sample_semantic_action(self) -> tuple[str, int, int]:
-        """A whole action, all equally likely: the element's name, x and y. From the seed, the episode and its step."""
+        """Draw a whole action, all equally likely, from the seed, the episode and its step: the element's name, x, y."""
         at = self.episodes
         key = (at.seeds, at.episode.clip(0), at.elapsed)
         drawn = [float(keyed(key, f"{what} sample", 1)[0, 0]) for what in FIRST]
@@ -194,19 +204,23 @@ class PowderworldEnv(_Face, gymnasium.Env[Array, Any], EzPickle):
         return (self.level.elements.index(str(elem_name)), x, y)[self.episodes.stage[0]]
 
     def sample_action(self) -> int:
-        """A valid action for the present stage, all equally likely."""
+        """Draw a valid action for the present stage, all equally likely."""
         return self.semantic_action_to_action(*self.sample_semantic_action())
 
 
 class PowderworldVectorEnv(_Face, VectorEnv[Any, Any, Any]):
-    """Environment i plays the same episodes as a `PowderworldEnv` with the seed `seed` + i, whatever the others do.
+    """Many worlds of a level at once. Environment i plays the episodes of a `PowderworldEnv` with the seed `seed` + i.
 
     Args:
         level: as in `PowderworldEnv`.
-        num_envs: worlds at once.
+        num_envs: the number of worlds, B.
         max_episode_steps: truncates episodes; the level's number by default.
         autoreset_mode: one of Gymnasium's, or its name.
         options: those of `EnvOptions`.
+
+    Raises:
+        CompileError: an unknown level, or a mistake in its file.
+        ValueError: another argument is wrong.
     """
 
     def __init__(
@@ -241,10 +255,12 @@ class PowderworldVectorEnv(_Face, VectorEnv[Any, Any, Any]):
                 They hold for these episodes; later ones draw a task. ``reset_mask``: bool [B].
 
         Returns:
-            observations uint8 [B, H, W, 6]; infos: ``goal``, of the same shape, and ``task_id``, int64 [B].
+            Observations uint8 [B, H, W, 6]; infos: ``goal``, of the same shape, and ``task_id``, int64 [B].
 
         Raises:
-            KeyError, TypeError, ValueError: something is wrong with a seed or an option. Nothing has changed then.
+            KeyError: an unknown option. Nothing has changed then, nor in the other cases.
+            TypeError: a seed or an option has the wrong type.
+            ValueError: a seed or an option is out of range, or has the wrong length.
         """
         given = dict(options or {})
         check_options(given, BATCH_OPTIONS)
@@ -267,16 +283,16 @@ class PowderworldVectorEnv(_Face, VectorEnv[Any, Any, Any]):
         return [self._task({**given, "task_id": number}) for number in ids.tolist()]
 
     def step(self, actions: Any) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        """One choice in every episode: integers [B]. Those that are not valid are replaced by random valid ones.
+        """Make one choice in every episode: integers [B]. Invalid choices are replaced by random valid ones.
 
         Returns:
-            observations uint8 [B, H, W, 6]; reward float64 [B]; terminated and truncated, bool [B]; infos: ``success``,
+            Observations uint8 [B, H, W, 6]; reward float64 [B]; terminated and truncated, bool [B]; infos: ``success``,
             float64 [B]; where an episode began, its ``goal`` and ``task_id``, as `reset` gives them; under SAME_STEP
             ``final_obs`` and ``final_info`` too.
 
         Raises:
-            ResetNeeded: before the first reset, or under DISABLED in an episode that has ended. TypeError, ValueError:
-            actions of another type or shape.
+            ResetNeeded: before the first reset, or under DISABLED in an episode that has ended.
+            ValueError: actions of another type or shape.
         """
         given = np.asarray(actions)
         if given.shape != (self.num_envs,) or given.dtype.kind not in "iu":
@@ -323,5 +339,5 @@ class PowderworldVectorEnv(_Face, VectorEnv[Any, Any, Any]):
         }
 
     def render(self) -> tuple[Any, ...] | None:
-        """Each world's picture, uint8 [height, width, 3]."""
+        """Draw each world: uint8 [height, width, 3]; None without `render_mode`."""
         return None if self.render_mode is None else self._pictures()

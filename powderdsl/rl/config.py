@@ -102,7 +102,7 @@ class TrainConfig:
     eval_episodes: int = setting(64, "How many of them.", 1, 1 << 20, may_change=True)
 
     def as_json(self) -> dict[str, Any]:
-        """All settings, as JSON has them."""
+        """Return all settings as plain values, for JSON."""
         return asdict(self)
 
     @property
@@ -148,7 +148,16 @@ a fully convolutional network with one score for each bin and deed."""
 
 
 def preset(name: str, task: str, **changes: Any) -> TrainConfig:
-    """The settings of a preset, with changes. Raises CompileError (PD640) with everything that is wrong."""
+    """Return the settings of a preset for a task, with changes.
+
+    Args:
+        name: one of `PRESETS`: ``paper``, ``small``, ``fcn``.
+        task: name of a shipped task, or path of a task file.
+        changes: fields of `TrainConfig`, which replace those of the preset.
+
+    Raises:
+        CompileError: PD640, with all mistakes at once.
+    """
     problems = []
     if name not in PRESETS:
         problems.append("; ".join([f"there is no preset `{name}`", *suggest(str(name), PRESETS, "presets")]))
@@ -160,7 +169,7 @@ def preset(name: str, task: str, **changes: Any) -> TrainConfig:
 
 
 def from_json(values: Mapping[str, Any]) -> TrainConfig:
-    """Settings as `TrainConfig.as_json` gives them; missing ones have their defaults. Raises CompileError (PD640)."""
+    """Read the settings that `TrainConfig.as_json` gave; missing ones get their defaults. Raises CompileError (PD640)."""
     return _checked(values, [])
 
 

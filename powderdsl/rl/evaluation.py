@@ -167,16 +167,23 @@ def evaluate(
     worlds that it trained on.
 
     Args:
-        run_or_task: a run, or the path or name of one, or a task as `Task`, which has no trained policy.
-        splits: all of the task's unless given.
-        policies: some of POLICIES. Unless given, all that the task and the run have, but not an expert that searches,
-            which takes as long as its many plans.
+        run_or_task: a run, its path or its name; or a `Task`, which has no trained policy.
+        splits: names of splits; all splits of the task unless given.
+        policies: some of ``trained``, ``expert``, ``random``, ``nothing``. Unless given, all that the task and the run
+            have, except an expert that searches, which is slow.
+        episodes: the number of episodes on each split.
         deterministic: the trained policy takes the likeliest action, instead of drawing one.
-        backend, device: those of the run unless given.
+        seed: seed of the actions that policies draw.
+        backend: that of the run unless given.
+        device: that of the run unless given.
         packs: names or files of packs that are added to the rules of a run's task.
 
+    Returns:
+        The mean return of each policy on each split with its 95 % interval, lengths of episodes, and rates of success.
+
     Raises:
-        CompileError: PD620 for a run that is not there, PD801 for a split. ValueError: another argument is wrong.
+        CompileError: PD620 if there is no such run, PD801 if there is no such split.
+        ValueError: another argument is wrong.
     """
     run, config, task = subject(run_or_task, packs)
     names = [split.name for split in task.splits] if splits is None else list(dict.fromkeys(splits))

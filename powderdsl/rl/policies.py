@@ -88,9 +88,15 @@ class _NoOptimizer:
 
 
 def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: bool = False) -> TrainedPolicy:
-    """The policy of a run's newest checkpoint, for the observations and actions of `env`, on its device.
+    """Load the policy of a run's newest checkpoint, for the observations and actions of `env`, on its device.
 
-    The rules of `env` may have packs that the run did not know: see `task_of`.
+    Args:
+        run: a run, its path or its name.
+        env: the environment to play. Its rules may have packs that the run did not know: see `task_of`.
+        deterministic: take the likeliest action, instead of drawing one.
+
+    Returns:
+        A function from observations [B, …] and keys, int64 [B], to actions, int64 [B, 5]: see `envs.acting.Policy`.
 
     Raises:
         CompileError: PD620 if there is no such run or checkpoint; PD623 if the environment does not fit the run.

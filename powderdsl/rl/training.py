@@ -63,14 +63,22 @@ Progress = Callable[[int, float | None], None]
 
 
 def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None = None) -> RunFolder:
-    """Train until `config.steps` interactions are reached: begin a run in `folder`, or continue with the one there.
+    """Train until `config.steps` interactions are reached.
 
-    Rollouts are whole: a run ends with the first that reaches `steps`. A run that is interrupted and continues gives the
-    same weights as one that was not, bit by bit, on a processor; so does one whose `steps` are raised.
+    Rollouts are whole: a run ends with the first that reaches `steps`. On a CPU, a run that is interrupted and continues
+    gives the same weights, bit for bit, as one that is not; so does a run whose `steps` are raised.
+
+    Args:
+        config: the settings.
+        folder: the folder of a new run, or of the run to continue.
+        progress: called after every action with the interactions so far, and the mean return of the last 100 episodes.
+
+    Returns:
+        The folder of the run, with its checkpoints and metrics.
 
     Raises:
-        CompileError: PD640 for settings, all mistakes at once; what `load_task` says of the task; PD621 if the folder
-            holds another run; PD622 if another process trains there.
+        CompileError: PD640 for settings, all mistakes at once; the errors of `load_task`; PD621 if the folder holds
+            another run; PD622 if another process trains there.
         KeyboardInterrupt: after the state before the rollout that was in progress has been saved.
     """
     check_config(config)

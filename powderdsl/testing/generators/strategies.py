@@ -1,4 +1,4 @@
-"""Hypothesis strategies for rulesets and start worlds. What they find, Hypothesis shrinks."""
+"""Hypothesis strategies for rulesets and start worlds. Hypothesis shrinks the examples that fail."""
 
 from __future__ import annotations
 
@@ -21,21 +21,25 @@ T = TypeVar("T")
 def worlds(
     rules: Ruleset | str, max_batch: int = 3, max_side: int = 65, shape: tuple[int, int, int] | None = None
 ) -> st.SearchStrategy[Start]:
-    """Start worlds of a ruleset: any ids, fields and parameters it allows, in odd shapes.
+    """Return a strategy for start worlds of a ruleset: any ids, fields and parameters it allows, in odd shapes.
 
     Args:
         rules: a checked model, or a name as `powderdsl.load` takes it.
-        max_batch, max_side: bounds of worlds, rows and columns.
-        shape: (worlds, rows, columns), if it must be this one.
+        max_batch: the largest number of worlds.
+        max_side: the largest number of rows, and of columns.
+        shape: (worlds, rows, columns); unless given, it is drawn too.
     """
     ruleset = load(rules) if isinstance(rules, str) else rules
     return chosen(lambda choices: random_start(ruleset, choices, shape, max_batch, max_side))
 
 
 def rulesets(manner: Manner | None = None) -> st.SearchStrategy[Ruleset]:
-    """Random rulesets, made as text and read by the whole front end. `manner` leaves things out.
+    """Return a strategy for random rulesets, which are made as text and read by the whole front end.
 
-    About one text in seventy is refused by the static checks, and passed over.
+    About one text in seventy is refused by the static checks, and skipped.
+
+    Args:
+        manner: parts of the language to leave out.
     """
 
     def make(choices: Choices) -> Ruleset:
@@ -48,7 +52,7 @@ def rulesets(manner: Manner | None = None) -> st.SearchStrategy[Ruleset]:
 
 
 def chosen(make: Callable[[Choices], T]) -> st.SearchStrategy[T]:
-    """Values that a function makes of Hypothesis' choices: plain options come first, so examples shrink to them."""
+    """Return a strategy for the values that `make` builds from choices; plain options come first, for shrinking."""
 
     @st.composite
     def strategy(draw: st.DrawFn) -> T:
