@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from powderdsl.diagnostics import CompileError, Label, Reporter, Severity, Source, Span, suggest
-from powderdsl.model.check import check, with_outgrown
+from powderdsl.model.check import check, demote_outgrown
 from powderdsl.model.composition.compose import Palette, compose
 from powderdsl.model.composition.names import words_of_tree
 from powderdsl.model.declarations import PackDecl, RulesetDecl
@@ -133,7 +133,7 @@ def load_with_diagnostics(
         model = set_params(model, params, reporter)
     reporter.raise_if_errors()
     remarks = tuple(d for d in reporter.diagnostics if d.severity is not Severity.ERROR)
-    return model, with_outgrown(model, remarks)
+    return model, demote_outgrown(model, remarks)
 
 
 def whole_palette(*names: str | Path) -> tuple[str | None, ...]:
@@ -414,12 +414,14 @@ def lower(ruleset: Ruleset, memo: Memo | None = None) -> Program:
 
 def parts(program: Program, memo: Memo | None = None) -> tuple[Segment, ...]:
     """Optimized IR in segments, on bit planes where they can carry it."""
-    from powderdsl.ir.segments import Carried, carry, segments
+    from powderdsl.ir.segments import PassForm, choose_form, segments
     from powderdsl.ir.text import structure
 
-    def carried(whole: Program, pass_: PassGraph) -> Carried:
+    def form_of(whole: Program, pass_: PassGraph) -> PassForm:
         if memo is None:
-            return carry(whole, pass_)
-        return memo.of(("planes", pass_.name), (whole.slots, structure(pass_)), lambda: carry(whole, pass_))
+            return choose_form(whole, pass_)
+        return memo.of(
+            ("planes", pass_.name), (whole.slots, structure(pass_)), lambda: choose_form(whole, pass_)
+        )
 
-    return segments(program, carried)
+    return segments(program, form_of)

@@ -88,7 +88,7 @@ ROWS = {
 RUN = """\
 import torch
 from powderdsl.ir.ops import REAL, Graph, PassGraph, Program, SlotType, SubstepGraph, integer
-from powderdsl.ir.segments import carry, segments
+from powderdsl.ir.segments import choose_form, segments
 from powderdsl.ir.stages import run_passes
 from powderdsl.targets.cpp.source import native_source
 from powderdsl.targets.cuda.source import cuda_source
@@ -119,7 +119,7 @@ state = {
 zeros = torch.zeros(2, dtype=torch.int64)
 job = Job(state, Clock(zeros, zeros, zeros), 3, {}, {}, None)
 (part,) = segments(program)
-assert part.planes is not None, carry(program, program.passes[0]).why
+assert part.planes is not None, choose_form(program, program.passes[0]).why
 results = [
     runnable.run(job)
     for runnable in (TorchProgram(program, torch.device("cpu")), WasmProgram(program, part.planes, Tensors()))

@@ -6,7 +6,7 @@ from collections import Counter
 from dataclasses import dataclass
 
 from powderdsl.ir.ops import OPS, REAL, Offset, PassGraph, Program, nodes_of
-from powderdsl.ir.segments import Carried, carry
+from powderdsl.ir.segments import PassForm, choose_form
 
 WEIGHTS = {"gates": 1.0, "shifts": 4.0, "moves": 8.0, "random_bits": 8.0, "reals": 32.0, "dense": 200.0}
 """The cost of one of each, in vector operations on 512 cells: sixteen floats fill the vector that holds 512 flags, a
@@ -43,7 +43,7 @@ class PassCost:
 
 def costs(program: Program) -> tuple[PassCost, ...]:
     """The costs of the passes of an optimized program, in their order. Shares add up to 1."""
-    forms = [carry(program, pass_) for pass_ in program.passes]
+    forms = [choose_form(program, pass_) for pass_ in program.passes]
     counts = [_work(form) for form in forms]
     weights = [sum(WEIGHTS[kind] * count[kind] for kind in WEIGHTS) for count in counts]
     total = sum(weights) or 1.0
@@ -63,7 +63,7 @@ def costs(program: Program) -> tuple[PassCost, ...]:
     )
 
 
-def _work(form: Carried) -> Counter[str]:
+def _work(form: PassForm) -> Counter[str]:
     """The amount of each kind of work."""
     count: Counter[str] = Counter()
     bits: Counter[str] = Counter()

@@ -33,7 +33,7 @@ class Type:
 
     @property
     def type(self) -> Type:
-        """What makes a number of this type."""
+        """The constructor of numbers of this type: the type itself."""
         return self
 
     @property
@@ -238,7 +238,7 @@ def _comparison(op: str, number: int, swapped: bool) -> bytes:
 
 
 def choose(flags: bytes, a: Values, b: Values, kind: Type, count: int) -> Values:
-    """Those of `a` where a flag is 1, those of `b` elsewhere."""
+    """The values of `a` where a flag is 1, and of `b` elsewhere."""
     if len(flags) == 1:
         return a if flags[0] else b
     if isinstance(a, bytes) and isinstance(b, bytes) and len(a) == len(b) == 1:
@@ -256,7 +256,7 @@ def choose(flags: bytes, a: Values, b: Values, kind: Type, count: int) -> Values
 # Values elsewhere
 
 Offsets = Sequence[int]
-"""Where along an axis values come from, in values from the beginning."""
+"""The offsets of values along an axis, in values from the beginning."""
 
 
 def _runs(axes: Sequence[Offsets]) -> tuple[list[int], int]:
@@ -297,7 +297,7 @@ def gather(values: Values, axes: Sequence[Offsets]) -> Values:
 
 
 def scatter(values: Values, axes: Sequence[Offsets], new: Values) -> Values:
-    """The values with others at the sums of one offset from each axis, alike and as many."""
+    """The values with new ones, of one type and as many, at the sums of one offset from each axis."""
     if not all(map(len, axes)):
         return values
     changed: Any = bytearray(values) if isinstance(values, bytes) else values[:]
@@ -313,9 +313,9 @@ def roll(values: Values, outer: int, count: int, inner: int, shift: int) -> Valu
         return values
     block, cut = count * inner, shift % count * inner
     cut -= block if 2 * cut > block else 0
-    # All move at once; then those that leave their block return at its other end.
-    circular: Any = values
-    moved = circular[-cut:] + circular[:-cut]
+    # All values move at once; then values that leave their block return at its other end.
+    either: Any = values
+    moved = either[-cut:] + either[:-cut]
     changed: Any = bytearray(moved) if isinstance(values, bytes) else moved
     for place in range(cut) if cut > 0 else range(block + cut, block):
         changed[place::block] = values[(place - cut) % block :: block]

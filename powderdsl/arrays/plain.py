@@ -1,7 +1,7 @@
-"""The names of NumPy that this project uses, on arrays in plain Python. What is missing raises an error.
+"""The names of NumPy that this project uses, on arrays in plain Python. Other names raise AttributeError.
 
-In NumPy a slice is a view, which sees what is written to its array later. Here it is a copy that cannot be written to,
-and using it after its array was written to is an error.
+In NumPy a slice is a view, which sees later writes to its array. Here it is a copy that cannot be written to, and using
+it after its array was written to is an error.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def __getattr__(name: str) -> Any:
 
 
 def _reduction(call: Callable[[Values], Any], result: Type | None = None) -> Any:
-    """A method that makes one number of those along an axis, along some, or of all."""
+    """A method that reduces an axis, some axes, or all of them to one number."""
 
     def method(self: ndarray, axis: Any = None) -> ndarray:
         full, kind = self.full, result or self.dtype
@@ -55,7 +55,7 @@ def _reduction(call: Callable[[Values], Any], result: Type | None = None) -> Any
 
 
 class ndarray:
-    """An array. One without axes is a number: what reductions and indices of single cells give."""
+    """An array. One without axes is a number, as reductions and indices of single cells return it."""
 
     __slots__ = ("_base", "_seen", "_values", "_written", "dtype", "shape")
 
@@ -150,7 +150,7 @@ class ndarray:
         return ndarray(tuple(sides), self.dtype, self.values, self)
 
     def offsets(self) -> list[range]:
-        """Where the values along each axis are."""
+        """The offsets of the values along each axis."""
         steps = [prod(self.shape[axis + 1 :]) or 1 for axis in range(self.ndim)]
         return [range(0, side * step, step) for side, step in zip(self.shape, steps, strict=True)]
 
@@ -176,7 +176,7 @@ class ndarray:
         self._written += 1
 
     def _select(self, key: Any) -> tuple[list[Offsets], Shape, bool]:
-        """Where the values are that a key selects, their shape, and whether arrays select them."""
+        """The offsets along each axis of the values that a key selects, their shape, and True if arrays select them."""
         items = [_part(item) for item in (key if isinstance(key, tuple) else (key,))]
         rest = [slice(None)] * (self.ndim - sum(map(_axes_taken, items)))
         dots = next((place for place, item in enumerate(items) if item is ...), None)
@@ -243,7 +243,7 @@ def _axes_taken(item: Any) -> int:
 
 
 def _places(item: int | ndarray, sides: Shape, steps: Sequence[int]) -> ndarray:
-    """What an integer or an array selects along the first of some axes, or flags along several: offsets."""
+    """The offsets that an integer or an array selects along the first of some axes, or flags along several."""
     if isinstance(item, ndarray) and item.dtype is bool_:
         if item.shape != sides[: item.ndim]:
             raise IndexError(f"flags of the shape {item.shape} in an index of {sides}")
@@ -266,7 +266,7 @@ def _within(places: Sequence[int], side: int) -> Sequence[int]:
 
 
 def asarray(values: Any, dtype: Any = None) -> ndarray:
-    """An array of anything that is one, of a number, or of nested lists."""
+    """An array of an array, of a number, or of nested lists."""
     if isinstance(values, ndarray):
         return values if dtype is None or dtype is values.dtype else values.astype(dtype)
     shape, leaves = _nested(values)
@@ -409,7 +409,7 @@ def repeat(values: ndarray, repeats: int, axis: int) -> ndarray:
 
 
 def _together(first: Shape, second: Shape) -> Shape:
-    """The shape of two arrays together; what does not fit it, `broadcast_to` will refuse."""
+    """The shape of two arrays together; `broadcast_to` refuses arrays that do not fit it."""
     count = max(len(first), len(second))
     pairs = zip((1,) * (count - len(first)) + first, (1,) * (count - len(second)) + second, strict=True)
     return tuple(b if a == 1 else a for a, b in pairs)
@@ -477,11 +477,11 @@ def where(condition: Any, yes: Any, no: Any) -> ndarray:
 
 
 def isin(values: ndarray, test_elements: Sequence[int]) -> ndarray:
-    wanted, numbers_ = frozenset(test_elements), values.values
-    if isinstance(numbers_, bytes):
+    wanted, stored = frozenset(test_elements), values.values
+    if isinstance(stored, bytes):
         table = bytes(number in wanted for number in range(256))
-        return ndarray(values.shape, bool_, numbers_.translate(table))
-    return ndarray(values.shape, bool_, bytes(map(wanted.__contains__, numbers_)))
+        return ndarray(values.shape, bool_, stored.translate(table))
+    return ndarray(values.shape, bool_, bytes(map(wanted.__contains__, stored)))
 
 
 minimum, maximum = partial(_binary, "minimum"), partial(_binary, "maximum")
@@ -514,7 +514,7 @@ def errstate(**_: str) -> nullcontext[None]:
     return nullcontext()
 
 
-# Questions
+# Comparisons and searches
 
 
 def array_equal(x: Any, y: Any) -> bool:
@@ -537,7 +537,7 @@ def unique(values: Any) -> ndarray:
 
 
 def searchsorted(values: ndarray, wanted: ndarray, side: str = "left") -> ndarray:
-    """How many of ascending numbers are below others, or not above them (``right``)."""
+    """The number of ascending numbers below each of others, or not above each (``right``)."""
     call, listed = bisect_left if side == "left" else bisect_right, values.tolist()
     if bool(isnan(wanted).any()):
         raise TypeError("searchsorted of NaN is not there without NumPy")

@@ -1,4 +1,4 @@
-"""Diagnostics: what is wrong, where, and what to write instead. Used by every stage; depends on nothing."""
+"""Diagnostics: the mistake, its place, and the fix. Used by every stage; depends on nothing."""
 
 from powderdsl.diagnostics.codes import CODES, Code, Severity
 from powderdsl.diagnostics.diagnostic import Diagnostic, Label, Source, Span

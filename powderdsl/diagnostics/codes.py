@@ -20,7 +20,7 @@ class Severity(Enum):
 
 
 class Code(NamedTuple):
-    """A row: the code, its slug (names the fault, not the fix), how severe it is."""
+    """A row: the code, its slug (which names the fault, not the fix), and its severity."""
 
     code: str
     slug: str
@@ -149,7 +149,7 @@ def find_code(word: str) -> Code | None:
 
 
 def similar(word: str) -> tuple[str, ...]:
-    """Codes and slugs that look like an unknown one; all codes of its hundred if it looks like a code."""
+    """Codes and slugs similar to an unknown one; all codes of its hundred if it looks like a code."""
     text = word.strip().lower()
     known = {name.lower(): name for row in CODES.values() for name in (row.code, row.slug)}
     if text.startswith("pd") and len(text) >= 3:

@@ -75,7 +75,7 @@ class Label:
 
 @dataclass(frozen=True)
 class Diagnostic:
-    """One mistake (or remark): a code of the table, the place, what is wrong, and how to fix it."""
+    """One mistake (or remark): a code of the table, the place, the message, and the fixes."""
 
     code: str
     message: str

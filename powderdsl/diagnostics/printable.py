@@ -45,7 +45,7 @@ def printable(text: str, *, lines: bool = False) -> str:
 
 
 def styled(text: str) -> str:
-    """A text whose colors stay, and everything else as `printable` has it. What comes from files is escaped before."""
+    """A text escaped by `printable`, except colors. Text from files must be escaped before."""
     pieces = _STYLE.split(text)
     return "".join(piece if at % 2 else printable(piece, lines=True) for at, piece in enumerate(pieces))
 
@@ -89,7 +89,7 @@ def character_name(char: str) -> str:
 
 
 def shown_character(char: str) -> str:
-    """A character in a message: as it is, and what it is if it is not ASCII."""
+    """A character in a message, with its name if it is not ASCII."""
     return f"`{char}`" if char.isascii() else f"`{printable(char)}` ({character_name(char)})"
 
 
@@ -128,7 +128,7 @@ def printable_streams() -> Iterator[None]:
 
 
 def unguarded(stream: Any) -> Any:
-    """The stream behind a `PrintableStream`, for code that draws on a terminal; any other stream as it is."""
+    """The stream behind a `PrintableStream`, for code that draws on a terminal; any other stream unchanged."""
     return stream.unguarded if isinstance(stream, PrintableStream) else stream
 
 

@@ -18,7 +18,7 @@ MAX_CANDIDATES = 500
 
 
 class CompileError(Exception):
-    """Bad input: rule files, worlds, tasks. `diagnostics` has everything that was found, in source order."""
+    """Bad input: rule files, worlds, tasks. `diagnostics` has all errors, in source order."""
 
     def __init__(self, diagnostics: Iterable[Diagnostic]):
         self.diagnostics = tuple(diagnostics)
@@ -58,7 +58,7 @@ class Reporter:
     error = report
 
     def add(self, diagnostic: Diagnostic) -> None:
-        """Add what another reporter has found. Raises CompileError as `report` does."""
+        """Add a diagnostic. Raises CompileError as `report` does."""
         if diagnostic in self._diagnostics:
             return
         if diagnostic.severity is Severity.ERROR:

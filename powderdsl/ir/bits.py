@@ -38,7 +38,7 @@ MAX_GATES = 1 << 14
 
 
 class NotBits(Exception):
-    """Something that bit planes cannot carry; torch tensors can. `place` is the rule's file and line."""
+    """Raised for a pass that bit planes cannot carry, but torch tensors can. `place` is the rule's file and line."""
 
     def __init__(self, why: str, place: str = ""):
         super().__init__(why)
@@ -50,7 +50,7 @@ def _opposite(a: Node, b: Node) -> bool:
 
 
 def simpler(build: Graph, op: str, args: tuple[Node, ...], attr: Hashable = None) -> Node | None:
-    """Constants evaluated, except floats, and the algebra of flags: what an operation is without itself, if anything."""
+    """A simpler node equal to an operation, or None: constants evaluated, except floats, and the algebra of flags."""
     row = OPS[op]
     constants = [arg.attr for arg in args if arg.op == "const" and arg.type != REAL]
     if row.evaluate is not None and len(constants) == len(args):
@@ -101,7 +101,7 @@ Bits = tuple[Node, ...]
 class Gates(Graph):
     """Boolean circuits on bit planes: gates that fold as they are built, adders, comparators, truth tables.
 
-    `slots` are the types of what the nodes find that are lowered to gates.
+    `slots` are the types of the slots that lowered nodes read.
     """
 
     def __init__(self, slots: Mapping[str, Type] | None = None) -> None:
@@ -126,10 +126,7 @@ class Gates(Graph):
         return super().derive(op, *args, attr=attr)
 
     def shift(self, a: Node, offset: Offset, wraps: bool = True) -> Node:
-        if a.type == REAL and a.op in (
-            "const",
-            "param",
-        ):  # planes may have shown that it is the same everywhere
+        if a.type == REAL and a.op in ("const", "param"):  # lowering may have made a float uniform
             return self.shift_uniform(a, offset, wraps)
         if a is self.no or (a is self.yes and wraps):
             return a
@@ -195,7 +192,7 @@ class Gates(Graph):
         return self.fit([self.select(condition, *pair) for pair in self.pairs(yes, no, type.bits)], type)
 
     def divide(self, a: Bits, b: Bits, most: int) -> tuple[Bits, Bits]:
-        """a / b rounded down, and the remainder, where 0 < b ≤ most; where b is 0 they mean nothing.
+        """a / b rounded down, and the remainder, for 0 < b ≤ most; both are arbitrary where b is 0.
 
         Long division from the highest bit: twice the remainder so far plus the bit, less b if it fits.
         """
@@ -244,8 +241,8 @@ class Gates(Graph):
         row = _FLAT.get(node.op)
         return row(self, node, *args) if row else self.rebuild(node, args)
 
-    def looked_up(self, a: Bits, of: Type, function: Callable[[int], int | None], type: Type) -> Bits:
-        """What a function gives for a small integer of a range; where that is None it does not matter."""
+    def look_up(self, a: Bits, of: Type, function: Callable[[int], int | None], type: Type) -> Bits:
+        """The value of a function of a small integer in a range; None means any value."""
         if of.bits > MAX_TABLE_BITS:
             raise NotBits(f"a table over {of.bits} planes")
         values = {number & ((1 << of.bits) - 1): function(number) for number in range(of.lo, of.hi + 1)}
@@ -297,7 +294,7 @@ _NO, _YES = Split(-1), Split(-2)
 
 @cache
 def _half(inputs: int, i: int) -> int:
-    """The numbers of so many bits whose bit i is 0, as a set of bits."""
+    """The numbers of `inputs` bits whose bit i is 0, as a set of bits."""
     step = 1 << i
     return ((1 << (1 << inputs)) - 1) // ((1 << 2 * step) - 1) * ((1 << step) - 1)
 
@@ -361,7 +358,7 @@ def lower_pass(program: Program, pass_: PassGraph) -> PassGraph:
             raise
 
     def write(name: str, node: Node) -> list[tuple[str, Node]]:
-        """The writes of bit planes that a write of a slot becomes. The range of a scratch slot is that of the node."""
+        """The writes of bit planes for a write of a slot. The range of a scratch slot is that of the node."""
         value = values[node]
         if isinstance(value, Node):
             return [(name, value)]
@@ -439,7 +436,7 @@ def _compare(gates: Gates, node: Node, a: Bits, b: Bits) -> Node:
                 joined = _any_neighbor(gates, side)
                 return joined if True in some else gates.not_(joined)
         if side.type.bits <= 5:
-            return gates.looked_up(bits, side.type, test, FLAG)[0]
+            return gates.look_up(bits, side.type, test, FLAG)[0]
     if node.op == "eq":
         return gates.eq(a, b)
     return gates.lt(a, b) if node.op == "lt" else gates.not_(gates.lt(b, a))
@@ -494,7 +491,7 @@ def _quotient(gates: Gates, node: Node, value: Bits, divisor: Bits) -> Bits:
     if by.lo == by.hi and by.lo > 0 and by.lo & (by.lo - 1) == 0:  # rounded down, as a shift is
         return gates.fit(value[by.lo.bit_length() - 1 :] or value[-1:], node.type)
     if by.lo == by.hi and by.lo and of.bits <= MAX_TABLE_BITS // 2:
-        return gates.looked_up(value, of, lambda number: number // by.lo, node.type)
+        return gates.look_up(value, of, lambda number: number // by.lo, node.type)
     most = max(abs(by.lo), abs(by.hi))
     if by.signed:  # a div -b = -a div b
         negative = divisor[-1]
@@ -513,7 +510,7 @@ def _mod(gates: Gates, node: Node, value: Bits) -> Bits:
     if node.args[0].type.bits > MAX_TABLE_BITS // 2:
         _, rest = gates.divide(value, gates.constant(modulus), modulus)
         return gates.fit(rest, node.type)
-    return gates.looked_up(value, node.args[0].type, lambda number: number % modulus, node.type)
+    return gates.look_up(value, node.args[0].type, lambda number: number % modulus, node.type)
 
 
 def _to_real(gates: Gates, node: Node, value: Bits) -> Node:
@@ -522,17 +519,17 @@ def _to_real(gates: Gates, node: Node, value: Bits) -> Node:
     if max(abs(of.lo), abs(of.hi)) >= 1 << 24:
         raise NotBits("an integer too large for float32")
     weights: dict[Node, float] = {}  # equal planes count together
-    always = 0.0
+    base = 0.0
     for i, plane in enumerate(value):
         weight = float(1 << i) if i < len(value) - 1 else -float(1 << i)
         if plane.op == "const":
-            always += weight if plane.attr else 0.0
+            base += weight if plane.attr else 0.0
         else:
             weights[plane] = weights.get(plane, 0.0) + weight
     if not weights:
-        return gates.real(always)
+        return gates.real(base)
     (first, weight), *others = weights.items()
-    total = gates.select(first, gates.real(always + weight), gates.real(always))
+    total = gates.select(first, gates.real(base + weight), gates.real(base))
     for plane, weight in others:
         total = gates.derive("add", total, gates.select(plane, gates.real(weight), gates.real(0.0)))
     return total
@@ -546,8 +543,8 @@ _INTEGERS: dict[str, Callable[..., Node | Bits]] = {
     "below": _below,
     "shift": _plane_by_plane,
     "count": _count,
-    "in_set": lambda gates, node, a: gates.looked_up(a, node.args[0].type, node.attr.__contains__, FLAG)[0],
-    "table": lambda gates, node, a: gates.looked_up(
+    "in_set": lambda gates, node, a: gates.look_up(a, node.args[0].type, node.attr.__contains__, FLAG)[0],
+    "table": lambda gates, node, a: gates.look_up(
         a, node.args[0].type, dict(enumerate(node.attr)).get, node.type
     ),
     "eq": _compare,
@@ -567,7 +564,7 @@ _INTEGERS: dict[str, Callable[..., Node | Bits]] = {
     "swap": _plane_by_plane,
     "arrive": _plane_by_plane,
 }
-"""Operations that give integers or take some, by their gates."""
+"""The gates of operations on integers or with integer results."""
 
 _FLAT: dict[str, Callable[..., Node]] = {
     "shift": lambda gates, node, value: gates.shift(value, node.attr[:2], node.attr[2]),
@@ -575,4 +572,4 @@ _FLAT: dict[str, Callable[..., Node]] = {
     "swap": _move,
     "arrive": _move,
 }
-"""Operations on flags and floats that do not stay as they are."""
+"""The nodes of operations on flags and floats that change on bit planes."""

@@ -67,7 +67,7 @@ ROUNDER = 12582912.0
 
 @dataclass
 class Inputs:
-    """What expressions read: the current node of each slot, and under ``let NAME`` of each value that `let` has fixed."""
+    """The inputs of expressions: the current node of each slot, and of each value under `let` as ``let NAME``."""
 
     ruleset: Ruleset
     build: Graph
@@ -120,7 +120,7 @@ class Inputs:
 def lower_expression(expr: Expr, at: Inputs) -> Parts:
     """The nodes of a checked expression.
 
-    What has no case is an operation of the IR, as its row says, of numbers or of both parts of vectors.
+    An operation without a case becomes the IR operation of its row, on numbers or on both parts of vectors.
     """
     build, value = at.build, expr.value
     match expr.op:
@@ -169,7 +169,7 @@ def lower_expression(expr: Expr, at: Inputs) -> Parts:
         case "vector", ((y,), (x,)):
             return y, x
     name = OPERATIONS[expr.op].lowers or expr.op
-    # Numbers beside vectors serve both parts.
+    # A number combined with a vector serves both parts.
     return tuple([
         build.derive(name, *[parts[i % len(parts)] for parts in args], attr=value)
         for i in range(max(map(len, args), default=1))
@@ -191,7 +191,7 @@ def _real(build: Graph, value: float | Fraction) -> Node:
 
 
 def draws_below(chance: Fraction | float, threshold: Threshold) -> int:
-    """How many of the 2^bits draws lie below a chance, or not above it."""
+    """The number of the 2^bits draws that lie below a chance, or not above it."""
     scaled = Fraction(float(chance)) * (1 << threshold.bits) - Fraction(1, 2)
     count = ceil(scaled) if threshold.strict else floor(scaled) + 1
     return min(max(count, 0), 1 << threshold.bits)
@@ -311,7 +311,7 @@ Claim = tuple[Rule, Node]
 """A rule and the cells in which it happens."""
 
 LIVE_BUDGET = 100_000
-"""Nodes evaluated to find rules that no world lets happen, a tenth of a second. After that every rule stays."""
+"""Nodes evaluated to find rules that can never happen, a tenth of a second. After that every rule stays."""
 
 
 def part_names(name: str, kind: Kind) -> tuple[str, ...]:
@@ -379,7 +379,7 @@ def lower_pass(ruleset: Ruleset, pass_: Pass, graph: Graph) -> dict[str, Node]:
 
 
 def lower_substep(ruleset: Ruleset, pass_: Pass, number: int, graph: Graph) -> dict[str, Node]:
-    """The nodes of what one substep of a pass writes, as functions of the world that the substep finds.
+    """The nodes that one substep of a pass writes, as functions of the world before the substep.
 
     Scratch fields and values that `let` fixed in earlier substeps are inputs too, the latter as ``let NAME``; values
     that this substep fixes are among the results.
@@ -395,7 +395,7 @@ def lower_substep(ruleset: Ruleset, pass_: Pass, number: int, graph: Graph) -> d
 
 
 class _PassLowering:
-    """Lowers one pass: keeps the current node of every slot and let."""
+    """Lowers one pass; `state` has the current node of every slot and let."""
 
     def __init__(self, ruleset: Ruleset, pass_: Pass, graph: Graph, ranges: Mapping[str, Type] | None = None):
         self.ruleset, self.pass_ = ruleset, pass_
@@ -404,7 +404,7 @@ class _PassLowering:
         self.slots = {slot.name: slot for slot in slots(ruleset)} | self.scratch
         """The state's arrays, and scratch fields."""
         self.parts = [(slot, part) for slot in self.slots.values() for part in slot_parts(slot, ruleset)]
-        self.travelling = [part.name for slot, part in self.parts if slot.travels]
+        self.traveling = [part.name for slot, part in self.parts if slot.travels]
         self.state: dict[str, Node] = {}
         for _, part in self.parts:
             self.state[part.name] = self.build.input(part.name, (ranges or {}).get(part.name, part.type))
@@ -437,7 +437,7 @@ class _PassLowering:
         at = self.inputs()
         claims: list[Claim] = [(rule, node(rule.mask, at)) for rule in moment.rules]
         if moment.policy in ("drop_both", "first_wins"):
-            claims = self._apart(claims, moment.policy)
+            claims = self._keep_apart(claims, moment.policy)
         movers = [(rule, mask) for rule, mask in claims if not isinstance(rule, Assign)]
         writes = [
             (rule, mask, lower_expression(rule.value, at))
@@ -490,7 +490,7 @@ class _PassLowering:
             if element is not None:
                 left = self._fresh(node(element, at), at)
             else:
-                left = {name: build.shift(before[name], rule.offset) for name in self.travelling}  # type: ignore[union-attr]  # only moves have none
+                left = {name: build.shift(before[name], rule.offset) for name in self.traveling}  # type: ignore[union-attr]  # only moves have none
             for name, value in left.items():
                 state[name] = build.select(mask, value, state[name])
         for rule, mask in movers:
@@ -498,13 +498,13 @@ class _PassLowering:
                 continue
             swaps = isinstance(rule, Swap)
             op = "swap" if swaps and policy != "overwrite" else "arrive"
-            for name in self.travelling:
+            for name in self.traveling:
                 state[name] = build.derive(op, before[name], mask, state[name], attr=rule.offset)
                 if swaps and op == "arrive":
                     state[name] = build.select(mask, build.shift(before[name], rule.offset), state[name])
 
     def _fresh(self, element: Node, at: Inputs) -> dict[str, Node]:
-        """What a new cell of an element holds."""
+        """The nodes of the slots in a new cell of an element."""
         build, fresh = self.build, {"element": element}
         for slot, part in self.parts:
             if not slot.travels or slot.name == "element":
@@ -521,12 +521,12 @@ class _PassLowering:
             fresh[part.name] = at.by_element(element, values)
         return fresh
 
-    def _apart(self, claims: Sequence[Claim], policy: str) -> list[Claim]:
+    def _keep_apart(self, claims: Sequence[Claim], policy: str) -> list[Claim]:
         """Narrow the masks of movers so that no two claim one cell."""
         build = self.build
 
         def reach(rule: Rule, cells: Node, way: int) -> Node:
-            """The cells and their targets, or under -1 these cells and those from where they are targets."""
+            """The cells and their targets; for way -1 the cells and the cells whose targets they are."""
             return build.any([build.shift(cells, (way * dy, way * dx)) for dy, dx in footprint(rule)])
 
         narrowed: list[Claim] = []

@@ -43,7 +43,7 @@ class Type:
 
     @property
     def signed(self) -> bool:
-        """Whether the highest bit plane is a sign."""
+        """True if the highest bit plane is a sign."""
         return self.lo < 0
 
 
@@ -197,10 +197,10 @@ class Node:
     attr: Any
     index: int
     places: tuple[str, ...] = field(default=(), repr=False)
-    """Where it was written: ``rules/acme.yaml:12``. Takes no part in interning."""
+    """The rule's file and line: ``rules/acme.yaml:12``. It takes no part in interning."""
 
     def is_input(self, slot: str) -> bool:
-        """Whether it is what the pass finds in a slot."""
+        """True if the node is the value of a slot before the pass."""
         return self.op == "input" and self.attr == slot
 
 
@@ -210,7 +210,7 @@ class Graph:
     def __init__(self) -> None:
         self._nodes: dict[Hashable, Node] = {}
         self.place = ""
-        """Where the rule was written that nodes are made for."""
+        """The file and line of the rule for which nodes are made."""
 
     def copy(self) -> Graph:
         """A graph with the same nodes, to which others can be added."""
@@ -265,7 +265,7 @@ class Graph:
         return self.derive("or", a, b)
 
     def any(self, flags: Sequence[Node]) -> Node:
-        """Whether some of these hold."""
+        """The flag that holds where any of some flags holds."""
         return reduce(self.or_, flags) if flags else self.flag(False)
 
     def select(self, condition: Node, yes: Node, no: Node) -> Node:
@@ -300,7 +300,7 @@ class Graph:
 
 @dataclass(frozen=True)
 class SubstepGraph:
-    """What one substep writes: the new node of each slot, and the flags without which nothing changes."""
+    """The writes of one substep: the new node of each slot, and the flags without which nothing changes."""
 
     label: str
     place: str
@@ -388,7 +388,7 @@ class Program:
 
 
 def needed(roots: Iterable[Item], below: Callable[[Item], Sequence[Item]]) -> dict[Item, Sequence[Item]]:
-    """All that some items need, and these: each after what is below it, with that."""
+    """Some items and all items below them, each after the items directly below it, mapped to these."""
     done: dict[Item, Sequence[Item]] = {}
     begun: dict[Item, Sequence[Item]] = {}
     stack = [*roots][::-1]
@@ -420,7 +420,7 @@ def nodes_of(pass_: PassGraph, *, substeps: bool = True) -> list[Node]:
 
 
 def taken(stack: list[Item]) -> Iterator[Item]:
-    """Take items from a stack, to which the caller adds others, each once."""
+    """Pop each item of a stack once, while the caller adds others."""
     seen: set[Item] = set()
     while stack:
         top = stack.pop()
@@ -446,7 +446,7 @@ def conjunctions(node: Node) -> Iterator[Node]:
 
 
 def conjuncts(node: Node) -> list[Node]:
-    """These flags without those that are conjunctions themselves."""
+    """The flags of `conjunctions` that are not conjunctions themselves."""
     return [part for part in conjunctions(node) if part.op != "and"]
 
 

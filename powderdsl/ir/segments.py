@@ -15,15 +15,15 @@ from powderdsl.ir.ops import PassGraph, Program
 
 @dataclass(frozen=True)
 class Segment:
-    """Passes in a row. `planes` is `program` on bit planes, None if they run on cells."""
+    """Consecutive passes. `planes` is `program` on bit planes, or None for passes on cells."""
 
     program: Program
     planes: Program | None
 
 
 @dataclass(frozen=True)
-class Carried:
-    """A pass and the same on bit planes, or why these cannot carry it and the rule that this is due to."""
+class PassForm:
+    """A pass and its form on bit planes, or the reason and the rule why bit planes cannot carry it."""
 
     cells: PassGraph
     planes: PassGraph | None
@@ -31,29 +31,28 @@ class Carried:
     place: str = ""
 
 
-def carry(program: Program, pass_: PassGraph) -> Carried:
+def choose_form(program: Program, pass_: PassGraph) -> PassForm:
     """The form in which a pass of a program runs."""
     try:
-        return Carried(pass_, lower_pass(program, pass_))
+        return PassForm(pass_, lower_pass(program, pass_))
     except NotBits as error:
-        return Carried(pass_, None, str(error), error.place)
+        return PassForm(pass_, None, str(error), error.place)
 
 
-def segments(program: Program, carry: Callable[[Program, PassGraph], Carried] = carry) -> tuple[Segment, ...]:
+def segments(
+    program: Program, choose_form: Callable[[Program, PassGraph], PassForm] = choose_form
+) -> tuple[Segment, ...]:
     """The longest segments of a program. Slots that reset do so in the first one only."""
     parts = []
     slots = program.slots
-    carried = [carry(program, pass_) for pass_ in program.passes]
-    if not carried:
+    forms = [choose_form(program, pass_) for pass_ in program.passes]
+    if not forms:
         return (Segment(program, lower_bits(program)),)
-    for packed, group in groupby(carried, lambda form: form.planes is not None):
-        forms = tuple(group)
-        part = replace(program, slots=slots, passes=tuple(form.cells for form in forms))
-        planes = replace(
-            part,
-            slots=plane_slots(slots),
-            passes=tuple(form.planes for form in forms if form.planes is not None),
-        )
+    for packed, group in groupby(forms, lambda form: form.planes is not None):
+        run = tuple(group)
+        part = replace(program, slots=slots, passes=tuple(form.cells for form in run))
+        passes = tuple(form.planes for form in run if form.planes is not None)
+        planes = replace(part, slots=plane_slots(slots), passes=passes)
         parts.append(Segment(part, planes if packed else None))
         slots = tuple(replace(slot, resets=False) for slot in program.slots)
     return tuple(parts)

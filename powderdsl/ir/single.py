@@ -17,12 +17,12 @@ def single(value: float) -> float:
 
 
 def all_ones(value: float) -> bool:
-    """Whether all bits of the fraction of its float32 are ones."""
+    """True if all bits of the fraction of the float32 are ones."""
     return int.from_bytes(struct.pack("<f", value), "little") & 0x7FFFFF == 0x7FFFFF
 
 
 def stepped(value: float, by: int) -> float:
-    """The float32 so many steps up or down from one that is 0 or more and finite."""
+    """The float32 that is `by` steps away from a finite float32 of at least 0."""
     (bits,) = struct.unpack("<I", struct.pack("<f", abs(value)))
     result: float = struct.unpack("<f", struct.pack("<I", bits + by))[0]
     return result

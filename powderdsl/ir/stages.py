@@ -51,7 +51,7 @@ def rewrite_pass(pass_: PassGraph, rules: Sequence[Rewrite]) -> PassGraph:
 
 
 def fold(node: Node, build: Graph) -> Node | None:
-    """Constant folding, the algebra of flags, and what ranges decide."""
+    """Constant folding, the algebra of flags, and comparisons that ranges decide."""
     known = simpler(build, node.op, node.args, node.attr)
     if known is not None:
         return known
@@ -63,7 +63,7 @@ def fold(node: Node, build: Graph) -> Node | None:
             # x in S and x in T = x in S ∩ T, x in S or x in T = x in S ∪ T
             return build.in_set(x, s & t if node.op == "and" else s | t)
         case "in_set", (x,), members:
-            # x in {} = no, x in everything = yes; what x cannot be is left out
+            # x in {} = no, x in everything = yes; values outside the range of x are left out
             reachable = frozenset(i for i in members if x.type.lo <= i <= x.type.hi)
             if len(reachable) in (0, x.type.hi - x.type.lo + 1):
                 return build.flag(bool(reachable))
@@ -140,7 +140,7 @@ def resolve(node: Node, build: Graph) -> Node | None:
 
 
 def _is_table(node: Node) -> bool:
-    """Whether a value is a property, or an element id as stored somewhere, which sets of ids suit best."""
+    """True for a property, and for a stored element id: both are tested best with sets of ids."""
     stored = node
     while stored.op == "shift":
         stored = stored.args[0]
@@ -160,10 +160,10 @@ Tables = dict[Node, frozenset[Node]]
 
 def specialise(pass_: PassGraph) -> PassGraph:
     """In `x in {3} and P(table(x))`, the table has one value: P becomes simpler. Rules of loops look like this."""
-    return rewrite_pass(pass_, [partial(_specialise, {})])
+    return rewrite_pass(pass_, [partial(_use_known_element, {})])
 
 
-def _specialise(tables: Tables, node: Node, build: Graph) -> Node | None:
+def _use_known_element(tables: Tables, node: Node, build: Graph) -> Node | None:
     if node.op != "and" or not _tables(node, tables):
         return None
     parts = conjuncts(node)
@@ -187,7 +187,7 @@ def _specialise(tables: Tables, node: Node, build: Graph) -> Node | None:
 
 
 def _tables(node: Node, known: Tables) -> frozenset[Node]:
-    """The values whose tables a condition asks for. Graphs share nodes, so answers are kept in `known`."""
+    """The values whose tables a condition reads. Graphs share nodes, so results are kept in `known`."""
     if node not in known:
         parts = [_tables(arg, known) for arg in node.args] if node.op in _LOGIC else []
         own = node.args if node.op == "table" else ()
@@ -198,7 +198,7 @@ def _tables(node: Node, known: Tables) -> frozenset[Node]:
 def share(node: Node, build: Graph) -> Node | None:
     """Shifts move outwards over what is computed cell by cell: one read a neighbor and value, shared by all rules.
 
-    What is combined then stands on one side, and a flag is a fraction of a number: the question is asked once.
+    Values are then combined before the shift, and a shifted flag is cheaper than a shifted number.
     """
     args: tuple[Node, ...]
     match node.op, node.args:

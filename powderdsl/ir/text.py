@@ -61,10 +61,10 @@ def attr_text(attr: object) -> str:
 
 
 def structure(pass_: PassGraph, *, places: bool = True) -> bytes:
-    """A digest that is equal for two passes only if every stage makes the same of both.
+    """A digest that is equal for two passes only if every stage gives equal results for both.
 
     Args:
-        places: whether they are also written in the same places, which messages and listings name.
+        places: also compare the files and lines of rules, which messages and listings name.
     """
     numbers: dict[Node, int] = {}
     rows: list[object] = []

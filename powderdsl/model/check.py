@@ -1,6 +1,6 @@
 """Declarations -> checked model. One straight function; each step reports all it can.
 
-Some packs of a composition are also checked alone: what they are for their authors, without added packs.
+Some packs of a composition are also checked alone, as their authors knew them, without added packs.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from powderdsl.model.text import place_of
 from powderdsl.model.types import Declared, Ruleset, Stream
 
 OF_COMPOSITIONS = ("PD315", "PD316")
-"""Warnings for whoever puts packs together: what is misspelled beside all known words, which of two values is lost."""
+"""Warnings about a combination of packs: misspelled optional names, and values that another pack replaces."""
 
 
 def resolve_names(
@@ -72,7 +72,7 @@ def check(
         elsewhere: words that packs define which are not loaded, with the pack.
         alone: no pack counts as added to others: rules that meet are errors.
     """
-    typer, values = resolve_names(packs, ruleset, reporter, palette)
+    typer, element_values = resolve_names(packs, ruleset, reporter, palette)
     composition = typer.symbols
     elaborated = Elaborator(typer)
     elaborated.run(composition.passes)
@@ -98,7 +98,7 @@ def check(
     order, matrix = lay_out(composition, passes, reporter)
     reporter.raise_if_errors()
     undecided += report_needless(passes, composition.fields, facts, reporter)
-    ruleset_model = Ruleset(
+    checked = Ruleset(
         name=title(composition.packs, composition.ruleset),
         about=ruleset.about if ruleset else (packs[0].about if len(packs) == 1 else ""),
         packs=tuple(composition.packs),
@@ -116,9 +116,9 @@ def check(
         invariants=invariants,
         declared=Declared(tuple(packs), ruleset),
     )
-    undecided += report_undrawn(ruleset_model, values, facts, reporter)
+    undecided += report_undrawn(checked, element_values, facts, reporter)
     report_undecided(undecided, reporter)
-    return ruleset_model
+    return checked
 
 
 def _streams(symbols: Composition, elaborated: Elaborator, reporter: Reporter) -> tuple[Stream, ...]:
@@ -135,7 +135,7 @@ def _streams(symbols: Composition, elaborated: Elaborator, reporter: Reporter) -
 # Some packs alone
 
 
-def restricted(ruleset: Ruleset, packs: Collection[str]) -> Ruleset | None:
+def select_packs(ruleset: Ruleset, packs: Collection[str]) -> Ruleset | None:
     """The model of some of a ruleset's packs, with its parameters; None if they are not a ruleset of their own."""
     model = _check_some(ruleset.declared, packs, Reporter())
     if model is None:
@@ -144,11 +144,11 @@ def restricted(ruleset: Ruleset, packs: Collection[str]) -> Ruleset | None:
     return model.with_params({p.name: p.default for p in ruleset.params if p.name in names})
 
 
-def without(ruleset: Ruleset, pack: str) -> Ruleset | None:
+def without_pack(ruleset: Ruleset, pack: str) -> Ruleset | None:
     """The model without one pack and the packs that need it; None if the rest is not a ruleset."""
     assert ruleset.declared is not None
     needs = needs_of({decl.name.text: decl for decl in ruleset.declared.packs})
-    return restricted(ruleset, [name for name in needs if pack not in needs[name]])
+    return select_packs(ruleset, [name for name in needs if pack not in needs[name]])
 
 
 def _check_some(
@@ -166,7 +166,7 @@ def _check_some(
 
 
 def _without_packs(decl: RulesetDecl | None, gone: set[str]) -> RulesetDecl | None:
-    """A ruleset that names nothing of packs that are gone: no channels, and no invariants if some of them are its own."""
+    """A ruleset without names of missing packs: no channels, and no invariants if one of its own packs is missing."""
     if decl is None:
         return None
     invariants = decl.invariants if gone.isdisjoint(decl.members) else ()
@@ -175,8 +175,8 @@ def _without_packs(decl: RulesetDecl | None, gone: set[str]) -> RulesetDecl | No
     return replace(decl, matrix=(), slots=None, invariants=invariants, base=base, beside=beside)
 
 
-def with_outgrown(ruleset: Ruleset, remarks: tuple[Diagnostic, ...]) -> tuple[Diagnostic, ...]:
-    """The same remarks, where warnings that nobody would get without the added packs are notes (PD515)."""
+def demote_outgrown(ruleset: Ruleset, remarks: tuple[Diagnostic, ...]) -> tuple[Diagnostic, ...]:
+    """The remarks, with warnings that only added packs cause turned into notes (PD515)."""
     warnings = {
         remark: span
         for remark in remarks
@@ -198,16 +198,16 @@ def with_outgrown(ruleset: Ruleset, remarks: tuple[Diagnostic, ...]) -> tuple[Di
         added, reporter = ruleset.added_to(scope), Reporter()
         if not added or _check_some(ruleset.declared, scope, reporter) is None:
             continue
-        known = {(remark.code, remark.primary.span) for remark in reporter.diagnostics}
+        alone = {(remark.code, remark.primary.span) for remark in reporter.diagnostics}
         for remark, span in own.items():
-            if (remark.code, span) not in known:
+            if (remark.code, span) not in alone:
                 message = f"{Difference(added).with_packs}, {remark.message}: {place_of(span)}"
                 notes[remark] = replace(remark, code="PD515", message=message, helps=())
     return tuple(notes.get(remark, remark) for remark in remarks)
 
 
 def _known_words(author: PackDecl | RulesetDecl) -> list[str]:
-    """The words of a pack's own rules and elements, or a ruleset's invariants, by which it shows what it knows."""
+    """The words that a pack's rules and elements, or a ruleset's invariants, use: they show which packs it knows."""
     if isinstance(author, RulesetDecl):
         return [word for line in author.invariants for word in words_of(line)]
     words = [*pack_words(author), *(also.name.word for also in author.also)]

@@ -37,21 +37,21 @@ STEPS = Form(
 
 
 class Definition(Entry):
-    """What a file defines, or adds to what another one defines."""
+    """A definition in a file, or an addition to a definition of another file."""
 
     pack: str = ""
-    """The pack or ruleset in whose file it stands."""
+    """The pack or ruleset of the file."""
     values: tuple[Pair, ...] = ()
     """Values of single elements: of this one, by property or field, or of this property or field, by element."""
 
     @property
     def qualified(self) -> str:
-        """The name that it has whatever else is loaded."""
+        """The name that does not depend on the other loaded packs."""
         return f"{self.pack}.{self.name.text}"
 
     @property
     def span(self) -> Span:
-        """Where its name stands in the file."""
+        """The span of the name in the file."""
         return self.name.span
 
 
@@ -66,7 +66,7 @@ class PropertyDecl(Definition, noun="a property", others="an element"):
 
 
 class TintDecl(Entry, noun="a tint"):
-    """How a field tints cells in pictures, as written."""
+    """The tint that a field gives cells in pictures, as written."""
 
     color: str = keyed(
         'the color that cells are tinted toward, quoted: "#RRGGBB"', MISSING, name="to", form=COLOR
@@ -106,7 +106,7 @@ TypedDecl = PropertyDecl | FieldDecl | ParamDecl
 
 
 class RampDecl(Entry, noun="a color_by"):
-    """How an element's color follows a field, as written. `start` is None for the element's own color."""
+    """The color of an element as a function of a field, as written. `start` is None for the element's own color."""
 
     field: Scalar = keyed("the field that the color follows", MISSING)
     start: str | None = keyed(

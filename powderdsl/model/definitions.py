@@ -23,7 +23,7 @@ from powderdsl.model.declarations import (
 )
 from powderdsl.model.expressions.operators import Broken, Operand, Poisoned, Scope, SetOf, Unresolved
 from powderdsl.model.expressions.symbols import (
-    clamped,
+    clamp,
     default_of,
     read_bounds,
     read_kind,
@@ -55,14 +55,14 @@ KINDS = {
     "property": (("int", "flag", "chance"), "kinds of properties: LOW..HIGH, flag, chance"),
     "field": (("int", "flag", "real", "vec2", "element", "direction"), "use `real(0..1)`"),
 }
-"""The kinds that each may have, and what to write instead of another one."""
+"""The kinds that each may have, and the fix for another kind."""
 
 
 def define_symbols(typer: Typer) -> list[tuple[str, int, Span]]:
-    """Complete a typer's symbols, whose names are known. Reports what is wrong with definitions and leaves it out.
+    """Complete a typer's symbols, whose names are known. Reports wrong definitions and leaves them out.
 
     Returns:
-        Where elements' own values of properties stand: property, id, place.
+        The elements' own values of properties: property, id, span.
     """
     symbols = typer.symbols
     names, elements = symbols.names, symbols.elements
@@ -107,7 +107,7 @@ def define_symbols(typer: Typer) -> list[tuple[str, int, Span]]:
             number = elements[word].id
             with suppress(Poisoned):
                 _check_may_have(field, number, word, span, typer)
-                value = clamped(typer.constant(syntax, field.kind, Scope(pack, {})), field.kind)
+                value = clamp(typer.constant(syntax, field.kind, Scope(pack, {})), field.kind)
                 own |= {number: value} if value != field.default else {}
         symbols.fields[name] = replace(field, own=tuple(sorted(own.items())))
     for name, named_set in typer.sets.items():
@@ -206,13 +206,13 @@ def _field(name: str, decl: FieldDecl, typer: Typer) -> Field:
         most = typer.constant(decl.tint.most, CHANCE, scope) if decl.tint.most else 1
         tint = Tint(decl.tint.color, decl.tint.full, float(most))  # type: ignore[arg-type]  # a chance is a number
     return Field(
-        name, kind, clamped(default, kind), decl.at, decl.resets is not None, of, decl.pack, decl.span,
+        name, kind, clamp(default, kind), decl.at, decl.resets is not None, of, decl.pack, decl.span,
         word=word if word != name else "", tint=tint,
     )  # fmt: skip
 
 
 def _element_values(typer: Typer) -> dict[str, dict[str, tuple[str, Span, Syntax]]]:
-    """By property or field and element, global names: the pack whose value holds, its place and it.
+    """The pack, span and syntax of each value, by global name of the property or field, then of the element.
 
     Reports keys that name nothing, and values that are replaced by others.
     """
@@ -247,7 +247,7 @@ def _element_values(typer: Typer) -> dict[str, dict[str, tuple[str, Span, Syntax
 
 
 def _check_may_have(field: Field, number: int, element: str, span: Span, typer: Typer) -> None:
-    """Raises Poisoned after reporting that fresh cells of the element can have no value of their own."""
+    """Report that fresh cells of the element cannot have their own value of the field. Raises Poisoned."""
     if field.at != "element":
         label, fix = "a field of a place belongs to no element", "say `at: element`"
     elif field.resets:
@@ -274,7 +274,7 @@ def _value(prop: Property, syntax: Syntax, pack: str, typer: Typer) -> Value | s
     with suppress(Poisoned, Unresolved):
         expr = typer.of_kind(typer.evaluate(syntax, scope), kind, syntax.span)
         if expr.op != "param":
-            return typer.settled(expr, syntax.span)
+            return typer.constant_of(expr, syntax.span)
         if expr.kind.name == kind.name and kind.lo <= expr.kind.lo <= expr.kind.hi <= kind.hi:
             return str(expr.value)
         label, fix = f"it is {expr.kind}", f"declare it as {kind}"
@@ -286,7 +286,7 @@ def _value(prop: Property, syntax: Syntax, pack: str, typer: Typer) -> Value | s
 
 
 def element_ramps(typer: Typer) -> dict[str, ColorRamp]:
-    """The ramps by global names of elements. Of several for one element the last holds. Reports what is wrong."""
+    """The ramps by global names of elements. The last of several ramps of an element applies. Reports wrong ramps."""
     symbols = typer.symbols
     properties = symbols.names.declared(PropertyDecl)
     fields = symbols.names.declared(FieldDecl)
@@ -366,13 +366,13 @@ def set_params(ruleset: Ruleset, values: Mapping[str, Any], reporter: Reporter) 
 
 
 def in_words(kind: Kind) -> str:
-    """The values of a kind in a sentence that asks for one."""
+    """The values of a kind, for a message that asks for one."""
     wanted = f"{'an integer' if kind.name == 'int' else 'a number'} from {kind.lo:g} to {kind.hi:g}"
     return {"flag": "`yes` or `no`", "chance": "a chance from 0% to 100%"}.get(kind.name, wanted)
 
 
 def param_value(kind: Kind, value: Any) -> Value | None:
-    """The value of a kind that text (``"5%"``, ``"yes"``) or a number means, if it means one."""
+    """The value of a kind for a text (``"5%"``, ``"yes"``) or a number; None if it has none."""
     text = value.strip() if isinstance(value, str) else ""
     try:
         number = float(text[:-1]) / 100 if text.endswith("%") else float(FLAG_WORDS.get(text, value))

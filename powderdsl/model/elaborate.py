@@ -24,7 +24,7 @@ from powderdsl.model.expressions.operators import (
     Unresolved,
     conjunction,
     kind_name,
-    turned,
+    rotate,
 )
 from powderdsl.model.expressions.symbols import default_of, read_kind
 from powderdsl.model.expressions.typer import Typer
@@ -67,7 +67,7 @@ ORIENTATIONS: dict[str | None, tuple[Matrix, ...]] = {
 
 
 class Elaborator:
-    """Turns declared passes into checked ones, one after the other; knows facts about rules that later checks need."""
+    """Turns declared passes into checked ones in order, and collects facts about rules that later checks need."""
 
     def __init__(self, typer: Typer):
         self.typer = typer
@@ -75,11 +75,11 @@ class Elaborator:
         self.streams: dict[str, Stream] = {}
         self.overridden: set[str] = set()
         self.inactive: dict[Span, str] = {}
-        """Rules some copy of which asks for something that is not loaded, and its name."""
+        """Rules with a copy that needs a name which is not loaded, and that name."""
         self.empty: dict[Span, str] = {}
-        """Rules that ask for a set or tag without elements, and its name."""
+        """Rules that read a set or tag without elements, and its name."""
         self.active: set[Span] = set()
-        """Rules some copy of which does not."""
+        """Rules with a copy whose names are all loaded."""
         self._rules = self._tried = 0
 
     def run(self, passes: Mapping[str, PassDecl]) -> None:
@@ -167,7 +167,7 @@ class Elaborator:
             self.typer.used.discard(variable)
         labeled = []
         for inner in scopes:
-            words = [f"{name} = {_show(inner.locals[name])}" for name in variables]
+            words = [f"{name} = {_name_of(inner.locals[name])}" for name in variables]
             labeled.append((inner, ", ".join([label, *words] if label else words)))
         return labeled
 
@@ -253,13 +253,13 @@ class Elaborator:
         return rules
 
     def _mask(self, subjects: Sequence[Syntax], syntax: Syntax, scope: Scope) -> Expr:
-        """The condition of a rule: what its subjects are, and its clauses."""
+        """The condition of a rule: its subjects and its clauses."""
         parts = [self.typer.condition(subject, scope) for subject in subjects]
         for kind in ("condition", "where"):
             if clause := syntax.child(kind):
                 parts.append(self.typer.condition(clause.children[0], scope))
         if clause := syntax.child("chance"):
-            # Named by where the rule stands, not by how many were unrolled before it: other packs shift nothing.
+            # Named by the rule's place, not by the number of rules unrolled before it: other packs shift nothing.
             label = f"[{self._label}]" if self._label else ""
             name = f"{self._decl.qualified}#{self._numbers[id(syntax)]}{label}"
             self.streams[name] = Stream(name, name_number(name), 32)
@@ -348,13 +348,13 @@ class Elaborator:
         part = {0: Expr("const", REAL, value=0.0), 1: strength, -1: Expr("neg", REAL, (strength,))}
         rules: list[Rule] = []
         for side in DIRECTION_SETS["sides"]:
-            dy, dx = turned(side, scope.orientation)
+            dy, dx = rotate(side, scope.orientation)
             vector = Expr("vector", VEC2, (part[dy], part[dx]), span=amount.span)
             rules.append(Assign(name, (dy, dx), "+=", vector, mask, syntax.span))
         return rules
 
 
-def _show(operand: Operand) -> str:
+def _name_of(operand: Operand) -> str:
     match operand:
         case Place():
             names = [n for n, o in DIRECTIONS.items() if o == operand.offset]

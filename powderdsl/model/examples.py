@@ -1,4 +1,4 @@
-"""Tests inside packs: small worlds drawn in ASCII, values of their fields drawn in words, and what becomes of them."""
+"""Tests inside packs: small worlds drawn in ASCII, values of their fields drawn in words, and expected worlds."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from powderdsl.model.composition.compose import Composition
 from powderdsl.model.composition.names import report_unknown, words_of
 from powderdsl.model.declarations import ElementDecl, TestDecl
 from powderdsl.model.expressions.operators import Poisoned, Scope, Unresolved
-from powderdsl.model.expressions.symbols import clamped_number
+from powderdsl.model.expressions.symbols import clamp_number
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.schema import comment_after
 from powderdsl.model.types import CHANCE, Cell, Example, FieldGrid, Kernel, Kind, Often, plus
@@ -59,7 +59,7 @@ def read_word(word: str, kind: Kind, ids: Mapping[str, int], *, ranges: bool = F
     """The bounds of each component of the value: two of a vector, one of other kinds.
 
     Args:
-        ids: what words stand for which element.
+        ids: element ids by word.
         ranges: numbers may be ranges, `1..3`.
 
     Raises:
@@ -91,7 +91,7 @@ def read_word(word: str, kind: Kind, ids: Mapping[str, int], *, ranges: bool = F
 
 
 def _number(word: str, kind: Kind) -> float | None:
-    """The number that a word is, if it is one."""
+    """The number that a word spells; None for other words."""
     whole = kind.name == "int"
     if not re.fullmatch(_WHOLE if whole else _NUMBER, word):
         return None
@@ -100,7 +100,7 @@ def _number(word: str, kind: Kind) -> float | None:
         label = f"the range is {kind.lo:g}..{kind.hi:g}"
         fix = "write a number in this range, or widen it where it is declared"
         raise WordProblem("PD402", f"{word} lies outside {kind}", label, fix)
-    return int(value) if whole else float(clamped_number(value, kind))
+    return int(value) if whole else float(clamp_number(value, kind))
 
 
 def direction_word(octant: int) -> str:
@@ -109,10 +109,10 @@ def direction_word(octant: int) -> str:
 
 
 DEFAULT = "."
-"""The word of a cell that is as a fresh cell of its element has it."""
+"""The word of a cell with the value of a fresh cell of its element."""
 
 ANYTHING = "?"
-"""The word of an expected cell that is not looked at."""
+"""The word of an expected cell that is not compared."""
 
 
 def check_examples(typer: Typer) -> tuple[Example, ...]:

@@ -53,7 +53,7 @@ def check_invariants(
     """The invariants of all packs and of the ruleset, except invariants that need a pack which is not loaded.
 
     Args:
-        check_alone: what an invariant that cannot hold is tried with: the packs of its scope.
+        check_alone: checks the packs of the scope of an invariant that cannot hold.
     """
     written: list[tuple[str, Syntax, RulesetDecl | None]]
     written = [(name, line, None) for name, pack in composition.packs.items() for line in pack.invariants]
@@ -110,7 +110,7 @@ _FORMS = (
 
 @dataclass(frozen=True)
 class _Statement:
-    """Reads what an invariant says. Its methods raise Poisoned after reporting, or Unresolved."""
+    """Reads the statement of an invariant. Its methods raise Poisoned after reporting, or Unresolved."""
 
     typer: Typer
     scope: Scope
@@ -212,7 +212,7 @@ class _Statement:
         return Bounded(name, lo, hi)
 
     def asked(self, condition: Expr, span: Span) -> Expr:
-        """The condition, unless it is not a question: it may depend on an absent pack, or be false by its words."""
+        """The condition, after reporting one that is always true or always false."""
         if condition == FALSE:
             self.says_nothing(span, "no cell can fulfill this", is_empty=True)
         elif condition == TRUE:
@@ -220,7 +220,7 @@ class _Statement:
         return condition
 
     def says_nothing(self, span: Span, label: str, *, is_empty: bool = False) -> None:
-        """Report an invariant that no world can break. What is empty may need a pack that is not loaded."""
+        """Report an invariant that no world can break. Raises Unresolved if an empty one may need an absent pack."""
         if is_empty and self.typer.absent:
             raise Unresolved(", ".join(sorted(self.typer.absent)))
         message = "this invariant is always true"

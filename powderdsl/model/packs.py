@@ -54,7 +54,7 @@ def read_file(source: Source, reporter: Reporter) -> PackDecl | RulesetDecl | No
 
 
 class _PackReader(Reader):
-    """Reads the records of rule files: what follows from no declaration of a key stands here."""
+    """Reads the records of rule files. Its methods check what the declarations of keys cannot."""
 
     owner = ""
     """The pack or ruleset whose file this is."""
@@ -83,7 +83,7 @@ class _PackReader(Reader):
             )  # fmt: skip
         return ruleset
 
-    def made(self, kind: type[R], **values: Any) -> R | None:
+    def build(self, kind: type[R], **values: Any) -> R | None:
         if kind is RulesetDecl:
             values["rename"] = tuple(
                 pair for pair in values.get("rename", ()) if self.name(pair[1], "a name")
@@ -93,7 +93,7 @@ class _PackReader(Reader):
             values["tests"] = tuple(self.tests(values.get("tests")))
         elif kind is TestDecl:
             values["often"] = tuple(self.often(values.get("often")))
-        return super().made(kind, **values)
+        return super().build(kind, **values)
 
     def entry(self, kind: type[E], name: Scalar, node: Node) -> E | None:
         record: Any

@@ -104,12 +104,12 @@ def look(value: Array, offset: Offset) -> Array:
 
 
 def back(offset: Offset) -> Offset:
-    """The way from that neighbor to the cell."""
+    """The offset from the neighbor to the cell."""
     return (-offset[0], -offset[1])
 
 
 def inside(shape: tuple[int, ...], offset: Offset) -> Array:
-    """bool [H, W]: whether the neighbor lies inside the grid."""
+    """bool [H, W]: True where the neighbor lies inside the grid."""
     height, width = shape
     y, x = np.arange(height)[:, None] + offset[0], np.arange(width) + offset[1]
     return (y >= 0) & (y < height) & ((x >= 0) & (x < width))
@@ -131,10 +131,10 @@ def neighborhood(value: Array, kernel: Kernel) -> Array:
 
 
 class Change(NamedTuple):
-    """How a slot is written: by a rule, or as every step does it.
+    """A write of a slot: by a rule, or by every step.
 
-    `asked` is the way from a written cell to the one in which the rule's condition holds, `source` the way to the one
-    that its new content comes from.
+    `asked` is the offset from a written cell to the cell in which the rule's condition holds, `source` the offset to the
+    cell that the new content comes from.
     """
 
     how: str
@@ -145,10 +145,10 @@ class Change(NamedTuple):
 
 
 class Watch(Protocol):
-    """Is told what a step does, and changes nothing. Contexts continue changing."""
+    """Receives the events of a step. Contexts change after each event."""
 
     def begins(self, moment: Moment, at: Context, masks: Mapping[int, Array]) -> None:
-        """The lets of a substep are fixed; `masks` says where each rule will happen, by `id`."""
+        """The lets of a substep are fixed; `masks` has the cells in which each rule will happen, by `id`."""
 
     def wrote(self, change: Change, before: Array, after: Array, mask: Array | None = None) -> None:
         """A slot was written where the mask holds; without a mask, anywhere."""
@@ -156,7 +156,7 @@ class Watch(Protocol):
 
 @dataclass
 class Context:
-    """Everything an expression reads: the world as the substep finds it, values fixed earlier, draws, parameters."""
+    """The inputs of expressions: the world before the substep, values fixed earlier, draws, parameters."""
 
     ruleset: Ruleset
     state: State
@@ -337,7 +337,7 @@ def run_moment(moment: Moment, at: Context, table: Mapping[str, Slot]) -> State:
     values = {
         id(write): evaluate(write.value, at) for write in (*assigns, *(effect for _, effect in effects))
     }
-    travelling = [slot for slot in table.values() if slot.travels]
+    traveling = [slot for slot in table.values() if slot.travels]
     state = dict(at.state)
 
     def write(change: Change, value: Array, mask: Array) -> None:
@@ -354,13 +354,13 @@ def run_moment(moment: Moment, at: Context, table: Mapping[str, Slot]) -> State:
 
     def become(how: str, rule: Rule, target: Expr) -> None:
         ids = evaluate(target, at)
-        for slot in travelling:
+        for slot in traveling:
             write(Change(how, slot, rule), _in_fresh_cells(slot, ids, at), masks[id(rule)])
 
     def arrive(rule: Swap | Move, source: Offset, asked: Offset = (0, 0)) -> None:
         """Content comes from the neighbor `source` where the rule's condition holds in the neighbor `asked`."""
         mask = look(masks[id(rule)], asked)
-        for slot in travelling:
+        for slot in traveling:
             write(Change("arrive", slot, rule, asked, source), look(before[slot.name], source), mask)
 
     for assignment in assigns:
@@ -388,7 +388,7 @@ def run_moment(moment: Moment, at: Context, table: Mapping[str, Slot]) -> State:
 
 
 def masks_of(moment: Moment, at: Context) -> dict[int, Array]:
-    """Where each rule of a substep happens, bool [B, H, W] by `id`. `at.lets` has the substep's lets."""
+    """The cells in which each rule of a substep happens, bool [B, H, W] by `id`. `at.lets` has the substep's lets."""
     masks = {id(rule): evaluate(rule.mask, at) for rule in moment.rules}
     if moment.policy in ("drop_both", "first_wins"):
         claims = [rule for rule in moment.rules if not isinstance(rule, Assign)]
@@ -435,7 +435,7 @@ def _settle_claims(policy: str, claims: list[Any], masks: dict[int, Array]) -> N
         return mask | look(mask, back(rule.offset)) if isinstance(rule, (Swap, Move)) else mask
 
     def touches(rule: Any, cells: Array) -> Array:
-        """Where a rule would touch one of these cells."""
+        """The cells in which a rule would touch one of these cells."""
         return cells | look(cells, rule.offset) if isinstance(rule, (Swap, Move)) else cells
 
     taken = np.zeros_like(next(iter(wanted.values()))) if wanted else None
@@ -457,7 +457,7 @@ def _settle_claims(policy: str, claims: list[Any], masks: dict[int, Array]) -> N
 # Steps
 
 
-def clamped(state: State, table: Mapping[str, Slot]) -> State:
+def clamp(state: State, table: Mapping[str, Slot]) -> State:
     """The state with float fields within their range, and zero for NaN and magnitudes below SNAP."""
     result = dict(state)
     for name, slot in table.items():
@@ -476,7 +476,7 @@ def run_pass(pass_: Pass, at: Context, table: Mapping[str, Slot]) -> State:
     everything = {**table, **scratch}
     for moment in pass_.moments:
         at.state = run_moment(moment, at, everything)
-    after = clamped({name: value for name, value in at.state.items() if name in table}, table)
+    after = clamp({name: value for name, value in at.state.items() if name in table}, table)
     if at.watch is not None:
         for name, slot in table.items():
             at.watch.wrote(Change("settle", slot), at.state[name], after[name])
@@ -489,7 +489,7 @@ def _fresh(slot: Slot, shape: tuple[int, int, int]) -> Array:
     return _default(slot, np.zeros(whole, WIDE[slot.kind.name])).copy()
 
 
-def widened(ruleset: Ruleset, state: Mapping[str, Array]) -> State:
+def widen(ruleset: Ruleset, state: Mapping[str, Array]) -> State:
     """The slots of a state in the dtypes that steps compute in."""
     kinds = {slot.name: slot.kind.name for slot in slots(ruleset)}
     return {name: value.astype(WIDE[kinds[name]]) for name, value in state.items()}
@@ -520,15 +520,15 @@ def step(
 
     Args:
         state: arrays by slot name in their storage dtypes (`model.state`); not changed.
-        clock: what the random numbers depend on.
+        clock: the inputs of the random numbers.
         params: [B] arrays by qualified name.
         passes: names of the passes to run; all of them by default.
         draws: float64 [B, H, W] in [0, 1) by stream name, instead of our own numbers.
         tick: called with the name of each pass when it is done.
-        watch: is told of each substep and each write.
+        watch: receives each substep and each write.
     """
     table = {slot.name: slot for slot in slots(ruleset)}
-    working = widened(ruleset, state)
+    working = widen(ruleset, state)
     shape = state["element"].shape
     for name, slot in table.items():
         if slot.resets:

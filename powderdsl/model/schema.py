@@ -1,4 +1,4 @@
-"""Records of rule files, tasks, scenes and studies: dataclasses whose fields say their key, and their one reader."""
+"""Records of rule files, tasks, scenes and studies: dataclasses whose fields declare keys, and their reader."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ RECORDS: dict[str, type[Record]] = {}
 class Record:
     """A mapping in a file, as a frozen dataclass. Its fields that are declared with `keyed` have a key.
 
-    `noun` has its article. `others` is what further keys name, if there may be any: their values are lines, and the
+    `noun` has its article. `others` is the noun for further keys, if any are allowed: their values are lines, and the
     record has them in `values`. `prefixes` begin keys that are lines themselves: `for side in (left, right)`.
     """
 
@@ -48,7 +48,7 @@ E = TypeVar("E", bound=Entry)
 
 @dataclass(frozen=True)
 class Form:
-    """How a word is written: a pattern, a noun for such words, what to say of others, and the word's meaning."""
+    """The form of a word: a pattern, a noun for such words, the label and the fix for others, and its reader."""
 
     pattern: str
     noun: str
@@ -78,16 +78,16 @@ class Key:
     name: str = ""
     """The key, if it is not the field's name."""
     required: bool = False
-    """Whether the file must have it. A field without a default is required too: without it there is no record."""
+    """True if the file must have it. A field without a default is required too: without it there is no record."""
     choices: tuple[str, ...] = ()
     bounds: tuple[int, int] = (0, 0)
     """Of a number."""
     form: Form | None = None
     """Of a word."""
     short: bool = False
-    """Whether an entry that is no mapping says this."""
+    """True if an entry that is not a mapping is the value of this key."""
     maps: str = ""
-    """From what to what a mapping leads that is no record: "parameters to values"."""
+    """The keys and values of a mapping that is not a record: "parameters to values"."""
     shape: str = ""
     field: str = ""
     type: Any = None
@@ -147,14 +147,14 @@ _MEANT = {
     "state": "fields",
     "constants": "params",
 }
-"""Keys that people expect, and what they are called here."""
+"""Keys that people expect, and the key that is meant."""
 
 NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 MAX_NAME = 40
 
 
 def first_line(node: Node) -> Span:
-    """The first line of a node: underlining a whole block helps nobody."""
+    """The first line of a node, for labels: a whole block is too long to underline."""
     span = node.span
     end = span.source.text.find("\n", span.start)
     return Span(span.source, span.start, max(min(span.end, end if end >= 0 else span.end), span.start + 1))
@@ -183,7 +183,7 @@ Entries = dict[str, tuple[Scalar, Node]]
 
 
 class Reader:
-    """Reads records from located YAML, reporting what does not fit."""
+    """Reads records from located YAML and reports mistakes."""
 
     def __init__(self, reporter: Reporter):
         self.reporter = reporter
@@ -195,9 +195,9 @@ class Reader:
 
         Other fields that are absent, or wrong and reported, have their defaults.
         """
-        return self.made(kind, **given, **self.values(kind, self.mapping(kind, node, what)))
+        return self.build(kind, **given, **self.values(kind, self.mapping(kind, node, what)))
 
-    def made(self, kind: type[R], **values: Any) -> R | None:
+    def build(self, kind: type[R], **values: Any) -> R | None:
         """A record of values by field, unless a field without a default lacks one."""
         for row in keys_of(kind).values():
             if row.required and row.field not in values and not hasattr(kind, row.field):
@@ -210,7 +210,7 @@ class Reader:
         for row in keys.values():
             if row.short and not (isinstance(node, Mapping) and len(keys) > 1):
                 value = self.value(row, name, node)
-                return self.made(kind, name=name, **({} if value is None else {row.field: value}))
+                return self.build(kind, name=name, **({} if value is None else {row.field: value}))
         noun = kind.NOUN.split(" ", 1)[-1]
         return self.record(kind, node, f"the {noun} `{name.text}`" if noun else f"`{name.text}`", name=name)
 
@@ -220,7 +220,7 @@ class Reader:
         return (record for name, value in pairs if (record := self.entry(kind, name, value)) is not None)
 
     def values(self, kind: type[Record], entries: Entries) -> dict[str, Any]:
-        """The values of entries by field. What is wrong is reported and left out."""
+        """The values of entries by field. Wrong values are reported and left out."""
         keys, values, others = keys_of(kind), {}, []
         for name, (key, node) in entries.items():
             if name in keys:
@@ -257,7 +257,7 @@ class Reader:
             self.shape(node, f"a single value for `{key.text}`", fix)
             return None
         if row.form is not None:
-            return self.formed(row.form, key.text, node)
+            return self.read_form(row.form, key.text, node)
         if row.shape == "flag":
             return self.choice(key.text, node, ("yes", "no", "true", "false")) in ("yes", "true")
         if row.choices:
@@ -302,7 +302,7 @@ class Reader:
         return entries
 
     def _is_empty(self, key: Scalar, value: Node, row: Key) -> bool:
-        """Report a key that lacks its value, which YAML may take for a comment. Returns whether it does."""
+        """True if a key lacks its value, which YAML may take for a comment. Reports the missing value."""
         if isinstance(value, Scalar):
             is_empty = value.style == "plain" and not value.text
         else:
@@ -385,7 +385,7 @@ class Reader:
         return ()
 
     def name(self, key: Scalar, what: str) -> bool:
-        """Whether a scalar can be a name; reports if not."""
+        """True if a scalar can be a name. Reports another scalar."""
         word = key.text[:MAX_NAME]
         if NAME.match(key.text) and word == key.text:
             return True
@@ -413,7 +413,7 @@ class Reader:
         self.shape(node, wanted, help_text)
         return None
 
-    def formed(self, form: Form, key: str, word: Scalar) -> Any:
+    def read_form(self, form: Form, key: str, word: Scalar) -> Any:
         """The meaning of a word of a form; None after reporting another word."""
         if re.fullmatch(form.pattern, word.text.strip()):
             return form.read(word.text.strip())

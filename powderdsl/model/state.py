@@ -35,7 +35,7 @@ class Slot:
 
     @property
     def planes(self) -> int:
-        """How many arrays of cells it has: 2 for vec2, else 1."""
+        """The number of arrays of cells: 2 for vec2, else 1."""
         return 2 if self.kind.name == "vec2" else 1
 
     @cached_property
@@ -65,18 +65,18 @@ def stored_range(kind: Kind) -> tuple[float, float]:
 
 def slots(ruleset: Ruleset) -> tuple[Slot, ...]:
     """All slots of a ruleset's worlds: the element, then stored properties and fields in the order of the ruleset."""
-    slots_ = [Slot("element", ELEMENT, 0, travels=True)]
-    slots_ += [Slot(prop.name, prop.kind, 0, travels=True) for prop in ruleset.properties if prop.stored]
-    slots_ += [
+    stored = [Slot("element", ELEMENT, 0, travels=True)]
+    stored += [Slot(prop.name, prop.kind, 0, travels=True) for prop in ruleset.properties if prop.stored]
+    stored += [
         Slot(field.name, field.kind, field.default, field.at == "element", field.resets, field.of, field.own)
         for field in ruleset.fields
     ]
     place = {name: number for number, name in enumerate(ruleset.order)}
-    return tuple(sorted(slots_, key=lambda slot: place.get(slot.name, -1)))
+    return tuple(sorted(stored, key=lambda slot: place.get(slot.name, -1)))
 
 
 def property_dtype(prop: Property) -> str:
-    """The dtype in which a property is read that follows from the element."""
+    """The dtype of a property whose values follow from the element."""
     if prop.kind.name == "chance":
         return "float32"
     if prop.kind.name == "int":
@@ -94,7 +94,7 @@ def property_values(ruleset: Ruleset, name: str) -> list[float]:
 
 
 def fresh_values(ruleset: Ruleset, slot: Slot) -> list[Any]:
-    """What new cells of elements hold in a slot, by id: 256 numbers, or pairs."""
+    """The value of a slot in new cells of each element, by id: 256 numbers, or pairs."""
     if slot.name == "element":
         return [*range(256)]
     if ruleset.property(slot.name) is None:
@@ -112,18 +112,18 @@ def scratch_slots(pass_: Pass) -> dict[str, Slot]:
 
 
 def qualified_slots(ruleset: Ruleset) -> dict[str, str]:
-    """The name of each field and property that it has whatever else is loaded."""
-    slots_: list[Field | Property] = [*ruleset.fields, *ruleset.properties]
-    return {slot.name: f"{slot.pack}.{slot.word or slot.name}" for slot in slots_}
+    """The qualified name of each field and property, which does not depend on the other loaded packs."""
+    symbols: list[Field | Property] = [*ruleset.fields, *ruleset.properties]
+    return {symbol.name: f"{symbol.pack}.{symbol.word or symbol.name}" for symbol in symbols}
 
 
 def slot_name(ruleset: Ruleset, name: str) -> str:
-    """The name in `World.state` of a field or property by its plain or qualified name; others as they are."""
+    """The name in `World.state` of a field or property by its plain or qualified name; other names unchanged."""
     return next((plain for plain, word in qualified_slots(ruleset).items() if word == name), name)
 
 
 def fits(ruleset: Ruleset, size: tuple[int, ...]) -> bool:
-    """Whether worlds of this many rows and columns may follow these rules."""
+    """True if worlds of this many rows and columns may follow the rules."""
     return all(side % ruleset.side_multiple == 0 for side in size[-2:])
 
 

@@ -34,7 +34,7 @@ from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.yaml_tree import Scalar
 
 _ATOM = 9
-"""How tightly a word binds, or what ends in a parenthesis."""
+"""The binding of a word, or of text that ends in a parenthesis."""
 _PLACES = {offset: name for name, offset in DIRECTIONS.items()}
 
 
@@ -61,7 +61,7 @@ def print_tree(packs: Iterable[PackDecl], pass_name: str | None = None) -> str:
 
 
 def _tree_lines(key: str, value: object, indent: str) -> Iterator[str]:
-    """What stands below a key, as far as it says anything."""
+    """The lines of the tree below a key, without values that are absent or the default."""
     match value:
         case Syntax():
             yield f"{indent}{key}: {one_line(value.span)}  # {place_of(value.span)}"
@@ -91,7 +91,7 @@ def place_of(span: Span) -> str:
 
 
 def one_line(span: Span) -> str:
-    """The text of a place, its line breaks as blanks."""
+    """The text of a span, its line breaks as blanks."""
     return " ".join(span.text.split())
 
 
@@ -163,19 +163,19 @@ def show_expr(ruleset: Ruleset, expr: Expr) -> str:
 
 
 def tint_text(item: Field) -> str:
-    """How it tints cells, after a blank; nothing where it does not."""
+    """The tint of a field after a blank, or an empty string."""
     tint = item.tint
     return f" tint {tint.color} full {tint.full} most {tint.most:g}" if tint else ""
 
 
 def ramp_text(element: Element) -> str:
-    """How its color follows a field, after a blank; nothing where it does not."""
+    """The color ramp of an element after a blank, or an empty string."""
     ramp = element.ramp
     return f" {ramp.start} -> {ramp.end} by {ramp.field} {ramp.lo}..{ramp.hi}" if ramp else ""
 
 
 class _Printer:
-    """Prints one ruleset; remembers the kernels it met, to name and list them."""
+    """Prints one ruleset, and remembers its kernels to name and list them."""
 
     def __init__(self, ruleset: Ruleset):
         self.ruleset = ruleset

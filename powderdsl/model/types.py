@@ -1,4 +1,4 @@
-"""The checked model: what a ruleset means, resolved, typed and unrolled. Frozen, printable, no torch, no NumPy.
+"""The checked model of a ruleset, resolved, typed and unrolled. Frozen, printable, no torch, no NumPy.
 
 Everything discrete has a declared range; every chance and count is explicit. The reference interpreter runs these
 values directly, and `ir/lower.py` lowers them; neither looks at syntax again.
@@ -77,7 +77,7 @@ def integer(lo: float, hi: float) -> Kind:
 
 @dataclass(frozen=True)
 class Expr:
-    """A typed expression. `op` is one of `operations.OPS`; `value` is what the operation needs besides its arguments."""
+    """A typed expression. `op` is a key of `operations.OPERATIONS`; `value` is the operation's further argument."""
 
     op: str
     kind: Kind
@@ -124,11 +124,11 @@ class Element:
     span: Span = field(compare=False, repr=False)
     word: str = field(default="", repr=False)
     ramp: ColorRamp | None = field(default=None, metadata=UNMEANING)
-    """How its color follows a field; without one it is `color` everywhere."""
+    """The color as a function of a field; without a ramp it is `color` everywhere."""
 
     @property
     def qualified(self) -> str:
-        """The name that it has whatever else is loaded."""
+        """The name that does not depend on the other loaded packs."""
         return f"{self.pack}.{self.word or self.name}"
 
 
@@ -148,7 +148,7 @@ class Property:
 
 @dataclass(frozen=True)
 class Tint:
-    """How a vector field tints cells in pictures: toward `color`, by its length / `full`, and at most by `most`."""
+    """The tint of cells by a vector field in pictures: toward `color`, by its length / `full`, at most by `most`."""
 
     color: str
     full: int
@@ -225,7 +225,7 @@ class Assign:
 
     @property
     def change(self) -> tuple[float, float]:
-        """The bounds of what it sets or adds."""
+        """The bounds of the value that it sets or adds."""
         kind = self.value.kind
         return (-kind.hi, -kind.lo) if self.op == "-=" else (kind.lo, kind.hi)
 
@@ -268,12 +268,12 @@ Rule = Transform | Swap | Move | Assign
 
 
 def writes_of(rule: Rule) -> tuple[Assign, ...]:
-    """The assignments that a rule is or has."""
+    """The assignments of a rule: the rule itself, or its effects."""
     return (rule,) if isinstance(rule, Assign) else rule.effects
 
 
 def alike(first: Rule, second: Rule) -> bool:
-    """Whether it makes no difference which of two transforms happens."""
+    """True if two transforms have the same result."""
     if not isinstance(first, Transform) or not isinstance(second, Transform):
         return False
     return first.target == second.target and first.effects == second.effects
@@ -352,7 +352,7 @@ class FieldGrid:
 
 @dataclass(frozen=True)
 class Often:
-    """Of the cells for which `before` holds at the start, `after` holds in such a part in the end."""
+    """A test's claim: `after` holds in the end in the part `chance` of the cells where `before` held at the start."""
 
     before: Expr
     after: Expr
@@ -362,7 +362,7 @@ class Often:
 
 @dataclass(frozen=True)
 class Example:
-    """A test of a pack: a world drawn in ASCII, and what it must look like some steps later."""
+    """A test of a pack: a world drawn in ASCII, and the expected world some steps later."""
 
     name: str
     given: tuple[str, ...]

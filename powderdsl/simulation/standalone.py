@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from powderdsl.compiler import lower, parts
-from powderdsl.ir.segments import carry
+from powderdsl.ir.segments import choose_form
 from powderdsl.model.state import (
     Slot,
     fits,
@@ -57,7 +57,7 @@ def standalone_module(ruleset: Ruleset, size: tuple[int, int], memo: Memo | None
     program = lower(ruleset, memo)
     segments = parts(program, memo)
     if len(segments) > 1 or segments[0].planes is None:
-        carried = (carry(program, one) for one in program.passes)
+        carried = (choose_form(program, one) for one in program.passes)
         refused = [one for one in carried if one.planes is None]
         notes = tuple(f"{one.place}: the pass `{one.cells.name}` needs {one.why}" for one in refused)
         helps = ("use smaller numbers or kernels there",)

@@ -188,9 +188,9 @@ class RecordedStep:
         clock = reference.Clock(*(to_numpy(part) for part in (world.seed, world.index, world.step)))
         self.cell, self.substeps, self.writes = cell, list[Substep](), list[Write]()
         self._rules = iter(numbered_rules(ruleset))
-        self.begin = reference.widened(ruleset, state)
+        self.begin = reference.widen(ruleset, state)
         params = reference.parameters(ruleset, 1, {})
-        self.end = reference.widened(ruleset, reference.step(ruleset, state, clock, params, watch=self))
+        self.end = reference.widen(ruleset, reference.step(ruleset, state, clock, params, watch=self))
 
     def begins(self, moment: Moment, at: reference.Context, masks: Mapping[int, Array]) -> None:
         """Record a substep: see `reference.Watch`."""

@@ -32,7 +32,7 @@ TERMINAL_WORDS = {
     "_END": "`end`",
     "$END": "the end of the line",
 }
-"""What each terminal is called in messages; keywords, which are missing here, are called by themselves."""
+"""The name of each terminal in messages; keywords, which are missing here, name themselves."""
 
 _VALUE_STARTS = {"NAME", "INTEGER", "LPAR"}
 _LITERALS = {"DECIMAL", "PERCENT", "YES", "NO", "TRUE", "FALSE"}
@@ -79,7 +79,7 @@ _WORDS = {
     "than": ", then",
     "else": "a if b else c",
 }
-"""Words that people write, and what the language says instead."""
+"""Words that people write, and the language's word."""
 
 _LETTERS = (
     "\u0430\u0435\u043e\u0440\u0441\u0443\u0445\u0456\u0458\u0455\u0410\u0412\u0415\u041a\u041c\u041d\u041e\u0420\u0421\u0422\u0425"
@@ -97,7 +97,7 @@ _LOOK_ALIKES = {
     **dict.fromkeys("\u201d\u201e", '"'),
     **dict(zip(_LETTERS, "aeopcyxijsABEKMHOPCTXoavABEHIKMNOPTXi", strict=True)),
 }
-"""Characters that look like others, or like nothing, and what is meant."""
+"""Characters that look like others, or like nothing, and the character that is meant."""
 
 CUT = "inside `{…}` and `[…]` YAML ends a value at a comma: quote it, or give it a line of its own"
 
@@ -116,7 +116,7 @@ def character_help(text: str, position: int, begin: int) -> str:
 
 
 def was_cut(text: str, begin: int, end: int) -> bool:
-    """Whether a comma of YAML's `{…}` or `[…]` stands right before or after the line."""
+    """True if a comma of YAML's `{…}` or `[…]` is right before or after the line."""
     before, after = text[max(begin - 64, 0) : begin], text[end : end + 64]
     return before.rstrip(" ").endswith(",") or after.lstrip(" ").startswith(",")
 
@@ -186,7 +186,7 @@ def token_help(token: str, accepted: Set[str], before: str, cut: bool) -> str:
 
 
 def expected_words(accepted: Set[str]) -> str:
-    """What could have followed, in words."""
+    """The terminals that could have followed, in words."""
     words = set()
     rest = set(accepted)
     if _VALUE_STARTS <= rest:

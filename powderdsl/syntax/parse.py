@@ -26,7 +26,7 @@ MAX_DEPTH = 48
 
 @dataclass(frozen=True)
 class Language:
-    """A part of the grammar: what a line of it is called, its start symbols, and the codes of its errors.
+    """A part of the grammar: the noun for a line, its start symbols, and the codes of its errors.
 
     The codes are for syntax, for size, and for escapes in quotes.
     """
@@ -120,7 +120,7 @@ def parse_text(line: Span, start: str, reporter: Reporter, usage: Sequence[str] 
 
 
 def depth(tree: Tree) -> int:
-    """How many parts of a tree lie inside one another, counted without recursion."""
+    """The depth of a tree, counted without recursion."""
     level: list[Any] = [tree]
     count = 0
     while level := [child for part in level for child in getattr(part, "children", ())]:

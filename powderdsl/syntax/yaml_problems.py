@@ -1,4 +1,4 @@
-"""PyYAML's errors in plain words: where the mistake is, and how to fix it.
+"""PyYAML's errors in plain words, with the location and a fix.
 
 PyYAML reports where its scanner gave up, in its own terms, or in libyaml's.
 """
@@ -19,7 +19,7 @@ _ENTRY = re.compile(r"\s*(?:- +)?(?P<key>[\w?]+): +(?P<value>[^\"'\s].*?)\s*\Z")
 
 @dataclass(frozen=True)
 class Place:
-    """Where the parser gave up (`at`) and where the thing began that it was reading (`since`)."""
+    """The offset at which the parser gave up (`at`), and the start of the value that it was reading (`since`)."""
 
     source: Source
     at: int
@@ -74,7 +74,7 @@ def report_yaml(error: yaml.YAMLError, source: Source, reporter: Reporter) -> No
 
 
 def _explain(place: Place, words: str) -> Diagnostic:
-    """What people usually did where PyYAML or libyaml reports something in these words."""
+    """The usual mistake behind an error that PyYAML or libyaml reports in some words."""
 
     def matches(pattern: str) -> bool:
         return re.search(pattern, words) is not None
@@ -190,7 +190,7 @@ def _unclosed_bracket(place: Place) -> Diagnostic:
 
 
 def _comment(place: Place) -> int | None:
-    """Where a comment begins between the two places. Quoted text is skipped."""
+    """The start of a comment between the two offsets; None without one. Quoted text is skipped."""
     quote = ""
     for i in range(place.since, min(place.at, len(place.text))):
         char = place.text[i]

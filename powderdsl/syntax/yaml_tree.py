@@ -46,7 +46,7 @@ class Scalar:
 
     @property
     def is_optional(self) -> bool:
-        """Whether it is the name of something that may be absent."""
+        """True for a name of a definition that may be absent."""
         return self.text.endswith("?")
 
 
@@ -110,7 +110,7 @@ def parse_yaml(source: Source, reporter: Reporter) -> Node | None:
 
 
 class _Abort(Exception):
-    """Stops at the first thing that makes the rest of the document meaningless or dangerous."""
+    """Raised to stop at the first mistake that makes the rest of the document meaningless or dangerous."""
 
 
 class _Builder:
@@ -233,7 +233,7 @@ class _Builder:
         self._fail("PD107", f"`{key.text}` has no value", key.span, label, fix)
 
     def _in_braces(self, start) -> bool:  # type: ignore[no-untyped-def]
-        """Whether a collection is written with `{…}` or `[…]`."""
+        """True if a collection is written with `{…}` or `[…]`."""
         return self.source.text[start.start_mark.index : start.start_mark.index + 1] in ("{", "[")
 
     def _collection_span(self, start, end, last: Span | None) -> Span:  # type: ignore[no-untyped-def]

@@ -27,7 +27,7 @@ MAX_DIRECTORY = 1 << 20
 MAX_HEADER = 10_000
 """Maximum bytes of an array's header."""
 _MAGIC, _ALIGNMENT, _SHAPE_ROOM = b"\x93NUMPY\1\0", 64, 21
-"""How arrays begin, in version 1.0; the multiple of bytes at which their values begin; characters that may hold the first side."""
+"""The first bytes of arrays of version 1.0; the alignment of their values; characters reserved for the first side."""
 _TYPES = {f"<{name[0]}{size}": f"{name}{8 * size}" for name in ("int", "uint", "float") for size in (2, 4, 8)}
 _TYPES |= {"|b1": "bool", "|i1": "int8", "|u1": "uint8"}
 _END, _LOCATOR, _END64 = struct.Struct("<4s4H2LH"), 20, struct.Struct("<4sQ2H2L4Q")
@@ -35,12 +35,12 @@ _END, _LOCATOR, _END64 = struct.Struct("<4s4H2LH"), 20, struct.Struct("<4sQ2H2L4
 
 
 class BadArchive(Exception):
-    """What is wrong with an archive."""
+    """An archive that is damaged or not an .npz."""
 
 
 @dataclass(frozen=True)
 class Header:
-    """What an array claims to be, and where its bytes begin in the unpacked member.
+    """The header of an array, and the offset at which its bytes begin in the unpacked member.
 
     `dtype` is NumPy's name, such as ``uint8``, or ``str``; `itemsize` the bytes of a number or text.
     """

@@ -1,4 +1,4 @@
-"""A name for what a model means: equal models have equal fingerprints, in every process and on every machine."""
+"""Fingerprints of models: equal models have equal fingerprints, in every process and on every machine."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ REPEATED = 2.0
 """Seconds in which the same SIGTERM or SIGHUP counts once: `timeout` sends two."""
 
 LIFELINE = "POWDERDSL_LIFELINE"
-"""Environment variable of processes that end when their stdin is closed: whoever holds the other end started them."""
+"""Environment variable of processes that end when their stdin is closed, whose other end their starter holds."""
 
 GRACE = 30.0
 """Seconds that such a process has for its last checkpoint."""
@@ -72,7 +72,7 @@ def held_back() -> Iterator[Callable[[], bool]]:
 
 
 def end_with_stdin() -> None:
-    """End this process, as after SIGTERM, when its stdin is closed: then whoever started it is gone."""
+    """End this process, as after SIGTERM, when its stdin is closed, because the process that started it has ended."""
 
     def watch() -> None:
         while os.read(0, 1 << 10):

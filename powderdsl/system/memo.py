@@ -1,4 +1,4 @@
-"""Compiling soon, and soon again: results of earlier work, and no garbage collection meanwhile."""
+"""Faster repeated compilation: results of earlier work, and a pause of garbage collection."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ _MISSING: Any = object()
 
 
 class Memo:
-    """Results by what they depend on: for each thing, such as a file, those of its last few versions.
+    """A cache of results by their inputs: for each thing, such as a file, the results of its last few versions.
 
-    For programs that compile again and again: an editor, a page, a watcher of files. Functions that take one return what
-    they would return without. Threads may share one: two of them may make the same thing at once.
+    For programs that compile again and again: an editor, a page, a watcher of files. A memo never changes a function's
+    result. Threads may share one: two of them may compute the same result at once.
 
     Args:
-        versions: of each thing.
-        things: beyond that, those that were not used for longest are forgotten.
+        versions: the most versions of each thing.
+        things: the most things; the least recently used are dropped.
     """
 
     def __init__(self, versions: int = 4, things: int = 4000):
@@ -28,7 +28,7 @@ class Memo:
         self._results: dict[Hashable, dict[Hashable, Any]] = {}
 
     def of(self, thing: Hashable, version: Hashable, make: Callable[[], T]) -> T:
-        """The result for a version of a thing, which is made if it is not known. An exception is not kept."""
+        """The result for a version of a thing, computed by `make` if it is not known. Exceptions are not kept."""
         # Each line below is one operation on a dict, which threads see done or not done. There is no lock, which a
         # fork could copy while another thread holds it.
         results = self._results.setdefault(thing, {})
@@ -47,10 +47,10 @@ class Memo:
 
 @contextmanager
 def collection_paused() -> Iterator[None]:
-    """Do not look for cycles meanwhile; also a decorator.
+    """Pause garbage collection inside the block; also a decorator.
 
-    Compilation makes many small objects that all live on. Looking through them, and through everything that torch
-    has loaded, again and again takes a quarter of its time and finds nothing.
+    Compilation makes many small objects that stay alive. Searching them, and all objects of torch, for cycles takes a
+    quarter of its time and frees nothing.
     """
     enabled = gc.isenabled()
     gc.disable()

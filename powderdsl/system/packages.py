@@ -13,7 +13,7 @@ def require(module: str, work: str, *helps: str) -> Any:
     """Import a module.
 
     Args:
-        work: what needs it, as a sentence begins: ``reading a picture``. helps: how to install it, what to do without.
+        work: the subject of a sentence that needs the module: ``reading a picture``. helps: fixes.
 
     Raises:
         CompileError: PD612 if it cannot be imported.

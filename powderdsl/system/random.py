@@ -1,4 +1,4 @@
-"""Counter-based random numbers: hashes of what a draw is for. No generator, no state; needs torch only for tensors.
+"""Counter-based random numbers: hashes of a draw's inputs. No generator, no state; needs torch only for tensors.
 
 The reference (`model.reference`) has its own, which these are compared with.
 """

@@ -110,7 +110,7 @@ def inside(folder: str | Path, name: str) -> Path:
 
 
 def is_path(word: str) -> bool:
-    """Whether a word that may be a name or a path is a path: rules, tasks, runs and packs have plain names."""
+    """True if a word is a path and not a name: rules, tasks, runs and packs have plain names."""
     return (
         any(char in word for char in "/\\")
         or word.startswith(("~", "."))
@@ -119,7 +119,7 @@ def is_path(word: str) -> bool:
 
 
 def check_links(folder: str | Path) -> None:
-    """Refuse a folder with links that lead out of it: who writes there would write elsewhere.
+    """Refuse a folder with links that lead out of it: writes to them would land elsewhere.
 
     Raises:
         OSError: there is such a link, or the folder cannot be listed; `filename` says which.

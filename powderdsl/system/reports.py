@@ -1,4 +1,4 @@
-"""How commands and studies write what they found: aligned tables, and JSON of dataclasses."""
+"""Output of commands and studies: aligned tables, and JSON of dataclasses."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ def setting(
         default: a value, or a type that makes one, such as `dict`.
         about: the help of its option; without it there is none. option: the option's name, unless it is the field's.
         low, high, choices, form: see `Limits`.
-        may_change: whether a run may be resumed with another value.
+        may_change: allow a run to be resumed with another value.
     """
     pattern = f"(?s:.{{{1 if default else 0},{MAX_TEXT}}})"
     limits = Limits(low, high, tuple(choices), pattern, form)
@@ -163,7 +163,7 @@ def _read(kind: Any, value: Any, path: str, problems: list[str]) -> Any:
 
 
 def _check(kind: Any, value: Any, limits: Limits) -> tuple[bool, str]:
-    """Whether a value is one of a type, and what such values are. Those in lists and mappings are not looked at."""
+    """True if a value fits a type, and the name of such values. Values in lists and mappings are not checked."""
     names = getattr(kind, "_fields", ())
     low, high = (len(names), len(names)) if names else limits.length
     if names or get_origin(kind) is tuple:

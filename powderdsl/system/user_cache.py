@@ -27,7 +27,7 @@ def check_private(folder: Path) -> None:
     """Refuse a folder to which another user may write. Raises PermissionError."""
     if not hasattr(os, "getuid"):
         return
-    # A link is looked at too: whoever owns it decides where it leads.
+    # A link is checked too: its owner decides where it leads.
     for status in (folder.lstat(), folder.stat()):
         if status.st_uid != os.getuid():
             raise PermissionError(f"{folder} belongs to another user")

@@ -54,7 +54,7 @@ def replacing(path: Path, *, follow: bool = False) -> Iterator[Path]:
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Report what the system says inside as an error of writing `path`: CompileError (PD613)."""
+    """Raise errors of the system inside the block as an error of writing `path`: CompileError (PD613)."""
     try:
         yield
     except OSError as error:
@@ -79,7 +79,7 @@ def write_text(path: Path, text: str, *, follow: bool = False) -> None:
 
 
 def destination(path: Path, *, follow: bool) -> Path:
-    """Where a file of this name is written: the path itself, or where a link leads.
+    """The path that a write replaces: the path itself, or the target of a link.
 
     Raises:
         CompileError: PD613 if something else than a file is there, or links form a loop.

@@ -90,7 +90,7 @@ def read_agent(reader: Reader, decl: AgentDecl, rules: Ruleset, size: Size) -> A
         decl.steps_per_action,
         decl.free_steps,
         _speed_field(reader, decl.speed_field, rules, blows, place),
-        reader.formed(SPEED, "speed", decl.speed) or 0.0 if decl.speed else 0.0,
+        reader.read_form(SPEED, "speed", decl.speed) or 0.0 if decl.speed else 0.0,
     )
 
 

@@ -8,7 +8,7 @@ import powderdsl
 from powderdsl.compiler import lower
 from powderdsl.ir import bits
 from powderdsl.ir.ops import PassGraph, Program
-from powderdsl.ir.segments import Carried, carry, segments
+from powderdsl.ir.segments import PassForm, choose_form, segments
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.programs import BackendProgram
 from powderdsl.simulation.simulator import Simulator
@@ -64,7 +64,7 @@ def spread(name: str) -> Ruleset:
 def test_a_pass_of_too_many_gates_runs_on_cells() -> None:
     """A kernel of 441 weights over numbers of eleven bits. Its rule is named, the other passes stay on planes."""
     program = lower(spread("heavy"))
-    carried = {pass_.name: carry(program, pass_) for pass_ in program.passes}
+    carried = {pass_.name: choose_form(program, pass_) for pass_ in program.passes}
     assert [name for name, one in carried.items() if one.planes is None] == ["weigh"]
     assert carried["weigh"].why == f"more than {bits.MAX_GATES:,} gates"
     assert carried["weigh"].place.startswith("heavy.yaml:")
@@ -110,9 +110,9 @@ def test_any_passes_on_cells(name: str, torch) -> None:  # type: ignore[no-untyp
 def with_refused(rules: Ruleset, program: Program, refused: list[str]) -> Simulator:
     """A simulator on planes that runs some passes on cells."""
 
-    def choose(program: Program, pass_: PassGraph) -> Carried:
-        found = carry(program, pass_)
-        return Carried(pass_, None, "refused here") if pass_.name in refused else found
+    def choose(program: Program, pass_: PassGraph) -> PassForm:
+        found = choose_form(program, pass_)
+        return PassForm(pass_, None, "refused here") if pass_.name in refused else found
 
     sim = powderdsl.compile(rules, backend="torch")
     mixed = mixed_program(

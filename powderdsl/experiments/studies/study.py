@@ -324,7 +324,7 @@ class _StudyReader:
             if not scalars:
                 self.error("PD109", f"`{key.text}` has no values", key.span, f"none for `{size}`")
             for word in scalars:
-                self.reader.formed(VALUE, key.text, word)
+                self.reader.read_form(VALUE, key.text, word)
         sets = {} if decl.sets is None else self.sets(decl.sets, [*decl.small, *decl.paper])
         return Axis(key, decl.about or key.text, values, sets)
 

@@ -1,8 +1,8 @@
-"""What added packs change for the packs whose authors did not know them: values, conflicts, claims and warnings.
+"""Effects of added packs on packs whose authors did not know them: values, conflicts, claims and warnings.
 
 The packs that an author knew are a scope, see `Composition.scope`. Packs outside it were added. A conflict, a claim
-(an invariant or a test) or a warning is judged by its scope alone; what only added packs bring about is reported at
-what they do.
+(an invariant or a test) or a warning is judged by its scope alone; if only added packs cause it, it is reported at the
+line of the added pack.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ CheckAlone = Callable[[tuple[str, ...], Reporter], object]
 
 @dataclass(frozen=True)
 class Cause:
-    """Something in the file of an added pack: a rule with its text, or what it does to other packs in a few words."""
+    """A place in the file of an added pack: a rule with its text, or its effect on other packs in a few words."""
 
     pack: str
     span: Span
@@ -36,10 +36,9 @@ class Cause:
 
 @dataclass(frozen=True)
 class Difference:
-    """Why a claim or a warning is not the same with more packs than those of its scope.
+    """The reason why a claim or a warning changes with more packs than those of its scope.
 
-    `packs` are the added packs that matter, in load order; `causes` is what in their files does it, as far as that is
-    known.
+    `packs` are the added packs that matter, in load order; `causes` are the places in their files, as far as known.
     """
 
     packs: tuple[str, ...]
@@ -72,19 +71,21 @@ def pack_words(pack: PackDecl) -> Iterator[str]:
 
 
 GivenValue = tuple[str, Span, Syntax | ColorRamp]
-"""What a pack gives an element: the pack, where, the value."""
+"""A value that a pack gives an element: the pack, the place, the value."""
 
 
 def report_replaced(
     what: str, element: str, lost: GivenValue, held: GivenValue, composition: Composition, reporter: Reporter
 ) -> None:
-    """Report that a pack replaces what another one gives an element: a note if it needs that pack, else a warning.
+    """Report that a pack replaces a value of another pack: a note if it needs that pack, else a warning.
 
-    What a ruleset gives replaces that of its packs without a word; a pack that is added to it may replace it.
+    Values of a ruleset replace values of its packs without a report; a pack that is added to it may replace them.
     """
     (before, old, lost_value), (after, new, value) = lost, held
     needs = composition.names.needs
-    if after not in needs or _meaning(lost_value) == _meaning(value):  # a ruleset knows what its packs say
+    if after not in needs or _meaning(lost_value) == _meaning(
+        value
+    ):  # a ruleset knows the values of its packs
         return
     if before not in needs or before in needs[after]:
         reporter.report(
@@ -100,7 +101,7 @@ def report_replaced(
 
 
 def _meaning(value: Syntax | ColorRamp) -> object:
-    """Numbers by what they come to, anything else by its words."""
+    """The number that a value is, or the words of any other value."""
     if isinstance(value, ColorRamp):
         return value
     text = " ".join(value.span.text.split())
@@ -123,10 +124,10 @@ class AddedPacks:
     _conflicts: dict[tuple[str, ...], frozenset[Span] | None] = field(default_factory=dict)
 
     def causes(self, pack: str, place: Span, ids: Sequence[int]) -> tuple[Cause, ...]:
-        """What added packs do that causes a conflict in `pack`; empty if it has the conflict without them.
+        """The places in added packs that cause a conflict in `pack`; empty if it has the conflict without them.
 
         Args:
-            place: where the conflict is reported. ids: elements with which the rules meet.
+            place: the span at which the conflict is reported. ids: elements with which the rules meet.
         """
         packs = self.composition.packs
         words = frozenset(pack_words(packs[pack]))
@@ -143,18 +144,16 @@ class AddedPacks:
         return tuple(cause for name in elements for cause in self._additions(name, scope, words))
 
     def _conflicts_alone(self, scope: tuple[str, ...]) -> frozenset[Span] | None:
-        """Where rules of some packs alone meet; None if something else is wrong with them."""
+        """The spans at which rules of some packs alone conflict; None if they have other errors."""
         reporter = Reporter()
         self.check_alone(scope, reporter)
-        errors = [diagnostic for diagnostic in reporter.diagnostics if diagnostic.severity.value == "error"]
-        if any(diagnostic.code not in CODES for diagnostic in errors):
+        errors = [d for d in reporter.diagnostics if d.severity.value == "error"]
+        if any(d.code not in CODES for d in errors):
             return None
-        return frozenset(
-            diagnostic.primary.span for diagnostic in errors if diagnostic.primary.span is not None
-        )
+        return frozenset(d.primary.span for d in errors if d.primary.span is not None)
 
     def _additions(self, element: str, scope: tuple[str, ...], words: frozenset[str]) -> list[Cause]:
-        """The tags among some words that packs outside a scope give an element, else such values, else the element itself."""
+        """The tags among some words that packs outside a scope give an element, else their values, else the element."""
         composition = self.composition
         tags: list[Cause] = []
         values: list[Cause] = []

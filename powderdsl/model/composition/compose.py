@@ -58,7 +58,7 @@ Palette = Sequence[str | None]
 
 @dataclass
 class Composition:
-    """Packs merged: all that is known everywhere. Dictionaries are by global name, in load order."""
+    """Merged packs and their global names. Dictionaries are by global name, in load order."""
 
     packs: dict[str, PackDecl]
     ruleset: RulesetDecl
@@ -95,12 +95,12 @@ class Composition:
         return min(self.names_by_id, key=self.order.__getitem__)
 
     def is_declared(self, name: str, pack: str) -> bool:
-        """Whether some pack declares the name, even if its declaration is wrong."""
+        """True if some pack declares the name, even with a wrong declaration."""
         return self.names.of(pack, name) in self.names.versions or f"{pack}.{name}" in self.param_decls
 
     @cached_property
     def side_multiple(self) -> int:
-        """The least common multiple of what the packs ask of the sides of worlds."""
+        """The least common multiple of the packs' `side_multiple`."""
         return lcm(*map(attrgetter("side_multiple"), self.packs.values()))
 
     @cached_property
@@ -145,7 +145,7 @@ class Composition:
             is_own = any(pack in ruleset.members for ruleset in self.ruleset.lineage)
             (own if is_own else added).extend(self.packs[pack].also)
         for ruleset in self.ruleset.lineage:
-            own += [_waiting(decl, self.left_out) for decl in ruleset.also]
+            own += [_mark_optional(decl, self.left_out) for decl in ruleset.also]
         entries: list[tuple[str, ElementDecl | AlsoDecl]] = [*self.names.declared(ElementDecl).items()]
         for decl in (*own, *added):
             entries.append((self.names.of(decl.pack, decl.name.word), decl))
@@ -178,8 +178,8 @@ class Composition:
         return name if name in self.elements else None
 
 
-def _waiting(also: AlsoDecl, names: frozenset[str]) -> AlsoDecl:
-    """What a ruleset adds to an element, with a `?` behind some names."""
+def _mark_optional(also: AlsoDecl, names: frozenset[str]) -> AlsoDecl:
+    """The addition of a ruleset to an element, with a `?` behind some names."""
 
     def optional(scalar: Scalar) -> Scalar:
         return replace(scalar, text=f"{scalar.text}?") if scalar.text in names else scalar
@@ -233,9 +233,9 @@ def compose(
     groups = _groups(loaded, ruleset)
     requests = [_id_requests(group, names, reporter) for group in groups]
     natural = _ids(requests, names, ruleset is not NO_RULESET)
-    all_requests = [*chain.from_iterable(requests)]
+    every_request = [*chain.from_iterable(requests)]
     ids = _ids(requests, names, ruleset is not NO_RULESET, palette) if palette else natural
-    _report_ids(all_requests, ids, names, reporter, recorded=palette is not None)
+    _report_ids(every_request, ids, names, reporter, recorded=palette is not None)
     elements = _elements(declared, ids, reporter)
     wanted = ruleset.placing.slots or 0
     own = max((ids.get(decl.qualified, -1) for decl in requests[0]), default=-1) + 1 if requests else 0
@@ -326,10 +326,10 @@ def _groups(packs: Mapping[str, PackDecl], ruleset: RulesetDecl) -> list[list[Pa
 
 
 def _id_requests(group: Sequence[PackDecl], names: Names, reporter: Reporter) -> list[ElementDecl]:
-    """The elements of some packs in the order in which ids are decided: elements that ask for an id come first.
+    """The elements of some packs in the order in which ids are assigned: elements that ask for an id come first.
 
-    An element that overrides another one asks for the same id unless it says another one, with a warning. Elements of
-    packs that are left out keep their ids reserved.
+    An element that overrides another one asks for the same id unless its file says another one, which is a warning.
+    Elements of packs that are left out keep their ids reserved.
     """
     requests: list[ElementDecl] = []
     others: list[ElementDecl] = []
@@ -337,7 +337,7 @@ def _id_requests(group: Sequence[PackDecl], names: Names, reporter: Reporter) ->
         versions = names.versions.get(names.known.get(decl.qualified, ""), [decl])
         if versions[-1] is not decl or (decl.override and decl.qualified not in names.known):
             continue
-        asking = [decl_ for decl_ in versions if decl_.id]
+        asking = [version for version in versions if version.id]
         for new, old in pairwise(asking):
             if new.number != old.number:
                 reporter.report(
@@ -355,7 +355,7 @@ def _id_requests(group: Sequence[PackDecl], names: Names, reporter: Reporter) ->
 def _ids(
     groups: Sequence[Sequence[ElementDecl]], names: Names, of_ruleset: bool, palette: Palette = ()
 ) -> dict[str, int]:
-    """Ids by qualified name. Earlier wishes are decided first, so further packs change nothing.
+    """Ids by qualified name. Earlier groups come first, so further packs change nothing.
 
     An element has the id that a palette has for it, or for one that it overrides. Else it has the id that its file
     gives, unless that is taken or beyond the palette. All others have the lowest free id: above those of the ruleset's
@@ -447,7 +447,7 @@ def _elements(
 
 
 def _glyphs(elements: Mapping[str, ElementDecl]) -> dict[str, str]:
-    """A glyph for each global name: what files say comes first, then free letters in the order of the elements."""
+    """A glyph for each global name: glyphs of files first, then free letters in the order of the elements."""
     owners: dict[str, ElementDecl] = {}
     for decl in elements.values():
         if decl.glyph:

@@ -1,4 +1,4 @@
-"""Where channels stand: in an order that further packs do not disturb.
+"""The order of the matrix's channels, which further packs do not disturb.
 
 First comes what a ruleset's own packs hold, as its `matrix:` says, with one channel for each of its ids; without a
 ruleset the first pack stands in its place. Then, for each further pack in load order: its elements, the properties that

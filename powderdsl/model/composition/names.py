@@ -81,11 +81,11 @@ class Names:
         return self.versions[name][-1].pack if name in self.versions else None
 
     def knows(self, pack: str, name: str) -> bool:
-        """Whether a pack can be expected to know a global name: its own, or one of a pack that it needs."""
+        """True if a global name is a pack's own, or one of a pack that it needs."""
         return self.pack(name) in (None, *self.needs.get(pack, (pack,)))
 
     def check_word(self, scalar: Scalar, noun: str) -> bool:
-        """Whether a word may name something; reports one that belongs to the language."""
+        """True if a word may name something. Reports a reserved word."""
         if scalar.text in self.reserved:
             self.reporter.error(
                 "PD311", f"`{scalar.text}` is a reserved word", scalar.span, f"cannot name {noun}",
@@ -135,7 +135,7 @@ class Names:
         self._know(decl, name)
 
     def _know(self, decl: Definition, name: str) -> None:
-        """Remember the global name of a definition, also for those who name a pack that its pack stands in for."""
+        """Remember the global name of a definition, also under the packs that its pack stands in for."""
         self.known[decl.qualified] = name
         for other in self.packs[decl.pack].provides:
             self.known.setdefault(f"{other.text}.{decl.name.text}", name)
@@ -199,7 +199,7 @@ def with_stand_ins(packs: Iterable[PackDecl]) -> dict[str, PackDecl]:
 
 
 def in_order(names: Iterable[str], after: Mapping[str, Collection[str]]) -> list[str]:
-    """The names in a stable topological order; those of a cycle as they stand."""
+    """The names in a stable topological order; names of a cycle keep their order."""
     ordered: list[str] = []
     waiting = list(names)
     while waiting:
@@ -218,7 +218,7 @@ def needed_first(packs: Mapping[str, PackDecl]) -> list[str]:
 
 
 def order_passes(names: Names, reporter: Reporter) -> dict[str, PassDecl]:
-    """The passes sorted by `after` and `before`, then by load order. What overrides a pass keeps the place of that one."""
+    """The passes sorted by `after` and `before`, then by load order. A pass that overrides another takes its place."""
     passes = names.declared(PassDecl)
     if len(passes) > MAX_PASSES:
         last = list(passes.values())[MAX_PASSES].span
@@ -270,10 +270,10 @@ def report_misspelled(
     elsewhere: Callable[[], Mapping[str, str]],
     reporter: Reporter,
 ) -> None:
-    """Warn of optional names that no pack defines and that are a slip away from one that some pack defines.
+    """Warn of optional names that no pack defines but that are close to a name that some pack defines.
 
     Args:
-        elsewhere: words that packs define which are not loaded, and these packs. Asked only if it matters.
+        elsewhere: returns the words of packs that are not loaded, with the packs. Called only if it matters.
     """
     known: set[str] = set()
     for pack in (*packs, *ruleset.left_out.values()):
@@ -312,7 +312,7 @@ def words_of_tree(tree: Node | None) -> Iterator[str]:
 
 
 def _optional_names(value: object) -> Iterator[tuple[str, Span]]:
-    """Every word with a `?` in declarations, and where it stands."""
+    """Every word with a `?` in declarations, with its span."""
     match value:
         case Scalar():
             if _OPTIONAL.fullmatch(value.text):

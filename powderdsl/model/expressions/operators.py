@@ -112,7 +112,7 @@ class Unresolved(Exception):
         self.name = name
 
 
-# Where an expression stands
+# Scopes
 
 Matrix = tuple[tuple[int, int], tuple[int, int]]
 IDENTITY: Matrix = ((1, 0), (0, 1))
@@ -120,7 +120,7 @@ IDENTITY: Matrix = ((1, 0), (0, 1))
 
 @dataclass(frozen=True)
 class Scope:
-    """Where an expression stands: its pack, the local names, and how it is turned by a symmetry."""
+    """The context of an expression: its pack, the local names, and the orientation under a symmetry."""
 
     pack: str
     locals: dict[str, Operand]
@@ -130,7 +130,7 @@ class Scope:
         return replace(self, locals={**self.locals, **names})
 
 
-def turned(offset: Offset, matrix: Matrix) -> Offset:
+def rotate(offset: Offset, matrix: Matrix) -> Offset:
     (a, b), (c, d) = matrix
     return (a * offset[0] + b * offset[1], c * offset[0] + d * offset[1])
 
@@ -195,7 +195,7 @@ def _join(op: str, values: list[Expr], span: Span | None) -> Expr:
 
 
 PlacedValue = tuple[Expr, Span]
-"""A value and where it stands."""
+"""A value and its span."""
 
 MAX_MODULUS = 64
 
@@ -206,11 +206,11 @@ def kind_name(value: Operand | None) -> str:
 
 
 def is_integer(value: Expr) -> bool:
-    """Whether a value is an integer, or a constant that is one."""
+    """True for an integer value, and for an integer constant."""
     return value.value.denominator == 1 if value.kind == NUMBER else value.kind.name == "int"
 
 
-def whole(
+def integer_constant(
     typer: Typer, syntax: Syntax, scope: Scope, lo: int, hi: int, message: str, label: str = "", *helps: str
 ) -> int:
     """An integer constant from `lo` to `hi`."""
@@ -247,7 +247,7 @@ _COMPARABLE = {
     ELEMENT: ("an element", "ask for an element, or one of a set, with `is`"),
     DIRECTION: ("a direction", "such as `left`, or `at(-1, 1)`"),
 }
-"""Kinds that are compared with their own kind only: in words, and what to write instead."""
+"""Kinds that are compared with their own kind only: in words, and the fix."""
 
 
 def compare(typer: Typer, sign: str, left: PlacedValue, right: PlacedValue, span: Span) -> Expr:
@@ -337,8 +337,8 @@ def _check_resolution(typer: Typer, draw: Expr, chance: Fraction, span: Span) ->
 # `is` and `in`
 
 
-def holds(typer: Typer, left: Operand, right: Operand, syntax: Syntax) -> Expr:
-    """Whether `left` is, or lies in, `right`, for every pair of operands that can stand there."""
+def membership(typer: Typer, left: Operand, right: Operand, syntax: Syntax) -> Expr:
+    """The condition `left is right` or `left in right`, for every pair of operands that is allowed."""
     span = syntax.span
     first, second = (child.span for child in syntax.children)
     match left, right:
@@ -380,11 +380,11 @@ def holds(typer: Typer, left: Operand, right: Operand, syntax: Syntax) -> Expr:
 
 
 def _equals(typer: Typer, left: Operand, item: Operand, syntax: Syntax) -> Expr:
-    """Whether `left` is one item of a list: numbers are compared, places and elements named."""
+    """The condition that `left` equals an item of a list. Numbers are compared; other items follow `membership`."""
     if isinstance(item, Expr) and item.kind == NUMBER:
         value = typer.value(left, syntax.children[0].span)
         return compare(typer, "==", (value, syntax.span), (item, syntax.span), syntax.span)
-    return holds(typer, left, item, syntax)
+    return membership(typer, left, item, syntax)
 
 
 # Arithmetic
@@ -413,7 +413,7 @@ def calculation(typer: Typer, syntax: Syntax, scope: Scope, modulus: int = 0) ->
         return _on_vectors(typer, op, values, span)
     result = arithmetic(typer, op, values, span)
     if result.kind != NUMBER:
-        return typer.bounded(result, span)
+        return typer.check_range(result, span)
     if abs(result.value) > 10**6 or result.value.denominator > 10**18:
         raise typer.fail("PD402", "a constant out of reach", span, "numbers go up to 1,000,000")
     return result
@@ -434,7 +434,7 @@ def _on_vectors(typer: Typer, op: str, values: Sequence[PlacedValue], span: Span
 def modulo(typer: Typer, syntax: Syntax, scope: Scope) -> Expr:
     """`x mod n` for an integer constant n; coordinates (and their sums) may only appear here."""
     left, right = syntax.children
-    modulus = whole(typer, right, scope, 1, MAX_MODULUS, "`mod` takes an integer constant")
+    modulus = integer_constant(typer, right, scope, 1, MAX_MODULUS, "`mod` takes an integer constant")
     value = _coordinate_sum(typer, left, modulus, scope)
     if value.kind != NUMBER:
         return Expr("mod", integer(0, modulus - 1), (value,), modulus, syntax.span)
@@ -456,10 +456,10 @@ def _coordinate_sum(typer: Typer, syntax: Syntax, modulus: int, scope: Scope) ->
 
 
 def _coordinate_quotient(typer: Typer, syntax: Syntax, modulus: int, scope: Scope) -> Expr:
-    """`row div n` under `mod m`: what `row mod (n · m)` says, divided by n."""
+    """`row div n` under `mod m`: the value of `row mod (n · m)`, divided by n."""
     left, right = syntax.children
     message = "a coordinate is divided by an integer constant"
-    divisor = whole(typer, right, scope, 1, MAX_MODULUS // modulus, message)
+    divisor = integer_constant(typer, right, scope, 1, MAX_MODULUS // modulus, message)
     inner = typer.of_kind(_coordinate_sum(typer, left, modulus * divisor, scope), INTEGER, left.span)
     known = Expr("mod", integer(0, modulus * divisor - 1), (inner,), modulus * divisor, left.span)
     by = typer.of_kind(number(divisor), INTEGER, right.span)
@@ -469,7 +469,7 @@ def _coordinate_quotient(typer: Typer, syntax: Syntax, modulus: int, scope: Scop
 def choose(
     typer: Typer, condition: Expr, yes: tuple[Operand, Span], no: tuple[Operand, Span], span: Span
 ) -> Expr | PlaceChoice:
-    """`a if c else b`, both of one kind; integers join their ranges. What it is of places depends on its use."""
+    """`a if c else b`, both of one kind; ranges of integers are joined. The kind of a choice of places depends on its use."""
     if isinstance(yes[0], (Place, PlaceChoice)) and isinstance(no[0], (Place, PlaceChoice)):
         return PlaceChoice(condition, yes[0], no[0])
     a, b = typer.value(*yes), typer.value(*no)
@@ -511,7 +511,10 @@ def call(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
         message, label = f"`{name}` takes {wanted}, found {count}", "too few" if count < lo else "too many"
         raise typer.fail("PD406", message, syntax.span, label, f"write `{usage}`")
     if function is None:
-        return _shaped(typer, syntax, scope)
+        radius = integer_constant(
+            typer, syntax.children[0], scope, 1, MAX_RADIUS, "a radius is an integer constant"
+        )
+        return shaped_kernel(name, radius)
     if name in CALLS:
         return CALLS[name](typer, syntax, scope)
     operands = [(typer.evaluate(child, scope), child.span) for child in syntax.children]
@@ -550,7 +553,7 @@ def _meaning(function: Operation) -> Syntax:
 def _expand(
     typer: Typer, function: Operation, operands: Sequence[tuple[Operand, Span]], span: Span
 ) -> Operand:
-    """What a call stands for. Mistakes are shown at the arguments, or at the call."""
+    """The value of a function with a `meaning`. Mistakes are shown at the arguments, or at the call."""
     arguments = dict(zip(function.parameters, operands, strict=True))
 
     def placed(node: Syntax) -> Syntax:
@@ -568,17 +571,11 @@ def _expand(
 
 
 def _kernel(typer: Typer, syntax: Syntax, scope: Scope) -> Kernel | None:
-    """The kernel that stands after `in`, if it is one."""
+    """The kernel after `in`; None if the operand is not a kernel."""
     operand = typer.find(syntax.text, syntax.span, scope) if syntax.kind == "name" else None
     if operand is None and syntax.text in KERNEL_SHAPES:
         operand = typer.evaluate(syntax, scope)
     return operand if isinstance(operand, Kernel) else None
-
-
-def _shaped(typer: Typer, syntax: Syntax, scope: Scope) -> Kernel:
-    (argument,) = syntax.children
-    radius = whole(typer, argument, scope, 1, MAX_RADIUS, "a radius is an integer constant")
-    return shaped_kernel(syntax.text, radius)
 
 
 def _neighborhood(typer: Typer, syntax: Syntax, scope: Scope) -> Expr:
@@ -593,7 +590,7 @@ def _neighborhood(typer: Typer, syntax: Syntax, scope: Scope) -> Expr:
         match value.kind.name:
             case "int":
                 kind = _sum_range(kernel, value.kind.lo, value.kind.hi)
-                return typer.bounded(Expr("sum", kind, (value,), kernel, span), span)
+                return typer.check_range(Expr("sum", kind, (value,), kernel, span), span)
             case "vec2":
                 return Expr("sum", VEC2, (value,), kernel, span)
             case "flag":
@@ -624,7 +621,9 @@ def _at(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
     message, label = "`at` takes two integer constants", "not an integer constant"
     fix = "where it varies, loop over the values: `any(… for n in 0..3)`"
     most = MAX_MAGNITUDE
-    rows, columns = (whole(typer, c, scope, -most, most, message, label, fix) for c in syntax.children)
+    rows, columns = (
+        integer_constant(typer, c, scope, -most, most, message, label, fix) for c in syntax.children
+    )
     return typer.turn(Place(typer.offset((rows, columns), syntax.span)), scope)
 
 
@@ -632,7 +631,7 @@ _QUARTERS = {"clockwise": 1, "opposite": 2, "counterclockwise": 3}
 
 
 def _turn(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
-    """A neighbor or a direction turned clockwise; a mirrored copy of a rule turns it the other way."""
+    """A neighbor or a direction turned clockwise; a mirrored copy of a rule turns it counterclockwise."""
     (child,) = syntax.children
     operand = typer.evaluate(child, scope)
     if isinstance(operand, PlaceChoice):
@@ -674,4 +673,4 @@ CALLS: dict[str, Call] = {
     **dict.fromkeys(_QUARTERS, _turn),
     "pick": _pick,
 }
-"""Functions whose arguments need more than to be of a kind."""
+"""Functions whose arguments need more checks than their kinds."""

@@ -17,6 +17,7 @@ from powderdsl.model.builtins import (
     grid_kernel,
 )
 from powderdsl.model.composition.compose import Composition
+from powderdsl.model.composition.names import MAX_PLACES
 from powderdsl.model.declarations import KernelDecl, StreamDecl, TagDecl
 from powderdsl.model.expressions.operators import Items, Place, SetOf
 from powderdsl.model.operations import FUNCTIONS
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
 
 
 def add_constants(composition: Composition) -> None:
-    """Define what needs no evaluation: directions, kernels, elements, tags, streams."""
+    """Define the constants that need no evaluation: directions, kernels, elements, tags, streams."""
     constants, names, elements = composition.constants, composition.names, composition.elements
     constants |= {name: Place(offset) for name, offset in DIRECTIONS.items()}
     constants |= {name: Items(tuple(map(Place, offsets))) for name, offsets in DIRECTION_SETS.items()}
@@ -129,35 +130,32 @@ def read_kind(syntax: Syntax, typer: Typer) -> Kind:
 
 
 def default_of(kind: Kind, first_id: int = 0) -> Value:
-    """The value of something whose file gives no default: zero or the nearest bound to it; the first element."""
+    """The default of a kind if the file gives none: zero or the bound nearest to zero; the first element."""
     if kind.name in ("int", "real", "vec2"):
         zero = min(max(0, kind.lo), kind.hi)
         return int(zero) if kind.name == "int" else float(zero) if kind.name == "real" else (zero, zero)
     return first_id if kind.name == "element" else 0
 
 
-def clamped(default: Value, kind: Kind) -> Value:
+def clamp(default: Value, kind: Kind) -> Value:
     """A field's default as steps leave it: floats within bounds, and zero where they are smaller than SNAP."""
     if kind.name not in ("real", "vec2"):
         return default
     if isinstance(default, tuple):
-        return clamped_number(default[0], kind), clamped_number(default[1], kind)
-    return clamped_number(default, kind)
+        return clamp_number(default[0], kind), clamp_number(default[1], kind)
+    return clamp_number(default, kind)
 
 
-def clamped_number(value: float | Fraction, kind: Kind) -> float:
+def clamp_number(value: float | Fraction, kind: Kind) -> float:
     number = min(max(float(value), kind.lo), kind.hi)
     return number if abs(number) >= SNAP else 0.0
 
 
 # Unknown names
 
-MAX_PLACES = 4
-"""Places of a name that are shown besides the first."""
-
 
 def report_unknown_names(typer: Typer) -> None:
-    """Report every name that was looked up and not found once, with all its places, then forget them."""
+    """Report every name that was looked up and not found, once with all its places, then forget them."""
     for (name, after_dot), places in typer.unknown.items():
         first, *others = sorted(places, key=lambda span: (span.source.name, span.start))
         label = "no loaded pack has such a field or property" if after_dot else "no loaded pack defines it"
@@ -171,7 +169,7 @@ def report_unknown_names(typer: Typer) -> None:
 
 
 def _fix(name: str, known_here: Iterable[str], after_dot: bool, symbols: Composition) -> str:
-    """What to write instead of an unknown name. `known_here` are local names that it could have been meant for."""
+    """The fix for an unknown name. `known_here` are the local names of its scope."""
     elsewhere = [qualified for qualified in symbols.params if qualified.endswith(f".{name}")]
     if elsewhere:
         return f"write `{elsewhere[0]}`: a parameter of another pack is named with its pack"

@@ -35,14 +35,14 @@ from powderdsl.model.expressions.operators import (
     compare,
     conjunction,
     disjunction,
-    holds,
     kind_name,
     look,
     member,
+    membership,
     modulo,
     negation,
     number,
-    turned,
+    rotate,
 )
 from powderdsl.model.expressions.symbols import read_bounds, read_number
 from powderdsl.model.logic.needless import report_repeated
@@ -94,7 +94,7 @@ _HELPS: dict[str, tuple[str, ...]] = {
     "vec2": ("such as `vector(1, 0)`: rows down, columns right",),
     "direction": ("such as `left`, or `octant(…)`",),
 }
-"""What to write where a value of a kind is needed."""
+"""The fix where a value of a kind is needed."""
 
 _OPERANDS: dict[type, str] = {
     Place: "a place",
@@ -130,7 +130,7 @@ class Typer:
         """Tags and sets without elements that the rule asks for."""
         self.resolving: list[str] = []
         self.unknown: dict[tuple[str, bool], dict[Span, Iterable[str]]] = {}
-        """Names that were not found, and whether they stand after a dot: their places, each with the local names there."""
+        """By unknown name, and True if it follows a dot: its places, each with the local names there."""
         self._sets_too_deep = False
         self._work = self._rule_start = 0
         self._rule_span: Span | None = None
@@ -186,9 +186,9 @@ class Typer:
             value = self.of_kind(self.evaluate(syntax, scope), kind, syntax.span)
         except Unresolved as missing:
             raise self.fail("PD301", f"unknown name `{missing.name}`", syntax.span) from None
-        return self.settled(value, syntax.span)
+        return self.constant_of(value, syntax.span)
 
-    def settled(self, value: Expr, span: Span) -> Constant:
+    def constant_of(self, value: Expr, span: Span) -> Constant:
         """The number, or the pair, that an expression is if it is constant."""
         parts = value.args if value.op == "vector" else (value,)
         if any(part.op != "const" for part in parts):
@@ -344,7 +344,7 @@ class Typer:
             raise self.fail("PD409", "the neighbor is too far away", span, label)
         return offset
 
-    def bounded(self, value: Expr, span: Span) -> Expr:
+    def check_range(self, value: Expr, span: Span) -> Expr:
         """An integer; reports a range that is too large."""
         most = max(abs(value.kind.lo), abs(value.kind.hi))
         if most > MAX_MAGNITUDE:
@@ -387,7 +387,7 @@ class Typer:
         return Expr("draw", DRAW, value=name, span=span) if name in symbols.streams else None
 
     def is_new(self, name: Scalar | Syntax, scope: Scope) -> bool:
-        """Whether a local name is new; reports one that hides another which its pack knows."""
+        """True if a local name is new. Reports a name that hides another one which its pack knows."""
         names, word = self.symbols.names, name.text
         other = scope.locals.get(word) or self.find(word, name.span, Scope(scope.pack, {}))
         if other is None or (
@@ -436,11 +436,11 @@ class Typer:
             return operand
         match operand:
             case Place():
-                return Place(turned(operand.offset, scope.orientation))
+                return Place(rotate(operand.offset, scope.orientation))
             case Items():
                 return Items(tuple(self.turn(item, scope) for item in operand.items))
             case Kernel():
-                weights = sorted((*turned((dy, dx), scope.orientation), w) for dy, dx, w in operand.weights)
+                weights = sorted((*rotate((dy, dx), scope.orientation), w) for dy, dx, w in operand.weights)
                 return replace(operand, weights=tuple(weights))
         return operand
 
@@ -467,7 +467,7 @@ class Typer:
         return operand
 
     def attribute(self, syntax: Syntax, scope: Scope) -> Operand:
-        """``place.name``, ``vector.row``, ``pack.name`` or ``place.pack.name``: what one pack defines has its name with it."""
+        """``place.name``, ``vector.row``, ``pack.name`` or ``place.pack.name``."""
         (before,) = syntax.children
         name, value = self._global_name(syntax), None
         if name and before.kind in ("name", "attribute") and not self._is_own_word(before, scope):
@@ -499,7 +499,7 @@ class Typer:
         raise self.wrong(value, "a field, property or neighbor after the dot", word)
 
     def _global_name(self, syntax: Syntax) -> str | None:
-        """The name by which everything is known that ``pack.name`` stands for, if it is the name of something."""
+        """The global name of ``pack.name``; None if it names nothing."""
         (pack,) = syntax.children
         qualified = f"{pack.text}.{syntax.text}"
         if qualified in self.symbols.params:
@@ -507,7 +507,7 @@ class Typer:
         return self.symbols.names.known.get(qualified)
 
     def _is_own_word(self, word: Syntax, scope: Scope) -> bool:
-        """Whether a word before a dot is a place, a vector or a name of its block, and not the name of a pack.
+        """True if a word before a dot is a place, a vector or a name of its block, not the name of a pack.
 
         Elements, tags and numbers have nothing after a dot: `salt.salt` is the element of the pack `salt`.
         """
@@ -517,12 +517,12 @@ class Typer:
     def optional_attribute(self, syntax: Syntax, scope: Scope) -> Operand:
         """``pack.name?``, ``below.name?``: absent unless a loaded pack defines it."""
         try:
-            return self.attribute(self.certain(syntax, scope), scope)
+            return self.attribute(self.without_mark(syntax, scope), scope)
         except Unresolved as missing:
             self.absent.add(missing.name)
             return Absent(missing.name)
 
-    def certain(self, syntax: Syntax, scope: Scope) -> Syntax:
+    def without_mark(self, syntax: Syntax, scope: Scope) -> Syntax:
         """An attribute without its question mark. Raises Unresolved if nothing that is loaded has its name."""
         (before,) = syntax.children
         span = syntax.span
@@ -582,7 +582,7 @@ class Typer:
 
     def is_(self, syntax: Syntax, scope: Scope) -> Operand:
         left, right = self.operands(syntax, scope)
-        result = holds(self, left, right, syntax)
+        result = membership(self, left, right, syntax)
         return result if syntax.kind in ("is_", "in_") else negation(result, syntax.span)
 
     def choose(self, syntax: Syntax, scope: Scope) -> Operand:
@@ -647,7 +647,7 @@ class Typer:
 
 
 def _integer_helps(value: Expr, span: Span) -> tuple[str, ...]:
-    """What to write instead of a float where an integer is wanted."""
+    """The fix for a float where an integer is needed."""
     if value.kind.name != "real":
         return ()
     declared = "or declare what takes it as `real(LOW..HIGH)`"
@@ -677,4 +677,4 @@ HANDLERS: dict[str, Callable[[Typer, Syntax, Scope], Operand]] = {
     **dict.fromkeys(("add", "sub", "mul", "div", "quotient", "neg"), calculation),
     "mod": modulo,
 }
-"""By kind of syntax node, what reads an expression whose parts have operands of their own."""
+"""By kind of syntax node, the function that evaluates an expression with parts."""

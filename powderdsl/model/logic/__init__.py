@@ -1,1 +1,1 @@
-"""What conditions allow: the constraint search, and the conflicts and needless rules that it finds."""
+"""The constraint search on conditions, and the conflicts and needless rules that it finds."""

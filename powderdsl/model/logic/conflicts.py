@@ -28,10 +28,10 @@ from powderdsl.model.logic.satisfy import (
     Conditions,
     Facts,
     Lets,
-    alone,
     decide,
     example,
     satisfiable,
+    single_domains,
 )
 from powderdsl.model.operations import OPERATIONS
 from powderdsl.model.types import (
@@ -58,17 +58,17 @@ COMPARISONS = 1_000_000
 """Work for comparing the rules of all substeps, in nodes: a second."""
 
 GLANCE = 3
-"""What a comparison of two rules costs, in nodes."""
+"""The cost of a comparison of two rules, in nodes."""
 
 MAX_PARTS = 64
-"""Parts of a condition that follows from a value; of a longer one nothing is kept, which is true of it too."""
+"""The most parts of a condition that follows from a value; a longer one is dropped, which stays correct."""
 
 
 @dataclass(frozen=True)
 class Conflict:
     """Two rules (or two copies of one) that may claim one cell. Rounds of a loop repeat it, so it is a value.
 
-    `first` and `second` are what the rules do, without their conditions; it is reported at the second.
+    `first` and `second` are the spans of the rules without their conditions; it is reported at the second.
     """
 
     code: str
@@ -120,7 +120,7 @@ class Conflict:
 
 
 def _claim(rule: Rule) -> Span:
-    """The part of a rule's text to underline: what it does, without its condition."""
+    """The part of a rule's text to underline: the rule without its condition."""
     span = rule.span
     rest = re.search(r",?\s+(if|where|with|then)\b", span.text)
     return Span(span.source, span.start, span.start + rest.start()) if rest and rest.start() else span
@@ -155,7 +155,7 @@ def check_logic(
         earlier: Lets = {}
         for number, moment in enumerate(pass_.moments):
             lets = earlier | moment.values
-            earlier = lasting(lets)
+            earlier = flags_for_later(lets)
             live = []
             for rule in moment.rules:
                 happens = decide(facts, [(rule.mask, HERE)], lets)
@@ -241,10 +241,10 @@ def _report_conflicts(
 
 
 def _may_settle(moment: Moment) -> bool:
-    """Whether `first_wins` changes nothing where no two rules meet.
+    """True if `first_wins` changes nothing where no two rules meet.
 
-    Moves may go where another one leaves, and transforms into one element may all have their effects: under the policy
-    they may not.
+    Without the policy, moves may go where another one leaves, and transforms into one element may all have their
+    effects.
     """
     transforms = [rule for rule in moment.rules if isinstance(rule, Transform)]
     targets = [rule.target for rule in transforms]
@@ -273,7 +273,10 @@ def _check_substep(
 def _conflicts_of(
     rules: Sequence[tuple[Rule, Expr]], facts: Facts, lets: Lets
 ) -> Iterator[tuple[Conflict, dict[Offset, int]]]:
-    """For each rule, given with its condition, the first one, maybe itself, with which it may claim one cell."""
+    """The conflict of each rule with the first rule, maybe itself, with which it may claim one cell.
+
+    Rules come with their conditions. Each conflict has an example of elements by place.
+    """
     domains = list(_domains((mask for _, mask in rules), facts, lets))
     for i, (second, mask) in enumerate(rules):
         undecided = None
@@ -281,7 +284,7 @@ def _conflicts_of(
             (rules[j][0], ((rules[j][1], HERE), (mask, at)))
             for j in (i, *range(i))
             for at in _claims(rules[j][0], second)
-            if not _are_apart(domains[j], domains[i], at, facts.budget)
+            if not _are_disjoint(domains[j], domains[i], at, facts.budget)
         )
         for first, question in pairs:
             if facts.budget.left < 0:
@@ -317,7 +320,7 @@ def _in_words(facts: Facts, elements: dict[Offset, int]) -> str:
 
 
 def _claims(first: Rule, second: Rule) -> Iterator[Offset]:
-    """Where, relative to the first rule's cell, the second would claim one of the same cells."""
+    """The offsets from the first rule's cell to cells in which the second rule would claim a cell of the first."""
     if isinstance(first, Assign) or isinstance(second, Assign):
         assert isinstance(first, Assign)
         assert isinstance(second, Assign)
@@ -379,21 +382,21 @@ def _parity(conflict: Conflict, question: Conditions, facts: Facts, lets: Lets) 
 
 
 Domains = dict[tuple[int, Offset], frozenset[object]]
-"""What a condition leaves of single variables, each with a number and its place: elements, fields and counts."""
+"""The values that a condition leaves of single variables, by number and place: elements, fields and counts."""
 
 
 def _domains(masks: Iterable[Expr], facts: Facts, lets: Lets) -> Iterator[Domains]:
     numbers: dict[tuple[str, object], int] = {}
     for mask in masks:
-        domains = alone(facts, mask, lets)
+        domains = single_domains(facts, mask, lets)
         yield {
             (numbers.setdefault((what, name), len(numbers)), at): values
             for (what, name, at), values in domains.items()
         }
 
 
-def _are_apart(first: Domains, second: Domains, at: Offset, budget: Budget) -> bool:
-    """Whether some variable cannot be as the first condition and, `at` away from it, the second ask for."""
+def _are_disjoint(first: Domains, second: Domains, at: Offset, budget: Budget) -> bool:
+    """True if the first condition and, `at` away from it, the second leave no common value of some variable."""
     budget.left -= GLANCE
     for (number, place), values in second.items():
         known = first.get((number, plus(place, at)))
@@ -402,12 +405,12 @@ def _are_apart(first: Domains, second: Domains, at: Offset, budget: Budget) -> b
     return False
 
 
-def lasting(lets: Lets) -> Lets:
-    """The flags among some values, in the order in which they were fixed, as they can be looked through later.
+def flags_for_later(lets: Lets) -> Lets:
+    """The flags among some values, in the order in which they were fixed, as later substeps may use them.
 
-    Each is itself, as something unknown, and the condition on coordinates that follows from it.
+    Each becomes an unknown flag and the condition on coordinates that follows from the value.
     """
-    lasting_lets: Lets = {}
+    flags: Lets = {}
     follow: Lets = {}
     for name, value in lets.items():
         if value.kind != FLAG:
@@ -415,8 +418,8 @@ def lasting(lets: Lets) -> Lets:
         condition = _follows(value, follow)
         if condition != TRUE and sum(1 for _ in islice(condition.walk(), MAX_PARTS + 1)) <= MAX_PARTS:
             follow[name] = condition
-            lasting_lets[name] = conjunction([Expr("let", FLAG, value=f"{name} before"), condition])
-    return lasting_lets
+            flags[name] = conjunction([Expr("let", FLAG, value=f"{name} before"), condition])
+    return flags
 
 
 def _follows(expr: Expr, follow: Lets) -> Expr:

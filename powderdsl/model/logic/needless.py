@@ -156,7 +156,7 @@ def _report_overruled(
 
 
 def _matters(rule: Rule, rivals: Sequence[Rule], moment: Moment, facts: Facts) -> bool | None:
-    """Whether a rule that may happen is not always overruled by its rivals; None if that takes too much work."""
+    """False if the rivals of a rule always overrule it; None if deciding takes too much work."""
     facts.budget.left -= len(moment.rules) // GLANCES
     if facts.budget.left < 0:
         return None
@@ -167,7 +167,7 @@ def _matters(rule: Rule, rivals: Sequence[Rule], moment: Moment, facts: Facts) -
 
 
 def _rivals(rule: Rule, place: int, moment: Moment) -> list[Rule]:
-    """The rules of a substep that keep this one from having an effect where they happen."""
+    """The rules of a substep that overrule a rule wherever they happen."""
     rivals: list[Rule] = []
     for number, other in enumerate(moment.rules):
         earlier = number < place
@@ -193,7 +193,7 @@ def report_undrawn(
     """Report chances of elements against which no rule draws there: mostly a tag is missing.
 
     Args:
-        given: property, element id, and the place of an element's value of it.
+        given: property, element id, and the span of the element's value.
 
     Returns:
         The chances that perhaps no rule draws, which takes too much work to decide.
@@ -229,7 +229,7 @@ def _may_draw(name: str, number: int, ruleset: Ruleset, facts: Facts) -> Iterato
 
 
 def _reads(name: str, parts: Iterable[Expr], lets: Lets, everywhere: Lets) -> dict[Offset | None, None]:
-    """Where expressions read a property. None stands for cells whose places or substeps are not told apart."""
+    """The offsets at which expressions read a property; None stands for reads at unknown places."""
     places: dict[Offset | None, None] = {}
     opened = set()
     waiting: list[tuple[Expr, Offset | None]] = [(part, HERE) for part in parts]
@@ -241,7 +241,7 @@ def _reads(name: str, parts: Iterable[Expr], lets: Lets, everywhere: Lets) -> di
                 places[at] = None
             case "let":
                 if expr.value not in lets:
-                    at = None  # fixed before: what stood there then may be elsewhere now
+                    at = None  # fixed in an earlier substep: the element may be elsewhere now
                 args = (everywhere[str(expr.value)],) if (expr.value, at) not in opened else ()
                 opened.add((expr.value, at))
             case "look":
@@ -276,9 +276,9 @@ def _report_lost_writes(
 
 
 def _arrives(write: Assign, rule: Rule, ids: tuple[int, ...], moment: Moment, facts: Facts) -> bool | None:
-    """Whether the cell may hold one of these elements when the write lands; None if that is too hard.
+    """True if the cell may hold one of these elements when the write lands; None if deciding takes too much work.
 
-    Assignments come before all that moves, effects after it.
+    Assignments come before movements, effects after them.
     """
     brought = _brings(rule).get(write.offset)
     stays = rule.mask, look(ELEMENT_HERE, write.offset)
@@ -310,7 +310,7 @@ def _brings(rule: Rule) -> dict[Offset, Expr]:
 
 
 def report_undecided(spans: Iterable[Span], reporter: Reporter) -> None:
-    """Note the rules for which it is not known whether they ever have an effect.
+    """Report the rules that took too much work to decide.
 
     Args:
         spans: rules, writes and values; repetitions count once.
@@ -415,7 +415,7 @@ def overridden_ids(passes: tuple[Pass, ...], names: Sequence[str], facts: Facts)
 
 
 def without_dead_overrides(passes: tuple[Pass, ...], dead: frozenset[str]) -> tuple[Pass, ...]:
-    """The passes without assignments to properties that no cell can come to override: there is no place for them."""
+    """The passes without assignments to properties that no cell can override: these properties are not stored."""
 
     def alive(moment: Moment) -> Moment:
         rules = [r for r in moment.rules if not (isinstance(r, Assign) and r.field in dead)]

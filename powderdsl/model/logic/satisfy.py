@@ -17,11 +17,11 @@ from powderdsl.model.operations import OPERATIONS, Bounds
 from powderdsl.model.types import FLAG, HERE, Expr, Field, Offset, Property, plus
 
 Variable = tuple[str, object, Offset]
-"""A variable: what it is, the name or expression, and the place."""
+"""A variable: its sort, the name or expression, and the place."""
 Lets = dict[str, Expr]
 """Values of a substep by name."""
 Conditions = Sequence[tuple[Expr, Offset]]
-"""Each with the place where it is asked."""
+"""Each with the place where it must hold."""
 
 MAX_DOMAIN = 256
 MAX_LET = 150
@@ -57,7 +57,7 @@ class Budget:
 
 @dataclass(frozen=True)
 class Facts:
-    """What is known about cells: which ids exist, and the properties of the elements."""
+    """The facts about cells: the existing ids, and the properties of the elements."""
 
     ids: tuple[int, ...]
     properties: dict[str, Property]
@@ -70,7 +70,7 @@ class Facts:
     budget: Budget = field(default_factory=Budget, compare=False, repr=False)
 
     def relaxed(self) -> Facts:
-        """The same cells, but with any element's properties: what a rule could meet in other packs."""
+        """The facts with unknown properties, as elements of other packs may have."""
         free = dict(self.properties)
         for name, p in free.items():
             unknown = replace(p, values=("?",) * len(p.values))
@@ -79,7 +79,7 @@ class Facts:
 
 
 def decide(facts: Facts, conditions: Conditions, lets: Lets | None = None) -> bool | None:
-    """Whether the conditions may hold together; None if that takes too much work. False is a proof."""
+    """True if the conditions may hold together; None if deciding takes too much work. False is a proof."""
     if lets and _ask(facts, conditions, None, _Search.possible) is False:
         return False  # whatever the values of lets are
     return _ask(facts, conditions, lets, _Search.possible)
@@ -91,7 +91,7 @@ def satisfiable(facts: Facts, conditions: Conditions, lets: Lets | None = None) 
 
 
 def some(answers: Iterable[bool | None]) -> bool | None:
-    """Whether one of the answers is yes, looking no further; None if none is, and one is not known."""
+    """True at the first answer that is True; else None if one is None, else False."""
     undecided = False
     for answer in answers:
         if answer:
@@ -104,7 +104,7 @@ Key = TypeVar("Key", bound=Hashable)
 
 
 class Answers(dict[Key, bool | None]):
-    """Whether the answer is yes for one of the copies that each rule has; None if none is, and one is not known."""
+    """The answers for rules that have several copies, joined by `some`."""
 
     def add(self, rule: Key, answer: bool | None) -> None:
         self[rule] = some((self.get(rule, False), answer))
@@ -114,9 +114,9 @@ class Answers(dict[Key, bool | None]):
         return [rule for rule, known in self.items() if known is answer]
 
 
-def alone(facts: Facts, condition: Expr, lets: Lets) -> dict[Variable, frozenset[object]]:
-    """What a condition leaves of variables that parts of it decide alone: an element, a field, a count at a place."""
-    return _ask(facts, [(condition, HERE)], lets, _Search.alone) or {}
+def single_domains(facts: Facts, condition: Expr, lets: Lets) -> dict[Variable, frozenset[object]]:
+    """The values of single variables that a condition allows: an element, a field or a count at a place."""
+    return _ask(facts, [(condition, HERE)], lets, _Search.single_domains) or {}
 
 
 def example(facts: Facts, conditions: Conditions, lets: Lets) -> dict[Offset, int]:
@@ -147,7 +147,7 @@ def _ask(
 class _Term(NamedTuple):
     """A part of a condition at its place. `keys` are the numbers of the variables that it reads, in order.
 
-    `about` is what its operation needs besides: a property, the elements and the default of a field, a shift.
+    `about` is the operation's further argument: a property, the elements and the default of a field, or a shift.
     """
 
     op: str
@@ -157,7 +157,7 @@ class _Term(NamedTuple):
     about: Any = None
 
     def conjuncts(self) -> Iterator[_Term]:
-        """What must hold so that it holds, if it is a condition."""
+        """The parts that must all hold for the condition to hold."""
         if self.op != "and":
             yield self
         else:
@@ -166,7 +166,7 @@ class _Term(NamedTuple):
 
 
 class _Search:
-    """One question. Lets of the substep are looked through; conjunctions are split."""
+    """One search. Lets of the substep are replaced by their values; conjunctions are split."""
 
     def __init__(self, facts: Facts, conditions: Conditions, lets: Lets):
         self.facts, self.budget, self.lets = facts, facts.budget, lets
@@ -182,13 +182,13 @@ class _Search:
         """False if no assignment satisfies all conditions."""
         if not self._narrow():
             return False
-        # Small domains first; what is equally small in the order in which the conditions name it.
+        # Small domains first; domains of one size in the order in which the conditions name them.
         joint = [term for term in self._terms if len(term.keys) > 1]
         sizes = {key: len(self._domains[key]) for term in joint for key in term.keys}
         return self._assign(sorted(sizes, key=sizes.__getitem__), joint)
 
-    def alone(self) -> dict[Variable, frozenset[object]] | None:
-        """The values that conditions on one variable leave of it, draws left out; None if one leaves nothing."""
+    def single_domains(self) -> dict[Variable, frozenset[object]] | None:
+        """The values that conditions on one variable leave of it, without draws; None if nothing is left."""
         whole = self._domains.copy()
         if not self._narrow():
             return None
@@ -258,7 +258,7 @@ class _Search:
         return list(range(int(kind.lo), int(kind.hi) + 1))
 
     def _term(self, node: Expr, at: Offset) -> _Term:
-        """The expression at a place. What cannot be enumerated is ``unknown``."""
+        """The expression at a place. A value that cannot be enumerated is ``unknown``."""
         self.budget.spend(1)
         unknown = _Term("unknown", node)
         match node.op:

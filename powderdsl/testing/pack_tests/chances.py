@@ -108,6 +108,6 @@ def world_context(world: World, *conditions: Expr) -> reference.Context:
         if part.op in ("field", "property")
     }
     names = [name for name in world.state if name == "element" or name in read]
-    state = reference.widened(ruleset, {name: to_numpy(world.state[name]) for name in names})
+    state = reference.widen(ruleset, {name: to_numpy(world.state[name]) for name in names})
     clock = reference.Clock(to_numpy(world.seed), to_numpy(world.index), to_numpy(world.step))
     return reference.Context(ruleset, state, reference.parameters(ruleset, len(world), {}), {}, clock)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from powderdsl.arrays import NDArray, np
 from powderdsl.model import reference
-from powderdsl.model.check import restricted, without
+from powderdsl.model.check import select_packs, without_pack
 from powderdsl.model.examples import direction_word
 from powderdsl.model.text import one_line, show_number, show_single, show_value
 from powderdsl.model.types import Cell, Example, FieldGrid, Kind, Ruleset
@@ -84,10 +84,10 @@ def _added(result: ExampleResult, ruleset: Ruleset, sim: Simulator) -> tuple[str
     """The packs outside a failed test's scope with which it fails; those without each of which it passes, if any."""
     scope = result.example.scope
     added = ruleset.added_to(scope) if scope and not result.passed else ()
-    if not added or not _passes(result.example, restricted(ruleset, scope), sim):
+    if not added or not _passes(result.example, select_packs(ruleset, scope), sim):
         return ()
     some = added[:MOST] if len(added) > 1 else ()
-    return tuple(pack for pack in some if _passes(result.example, without(ruleset, pack), sim)) or added
+    return tuple(pack for pack in some if _passes(result.example, without_pack(ruleset, pack), sim)) or added
 
 
 def _passes(example: Example, ruleset: Ruleset | None, sim: Simulator) -> bool:

@@ -8,7 +8,7 @@ from typing import Any
 
 from powderdsl.arrays import np
 from powderdsl.diagnostics import Span
-from powderdsl.model.check import without
+from powderdsl.model.check import without_pack
 from powderdsl.model.composition.added_packs import Cause, Difference
 from powderdsl.model.declarations import PackDecl
 from powderdsl.model.state import slots
@@ -133,7 +133,7 @@ def _rules(ruleset: Ruleset, lines: Iterable[Span], packs: tuple[str, ...]) -> l
 
 def _still(prop: Property, ruleset: Ruleset, counterexample: Counterexample, pack: str) -> bool:
     """True if the world still breaks the invariant without a pack."""
-    fewer = without(ruleset, pack)
+    fewer = without_pack(ruleset, pack)
     if fewer is None:
         return True
     # The elements of other rules may have other ids: the claim is that of the same line there.

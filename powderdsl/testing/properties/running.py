@@ -111,7 +111,7 @@ def differences(first: State, second: State, names: Iterable[str] | None = None)
 def context(ruleset: Ruleset, state: State, sample: Start, step: int) -> reference.Context:
     """The values that a condition reads: the state of worlds, parameters, the clock."""
     params = reference.parameters(ruleset, len(sample), sample.params)
-    working = reference.widened(ruleset, {slot.name: state[slot.name] for slot in slots(ruleset)})
+    working = reference.widen(ruleset, {slot.name: state[slot.name] for slot in slots(ruleset)})
     clock = reference.Clock(sample.seed, sample.index, sample.step + step)
     return reference.Context(ruleset, working, params, {}, clock)
 

@@ -11,7 +11,7 @@ from powderdsl.analysis.ledger import Ledger, Proven
 from powderdsl.analysis.ledger import ledger as make_ledger
 from powderdsl.analysis.proofs import prove
 from powderdsl.arrays import np
-from powderdsl.model.check import restricted
+from powderdsl.model.check import select_packs
 from powderdsl.model.expressions.operators import ELEMENT_HERE, member
 from powderdsl.model.types import Never, Ruleset, Symmetric, Total
 from powderdsl.simulation.draw import shown_fields
@@ -168,7 +168,7 @@ class InvariantSearch:
         ruleset = self.runner.ruleset
         broken = [(trial, trial.counterexample) for trial in self.trials if trial.counterexample is not None]
         for scope in dict.fromkeys(trial.prop.scope for trial, _ in broken):
-            alone = restricted(ruleset, scope) if scope and ruleset.added_to(scope) else None
+            alone = select_packs(ruleset, scope) if scope and ruleset.added_to(scope) else None
             if alone is None:
                 continue
             some = [(trial, world) for trial, world in broken if trial.prop.scope == scope]
