@@ -14,32 +14,27 @@ SCHEMA = 1
 
 def ledger_text(ledger: Ledger) -> str:
     """The whole ledger, ends with a line break; equal rules give equal texts."""
-    blocks = [_head(ledger), _sums(ledger), _sources(ledger)]
+    head = [
+        f"ledger of {ledger.name}: {len(ledger.elements)} elements, {len(ledger.rules)} lines of rules",
+        "What is not listed cannot happen: in worlds of any size and content, with any parameters.",
+    ]
+    if not ledger.complete:
+        head.append(
+            "Not decided in full: the rules are too many. What could not be excluded in time is listed."
+        )
+    blocks: list[Iterable[str]] = [head, _sums(ledger), _sources(ledger)]
     blocks += [_element(ledger, name) for name in ledger.elements]
     blocks += [_rules(ledger), _fields(ledger), _overlaps(ledger)]
     return "\n\n".join("\n".join(block) for block in blocks) + "\n"
-
-
-def _head(ledger: Ledger) -> Iterator[str]:
-    yield f"ledger of {ledger.name}: {len(ledger.elements)} elements, {len(ledger.rules)} lines of rules"
-    yield "What is not listed cannot happen: in worlds of any size and content, with any parameters."
-    if not ledger.complete:
-        yield "Not decided in full: the rules are too many. What could not be excluded in time is listed."
 
 
 def _sums(ledger: Ledger) -> Iterator[str]:
     yield "sums of cells"
     for title, sums in ledger.sums.items():
         for names in sums:
-            yield f"  {title:<12} {_sum(names, ledger)}"
-
-
-def _sum(names: tuple[str, ...], ledger: Ledger) -> str:
-    """The sum as `a + b`, or as `all but c` where that is shorter."""
-    others = [name for name in ledger.elements if name not in names]
-    if not others:
-        return "all cells"
-    return "all but " + " and ".join(others) if len(others) < 3 < len(names) else " + ".join(names)
+            others = [name for name in ledger.elements if name not in names]
+            text = "all but " + " and ".join(others) if len(others) < 3 < len(names) else " + ".join(names)
+            yield f"  {title:<12} {text if others else 'all cells'}"
 
 
 def _sources(ledger: Ledger) -> Iterator[str]:
@@ -128,7 +123,12 @@ def ledger_data(ledger: Ledger) -> dict[str, Any]:
         "never_falls": ledger.rising_sums,
         "never_rises": ledger.falling_sums,
         "elements": [_element_data(ledger, name, numbers) for name in ledger.elements],
-        "rules": [_rule_data(entry) for entry in ledger.rules],
+        "rules": [
+            {"rule": line.text, "where": str(line), "pass": line.pass_name, "pack": line.pack}
+            | _without(entry, "rule")
+            for entry in ledger.rules
+            for line in [entry.rule]
+        ],
         "fields": [
             _without(entry, "writers", "reaches") | {"written_by": [numbers[line] for line in entry.writers]}
             for entry in ledger.fields
@@ -151,11 +151,6 @@ def _element_data(ledger: Ledger, name: str, numbers: dict[RuleLine, int]) -> di
         "becomes": {after: lines for (before, after), lines in changes.items() if before == name},
         "moved_by": [numbers[entry.rule] for entry in ledger.rules if name in entry.moves],
     }
-
-
-def _rule_data(entry: RuleEntry) -> dict[str, Any]:
-    line, effects = entry.rule, _without(entry, "rule")
-    return {"rule": line.text, "where": str(line), "pass": line.pass_name, "pack": line.pack, **effects}
 
 
 def _without(entry: RuleEntry | FieldEntry, *names: str) -> dict[str, Any]:

@@ -307,7 +307,7 @@ def scatter(values: Values, axes: Sequence[Offsets], new: Values) -> Values:
     return bytes(changed) if isinstance(values, bytes) else changed
 
 
-def roll(values: Values, outer: int, count: int, inner: int, shift: int) -> Values:
+def roll(values: Values, count: int, inner: int, shift: int) -> Values:
     """Values [outer, count, inner] in which number i of the middle axis comes from i - shift; it wraps around."""
     if len(values) == 1 or not values or shift % count == 0:
         return values

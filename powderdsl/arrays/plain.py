@@ -373,7 +373,7 @@ def roll(values: ndarray, shift: Any, axis: Any) -> ndarray:
     rolled, shape = values.values, values.shape
     for places, axis_number in [(shift, axis)] if isinstance(axis, int) else zip(shift, axis, strict=True):
         at = range(len(shape))[axis_number]
-        rolled = numbers.roll(rolled, prod(shape[:at]), shape[at], prod(shape[at + 1 :]), places)
+        rolled = numbers.roll(rolled, shape[at], prod(shape[at + 1 :]), places)
     return ndarray(shape, values.dtype, rolled)
 
 
@@ -503,10 +503,6 @@ def floor(x: ndarray) -> ndarray:
 
 def isnan(x: ndarray) -> ndarray:
     return _compare("ne", x, x)
-
-
-def isfinite(x: ndarray) -> ndarray:
-    return ndarray(x.shape, bool_, bytes(map(math.isfinite, x.values)))
 
 
 def errstate(**_: str) -> nullcontext[None]:

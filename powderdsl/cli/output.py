@@ -27,7 +27,7 @@ def color_wanted(stream: IO[Any]) -> bool:
 
 def write_diagnostics(diagnostics: Iterable[Diagnostic], stream: IO[str]) -> None:
     """Write diagnostics as full texts with carets, separated by empty lines."""
-    from powderdsl.diagnostics.render import render_text
+    from powderdsl.diagnostics.diagnostic import render_text
 
     color = color_wanted(stream)
     write_styled(

@@ -1,8 +1,7 @@
 """Diagnostics: the mistake, its place, and the fix. Used by every stage; depends on nothing."""
 
 from powderdsl.diagnostics.codes import CODES, Code, Severity
-from powderdsl.diagnostics.diagnostic import Diagnostic, Label, Source, Span
-from powderdsl.diagnostics.report import CompileError, Reporter, suggest
+from powderdsl.diagnostics.diagnostic import CompileError, Diagnostic, Label, Reporter, Source, Span, suggest
 
 __all__ = [
     "CODES",

@@ -1,12 +1,31 @@
-"""A diagnostic as data, and places in source text: two character offsets; lines and columns are for printing only."""
+"""Diagnostics: as data, as text with carets or JSON, and the Reporter that collects them.
+
+Places in source text are two character offsets; lines and columns are for printing only.
+"""
 
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from functools import cached_property
+from typing import Any
+from unicodedata import combining, east_asian_width
 
 from powderdsl.diagnostics.codes import CODES, Severity
+from powderdsl.diagnostics.printable import printable
+
+TAB_WIDTH = 4
+MAX_SHOWN = 160
+"""The most characters of a source line that a diagnostic shows."""
+COLORS = {Severity.ERROR: "31;1", Severity.WARNING: "33;1", Severity.NOTE: "36;1"}
+
+MAX_ERRORS = 200
+"""The most errors that are reported: more would not be read."""
+
+MAX_CANDIDATES = 500
+"""The most names among which the one that a misspelled name means is searched; of more, only names with its first letter."""
 
 
 @dataclass(frozen=True)
@@ -92,3 +111,182 @@ class Diagnostic:
     def sort_key(self) -> tuple[str, int, int, str]:
         span = self.primary.span
         return (span.source.name, span.start, span.end, self.code) if span else ("", 0, 0, self.code)
+
+
+# Renderings
+
+
+def _cells(text: str) -> int:
+    """Terminal cells that `text` takes, tabs already expanded."""
+    return sum(0 if combining(char) else 2 if east_asian_width(char) in "WF" else 1 for char in text)
+
+
+def _snippet(label: Label, caret: str) -> tuple[str, str]:
+    """The source line and the line of carets below it, long lines cut to a window around the place."""
+    span = label.span
+    assert span is not None
+    line_number, column = span.source.position(span.start)
+    raw = span.source.line(line_number)
+    start = min(column - 1, len(raw))
+    end = max(min(start + span.end - span.start, len(raw)), start)
+    left = max(0, start - MAX_SHOWN // 2) if len(raw) > MAX_SHOWN else 0
+    right = min(len(raw), left + MAX_SHOWN)
+
+    def shown(piece: str) -> str:
+        # What cannot be printed takes one column, so that carets stay below their text.
+        chars = piece.expandtabs(TAB_WIDTH)
+        return "".join("\N{REPLACEMENT CHARACTER}" if printable(char) != char else char for char in chars)
+
+    text = ("…" if left else "") + shown(raw[left:right]) + ("…" if right < len(raw) else "")
+    before = _cells(shown(raw[left:start])) + (1 if left else 0)
+    width = max(1, _cells(shown(raw[left : min(end, right)])) + (1 if left else 0) - before)
+    return text, (" " * before + caret * width + (f" {printable(label.text)}" if label.text else "")).rstrip()
+
+
+def source_lines(labels: Sequence[Label]) -> tuple[list[str], int]:
+    """The source lines of labels with carets, the first label's as `^`; and the width of the line numbers."""
+    placed = [label for label in labels if label.span]
+    gutter = max((len(str(label.span.line)) for label in placed if label.span), default=1)
+    lines: list[str] = []
+    name = None
+    for label in placed:
+        assert label.span is not None
+        if label.span.source.name != name:
+            arrow = "-->" if name is None else ":::"
+            name = label.span.source.name
+            lines.append(f"{' ' * gutter}{arrow} {printable(label.span.place)}")
+            lines.append(f"{' ' * gutter} |")
+        text, carets = _snippet(label, "^" if label is labels[0] else "-")
+        lines += [f"{label.span.line:>{gutter}} | {text}".rstrip(), f"{' ' * gutter} | {carets}"]
+    return lines, gutter
+
+
+def render_text(diagnostic: Diagnostic, *, color: bool = False) -> str:
+    """The full text with source lines and carets. Ends without a line break."""
+
+    def paint(text: str, style: str) -> str:
+        return f"\x1b[{style}m{text}\x1b[0m" if color else text
+
+    severity = diagnostic.severity
+    head = (
+        paint(f"{severity.value}[{diagnostic.code}]", COLORS[severity]) + f": {printable(diagnostic.message)}"
+    )
+    places, gutter = source_lines([diagnostic.primary, *diagnostic.secondary])
+    lines = [head, *places]
+    lines.extend(f"{' ' * gutter} = note: {printable(note)}" for note in diagnostic.notes)
+    lines.extend(f"{' ' * gutter} = help: {printable(text)}" for text in diagnostic.helps)
+    lines.append(f"{' ' * gutter} = more: powderdsl explain {diagnostic.code}")
+    return "\n".join(lines)
+
+
+def diagnostic_data(diagnostic: Diagnostic, *, utf16: bool = False) -> dict[str, Any]:
+    """A diagnostic as plain data. `utf16` counts columns in UTF-16 units, as browser editors do."""
+
+    def point(source: Source, offset: int) -> dict[str, int]:
+        line, column = source.position(offset)
+        before = source.line(line)[: column - 1]
+        units = len(before.encode("utf-16-le")) // 2 if utf16 else len(before)
+        return {"line": line, "column": units + 1}
+
+    def label_data(label: Label) -> dict[str, Any]:
+        span = label.span
+        if span is None:
+            return {"span": None, "text": label.text}
+        ends = {"start": point(span.source, span.start), "end": point(span.source, span.end)}
+        return {"span": {"file": span.source.name, **ends}, "text": label.text}
+
+    return {
+        "code": diagnostic.code,
+        "severity": diagnostic.severity.value,
+        "message": diagnostic.message,
+        "primary": label_data(diagnostic.primary),
+        "secondary": [label_data(label) for label in diagnostic.secondary],
+        "notes": list(diagnostic.notes),
+        "helps": list(diagnostic.helps),
+    }
+
+
+# Collecting
+
+
+class CompileError(Exception):
+    """Bad input: rule files, worlds, tasks. `diagnostics` has all errors, in source order."""
+
+    def __init__(self, diagnostics: Iterable[Diagnostic]):
+        self.diagnostics = tuple(diagnostics)
+        super().__init__(self.diagnostics)
+
+    def __str__(self) -> str:
+        return "\n".join(render_text(diagnostic) for diagnostic in self.diagnostics)
+
+
+class Reporter:
+    """Collects diagnostics. Every stage reports all it can; `raise_if_errors` ends the stage."""
+
+    def __init__(self) -> None:
+        self._diagnostics: dict[Diagnostic, None] = {}
+        self._errors = 0
+
+    def report(
+        self,
+        code: str,
+        message: str,
+        span: Span | None,
+        label: str = "",
+        *,
+        secondary: Sequence[Label] = (),
+        notes: Sequence[str] = (),
+        helps: Sequence[str] = (),
+    ) -> None:
+        """Add a diagnostic. The code's row in the table decides whether it is an error, a warning or a note.
+
+        Raises:
+            CompileError: with everything so far, when there are MAX_ERRORS errors.
+        """
+        if span is not None and span.end <= span.start:
+            span = Span(span.source, span.start, span.start + 1)  # something to underline
+        self.add(Diagnostic(code, message, Label(span, label), tuple(secondary), tuple(notes), tuple(helps)))
+
+    error = report
+
+    def add(self, diagnostic: Diagnostic) -> None:
+        """Add a diagnostic. Raises CompileError as `report` does."""
+        if diagnostic in self._diagnostics:
+            return
+        if diagnostic.severity is Severity.ERROR:
+            self._errors += 1
+        elif len(self._diagnostics) > 10 * MAX_ERRORS:
+            return
+        self._diagnostics[diagnostic] = None
+        if self._errors >= MAX_ERRORS:
+            self.raise_if_errors()
+
+    @property
+    def diagnostics(self) -> tuple[Diagnostic, ...]:
+        """Everything found so far, in source order, without repetitions."""
+        return tuple(sorted(self._diagnostics, key=lambda diagnostic: diagnostic.sort_key))
+
+    @property
+    def has_errors(self) -> bool:
+        return self._errors > 0
+
+    def raise_if_errors(self) -> None:
+        """Raise CompileError with the errors found (warnings and notes stay with the reporter)."""
+        if self.has_errors:
+            errors = [d for d in self.diagnostics if d.severity is Severity.ERROR]
+            raise CompileError(errors)
+
+
+def suggest(word: str, candidates: Iterable[str], kind: str = "") -> tuple[str, ...]:
+    """Help lines for an unknown word: the close match, or the whole list when it is short."""
+    word = str(word)  # callers of the Python API may pass anything
+    known = sorted(set(candidates) - {word})
+    if len(known) > MAX_CANDIDATES:
+        known = [name for name in known if name[:1] == word[:1]][:MAX_CANDIDATES]
+    close = get_close_matches(word.lower(), known, n=1, cutoff=0.6)
+    if close:
+        return (f"did you mean `{close[0]}`?",)
+    if 0 < len(known) <= 8:
+        names = ", ".join(f"`{name}`" for name in known)
+        return (f"{kind or 'known here'}: {names}",)
+    return ()

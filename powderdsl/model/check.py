@@ -11,8 +11,7 @@ from functools import partial
 
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Severity, Span
 from powderdsl.model.composition.added_packs import AddedPacks, Difference, pack_words
-from powderdsl.model.composition.compose import Composition, Palette, compose, title
-from powderdsl.model.composition.layout import lay_out
+from powderdsl.model.composition.compose import Composition, Palette, compose, lay_out, title
 from powderdsl.model.composition.names import needs_of, report_misspelled, words_of
 from powderdsl.model.declarations import PackDecl, RulesetDecl
 from powderdsl.model.definitions import define_symbols, element_ramps
@@ -40,10 +39,7 @@ OF_COMPOSITIONS = ("PD315", "PD316")
 
 
 def resolve_names(
-    packs: Sequence[PackDecl],
-    ruleset: RulesetDecl | None,
-    reporter: Reporter,
-    palette: Palette | None = None,
+    packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Reporter, palette: Palette | None = None
 ) -> tuple[Typer, list[tuple[str, int, Span]]]:
     """A typer that knows all names of some packs, and the locations of elements' own property values.
 

@@ -110,9 +110,7 @@ class RampDecl(Entry, noun="a color_by"):
 
     field: Scalar = keyed("the field that the color follows", MISSING)
     start: str | None = keyed(
-        "the color at the low end of the range, quoted; the element's own by default",
-        name="from",
-        form=COLOR,
+        "the color at the low end of the range, quoted; the element's own by default", name="from", form=COLOR
     )
     end: str = keyed(
         'the color at the high end of the range, quoted: "#RRGGBB"', MISSING, name="to", form=COLOR

@@ -13,21 +13,9 @@ from powderdsl.diagnostics import Label, Reporter, Span, suggest
 from powderdsl.model.builtins import FLAG_WORDS
 from powderdsl.model.composition.added_packs import report_replaced
 from powderdsl.model.composition.names import report_unknown
-from powderdsl.model.declarations import (
-    ElementDecl,
-    FieldDecl,
-    KernelDecl,
-    PropertyDecl,
-    RampDecl,
-    TypedDecl,
-)
+from powderdsl.model.declarations import ElementDecl, FieldDecl, KernelDecl, PropertyDecl, RampDecl, TypedDecl
 from powderdsl.model.expressions.operators import Broken, Operand, Poisoned, Scope, SetOf, Unresolved
-from powderdsl.model.expressions.symbols import (
-    clamp,
-    default_of,
-    read_bounds,
-    read_kind,
-)
+from powderdsl.model.expressions.symbols import clamp, default_of, read_bounds, read_kind
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.schema import keys_of
 from powderdsl.model.state import stored_range

@@ -489,7 +489,7 @@ class Ruleset:
     passes: tuple[Pass, ...]
     matrix: tuple[MatrixChannel, ...]
     order: tuple[str, ...] = ()
-    """The names of all that a cell holds besides its element, as `model/composition/layout.py` orders it."""
+    """The names of all that a cell holds besides its element, as `model/composition/compose.py` orders it."""
     tests: tuple[Example, ...] = field(default=(), metadata=UNMEANING)
     invariants: tuple[Invariant, ...] = field(default=(), metadata=UNMEANING)
     side_multiple: int = field(default=1, metadata=UNMEANING)

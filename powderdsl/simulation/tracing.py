@@ -18,8 +18,8 @@ from typing import Any
 
 from powderdsl.arrays import np
 from powderdsl.diagnostics import Label, Span, suggest
+from powderdsl.diagnostics.diagnostic import source_lines
 from powderdsl.diagnostics.printable import printable
-from powderdsl.diagnostics.render import source_lines
 from powderdsl.model import reference
 from powderdsl.model.expressions.operators import TRUE, look
 from powderdsl.model.state import Slot, scratch_slots, slot_name

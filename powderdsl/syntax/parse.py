@@ -40,11 +40,7 @@ class Language:
 
 RULES = Language("rule", ("rule", "expression", "header", "invariant"), "PD201", "PD202", "PD203")
 STATEMENTS = Language(
-    "statement",
-    ("statement", "setting", "shape", "operand", "repeat", "choice"),
-    "PD605",
-    "PD605",
-    "PD605",
+    "statement", ("statement", "setting", "shape", "operand", "repeat", "choice"), "PD605", "PD605", "PD605"
 )
 LANGUAGES = {start: language for language in (RULES, STATEMENTS) for start in language.starts}
 

@@ -18,7 +18,7 @@ from typing import Any
 from powderdsl.arrays import np
 from powderdsl.compiler import load_with_diagnostics, read, shipped
 from powderdsl.diagnostics import CompileError, Reporter
-from powderdsl.diagnostics.render import diagnostic_data, render_text
+from powderdsl.diagnostics.diagnostic import diagnostic_data, render_text
 from powderdsl.model import declarations
 from powderdsl.model.builtins import RESERVED
 from powderdsl.model.definitions import set_params

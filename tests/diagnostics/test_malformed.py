@@ -14,7 +14,7 @@ import pytest
 
 import powderdsl
 from powderdsl.diagnostics import CompileError, Diagnostic
-from powderdsl.diagnostics.render import diagnostic_data, render_text
+from powderdsl.diagnostics.diagnostic import diagnostic_data, render_text
 from powderdsl.system.reports import as_json
 from tests.diagnostics.malformed_details import DETAILS
 

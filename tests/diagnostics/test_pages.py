@@ -31,7 +31,7 @@ from powderdsl.compiler import load_with_diagnostics
 from powderdsl.datasets.manifest import read_manifest
 from powderdsl.diagnostics import CODES, CompileError, Diagnostic, Reporter, Severity, Source
 from powderdsl.diagnostics.codes import page
-from powderdsl.diagnostics.render import render_text
+from powderdsl.diagnostics.diagnostic import render_text
 from powderdsl.experiments.runs import does_not_fit, find_run, held, open_run
 from powderdsl.experiments.studies.run import StudyRun, check_cluster, collected, read_folders
 from powderdsl.experiments.studies.study import TEXT, load_study, read_study

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from powderdsl.compiler import shipped, shipped_rules
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Source
-from powderdsl.diagnostics.render import diagnostic_data, render_text
+from powderdsl.diagnostics.diagnostic import diagnostic_data, render_text
 from powderdsl.model.check import check
 from powderdsl.model.declarations import PackDecl, RulesetDecl
 from powderdsl.model.packs import read_file

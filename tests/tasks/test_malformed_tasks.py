@@ -8,7 +8,7 @@ from contextlib import suppress
 import pytest
 
 from powderdsl.diagnostics import CompileError, Reporter, Severity, Source
-from powderdsl.diagnostics.render import render_text
+from powderdsl.diagnostics.diagnostic import render_text
 from powderdsl.tasks.file import read_task
 from powderdsl.tasks.shipped import load_task
 

@@ -13,6 +13,7 @@ import click
 import pytest
 
 from powderdsl.diagnostics import CompileError, Diagnostic, Label, Source, Span
+from powderdsl.diagnostics.diagnostic import render_text
 from powderdsl.diagnostics.printable import (
     PrintableStream,
     character_name,
@@ -23,7 +24,6 @@ from powderdsl.diagnostics.printable import (
     styled,
     unguarded,
 )
-from powderdsl.diagnostics.render import render_text
 from tests.cli.commands import powderdsl
 
 HOSTILE = "a\x1b]0;owned\x07\x1b[2J\x9b31m\u202eb\nc"

@@ -17,7 +17,7 @@ from powderdsl.cli.exits import BAD_INPUT, FAILED, OK
 from powderdsl.cli.output import counted, print_json, write_diagnostics
 from powderdsl.compiler import load_with_diagnostics, lower
 from powderdsl.diagnostics import CompileError, Diagnostic, Severity
-from powderdsl.diagnostics.render import diagnostic_data
+from powderdsl.diagnostics.diagnostic import diagnostic_data
 from powderdsl.model.types import Ruleset
 from powderdsl.system.reports import table
 from powderdsl.tasks.shipped import is_task

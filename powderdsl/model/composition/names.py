@@ -242,18 +242,12 @@ def order_passes(names: Names, reporter: Reporter) -> dict[str, PassDecl]:
     except CycleError as error:
         cycle = error.args[1][:0:-1]
         start = cycle.index(max(cycle, key=[*passes].index))  # likely in the file that is being written
-        _report_cycle([*cycle[start:], *cycle[: start + 1]], earlier, reporter)
+        cycle = [*cycle[start:], *cycle[: start + 1]]  # each pass comes after the next one
+        places = [(earlier[later][first], f"`{first}` before `{later}`") for later, first in pairwise(cycle)]
+        message = "the order of passes is a cycle: " + " after ".join(f"`{name}`" for name in cycle)
+        helps, others = ["take one of these names out of its `after` or `before`"], places[1:]
+        reporter.error("PD307", message, *places[0], secondary=[Label(*p) for p in others], helps=helps)
     return {name: passes[name] for name in in_order(passes, earlier)}
-
-
-def _report_cycle(cycle: list[str], earlier: dict[str, dict[str, Span]], reporter: Reporter) -> None:
-    """Report passes each of which comes after the next one."""
-    (place, label), *more = [
-        (earlier[later][first], f"`{first}` before `{later}`") for later, first in pairwise(cycle)
-    ]
-    message = "the order of passes is a cycle: " + " after ".join(f"`{name}`" for name in cycle)
-    helps = ["take one of these names out of its `after` or `before`"]
-    reporter.error("PD307", message, place, label, secondary=[Label(*step) for step in more], helps=helps)
 
 
 # Optional names that look like misspelled ones
