@@ -38,9 +38,9 @@ def _sums(ledger: Ledger) -> Iterator[str]:
 
 
 def _sources(ledger: Ledger) -> Iterator[str]:
-    made = {after for _, after in ledger.changes}
-    never = [name for name in ledger.elements if name not in made]
-    copied = [name for name in ledger.elements if name in made and ledger.never_appears(name)]
+    products = {after for _, after in ledger.changes}
+    never = [name for name in ledger.elements if name not in products]
+    copied = [name for name in ledger.elements if name in products and ledger.never_appears(name)]
     standing = [name for name in ledger.elements if ledger.unchanged(name)]
     yield "elements"
     yield f"  no rule makes: {_listed(never)}"

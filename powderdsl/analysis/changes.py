@@ -237,18 +237,18 @@ def _joint_effects(search: SubstepSearch) -> tuple[list[Rule], Pairs]:
         mixing = [rule for rule in rules if not isinstance(rule, Assign)]
     live = [rule for rule in mixing if search.may(rule)]
     lost: Ids = set()
-    made: Ids = set()
+    gained: Ids = set()
     for rule in live:
         cells = footprint(rule) if policy == "overwrite" else footprint(rule)[1:]
         there = {number for at in cells for number in search.elements(rule, at)}
         lost |= there
         if isinstance(rule, Transform):
-            made |= {after for _, after in _becomes(rule, search)}
+            gained |= {after for _, after in _becomes(rule, search)}
         elif isinstance(rule, Move) and rule.leaving is not None:
-            made |= {rule.leaving.value}
+            gained |= {rule.leaving.value}
         if policy == "overwrite" or (isinstance(rule, Move) and rule.leaving is None):
-            made |= there
-    return live, _pairs(lost, made)
+            gained |= there
+    return live, _pairs(lost, gained)
 
 
 # Worlds that lack an element. An element is absent if no cell holds it and no field names it.
@@ -498,10 +498,10 @@ def _in_turn(ruleset: Ruleset) -> Iterator[Candidate]:
     rules: list[tuple[int, RuleLine, Expr, Expr]] = []
     lets: Lets = {}
     for number, (pass_, moment) in enumerate(substeps(ruleset.passes)):
-        lets |= {f"{name}@{number}": _renamed(value, number) for name, value in moment.values.items()}
+        lets |= {f"{name}@{number}": _number_lets(value, number) for name, value in moment.values.items()}
         for rule in moment.rules:
             if isinstance(rule, Transform):
-                rules.append((number, rule_line(rule, pass_), rule.target, _renamed(rule.mask, number)))
+                rules.append((number, rule_line(rule, pass_), rule.target, _number_lets(rule.mask, number)))
     if len({line for _, line, _, _ in rules}) > MAX_LINES:
         return
     for (other, first, earlier, other_mask), (number, second, target, mask) in _ordered_pairs(rules):
@@ -511,9 +511,9 @@ def _in_turn(ruleset: Ruleset) -> Iterator[Candidate]:
             yield Overlap("first in turn", first, second), [way], lets
 
 
-def _renamed(expr: Expr, number: int) -> Expr:
+def _number_lets(expr: Expr, number: int) -> Expr:
     """The expression with the substep's number in names under `let`, which different substeps may share."""
     if expr.op == "let":
         return replace(expr, value=f"{expr.value}@{number}")
-    args = tuple(_renamed(arg, number) for arg in expr.args)
+    args = tuple(_number_lets(arg, number) for arg in expr.args)
     return replace(expr, args=args) if args else expr

@@ -174,6 +174,7 @@ class Ledger:
         reached = {name: {name} for name in self.elements}
         for before, after in pairs:
             reached[before].add(after)
+        # The transitive closure by Warshall's algorithm: the element on the way is the outer loop.
         for middle, start in product(self.elements, repeat=2):
             if middle in reached[start]:
                 reached[start] |= reached[middle]
@@ -230,9 +231,9 @@ class Ledger:
         ]
         if makers:
             return NotProven(f"`{element}` may come of other elements", tuple(makers))
-        made = any(after == element for _, after in self.changes)
+        is_made = any(after == element for _, after in self.changes)
         return Proven(
-            f"rules make `{element}` only where it is already" if made else f"no rule makes `{element}`"
+            f"rules make `{element}` only where it is already" if is_made else f"no rule makes `{element}`"
         )
 
     def reach(self, start: Iterable[str]) -> tuple[str, ...]:
@@ -319,7 +320,7 @@ def ledger(ruleset: Ruleset) -> Ledger:
         tuple(_entry(line, requirements.get(line.line), names) for line in effects),
         find_fields(ruleset, effects),
         find_overlaps(ruleset, parts[2]),
-        tuple(_named(named_by_fields(ruleset), names)),
+        tuple(_names_of(named_by_fields(ruleset), names)),
         all(facts.budget.left > 0 for facts in parts),
     )
 
@@ -330,13 +331,13 @@ def _entry(effects: LineEffects, requirements: Requirements | None, names: Mappi
         effects.line,
         effects.fires,
         tuple((names[a], names[b]) for a, b in sorted(effects.pairs)),
-        tuple(_named(effects.moves, names)),
-        tuple(tuple(_named(ids, names)) for ids in requirements.needs),
-        tuple(_named(requirements.copies & {after for _, after in effects.pairs}, names)),
+        tuple(_names_of(effects.moves, names)),
+        tuple(tuple(_names_of(ids, names)) for ids in requirements.needs),
+        tuple(_names_of(requirements.copies & {after for _, after in effects.pairs}, names)),
     )
 
 
-def _named(ids: Iterable[int], names: Mapping[int, str]) -> Iterator[str]:
+def _names_of(ids: Iterable[int], names: Mapping[int, str]) -> Iterator[str]:
     return (names[number] for number in sorted(ids))
 
 

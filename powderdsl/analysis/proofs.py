@@ -22,6 +22,7 @@ from powderdsl.model.types import (
     Total,
     Transform,
     Unchanging,
+    writes_of,
 )
 
 
@@ -30,32 +31,16 @@ def prove(claim: Claim, ruleset: Ruleset, ledger: Ledger, without: frozenset[int
 
     `NotProven` does not disprove it.
     """
-    verdict = _prove(claim, ruleset, ledger)
-    if verdict or not without or not isinstance(claim, Total) or claim.ids is None:
-        return verdict
-    return _conserved(claim.trend, set(_names(ruleset, claim.ids)), ledger, _names(ruleset, without))
-
-
-def _conserved(trend: str, counted: set[str], ledger: Ledger, without: list[str]) -> Verdict:
-    """The ledger's verdict on a count in worlds without some elements: rules that need these cannot happen."""
-    cells = frozenset(ledger.reach(name for name in ledger.elements if name not in without))
-    lines = [
-        line
-        for line, before, after in ledger.possible(cells)
-        if TREND_BREAKS[trend](after in counted, before in counted)
-    ]
-    if lines:
-        return NotProven("some rule may change the number", tuple(dict.fromkeys(lines)))
-    return Proven("no rule that can happen in such worlds changes the number so")
-
-
-def _prove(claim: Claim, ruleset: Ruleset, ledger: Ledger) -> Verdict:
     match claim:
         case Unchanging():
             verdicts = [ledger.unchanged(name) for name in _names(ruleset, claim.ids)]
             return next((v for v in verdicts if isinstance(v, NotProven)), verdicts[0])
         case Total() if claim.ids is not None:
-            return ledger.keeps(_names(ruleset, claim.ids), claim.trend)
+            counted = _names(ruleset, claim.ids)
+            verdict = ledger.keeps(counted, claim.trend)
+            if verdict or not without:
+                return verdict
+            return _prove_count(claim.trend, set(counted), ledger, _names(ruleset, without))
         case Bounded():
             prop = ruleset.property(claim.field)
             if prop is not None and not prop.stored:
@@ -70,6 +55,19 @@ def _prove(claim: Claim, ruleset: Ruleset, ledger: Ledger) -> Verdict:
             if not satisfiable(facts_of(ruleset), [(claim.condition, (0, 0))]):
                 return Proven("no cell can fulfill the condition")
     return NotProven("no proof is known for statements of this kind")
+
+
+def _prove_count(trend: str, counted: set[str], ledger: Ledger, without: list[str]) -> Verdict:
+    """The ledger's verdict on a count in worlds without some elements: rules that need these cannot happen."""
+    cells = frozenset(ledger.reach(name for name in ledger.elements if name not in without))
+    lines = [
+        line
+        for line, before, after in ledger.possible(cells)
+        if TREND_BREAKS[trend](after in counted, before in counted)
+    ]
+    if lines:
+        return NotProven("some rule may change the number", tuple(dict.fromkeys(lines)))
+    return Proven("no rule that can happen in such worlds changes the number so")
 
 
 def _names(ruleset: Ruleset, ids: Iterable[int]) -> list[str]:
@@ -108,19 +106,15 @@ def _substep_reach(moment: Moment, seen: int, lets: Mapping[str, int]) -> int:
     distances = [seen]
     for rule in moment.rules:
         mask = masks[id(rule)]
+        for write in writes_of(rule):
+            distances.append(_length(write.offset) + max(mask, _sight(write.value, seen, lets)))
         match rule:
-            case Assign():
-                distances.append(_length(rule.offset) + max(mask, _sight(rule.value, seen, lets)))
-                continue
             case Transform():
                 distances.append(max(mask, _sight(rule.target, seen, lets)))
-            case Swap() | Move(leaving=None):
-                distances.append(_length(rule.offset) + max(mask, seen))
-            case _:
-                assert rule.leaving is not None
-                distances.append(_length(rule.offset) + max(mask, seen, _sight(rule.leaving, seen, lets)))
-        for effect in rule.effects:
-            distances.append(_length(effect.offset) + max(mask, _sight(effect.value, seen, lets)))
+            case Swap() | Move():
+                left = rule.leaving if isinstance(rule, Move) else None
+                sight = seen if left is None else max(seen, _sight(left, seen, lets))
+                distances.append(_length(rule.offset) + max(mask, sight))
     return max(distances)
 
 

@@ -248,6 +248,7 @@ def choose(flags: bytes, a: Values, b: Values, kind: Type, count: int) -> Values
     wide = bytearray(count * size)
     for place in range(size):
         wide[place::size] = flags
+    # Bitwise choice on one large integer: 255 turns the flag of each byte into a mask of its bits.
     mask = int.from_bytes(wide, "little") * 255
     x, y = int.from_bytes(memoryview(a), "little"), int.from_bytes(memoryview(b), "little")
     return unpack((y ^ ((x ^ y) & mask)).to_bytes(count * size, "little"), getattr(a, "typecode", "B"))

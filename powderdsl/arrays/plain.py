@@ -469,11 +469,11 @@ def where(condition: Any, yes: Any, no: Any) -> ndarray:
     flags = asarray(condition, bool_)
     a, b, kind, shape = _match(yes, no)
     whole = _together(flags.shape, shape)
-    held, yes, no = (
+    mask, yes, no = (
         broadcast_to(operand, whole).values
         for operand in (flags, ndarray(shape, kind, a), ndarray(shape, kind, b))
     )
-    return ndarray(whole, kind, numbers.choose(bytes(held), yes, no, kind, prod(whole)))
+    return ndarray(whole, kind, numbers.choose(bytes(mask), yes, no, kind, prod(whole)))
 
 
 def isin(values: ndarray, test_elements: Sequence[int]) -> ndarray:

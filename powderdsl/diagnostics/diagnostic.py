@@ -132,14 +132,14 @@ def _snippet(label: Label, caret: str) -> tuple[str, str]:
     left = max(0, start - MAX_SHOWN // 2) if len(raw) > MAX_SHOWN else 0
     right = min(len(raw), left + MAX_SHOWN)
 
-    def shown(piece: str) -> str:
+    def visible(piece: str) -> str:
         # What cannot be printed takes one column, so that carets stay below their text.
         chars = piece.expandtabs(TAB_WIDTH)
         return "".join("\N{REPLACEMENT CHARACTER}" if printable(char) != char else char for char in chars)
 
-    text = ("…" if left else "") + shown(raw[left:right]) + ("…" if right < len(raw) else "")
-    before = _cells(shown(raw[left:start])) + (1 if left else 0)
-    width = max(1, _cells(shown(raw[left : min(end, right)])) + (1 if left else 0) - before)
+    text = ("…" if left else "") + visible(raw[left:right]) + ("…" if right < len(raw) else "")
+    before = _cells(visible(raw[left:start])) + (1 if left else 0)
+    width = max(1, _cells(visible(raw[left : min(end, right)])) + (1 if left else 0) - before)
     return text, (" " * before + caret * width + (f" {printable(label.text)}" if label.text else "")).rstrip()
 
 

@@ -58,7 +58,7 @@ def _escaped(char: str) -> str:
 # Letters that look like others
 
 
-def spelled(word: str) -> str:
+def spell(word: str) -> str:
     """An identifier as a message should print it: letters that only look like ASCII ones as ``\\uXXXX``.
 
     A word in another script stays as it is; a word that mixes ASCII with other scripts, or with other forms of Latin

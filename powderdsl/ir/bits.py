@@ -267,15 +267,15 @@ class Gates(Graph):
             matters, values = (matters >> (1 << i), values >> (1 << i)) if plane.attr else (matters, values)
             matters, values = matters & half, values & half
 
-        def made(split: Split) -> Node:
+        def circuit(split: Split) -> Node:
             if split.low is None:
                 return self.flag(split is _YES)
             plane = inputs[split.input]
             if split.high is None:
-                return self.derive("xor", plane, made(split.low))
-            return self.select(plane, made(split.high), made(split.low))
+                return self.derive("xor", plane, circuit(split.low))
+            return self.select(plane, circuit(split.high), circuit(split.low))
 
-        return made(_best_split(matters, values, len(inputs), tuple(used)))
+        return circuit(_best_split(matters, values, len(inputs), tuple(used)))
 
 
 class Split(NamedTuple):
@@ -305,10 +305,11 @@ def _split(matters: int, values: int, inputs: int, order: Sequence[int]) -> Spli
         return _YES if matters & values else _NO
     first, rest = order[0], order[1:]
     half, step = _half(inputs, first), 1 << first
+    # Numbers whose bit is 1 move to the places of those whose bit is 0, so that both halves can be compared.
     low, high = matters & half, matters >> step & half
     nos, yeses = values & low, values >> step & high
     differ = (nos ^ yeses) & low & high
-    if differ in (0, low & high):
+    if differ in (0, low & high):  # equal or opposite wherever both matter: one table serves both halves
         if differ:
             yeses ^= high
         joined = _split(low | high, nos | yeses & ~low, inputs, rest)

@@ -46,6 +46,7 @@ from powderdsl.model.types import (
     Transform,
     Value,
     footprint,
+    writes_of,
 )
 
 Parts = tuple[Node, ...]
@@ -439,16 +440,16 @@ class _PassLowering:
         if moment.policy in ("drop_both", "first_wins"):
             claims = self._keep_apart(claims, moment.policy)
         movers = [(rule, mask) for rule, mask in claims if not isinstance(rule, Assign)]
-        writes = [
-            (rule, mask, lower_expression(rule.value, at))
-            for rule, mask in claims
-            if isinstance(rule, Assign)
-        ]
-        effects = [
-            (effect, mask, lower_expression(effect.value, at))
-            for rule, mask in movers
-            for effect in rule.effects
-        ]
+        assigns = [(rule, mask) for rule, mask in claims if isinstance(rule, Assign)]
+        # All values are those before the substep; effects land after the movements.
+        writes, effects = (
+            [
+                (write, mask, lower_expression(write.value, at))
+                for rule, mask in rules
+                for write in writes_of(rule)
+            ]
+            for rules in (assigns, movers)
+        )
         before = dict(self.state)
         for write in writes:
             self._assign(*write)
@@ -515,9 +516,8 @@ class _PassLowering:
                 continue
             values = [build.const(part.default, part.type)] * self.ruleset.slots
             for identity, own in slot.own:
-                values[identity] = build.const(
-                    own if part.component is None else own[part.component], part.type
-                )
+                value = own if part.component is None else own[part.component]
+                values[identity] = build.const(value, part.type)
             fresh[part.name] = at.by_element(element, values)
         return fresh
 

@@ -323,14 +323,14 @@ class PassGraph:
     ) -> PassGraph:
         """The pass with other writes for each write of a slot, and another node for each guard."""
 
-        def written(pairs: Iterable[tuple[str, Node]]) -> tuple[tuple[str, Node], ...]:
+        def rewrite(pairs: Iterable[tuple[str, Node]]) -> tuple[tuple[str, Node], ...]:
             return tuple(chain.from_iterable(starmap(write, pairs)))
 
         substeps = [
-            replace(step, writes=written(step.writes), guards=tuple(map(guard, step.guards)))
+            replace(step, writes=rewrite(step.writes), guards=tuple(map(guard, step.guards)))
             for step in self.substeps
         ]
-        return replace(self, substeps=tuple(substeps), outputs=written(self.outputs))
+        return replace(self, substeps=tuple(substeps), outputs=rewrite(self.outputs))
 
 
 @dataclass(frozen=True)

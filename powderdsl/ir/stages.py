@@ -228,7 +228,7 @@ def prune(pass_: PassGraph) -> PassGraph:
     """The pass without writes of the values that slots already have, substeps that write nothing, and constant guards."""
     current: dict[str, Node] = {}
 
-    def changed(writes: Iterable[tuple[str, Node]]) -> tuple[tuple[str, Node], ...]:
+    def without_repeats(writes: Iterable[tuple[str, Node]]) -> tuple[tuple[str, Node], ...]:
         pairs = []
         for slot, node in writes:
             before, current[slot] = current.get(slot), node
@@ -238,7 +238,7 @@ def prune(pass_: PassGraph) -> PassGraph:
 
     substeps = []
     for step in pass_.substeps:
-        if writes := changed(step.writes):
+        if writes := without_repeats(step.writes):
             guards = tuple([guard for guard in step.guards if guard.op != "const" or guard.attr])
             substeps.append(replace(step, writes=writes, guards=guards))
     outputs = tuple([(slot, node) for slot, node in pass_.outputs if not node.is_input(slot)])

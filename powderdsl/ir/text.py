@@ -73,12 +73,12 @@ def structure(pass_: PassGraph, *, places: bool = True) -> bytes:
         args = [numbers[arg] for arg in node.args]
         rows.append((node.op, node.type, args, node.attr, node.index, node.places if places else ()))
 
-    def named(pairs: tuple[tuple[str, Node], ...]) -> object:
+    def numbered(pairs: tuple[tuple[str, Node], ...]) -> object:
         return [(name, numbers[node]) for name, node in pairs]
 
     substeps = [
-        (step.label, step.place if places else "", named(step.writes), [numbers[n] for n in step.guards])
+        (step.label, step.place if places else "", numbered(step.writes), [numbers[n] for n in step.guards])
         for step in pass_.substeps
     ]
-    whole = pass_.name, pass_.pack, substeps, named(pass_.outputs), rows
+    whole = pass_.name, pass_.pack, substeps, numbered(pass_.outputs), rows
     return sha256(repr(whole).encode()).digest()

@@ -333,16 +333,18 @@ class RulesetDecl(Record, noun="a ruleset"):
         return (*lineage.values(), self)
 
     @property
-    def placing(self) -> RulesetDecl:
+    def layout_ruleset(self) -> RulesetDecl:
         """The ruleset whose packs come first in ids and channels: the last that says `slots` or `matrix`."""
-        return self if self.slots or self.matrix or self.base is None else self.base.placing
+        return self if self.slots or self.matrix or self.base is None else self.base.layout_ruleset
 
     @property
-    def placed(self) -> list[str]:
+    def leading_packs(self) -> list[str]:
         """The packs of that ruleset, except packs that others of the same name replace."""
         members = self.members
         return [
-            name for name, ruleset in self.placing.members.items() if members.get(name, ruleset) is ruleset
+            name
+            for name, ruleset in self.layout_ruleset.members.items()
+            if members.get(name, ruleset) is ruleset
         ]
 
     @property

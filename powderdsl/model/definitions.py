@@ -56,7 +56,7 @@ def define_symbols(typer: Typer) -> list[tuple[str, int, Span]]:
     names, elements = symbols.names, symbols.elements
     for name, kernel in names.declared(KernelDecl).items():
         if kernel.shape is not None:
-            symbols.constants[name] = _shaped(name, kernel, kernel.shape, typer)
+            symbols.constants[name] = _shaped_kernel(name, kernel, kernel.shape, typer)
     for name, param in symbols.param_decls.items():
         word = names.of(param.pack, param.name.text)
         if word in names.versions and names.knows(param.pack, word):
@@ -114,7 +114,7 @@ def define_symbols(typer: Typer) -> list[tuple[str, int, Span]]:
     ]
 
 
-def _shaped(name: str, decl: KernelDecl, shape: Syntax, typer: Typer) -> Operand:
+def _shaped_kernel(name: str, decl: KernelDecl, shape: Syntax, typer: Typer) -> Operand:
     """A kernel that is declared by a shape and its radius."""
     try:
         kernel = typer.evaluate(shape, Scope(decl.pack, {}))
@@ -244,11 +244,8 @@ def _check_may_have(field: Field, number: int, element: str, span: Span, typer: 
         label, fix = f"`of:` leaves `{element}` out", f"add `{element}` to `of:`"
     else:
         return
-    message, declared = (
-        f"`{element}` cannot have a `{field.name}` of its own",
-        Label(field.span, "declared here"),
-    )
-    raise typer.fail("PD407", message, span, label, fix, secondary=[declared])
+    message = f"`{element}` cannot have a `{field.name}` of its own"
+    raise typer.fail("PD407", message, span, label, fix, secondary=[Label(field.span, "declared here")])
 
 
 def _value(prop: Property, syntax: Syntax, pack: str, typer: Typer) -> Value | str:

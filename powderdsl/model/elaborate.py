@@ -188,6 +188,7 @@ class Elaborator:
             return value  # a stream's draws are fixed for the whole step
         if value.kind.name in ("draw", "chance"):
             value = self.typer.of_kind(value, REAL, syntax.span)
+        # Copies of a block fix the same name again: each copy gets its own, which earlier rules do not read.
         count = self._lets.get(name, 0)
         self._lets[name] = count + 1
         unique = name if count == 0 else f"{name}#{count + 1}"

@@ -352,8 +352,6 @@ def check_assigned(examples: Sequence[Example], symbols: Composition, reporter: 
             names = (legend[character] for cell, character in cells if cell)
             name = next((name for name in names if elements[name].id not in prop.stored), None)
             if name is not None:
-                message, label = (
-                    f"no rule assigns `{grid.name}` of `{name}`",
-                    f"a cell that holds `{name}` has a value here",
-                )
+                message = f"no rule assigns `{grid.name}` of `{name}`"
+                label = f"a cell that holds `{name}` has a value here"
                 reporter.error("PD407", message, grid.span, label, helps=["write `.` for such cells"])

@@ -120,37 +120,37 @@ class _Statement:
         match line.kind:
             case "trend":  # `SET never changes`, `count(…) never rises`, `count(…) never falls`
                 is_total = parts[0].kind == "call" and parts[0].text in ("count", "sum")
-                self.words(parts[1:], tuple(TRENDS) if is_total else ("changes",))
+                self.check_words(parts[1:], tuple(TRENDS) if is_total else ("changes",))
                 if is_total:
                     return self.total(parts[0], TRENDS[parts[1].text])
                 ids = typer.set_of(typer.evaluate(parts[0], scope), parts[0].span).ids
                 if not ids:
-                    self.says_nothing(parts[0].span, "no element is meant", is_empty=True)
+                    self.report_trivial(parts[0].span, "no element is meant", is_empty=True)
                 return Unchanging(frozenset(ids))
             case "total":  # `count(…) is constant`, `sum(…) is constant`
                 (what,) = parts
                 if what.kind != "is_" or what.children[0].kind != "call" or what.children[1].kind != "name":
                     raise typer.fail("PD201", "this states nothing", what.span, "not an invariant", *_FORMS)
-                self.words(what.children[1:], ("constant",))
+                self.check_words(what.children[1:], ("constant",))
                 return self.total(what.children[0], "constant")
             case "never":  # `never CONDITION`, `never CONDITION for N steps`
                 duration, steps = line.child("duration"), 1
                 if duration is not None:
-                    self.words(duration.children, ("steps", "step"))
+                    self.check_words(duration.children, ("steps", "step"))
                     steps = self.number(duration, 1, MAX_STEPS)
                 condition = typer.condition(parts[0], scope)
                 if condition == TRUE:
                     raise typer.fail(
                         "PD511", "this invariant cannot hold", parts[0].span, "every cell fulfills this",
                         "say what no cell may fulfill")  # fmt: skip
-                return Never(self.asked(condition, parts[0].span), steps)
+                return Never(self.check_open(condition, parts[0].span), steps)
             case "reach":  # `nothing reaches beyond N cells`
-                self.words(parts, ("nothing",), ("reaches",), ("beyond",), ("cells", "cell"))
+                self.check_words(parts, ("nothing",), ("reaches",), ("beyond",), ("cells", "cell"))
                 return Local(self.number(line, 0, MAX_RADIUS))
             case "agree":  # `mirrored worlds agree`, `rotated worlds agree`
-                self.words(parts, ("mirrored", "rotated"), ("worlds",), ("agree",))
+                self.check_words(parts, ("mirrored", "rotated"), ("worlds",), ("agree",))
                 return Symmetric(parts[0].text)
-        return self.stays(line)
+        return self.bounds(line)
 
     def total(self, call: Syntax, trend: str) -> Total:
         typer, scope = self.typer, self.scope
@@ -169,9 +169,9 @@ class _Statement:
                 number for operand, span in operands for number in typer.set_of(operand, span).ids
             )
             if not ids:
-                self.says_nothing(call.span, "no element is counted", is_empty=True)
+                self.report_trivial(call.span, "no element is counted", is_empty=True)
             elif ids == typer.symbols.names_by_id.keys():
-                self.says_nothing(call.span, "all cells are counted")
+                self.report_trivial(call.span, "all cells are counted")
             return Total(member(ELEMENT_HERE, tuple(sorted(ids)), call.span), trend, ids)
         if call.text == "sum" and len(operands) == 1:
             (operand, span), *_ = operands
@@ -183,9 +183,9 @@ class _Statement:
                 raise typer.wrong(value, "an integer", span, fix)
             return Total(value, trend, None)
         flags = [typer.flag(operand, span) for operand, span in operands]
-        return Total(self.asked(disjunction(flags, call.span), call.span), trend, None)
+        return Total(self.check_open(disjunction(flags, call.span), call.span), trend, None)
 
-    def stays(self, line: Syntax) -> Claim:
+    def bounds(self, line: Syntax) -> Claim:
         """`FIELD stays in LOW..HIGH`."""
         typer = self.typer
         what, bounds = line.children
@@ -211,22 +211,22 @@ class _Statement:
             raise typer.fail("PD511", "this invariant cannot hold", bounds.span, label, "widen the bounds")
         return Bounded(name, lo, hi)
 
-    def asked(self, condition: Expr, span: Span) -> Expr:
+    def check_open(self, condition: Expr, span: Span) -> Expr:
         """The condition, after reporting one that is always true or always false."""
         if condition == FALSE:
-            self.says_nothing(span, "no cell can fulfill this", is_empty=True)
+            self.report_trivial(span, "no cell can fulfill this", is_empty=True)
         elif condition == TRUE:
-            self.says_nothing(span, "every cell fulfills this")
+            self.report_trivial(span, "every cell fulfills this")
         return condition
 
-    def says_nothing(self, span: Span, label: str, *, is_empty: bool = False) -> None:
+    def report_trivial(self, span: Span, label: str, *, is_empty: bool = False) -> None:
         """Report an invariant that no world can break. Raises Unresolved if an empty one may need an absent pack."""
         if is_empty and self.typer.absent:
             raise Unresolved(", ".join(sorted(self.typer.absent)))
         message = "this invariant is always true"
         self.typer.reporter.report("PD510", message, span, label, helps=["remove it"])
 
-    def words(self, words: tuple[Syntax, ...], *wanted: tuple[str, ...]) -> None:
+    def check_words(self, words: tuple[Syntax, ...], *wanted: tuple[str, ...]) -> None:
         """Report the first word that is not one of the words wanted in its position."""
         for word, options in zip(words, wanted, strict=True):
             if word.text not in options:
@@ -238,9 +238,7 @@ class _Statement:
     def number(self, line: Syntax, least: int, most: int) -> int:
         text = line.text
         if len(text) > 6 or not least <= int(text) <= most:
-            message, fix = (
-                f"{text[:12]} lies outside {least}..{most}",
-                f"write a number from {least} to {most}",
-            )
+            message = f"{text[:12]} lies outside {least}..{most}"
+            fix = f"write a number from {least} to {most}"
             raise self.typer.fail("PD402", message, line.span, "out of range", fix)
         return int(text)

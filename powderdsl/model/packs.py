@@ -158,9 +158,9 @@ class _PackReader(Reader):
 
     # Passes
 
-    def block(self, kind: type[Block], node: Node, what: str, **given: Any) -> Block:
+    def block(self, kind: type[Block], node: Node, what: str, **known: Any) -> Block:
         entries = self.mapping(kind, node, what)
-        values = given | self.values(kind, entries)
+        values = known | self.values(kind, entries)
         actions = [entry for key, entry in entries.items() if key.startswith(("do", *Block.PREFIXES))]
         if len(actions) > 1:
             self.reporter.error(

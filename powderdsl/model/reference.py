@@ -266,12 +266,8 @@ _OPS: dict[str, Any] = {
 
 # Floats, step by step: each rounds once, to float32. Another order of these steps would give other bits.
 
-FAN = {
-    op: np.dtype("float32").type(value)
-    for op, value in (("near", 0.92387953251128674), ("far", 0.38268343236508977))
-}
+NEAR, FAR = 0.92387953251128674, 0.38268343236508977
 """cos(π/8) and cos(3π/8): the borders of the octants."""
-
 
 HALF_PI = (1.5703125, 0.0004837512969970703125, 7.549789954891609e-08)
 """π/2 in three parts, the first two of so few bits that small multiples of them are exact."""
@@ -315,7 +311,7 @@ def octant(v: Array) -> Array:
     """The octant of the angle acos(x / (|v| + 0.001)), by comparing x with the octants' borders."""
     y, x = v[:, 0], v[:, 1]
     reach = np.sqrt(y * y + x * x) + np.float32(0.001)
-    near, far = FAN["near"] * reach, FAN["far"] * reach
+    near, far = np.float32(NEAR) * reach, np.float32(FAR) * reach
     lower = np.where(x > -far, 2, np.where(x > -near, 3, 4))
     half = np.where(x > near, 0, np.where(x > far, 1, lower))
     return np.where(y < 0, (8 - half) % 8, half)

@@ -10,7 +10,7 @@ from types import UnionType
 from typing import Any, ClassVar, TypeVar, dataclass_transform, get_args, get_origin, get_type_hints
 
 from powderdsl.diagnostics import Reporter, Source, Span, suggest
-from powderdsl.diagnostics.printable import look_alikes, shown_character, spelled
+from powderdsl.diagnostics.printable import look_alikes, shown_character, spell
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.parse import parse_scalar
 from powderdsl.syntax.yaml_tree import Mapping, Node, Scalar, Sequence, parse_yaml
@@ -190,12 +190,12 @@ class Reader:
 
     # Records
 
-    def record(self, kind: type[R], node: Node, what: str, **given: Any) -> R | None:
+    def record(self, kind: type[R], node: Node, what: str, **known: Any) -> R | None:
         """The record of a mapping; None after a report if a field without a default has no value.
 
         Other fields that are absent, or wrong and reported, have their defaults.
         """
-        return self.build(kind, **given, **self.values(kind, self.mapping(kind, node, what)))
+        return self.build(kind, **known, **self.values(kind, self.mapping(kind, node, what)))
 
     def build(self, kind: type[R], **values: Any) -> R | None:
         """A record of values by field, unless a field without a default lacks one."""
@@ -242,8 +242,8 @@ class Reader:
             case "section":
                 return tuple(self.entries(row.type, node))
             case "record":
-                given = {"name": key} if issubclass(row.type, Entry) else {}
-                return self.record(row.type, node, f"`{key.text}`", **given)
+                known = {"name": key} if issubclass(row.type, Entry) else {}
+                return self.record(row.type, node, f"`{key.text}`", **known)
             case "pairs":
                 wanted = f"a mapping from {row.maps}"
                 pairs = self.pairs(node, wanted, about) if row.maps else self.named(node, "a value")
@@ -391,7 +391,7 @@ class Reader:
             return True
         odd = look_alikes(key.text)
         if odd:
-            word, label = spelled(word), "not all of it is plain ASCII"
+            word, label = spell(word), "not all of it is plain ASCII"
             helps = ["type these again: " + ", ".join(shown_character(char) for char in odd)]
         else:
             label = "letters, digits and `_`, a letter first"

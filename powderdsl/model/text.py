@@ -193,23 +193,23 @@ class _Printer:
             tags = f" tags {' '.join(sorted(element.tags))}" if element.tags else ""
             color = f"{element.color}{ramp_text(element)}"
             head = f"element {element.id} {element.qualified} {element.glyph} {color}{tags}"
-            yield self.placed(head, element.span)
+            yield self.with_place(head, element.span)
         for prop in rules.properties:
             values = ", ".join(
                 f"{e.name} {show_value(rules, prop.kind, prop.values[e.id])}" for e in rules.elements
             )
             stored = f" stored {show_set(rules, prop.stored)}" if prop.stored else ""
-            yield self.placed(f"property {prop.name} {prop.kind}{stored}: {values}", prop.span)
+            yield self.with_place(f"property {prop.name} {prop.kind}{stored}: {values}", prop.span)
         for item in rules.fields:
-            yield self.placed(f"field {self.field(item)}", item.span)
+            yield self.with_place(f"field {self.field(item)}", item.span)
         for stream in rules.streams:
             yield f"stream {stream.name} {stream.bits} bits, number {stream.ident:#010x}"
         for param in rules.params:
             value = show_value(rules, param.kind, param.default)
-            yield self.placed(f"param {param.name} {param.kind} = {value}", param.span)
+            yield self.with_place(f"param {param.name} {param.kind} = {value}", param.span)
         for example in rules.tests:
             steps = f"{example.steps} step{'' if example.steps == 1 else 's'}"
-            yield self.placed(f"test {example.pack}: {example.name}, {steps}", example.span)
+            yield self.with_place(f"test {example.pack}: {example.name}, {steps}", example.span)
 
     def field(self, item: Field) -> str:
         default = show_value(self.ruleset, item.kind, item.default)
@@ -229,15 +229,15 @@ class _Printer:
         return lines
 
     @staticmethod
-    def placed(text: str, span: Span) -> str:
+    def with_place(text: str, span: Span) -> str:
         return f"{text}  # {place_of(span)}"
 
     # Passes
 
     def pass_lines(self, pass_: Pass) -> Iterator[str]:
-        yield self.placed(f"pass {pass_.name} of {pass_.pack}", pass_.span)
+        yield self.with_place(f"pass {pass_.name} of {pass_.pack}", pass_.span)
         for item in pass_.scratch:
-            yield self.placed(f"  scratch {item.name} {item.kind}", item.span)
+            yield self.with_place(f"  scratch {item.name} {item.kind}", item.span)
         for moment in pass_.moments:
             yield from self.moment_lines(moment)
 
@@ -246,9 +246,9 @@ class _Printer:
         policy = "" if moment.policy == "prove" else f" conflicts {moment.policy}"
         yield f"  substep{label}{policy}"
         for let in moment.lets:
-            yield self.placed(f"    let {let.name}: {let.value.kind} = {self.expr(let.value)}", let.span)
+            yield self.with_place(f"    let {let.name}: {let.value.kind} = {self.expr(let.value)}", let.span)
         for rule in moment.rules:
-            yield self.placed(f"    {self.rule(rule)}", rule.span)
+            yield self.with_place(f"    {self.rule(rule)}", rule.span)
 
     def rule(self, rule: Rule) -> str:
         text = ""

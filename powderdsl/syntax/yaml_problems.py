@@ -106,10 +106,8 @@ def _explain(place: Place, words: str) -> Diagnostic:
         backslash = place.text.rfind("\\", 0, place.at + 1)
         return _problem("an unknown escape", place.span(backslash, 2), label, fix)
     if matches("could not find expected ':'"):
-        span, fix = (
-            place.rest(place.since),
-            "a key ends with `:`; text that continues is indented deeper than its key",
-        )
+        span = place.rest(place.since)
+        fix = "a key ends with `:`; text that continues is indented deeper than its key"
         return _problem("a line that is neither a key nor a value", span, "no `:` after it", fix)
     if matches("sequence entries are not allowed"):
         quoted, fix = place.quoted(place.at), "put `- …` on a line of its own"
@@ -171,10 +169,8 @@ def _unclosed_bracket(place: Place) -> Diagnostic:
     comment = _comment(place)
     if comment is not None:
         value = re.split(r"[ \t\r\n,}\]]", place.text[comment:], maxsplit=1)[0]
-        message, label = (
-            f"a comment inside `{opener}…{closer}`",
-            "YAML reads a `#` after a space as a comment",
-        )
+        message = f"a comment inside `{opener}…{closer}`"
+        label = "YAML reads a `#` after a space as a comment"
         fix = f'put quotes around a value that starts with `#`: "{value}"'
         return _problem(message, place.rest(comment), label, fix, Label(opened, "opened here"))
     message, fix = f"a `{opener}` that is never closed", f"write the `{closer}`"

@@ -55,14 +55,9 @@ def pack_words(pack: PackDecl) -> Iterator[str]:
     for entry in pack.entries:
         if entry.ramp is not None:
             yield entry.ramp.field.word.rpartition(".")[2]
-    lines = [*pack.lines, *pack.invariants]
-    for named_set in pack.sets:
-        lines.append(named_set.members)
-    for test in pack.tests:
-        lines += test.always
-    for decl in pack.fields:
-        if decl.of is not None:
-            lines.append(decl.of)
+    lines = [*pack.lines, *pack.invariants, *(named_set.members for named_set in pack.sets)]
+    lines += [line for test in pack.tests for line in test.always]
+    lines += [decl.of for decl in pack.fields if decl.of is not None]
     for line in lines:
         yield from words_of(line)
 
@@ -75,13 +70,18 @@ GivenValue = tuple[str, Span, Syntax | ColorRamp]
 
 
 def report_replaced(
-    what: str, element: str, lost: GivenValue, held: GivenValue, composition: Composition, reporter: Reporter
+    what: str,
+    element: str,
+    loser: GivenValue,
+    winner: GivenValue,
+    composition: Composition,
+    reporter: Reporter,
 ) -> None:
     """Report that a pack replaces a value of another pack: a note if it needs that pack, else a warning.
 
     Values of a ruleset replace values of its packs without a report; a pack that is added to it may replace them.
     """
-    (before, old, lost_value), (after, new, value) = lost, held
+    (before, old, lost_value), (after, new, value) = loser, winner
     needs = composition.names.needs
     if after not in needs or _meaning(lost_value) == _meaning(
         value

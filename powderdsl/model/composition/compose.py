@@ -244,15 +244,15 @@ def compose(
     ids = _ids(requests, names, ruleset is not NO_RULESET, palette) if palette else natural
     _report_ids(every_request, ids, names, reporter, recorded=palette is not None)
     elements = _elements(declared, ids, reporter)
-    wanted = ruleset.placing.slots or 0
+    wanted = ruleset.layout_ruleset.slots or 0
     own = max((ids.get(decl.qualified, -1) for decl in requests[0]), default=-1) + 1 if requests else 0
     # The packs of the ruleset that declares `slots` must fit; packs loaded on top of them add slots.
-    beyond = [e for e in elements.values() if 0 < wanted <= e.id and e.pack in ruleset.placed]
+    beyond = [e for e in elements.values() if 0 < wanted <= e.id and e.pack in ruleset.leading_packs]
     if palette is None and beyond:
         top = beyond[-1]
         reporter.error(
             "PD402", f"element `{top.name}` has id {top.id}, but the ruleset has {wanted} slots", top.span,
-            helps=[f"say `slots: {top.id + 1}` in {ruleset.placing.source.name}"],
+            helps=[f"say `slots: {top.id + 1}` in {ruleset.layout_ruleset.source.name}"],
         )  # fmt: skip
     composition = Composition(
         packs=loaded,
@@ -322,7 +322,7 @@ def _groups(packs: Mapping[str, PackDecl], ruleset: RulesetDecl) -> list[list[Pa
     A ruleset's own packs come first, packs that it leaves out included, because their positions stay reserved. Each
     further pack follows by itself, after the packs that it needs: the order in which packs are named matters little.
     """
-    own = ruleset.placed
+    own = ruleset.leading_packs
     groups = [
         [packs.get(name) or ruleset.left_out[name] for name in own if name in packs.keys() | ruleset.left_out]
     ]
@@ -528,7 +528,7 @@ def lay_out(
         for name in block:
             if name not in fields or not fields[name].resets:
                 parts[2 * group + 1] += known[name]
-    written = composition.ruleset.placing.matrix
+    written = composition.ruleset.layout_ruleset.matrix
     if written:
         own = [_named_channels(scalar, known, composition, reporter) for scalar in written]
         shown = [parts[0] if channels is None else channels for channels in own]

@@ -283,15 +283,15 @@ def report_misspelled(
             unknown.setdefault(word, {})[span] = None
     others = elsewhere() if unknown else {}
     for word, places in unknown.items():
-        meant = None if word in others else _meant(word, (*sorted(known), *others))
-        if meant is None:
+        closest = None if word in others else _closest(word, (*sorted(known), *others))
+        if closest is None:
             continue
         first, *more = places
         reporter.report(
             "PD315", f"no loaded or shipped pack defines `{word}`", first,
             "with the `?`, it is always absent",
             secondary=[Label(span, "and here") for span in more[:MAX_PLACES]],
-            helps=[f"did you mean `{meant}?`" + ("" if meant in known else f", which `{others[meant]}` defines")],
+            helps=[f"did you mean `{closest}?`" + ("" if closest in known else f", which `{others[closest]}` defines")],
         )  # fmt: skip
 
 
@@ -331,7 +331,7 @@ def _optional_names(value: object) -> Iterator[tuple[str, Span]]:
         yield from _optional_names(part)
 
 
-def _meant(word: str, names: Sequence[str]) -> str | None:
+def _closest(word: str, names: Sequence[str]) -> str | None:
     """The name that a word misspells. Short words, and the first letter, are taken to be right: `ash` is not `dash`."""
     longer = [name for name in names if name[0] == word[0] and min(len(name), len(word)) > 3]
     turned = (name for name in longer if sorted(name) == sorted(word))

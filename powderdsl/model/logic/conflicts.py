@@ -221,7 +221,7 @@ def _report_conflicts(
     """Report conflicts; the passes with those resolved that added packs bring about."""
     resolved: set[tuple[int, int]] = set()
     for conflict, (elements, places) in conflicts.items():
-        words = _in_words(facts, elements)
+        words = _example_text(facts, elements)
         pass_, moments = passes[places[0][0]], [passes[at].moments[number] for at, number in places]
         causes = (
             added.causes(pass_.pack, conflict.second, list(elements.values()) or facts.ids) if added else ()
@@ -229,7 +229,7 @@ def _report_conflicts(
         if not causes:
             conflict.report([moment.label for moment in moments], words, reporter)
             continue
-        settled = conflict.assigns or all(map(_may_settle, moments))
+        settled = conflict.assigns or all(map(_allows_first_wins, moments))
         if settled and not conflict.assigns:
             resolved.update(places)
         conflict.report_added(causes, pass_.name, words, settled, reporter)
@@ -240,7 +240,7 @@ def _report_conflicts(
     return tuple([replace(pass_, moments=tuple(moments)) for pass_, moments in pairs])
 
 
-def _may_settle(moment: Moment) -> bool:
+def _allows_first_wins(moment: Moment) -> bool:
     """True if `first_wins` changes nothing where no two rules meet.
 
     Without the policy, moves may go where another one leaves, and transforms into one element may all have their
@@ -283,7 +283,7 @@ def _conflicts_of(
         pairs = (
             (rules[j][0], ((rules[j][1], HERE), (mask, at)))
             for j in (i, *range(i))
-            for at in _claims(rules[j][0], second)
+            for at in _claim_offsets(rules[j][0], second)
             if not _are_disjoint(domains[j], domains[i], at, facts.budget)
         )
         for first, question in pairs:
@@ -292,7 +292,7 @@ def _conflicts_of(
             answer = decide(facts, question, lets)
             if answer:
                 conflict = _conflict(first, second)
-                yield _parity(conflict, question, facts, lets), example(facts, question, lets)
+                yield _suggest_side_multiple(conflict, question, facts, lets), example(facts, question, lets)
                 break
             if answer is None and undecided is None:
                 undecided = first
@@ -300,17 +300,15 @@ def _conflicts_of(
             if undecided is not None and facts.budget.left >= 0:
                 # That their conditions exclude each other would not help.
                 note = "their conditions combine too many values to decide whether they can meet"
-                helps = (
-                    "choose what happens if they do: `conflicts: first_wins`",
-                    "or put one of them under `then:`",
-                )
+                choice = "choose what happens if they do: `conflicts: first_wins`"
+                helps = (choice, "or put one of them under `then:`")
                 yield replace(_conflict(undecided, second), notes=(note,), helps=helps), {}
 
 
 _PLACES = {(0, 0): "here", (-1, 0): "above", (1, 0): "below", (0, -1): "on the left", (0, 1): "on the right"}
 
 
-def _in_words(facts: Facts, elements: dict[Offset, int]) -> str:
+def _example_text(facts: Facts, elements: dict[Offset, int]) -> str:
     """An example of elements where two rules meet, such as `x` here and `y` below."""
     names = [(at, facts.names[number]) for at, number in sorted(elements.items()) if number in facts.names]
     if not names or len(elements) > 4:
@@ -319,7 +317,7 @@ def _in_words(facts: Facts, elements: dict[Offset, int]) -> str:
     return "for example with " + " and ".join(filter(None, [", ".join(places), last]))
 
 
-def _claims(first: Rule, second: Rule) -> Iterator[Offset]:
+def _claim_offsets(first: Rule, second: Rule) -> Iterator[Offset]:
     """The offsets from the first rule's cell to cells in which the second rule would claim a cell of the first."""
     if isinstance(first, Assign) or isinstance(second, Assign):
         assert isinstance(first, Assign)
@@ -354,10 +352,8 @@ def _conflict(first: Rule, second: Rule) -> Conflict:
     if first is second or first.span == second.span:
         message = "a cell may be both mover and target"
         note = "the moves of one substep happen at once: no cell may take part in two of them"
-        helps = (
-            "add a condition that a target cannot meet, such as a comparison of densities",
-            "or choose a policy: `conflicts: drop_both`",
-        )
+        fix = "add a condition that a target cannot meet, such as a comparison of densities"
+        helps = (fix, "or choose a policy: `conflicts: drop_both`")
         return Conflict("PD501", message, here, here, (note,), helps)
     code = "PD501" if isinstance(first, (Swap, Move)) or isinstance(second, (Swap, Move)) else "PD502"
     message = "two rules may claim the same cell in one substep"
@@ -365,7 +361,7 @@ def _conflict(first: Rule, second: Rule) -> Conflict:
     return Conflict(code, message, here, there, (), (_EXCLUDE, choice))
 
 
-def _parity(conflict: Conflict, question: Conditions, facts: Facts, lets: Lets) -> Conflict:
+def _suggest_side_multiple(conflict: Conflict, question: Conditions, facts: Facts, lets: Lets) -> Conflict:
     """The conflict with the fix for rules that alternate by row or column: worlds without a seam keep them apart."""
     exprs = [*(condition for condition, _ in question), *lets.values()]
     nodes = [node for expr in exprs for node in expr.walk()]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import TYPE_CHECKING
 
 from powderdsl.diagnostics import Label, Reporter, Span
@@ -140,7 +141,7 @@ def _report_overruled(
         for place, rule in enumerate(moment.rules):
             if not matters.get(rule.span):
                 rivals = _rivals(rule, place, moment)
-                matters.add(rule.span, _matters(rule, rivals, moment, facts))
+                matters.add(rule.span, _may_matter(rule, rivals, moment, facts))
                 if rivals:
                     winners.setdefault(rule.span, rivals[0])
     for span in matters.where(False):
@@ -155,7 +156,7 @@ def _report_overruled(
     return [span for span in matters.where(None) if not _inside_any(span, silent)]
 
 
-def _matters(rule: Rule, rivals: Sequence[Rule], moment: Moment, facts: Facts) -> bool | None:
+def _may_matter(rule: Rule, rivals: Sequence[Rule], moment: Moment, facts: Facts) -> bool | None:
     """False if the rivals of a rule always overrule it; None if deciding takes too much work."""
     facts.budget.left -= len(moment.rules) // GLANCES
     if facts.budget.left < 0:
@@ -188,7 +189,7 @@ def _rivals(rule: Rule, place: int, moment: Moment) -> list[Rule]:
 
 
 def report_undrawn(
-    ruleset: Ruleset, given: Sequence[tuple[str, int, Span]], facts: Facts, reporter: Reporter
+    ruleset: Ruleset, element_values: Sequence[tuple[str, int, Span]], facts: Facts, reporter: Reporter
 ) -> list[Span]:
     """Report chances of elements against which no rule draws there: mostly a tag is missing.
 
@@ -201,7 +202,7 @@ def report_undrawn(
     quick = _limited(facts)
     undecided = []
     shown = {channel.source for channel in ruleset.matrix}
-    for name, number, span in given:
+    for name, number, span in element_values:
         prop = facts.properties[name]
         if prop.kind != CHANCE or name in shown or prop.values[number] == 0:
             continue
@@ -265,7 +266,7 @@ def _report_lost_writes(
             for write in writes_of(rule):
                 key, field = (write.span, write.field), fields.get(write.field)
                 if field and field.of is not None and rule.span not in silent and not arrives.get(key):
-                    arrives.add(key, _arrives(write, rule, tuple(sorted(field.of)), moment, facts))
+                    arrives.add(key, _may_land(write, rule, tuple(sorted(field.of)), moment, facts))
     for span, name in arrives.where(False):
         reporter.report(
             "PD516", f"this write to `{name}` is always lost", span, f"no cell that it reaches has a `{name}`",
@@ -275,7 +276,7 @@ def _report_lost_writes(
     return [span for span, _ in arrives.where(None)]
 
 
-def _arrives(write: Assign, rule: Rule, ids: tuple[int, ...], moment: Moment, facts: Facts) -> bool | None:
+def _may_land(write: Assign, rule: Rule, ids: tuple[int, ...], moment: Moment, facts: Facts) -> bool | None:
     """True if the cell may hold one of these elements when the write lands; None if deciding takes too much work.
 
     Assignments come before movements, effects after them.
@@ -377,10 +378,9 @@ def _report_unwritten(composition: Composition, reporter: Reporter) -> None:
     for name, field in names.declared(FieldDecl).items():
         if name not in words and field.name.text not in words:
             _unused("field", name, field.span, reporter)
-    for block in (
-        block for pack in composition.packs.values() for pass_ in pack.passes for block in pass_.walk()
-    ):
-        inner = [line for pass_ in block.walk() if pass_ is not block for line in pass_.lines]
+    passes = chain.from_iterable(pack.passes for pack in composition.packs.values())
+    for block in chain.from_iterable(pass_.walk() for pass_ in passes):
+        inner = [line for nested in block.walk() if nested is not block for line in nested.lines]
         later = {word for line in (*block.lines[len(block.lets) :], *inner) for word in words_of(line)}
         for scalar, value in reversed(block.lets):
             if scalar.text not in later:
@@ -421,11 +421,7 @@ def without_dead_overrides(passes: tuple[Pass, ...], dead: frozenset[str]) -> tu
         rules = [r for r in moment.rules if not (isinstance(r, Assign) and r.field in dead)]
         return replace(moment, rules=tuple(rules))
 
-    return (
-        tuple(replace(pass_, moments=tuple(map(alive, pass_.moments))) for pass_ in passes)
-        if dead
-        else passes
-    )
+    return tuple(replace(pass_, moments=tuple(map(alive, pass_.moments))) for pass_ in passes)
 
 
 def produced_ids(passes: tuple[Pass, ...], facts: Facts) -> frozenset[int]:

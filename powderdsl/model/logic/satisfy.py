@@ -131,8 +131,9 @@ def _ask(
     facts: Facts, conditions: Conditions, lets: Lets | None, answer: Callable[[_Search], Answer]
 ) -> Answer | None:
     """The answer of a search for these conditions; None if that takes too much work."""
+    # A question may spend `most` nodes: the rest is set aside meanwhile, so that one check at each node is enough.
     budget = facts.budget
-    reserve = max(budget.left - budget.most, 0)  # for the next question
+    reserve = max(budget.left - budget.most, 0)
     budget.left -= reserve
     try:
         budget.spend(QUESTION)
@@ -219,7 +220,10 @@ class _Search:
         return True
 
     def _assign(self, keys: list[int], joint: list[_Term]) -> bool:
-        """Choose values of variables, one after the other, with which the conditions may hold."""
+        """Choose values of variables, one after the other, with which the conditions may hold.
+
+        Each choice is checked at once against the bounds of all conditions that read the variable (backtracking).
+        """
         if not keys:
             return True
         key, *others = keys
