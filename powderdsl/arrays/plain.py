@@ -505,6 +505,10 @@ def isnan(x: ndarray) -> ndarray:
     return _compare("ne", x, x)
 
 
+def isfinite(x: ndarray) -> ndarray:
+    return ndarray(x.shape, bool_, bytes(map(math.isfinite, x.values)))
+
+
 def errstate(**_: str) -> nullcontext[None]:
     """Arithmetic never warns here."""
     return nullcontext()

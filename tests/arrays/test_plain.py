@@ -156,6 +156,7 @@ UNARY: dict[str, Callable[..., Any]] = {
     "abs": lambda np, a: np.abs(a),
     "sqrt": lambda np, a: np.sqrt(a),
     "isnan": lambda np, a: np.isnan(a),
+    "isfinite": lambda np, a: np.isfinite(a),
     "floor": lambda np, a: np.floor(a),
     "tolist": lambda np, a: a.tolist(),
     "any": lambda np, a: a.any(),
