@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -41,6 +41,15 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if long:
         config.hook.pytest_deselected(items=[one for one in items if one in long])
         items[:] = [one for one in items if one not in long]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _compiled_once() -> Iterator[None]:
+    """Rules that tests load again are neither checked nor lowered again."""
+    from tests.models import compiled_once  # late: the wheel tests begin without the compiler
+
+    with compiled_once():
+        yield
 
 
 @pytest.fixture(scope="session")

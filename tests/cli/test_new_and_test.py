@@ -194,7 +194,7 @@ def test_no_tests_are_no_failure(folder):
 
 @pytest.mark.slow
 def test_the_tests_in_the_shipped_packs_pass():
-    result = powderdsl("test", "powderworld")
+    result = powderdsl("test", "powderworld", "--examples", "100")
     assert result.exit_code == 0, result.stdout
 
 

@@ -14,6 +14,7 @@ import pytest
 from tests.cli.commands import environment_with
 from tests.cli.endless import COMMANDS, Place, last_step
 from tests.processes import waited
+from tests.tiers import tiered
 
 pytestmark = pytest.mark.skipif(
     not Path("/proc/self/environ").exists(), reason="looks for processes in /proc"
@@ -21,7 +22,7 @@ pytestmark = pytest.mark.skipif(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", tiered(COMMANDS, ["video", "compile", "train", "wm train", "fuzz"]))
 def test_sigterm_ends_a_command_cleanly(name: str, tmp_path: Path) -> None:
     if name == "video":
         pytest.importorskip("imageio_ffmpeg")
@@ -41,7 +42,7 @@ def test_sigterm_ends_a_command_cleanly(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["video", "fuzz", "mutate", "wm train"])
+@pytest.mark.parametrize("name", tiered(["video", "fuzz", "mutate", "wm train"], ["video", "mutate"]))
 def test_after_sigkill_nothing_runs_on_and_the_next_command_works(name: str, tmp_path: Path) -> None:
     if name == "video":
         pytest.importorskip("imageio_ffmpeg")

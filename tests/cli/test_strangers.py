@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.commands import powderdsl
+from tests.tiers import tiered
 
 ELEMENT = """
 pack: slime
@@ -128,7 +129,7 @@ def run(*words: str) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", PACKS)
+@pytest.mark.parametrize("name", tiered(PACKS, ["crab"]))
 def test_a_pack_of_each_kind_goes_through_every_command(name: str) -> None:
     file = f"{name}.yaml"
     run("check", f"powderworld+{file}", "--quick")

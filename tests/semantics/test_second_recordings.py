@@ -32,6 +32,7 @@ import powderdsl
 from powderdsl.model.state import slots
 from powderdsl.model.types import Ruleset
 from tests.recordings import Recording, State, given, read_recording, recording_paths, where_first
+from tests.tiers import tiered
 
 DATA = Path(__file__).parents[1] / "data" / "second"
 RECORDINGS = recording_paths("POWDERDSL_SECOND_RECORDINGS", DATA, "before_custom1")
@@ -113,9 +114,10 @@ def compiled(name: str, backend: str) -> Runner:
     return Runner(backend, ruleset, powderdsl.compile(ruleset, backend=backend))
 
 
-@pytest.fixture(
-    params=[(name, backend) for name in RULESETS for backend in ("reference", "wasm")], ids="-".join
-)
+RUNNERS = [(name, backend) for name in RULESETS for backend in ("reference", "wasm")]
+
+
+@pytest.fixture(params=tiered(RUNNERS, RUNNERS[1:3]), ids="-".join)
 def runner(request: pytest.FixtureRequest) -> Runner:
     return compiled(*request.param)
 

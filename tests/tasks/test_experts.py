@@ -166,7 +166,7 @@ def test_scores_on_the_experts_scale() -> None:
 
 def test_test_worlds_that_are_training_worlds_are_told_apart() -> None:
     """A sixth of these test worlds are empty, as training worlds without lines and disks are."""
-    found = evaluate(load_task("destroying"), episodes=64, policies=["nothing"], backend="torch")
+    found = evaluate(load_task("destroying"), episodes=64, policies=["nothing"], backend="wasm")
     assert list(found.seen) == ["test"]
     seen = found.seen["test"]
     assert 3 < seen.worlds < 25

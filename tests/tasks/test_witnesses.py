@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from powderdsl.compiler import shipped
 from powderdsl.tasks.shipped import load_task, shipped_tasks
 from tests.tasks.witnesses import WITNESSES, Act, Seen
 from tests.tiers import tiered
@@ -84,7 +85,9 @@ def play(name: str, split: str) -> dict[str, Played]:
     return {player: Played(solved[part], returns[part]) for player, part in zip(PLAYERS, parts, strict=True)}
 
 
-SECOND = [name for name in shipped_tasks() if load_task(name).family]
+SECOND = [
+    name for name in shipped_tasks() if "\nfamily:" in (shipped("tasks") / f"{name}.yaml").read_text("utf-8")
+]
 
 
 @pytest.mark.parametrize("split", ["train", "test"])

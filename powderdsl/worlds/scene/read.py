@@ -6,6 +6,7 @@ import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -277,7 +278,17 @@ def shipped_scenes() -> tuple[Scene, ...]:
     package = Path(__file__).resolve().parents[2]
     installed = package / "data" / "tasks" / "scenes"
     directory = installed if installed.is_dir() else package.parent / "tasks" / "scenes"
-    return tuple(scene for path in sorted(directory.glob("*.yaml")) for scene in read_file(path))
+    sources = [read_source(path, Reporter()) for path in sorted(directory.glob("*.yaml"))]
+    return tuple(scene for source in filter(None, sources) for scene in _scenes_of(source))
+
+
+@lru_cache(maxsize=32)
+def _scenes_of(source: Source) -> tuple[Scene, ...]:
+    """The scenes of a shipped file, which tasks and tests look up again and again. Raises CompileError."""
+    reporter = Reporter()
+    scenes = read_scenes(source, reporter)
+    reporter.raise_if_errors()
+    return scenes
 
 
 def read_file(path: Path) -> tuple[Scene, ...]:
