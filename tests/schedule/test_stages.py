@@ -91,7 +91,7 @@ FAULTY = (533, 5351)
 
 
 @pytest.mark.parametrize("stages", [CPU, CUDA], ids=("cpu", "cuda"))
-@pytest.mark.parametrize("rules", RULES)
+@pytest.mark.parametrize("rules", tiered(RULES, RULES[:-3]))
 def test_every_stage(rules: str, stages: tuple[Stage, ...]) -> None:
     run_stages(load(rules), stages)
 
@@ -146,7 +146,7 @@ def run_stages(rules: Ruleset, stages: tuple[Stage, ...]) -> None:
 
 
 @pytest.mark.parametrize("in_place", [False, True])
-@pytest.mark.parametrize("rules", RULES)
+@pytest.mark.parametrize("rules", tiered(RULES, RULES[:-3]))
 def test_buffers(rules: str, in_place: bool) -> None:
     """No variable is read after its buffer has been written over; values end in their slots' own buffers."""
     pool: Pool | None = None
