@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -13,26 +12,13 @@ from powderdsl.simulation.simulator import Simulator
 from powderdsl.targets.cpp.build import Building
 from tests.cli.commands import command_line, environment_with, powderdsl
 from tests.compilers import skip_without_compiler
-from tests.fuzz import COMPARED, STARTS_AT_ONCE, differential
+from tests.fuzz import COMPARED, differential
 from tests.fuzz.cases import read_case, write_case
 from tests.fuzz.reducer import reduce_case
-from tests.processes import started, waited
 
 
 def listed(names: tuple[str, ...]) -> str:
     return f"{', '.join(names[:-1])} and {names[-1]}"
-
-
-@pytest.mark.slow
-def test_a_run_reports_what_it_compared(tmp_path: Path) -> None:
-    options = ("fuzz", "--jobs", 1, "--worlds", 2, "--steps", 1, "--save", tmp_path)
-    options += ("--backends", "torch,wasm")
-    first = powderdsl(*options, "--seeds", "0..2")
-    assert first.exit_code == 0, first.stderr
-    assert "2 rulesets" in first.stdout
-    assert "torch and wasm against the reference" in first.stdout
-    assert "no differences found" in first.stdout
-    assert "bit planes" in first.stdout
 
 
 @pytest.mark.slow
@@ -45,49 +31,6 @@ def test_every_target_is_compared_unless_some_are_named(tmp_path: Path) -> None:
     some = powderdsl(*given, "--backends", "reference,cuda-emulated")
     assert some.exit_code == 0, some.stderr
     assert ": cuda-emulated against the reference" in some.stdout
-
-
-def test_without_a_compiler_the_others_are_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CXX", "no-such")
-    given = ("fuzz", "--jobs", 1, "--worlds", 1, "--steps", 1, "--seeds", "0..1", "--save", tmp_path)
-    usual = powderdsl(*given)
-    assert usual.exit_code == 0
-    assert "without `native` and `cuda-emulated`: no C++ compiler" in usual.stderr
-    assert f": {listed(STARTS_AT_ONCE)} against the reference" in usual.stdout
-    asked = powderdsl(*given, "--backends", "wasm,cuda-emulated")
-    assert asked.exit_code == 2
-    assert "leave `cuda-emulated` out of --backends" in asked.stderr
-
-
-@pytest.mark.slow
-def test_ctrl_c_ends_a_run_with_its_report(tmp_path: Path) -> None:
-    line = command_line(
-        "fuzz", "--jobs", 1, "--worlds", 1, "--steps", 1, "--save", tmp_path / "found", "--backends", "wasm"
-    )
-    with started([*line, "--seeds", "0..100000"], env=environment_with(), stdout=subprocess.PIPE) as running:
-        assert waited(lambda: (tmp_path / "found").exists() or running.poll() is not None)
-        running.send_signal(signal.SIGINT)
-        told, _ = running.communicate(timeout=240)
-    assert running.returncode == 0
-    assert "interrupted" in told
-    assert "no differences found" in told
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (("--seeds", "5..2"), "is not a range of seeds"),
-        (("--backends", "torch,sparse"), "no backend `sparse`"),
-        (("--backends", "torch,wasm,torch"), "`torch` is named twice: nothing is compared with itself"),
-        (("--backends", "reference"), "the reference is not compared with itself"),
-        (("--seeds", "0..2", "--seconds", "3"), "not both"),
-        (("--replay", "nowhere.yaml"), "cannot read `nowhere.yaml`"),
-    ],
-)
-def test_bad_options(options: tuple[str, ...], words: str) -> None:
-    result = powderdsl("fuzz", *options)
-    assert result.exit_code == 2
-    assert words in result.stderr
 
 
 @pytest.mark.slow

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 
 import click
@@ -54,11 +53,8 @@ def test_python_m_powderdsl():
     [
         ("check",),
         ("run",),
-        ("run", "core", "--steps", "-1"),
         ("run", "core", "--steps", "many"),
-        ("run", "core", "--size", "4x"),
         ("run", "core", "--size", "0x4"),
-        ("run", "core", "--size", "99999999x1"),
         ("run", "core", "--batch", "0"),
         ("run", "core", "--seed", "-1"),
         ("run", "core", "--seed", str(2**64)),
@@ -68,16 +64,11 @@ def test_python_m_powderdsl():
         ("run", "core", "--every", "0"),
         ("run", "core", "--backend", "abacus"),
         ("run", "core", "--set", "no-equals-sign"),
-        ("run", "core", "--set", "=1"),
-        ("run", "core", "--set", "core.x="),
         ("run", "core", "--out", "x.jpg"),
-        ("run", "core", "--out", "x"),
         ("run", "core", "--nonsense"),
-        ("run", "core", "surplus"),
         ("compile", "core"),
         ("compile", "core", "--emit", "poetry"),
         ("render", "garden", "--rules", "core"),
-        ("new",),
         ("explain", "PD301", "PD302"),
     ],
 )
@@ -186,31 +177,3 @@ def test_a_closed_pipe_is_no_mistake():
         running.stdout.close()
         assert "Traceback" not in running.stderr.read()
         running.wait(timeout=60)
-
-
-JSON = {
-    "check life": ("check", "life"),
-    "show life": ("show", "life"),
-    "test life": ("test", "life", "--examples", "0", "--no-keep"),
-    "trace life": ("trace", "life", "--at", "1,1", "--step", "1", "--size", "8", "--backend", "reference"),
-    "bench life": (
-        "bench",
-        "life",
-        "--backend",
-        "wasm",
-        "--seconds",
-        "0.01",
-        "--rounds",
-        "1",
-        "--size",
-        "8",
-    ),
-}
-
-
-@pytest.mark.parametrize("arguments", JSON.values(), ids=JSON)
-def test_json_has_one_spelling(arguments):
-    result = powderdsl(*arguments, "--json")
-    assert result.exit_code == 0, result.output
-    json.loads(result.stdout)
-    assert "--json" in powderdsl(arguments[0], "--help").stdout

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import shutil
 
 import pytest
 
 import powderdsl as package
-from powderdsl.compiler import shipped
 from powderdsl.testing.mutation.judging import Original, sampled
 from tests.cli.commands import powderdsl
 
@@ -63,14 +61,6 @@ def test_written_tests_pass_and_notice_what_survived_before(folder):
     assert after["mutants"] == before["mutants"]
     assert after["survived"] == 0
     assert after["generated"] >= before["survived"]
-
-
-def test_mutants_of_a_shipped_pack_are_noticed(folder):
-    shutil.copy(shipped("rules") / "wireworld.yaml", folder)
-    found = json.loads(mutate("wireworld.yaml", "--json", "--mutants", "12").stdout)["wireworld.yaml"]
-    assert found["mutants"] == 12
-    assert found["killed"] + found["survived"] + found["equivalent"] == 12
-    assert found["killed"] >= 8
 
 
 def test_a_sample_is_in_proportion_and_the_same_again():

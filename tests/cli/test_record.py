@@ -31,20 +31,8 @@ def task(tmp_path: Path) -> Path:
 
 def test_a_dataset_is_recorded_and_verified(task: Path, tmp_path: Path) -> None:
     out = tmp_path / "data"
-    command = (
-        "record",
-        task,
-        "--out",
-        out,
-        "--episodes",
-        10,
-        "--shard",
-        4,
-        "--seed",
-        2,
-        "--backend",
-        "wasm",
-    )
+    few = ("--episodes", 10, "--shard", 4, "--seed", 2, "--backend", "wasm")
+    command = ("record", task, "--out", out, *few)
     more = ("--knob", "disks=2", "--set", "water.melt=50%", "--split", "test", "--worlds", 5)
     done = powderdsl(*command, *more, "--policy", "nothing", "--observation", "compact", "--compress")
     assert done.exit_code == 0, done.stderr
@@ -76,29 +64,16 @@ def test_what_is_missing_is_named(task: Path) -> None:
     assert "missing --out\n" in powderdsl("record", task, "--episodes", "1").stderr
 
 
-def test_a_folder_with_other_files_is_refused(task: Path, tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").write_text("mine")
-    found = powderdsl("record", task, "--out", tmp_path, "--episodes", "1")
-    assert found.exit_code == 2
-    assert "PD630" in found.stderr
-    assert "holds notes.txt" in found.stderr
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (("--verify", "gone"), "PD630"),
         (("small", "--verify", "gone"), "--verify does not go with TASK"),
-        (("--seed", "-1"), "is not in the range"),
         (("--knob", "disks"), "write NAME=N"),
         (("sand-pushing", "--out", "d", "--episodes", "1", "--policy", "runs/clever"), "PD620"),
         (("--observation", "matrix"), "matrix"),
-        (("sand-pushing", "--out", "a/b", "--episodes", "1"), "PD613"),
         (("sand-pushing", "--out", "d", "--episodes", "1", "--split", "tst"), "did you mean `test`"),
-        (("sand-pushing", "--out", "d", "--episodes", "1", "--knob", "lines=99"), "PD803"),
         (("destroying", "--out", "d", "--episodes", "1", "--policy", "nothing"), "may neither `blow`"),
-        (("sand-pushing", "--out", "d", "--episodes", "1", "--device", "tpu"), "PD701"),
-        (("sand-pushing", "--out", "d", "--episodes", "1", "--shard", "100000"), "may take"),
     ],
 )
 def test_bad_values(

@@ -81,22 +81,6 @@ def test_a_killed_study_resumes_at_once(tmp_path: Path) -> None:
         assert "PD622" not in log
 
 
-def test_two_studies_in_a_folder_do_not_run_the_same_points(tmp_path: Path) -> None:
-    """The second one leaves to the first what that works on, and says so."""
-    place, command = Place(tmp_path), COMMANDS["study"]
-    locks = [tmp_path / f"out/runs/batch=12,seed={seed}/.lock" for seed in (0, 1)]
-    with place.begun(command) as running:
-        assert waited(lambda: running.poll() is not None or all(path.exists() for path in locks))
-        with place.begun(command) as other:
-            other.wait(timeout=120)
-            assert other.returncode == 1, place.said()
-            assert "another process works on it" in place.said()
-            assert "not complete: other processes hold 2 combinations" in place.said()
-        assert running.poll() is None
-        running.kill()
-    assert waited(lambda: not place.survivors(), 60)
-
-
 CAUGHT = """
 import os, signal, sys, time
 from powderdsl.system.interrupts import Terminated, held_back, interruptible

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 
 import pytest
@@ -77,40 +78,10 @@ generate:
 agent: {may: [empty, sand], bins: 2, brush: 4, actions: 2, steps_per_action: 1}
 reward: {each: count(sand)}
 """
-MODEL = [
-    "--width",
-    "1",
-    "--iterations",
-    "2",
-    "--batch",
-    "2",
-    "--states",
-    "4",
-    "--buffer",
-    "64",
-    "--refresh",
-    "2",
-    "--backend",
-    "wasm",
-]
-AGENT = [
-    "--preset",
-    "small",
-    "--features",
-    "2",
-    "--envs",
-    "2",
-    "--rollout",
-    "4",
-    "--batch",
-    "4",
-    "--epochs",
-    "1",
-    "--steps",
-    "8",
-    "--backend",
-    "wasm",
-]
+MODEL = shlex.split("--width 1 --iterations 2 --batch 2 --states 4 --buffer 64 --refresh 2 --backend wasm")
+AGENT = shlex.split(
+    "--preset small --features 2 --envs 2 --rollout 4 --batch 4 --epochs 1 --steps 8 --backend wasm"
+)
 PACKS = {"slime": ELEMENT, "heat": FIELD, "crab": CREATURE, "bugs": AUTOMATON}
 
 
@@ -133,18 +104,7 @@ def run(*words: str) -> str:
 def test_a_pack_of_each_kind_goes_through_every_command(name: str) -> None:
     file = f"{name}.yaml"
     run("check", f"powderworld+{file}", "--quick")
-    run(
-        "run",
-        f"powderworld+{file}",
-        "--size",
-        "12x12",
-        "--steps",
-        "3",
-        "--backend",
-        "wasm",
-        "--out",
-        "w.npz",
-    )
+    run(*f"run powderworld+{file} --size 12x12 --steps 3 --backend wasm --out w.npz".split())
     run("wm", "train", "--task", "pool.yaml", *MODEL, "--run", "less")
     run("wm", "finetune", "less", "--packs", file, "--iterations", "2", "--backend", "wasm", "--run", "more")
     run("wm", "eval", "more", "--split", "train", "--worlds", "2", "--backend", "wasm")

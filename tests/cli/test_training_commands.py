@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import signal
 import subprocess
 import sys
@@ -14,20 +15,7 @@ from tests.cli.commands import powderdsl as run
 from tests.processes import started, waited
 from tests.rl.tiny_tasks import write_task
 
-QUICK = (
-    "--preset",
-    "small",
-    "--envs",
-    "4",
-    "--rollout",
-    "8",
-    "--batch",
-    "16",
-    "--epochs",
-    "1",
-    "--features",
-    "8",
-)
+QUICK = shlex.split("--preset small --envs 4 --rollout 8 --batch 16 --epochs 1 --features 8")
 
 
 def test_train_evaluate_and_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -51,21 +39,12 @@ def test_train_evaluate_and_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     }
 
 
-def test_all_mistakes_are_said_at_once() -> None:
-    result = run("train", "sand-pushing", "--epochs", "0", "--batch", "1", "--gamma", "7", "--steps", "0")
-    assert result.exit_code == 2
-    assert result.output.count("error[PD640]") == 4
-    assert "4 errors" in result.output
-
-
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
         (("train",), "TASK"),
         (("train", "sand-pulling"), "sand-pushing"),
-        (("train", "sand-pushing", "--steps", "1.5"), "1.5"),
         (("train", "sand-pushing", "--split", "tset"), "no split"),
-        (("train", "sand-pushing", "--n-lines", "99"), "lines"),
         (("train", "keep-ice", "--complexity", "3"), "no knob `complexity`"),
         (("train", "sand-pushing", "--network", "paper", "--observation", "rgb"), "rgb"),
         (("train", "--resume", "nowhere"), "nowhere"),
@@ -74,7 +53,6 @@ def test_all_mistakes_are_said_at_once() -> None:
         (("evaluate", "nowhere"), "PD620"),
         (("evaluate", "sand-pushing", "--policies", "trained"), "random, nothing"),
         (("evaluate", "nowhere", "--knob", "lines=2"), "a run has its own"),
-        (("watch", "nowhere"), "PD620"),
         (("watch", "sand-pushing", "--policy", "trained"), "no trained policy"),
         (("watch", "sand-pushing", "--out", "x.png"), ".gif or .mp4"),
         (("watch", "sand-pushing", "--scale", "32", "--worlds", "64", "--out", "no/x.gif"), "PD613"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-from collections import Counter
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from torch.utils.data import DataLoader, IterableDataset, WeightedRandomSampler
+from torch.utils.data import DataLoader, IterableDataset
 
 from powderdsl.datasets import Dataset, Transitions, record, split
 from powderdsl.datasets.dataset import Batch
@@ -68,16 +67,6 @@ def test_a_loader_yields_each_transition_once(
     ]
     assert sorted(found) == TRANSITIONS
     assert (found == TRANSITIONS) is not shuffle
-
-
-def test_a_sampler_decides_what_is_read(counted: Dataset) -> None:
-    rows = Transitions(counted)
-    weights = [1.0 if t == 0 else 0.0 for _, t in TRANSITIONS]
-    sampler = WeightedRandomSampler(weights, 500, generator=torch.Generator().manual_seed(1))
-    found = Counter(
-        name for batch in loader(rows, (0, None), batch_size=50, sampler=sampler) for name in names(batch)
-    )
-    assert set(found) == {(e, 0) for e in range(len(LENGTHS))}
 
 
 def test_numbers_are_those_of_a_sequence(counted: Dataset) -> None:

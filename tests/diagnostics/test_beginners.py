@@ -151,11 +151,6 @@ def test_a_color_without_quotes_on_the_last_line(entry: str, end: str, tmp_path:
     assert any('"#123456"' in one for one in found[0].helps)
 
 
-def test_characters_are_named(tmp_path: Path) -> None:
-    (found,) = load(PACK.replace("RULE", "soil -> weed if count(s\u0430il) > 1"), tmp_path)
-    assert "(U+0430 CYRILLIC SMALL LETTER A)" in found.message
-
-
 def test_a_pack_that_others_need_is_missed_once() -> None:
     result = command("check", "powderworld-core", "--quick")
     assert result.exit_code == 2

@@ -12,17 +12,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from powderdsl.model.declarations import PackDecl
 from powderdsl.testing.generators.strategies import chosen
-from tests.fuzz import damage
 from tests.fuzz.damage import (
     KINDS,
-    damaged_text,
     load_damaged,
-    needed,
-    rule_texts,
     run_trial,
-    whole,
 )
 from tests.tiers import tiered
 
@@ -77,26 +71,3 @@ def test_seeded_damage(seeds: int) -> None:
     assert sum(trial.accepted for trial in trials) >= seeds // 50
     wrong = [trial for trial in trials if trial.problem is not None and not trial.problem.startswith("took")]
     assert wrong == []
-
-
-def test_a_mistake_of_ours_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(text: str) -> None:
-        raise RecursionError("too deep")
-
-    monkeypatch.setattr(damage, "load_damaged", broken)
-    assert run_trial(1).problem == "RecursionError: too deep"
-    monkeypatch.setattr(damage, "load_damaged", lambda text: None)
-    monkeypatch.setattr(damage, "MAX_MEGABYTES", 1)
-    assert "MB" in str(run_trial(1).problem)
-
-
-def test_one_seed_one_text() -> None:
-    assert damaged_text(5) == damaged_text(5)
-    assert len({damaged_text(seed) for seed in range(30)}) > 25
-
-
-def test_undamaged_files_load() -> None:
-    for name, text in rule_texts().items():
-        if isinstance(whole(name), PackDecl) and "elements:" in text:
-            assert load_damaged(text) is not None
-            assert isinstance(needed(text), list)

@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from powderdsl.compiler import load_with_diagnostics
-from powderdsl.diagnostics import CODES, Severity
 from powderdsl.model.types import Ruleset
 
 
@@ -196,7 +195,6 @@ passes:
     ("rule", "lost"),
     [
         ("load := 2 where floor", "load := 2"),
-        ("load += 2 where (floor, heap) and below is crate", "load += 2"),
         ("right.load := 2 where right is heap", "right.load := 2"),
         ("load := 2 where count(crate) > 2", None),
         ("right.load := 2 where left is crate", None),
@@ -210,8 +208,6 @@ passes:
         ("crate moves right leaving floor if right is floor, then load += 1", None),
         ("heap swaps below if below is floor, then below.load := 1", "below.load := 1"),
         ("heap swaps below if below is crate, then load := 1", None),
-        ("heap swaps below if below is crate, then below.load := 1", "below.load := 1"),
-        ("heap -> floor if left is crate and right is heap, then left.load += 1", None),
         ("heap -> floor if left is crate and right is heap, then right.load += 1", "right.load += 1"),
     ],
 )
@@ -240,10 +236,3 @@ def test_empty_sections_are_told(section: str) -> None:
         f"{section}:", f"{section}: " + ("[]" if section in ("tests", "invariants", "needs") else "{}")
     )
     assert ("PD113", section) not in loaded("core+yard.yaml", yard=meant)[1]
-
-
-def test_every_remark_is_a_warning_or_a_note() -> None:
-    """None of them keeps strangers' packs from being loaded together."""
-    for code in ("PD113", "PD315", "PD316", "PD318", "PD516"):
-        assert CODES[code].severity is Severity.WARNING
-    assert CODES["PD317"].severity is Severity.NOTE

@@ -10,14 +10,12 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-import torch
-from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.wrappers import TimeLimit, TransformObservation
 from gymnasium.wrappers import vector as wrappers
 
 from powderdsl.envs.gym import PowderEnv, PowderVectorEnv
 from powderdsl.envs.sb3 import PowderVecEnv
-from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.tasks.episodes import TaskProgram
 
 Wrap = Callable[[VectorEnv[Any, Any, Any]], VectorEnv[Any, Any, Any]]
@@ -101,17 +99,6 @@ def test_infos_have_the_same_keys_after_every_step(small: TaskProgram, mode: Aut
     assert kinds(first) == {name: kind for name, kind in found[0].items() if "final" not in name}
 
 
-def test_tensors_have_the_same_keys_too(small: TaskProgram) -> None:
-    env = TensorEnv(small, 3)
-    env.reset(seed=0)
-    keys = set()
-    for _ in range(8):
-        _, _, terminated, truncated, info = env.step(torch.zeros(3, 5, dtype=torch.int64))
-        keys.add(tuple(info))
-        assert len(info["final_obs"]) == int((terminated | truncated).sum())
-    assert len(keys) == 1
-
-
 def test_one_world_has_the_same_keys_in_reset_and_steps(small: TaskProgram) -> None:
     env = PowderEnv(small)
     env.action_space.seed(0)
@@ -164,11 +151,3 @@ def test_specs_make_the_same_environment_again(small: TaskProgram) -> None:
     assert batch.num_envs == 3
     assert batch.metadata["autoreset_mode"] is AutoresetMode.DISABLED
     assert batch.single_action_space == one.action_space
-
-
-def test_worlds_in_gymnasiums_own_vectors_have_constant_keys(small: TaskProgram) -> None:
-    env = SyncVectorEnv([lambda: PowderEnv(small)] * 2)
-    env.action_space.seed(0)
-    env.reset(seed=0)
-    found = [kinds(env.step(env.action_space.sample())[4]) for _ in range(14)]
-    assert all(one == found[0] for one in found)

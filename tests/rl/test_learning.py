@@ -166,10 +166,6 @@ def test_shaped_tasks_are_the_same_worlds(name: str) -> None:
     assert not torch.equal(*total)
 
 
-def test_some_tasks_have_shaped_rewards() -> None:
-    assert "sand-pushing" in SHAPED
-
-
 def test_frames_are_those_of_stable_baselines(tmp_path: Path) -> None:
     env = PowderVecEnv(str(write_task(tmp_path, DIG)), 3, backend="wasm", actions="full")
     stacked, own = VecFrameStack(env, 3, channels_order="first"), FrameStack(3)

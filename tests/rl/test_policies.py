@@ -191,20 +191,24 @@ def test_a_film_is_written(run: RunFolder, tmp_path: Path) -> None:
         assert image.n_frames == 1 + 4 * (1 + 2) + 3  # type: ignore[attr-defined]
 
 
-def test_films_show_fields(tmp_path: Path) -> None:
-    """Where the color of an element follows a field, films show it after each step."""
-    (tmp_path / "stove.yaml").write_text(
-        "pack: stove\nneeds: core\nfields: {heat: {type: 0..9, at: place}}\n"
+def warm_task(folder: Path, *, start: int) -> str:
+    """A task file whose cells are stoves that heat up and change color."""
+    (folder / "stove.yaml").write_text(
+        f"pack: stove\nneeds: core\nfields: {{heat: {{type: 0..9, at: element, stove: {start}}}}}\n"
         'elements: {stove: {density: 5, color: "#303030", color_by: {field: heat, to: "#FF3000"}}}\n'
         "passes: {burn: {do: heat += 1 where stove}}\n"
     )
-    (tmp_path / "task.yaml").write_text(
+    (folder / "task.yaml").write_text(
         "task: warm\nrules: core+stove.yaml\nsize: [8, 8]\nfill: stove\n"
         "agent: {may: [wall, nothing], bins: 2, brush: 4, actions: 1, steps_per_action: 2}\nreward: {each: placed}\n"
     )
-    _, pictures = film(
-        compile_task(str(tmp_path / "task.yaml"), backend="wasm"), None, torch.arange(1), factor=1
-    )
+    return str(folder / "task.yaml")
+
+
+def test_films_show_fields(tmp_path: Path) -> None:
+    """Where the color of an element follows a field, films show it after each step."""
+    program = compile_task(warm_task(tmp_path, start=0), backend="wasm")
+    _, pictures = film(program, None, torch.arange(1), factor=1)
     reds = [int(frame[4, 4, 0]) for frame in pictures]
     assert reds == [48, 48, 71, 94]  # the start, the action, two steps
 
@@ -212,17 +216,8 @@ def test_films_show_fields(tmp_path: Path) -> None:
 def test_start_worlds_of_a_task_show_fields(tmp_path: Path) -> None:
     from tests.cli.commands import powderdsl
 
-    (tmp_path / "stove.yaml").write_text(
-        "pack: stove\nneeds: core\nfields: {heat: {type: 0..9, at: element, stove: 9}}\n"
-        'elements: {stove: {density: 5, color: "#303030", color_by: {field: heat, to: "#FF3000"}}}\n'
-        "passes: {burn: {do: heat -= 1 where stove}}\n"
-    )
-    (tmp_path / "task.yaml").write_text(
-        "task: warm\nrules: core+stove.yaml\nsize: [8, 8]\nfill: stove\n"
-        "agent: {may: [wall, nothing], bins: 2, brush: 4, actions: 1, steps_per_action: 2}\nreward: {each: placed}\n"
-    )
     out = tmp_path / "sheet.png"
-    result = powderdsl("show", str(tmp_path / "task.yaml"), "--seeds", "1", "--out", str(out))
+    result = powderdsl("show", warm_task(tmp_path, start=9), "--seeds", "1", "--out", str(out))
     assert result.exit_code == 0, result.output
     with Image.open(out) as image:
         assert image.convert("RGB").getpixel((9, 9)) == (255, 48, 0)

@@ -119,10 +119,6 @@ def test_a_wrong_shard_is_told(text: str, steps_run: list[str]) -> None:
     assert steps_run == []
 
 
-def test_a_shard_is_read() -> None:
-    assert SHARD.convert("2/7", None, None) == (2, 7)
-
-
 # Shards and `collect`
 
 

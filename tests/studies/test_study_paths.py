@@ -127,7 +127,7 @@ def test_results_with_a_link_that_leads_out_are_refused(tmp_path):
 
 def test_every_word_that_stands_for_a_value_is_known():
     """An option with a new kind of value must say what it is before studies may give it."""
-    plain = {
+    plain = [
         "N",
         "A,B",
         "NAME=N",
@@ -140,8 +140,7 @@ def test_every_word_that_stands_for_a_value_is_known():
         "DEVICE",
         "EVAL-SPLIT",
         "SWAP",
-        "",
-    }
+    ]
     found = commands()
     assert set(found) == set(CALLED)
     from importlib import import_module
@@ -154,7 +153,7 @@ def test_every_word_that_stands_for_a_value_is_known():
             offered = {name[2:] for name in one.opts} & found[words].keys()
             assert not offered or not {*one.opts} & {*NOT_FOR_STUDIES}
             if offered or isinstance(one, click.Argument):
-                assert (one.metavar or "") in {"FILE", "FILE.json", *READ, *plain}, one.name
+                assert (one.metavar or "") in {"", "FILE", "FILE.json", *READ, *plain}, one.name
         paths = [one for one in command.params if isinstance(one.type, click.Path)]
         for one in paths:
             name = one.opts[0][2:]

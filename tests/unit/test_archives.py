@@ -63,8 +63,7 @@ def test_worlds_that_could_not_be_loaded_are_not_saved(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("member", ["x.npy", "y.npy"])
-def test_what_is_no_array_of_numbers(member, tmp_path):
+def test_members_that_are_not_numbers_are_refused(tmp_path):
     for value in (
         np.array([None]),
         np.zeros(2, [("a", "i4")]),
@@ -72,7 +71,7 @@ def test_what_is_no_array_of_numbers(member, tmp_path):
         np.array([1j]),
         np.array([1], ">i4"),
     ):
-        np.savez(tmp_path / "a.npz", **{member.removesuffix(".npy"): value})
+        np.savez(tmp_path / "a.npz", x=value)
         with pytest.raises(BadArchive), open_archive(tmp_path / "a.npz"):
             pass
 

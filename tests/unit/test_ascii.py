@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
@@ -45,27 +44,12 @@ def test_a_legend_wins_over_glyphs():
     assert with_legend("s□.", {"s": "water", "□": "core.sand"}).tolist() == [[3, 2, 0]]
 
 
-def test_exact_text():
-    ids = np.array([[0, 1], [2, 13]])
-    assert write_ascii(ids, ELEMENTS) == ".#\ns%\n"
-    assert write_ascii(torch.tensor(ids), ELEMENTS) == ".#\ns%\n"
-
-
 def test_unknown_characters_are_named_once_each_where_they_first_stand():
     assert problems("..X\n.YX\nY..\n") == [("PD610", "X"), ("PD610", "Y")]
 
 
-def test_the_help_says_what_is_known():
-    with pytest.raises(CompileError, match=r"known: \.\s+empty\s+#\s+wall"):
-        read_ascii("?", ELEMENTS)
-
-
 def test_uneven_rows_are_shown_without_the_space_around_them():
     assert problems("....\n  . . .  \n\n....\n.....\n") == [("PD611", ". . ."), ("PD611", ".....")]
-
-
-def test_both_kinds_of_mistakes_come_together():
-    assert problems("....\nX..\n") == [("PD610", "X"), ("PD611", "X..")]
 
 
 @pytest.mark.parametrize("text", ["", " \n\t\n"])

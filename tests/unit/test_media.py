@@ -10,14 +10,12 @@ import sys
 import imageio_ffmpeg
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from powderdsl.diagnostics import CompileError
 from powderdsl.simulation import media
 from powderdsl.simulation.draw import CellTint, palette, rgb, scale
 from powderdsl.simulation.media import write_gif, write_mp4, write_png
-from powderdsl.system.writing import replacing
 from tests.unit.elements import ELEMENTS
 
 COLORS = palette(ELEMENTS)
@@ -42,15 +40,6 @@ def mp4_frames(path, width: int, height: int) -> np.ndarray:
         [*command, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"], capture_output=True, check=True
     )
     return np.frombuffer(output.stdout, dtype=np.uint8).reshape(-1, height, width, 3)
-
-
-def test_png(tmp_path):
-    image = world(0)
-    for given in (image, torch.tensor(image), image[:, ::-1]):
-        write_png(tmp_path / "x.png", given)
-        with Image.open(tmp_path / "x.png") as found:
-            assert found.format == "PNG"
-            assert np.array_equal(np.array(found), np.asarray(given))
 
 
 def test_gif_keeps_every_color_of_worlds(tmp_path):
@@ -166,15 +155,3 @@ def test_a_written_file_has_the_permissions_of_any_new_file(tmp_path):
     finally:
         assert os.umask(old) == 0o027
     assert stat.S_IMODE((tmp_path / "x.png").stat().st_mode) == 0o640
-
-
-def test_replacing_shows_nothing_before_it_is_complete(tmp_path):
-    path = tmp_path / "x.txt"
-    path.write_text("older")
-    with replacing(path) as temporary:
-        temporary.write_text("new")
-        assert temporary.parent == tmp_path
-        assert temporary.suffix == ".txt"
-        assert path.read_text() == "older"
-    assert path.read_text() == "new"
-    assert list(tmp_path.iterdir()) == [path]

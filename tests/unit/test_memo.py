@@ -13,8 +13,6 @@ import pytest
 from powderdsl import compiler
 from powderdsl.compiler import load_with_diagnostics, lower, parts, shipped
 from powderdsl.diagnostics import CompileError
-from powderdsl.ir.ops import PassGraph
-from powderdsl.ir.text import structure
 from powderdsl.simulation.standalone import standalone_module
 from powderdsl.system.memo import Memo
 from powderdsl.targets.wasm import source
@@ -152,27 +150,6 @@ def test_only_what_has_changed_is_made_again(rules: Path, counted: Counter[str])
     water.write_text(text.replace("count(ice) >= 3", "count(ice) >= 4", 1), encoding="utf-8")
     assert code(path, memo) != first
     assert counted["plan"] == passes + 1
-
-
-def test_mistakes_are_reported_each_time(rules: Path) -> None:
-    path, file = rules / "small.yaml", rules / "sand.yaml"
-    file.write_text(file.read_text(encoding="utf-8").replace("elements:", "elemments:"), encoding="utf-8")
-    messages = []
-    for _ in range(3):
-        with pytest.raises(CompileError) as found:
-            load_with_diagnostics(path)
-        messages.append(str(found.value))
-    assert len(set(messages)) == 1
-    assert "elemments" in messages[0]
-
-
-def test_structure_tells_passes_apart() -> None:
-    def passes(name: str) -> tuple[PassGraph, ...]:
-        return lower(load_with_diagnostics(name)[0]).passes
-
-    once, again = passes("powderworld"), passes("powderworld")
-    assert [structure(one) for one in once] == [structure(one) for one in again]
-    assert len({structure(one, places=False) for one in (*once, *again)}) == len(once)
 
 
 def test_modules_that_stand_alone_use_memos(rules: Path, counted: Counter[str]) -> None:

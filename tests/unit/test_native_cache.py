@@ -102,13 +102,6 @@ def test_only_leftovers_of_killed_processes_are_removed(tmp_path: Path) -> None:
         assert names(tmp_path) == {library.name, mine.name, "b.lock"}
 
 
-def test_clear(tmp_path: Path) -> None:
-    libraries = {put(tmp_path, key, b"code") for key in "ab"}
-    with scratch_folder(tmp_path) as being_built:
-        assert {entry.path for entry in cache.clear(tmp_path)} == libraries
-        assert names(tmp_path) == {being_built.name}
-
-
 def test_a_cache_that_cannot_be_written_still_serves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     library = put(tmp_path, "a", b"code")
 
@@ -209,13 +202,13 @@ def test_without_a_compiler_all_that_were_tried_are_named(
 def test_another_compiler_source_or_level_is_another_library(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found = set()
+    libraries = set()
     for version in ("g++ 1", "g++ 2"):
         monkeypatch.setenv("CXX", str(fake(tmp_path, f"cc{version[-1]}", version)))
         for level in ("-O1", "-O2"):
             with building(Building(level, tmp_path)):
-                found |= {build("// a\n"), build("// b\n"), build("// a\n")}
-    assert len(found) == len(calls(tmp_path)) == 8
+                libraries |= {build("// a\n"), build("// b\n"), build("// a\n")}
+    assert len(libraries) == len(calls(tmp_path)) == 8
 
 
 def test_units_are_compiled_side_by_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,8 +16,6 @@ from powderdsl.diagnostics import CompileError, Diagnostic, Label, Source, Span
 from powderdsl.diagnostics.diagnostic import render_text
 from powderdsl.diagnostics.printable import (
     PrintableStream,
-    character_name,
-    look_alikes,
     printable,
     printable_streams,
     spelled,
@@ -72,11 +70,6 @@ def test_only_colors_pass_as_styles():
 )
 def test_look_alikes_are_spelled_out(word, shown):
     assert spelled(word) == shown
-
-
-def test_look_alikes_have_names():
-    assert look_alikes("wаtеr") == ("а", "е")
-    assert character_name("а") == "U+0430 CYRILLIC SMALL LETTER A"
 
 
 def test_a_stream_escapes_whatever_writes_to_it(capsys):

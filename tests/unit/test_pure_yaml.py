@@ -11,10 +11,8 @@ import pytest
 
 from powderdsl.diagnostics import Diagnostic, Reporter, Source
 from powderdsl.syntax import yaml_tree
-from powderdsl.testing.generators.choices import Choices
 from tests.diagnostics.test_malformed import FILES as MALFORMED
 from tests.diagnostics.test_malformed import SECTIONS
-from tests.fuzz.damage import damaged_lines, damaged_tokens
 
 ROOT = Path(__file__).resolve().parents[2]
 FILES = [
@@ -100,15 +98,6 @@ def test_damaged_texts(monkeypatch: pytest.MonkeyPatch) -> None:
     texts = [(ROOT / name).read_text(encoding="utf-8") for name in FILES]
     differences = sum(differs(damaged(rng, rng.choice(texts)), monkeypatch) for _ in range(5_000))
     assert differences < 50
-
-
-def test_damaged_rule_files(monkeypatch: pytest.MonkeyPatch) -> None:
-    texts = [
-        damage(Choices.seeded(seed)).replace("\ufeff", "")
-        for seed in range(100)
-        for damage in (damaged_lines, damaged_tokens)
-    ]
-    assert sum(differs(text, monkeypatch) for text in texts) < 5
 
 
 @pytest.mark.parametrize("name", [name for name, *_ in (*MALFORMED, *SECTIONS)])

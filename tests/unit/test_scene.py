@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ from hypothesis import strategies as st
 
 from powderdsl.diagnostics import CODES, CompileError, Reporter, Source, Span
 from powderdsl.worlds.raster import MAX_COORDINATE, Shape, mask
-from powderdsl.worlds.scene import draw_start, find_scene, shipped_scenes
+from powderdsl.worlds.scene import draw_start, find_scene
 from powderdsl.worlds.scene.read import parse_statement, read_file, read_scenes
 from powderdsl.worlds.scene.statements import STATEMENTS
 from tests.unit.elements import ELEMENTS, ID, RULES, Rules
@@ -57,60 +56,6 @@ def errors(text: str) -> tuple:
 # The shapes
 
 
-def test_a_disk_has_the_cells_nearer_than_its_radius():
-    assert picture(mask(disk((2, 2), 2), (5, 5))) == [".....", ".xxx.", ".xxx.", ".xxx.", "....."]
-    assert picture(mask(disk((2, 2), 1), (5, 5))) == [".....", ".....", "..x..", ".....", "....."]
-
-
-def test_a_disk_is_cut_off_at_the_edge():
-    assert picture(mask(disk((-1, 3), 3), (3, 4))) == [".xxx", ".xxx", "...."]
-
-
-@pytest.mark.parametrize(("width", "thickness"), [(1, 3), (3, 3), (4, 3), (5, 5), (8, 5), (9, 7)])
-def test_a_level_line_is_as_thick_as_its_width_says(width, thickness):
-    cells = mask(line((10, 2), (10, 6), width), (21, 9))
-    assert cells.sum(axis=0).tolist() == [0, 0] + [thickness] * 5 + [0, 0]
-    assert np.array_equal(mask(line((2, 10), (6, 10), width), (9, 21)), cells.T)
-
-
-def test_a_diagonal_line_is_walked_along_its_columns():
-    # Both axes are equally long: the ends are cut off at a column, not at a row.
-    cells = mask(line((3, 3), (5, 5), 1), (9, 9))
-    assert sorted(set(np.nonzero(cells)[1].tolist())) == [3, 4, 5]
-    assert sorted(set(np.nonzero(cells)[0].tolist())) == [2, 3, 4, 5, 6]
-
-
-def test_a_line_may_be_a_point():
-    assert picture(mask(line((1, 1), (1, 1), 3), (3, 3))) == [".x.", ".x.", ".x."]
-
-
-@settings(max_examples=200, deadline=None)
-@given(
-    start=st.tuples(st.integers(-4, 20), st.integers(-4, 20)),
-    end=st.tuples(st.integers(-4, 20), st.integers(-4, 20)),
-    width=st.integers(1, 12),
-)
-def test_lines_agree_with_the_definition_in_exact_fractions(start, end, width):
-    """Cell by cell: |distance| < 1 + width·√(1 + slope²)/4, squared so that no root is taken."""
-    (top, left), (bottom, right_end) = start, end
-    down, right = bottom - top, right_end - left
-    expected = np.zeros((16, 16), dtype=bool)
-    for row in range(16):
-        for column in range(16):
-            if abs(down) > abs(right):
-                inside = min(top, bottom) <= row <= max(top, bottom)
-                slope, distance = Fraction(right, down), column - left - Fraction(right, down) * (row - top)
-            else:
-                inside = min(left, right_end) <= column <= max(left, right_end)
-                slope = Fraction(down, right) if right else Fraction(0)
-                distance = row - top - slope * (column - left)
-            excess = abs(distance) - 1
-            near = excess < 0 or excess**2 < Fraction(width**2, 16) * (1 + slope**2)
-            expected[row, column] = inside and near
-    assert np.array_equal(mask(line(start, end, width), (16, 16)), expected)
-    assert np.array_equal(mask(line(end, start, width), (16, 16)), expected)
-
-
 def test_the_largest_numbers_do_not_overflow():
     far = MAX_COORDINATE
     diagonal = mask(line((-far, -far), (far, far), 1), (8, 8))
@@ -126,25 +71,6 @@ def test_boxes_leave_the_end_out_and_frames_follow_the_size():
     assert mask(box(), (2, 3)).all()
     assert picture(mask(Shape("frame"), (4, 3))) == ["xxx", "x.x", "x.x", "xxx"]
     assert mask(Shape("frame"), (1, 5)).all()
-
-
-@settings(max_examples=60, deadline=None)
-@given(
-    height=st.integers(1, 12),
-    width=st.integers(1, 12),
-    shape=st.one_of(
-        st.builds(disk, st.tuples(st.integers(-9, 20), st.integers(-9, 20)), st.integers(1, 15)),
-        st.builds(
-            line,
-            st.tuples(st.integers(-9, 20), st.integers(-9, 20)),
-            st.tuples(st.integers(-9, 20), st.integers(-9, 20)),
-            st.integers(1, 9),
-        ),
-    ),
-)
-def test_a_shape_stays_where_it_is_when_the_world_grows(height, width, shape):
-    large = mask(shape, (30, 30))
-    assert np.array_equal(mask(shape, (height, width)), large[:height, :width])
 
 
 # The statements
@@ -210,12 +136,6 @@ def test_the_garden_has_something_of_everything():
     assert set(np.unique(ids)) == set(ID.values()) - {ID["fire"]}
 
 
-def test_shipped_scenes_have_names_of_their_own_and_say_what_they_show():
-    scenes = shipped_scenes()
-    assert len({scene.name for scene in scenes}) == len(scenes) >= 9
-    assert all(scene.about.endswith(".") for scene in scenes)
-
-
 SMALL = """scene: small
 size: [4, 5]
 fill: empty
@@ -244,11 +164,6 @@ draw: |
     assert load(tmp_path, text).tolist() == [[3, 0, 0, 0, 0], [0] * 5, [0, 0, 0, 2, 2], [0, 0, 0, 2, 2]]
 
 
-def test_later_statements_paint_over_earlier_ones(tmp_path):
-    text = SMALL.replace("rows 2:", "rows 2:4")
-    assert load(tmp_path, text).tolist() == [[1] * 5, [1, 0, 0, 0, 1], [1, 2, 2, 2, 1], [1] * 5]
-
-
 def test_another_size_moves_the_frame_and_open_ends_and_nothing_else(tmp_path):
     text = SMALL.replace("rows 2:", "rows 2:end")
     assert load(tmp_path, text, size=(5, 3)).tolist() == [
@@ -264,12 +179,6 @@ def test_a_scene_without_statements_is_its_fill(tmp_path):
     assert (load(tmp_path, "scene: lake\nsize: [2, 3]\nfill: core.water\n") == ID["water"]).all()
 
 
-def test_windows_line_ends_and_a_byte_order_mark(tmp_path):
-    path = tmp_path / "scene.yml"
-    path.write_bytes(b"\xef\xbb\xbf" + SMALL.replace("rows 2:", "rows 2:4").replace("\n", "\r\n").encode())
-    assert load_scene(str(path), RULES)[2].tolist() == [1, 2, 2, 2, 1]
-
-
 def test_elements_need_only_be_known_where_they_are_drawn():
     """A ruleset without some element still has the scenes that do not use it."""
     few = Rules(tuple(element for element in ELEMENTS if element.name in ("empty", "wall", "sand", "water")))
@@ -278,10 +187,6 @@ def test_elements_need_only_be_known_where_they_are_drawn():
         load_scene(f"{DESIGNED}#stone-arches", few)
     assert {found.code for found in caught.value.diagnostics} == {"PD604"}
     assert len(caught.value.diagnostics) == 6
-
-
-def test_spans_play_no_part_in_equality():
-    assert statement("frame wall") == statement("   frame   wall")
 
 
 # What can be wrong. Each row: the file, the code, the text under the caret.
@@ -303,11 +208,8 @@ HEAD = "scene: bad\nsize: [8, 8]\nfill: empty\ndraw:\n"
         ("disk sand at (1, 1) raduis 2", "PD605", "raduis"),
         ("disk sand at (1, 1)", "PD605", "\n"),
         ("disk sand at (1 1) radius 2", "PD605", "1"),
-        ("disk sand at (1, 1, 1) radius 2", "PD605", ","),
-        ("disk sand at [1, 1] radius 2", "PD605", "["),
         ("disk sand at (1, 1) radius two", "PD605", "two"),
         ("disk sand at (1, 1) radius 0", "PD606", "0"),
-        ("disk sand at (1, 1) radius -3", "PD606", "-3"),
         ("disk sand at (1, 1) radius 2.5", "PD606", "2.5"),
         ("disk sand at (1, 1) radius 5px", "PD605", "px"),
         ("disk sand at (1, 1e3) radius 2", "PD606", "1e3"),
@@ -315,16 +217,12 @@ HEAD = "scene: bad\nsize: [8, 8]\nfill: empty\ndraw:\n"
         ("disk sand at (1, 99999999999999999999) radius 2", "PD606", "99999999999999999999"),
         ("disk sand at (20, 20) radius 3", "PD608", "disk sand at (20, 20) radius 3"),
         ("line wall from (0, 0) to (3, 3)", "PD605", "\n"),
-        ("line wall from (0, 0) to (3, 3) width 0", "PD606", "0"),
-        ("line wall (0, 0) to (3, 3) width 1", "PD605", "("),
         ("line wall from (-9, 0) to (-9, 5) width 1", "PD608", "line wall from (-9, 0) to (-9, 5) width 1"),
         ("box water rows 5:3", "PD606", "5:3"),
-        ("box water rows 3:3", "PD606", "3:3"),
         ("box water rows -2:4", "PD606", "-2"),
         ("box water columns 9:12", "PD608", "box water columns 9:12"),
         ("box water rows 1:2:3", "PD605", ":"),
         ("box water columns 1:2 rows 1:2", "PD605", "rows"),
-        ("box water rows 1:2 rows 1:2", "PD605", "rows"),
         ("frame", "PD605", "\n"),
         ("frame wall wall", "PD605", "wall"),
         ("heap wall", "PD605", "heap"),
@@ -335,7 +233,6 @@ HEAD = "scene: bad\nsize: [8, 8]\nfill: empty\ndraw:\n"
         ("disk sand at (1, 1) radius 3..2", "PD605", "3..2"),
         ("fill sand in slot", "PD605", "slot"),
         ("fill sand over water", "PD605", "water"),
-        ("frame a.b.c", "PD605", "."),
         ("frame wåll", "PD605", "å"),
         ('"frame \\"wall\\""', "PD605", '"frame \\"wall\\""'),
         ('""', "PD605", '"'),
@@ -360,15 +257,10 @@ def test_a_bad_statement(line, code, under):
         ("scene: [a]\nsize: [8, 8]\nfill: empty\n", "PD107", "[a]"),
         ("scene: a b\nsize: [8, 8]\nfill: empty\n", "PD111", "a b"),
         ("scene: a\nsize: [8, 8]\n", "PD109", "s"),
-        ("scene: a\nfill: empty\n", "PD109", "s"),
-        ("size: [8, 8]\nfill: empty\n", "PD109", "s"),
         ("scene: a\nsize: 64\nfill: empty\n", "PD607", "64"),
         ("scene: a\nsize: [8, 8, 8]\nfill: empty\n", "PD607", "[8, 8, 8]"),
-        ("scene: a\nsize: [8, eight]\nfill: empty\n", "PD607", "[8, eight]"),
-        ("scene: a\nsize: [-8, 8]\nfill: empty\n", "PD607", "[-8, 8]"),
         ("scene: a\nsize: [0, 8]\nfill: empty\n", "PD607", "[0, 8]"),
         ("scene: a\nsize: [4097, 4096]\nfill: empty\n", "PD607", "[4097, 4096]"),
-        ("scene: a\nsize: [999999999, 999999999]\nfill: empty\n", "PD607", "[999999999, 999999999]"),
         ("scene: a\nsize: [8, 8]\nfill: empty\nsise: 3\n", "PD108", "sise"),
         ("scene: a\nsize: [8, 8]\nfill: empty\nfill: wall\n", "PD104", "fill"),
         ("scene: a\nsize: [8, 8]\nfill: empty\ndraw: frame wall\n", "PD107", "frame wall"),
@@ -423,22 +315,11 @@ draw:
     assert [one.primary.span.text for one in numbers] == ["x1", "1.5", "2.5", "0"]
 
 
-def test_the_message_shows_the_line(tmp_path):
-    with pytest.raises(CompileError) as caught:
-        load(tmp_path, SMALL.replace("rows 2:", "rows 2:4").replace("sand", "snad"))
-    assert str(caught.value).splitlines()[0] == "error[PD604]: unknown element `snad`"
-    assert "5 |   - box snad rows 2:4\n  |         ^^^^" in str(caught.value)
-
-
 @pytest.mark.parametrize("size", [(0, 5), (5, -1), (4096, 4097), (1 << 40, 1 << 40)])
 def test_another_size_has_the_same_limits(tmp_path, size):
     with pytest.raises(CompileError) as caught:
         load(tmp_path, SMALL.replace("rows 2:", "rows 2:4"), size=size)
     assert [one.code for one in caught.value.diagnostics] == ["PD607"]
-
-
-def test_a_world_may_have_any_shape_within_the_limit(tmp_path):
-    assert load(tmp_path, "scene: long\nsize: [1, 16777216]\nfill: empty\ndraw: [frame wall]\n").all()
 
 
 @pytest.mark.parametrize(

@@ -146,16 +146,6 @@ def test_an_interrupted_run_ends_with_the_same_weights(dunes: str) -> None:
     assert torch.equal(torch.random.get_rng_state(), before)
 
 
-def test_weights_of_a_network_depend_on_the_seed_alone(dunes: str) -> None:
-    network, encoder = custom_network("nets:Wide"), ActionChannels(5)
-    torch.rand(3)
-    one = network.build(encoder, 7).state_dict()
-    torch.rand(3)
-    other = network.build(encoder, 7).state_dict()
-    assert same(one, other)
-    assert not same(one, network.build(encoder, 8).state_dict())
-
-
 @pytest.mark.parametrize(
     ("name", "said"),
     [
@@ -258,16 +248,6 @@ def test_hostile_names_in_a_run_are_text(dunes: str) -> None:
             code, output, imported = was_imported(*command)
             assert (code, imported) == (2, False), (name, output)
             assert "Traceback" not in output
-
-
-def test_a_checkpoint_that_names_a_network_is_text(dunes: str) -> None:
-    words = ("wm", "train", "--task", dunes, "--run", "run", *QUICK, "--width", 2)
-    assert run(*words, "--iterations", 1).exit_code == 0
-    found = load_trained("run")
-    state = {**found.checkpoint.state, "network": "nets:Wide", "module": "nets:Wide"}
-    found.run.save_checkpoint(1, state)
-    code, output, imported = was_imported("wm", "eval", "run", "--backend", "torch", "--split", "two")
-    assert (code, imported) == (0, False), output
 
 
 @pytest.mark.parametrize("command", ["wm train", "wm finetune, on: trained", "wm eval, on: trained"])

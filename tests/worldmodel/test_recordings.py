@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor
 
-from powderdsl.datasets import Dataset, record
+from powderdsl.datasets import record
 from powderdsl.diagnostics import CompileError
 from powderdsl.tasks.episodes import compile_task
 from powderdsl.tasks.shipped import load_task
@@ -328,10 +327,3 @@ def test_damaged_runs_are_refused(wrong: dict[str, object], copy: Path) -> None:
     with pytest.raises(CompileError) as error:
         load_trained("run")
     assert error.value.diagnostics[0].code in ("PD620", "PD623")
-
-
-def test_inputs_stay_bytes(recording: Recording) -> None:
-    inputs: Tensor
-    inputs, ends = recording.pairs(recording.all, torch.arange(4))
-    assert inputs.dtype == ends.dtype == torch.uint8
-    assert isinstance(recording.dataset, Dataset)

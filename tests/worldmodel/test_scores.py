@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from powderdsl.worldmodel.networks import UNet, fresh_unet
-from powderdsl.worldmodel.scores import baseline, elements_of, frequent, outcomes, score, still
+from powderdsl.worldmodel.scores import elements_of, frequent, outcomes, score, still
 
 START = torch.tensor([[[0, 0, 1, 1], [2, 2, 2, 0]]], dtype=torch.uint8)
 END = torch.tensor([[[0, 1, 1, 1], [2, 0, 2, 0]]], dtype=torch.uint8)
@@ -38,21 +38,6 @@ def test_the_most_frequent_outcome_is_what_a_hand_computes() -> None:
     )
     assert found.loss == pytest.approx(-expected / 8)
     assert (found.accuracy, found.changed_accuracy) == (0.75, 0.0)
-
-
-def test_frequencies_of_much_data_give_the_conditional_entropy() -> None:
-    many = outcomes(PAIRS, 4) * 100_000
-    found = score(frequent(many, ids=(0, 1, 2)), PAIRS, 4)
-    entropy = -(4 * math.log(2 / 3) + 2 * math.log(1 / 3)) / 8
-    assert found.loss == pytest.approx(entropy, rel=1e-4)
-
-
-def test_no_other_chance_that_cells_stay_does_better() -> None:
-    counts = outcomes(PAIRS, 4) * 100_000
-    best = score(still(counts, ids=(0, 1, 2)), PAIRS, 4).loss
-    for stays in (0.70, 0.74, 0.76, 0.80):
-        chances = torch.full((3, 3), (1 - stays) / 2, dtype=torch.float64).fill_diagonal_(stays)
-        assert score(baseline(chances), PAIRS, 3).loss > best
 
 
 def test_a_network_is_scored_as_torch_would() -> None:
@@ -170,22 +155,3 @@ def test_a_predictor_that_knows_the_probabilities_is_calibrated() -> None:
     sharper = score(lambda ids: 3 * chances[: len(ids)].log(), [(starts, ends)], 4)
     assert sharper.ece is not None
     assert sharper.ece > 0.05
-
-
-def test_counts_do_not_depend_on_batches() -> None:
-    torch.manual_seed(1)
-    logits = 4 * torch.randn(40, 5, 9, 7)
-    starts, ends = (torch.randint(0, 5, (40, 9, 7), dtype=torch.uint8) for _ in range(2))
-    at = {tuple(one.flatten().tolist()): number for number, one in enumerate(starts)}
-
-    def network(ids: Tensor) -> Tensor:
-        return logits[[at[tuple(one.flatten().tolist())] for one in ids]]
-
-    whole = score(network, [(starts, ends)], 5)
-    order = torch.randperm(40)
-    parts = score(network, [(starts[one], ends[one]) for one in order.split(7)], 5)
-    assert torch.equal(whole.bins, parts.bins)
-    assert torch.equal(whole.confusion, parts.confusion)
-    one, other = whole.plain(), parts.plain()
-    assert one.pop("loss") == pytest.approx(other.pop("loss"))
-    assert one == other

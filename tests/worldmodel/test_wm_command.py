@@ -43,21 +43,8 @@ def test_train_eval_finetune_and_show(dunes: str, tmp_path: Path) -> None:
     kept = json.loads((folder / "evaluation.json").read_text())
     assert list(kept["tests"]) == ["falling"]
 
-    result = run(
-        *(
-            "wm",
-            "finetune",
-            folder,
-            "--packs",
-            "stone",
-            "--iterations",
-            3,
-            "--run",
-            tuned,
-            "--backend",
-            "torch",
-        )
-    )
+    words = f"wm finetune {folder} --packs stone --iterations 3 --run {tuned} --backend torch"
+    result = run(*words.split())
     assert result.exit_code == 0, result.output
     about = json.loads((tuned / "run.json").read_text())
     assert about["config"]["data"]["only"] == ["stone"]
