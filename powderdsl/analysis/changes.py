@@ -349,9 +349,7 @@ class ReducedWorld:
 
     def __init__(self, search: SubstepSearch, absent: frozenset[int], lets: Lets):
         self.absent = absent
-        facts = replace(
-            search.facts, ids=tuple(number for number in search.facts.ids if number not in absent)
-        )
+        facts = replace(search.facts, ids=tuple(i for i in search.facts.ids if i not in absent))
         self.search = SubstepSearch(replace(search.moment, rules=()), facts, {})
         for name, value in lets.items():
             reduced = self.rewrite(value)
@@ -363,9 +361,7 @@ class ReducedWorld:
     def _is_possible(self, *conditions: Expr) -> bool:
         """True if a cell of this world may fulfill all conditions."""
         facts = self.search.facts
-        return bool(facts.ids) and satisfiable(
-            facts, [(condition, HERE) for condition in conditions], self.search.lets
-        )
+        return bool(facts.ids) and satisfiable(facts, [(c, HERE) for c in conditions], self.search.lets)
 
     def may(self, rule: Rule) -> bool:
         """True if the rule may happen in this world."""

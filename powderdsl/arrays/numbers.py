@@ -163,9 +163,7 @@ def unify(several: Sequence[Values], kind: Type) -> list[Values]:
     """Values of one type, all as bytes or all as an `array.array`."""
     if len({type(values) for values in several}) == 1:
         return list(several)
-    return [
-        unpack(raw_of(values, kind), kind.code) if isinstance(values, bytes) else values for values in several
-    ]
+    return [unpack(raw_of(v, kind), kind.code) if isinstance(v, bytes) else v for v in several]
 
 
 _NONZERO = bytes([0]) + bytes([1]) * 255

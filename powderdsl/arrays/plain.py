@@ -278,9 +278,7 @@ def asarray(values: Any, dtype: Any = None) -> ndarray:
     else:
         kind = _dtype(dtype)
     if arrays:
-        leaves = [
-            number for leaf in leaves for number in (leaf.full if isinstance(leaf, ndarray) else (leaf,))
-        ]
+        leaves = [n for leaf in leaves for n in (leaf.full if isinstance(leaf, ndarray) else (leaf,))]
     return ndarray(shape, kind, numbers.pack_exactly(leaves, kind))
 
 
@@ -541,6 +539,5 @@ def searchsorted(values: ndarray, wanted: ndarray, side: str = "left") -> ndarra
     call, listed = bisect_left if side == "left" else bisect_right, values.tolist()
     if bool(isnan(wanted).any()):
         raise TypeError("searchsorted of NaN is not there without NumPy")
-    return ndarray(
-        wanted.shape, int64, numbers.pack_exactly([call(listed, number) for number in wanted.values], int64)
-    )
+    counts = [call(listed, number) for number in wanted.values]
+    return ndarray(wanted.shape, int64, numbers.pack_exactly(counts, int64))

@@ -168,11 +168,9 @@ def render_text(diagnostic: Diagnostic, *, color: bool = False) -> str:
         return f"\x1b[{style}m{text}\x1b[0m" if color else text
 
     severity = diagnostic.severity
-    head = (
-        paint(f"{severity.value}[{diagnostic.code}]", COLORS[severity]) + f": {printable(diagnostic.message)}"
-    )
+    code = paint(f"{severity.value}[{diagnostic.code}]", COLORS[severity])
     places, gutter = source_lines([diagnostic.primary, *diagnostic.secondary])
-    lines = [head, *places]
+    lines = [f"{code}: {printable(diagnostic.message)}", *places]
     lines.extend(f"{' ' * gutter} = note: {printable(note)}" for note in diagnostic.notes)
     lines.extend(f"{' ' * gutter} = help: {printable(text)}" for text in diagnostic.helps)
     lines.append(f"{' ' * gutter} = more: powderdsl explain {diagnostic.code}")

@@ -339,13 +339,9 @@ class RulesetDecl(Record, noun="a ruleset"):
 
     @property
     def leading_packs(self) -> list[str]:
-        """The packs of that ruleset, except packs that others of the same name replace."""
-        members = self.members
-        return [
-            name
-            for name, ruleset in self.layout_ruleset.members.items()
-            if members.get(name, ruleset) is ruleset
-        ]
+        """The packs of `layout_ruleset`, except packs that others of the same name replace."""
+        members, leading = self.members, self.layout_ruleset.members
+        return [name for name, ruleset in leading.items() if members.get(name, ruleset) is ruleset]
 
     @property
     def renames(self) -> dict[str, tuple[Scalar, Scalar]]:

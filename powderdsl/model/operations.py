@@ -70,6 +70,10 @@ class Operation:
         return min(values), max(values)
 
 
+def _abs_bounds(a: Bounds) -> Bounds:
+    return 0 if a[0] <= 0 <= a[1] else min(map(abs, a)), max(map(abs, a))
+
+
 def _quotient_bounds(a: Bounds, b: Bounds) -> Bounds:
     """For divisors of one sign, the extremes lie at the ends of both ranges."""
     divisors = [d for d in (b[0], min(b[1], -1), max(b[0], 1), b[1]) if d and b[0] <= d <= b[1]]
@@ -119,14 +123,7 @@ _TABLE = (
     Operation(
         "max", "the larger of two numbers", "max(A, B)", (NUMBER,), most=8, evaluate=max, monotone=True
     ),
-    Operation(
-        "abs",
-        "a number without its sign",
-        "abs(A)",
-        (NUMBER,),
-        evaluate=abs,
-        bounds=lambda a: (0 if a[0] <= 0 <= a[1] else min(map(abs, a)), max(map(abs, a))),
-    ),
+    Operation("abs", "a number without its sign", "abs(A)", (NUMBER,), evaluate=abs, bounds=_abs_bounds),
     Operation(
         "clamp", "a number kept between two bounds", "clamp(A, LOW, HIGH)", meaning="min(max(A, LOW), HIGH)"
     ),

@@ -83,9 +83,8 @@ def report_replaced(
     """
     (before, old, lost_value), (after, new, value) = loser, winner
     needs = composition.names.needs
-    if after not in needs or _meaning(lost_value) == _meaning(
-        value
-    ):  # a ruleset knows the values of its packs
+    # A ruleset knows the values of its packs.
+    if after not in needs or _meaning(lost_value) == _meaning(value):
         return
     if before not in needs or before in needs[after]:
         reporter.report(

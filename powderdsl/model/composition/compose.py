@@ -375,9 +375,7 @@ def _ids(
     for place, group in enumerate(groups):
         for decl in group:
             versions = names.versions.get(names.known.get(decl.qualified, ""), [decl])
-            number = next(
-                (recorded[version.qualified] for version in versions if version.qualified in recorded), None
-            )
+            number = next((recorded[v.qualified] for v in versions if v.qualified in recorded), None)
             if number is None and free:
                 number = decl.number
                 if number not in free or 0 < len(palette) <= number:
@@ -489,9 +487,8 @@ def _add_entries(composition: Composition, reporter: Reporter) -> None:
                 more = "; to make a tag, declare it under `tags:`"
                 report_unknown("tag", scalar, tags, reporter, more=more)
         if element is not None:
-            elements[name] = replace(
-                element, color=entry.color or element.color, tags=element.tags | known_tags
-            )
+            tags_of = element.tags | known_tags
+            elements[name] = replace(element, color=entry.color or element.color, tags=tags_of)
 
 
 # Channels, in an order that further packs do not disturb

@@ -511,10 +511,8 @@ def call(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
         message, label = f"`{name}` takes {wanted}, found {count}", "too few" if count < lo else "too many"
         raise typer.fail("PD406", message, syntax.span, label, f"write `{usage}`")
     if function is None:
-        radius = integer_constant(
-            typer, syntax.children[0], scope, 1, MAX_RADIUS, "a radius is an integer constant"
-        )
-        return shaped_kernel(name, radius)
+        message, argument = "a radius is an integer constant", syntax.children[0]
+        return shaped_kernel(name, integer_constant(typer, argument, scope, 1, MAX_RADIUS, message))
     if name in CALLS:
         return CALLS[name](typer, syntax, scope)
     operands = [(typer.evaluate(child, scope), child.span) for child in syntax.children]

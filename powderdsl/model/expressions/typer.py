@@ -405,9 +405,8 @@ class Typer:
 
     def resolve_set(self, name: str, span: Span) -> Operand:
         if name in self.resolving:
-            path = " -> ".join(
-                f"`{set_name}`" for set_name in [*self.resolving[self.resolving.index(name) :], name]
-            )
+            cycle = [*self.resolving[self.resolving.index(name) :], name]
+            path = " -> ".join(f"`{set_name}`" for set_name in cycle)
             message = f"the set `{name}` is defined by itself"
             raise self.fail("PD307", message, span, path, "list elements or tags")
         if len(self.resolving) >= MAX_SET_DEPTH:
@@ -612,9 +611,8 @@ class Typer:
         rounds = prod(len(domain) for domain in domains.values())
         if rounds > MAX_ROUNDS:
             raise self._too_long(rounds, bindings[0].span.to(bindings[-1].span), f"{MAX_ROUNDS:,}")
-        return [
-            scope.bind(**dict(zip(domains, values, strict=True))) for values in product(*domains.values())
-        ]
+        choices = product(*domains.values())
+        return [scope.bind(**dict(zip(domains, values, strict=True))) for values in choices]
 
     def _too_long(self, rounds: int, span: Span, limit: str) -> Poisoned:
         label, fix = f"the limit is {limit}", "loop over fewer things"

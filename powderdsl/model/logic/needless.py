@@ -66,11 +66,7 @@ def report_needless(
     Returns:
         The rules and writes that may have no effect, which takes too much work to decide.
     """
-    silent = [
-        diagnostic.primary.span
-        for diagnostic in reporter.diagnostics
-        if diagnostic.code in SILENT and diagnostic.primary.span
-    ]
+    silent = [d.primary.span for d in reporter.diagnostics if d.code in SILENT and d.primary.span]
     _report_decided(passes, silent, reporter)
     undecided = _report_overruled(passes, _limited(facts), silent, reporter)
     return undecided + _report_lost_writes(passes, fields, _limited(facts), silent, reporter)
