@@ -529,9 +529,11 @@ def nonzero(values: ndarray) -> tuple[ndarray, ...]:
 
 
 def unique(values: Any) -> ndarray:
-    """The different numbers, in ascending order."""
+    """The different numbers, in ascending order; NaN counts once and comes last."""
     array = asarray(values)
-    return asarray(sorted(set(array.values)), array.dtype)
+    different = {value for value in array.values if value == value}
+    nan = [math.nan] if any(value != value for value in array.values) else []
+    return asarray([*sorted(different), *nan], array.dtype)
 
 
 def searchsorted(values: ndarray, wanted: ndarray, side: str = "left") -> ndarray:
