@@ -100,15 +100,13 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "ogbench": (*_SCREEN, "experiments.runs", "tasks", "tasks.tensors", "tasks.episodes", "envs"),
     # Calls commands, in processes of their own.
     "experiments.studies": (*_FRONT, "compiler", "experiments.runs"),
-    "web.worlds": _FRONT,
-    "web": (*_BACK, "simulation.standalone", *_WORLDS, "tasks", "tasks.tensors", "web.worlds"),
-    "web.bridge": (*_SCREEN, "simulation.standalone", *_TESTING, "web.worlds"),
+    "web": (*_BACK, "simulation.standalone", *_WORLDS, "tasks", "tasks.tensors"),
+    "web.bridge": (*_SCREEN, "simulation.standalone", *_TESTING),
     "cli": (
         *_SCREEN,
         "analysis.costs",
         "simulation.standalone",
         "web",
-        "web.worlds",
         *_TESTING,
         "testing.mutation",
         *_LEARNING,
@@ -131,8 +129,6 @@ class Home:
 _TEXT = ("syntax",)
 _TORCH = (
     "targets.tensor_kind",
-    "targets.random",
-    "targets.words",
     "targets.torch.program",
     "targets.arrays.program",
     "targets.cpp.program",

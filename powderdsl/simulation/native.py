@@ -45,8 +45,7 @@ from powderdsl.targets.cpp.build import (
 )
 from powderdsl.targets.cpp.program import NativeProgram, compile_program, recall, remember
 from powderdsl.targets.cpp.source import known_width
-from powderdsl.targets.job import Job, Runnable, shape_of, unavailable
-from powderdsl.targets.mixed import mixed_program
+from powderdsl.targets.job import Job, Runnable, mixed_program, shape_of, unavailable
 from powderdsl.targets.torch.program import TorchProgram
 
 SOURCES = ("compiler.py", "simulation/native.py", "model", "analysis", "ir", "schedule", "targets")

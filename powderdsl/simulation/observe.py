@@ -21,8 +21,7 @@ from powderdsl.model.types import Ruleset
 from powderdsl.simulation.draw import looks, rgb
 from powderdsl.targets.cpp.program import PackedState
 from powderdsl.targets.job import shape_of
-from powderdsl.targets.tensor_kind import Tensors
-from powderdsl.targets.words import pack, word_count
+from powderdsl.targets.tensor_kind import Tensors, pack, word_count
 
 State = Mapping[str, Tensor]
 

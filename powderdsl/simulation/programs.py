@@ -17,8 +17,7 @@ from powderdsl.model.types import Ruleset
 from powderdsl.system.memo import Memo, collection_paused
 from powderdsl.system.writing import failure
 from powderdsl.targets.array_kind import Array, ArrayKind
-from powderdsl.targets.job import Job, Runnable, unavailable
-from powderdsl.targets.mixed import mixed_program
+from powderdsl.targets.job import Job, Runnable, mixed_program, unavailable
 from powderdsl.targets.wasm.host import this_host
 from powderdsl.targets.wasm.program import WasmProgram
 

@@ -1,4 +1,4 @@
-"""Torch tensors on one device, as worlds and programs use them."""
+"""Torch tensors on one device, as worlds and programs use them, and flags packed into words."""
 
 from __future__ import annotations
 
@@ -72,3 +72,25 @@ class Tensors(ArrayKind):
     def bytes_of(self, array: Tensor) -> Any:
         """A view: the tensor must live longer."""
         return (ctypes.c_ubyte * array.nbytes).from_address(array.data_ptr())
+
+
+WORD = 64
+"""Columns in a word of packed flags."""
+
+
+def word_count(width: int) -> int:
+    return -(-width // WORD)
+
+
+_LITTLE = torch.tensor([1 << i for i in range(8)], dtype=torch.uint8)
+
+
+def pack(flags: Tensor) -> Tensor:
+    """bool [..., W] → int64 [..., ⌈W/64⌉]."""
+    width = flags.shape[-1]
+    missing = word_count(width) * WORD - width
+    if missing:
+        flags = torch.nn.functional.pad(flags.to(torch.uint8), (0, missing))
+    octets = flags.to(torch.uint8).reshape(*flags.shape[:-1], -1, 8)
+    packed = (octets * _LITTLE.to(flags.device)).sum(-1, dtype=torch.uint8)
+    return packed.view(torch.int64)

@@ -21,9 +21,8 @@ from powderdsl.tasks.drawings import choice_ids, element_ids, limited, line_in, 
 from powderdsl.tasks.goals import GoalChecker, parts_of
 from powderdsl.tasks.task import BLOW, MAX_SIDE, NO_CHANGE, Agent, Expert, ExpertMove, Measure
 from powderdsl.worlds.raster import Shape, Size
-from powderdsl.worlds.scene.amounts import constants
 from powderdsl.worlds.scene.read import two_integers
-from powderdsl.worlds.scene.statements import amounts_of
+from powderdsl.worlds.scene.statements import amounts_of, constants
 
 ACTS = {"blow": BLOW, "nothing": NO_CHANGE}
 """Words of `may:` that are not elements."""

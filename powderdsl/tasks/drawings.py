@@ -29,20 +29,18 @@ from powderdsl.worlds.ascii import load_ascii, parse_ascii
 from powderdsl.worlds.image import read_image
 from powderdsl.worlds.raster import Setting, Shape, Size, mask
 from powderdsl.worlds.scene import draw_start, find_scene, shipped_scenes
-from powderdsl.worlds.scene.amounts import (
-    Written,
-    constants,
-    number,
-    read_amount,
-    report_unknown,
-)
 from powderdsl.worlds.scene.read import covers_nothing, not_a_statement
 from powderdsl.worlds.scene.statements import (
     RANGES,
     Statement,
+    Written,
     amounts_of,
+    constants,
+    number,
+    read_amount,
     read_line,
     read_statement,
+    report_unknown,
     shape_of,
 )
 

@@ -37,9 +37,8 @@ from powderdsl.tasks.drawings import (
 from powderdsl.tasks.goals import ACTION_WORDS, FUNCTIONS, GoalChecker
 from powderdsl.tasks.task import MAX_SIDE, Goal, Knob, Split, Task
 from powderdsl.worlds.raster import Size
-from powderdsl.worlds.scene.amounts import Written, number, read_amount, report_unknown
 from powderdsl.worlds.scene.read import two_integers
-from powderdsl.worlds.scene.statements import Statement
+from powderdsl.worlds.scene.statements import Statement, Written, number, read_amount, report_unknown
 
 
 class KnobDecl(Entry, noun="a knob"):

@@ -218,8 +218,7 @@ class Session:
 
     def open_world(self, data: str) -> dict[str, Any]:
         """The first world of an .npz (base64)."""
-        from powderdsl.web.worlds import first_world_data
-        from powderdsl.worlds.store import load_world
+        from powderdsl.worlds.store import first_world_data, load_world
 
         path = self.folder.parent / "opened.npz"
         path.write_bytes(base64.b64decode(data))

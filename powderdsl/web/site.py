@@ -37,9 +37,9 @@ from powderdsl.system.writing import replacing
 from powderdsl.targets.array_kind import ArrayKind
 from powderdsl.tasks.shipped import load_task, shipped_tasks
 from powderdsl.tasks.tensors.generator import StartWorlds
-from powderdsl.web.worlds import world_data
 from powderdsl.worlds.raster import Size, mask
 from powderdsl.worlds.scene import draw_start, shipped_scenes
+from powderdsl.worlds.store import world_data
 from powderdsl.worlds.strewn import frame_element, random_shape, strew
 
 HERE = Path(__file__).parent

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import os
+from collections.abc import Mapping
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -11,7 +13,7 @@ from typing import Any
 from powderdsl.arrays import np
 from powderdsl.diagnostics import CompileError
 from powderdsl.model.state import qualified_slots, slot_name
-from powderdsl.model.types import ELEMENT
+from powderdsl.model.types import ELEMENT, Ruleset
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.system.archives import Archive, BadArchive, open_archive, write_archive
 from powderdsl.system.reading import parse_json
@@ -177,3 +179,39 @@ def _bad(path: Path, problem: str) -> CompileError:
 
 def _mismatch(path: Path, problem: str, fix: str) -> CompileError:
     return failure("PD603", f"`{path}` does not fit: {problem}", helps=(fix,))
+
+
+# Worlds as JSON, as the page reads and writes them (`web/page/worlds.js`)
+
+
+def world_data(
+    ruleset: Ruleset, ids: Any, fields: Mapping[str, Any], clock: tuple[int, int, int]
+) -> dict[str, Any]:
+    """A world as JSON: ids [H, W] and whole fields [H, W] or [2, H, W], by qualified names."""
+    qualified = qualified_slots(ruleset)
+    return {
+        "rows": int(ids.shape[0]),
+        "columns": int(ids.shape[1]),
+        "palette": {str(element.id): element.qualified for element in ruleset.elements},
+        "ids": _text(ids.astype("uint8").tobytes()),
+        "fields": {
+            qualified.get(name, name): {
+                "type": str(values.dtype),
+                "components": 2 if values.ndim == 3 else 1,
+                "values": _text(values.tobytes()),
+            }
+            for name, values in fields.items()
+        },
+        "clock": [str(number) for number in clock],
+    }
+
+
+def first_world_data(world: World) -> dict[str, Any]:
+    """The first of some worlds of a simulator as JSON."""
+    state = {name: world.sim.kind.to_numpy(values)[0] for name, values in world.state.items()}
+    clock = int(world.seed[0]), int(world.index[0]), int(world.step[0])
+    return world_data(world.sim.ruleset, state.pop("element"), state, clock)
+
+
+def _text(data: bytes) -> str:
+    return base64.b64encode(data).decode()

@@ -13,7 +13,7 @@ from powderdsl.compiler import shipped_tests
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.simulation.simulator import compile as compile_rules
-from powderdsl.targets.mixed import MixedProgram
+from powderdsl.targets.job import MixedProgram
 from powderdsl.targets.wasm.program import WasmState
 from powderdsl.testing.generators.cases import load_text
 from tests.semantics.test_mixed import HEAVY

@@ -12,7 +12,7 @@ from powderdsl.ir.segments import PassForm, choose_form, segments
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.programs import BackendProgram
 from powderdsl.simulation.simulator import Simulator
-from powderdsl.targets.mixed import MixedProgram, mixed_program
+from powderdsl.targets.job import MixedProgram, mixed_program
 from powderdsl.targets.tensor_kind import Tensors
 from powderdsl.targets.torch.program import TorchProgram
 from powderdsl.targets.wasm.program import WasmProgram

@@ -16,7 +16,7 @@ import wasmtime
 import powderdsl
 from powderdsl.web import bridge
 from powderdsl.web.site import Entry, shipped_entries
-from powderdsl.web.worlds import world_data
+from powderdsl.worlds.store import world_data
 
 
 @pytest.fixture

@@ -126,8 +126,7 @@ def _kernels(program: Program, backend: str, pass_name: str | None) -> Iterator[
 
             yield cuda_source(part.planes, 64, 64, SHOWN_SHARED).text
         else:
-            from powderdsl.targets.wasm.passes import pass_function_name
-            from powderdsl.targets.wasm.source import wasm_module
+            from powderdsl.targets.wasm.source import pass_function_name, wasm_module
 
             chosen = None if pass_name is None else pass_function_name(pass_name)
             yield wasm_module(part.planes, SHOWN_WIDTH).listing(chosen)

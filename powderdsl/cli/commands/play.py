@@ -50,7 +50,7 @@ def command(
         start = None
         if world is not None:
             from powderdsl.cli.start_worlds import start as begin
-            from powderdsl.web.worlds import first_world_data
+            from powderdsl.worlds.store import first_world_data
 
             drawn = first_world_data(begin(ruleset, world, None, None, None))
             start = {"name": Path(world).name, "about": "", **drawn}

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from powderdsl.ir.ops import Program
-from powderdsl.targets import words as torch_words
 from powderdsl.targets.codec import parameters, pieces
 from powderdsl.targets.cuda import build
 from powderdsl.targets.cuda.source import KernelSource, cuda_source
 from powderdsl.targets.job import Job, Like, PackedArrays, Runnable, like_of, shape_of, unavailable
+from powderdsl.targets.tensor_kind import pack
 from powderdsl.targets.torch.program import packed_program
 
 _HELP = "run on the device `cuda`, or on the backend `torch`, or on `native` on the CPU"
@@ -121,7 +121,7 @@ class CudaProgram:
                     reals[:, layout.reals[piece.slot]] = piece.of(value)
                     continue
                 for i, plane in enumerate(piece.planes):
-                    words = torch_words.pack((value >> i) & 1 != 0)
+                    words = pack((value >> i) & 1 != 0)
                     planes[:, layout.planes[plane]] = words.view(torch.int32)[..., :row_words]
         return DeviceState(self, planes, reals, like_of(state))
 

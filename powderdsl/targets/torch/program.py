@@ -16,16 +16,52 @@ from torch import Tensor
 from powderdsl.ir.ops import SNAP, Program, Threshold, kernel_rows
 from powderdsl.ir.segments import segments
 from powderdsl.system.memo import collection_paused
-from powderdsl.system.random import base_keys
-from powderdsl.targets import random
+from powderdsl.system.random import MASK, base_keys, mix
 from powderdsl.targets.codec import limits, pieces
-from powderdsl.targets.job import Job, Runnable
-from powderdsl.targets.mixed import mixed_program
+from powderdsl.targets.job import Job, Runnable, mixed_program
 from powderdsl.targets.torch.source import load_source, pass_source
 
 PassFunction = Callable[[Any, dict[str, Tensor]], dict[str, Tensor]]
 
 _DTYPES = {"flag": torch.bool, "int": torch.int32, "real": torch.float32}
+
+
+# Random numbers: the bit planes of each draw are hashes of (seed, world, step, stream, word). The same numbers as
+# `model.reference.draw`, in int64 arithmetic kept below 2³²: no generator, no state, no host sync.
+
+
+def step_keys(base: Tensor, step: Tensor, idents: Tensor) -> Tensor:
+    """Keys of one step for each stream: int64 [S, 2, B]. `step` is [B], `idents` [S]."""
+    keys = mix((base + (step & MASK)) & MASK)
+    return mix((keys[None] + idents[:, None, None]) & MASK)
+
+
+def words(keys: Tensor, bits: int, height: int, width: int) -> Tensor:
+    """Hashes of the first `bits` bit planes: int64 [bits, B, H, ⌈W/32⌉]; bit x % 32 of word x // 32 is column x.
+
+    `keys` is [2, B]: one stream's part of `step_keys`.
+    """
+    across = -(-width // 32)
+    number = torch.arange(height * across, dtype=torch.int64, device=keys.device).view(height, across) * 32
+    plane = torch.arange(bits, dtype=torch.int64, device=keys.device)
+    n = ((number + plane[:, None, None]) * 0x9E3779B1) & MASK
+    h = (n[:, None] + keys[0][:, None, None]) & MASK
+    h = h ^ (h >> 16)
+    h = (h * 0x7FEB352D) & MASK
+    h = h ^ (h >> 15)
+    h = (((h + keys[1][:, None, None]) & MASK) * 0x846CA68B) & MASK
+    return h ^ (h >> 16)
+
+
+def draws(keys: Tensor, bits: int, height: int, width: int) -> Tensor:
+    """The first `bits` bits of each cell's draw as an integer: int64 [B, H, W]."""
+    planes = words(keys, bits, height, width)
+    column = torch.arange(32, dtype=torch.int64, device=keys.device)
+    result = torch.zeros((), dtype=torch.int64, device=keys.device)
+    for plane in planes:
+        result = (result << 1) | ((plane[..., None] >> column) & 1)
+    batch, rows, across, _ = result.shape
+    return result.view(batch, rows, across * 32)[..., :width]
 
 
 @dataclass
@@ -50,7 +86,7 @@ class Kernels:
     def begin(self, step: Tensor) -> None:
         """Start a step: new keys, no draws yet."""
         self.step = step
-        self.keys = random.step_keys(self.base, step, self.idents)
+        self.keys = step_keys(self.base, step, self.idents)
         self._draws.clear()
 
     def full(self, x: Tensor) -> Tensor:
@@ -97,7 +133,7 @@ class Kernels:
             if stream in self.given:
                 self._draws[key] = self.given[stream] >> (resolution - bits)
             else:
-                self._draws[key] = random.draws(self.keys[position], bits, *self.shape[1:])
+                self._draws[key] = draws(self.keys[position], bits, *self.shape[1:])
         return self._draws[key]
 
     def draw_real(self, stream: str) -> Tensor:

@@ -19,7 +19,7 @@ from powderdsl.system.random import MASK, base_keys, mix, name_number
 from powderdsl.targets.array_kind import Array, ArrayKind
 from powderdsl.tasks.task import Drawing, Generator, Group, Region, Task
 from powderdsl.worlds.raster import Shape, Size, covered_rows, mask
-from powderdsl.worlds.scene.amounts import constants
+from powderdsl.worlds.scene.statements import constants
 
 
 def shape_cells(kind: ArrayKind, shape: str, numbers: Sequence[Array | None], size: Size) -> Array:

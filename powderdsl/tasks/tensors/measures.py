@@ -18,9 +18,9 @@ from powderdsl.model.types import Expr, Ruleset
 from powderdsl.simulation.simulator import World
 from powderdsl.targets.cpp.counts import CellCounts, Counted
 from powderdsl.targets.cpp.program import NativeProgram, PackedState
+from powderdsl.targets.tensor_kind import pack
 from powderdsl.targets.torch.program import Kernels, PassFunction, compiled
 from powderdsl.targets.torch.source import pass_source
-from powderdsl.targets.words import pack
 from powderdsl.tasks.goals import REGION_LET, parts_of
 from powderdsl.tasks.task import Goal, Measure
 from powderdsl.tasks.tensors.generator import NOTHING

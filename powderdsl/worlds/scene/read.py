@@ -23,12 +23,12 @@ from powderdsl.syntax.sources import read_source
 from powderdsl.system.writing import failure
 from powderdsl.worlds.ascii import ids_by_name
 from powderdsl.worlds.raster import MAX_CELLS, Paint, Setting, Shape, Size, mask
-from powderdsl.worlds.scene.amounts import constants
 from powderdsl.worlds.scene.statements import (
     SETTING,
     STATEMENTS,
     Statement,
     amounts_of,
+    constants,
     read_line,
     read_statement,
     shape_of,
