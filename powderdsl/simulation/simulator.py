@@ -276,7 +276,7 @@ class Simulator:
         return self.kind.xp.where(cells[:, None] if slot.planes == 2 else cells, yes, no)
 
     def _integers(self, value: Any, name: str) -> Array:
-        array = self.kind.given(value, name)
+        array = self.kind.convert(value, name)
         if self.kind.sort(array) != "int":
             raise TypeError(f"{name} must be integers, found {array.dtype}")
         return array
@@ -332,7 +332,7 @@ class Simulator:
         raise ValueError(f"`{name}` follows from the element: no rule of {self.ruleset.name} changes it")
 
     def _shaped(self, value: Any, name: str, shape: tuple[int, ...], vector: bool = False) -> Array:
-        array = self.kind.given(value, name)
+        array = self.kind.convert(value, name)
         target = (shape[0], 2, *shape[1:]) if vector else shape
         if vector and array.ndim == 1 and len(array) == 2:
             array = array[None, :, None, None]

@@ -119,7 +119,7 @@ def checked_parameter(kind: ArrayKind, value: Any, param: Param, batch: int) -> 
     """Given values of a parameter: float64 [B] in memory of their own. Raises TypeError, ValueError."""
     xp, name = kind.xp, param.name
     lo, hi = stored_range(param.kind)
-    array = xp.asarray(kind.given(value, name), dtype=xp.float64)
+    array = xp.asarray(kind.convert(value, name), dtype=xp.float64)
     if array.ndim > 1 or (array.ndim == 1 and len(array) != batch):
         raise ValueError(f"{name} takes one value or {batch}, found shape {list(array.shape)}")
     if not bool(((array >= lo) & (array <= hi)).all()):

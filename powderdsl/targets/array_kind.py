@@ -1,6 +1,6 @@
 """The libraries whose arrays worlds and programs use: `powderdsl.arrays` here, and torch in `tensor_kind`.
 
-What both call by the same name is called by it, as `kind.xp.where`; the rest are methods of a kind.
+Functions with the same name in both libraries are called through `kind.xp`; the rest are methods of a kind.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ class ArrayKind:
 
     @property
     def on_cpu(self) -> bool:
-        """Whether arrays are in this process's memory."""
+        """True if arrays are in this process's memory."""
         return True
 
-    def given(self, value: Any, name: str) -> Array:
-        """Values from outside as an array, which may share their memory. Raises TypeError."""
+    def convert(self, value: Any, name: str) -> Array:
+        """A caller's values as an array, which may share their memory. Raises TypeError."""
         try:
             array = np.asarray(value)
         except (TypeError, ValueError, RuntimeError, OverflowError) as error:
@@ -54,7 +54,7 @@ class ArrayKind:
         return np.arange(count, dtype=np.int64)
 
     def copied(self, array: Array) -> Array:
-        """The same values in memory of their own, in C order."""
+        """The same values in new memory, in C order."""
         return array.copy()
 
     def contiguous(self, array: Array) -> Array:
@@ -74,7 +74,7 @@ class ArrayKind:
         return array
 
     def from_numpy(self, array: Array) -> Array:
-        """An array of this library; it may share the memory of a given one that can be written to."""
+        """An array of this library, which may share the memory of a writable argument."""
         return array
 
     # Programs in the memory of this process

@@ -1,6 +1,6 @@
 """The cache of compiled code: files that are added atomically and checked before they are loaded.
 
-<key>-<digest>-<name>    a library, a GPU kernel, or what else is needed to run one; modified when it was last used
+<key>-<digest>-<name>    a library, a GPU kernel, or other data needed to run it; modified when it was last used
 <key>.lock               held by the process that compiles
 .powderdsl-…             being added, or a compiler's
 """

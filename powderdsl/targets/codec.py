@@ -53,7 +53,7 @@ def pieces(program: Program) -> dict[str, tuple[Piece, ...]]:
 
 
 def limits(xp: Any, values: Any, threshold: Threshold) -> Any:
-    """For chances, float64 [B]: how many of the possible draws lie below each, or not above it if strict: int64 [B]."""
+    """For chances, float64 [B]: the number of possible draws below each, or not above it if strict: int64 [B]."""
     count = 1 << threshold.bits
     scaled = values * count - 0.5
     limit = -xp.floor(-scaled) if threshold.strict else xp.floor(scaled) + 1
@@ -70,8 +70,8 @@ def parameters(
 ) -> tuple[Any, Any]:
     """Parameters as the bits and floats that compiled code reads: uint8 [n, B], float32 [m, B].
 
-    `xp` is the library of the arrays, and `where` says on which device, if it has some. `planes` and `reals` give the
-    numbers of what is read: bits of a value or of a threshold, and values.
+    `xp` is the library of the arrays; `where` is its device argument, if it has one. `planes` numbers the bits of values
+    and thresholds that the code reads, and `reals` the values.
     """
     bits = xp.zeros((max(1, len(planes)), batch), dtype=xp.uint8, **where)
     views: dict[tuple[str, Threshold | None], Any] = {}

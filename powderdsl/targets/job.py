@@ -1,4 +1,4 @@
-"""What programs are given and what they are: jobs, clocks, runnables, and the time that each pass takes."""
+"""Programs and their jobs: clocks, states in a backend's memory, the time that each pass takes, and mixed programs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ class PassClock:
     """Seconds by pass. Work before the first pass has the name ``""``."""
 
     def __init__(self, device: Any):
-        """`device`: that of the arrays."""
         self._device = device
         self.seconds: defaultdict[str, float] = defaultdict(float)
         self._last = self._now()
@@ -45,7 +44,7 @@ class PassClock:
 class Clock(NamedTuple):
     """Seed and world index of each world, int64 [B], and its step: `since` steps after `start`, int64 [B].
 
-    Whoever needs the sum computes it: a step of one small world takes no longer than a few operations of torch.
+    The sum is computed only when it is read: a step of one small world takes no longer than a few operations of torch.
     """
 
     seed: Array
@@ -82,7 +81,7 @@ class PackedArrays(Mapping[str, Array]):
         return self._arrays[name]
 
     def has(self, name: str) -> bool:
-        """Whether a slot's array has been made."""
+        """True if a slot's array has been unpacked."""
         return name in self._arrays
 
     def __iter__(self) -> Iterator[str]:
@@ -106,7 +105,7 @@ class OwnedBatch(PackedArrays):
         raise NotImplementedError
 
     def __del__(self) -> None:
-        # Not a weakref.finalize, which takes as long as a quiet step. A signal may have ended `__init__` before its end.
+        # Not a weakref.finalize, which takes as long as a quiet step. A signal may have interrupted `__init__`.
         if (handle := getattr(self, "_handle", None)) is not None:
             self.release(handle)
 
@@ -147,12 +146,12 @@ def shape_of(state: Mapping[str, Array]) -> tuple[int, int, int]:
     return batch, height, width
 
 
-class Job(NamedTuple):  # made faster than a frozen dataclass, at each call
+class Job(NamedTuple):  # created at each call, faster than a frozen dataclass
     """Steps of a batch of worlds.
 
     `state` has one array per slot, in storage dtypes, and is not changed unless `reuse`. `params` are float64 [B], in a
-    mapping that nobody changes: programs recognize it. `draws`, int64 [B, H, W] below 2^bits, replace a stream's own
-    numbers; `passes` names the passes to run, None for all.
+    mapping that nobody changes: programs cache inputs by its identity. `draws`, int64 [B, H, W] below 2^bits, replace a
+    stream's numbers; `passes` names the passes to run, None for all.
     """
 
     state: Mapping[str, Array]
@@ -162,7 +161,7 @@ class Job(NamedTuple):  # made faster than a frozen dataclass, at each call
     draws: Mapping[str, Array]
     passes: frozenset[str] | None
     reuse: bool = False
-    """Whether `state` may be overwritten because nothing reads it afterwards."""
+    """True if `state` may be overwritten because nothing reads it afterwards."""
     timing: PassClock | None = None
     """Measures the time of passes, in programs that can report it."""
 
@@ -208,11 +207,11 @@ def mixed_program(
     packed: Callable[[Program, Program], Runnable],
     cells: Callable[[Program], Runnable],
 ) -> Runnable:
-    """The program of some segments. A single one needs no wrapper.
+    """The program of some segments. A single segment needs no wrapper.
 
     Args:
-        packed: makes the program of a segment from its numeric program and the same on bit planes.
-        cells: makes that of a segment which bit planes cannot represent.
+        packed: makes the program of a segment from its numeric program and the same program on bit planes.
+        cells: makes the program of a segment that bit planes cannot represent.
     """
     parts = [
         cells(segment.program) if segment.planes is None else packed(segment.program, segment.planes)

@@ -22,15 +22,15 @@ class Layout:
     fixed: dict[tuple[int, int, int], int] = field(default_factory=dict)
 
     def home(self, piece: Piece) -> tuple[int, int, bool]:
-        """Where a piece of the state is: its field's number, 0 and False; or that of its first plane, how many planes there
-        are, and whether the last one is a sign.
+        """The location of a piece of the state: the number of its field, 0 and False; or the number of its first plane, the
+        number of planes, and True if the last plane is a sign.
         """
         if piece.is_real:
             return self.reals[piece.slot], 0, False
         return self.planes[piece.planes[0]], len(piece.planes), piece.signed
 
     def limit(self, draw: Node) -> int:
-        """The first of the planes of the parameter that a draw is compared with: of its highest bit; the others follow."""
+        """The plane of the highest bit of the parameter that a draw is compared with; lower bits follow."""
         _, bits, name, threshold = draw.attr
         return self.param_planes[name, threshold, bits]
 
@@ -40,30 +40,30 @@ class NativeLayout(Layout):
     """The layout of a native context, and the sizes of its tables: the largest numbers and distances in any pass."""
 
     coins: dict[int, int] = field(default_factory=dict)
-    """By stream: the draws of one bit, each of which is made once a step."""
+    """The number of each stream whose draws are coins, which are tossed once a step."""
     moving: int = 0
     """Planes in a movement."""
     turned: int = 0
     """Masks of choices that a loop applies."""
     waiting: int = 0
-    """Rows of floats that wait for loops some rows behind."""
+    """Rows of floats that are buffered for loops some rows behind."""
     marks: int = 0
-    """Loops over cells that run together and ask planes in which rows to run."""
+    """Loops over cells that run together and test planes for rows to run in."""
     marked: int = 0
-    """Planes that such a loop asks."""
+    """Planes that such a loop tests."""
     reach: int = 1
-    """Columns beyond the edges at which a row of floats is read."""
+    """Distance in columns beyond the edges at which a row of floats is read."""
     real_rows: int = 1
-    """Rows away at which floats are read."""
+    """Distance in rows at which floats are read."""
     halo: int = 16
     """Rows and columns beyond the grid for which tables and rows of floats have room."""
     around_rows: int = 0
-    """Rows away at which planes are read, wrapping at the edges."""
+    """Distance in rows at which planes are read, wrapping at the edges."""
     beyond_rows: int = 0
-    """The same with zeros outside the grid."""
+    """The same distance with zeros outside the grid."""
 
     def cover(self, **sizes: int) -> None:
-        """Make tables as large as this, if they are smaller."""
+        """Enlarge tables to at least these sizes."""
         for name, size in sizes.items():
             setattr(self, name, max(getattr(self, name), size))
 

@@ -35,10 +35,10 @@ class Printer:
 
 
 class Values(Generic[Named]):
-    """Statements of a block, and the names of what they compute: of values by the id of their node, of anything else by a key."""
+    """Statements of a block, and the names of their results: by the id of a value's node, or by a key."""
 
     direct: tuple[str, ...] = ("shift",)
-    """Operations that are printed without names for their arguments; of a `when`, only the first one needs a name."""
+    """Operations that are printed without names for their arguments; of a `when`, only the first argument needs a name."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
@@ -46,7 +46,7 @@ class Values(Generic[Named]):
         self.count = 0
 
     def node(self, node: Node, args: Sequence[Named]) -> Named:
-        """The name or expression of a node, from the names of the arguments that get some before (`below`)."""
+        """The name or expression of a node, from the names of the arguments in `below`."""
         raise NotImplementedError
 
     def named(self, node: Node, value: Named) -> Named:
@@ -68,13 +68,13 @@ class Values(Generic[Named]):
         return node.args[:1] if node.op == "when" else node.args
 
     def fresh(self, prefix: str) -> str:
-        """A name that the block does not have yet."""
+        """A new name."""
         self.count += 1
         return f"{prefix}{self.count}"
 
     @contextmanager
     def inner(self, more: Mapping[object, Named] | None = None) -> Iterator[list[str]]:
-        """A block in this one: its lines, and names that are valid only there, such as `more`."""
+        """A nested block: its lines, and names that are valid only inside, such as `more`."""
         outer, known = self.lines, self.known
         self.lines, self.known = [], {**known, **(more or {})}
         yield self.lines
@@ -105,7 +105,7 @@ class WordText(Values[str]):
 
 
 def limited_draw(node: Node) -> Node | None:
-    """The draw that a conjunction is equal to, since it is only made where the other flag holds."""
+    """The draw that a conjunction equals, since the draw is only made where the other flag holds."""
     for value, draw in (node.args, node.args[::-1]) if node.op == "and" else ():
         if draw.op in DRAWS and draw.args[-1:] == (value,):
             return draw
@@ -142,11 +142,11 @@ class CellValues(Values[Named]):
         raise NotImplementedError
 
     def chosen(self, mask: Node, variables: Sequence[Named], values: Sequence[Node]) -> None:
-        """Set variables to other values where a mask holds; these are computed only if it holds in some cell."""
+        """Set variables to other values where a mask holds; values are computed only if the mask holds in some cell."""
         raise NotImplementedError
 
     def choice(self, node: Node) -> Named:
-        """The name of a chain of choices. Others on the same masks get names, too: the components of a vector share tests."""
+        """The name of a chain of choices. Chains on the same masks get names too: the components of a vector share tests."""
         chains = self.alike(node)
         variables = [self.variable(self.of(chain[-1].args[2])) for chain in chains]
         for choices in reversed(list(zip(*chains, strict=True))):
@@ -159,11 +159,11 @@ class CellValues(Values[Named]):
         return variables[0]
 
     def led_by(self, leader: Node) -> list[Node]:
-        """The comparisons that are computed only where another flag holds, their leader."""
+        """The comparisons that are computed only where a flag, their leader, holds."""
         return [node for node in self.nodes if node.op == "led" and node.args[0] is leader]
 
     def chain(self, node: Node) -> list[Node]:
-        """A choice and those below it in its third argument, the outermost first."""
+        """A choice and the choices below it in third arguments, outermost first."""
         chain: list[Node] = []
         while node.op == "select" and id(node) not in self.known:
             chain.append(node)
@@ -177,14 +177,16 @@ class CellValues(Values[Named]):
         for other in self.nodes:
             chain = [] if other is node else self.chain(other)
             same = len(chain) > 1 and [choice.args[0] for choice in chain] == masks
-            if same and not any(_depends(other, one[0]) or _depends(one[0], other) for one in chains):
+            if same and not any(_depends(other, c[0]) or _depends(c[0], other) for c in chains):
                 chains.append(chain)
         return chains
 
 
 def _printed_choices(nodes: Iterable[Node]) -> int:
-    """The number of choices in the text of a loop, beyond one each: those that a choice computes only where its mask
-    holds are printed again for every other choice that needs them."""
+    """The number of repeated choices in the text of a loop.
+
+    A choice computes nested choices only where its mask holds, so they are printed again for every other user.
+    """
     below: dict[Node, frozenset[Node]] = {}
     size: dict[Node, int] = {}
     for node in nodes:

@@ -15,7 +15,7 @@ from powderdsl.targets.array_kind import ArrayKind
 
 @dataclass(frozen=True)
 class Tensors(ArrayKind):
-    """The other kind of arrays: see `ArrayKind`, whose methods these are."""
+    """Torch tensors: see `ArrayKind` for the methods."""
 
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     xp: ClassVar[Any] = torch
@@ -24,7 +24,7 @@ class Tensors(ArrayKind):
     def on_cpu(self) -> bool:
         return self.device.type == "cpu"
 
-    def given(self, value: Any, name: str) -> Tensor:
+    def convert(self, value: Any, name: str) -> Tensor:
         flags = getattr(value, "flags", None)
         if getattr(flags, "writeable", True) is False:
             value = value.copy()  # torch warns of arrays that it could write to and may not

@@ -47,7 +47,7 @@ class Compiler:
     command: tuple[str, ...]
     family: str
     version: str
-    """The first line of what `--version` says."""
+    """The first line of the output of `--version`."""
 
 
 def find_compiler() -> Compiler:
@@ -99,7 +99,7 @@ def flags_for(compiler: Compiler, level: str, machine: str = "", features: str =
 
     Args:
         level: ``-O0`` to ``-O3``.
-        machine, features: of the processor, as `platform.machine` and `processor` say; this one's if empty.
+        machine, features: of the processor, as `platform.machine` and `processor` return them; this machine's if empty.
 
     Raises:
         NoCompiler: `$POWDERDSL_ARCH` is not a name.
@@ -178,7 +178,7 @@ def current() -> Building:
 
 
 def cache_key(source: str, compiler: Compiler, flags: tuple[str, ...]) -> str:
-    """A hash of everything on which a library depends."""
+    """A hash of everything that a library depends on."""
     program = shutil.which(compiler.command[0]) or ""
     parts = (source, os.path.realpath(program), *compiler.command, compiler.version, *flags, processor())
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
@@ -187,12 +187,12 @@ def cache_key(source: str, compiler: Compiler, flags: tuple[str, ...]) -> str:
 def build(source: str, ruleset: str = "", units: int = 1) -> Path:
     """The path of the library for a source, compiled unless it is in the cache.
 
-    Safe with other processes and threads doing the same: one of them compiles, and the library is added atomically. A
+    Safe with other processes and threads that do the same: one of them compiles, and the library is added atomically. A
     damaged library is compiled again.
 
     Args:
-        ruleset: a name for `powderdsl cache list`. units: the parts of the source that are compiled side by side, if this
-            machine can: each where UNIT is its number.
+        ruleset: a name for `powderdsl cache list`.
+        units: the number of parts of the source, selected by UNIT, that are compiled side by side.
 
     Raises:
         NoCompiler: none was found, or it failed.
@@ -200,20 +200,20 @@ def build(source: str, ruleset: str = "", units: int = 1) -> Path:
     compiler, how = find_compiler(), current()
     flags, folder = flags_for(compiler, how.level), how.place()
     key = cache_key(source, compiler, flags)
-    if found := cache.find(folder, key):
-        return found
+    if library := cache.find(folder, key):
+        return library
     with cache.turn(folder, key):
-        if found := cache.find(folder, key):
-            return found
+        if library := cache.find(folder, key):
+            return library
         try:
-            code = _compiled([*compiler.command, *flags], source, units, folder)
+            code = _compile([*compiler.command, *flags], source, units, folder)
             return cache.add(folder, key, code, ruleset)
         except OSError as error:
             raise NoCompiler(f"no room for compiled code: {error}") from None
 
 
-def _compiled(command: list[str], source: str, units: int, folder: Path) -> bytes:
-    """The library of a source; its units are compiled side by side, if this machine can."""
+def _compile(command: list[str], source: str, units: int, folder: Path) -> bytes:
+    """The library of a source; its units are compiled side by side on a machine with several processors."""
     with scratch_folder(folder) as scratch:
         text, library = scratch / "program.cpp", scratch / "library"
         text.write_text(source, encoding="utf-8")
@@ -229,20 +229,16 @@ def _compiled(command: list[str], source: str, units: int, folder: Path) -> byte
 
 
 def run_compilers(scratch: Path, *commands: list[str]) -> tuple[int, str]:
-    """Exit code and messages of compilers that run side by side. They end if this process is interrupted or exits.
+    """Run compilers side by side; return the exit code and messages. They end if this process is interrupted or exits.
 
-    Args:
-        scratch: a folder for their temporary files.
-
-    Raises:
-        NoCompiler: one cannot be started, or takes longer than TIMEOUT.
+    `scratch` is a folder for temporary files. Raises NoCompiler if one cannot be started, or takes longer than TIMEOUT.
     """
     environment = {**os.environ, "TMPDIR": str(scratch), "LC_ALL": "C"}
     processes: list[subprocess.Popen[bytes]] = []
     with TemporaryFile() as messages:
         try:
             for command in commands:
-                # A session of its own: g++ starts other programs, which are ended with it.
+                # In a new session, so that the programs that g++ starts end with it.
                 process = subprocess.Popen(
                     command,
                     stdin=subprocess.DEVNULL,
@@ -253,7 +249,7 @@ def run_compilers(scratch: Path, *commands: list[str]) -> tuple[int, str]:
                 )
                 processes.append(process)
                 _running.append(process)
-            # Without a limit, waiting holds a lock, and a fork would take the compilers for its own.
+            # Without a limit, waiting holds a lock, and a forked child would wait for the compilers too.
             codes = [process.wait(TIMEOUT) for process in processes]
         except OSError as error:
             raise NoCompiler(f"{commands[0][0]} could not be run: {error}") from None
@@ -270,17 +266,15 @@ _running: list[subprocess.Popen[bytes]] = []
 
 
 def _end(processes: Iterable[subprocess.Popen[bytes]]) -> None:
-    for process in processes:
-        if process.poll() is None:  # in a fork, the parent's compilers count as ended
+    for process in [*processes]:
+        if process.poll() is None:  # in a forked child, the parent's compilers count as ended
             os.killpg(process.pid, signal.SIGTERM)
             process.wait()
         if process in _running:
             _running.remove(process)
 
 
-@atexit.register
-def _end_all() -> None:
-    _end([*_running])
+atexit.register(_end, _running)
 
 
 _TYPES = {"p": ctypes.c_void_p, "i": ctypes.c_int, "l": ctypes.c_int64, "f": ctypes.c_float, "-": None}

@@ -1,4 +1,4 @@
-"""Loops over cells as C++: world by world, row by row, as many floats at a time as a vector holds. Rows outside the region are skipped."""
+"""Loops over cells as C++: world by world, row by row, one vector of floats at a time, in rows of the region."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from powderdsl.targets.layout import NativeLayout, braced, literal, param_key
 from powderdsl.targets.printing import CellValues
 
 AT_ONCE = 4
-"""Choices that are skipped together: whether one of them chooses something is hard to predict."""
+"""Choices that are skipped together: a branch for each choice would be hard to predict."""
 
 PLACE = (
     "const int lane = strips ? y / height : l, row = strips ? y - lane * height : y; (void)lane; (void)row;"
 )
-"""The lane, and the row of planes, in which the words of row y lie."""
+"""The lane and the row of planes that contain the words of row y."""
 
 _FLOATS = {
     "eq": "bits_eq({0}, {1})",
@@ -35,11 +35,11 @@ _FLOATS = {
     "sqrt": "root({0})",
     "settle": "settle({0}, {1}, {2}, SNAP)",
 }
-"""The expression of each operation on floats, with the arguments and then the attribute's numbers by number."""
+"""The expression of each operation on floats. Arguments are numbered first, then the attribute's numbers."""
 
 
 def sweeps_text(sweeps: Sweeps, layout: NativeLayout, reaches: Mapping[str, int]) -> str:
-    """The text of one loop over worlds, see EACH_WORLD in fields.hpp."""
+    """The text of one loop over worlds (EACH_WORLD in fields.hpp)."""
     rows = rows_of(sweeps, reaches)
     loops = [_Loop(number, plan, rows, layout) for number, plan in enumerate(rows.loops)]
     if keeps_values(sweeps.body[0]):
@@ -66,12 +66,14 @@ def sweeps_text(sweeps: Sweeps, layout: NativeLayout, reaches: Mapping[str, int]
         if loop.passing and lag < last:
             lines.append(f"else if (y >= rows) {{ {loop.gone()} }}")
     lines += ["} }", *(loop.after() for loop in loops)]
-    # In a function of its own, fewer values compete for registers.
+    # In a separate function, fewer values compete for registers.
     text = "\n".join(["[&]() __attribute__((noinline)) {", *lines, "}();"])
     if any(loop.region is None for loop in sweeps.body):
         return f"{{\n{text}\n}}"
     lasting = [(out.var.name, out.otherwise, out.into) for out in rows.outs if out.var.name not in rows.rings]
-    quiet = " ".join(f"{name} = keep({held(value)});" for name, value, _ in lasting if value is not None)
+    quiet = " ".join(
+        f"{name} = keep({storage_of(value)});" for name, value, _ in lasting if value is not None
+    )
     quiet += " ".join(f" give(c, {old});" for _, _, old in lasting if old is not None)
     return f"if ({' && '.join(_nothing(rows)) or 'true'}) {{ {quiet} }} else {{\n{text}\n}}"
 
@@ -85,8 +87,8 @@ def _in_place(loop: _Loop) -> str:
         old = str(out.otherwise.attr)
         value = old if old in loop.rows.places else f"keep({old})"
         lines.append(f"{out.var.name} = {value}; bool some{out.var.name} = false;")
-    asked = " || ".join(f"!{nothing}" for nothing in _nothing(loop.rows)) or "false"
-    lines.append(f"if ({asked}) {{ {' '.join(f'own(c, {name});' for name in names)}")
+    busy = " || ".join(f"!{nothing}" for nothing in _nothing(loop.rows)) or "false"
+    lines.append(f"if ({busy}) {{ {' '.join(f'own(c, {name});' for name in names)}")
     lines += [*loop.marking(), _addresses(loop.rows)]
     lines.append(f"EACH_WORLD for (int y = 0; y < rows; y++) {{\n{loop.text()}\n}}")
     lines.append(" ".join(f"{name}->still = no_rows_left(c, {name});" for name in names) + " }")
@@ -94,7 +96,7 @@ def _in_place(loop: _Loop) -> str:
 
 
 def _addresses(rows: Rows) -> str:
-    """Copies of the addresses that loops need: a compiler knows that what loops store does not change them."""
+    """Copies of the addresses that loops need: the compiler cannot prove that stores do not change the originals."""
     values = [value for plan in rows.loops for value in plan.loop.values]
     loads = {str(node.attr): node.type for node in ordered(values) if node.op == "load"}
     types = {rows.places.get(name, name): type for name, type in loads.items()}
@@ -119,8 +121,8 @@ def _nothing(rows: Rows) -> list[str]:
     return list(dict.fromkeys(tests))
 
 
-def held(value: Node) -> str:
-    """The variable that holds a plane or field, or a constant one of the context."""
+def storage_of(value: Node) -> str:
+    """The variable of a plane or field, or the context's constant plane or field."""
     if value.op == "load":
         return str(value.attr)
     if value.type == REAL:
@@ -129,12 +131,12 @@ def held(value: Node) -> str:
 
 
 def on_all(type: str, items: Iterable[str], call: str) -> str:
-    """A call on an array of pointers, which is named `all` in it."""
+    """A call on an array of pointers, which the call names `all`."""
     return f"{{ {type} all[] = {braced(items)}; {call} }}"
 
 
 class _Loop(CellValues[str]):
-    """The text of row y of a loop. Its values are those of the cells of a chunk: floats, or flags as bits."""
+    """The text of row y of a loop. Values belong to the cells of a chunk: floats, or flags as bits."""
 
     def __init__(self, number: int, plan: RowLoop, rows: Rows, layout: NativeLayout):
         super().__init__(ordered(plan.loop.results))
@@ -158,7 +160,7 @@ class _Loop(CellValues[str]):
         yield from self.marking()
 
     def marking(self) -> Iterator[str]:
-        """Mark the rows in which the region's planes have anything, for all lanes at once."""
+        """Mark the rows in which the region's planes hold a flag, for all lanes at once."""
         if planes := self.plan.marked:
             yield on_all("const Plane* const", planes, f"mark_rows(c, {self.number}, all, {len(planes)});")
 
@@ -177,7 +179,7 @@ class _Loop(CellValues[str]):
     # Rows that are written
 
     def at(self, name: str, dy: int) -> str:
-        """The pointer to a row that waits; to zeros if nothing is there."""
+        """The pointer to a buffered row; to zeros if the row is empty."""
         return f"at{name}[(y + {dy}) & {self.rows.rings[name].depth - 1}]"
 
     def gone(self) -> str:
@@ -264,14 +266,14 @@ class _Loop(CellValues[str]):
         return [f"const float* {name} = {call};" for call, name in self.pointers.items()]
 
     def busy(self, live: Node) -> str:
-        """A test that a field has anything in a row."""
+        """A test that a field is nonzero in a row."""
         name, dy = str(live.args[0].attr), live.attr[0]
         if name in self.rows.rings:
             return f"{self.at(name, dy)} != nothing"
         return f"v{name}.live[base + {f'lines[y + {dy}]' if dy else 'y'}]"
 
     def laid(self) -> Iterator[str]:
-        """A row of all choices: the columns of a word stay in registers while the choices whose masks hold there are applied."""
+        """A row of all choices: the columns of a word stay in registers while its choices are applied."""
         chains, count = self.plan.chains, len(self.plan.masks)
         heads = [f"g{number}[k]" for number in range(len(chains))]
         bases = [str(chain[0].args[2].attr) for chain in chains]
@@ -298,7 +300,7 @@ class _Loop(CellValues[str]):
         ]
         yield " ".join(self.rows_read())
         chosen = [node for chain in chains for node in ordered(choice.args[1] for choice in chain)]
-        # Where all choices are values of fields in other places, they are zero where these fields are.
+        # If all choices are values of fields at other cells, they are zero where these fields are.
         moves = all(node.op in ("shift", "load") or is_zero(node) for node in chosen)
         near = " || ".join(f"{name} != nothing" for name in self.pointers.values()) if moves else "true"
         yield f"const bool some = any ? {near} : {' || '.join(lives)};"
@@ -312,8 +314,8 @@ class _Loop(CellValues[str]):
         loads = (f"{head} = load({old}, x);" for head, old in zip(heads, olds_at, strict=True))
         yield f"EACH_REGISTER {{ {' '.join(loads)} }}"
         for begin in range(0, count, AT_ONCE):
-            asked = f"which & {(1 << AT_ONCE) - 1 << begin % 64:#x}ull" if count <= 64 else "which"
-            yield f"if ({asked}) {{ {' '.join(levels[begin : begin + AT_ONCE])} }}"
+            bits = f"which & {(1 << AT_ONCE) - 1 << begin % 64:#x}ull" if count <= 64 else "which"
+            yield f"if ({bits}) {{ {' '.join(levels[begin : begin + AT_ONCE])} }}"
         yield f"EACH_REGISTER {{ {' '.join(ends)} }} }}"
         yield f"{' '.join(self.ends())} }}"
 
@@ -325,7 +327,7 @@ class _Loop(CellValues[str]):
         return name
 
     def is_bare(self, name: str) -> bool:
-        """Tell whether a field's rows have zeros beyond the edges."""
+        """True if a field's rows have zeros beyond the edges."""
         return name in self.rows.rings and self.rows.rings[name].bare is not None
 
     def row(self, field: str, dy: int, *, wraps: bool = True) -> str:

@@ -1,4 +1,4 @@
-"""Numbers of cells where masks on bit planes hold, for packed worlds: lists of gates that the library evaluates."""
+"""Counts of cells where masks hold, for packed worlds: lists of gates that the library evaluates."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ _OPS = {"not": 2, "and": 3, "or": 4, "xor": 5}
 _PLANE, _MASK, _NOTHING = 0, 1, 6
 
 MOST_GATES = 512
-"""More are not worth it: the library looks at each gate for each word."""
+"""The most gates that are worth it: the library evaluates each gate for each word."""
 
 
 @dataclass(frozen=True)
 class Counted:
-    """The number of cells where a flag holds and the mask `region`, if it has one; or the height of the highest of them.
+    """The number of cells where a flag and the mask `region`, if given, hold, divided by `divisor`.
 
-    `divisor` is what the number is divided by.
+    With `highest`, the height of the highest such cell instead.
     """
 
     flag: Node
@@ -36,13 +36,13 @@ class CellCounts:
     """Counts in worlds of one program.
 
     Args:
-        counted: what is counted; flags are nodes on bit planes of slots and masks.
+        counted: the counts; flags are nodes on bit planes of slots and masks.
         planes: the numbers of the program's planes by slot.
         masks: words of masks that all worlds share, by name: int64 [H, ⌈W/64⌉].
-        rows: the rows that are looked at: the first, and the one after the last.
+        rows: the first row to count, and the row after the last.
 
     Raises:
-        KeyError: a flag needs more than these planes, these masks, and gates. ValueError: it has too many of them.
+        KeyError: a flag needs more than these planes, masks and gates. ValueError: more than MOST_GATES gates.
     """
 
     def __init__(

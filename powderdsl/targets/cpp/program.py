@@ -23,7 +23,7 @@ from powderdsl.targets.job import Job, Like, OwnedBatch, like_of, shape_of
 from powderdsl.targets.layout import Layout
 
 KEPT_INPUTS = 16
-"""How many mappings of parameters a program keeps the inputs for."""
+"""The number of mappings of parameters whose inputs a program keeps."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def recall(key: str) -> NativeCode | None:
     path = cache.find(folder, key)
     if path is None:
         return None
-    # Whoever can write into the folder has his libraries run as well: a pickle is no less safe than they are.
+    # Whoever can write into the folder can also replace libraries, so a pickle is as safe as they are.
     code: NativeCode = pickle.loads(read_bytes(path, cache.LIMIT))
     library = cache.find(folder, code.library.name.split("-")[0])
     return None if library is None else replace(code, library=library)
@@ -148,7 +148,7 @@ class NativeProgram:
         self.code, self.threads = code, threads
         self.layout, self.pieces = code.layout, code.pieces
         self._inputs: dict[int, Inputs] = {}
-        """By the `id` of the mapping, which they keep alive."""
+        """By the `id` of the mapping, which the inputs keep alive."""
         self.homes = {
             piece.slot: self.layout.home(piece) for parts in self.pieces.values() for piece in parts
         }
@@ -157,10 +157,10 @@ class NativeProgram:
         """The state `job.steps` later. Jobs with given draws or chosen passes are for other backends."""
         state, (seed, index, start, since) = job.state, job.clock
         seed, index, start = seed.contiguous(), index.contiguous(), start.contiguous()
-        inputs = self._inputs.get(id(job.params)) or self._made_inputs(job.params, len(start))
+        inputs = self._inputs.get(id(job.params)) or self._make_inputs(job.params, len(start))
         reuse = job.reuse
         if not (isinstance(state, PackedState) and state.program is self):
-            state, reuse = self._packed(state), True
+            state, reuse = self._pack(state), True
         handle = state.take() if reuse else state.handle
         seconds = None if job.timing is None else (ctypes.c_double * len(self.code.passes))()
         handle = self.library.pd_run(
@@ -172,7 +172,7 @@ class NativeProgram:
                 job.timing.add(name, spent)
         return PackedState(self, handle, state.like)
 
-    def _made_inputs(self, params: Mapping[str, Tensor], batch: int) -> Inputs:
+    def _make_inputs(self, params: Mapping[str, Tensor], batch: int) -> Inputs:
         """The inputs of some parameters, kept for the next call with the same mapping."""
         layout = self.layout
         bits, floats = parameters(torch, params, layout.param_planes, layout.param_reals, batch)
@@ -181,7 +181,7 @@ class NativeProgram:
         self._inputs[id(params)] = inputs = Inputs(params, bits, floats)
         return inputs
 
-    def _packed(self, state: Mapping[str, Tensor]) -> PackedState:
+    def _pack(self, state: Mapping[str, Tensor]) -> PackedState:
         handle: int = self.library.pd_new(*shape_of(state))
         for name, value in state.items():
             value = value.contiguous()

@@ -17,9 +17,9 @@ GENERATOR_VERSION = 12
 """Part of every cache key; increase it when generated code changes meaning."""
 
 LIBRARY = ("vectors", "runtime", "planes", "movements", "fields")
-"""Headers that come before the generated passes, in this order."""
+"""Headers before the generated passes, in this order."""
 DRIVER = ("driver", "views")
-"""Headers that come after them."""
+"""Headers after the generated passes."""
 
 UNIT_SIZE = 40_000
 """Letters of generated passes from which compiling two units side by side is faster."""
@@ -29,7 +29,7 @@ ONLY_IN = "#if !defined(UNIT) || UNIT == "
 
 
 class NativeSource(NamedTuple):
-    """A source file, its layout, and the number of units: with UNIT defined as its number, a unit's part is compiled."""
+    """A source file, its layout, and the number of units: with UNIT defined as a number, only that unit is compiled."""
 
     text: str
     layout: NativeLayout
@@ -47,16 +47,12 @@ def known_width(width: int) -> int:
 
 @collection_paused()
 def native_source(program: Program, width: int = 0) -> NativeSource:
-    """The source file of a program.
-
-    Args:
-        width: see `known_width`.
-    """
-    layout, asked = native_layout(program), 0
+    """The source file of a program. `width`: see `known_width`."""
+    layout, tested = native_layout(program), 0
     passes, calls = [], []
     for number, pass_ in enumerate(program.passes):
         schedule = plan(pass_, CPU)
-        asked |= tested_ids(schedule)
+        tested |= tested_ids(schedule)
         passes.append(pass_text(schedule, number, layout))
         calls.append(f"  pass_{number}(c); TICK({number})")
     sizes: dict[str, object] = {
@@ -79,9 +75,9 @@ def native_source(program: Program, width: int = 0) -> NativeSource:
         f"// {len(passes)} passes, generated; version {GENERATOR_VERSION}",
         *map("#define {} {}".format, sizes, sizes.values()),
         before,
-        *_in_units(passes, units, len(after)),
+        *_assign_units(passes, units, len(after)),
         f"{ONLY_IN}0",
-        *_tables(program, layout, asked),
+        *_tables(program, layout, tested),
         "static void run_passes(Context& c) {\n  START;",
         *calls,
         "}",
@@ -102,8 +98,8 @@ struct FixedPlane { int kind, a, b; };
 struct StepPlane { u64 a; int b; };"""
 
 
-def _tables(program: Program, layout: NativeLayout, asked: int) -> Iterator[str]:
-    """The types of tables, and tables of slots that a step resets, of planes and of streams; the ids that passes ask for."""
+def _tables(program: Program, layout: NativeLayout, tested: int) -> Iterator[str]:
+    """Tables of the slots that a step resets, of planes and of streams; the ids whose presence passes test."""
     planes, reals, idents, elements = [], [], [], []
     for slot in program.slots:
         if slot.name.startswith(ELEMENT):
@@ -121,11 +117,11 @@ def _tables(program: Program, layout: NativeLayout, asked: int) -> Iterator[str]
     yield f"static const std::vector<StepPlane> STEP_TABLE = {braced(map(braced, layout.step_planes))};"
     yield f"static const std::vector<u32> STREAM_IDENT = {braced(idents)};"
     yield f"constexpr int ELEMENTS = {len(elements)}, ELEMENT[] = {braced([*elements, 0])};"
-    yield f"constexpr u64 ASKED = {asked:#x}ull;"
+    yield f"constexpr u64 ASKED = {tested:#x}ull;"
 
 
-def _in_units(passes: Sequence[str], units: int, driver: int) -> Iterator[str]:
-    """The passes, each in a unit, so that all units are about as long; the first has a driver of so many letters, too."""
+def _assign_units(passes: Sequence[str], units: int, driver: int) -> Iterator[str]:
+    """The passes, spread over units of about the same length; the first unit also has a driver of `driver` letters."""
     sizes = [driver, *[0] * (units - 1)]
     chosen: dict[str, int] = {}
     for text in sorted(passes, key=len, reverse=True):

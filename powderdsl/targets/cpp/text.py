@@ -1,4 +1,4 @@
-"""Schedules -> C++: loops over rows and words of planes, movements, guards. Nothing is decided here."""
+"""Schedules -> C++: loops over rows and words of planes, movements, guards. All decisions are the schedule's."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from powderdsl.schedule.types import (
     variables,
 )
 from powderdsl.schedule.words import difference, only_clears
-from powderdsl.targets.cpp.cells import held, on_all, sweeps_text
+from powderdsl.targets.cpp.cells import on_all, storage_of, sweeps_text
 from powderdsl.targets.layout import NativeLayout, fixed_key, number, param_key
 from powderdsl.targets.printing import GATES, Printer, WordText, drawn_where, limited_draw
 
@@ -46,7 +46,7 @@ def pass_text(schedule: Schedule, number: int, layout: NativeLayout) -> str:
     for slot, var in schedule.inputs:
         del rest[var.name]
         place = printer.slot(slot, var)
-        if slot in changed:  # nothing else refers to it while the pass runs, so it may be overwritten
+        if slot in changed:  # no other reference exists while the pass runs, so it may be overwritten
             lines.append(f"{KINDS[var.type.name]}* {var.name} = {place}; {place} = nullptr;")
         else:
             lines.append(f"{KINDS[var.type.name]}* {var.name} = keep({place});")
@@ -55,7 +55,7 @@ def pass_text(schedule: Schedule, number: int, layout: NativeLayout) -> str:
     lines += printer.block(schedule.body)
     places, names = [], {}
     for i, (slot, node) in enumerate(schedule.outputs):
-        var = Var(held(node), node.type)
+        var = Var(storage_of(node), node.type)
         lines.append(f"{KINDS[var.type.name]}* s{i} = keep({var.name});")
         places.append(printer.slot(slot, var))
         if node.op == "load":
@@ -92,11 +92,11 @@ class _Printer(Printer):
         return f"c.slot[{self.layout.planes[name]}]"
 
     def whole(self, out: Out) -> Iterator[str]:
-        """An operation on whole planes that tests for empty ones itself."""
+        """An operation on whole planes that tests for empty planes itself."""
         value, args = out.value, out.value.args
         match value.op:
             case "load" | "const":
-                call = f"keep({held(value)})"
+                call = f"keep({storage_of(value)})"
             case "shift":
                 dy, dx, _ = value.attr
                 self.layout.cover(around_rows=abs(dy))
@@ -123,7 +123,7 @@ class _Printer(Printer):
         if guard.outs:
             yield "} else {"
             for out in guard.outs:
-                yield f"{out.var.name} = keep({held(out.value)});"
+                yield f"{out.var.name} = keep({storage_of(out.value)});"
         yield "}"
 
     def move(self, move: Move) -> Iterator[str]:
@@ -137,7 +137,7 @@ class _Printer(Printer):
         if copies and move.op == "swap":
             target = f"shifted(c, {movers}, {-dy}, {-dx})"
             for out in move.outs:
-                name, rest = out.var.name, held(out.value)
+                name, rest = out.var.name, storage_of(out.value)
                 call = f"swap_plane(c, {move.olds[name].attr}, {movers}, target, {rest}, {dy}, {dx})"
                 yield f"{{ Plane* target = {target}; {name} = {call}; give(c, target); }}"
                 if out.into:
@@ -145,7 +145,7 @@ class _Printer(Printer):
             return
         news = [*map("&{}".format, move.vars)]
         for out in move.outs:
-            old = held(out.value) if copies else move.olds[out.var.name].attr
+            old = storage_of(out.value) if copies else move.olds[out.var.name].attr
             yield f"{out.var.name} = {out.into or f'keep({old})'};"
         if fields:
             yield on_all("Field** const", news, f"swap_fields<{len(news)}>(c, {movers}, {dy}, {dx}, all);")
@@ -161,7 +161,7 @@ class _Printer(Printer):
             yield on_all("Plane** const", map("&{0.var.name}".format, planes), call)
 
     def update(self, loop: Compute) -> Iterator[str]:
-        """Planes that change only in words where a mask holds. Empty ones that can only lose flags need no copy."""
+        """Planes that change only in words where a mask holds. Empty planes that can only lose flags need no copy."""
         values = _Words(self.layout)
         for out in loop.outs:
             assert out.otherwise is not None
@@ -179,7 +179,7 @@ class _Printer(Printer):
             if only_clears(out, self.graph):
                 before.append(f"if (!{name}->zero) own(c, {name});")
                 stores.append(f"{words}[i] = {value};")
-            else:  # one that was empty may stay so
+            else:  # a plane that was empty may stay empty
                 before.append(f"V a{name} = splat(0); const bool e{name} = {name}->zero; own(c, {name});")
                 stores.append(f"{{ const V o = {value}; {words}[i] = o; a{name} |= o; }}")
                 after.append(f"{name}->zero = e{name} && !any(a{name});")
@@ -190,7 +190,7 @@ class _Printer(Printer):
         yield "\n".join([*values.lines, *stores, "}", *after, "}"])
 
     def words(self, loop: Compute) -> Iterator[str]:
-        """Planes that are all computed anew."""
+        """New planes."""
         values = _Words(self.layout)
         without, before, stores, after = [], [], [], []
         for out in loop.outs:
@@ -224,7 +224,7 @@ class _Words(WordText):
         self.places: dict[str, str] = {}
         """The planes that hold the old values of planes which are changed in place."""
         self.read: dict[str, str] = {}
-        """The pointers to planes that the loop reads, which would be loaded again after every store, by what they point to."""
+        """Cached data pointers: the compiler cannot prove that stores do not change the originals."""
         self.pointers: list[str] = []
         """Statements before the loop that set these pointers."""
 
@@ -282,10 +282,11 @@ class _Words(WordText):
         raise AssertionError(f"no C++ kernel for {node.op}")
 
     def draw(self, node: Node, args: Sequence[str]) -> str:
-        """A draw below a limit, which is a number, or is given plane by plane from the highest."""
+        """A draw below a limit: a number, or planes from the highest."""
         stream, bits = self.layout.streams[node.attr[0]], node.attr[1]
         where = drawn_where(node)
         wanted = "valid" if where is None else self.clean(where)
+        # A coin is tossed once a step for all masks, so its plane is shared.
         if is_coin(node):
             coin = number(self.layout.coins, stream)
             return f"{wanted} & ~{self.pointer(f'coin_plane(c, {coin}, {stream})')}[i]"

@@ -29,7 +29,7 @@ _DYNAMIC_SHARED = 8
 
 
 class NoCuda(Exception):
-    """No CUDA device, driver or NVRTC that works was found; the message says what."""
+    """No CUDA device, driver or NVRTC that works was found; the message names it."""
 
 
 class Worlds(ctypes.Structure):
@@ -54,7 +54,7 @@ def driver() -> ctypes.CDLL:
 
 @cache
 def nvrtc(version: str) -> ctypes.CDLL:
-    """NVRTC of a CUDA version such as ``13.0``: one that is loaded, on the library path or in a package. Raises NoCuda."""
+    """NVRTC of a CUDA version such as ``13.0``: loaded, on the library path, or in a package. Raises NoCuda."""
     major = version.split(".")[0]
     if sys.platform == "win32":
         names, pattern = [f"nvrtc64_{major}0_0.dll"], f"nvrtc64_{major}*.dll"
@@ -99,9 +99,8 @@ def machine_code(source: KernelSource, architecture: str, version: str) -> bytes
     except OSError as error:
         raise NoCuda(f"no cache folder: {error}") from None
     name = hashlib.sha256(key.encode()).hexdigest()[:32]
-    found = native_cache.find(folder, name)
-    if found is not None:
-        return found.read_bytes()
+    if (path := native_cache.find(folder, name)) is not None:
+        return path.read_bytes()
     code = compile_text(compiler, source.text, options)
     with suppress(OSError):
         native_cache.add(folder, name, code, f"{source.name}.cuda")
@@ -113,8 +112,8 @@ def compile_text(compiler: ctypes.CDLL, text: str, options: Sequence[str]) -> by
     program, size = ctypes.c_void_p(), ctypes.c_size_t()
     compiler.nvrtcCreateProgram(ctypes.byref(program), text.encode(), b"powderdsl.cu", 0, None, None)
     try:
-        given = (ctypes.c_char_p * len(options))(*(option.encode() for option in options))
-        if compiler.nvrtcCompileProgram(program, len(options), given):
+        encoded = (ctypes.c_char_p * len(options))(*(option.encode() for option in options))
+        if compiler.nvrtcCompileProgram(program, len(options), encoded):
             compiler.nvrtcGetProgramLogSize(program, ctypes.byref(size))
             log = ctypes.create_string_buffer(size.value)
             compiler.nvrtcGetProgramLog(program, log)

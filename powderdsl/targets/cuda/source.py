@@ -60,8 +60,7 @@ def cuda_source(program: Program, height: int, width: int, shared_limit: int) ->
     row_words = -(-width // WARP)
     words = height * row_words
     group = max(1, SMALL // words)
-    wanted = -(-group * words // WARP) * WARP * (2 if layout.reals else 1)
-    threads = min(MAX_THREADS, wanted)
+    threads = min(MAX_THREADS, -(-group * words // WARP) * WARP * (2 if layout.reals else 1))
     own = {"flag": len(layout.planes), "real": len(layout.reals)}
     pool, pending = Pool(own, dict(own)), Pending()
     homes = layout.planes | layout.reals

@@ -1,4 +1,4 @@
-"""Schedules -> CUDA C++: loops over words and cells, with buffers for variables. Nothing is decided here."""
+"""Schedules -> CUDA C++: loops over words and cells, with buffers for variables. All decisions are the schedule's."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _FLOATS = {
     "sqrt": "ROOT({0})",
     "settle": "settle({0}, {1}, {2})",
 }
-"""The expression of each operation on floats, with the arguments and then the attribute's numbers by number."""
+"""The expression of each operation on floats. Arguments are numbered first, then the attribute's numbers."""
 
 
 def pass_text(schedule: Schedule, layout: Layout) -> str:
@@ -55,7 +55,7 @@ class _Printer(Printer):
     def words(self, loop: Compute) -> Iterator[str]:
         values = _Words(self)
         answers: list[str] = []
-        held: list[str] = []
+        results: list[str] = []
         asks, stores, back = [], [], []
         for out in sorted(loop.outs, key=lambda out: out.var.type == ANSWER):
             name = out.var.name
@@ -63,7 +63,7 @@ class _Printer(Printer):
                 answers.append(name)
                 asks.append(f"{name} |= ({values.of(out.value.args[0])} & valid) != 0;")
                 continue
-            held.append(f"o_{name}[ROUNDS]")
+            results.append(f"o_{name}[ROUNDS]")
             own = f"o_{name}[k]" if loop.stores_last else f"o_{name}"
             stores.append(
                 f"{'' if loop.stores_last else 'const u32 '}{own} = {values.of(out.value)} & valid;"
@@ -72,7 +72,7 @@ class _Printer(Printer):
         yield from (f"bool {name} = false;" for name in answers)
         body = ["FOR_WORDS(k, i) { PLACE(i);", *values.lines, *asks, *stores]
         if loop.stores_last:
-            yield f"{{ u32 {', '.join(held)};"
+            yield f"{{ u32 {', '.join(results)};"
             yield "\n".join([*body, "}"])
             yield f"SYNC();\nFOR_WORDS(k, i) {{ {' '.join(back)} }} }}"
         else:
@@ -174,7 +174,7 @@ class _Words(WordText):
         return value if wraps else f"{value} & inside_word(y, w, {dy}, {dx})"
 
     def draw(self, node: Node, args: Sequence[str]) -> str:
-        """A draw below a limit, which is a number, or is given plane by plane from the highest."""
+        """A draw below a limit: a number, or planes from the highest."""
         stream, bits = self.layout.streams[node.attr[0]], node.attr[1]
         where = drawn_where(node)
         wanted = "valid" if where is None else f"{self.known[id(where)]} & valid"
@@ -250,7 +250,7 @@ class _Cells(CellValues[str]):
         return self.masks.setdefault(self.printer.numbers[node.attr], f"m{len(self.masks)}")
 
     def led(self, node: Node) -> str:
-        """A comparison, computed only where another one holds."""
+        """A comparison, computed only where its leader holds."""
         leader, comparison = node.args
         first = f"BIT({self.mask(leader)})" if leader.op == "load" else self.of(leader)
         with self.inner() as lines:

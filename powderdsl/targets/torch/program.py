@@ -1,6 +1,7 @@
 """The readable torch backend: one tensor element per cell, with masks, rolls and shifted sums. It has every IR operation.
 
-Each pass becomes a generated straight-line Python function. Its names come from node numbers, never from rule files. Flags are bool, integers int32, floats float32, all [B, H, W] or broadcastable to it.
+Each pass becomes a generated straight-line Python function. Its names come from node numbers, never from rule files. Flags
+are bool, integers int32, floats float32, all [B, H, W] or broadcastable to it.
 """
 
 from __future__ import annotations
@@ -102,7 +103,7 @@ class Kernels:
         return torch.where(self.inside(dy, dx), rolled, torch.zeros((), dtype=x.dtype, device=self.device))
 
     def inside(self, dy: int, dx: int) -> Tensor:
-        """bool [H, W]: whether the neighbor lies inside the grid."""
+        """True where the neighbor lies inside the grid: bool [H, W]."""
         if (dy, dx) not in self._masks:
             _, height, width = self.shape
             y = torch.arange(height, device=self.device)[:, None] + dy
@@ -111,7 +112,7 @@ class Kernels:
         return self._masks[dy, dx]
 
     def count(self, x: Tensor, weights: tuple[tuple[int, int, int], ...], wraps: bool) -> Tensor:
-        """The weighted number of neighbors that hold: sums of rows first, each pattern of weights once."""
+        """The weighted number of neighbors where a flag holds: sums of rows first, each pattern of weights once."""
         look = self.roll if wraps else self.reach
         cells = self.full(x).to(torch.int32)
         sums: dict[tuple[tuple[int, int], ...], Tensor] = {}
@@ -155,7 +156,7 @@ class Kernels:
         return self.params[name][:, None, None].to(_DTYPES[kind])
 
     def limit(self, name: str, bits: int, strict: bool) -> Tensor:
-        """A parameter as a chance [B, 1, 1]: how many of the possible draws lie below it, or not above it."""
+        """A parameter as a chance [B, 1, 1]: the number of possible draws below it, or not above it."""
         return limits(torch, self.params[name], Threshold(bits, strict))[:, None, None]
 
     @staticmethod
@@ -168,8 +169,8 @@ class Kernels:
         if isinstance(b, int):
             return torch.div(a, b, rounding_mode="floor")  # no rule divides by the constant 0
         numerator = torch.full_like(b, a) if isinstance(a, int) else a
-        found = torch.div(numerator, torch.where(b == 0, torch.ones_like(b), b), rounding_mode="floor")
-        return torch.where(b == 0, torch.zeros_like(found), found)
+        result = torch.div(numerator, torch.where(b == 0, torch.ones_like(b), b), rounding_mode="floor")
+        return torch.where(b == 0, torch.zeros_like(result), result)
 
     def settle(self, x: Tensor, low: float, high: float) -> Tensor:
         """No NaN, within bounds, nothing smaller than `snap`."""
@@ -181,8 +182,7 @@ class Kernels:
 class TorchProgram:
     """A program whose passes are generated torch functions.
 
-    Args:
-        snap: another threshold than SNAP for what becomes zero, to follow engines that keep every magnitude.
+    `snap` replaces the threshold SNAP below which floats become zero, to follow engines that keep every magnitude.
     """
 
     def __init__(self, program: Program, device: torch.device, snap: float = SNAP):
@@ -239,7 +239,7 @@ class TorchProgram:
 def packed_program(
     program: Program, device: torch.device, make: Callable[[Program, Program], Runnable]
 ) -> Runnable:
-    """A program on bit planes, see `mixed_program`; passes that they cannot represent run on torch tensors."""
+    """A program on bit planes, see `mixed_program`; passes that bit planes cannot represent run on torch tensors."""
     return mixed_program(segments(program), make, lambda cells: TorchProgram(cells, device))
 
 

@@ -142,11 +142,11 @@ _KERNELS: dict[str, str | Callable[..., str]] = {
     "swap": _swap,
     "arrive": _arrive,
 }
-"""The expression of each operation: with the names of the arguments by number, or a function of these."""
+"""The expression of each operation, with numbered arguments, or a function of the arguments' names."""
 
 
 def _significant_bits(pass_: PassGraph) -> dict[str, int]:
-    """How many bits of each stream the pass needs: all of them, unless every limit is a constant."""
+    """The number of bits of each stream that the pass needs: all bits, unless every limit is a constant."""
     needed: dict[str, int] = {}
     for node in nodes_of(pass_):
         if node.op in ("below", "draw"):
@@ -175,7 +175,7 @@ def pass_source(pass_: PassGraph, number: int) -> tuple[str, str, dict[str, obje
 
 
 def _with_deletions(lines: list[str], returned: str) -> list[str]:
-    """The lines with `del` after the last use of each plane: so that a large world needs memory for few planes at once."""
+    """The lines with `del` after the last use of each plane, so that a large world needs memory for few planes at once."""
     live = set(_PLANE.findall(returned))
     result: list[str] = []
     for line in reversed(lines):

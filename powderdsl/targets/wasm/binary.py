@@ -1,8 +1,8 @@
 """The binary format of WebAssembly: typed expressions, functions, modules, and their text.
 
-An expression (`Value`) is the code that leaves it on the stack, with its type. Variables and items in memory (`Place`) are
-expressions that can be set. Statements belong to the function that is being written (`body`): `at += 16`
-changes a variable when the function runs, `at + 16` is an expression. Nothing here knows rules or planes.
+An expression (`Value`) is code that leaves a value on the stack, with its type. Variables and items in memory (`Place`)
+are expressions that can be set. Statements belong to the function that is being written (`body`): `at += 16` changes a
+variable when the function runs, `at + 16` is an expression. Nothing here depends on rules or planes.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ _NUMBERED = (
     (0xFDE3, "f32x4.sqrt f32x4.add f32x4.sub f32x4.mul f32x4.div"),
     (0xFDEA, "f32x4.pmin f32x4.pmax"),
 )  # fmt: skip
-"""The instructions that are used, by number; those after a prefix as 0xFC and 0xFD followed by theirs."""
+"""The instructions in use, by number; numbers above 0xFF begin with the prefix 0xFC or 0xFD."""
 
 
 def unsigned(number: int) -> bytes:
@@ -164,7 +164,7 @@ class Value:
         return self if isinstance(other, int) and other == 1 else op(f"{self.type}.mul", self, other)
 
     def equals(self, other: Value | int) -> Value:
-        """Whether two integers are equal: i32."""
+        """True (i32) if two integers are equal."""
         return op(f"{self.type}.eqz", self) if other == 0 else op(f"{self.type}.eq", self, other)
 
     def __lshift__(self, by: Value | int) -> Value:
@@ -192,7 +192,7 @@ class Value:
             place.set(value)
 
 
-def _changing(operator: str) -> Callable[[Any, Value | int], Any]:
+def _in_place(operator: str) -> Callable[[Any, Value | int], Any]:
     def change(self: Place, other: Value | int) -> Place:
         self.set(getattr(self, operator)(other))
         return self
@@ -201,7 +201,7 @@ def _changing(operator: str) -> Callable[[Any, Value | int], Any]:
 
 
 class Place(Value):
-    """A value that can be set, by code before and after that of its new value."""
+    """A value that can be set, by code before and after the code of its new value."""
 
     __slots__ = ("after", "before")
 
@@ -212,9 +212,9 @@ class Place(Value):
     def set(self, value: Value | int) -> None:
         body.emit(self.before, _codes([value], self.type), self.after)
 
-    __iadd__, __isub__, __imul__ = _changing("__add__"), _changing("__sub__"), _changing("__mul__")
-    __iand__, __ior__, __ixor__ = _changing("__and__"), _changing("__or__"), _changing("__xor__")
-    __ilshift__, __irshift__ = _changing("__lshift__"), _changing("__rshift__")
+    __iadd__, __isub__, __imul__ = _in_place("__add__"), _in_place("__sub__"), _in_place("__mul__")
+    __iand__, __ior__, __ixor__ = _in_place("__and__"), _in_place("__or__"), _in_place("__xor__")
+    __ilshift__, __irshift__ = _in_place("__lshift__"), _in_place("__rshift__")
 
 
 class _Variable(Place):
@@ -255,12 +255,12 @@ Writer: TypeAlias = "Callable[..., Value | int | None]"
 
 
 def op(name: str, *args: Value | float, tail: bytes = b"") -> Value:
-    """An instruction on its arguments, where numbers are of its own type, or i32 beside vectors; `tail`: its immediates."""
+    """An instruction on its arguments. Numbers get its type, or i32 next to vectors; `tail`: its immediates."""
     return Value(RESULTS[name], _codes(args, _NUMBERS[name]) + OPCODES[name] + tail)
 
 
 def _codes(values: Iterable[Value | float], type: str) -> bytes:
-    """The code of values; numbers are of a type."""
+    """The code of values; numbers get the type `type`."""
     return b"".join([value.code if isinstance(value, Value) else const(type, value).code for value in values])
 
 
@@ -297,7 +297,7 @@ def load(name: str, address: Value | int, offset: int = 0) -> Place:
 
 @cache
 def _accesses(name: str, offset: int) -> tuple[bytes, bytes]:
-    """The code that loads an item at an address, and that stores it; the natural alignment is only a hint."""
+    """The code that loads an item at an address, and the code that stores it; the natural alignment is only a hint."""
     type, _, what = name.partition(".")
     size = "".join(c for c in what if c.isdigit())
     immediates = unsigned(_ALIGN[size or type]) + unsigned(offset)
@@ -357,7 +357,7 @@ class Body:
         self.function.body += b"".join(code)
 
     def variable(self, type: str) -> Local:
-        """A variable that holds anything; in a scope, until its end."""
+        """An uninitialized variable; in a scope, it lasts until the end of the scope."""
         function = self.function
         if free := function.free.get(type):
             local = Local(type, free.pop())
@@ -370,7 +370,7 @@ class Body:
 
     @contextmanager
     def scope(self) -> Iterator[None]:
-        """The variables made inside can be used again for others after it."""
+        """A scope, after which its variables can be reused."""
         function = self.function
         function.scopes.append([])
         yield
@@ -384,11 +384,11 @@ class Body:
         return local
 
     def do(self, value: Value) -> None:
-        """Run code, and drop what it leaves."""
+        """Run code, and drop its result."""
         self.emit(value.code, OPCODES["drop"] if value.type else b"")
 
     def give(self, value: Value | int) -> None:
-        """The result of the function is this; a number is an i32."""
+        """Return a value from the function; a number is an i32."""
         self.function.result = value.type if isinstance(value, Value) else "i32"
         self.emit(_codes([value], "i32"), OPCODES["return"])
 
@@ -409,11 +409,11 @@ class Body:
         self.emit(OPCODES["end"])
 
     def block(self) -> AbstractContextManager[int]:
-        """A block, by its label; jumping to it leaves it."""
+        """A block; jumping to its label leaves the block."""
         return self._nested("block")
 
     def loop(self) -> AbstractContextManager[int]:
-        """A loop, by its label; jumping to it begins it again."""
+        """A loop; jumping to its label continues the loop."""
         return self._nested("loop")
 
     def when(self, condition: Value) -> AbstractContextManager[int]:
@@ -463,7 +463,7 @@ class Module:
         self._custom: list[bytes] = []
 
     def define(self, write: Writer, name: str = "", *, export: bool = False) -> Callee:
-        """Add a function; `write` has its parameters, annotated with their types (`I32`), and usually its name."""
+        """Add a function; `write` has its parameters, annotated with types (`I32`), and its name unless `name` is given."""
         params = inspect.signature(write).parameters.values()
         function = Function([param.annotation.lower() for param in params])
         with body.of(function):
@@ -500,17 +500,17 @@ class Module:
         return Global(type, len(self._globals) - 1)
 
     def restart(self, variable: Global, start: int) -> None:
-        """Another value that a variable begins with."""
+        """Change the initial value of a variable."""
         self._globals[variable.index] = (variable.type, start)
 
     def data(self, address: int, octets: bytes) -> None:
-        """Bytes that the memory of an instance begins with."""
+        """Add initial bytes of an instance's memory."""
         self._data.append(
             b"\0" + const("i32", address).code + OPCODES["end"] + unsigned(len(octets)) + octets
         )
 
     def custom(self, name: str, octets: bytes) -> None:
-        """A custom section: hosts can read it, and running ignores it."""
+        """Add a custom section, which hosts can read and execution ignores."""
         self._custom.append(_text(name) + octets)
 
     @property
@@ -536,7 +536,7 @@ class Module:
         )
 
     def listing(self, only: str | None = None) -> str:
-        """The functions in the notation of the text format; with `only`, one and those that it calls."""
+        """The functions in the notation of the text format; with `only`, one function and those that it calls."""
         names = [f"{name}_{i}" for i, name in enumerate(self._names)]
         bodies = [_listing(BytesIO(code), names) for _, code in self._functions]
         wanted = [i for i, name in enumerate(self._names) if only in (None, name)]

@@ -95,13 +95,13 @@ class CellLoop(Loop):
     # Lines
 
     def find_starts(self) -> None:
-        """Find where the lines begin that are read, before the loop over their cells."""
+        """Compute the addresses of the lines to read, before the loop over their cells."""
         for read in reads_of(self.loop.results):
             key = (read.name, read.dy, read.wraps or not read.dy)
             if read.type == REAL and key not in self.starts:
                 line = self.library.other_line(self.line, read.dy, wraps=read.wraps)
                 line = line if isinstance(line, Local) else body.let(line)
-                self.starts[key] = body.let(self.library.line(self.held[read.name], line))
+                self.starts[key] = body.let(self.library.line(self.addresses[read.name], line))
 
     def live(self, field: Value, line: Value | None = None) -> Value:
         return (field + (self.line if line is None else line))[LIVE]
@@ -117,15 +117,15 @@ class CellLoop(Loop):
 
     def row_flags(self, planes: Iterable[str]) -> Value:
         """A test that planes hold a flag in this row of the lane."""
-        held = [self.held[name] for name in planes]
-        return op("i64.ne", self.library.row_flags(held, self.row, self.memory.half), 0)
+        addresses = [self.addresses[name] for name in planes]
+        return op("i64.ne", self.library.row_flags(addresses, self.row, self.memory.half), 0)
 
     def skip_unless(self, busy: Value, rests: Iterable[Node | None]) -> None:
-        """Skip a line that is not busy: what the loop writes is then the rest, or nothing."""
+        """Skip a line that is not busy: outputs get the values `rests`, or nothing."""
         with body.when(op("i32.eqz", busy)):
             for i, rest in enumerate(rests):
                 if rest is not None and rest.op == "load":
-                    self.copy(i, self.held[str(rest.attr)])
+                    self.copy(i, self.addresses[str(rest.attr)])
                 elif self.loop.outs[i].var.type == REAL:
                     self.set_live(i, ZERO)
                 else:
@@ -139,7 +139,7 @@ class CellLoop(Loop):
             body.jump(self.skip)
 
     def copy(self, place: int, source: Value) -> None:
-        """A line as it is in another field."""
+        """Copy a line from another field."""
         self.set_live(place, self.live(source))
         with body.when(self.live(source)):
             self.copy_cells(
@@ -164,7 +164,7 @@ class CellLoop(Loop):
         busy = self.row_flags(planes) if planes else ZERO
         for live in fields:
             line = self.library.other_line(self.line, live.attr[0], wraps=True)
-            busy = busy | self.live(self.held[str(live.args[0].attr)], line)
+            busy = busy | self.live(self.addresses[str(live.args[0].attr)], line)
         self.skip_unless(busy, [out.otherwise for out in self.loop.outs])
 
     def sweep(self) -> None:
@@ -178,7 +178,7 @@ class CellLoop(Loop):
         with self.each_word() as (at, x, stop):
             bits = {i: body.let(0, "i64") for i in flags}
             planes = [str(node.attr) for node in self.nodes if node.op == "load" and node.type != REAL]
-            words = {name: body.let(self.flags(self.held[name], at)) for name in dict.fromkeys(planes)}
+            words = {name: body.let(self.flags(self.addresses[name], at)) for name in dict.fromkeys(planes)}
             with body.each(x, stop, CHUNK) as column, body.scope():
                 self.column, self.at = column, at
                 chunks = Chunks(self, words)
@@ -222,9 +222,9 @@ class CellLoop(Loop):
     # Chains of choices
 
     def lay(self) -> None:
-        """A line of all choices: chunk by chunk in which a choice holds, one choice after the other.
+        """A line of all choices: one choice after the other, each in the chunks in which it holds.
 
-        What follows from the results comes last, if they are not the new fields themselves.
+        Operations on the results come last, if the results are not the new fields themselves.
         """
         library, memory, outs = self.library, self.memory, self.loop.outs
         chains = chains_of(self.loop)
@@ -233,7 +233,7 @@ class CellLoop(Loop):
         continued = [chain[-1] for chain in chains] != [out.value for out in outs]
         busy = self.row_flags(dict.fromkeys(masks))
         if continued:
-            busy = reduce(or_, (self.live(self.held[str(base.attr)]) for base in bases), busy)
+            busy = reduce(or_, (self.live(self.addresses[str(base.attr)]) for base in bases), busy)
         self.skip_unless(busy, [None] * len(outs) if continued else bases)
         self.find_starts()
         for i in range(len(outs)):
@@ -261,7 +261,7 @@ class CellLoop(Loop):
 
     def choose(self, at: Value, x: Value, mask: str, choices: Sequence[Node], lines: Sequence[Local]) -> None:
         """Choices on a mask, in the chunks of a word in which it holds: `x` is the word's first column."""
-        left = body.let(self.flags(self.held[mask], at))
+        left = body.let(self.flags(self.addresses[mask], at))
         with body.block() as done, body.loop() as again:
             body.jump(done, op("i64.eqz", left))
             nibble = body.let(op("i64.ctz", left) & (WORD - CHUNK))

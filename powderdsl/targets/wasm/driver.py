@@ -1,7 +1,7 @@
-"""What hosts call: batches of worlds, cells in and out, steps. Each function is exported under its name (`Driver`).
+"""The functions that hosts call: batches of worlds, cells in and out, steps. Each is exported under its name (`Driver`).
 
-Parameters and results are i32 unless said otherwise. `rows` are those of a world; the columns are those of the module. Boxes
-end before `bottom` and `right`.
+Parameters and results are i32 unless noted. `rows` are those of a world; the module fixes the columns. Boxes end before
+`bottom` and `right`.
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ from powderdsl.targets.wasm.library import (
 )
 
 LARGE_PLANE = 32 << 10
-"""Bytes of a plane of two worlds from which it is too large to be kept near."""
+"""Bytes of a plane of two worlds that exceed a near cache; then the lanes are strips of one world."""
 
 WEIGHTS = bytes(1 << i for i in range(8)) * 2
 
 
 def numbers_of(piece: Piece, layout: Layout, size: int) -> tuple[int, int, int, int]:
-    """What `load` and `store` take for a piece of the state whose cells have some bytes: slot, planes, signed, size."""
+    """The arguments of `load` and `store` for a piece of the state whose cells have `size` bytes."""
     slot, planes, signed = layout.home(piece)
     return slot if planes else len(layout.planes) + slot, planes, int(signed), size
 
@@ -74,7 +74,7 @@ class Batches:
             self.calls[write.__name__.strip("_")] = self.library.module.define(write, export=export)
 
     def part(self, batch: Value, number: int) -> Value:
-        """Where clocks (0), bits (1) or values (2) of parameters, or groups (3) begin, at a multiple of 16 bytes."""
+        """The address of the clocks (0), the bits (1) or values (2) of parameters, or the groups (3) of a batch."""
         at = batch + HEADER
         for size in self.sizes[:number]:
             at = (at + batch[WORLDS] * size + 15) & ~15
@@ -95,7 +95,7 @@ class Batches:
     def each_lane(
         self, batch: Value, address: Value, apart: Value, size: Value | int
     ) -> Iterator[tuple[Local, Local, Local]]:
-        """Group, lane, and where its cells of some bytes lie in an array, of all lanes that are used."""
+        """All lanes in use: group, lane, and the address of the lane's cells of `size` bytes in an array."""
         strips, number = self.library.strips, body.let(0)
         with self.each_group(batch) as group:
             with body.each(0, LANES) as lane:
@@ -107,7 +107,7 @@ class Batches:
 
     @contextmanager
     def each_run(self) -> Iterator[tuple[Local, Local]]:
-        """The words of all rows of a lane: bytes from the first word, and how many columns they have."""
+        """The words of all rows of a lane: bytes from the first word, and the number of columns."""
         memory = self.memory
         with body.each(0, self.library.cells, 16) as at:
             last = ((at % memory.row) >> 4).equals(memory.words - 1)
@@ -115,7 +115,7 @@ class Batches:
 
     @contextmanager
     def each_sixteen(self, size: Value, x: Local, count: Value) -> Iterator[None]:
-        """Sixteen cells of a byte at a time; `x` is the first one, and then the first that is left."""
+        """Sixteen cells of a byte at a time, from cell `x` on; afterwards, `x` is the first remaining cell."""
         with body.block() as done, body.loop() as again:
             body.jump(done, op("i32.ne", size, 1) | (count < x + 16))
             yield
@@ -135,15 +135,15 @@ class Driver(Batches):
 
     Args:
         program: on bit planes.
-        asked: the ids whose presence passes ask for.
+        tested: the ids whose presence passes test.
     """
 
-    def __init__(self, library: Library, program: Program, passes: Sequence[Callee], asked: int):
+    def __init__(self, library: Library, program: Program, passes: Sequence[Callee], tested: int):
         super().__init__(library)
-        self.program, self.passes, self.asked = program, passes, asked
+        self.program, self.passes, self.tested = program, passes, tested
 
     def add(self, *, export: bool) -> dict[str, Callee]:
-        """Add the functions, and give them by name. `export`: hosts see them, and the passes by number."""
+        """Add the functions, and return them by name. `export`: hosts see them, and the passes by number."""
         self.define(self._setup, self._renew, self._load_real, self._store_real)
         self.define(
             self.allocate, self.release, self.copy, self.scratch, self.load, self.store, export=export
@@ -177,7 +177,7 @@ class Driver(Batches):
         return batch
 
     def _renew(self, batch: I32) -> None:
-        """Planes and fields without anything, for a batch that has none."""
+        """Empty planes and fields, for a batch that has none."""
         library, memory = self.library, self.memory
         with self.each_group(batch) as group:
             for member, real in memory.slots:
@@ -185,14 +185,14 @@ class Driver(Batches):
             group[memory.present] = -1
 
     def release(self, batch: I32) -> None:
-        """A batch becomes as a new one, so that its memory can be used for as many worlds."""
+        """Clear a batch, so that its memory can be reused for the same number of worlds."""
         with self.each_group(batch) as group:
             for member, _ in self.memory.slots:
                 body.do(self.library.give(group[member]))
         body.do(self.calls["renew"](batch))
 
     def copy(self, old: I32, new: I32) -> None:
-        """A new batch gets what another one of as many worlds has, and shares what is not changed later."""
+        """Copy a batch into a new batch of the same size; planes and fields are shared until they change."""
         library, present = self.library, self.memory.present
         body.do(op("memory.copy", new + HEADER, old + HEADER, self.part(old, 3) - old - HEADER))
         apart = body.let(new - old)
@@ -203,7 +203,7 @@ class Driver(Batches):
             (group + apart)[present] = group[present]
 
     def scratch(self, size: I32) -> Value:
-        """Memory for the host, until it asks for more."""
+        """Memory for the host, valid until the next call."""
         library = self.library
         library.trap_from(size, 1)
         with body.when(library.scratch_end < library.scratch + size):
@@ -217,8 +217,9 @@ class Driver(Batches):
     def load(
         self, batch: I32, slot: I32, planes: I32, signed: I32, size: I32, start: I32, apart: I32
     ) -> None:
-        """Read cells [worlds, rows, columns] into planes from a slot on: integers of 1, 2 or 4 bytes, or f32 into a field if
-        there are no planes. `apart`: bytes from one world to the next.
+        """Read cells [worlds, rows, columns] into the planes from a slot on: integers of 1, 2 or 4 bytes.
+
+        With 0 planes, read f32 into a field. `apart`: bytes from one world to the next.
         """
         library, memory = self.library, self.memory
         with body.when(planes.equals(0)):
@@ -252,7 +253,7 @@ class Driver(Batches):
     def store(
         self, batch: I32, slot: I32, planes: I32, signed: I32, size: I32, start: I32, apart: I32
     ) -> None:
-        """Write cells, from first to last, each as 4 bytes of which `size` stay; `signed`: the last plane is the sign."""
+        """Write cells from first to last, each as 4 bytes of which `size` remain; `signed`: the last plane is the sign."""
         memory = self.memory
         with body.when(planes.equals(0)):
             body.do(self.calls["store_real"](batch, slot, start, apart))
@@ -268,8 +269,8 @@ class Driver(Batches):
                 return op("i32.wrap_i64", (plane + place)[memory.half] >> counted(x))
 
             def weight(bit: Value) -> Value:
-                one = 1 << bit
-                return either(signed & bit.equals(planes - 1), 0 - one, one)
+                power = 1 << bit
+                return either(signed & bit.equals(planes - 1), 0 - power, power)
 
             with self.each_sixteen(size, x, count):
                 cells = body.let(0, "v128")
@@ -321,7 +322,7 @@ class Driver(Batches):
     # Steps
 
     def run(self, batch: I32, steps: I32) -> None:
-        """Run steps, and add them to those of the inputs."""
+        """Run steps, and advance the clocks."""
         with body.block() as nothing:
             body.jump(nothing, steps.equals(0))
             with body.each(0, batch[GROUPS]) as group:
@@ -335,13 +336,13 @@ class Driver(Batches):
             clock += counted(steps)
 
     def world_of(self, batch: Value, number: Value, lane: int) -> Local:
-        """The world of a lane; unused lanes are the last world once more."""
+        """The world of a lane; unused lanes repeat the last world."""
         last = batch[WORLDS] - 1
         pair = body.let((number << 1) + lane)
         return body.let(either(self.library.strips, number, either(pair < last, pair, last)))
 
     def enter(self, batch: I32, number: I32) -> None:
-        """A group becomes the one that runs: parameters, and what the keys of its worlds have in common at all steps."""
+        """Select the group that runs: set its parameters, and the parts of its worlds' keys that all steps share."""
         library, memory, layout = self.library, self.memory, self.layout
         library.group.set(self.part(batch, 3) + number * memory.group)
         for lane in range(LANES):
@@ -367,11 +368,11 @@ class Driver(Batches):
                     self._twice(key, memory.at("worlds", i) + 8 * lane)
 
     def _twice(self, number: Value, at: int) -> None:
-        """A number for both hashes of a lane's word."""
+        """Store a number twice, for both hashes of a lane's word."""
         load("i64.load", 0, at).set(counted(number) * (1 << 32 | 1))
 
     def begin(self, batch: I32, number: I32, done: I32) -> None:
-        """What comes before the passes of a step: batch, number of the group, steps that are done."""
+        """Prepare a step: set the clock and the keys of draws, reset slots, update the present elements."""
         library, memory = self.library, self.memory
         for lane in range(LANES):
             with body.scope():
@@ -405,16 +406,16 @@ class Driver(Batches):
                     coin.set(0)
         for slot in self.program.slots:
             if slot.resets:
-                held, real = library.group[memory.slot(slot.name, slot.type)], slot.type == REAL
-                body.do(library.give(held))
+                place, real = library.group[memory.slot(slot.name, slot.type)], slot.type == REAL
+                body.do(library.give(place))
                 if real and slot.default:
                     make = library.module.define(self._constant_field)
-                    held.set(make(const("f32", slot.default)))
+                    place.set(make(const("f32", slot.default)))
                 else:
                     same = library.calm if real else library.everything if slot.default else library.nothing
-                    held.set(library.keep(same))
+                    place.set(library.keep(same))
         names = [name for name in self.layout.planes if name.startswith("element:")]
-        if ids := [code for code in range(1 << len(names)) if self.asked >> code & 1]:
+        if ids := [code for code in range(1 << len(names)) if self.tested >> code & 1]:
             look = library.module.define(partial(self._look, names, ids), "look")
             with body.when(library.present.equals(-1)):
                 body.do(look())
@@ -433,10 +434,10 @@ class Driver(Batches):
         return field
 
     def _look(self, names: Sequence[str], ids: Sequence[int]) -> None:
-        """Finds which of some ids are present, from products of their bits, which have planes."""
+        """Find the ids that are present, from products of the planes of their bits."""
         library, memory = self.library, self.memory
         planes = [body.let(library.group[memory.slot(name, None)]) for name in names]
-        found = {code: body.let(0, "v128") for code in ids}
+        present = {code: body.let(0, "v128") for code in ids}
         with body.each(0, library.cells, 16) as at, body.scope():
             products: list[Value] = [const("v128", -1)]
             for plane in planes:
@@ -444,16 +445,16 @@ class Driver(Batches):
                 without = [body.let(op("v128.andnot", product, bit)) for product in products]
                 products = [*without, *(body.let(product & bit) for product in products)]
             for code in ids:
-                found[code] |= products[code]
+                present[code] |= products[code]
         total: Value = const("i64", 0)
         for code in ids:
-            total = total | (counted(op("v128.any_true", found[code])) << code)
+            total = total | (counted(op("v128.any_true", present[code])) << code)
         library.present.set(total)
 
-    # What an instance makes once, when it learns the number of rows: sizes, constant planes, tables
+    # Sizes, constant planes and tables, which an instance makes once the number of rows is known
 
     def _setup(self, height: I32, strips: I32) -> None:
-        """Rows of a world, and whether the lanes are strips."""
+        """Set the rows of a world; `strips` is 1 if the lanes are strips of one world."""
         library, memory = self.library, self.memory
         library.world_rows.set(height)
         library.strips.set(strips)
@@ -494,7 +495,7 @@ class Driver(Batches):
     def _fixed(self, kind: int, a: int, b: int) -> Value:
         """A plane of a bit of coordinates (0: rows, 1: columns; modulus, bit), or of `inside` (2: rows, columns).
 
-        Its halo has what the other strip has there, and around the world nothing is inside.
+        Its halo holds the rows of the other strip; around the world nothing is inside.
         """
         library, memory = self.library, self.memory
         around = memory.extent.around

@@ -1,6 +1,6 @@
-"""Hosts: what compiles and runs modules of WebAssembly, which import nothing and export `memory`.
+"""Hosts, which compile and run modules of WebAssembly that import nothing and export `memory`.
 
-One is wasmtime in this process (`wasmtime_host`); in Pyodide it is the browser, or Node.js.
+The host is wasmtime in this process (`wasmtime_host`); in Pyodide, it is the browser or Node.js.
 """
 
 from __future__ import annotations
@@ -16,10 +16,9 @@ class RunningModule(Protocol):
     """An instance of a module: its functions and its memory, each for one thread at a time."""
 
     def call(self, name: str, *args: int) -> int:
-        """Call an exported function with i32. The result, if there is one, is taken as unsigned.
+        """Call an exported function with i32 arguments; return the result as unsigned, or 0 if there is none.
 
-        Raises:
-            MemoryError: the function has ended in a trap; modules do that when their memory is too small.
+        Raises MemoryError after a trap: modules trap when their memory is too small.
         """
         ...
 
@@ -50,7 +49,7 @@ def this_host() -> Callable[[bytes], Compiled]:
 
 
 def browser_module(code: bytes) -> Compiled:
-    """A module of JavaScript, compiled at once: on a page that is for a worker to do."""
+    """A module of JavaScript, compiled synchronously: on a page, only a worker may do that."""
     import js
     from pyodide.ffi import to_js
 
@@ -59,7 +58,7 @@ def browser_module(code: bytes) -> Compiled:
 
 
 class BrowserInstance:
-    """Addresses of its memory stay valid when it grows, views of it do not, so each call makes its own."""
+    """An instance in the browser. When its memory grows, addresses stay valid and views do not, so calls make new views."""
 
     def __init__(self, exports: Any):
         import js

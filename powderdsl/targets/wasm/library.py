@@ -1,14 +1,14 @@
-"""The memory of a module, and what generated passes call: planes and fields, rows around the edges, draws.
+"""The memory of a module, and the functions that generated passes call: planes, fields, rows around the edges, draws.
 
 Addresses are bytes. Everything is aligned to 16 bytes. A group is two lanes of work: two worlds, or the two halves of one.
 
     plane   refs, some, haloed, next: i32 each. Rows of words, lane by lane, with `around` rows above and below, which
             hold the rows that follow on the torus if `haloed`. `some`: it may hold a flag; if not, all words are zero.
-    field   refs, some, 2, next. A byte a line: whether it is `live`; other lines are zero and not to be read. Then the
+    field   refs, some, 2, next. A byte a line: 1 if it is `live`; other lines are zero and must not be read. Then the
             lines, of both lanes one after the other, with `reach` columns of the torus on both sides.
     batch   worlds, groups. Seeds, indices and steps, i64 a world each. The bits of parameters, a byte a
             world each. Their float32 values. The groups.
-    group   the planes and fields of slots, i32 each; i64: the ids that are present, of those that passes ask for.
+    group   the planes and fields of slots, i32 each; i64: the present ids, of those that passes test.
 """
 
 from __future__ import annotations
@@ -43,36 +43,36 @@ from powderdsl.targets.wasm.binary import (
 
 WORD, LANES = 64, 2
 HEADER = 16
-"""Bytes of numbers before what planes, fields and batches hold."""
+"""Bytes of numbers before the contents of planes, fields and batches."""
 
 REFS, SOME, HALOED, NEXT = (Member("i32.load", at) for at in (0, 4, 8, 12))
 FIELD = 2
-"""What fields have instead of `haloed`."""
+"""The value of `haloed` that marks fields."""
 
 REFS_SOME = Member("i64.load", 0)
 """Both together."""
 
 LIVE = Member("i32.load8_u", HEADER)
-"""Of a line: beyond a field as many bytes as its number."""
+"""The live byte of a line, at the field's address plus the line's number."""
 
 WORLDS, GROUPS = Member("i32.load", 0), Member("i32.load", 4)
 
 PAGE = 1 << 16
 GOLDEN, FIRST, SECOND = 0x9E3779B1, 0x7FEB352D, 0x846CA68B
 MOST_BITS = 64
-"""Of a draw."""
+"""The most bits of a draw."""
 
 AHEAD = 4
-"""Bits of a draw that are made together, since the multiplications of one wait for each other."""
+"""Bits of a draw that are computed together, since the multiplications of one bit wait for each other."""
 
 MAX_PARAMS = 1000
-"""What engines take of a function; more are passed in variables of the module."""
+"""The most parameters of a function that engines accept; more are passed in variables of the module."""
 
 UNROLLED = 4
-"""Words of a row up to which they are looked at without a loop."""
+"""Words of a row up to which they are read without a loop."""
 
 STILL, SWAPPED = bytes(range(16)), bytes([*range(8, 16), *range(8)])
-"""For `i8x16.swizzle`: the lanes as they are, and exchanged."""
+"""Patterns for `i8x16.swizzle`: the lanes unmodified, and exchanged."""
 
 ZERO = const("i32", 0)
 
@@ -82,9 +82,7 @@ def aligned(count: int, by: int = 16) -> int:
 
 
 class Extent(NamedTuple):
-    """The largest distances at which planes are read in rows (`around`), and fields in rows and columns; the most chains
-    of choices in a loop.
-    """
+    """The largest distances of reads: planes in rows (`around`), fields in rows and columns; the most chains in a loop."""
 
     around: int
     lines: int
@@ -117,19 +115,19 @@ class Memory:
         self.words = -(-width // WORD)
         """The words of a row."""
         self.whole = width % WORD == 0
-        """Whether all words of a row are full."""
+        """True if all words of a row are full."""
         self.row = 8 * LANES * self.words
         """The bytes of a plane's row, both lanes."""
         self.base = HEADER + extent.around * self.row
-        """Where a plane's first row lies."""
+        """The offset of a plane's first row."""
         self.flags, self.half = Member("v128.load", self.base), Member("i64.load", self.base)
-        """A word of a plane, and what a lane has of it: beyond the plane's address as far as beyond its first word."""
+        """A word of a plane, and the part of a lane, at the plane's address plus the offset from the first word."""
         self.halo = aligned(extent.reach, 4)
-        """The columns beside a line of a field for which there is room."""
+        """The columns of padding on each side of a line."""
         self.stride = aligned(width, 4) + 2 * self.halo + 4
-        """The floats of a line, with both halos and what a chunk may overlap."""
+        """The floats of a line, with both halos and the overlap of a chunk."""
         self.slots = [(Member("i32.load", 4 * i), False) for i in range(len(layout.planes))]
-        """The planes and fields of a group, by number; and whether they are fields."""
+        """The planes and fields of a group, by number; True for fields."""
         self.slots += [
             (Member("i32.load", 4 * (len(self.slots) + i)), True) for i in range(len(layout.reals))
         ]
@@ -169,7 +167,7 @@ class Memory:
         return self.slots[len(layout.planes) + layout.reals[name] if type == REAL else layout.planes[name]][0]
 
     def table(self, dy: int, *, wraps: bool) -> int:
-        """Where the pointer to a table of lines lies: for each line, the one `dy` below it in its world."""
+        """The address of the pointer to a table of lines: for each line, the line `dy` below in its world."""
         return self.at("lines", 2 * (dy + self.extent.lines) + (not wraps))
 
 
@@ -183,14 +181,14 @@ def integers(number: int) -> Value:
 
 
 def some(flags: Value) -> Value:
-    """Whether any bit of a vector is set."""
+    """True if any bit of a vector is set."""
     return op("v128.any_true", flags)
 
 
 def either(condition: Value, yes: Value | int, no: Value | int) -> Value:
     """A choice between two numbers, one of which is not constant."""
     type = yes.type if isinstance(yes, Value) else no.type if isinstance(no, Value) else "i32"
-    yes, no = (given if isinstance(given, Value) else const(type, given) for given in (yes, no))
+    yes, no = (value if isinstance(value, Value) else const(type, value) for value in (yes, no))
     return Value(type, yes.code + no.code + condition.code + op("select").code)
 
 
@@ -216,17 +214,17 @@ class Library:
         self._more: list[Global] = []
         variable, define = module.variable, module.define
         self.top = variable("i32", memory.top)
-        """Where memory that was never used begins."""
+        """The beginning of memory that was never used."""
         self.planes, self.fields = variable("i32"), variable("i32")
-        """The first plane and field that is free."""
+        """The first free plane and field."""
         self.rows, self.lines, self.cells = variable("i32"), variable("i32"), variable("i32")
         """Rows of a lane; lines of both lanes; bytes of the rows of a plane."""
         self.strips, self.plane_size, self.field_size = variable("i32"), variable("i32"), variable("i32")
         self.live_size = variable("i32")
         self.nothing, self.everything, self.inside = variable("i32"), variable("i32"), variable("i32")
-        """Planes: without a flag, with all; with all, and in the halo those of rows that lie in the world."""
+        """Planes: without flags; with all flags; with all flags, in the halo only in rows of the world."""
         self.calm, self.zeros, self.group = variable("i32"), variable("i32"), variable("i32")
-        """A field without a live line; a line of zeros; the group that runs."""
+        """A field without live lines; a line of zeros; the group that runs."""
         self.world_rows = variable("i32")
         """Rows of a world; 0 before the first batch."""
         self.row_list = variable("i32")
@@ -244,7 +242,7 @@ class Library:
         self.coin = define(self._coin)
 
     def more_params(self, count: int) -> list[Global]:
-        """Variables for what a function takes beyond MAX_PARAMS."""
+        """Variables for parameters beyond MAX_PARAMS."""
         while len(self._more) < count:
             self._more.append(self.module.variable("i32"))
         return self._more[: max(count, 0)]
@@ -257,7 +255,7 @@ class Library:
     # Memory
 
     def _bump(self, size: I32) -> Value:
-        """New memory: bytes, a multiple of 16 → address. Traps where the module's limit is reached."""
+        """New memory: bytes, a multiple of 16 → address. Traps at the module's limit."""
         place = body.let(self.top)
         with body.when(size >= self.module.most * PAGE):
             body.trap()
@@ -271,7 +269,7 @@ class Library:
         return place
 
     def trap_from(self, count: Value, size: int) -> None:
-        """Trap if items of a size, together with as much again, do not fit into the memory."""
+        """Trap if items of a size do not fit into half of the memory."""
         with body.when(counted(count) * size >= self.module.most * PAGE // 2):
             body.trap()
 
@@ -285,37 +283,37 @@ class Library:
         place[HALOED] = kind
         return place
 
-    def _give(self, held: I32) -> None:
-        """One owner less of a plane or field."""
-        left = body.let(held[REFS] - 1)
-        held[REFS] = left
-        with body.when(left.equals(0)), body.when(held[HALOED].equals(FIELD)):
-            held[NEXT] = self.fields
-            self.fields.set(held)
+    def _give(self, item: I32) -> None:
+        """Remove an owner of a plane or field; without owners, it is free."""
+        left = body.let(item[REFS] - 1)
+        item[REFS] = left
+        with body.when(left.equals(0)), body.when(item[HALOED].equals(FIELD)):
+            item[NEXT] = self.fields
+            self.fields.set(item)
             body.otherwise()
-            held[NEXT] = self.planes
-            self.planes.set(held)
+            item[NEXT] = self.planes
+            self.planes.set(item)
 
-    def _keep(self, held: I32) -> Value:
-        """One more owner of a plane or field, which is the result."""
-        held[REFS] += 1
-        return held
+    def _keep(self, item: I32) -> Value:
+        """Add an owner of a plane or field, and return it."""
+        item[REFS] += 1
+        return item
 
     def _own(self, plane: I32) -> Value:
-        """A plane of this owner alone, to be written over."""
+        """The plane if it has one owner, else a copy, so that it may be overwritten."""
         with body.when(plane[REFS].equals(1)):
             plane[HALOED] = 0
             body.give(plane)
-        return self._copied(plane, self.take, self.memory.base, self.cells)
+        return self._copy(plane, self.take, self.memory.base, self.cells)
 
     def _own_field(self, field: I32) -> Value:
-        """A field of this owner alone, to be written over."""
+        """The field if it has one owner, else a copy, so that it may be overwritten."""
         with body.when(field[REFS].equals(1)):
             body.give(field)
-        return self._copied(field, self.take_field, HEADER, self.field_size - HEADER)
+        return self._copy(field, self.take_field, HEADER, self.field_size - HEADER)
 
-    def _copied(self, old: Local, take: Callee, first: int, size: Value) -> Value:
-        """A copy of a plane or field, whose owner gives that back."""
+    def _copy(self, old: Local, take: Callee, first: int, size: Value) -> Value:
+        """A copy of a plane or field, which loses an owner."""
         new = body.let(take())
         body.do(op("memory.copy", new + first, old + first, size))
         new[SOME] = old[SOME]
@@ -325,7 +323,7 @@ class Library:
     # Rows around the edges
 
     def _edges(self, plane: I32) -> None:
-        """To be called before rows above and below are read. Beyond an edge, strips see the other strip."""
+        """Fill the rows above and below a plane, before they are read; beyond an edge, strips continue in the other strip."""
         memory, rows, around = self.memory, self.rows, self.memory.extent.around
         with body.when(plane[HALOED]):
             body.leave()
@@ -344,7 +342,7 @@ class Library:
                     load("v128.load", to + w, HEADER).set(seen)
 
     def row_flags(self, planes: Sequence[Value], row: Value, member: Member) -> Value:
-        """What planes hold in a row, together: `member` are words of both lanes, or of one."""
+        """The union of planes in a row: `member` is a word of both lanes, or of one lane."""
         if self.memory.words <= UNROLLED:
             places = [(plane + row, 16 * w) for plane in planes for w in range(self.memory.words)]
             return reduce(or_, [load(member.load, at, member.offset + more) for at, more in places])
@@ -364,7 +362,7 @@ class Library:
         return x ^ (x >> 16)
 
     def mixed(self, numbers: Value, key: Value | None = None) -> Local:
-        """The finalizer of keys, on a vector; with a second key added between the multiplications, that of draws."""
+        """The finalizer of keys, on a vector; with a second key added between the multiplications, the hash of draws."""
         h = body.let(numbers)
         h ^= op("i32x4.shr_u", h, 16)
         h.set(op("i32x4.mul", h, integers(FIRST)))
@@ -374,7 +372,7 @@ class Library:
         return h
 
     def first_number(self, word_number: Value, keys: Value) -> Value:
-        """What `ahead` takes for bit 0 of a word, by the number of the word in the hash."""
+        """The argument `number` of `ahead` for bit 0 of a word, by the number of the word in the hash."""
         return op("i32x4.add", splat(word_number * GOLDEN), load("v128.load", keys))
 
     def ahead(self, number: Local, keys: Value, count: int) -> list[Local]:
@@ -387,9 +385,9 @@ class Library:
         return drawn
 
     def _draw_below(self, at: I32, wanted: V128, keys: I32, limit: I64) -> Value:
-        """Which of the wanted cells draw below a constant, given as its bits from the highest, in the word numbered `at`.
+        """The wanted cells that draw below a constant, given as its bits from the highest, in the word numbered `at`.
 
-        Of the cells still open, those whose draw has a 0 where the limit has a 1 are below it; equal bits leave a cell open.
+        Of the undecided cells, those whose draw has a 0 where the limit has a 1 are below; equal bits leave a cell undecided.
         """
         number = body.let(self.first_number(at, keys))
         below = body.let(0, "v128")
@@ -434,7 +432,7 @@ class Library:
         return (at << 2) - (y << 5)
 
     def _coin(self, place: I32, keys: I32) -> Value:
-        """The plane of the highest bit of a stream's draws. Several passes ask for it: it is made once a step."""
+        """The plane of the highest bit of a stream's draws, made once a step, since several passes use it."""
         plane = body.let(word(place))
         with body.when(plane.equals(0)):
             plane.set(self.take())
@@ -535,8 +533,8 @@ class Library:
         by = dx % width
         if not by:
             return row
-        held = row if isinstance(row, Local) else body.let(row)
-        return (held >> by) | (held << (width - by))
+        row = row if isinstance(row, Local) else body.let(row)
+        return (row >> by) | (row << (width - by))
 
     # Lines of fields
 
@@ -549,11 +547,11 @@ class Library:
         return field + self.live_size + line * (4 * memory.stride) + (HEADER + 4 * memory.halo)
 
     def other_line(self, line: Value, dy: int, *, wraps: bool) -> Value:
-        """The line `dy` below; outside the world, one that is never live."""
+        """The line `dy` below; outside the world, a line that is never live."""
         return word(word(0, self.memory.table(dy, wraps=wraps)) + (line << 2)) if dy else line
 
     def finish_line(self, start: Value) -> None:
-        """Fill the columns of the torus beside a line."""
+        """Fill the halo of a line with the columns around the edge."""
         width, reach, halo = self.memory.width, self.memory.extent.reach, self.memory.halo
         before = body.let(start - 4 * halo) if reach else start
         for i in range(reach):

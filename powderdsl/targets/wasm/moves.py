@@ -1,8 +1,8 @@
 """Movements in place: planes change only in rows that movers leave or enter.
 
-Rows are visited so that the row which movers enter comes before theirs. Then a row's old flags are still there when the
-movers that it holds arrive elsewhere; those of the row before wait in a register, or in a row beside the planes. What
-comes around the edge waits in the planes' halos.
+Rows are visited so that the row that movers enter comes before theirs. Then a row's old flags are unchanged when its movers
+arrive elsewhere; the old flags of the row before are saved in a register, or in a row outside the planes. Flags that come
+around the edge are saved in the planes' halos.
 """
 
 from __future__ import annotations
@@ -15,19 +15,20 @@ from powderdsl.targets.wasm.binary import I32, Callee, Local, Value, body, const
 from powderdsl.targets.wasm.library import HALOED, LIVE, SOME, WORD, ZERO, Library, choose, either, some, word
 
 TOGETHER = 4
-"""Planes that a loop over rows of one word changes, since each waits for what it reads."""
+"""Planes that a loop over rows of one word changes together, to hide the latency of reads."""
 
 
 def groups_in_place(move: Move) -> dict[Leftover, list[Out]] | None:
-    """The planes of a movement by what movers leave behind; None if it needs copies: swaps reach the next row only."""
+    """The planes of a movement by their leftovers; None if it needs copies, as swaps beyond the next row do."""
     groups = move.leftovers()
     near = groups is not None and abs(move.offset[0]) <= 1 and groups.keys() == {"same"}
     return groups if near or move.op == "arrive" else None
 
 
 def rows_that_move(library: Library, downwards: bool) -> Callee:
-    """Lists the rows that movers leave or enter, if they move downwards from the bottom: planes of movers and of their
-    targets → the end of the list.
+    """A function that lists the rows that movers leave or enter: movers, targets → the end of the list.
+
+    If they move downwards, the list begins at the bottom.
     """
     memory, cells = library.memory, library.cells
 
@@ -105,7 +106,7 @@ class _Mover:
                 before[i].set(old)
 
     def long_row(self, plane: Local, before: Local, at: Local) -> None:
-        """A row of several words, of which the old ones are kept beside the planes."""
+        """A row of several words, whose old words are saved outside the planes."""
         memory, library, dx = self.memory, self.library, self.dx
         start = body.let(plane + at + memory.base)
         with body.each(0, memory.row, 16) as w:
@@ -138,7 +139,7 @@ class _Mover:
 def move_groups(
     library: Library, move: Move, movers: Local, groups: Mapping[Leftover, Sequence[Local]], targets: Callee
 ) -> None:
-    """Move planes in place, by what their movers leave behind. `targets` makes the plane of targets: movers, it."""
+    """Move planes in place, by their leftovers. `targets` writes the plane of targets: movers, targets."""
     entered = body.let(library.take())
     body.do(library.edges(movers))
     body.do(targets(movers, entered))
@@ -187,7 +188,7 @@ def exchanger(library: Library, offset: Offset) -> Callee:
 
 
 def _exchange_word(left: Local, x: Local, here: Local, there: Local, by: int, width: int) -> None:
-    """Cells of the movers `left`, the first of which is in column `x`, exchange with those `by` columns on, around."""
+    """Exchange cells of the movers `left`, a word from column `x` on, with those `by` columns to the right, around the edge."""
     with body.block() as done, body.loop() as again, body.scope():
         body.jump(done, op("i64.eqz", left))
         column = body.let(x + op("i32.wrap_i64", op("i64.ctz", left)))
@@ -196,7 +197,7 @@ def _exchange_word(left: Local, x: Local, here: Local, there: Local, by: int, wi
         if by:
             target.set(either(target < width, target, target - width))
         own, other = body.let(here + (column << 2)), body.let(there + (target << 2))
-        kept = body.let(word(own))
+        saved = body.let(word(own))
         word(own).set(word(other))
-        word(other).set(kept)
+        word(other).set(saved)
         body.jump(again)

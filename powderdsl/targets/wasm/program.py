@@ -24,10 +24,10 @@ from powderdsl.targets.wasm.library import GROUPS, HEADER, aligned
 from powderdsl.targets.wasm.source import wasm_module
 
 ROOM = 1 << 30
-"""Bytes of memory from which an instance takes no new batches. What it has can be stepped and read: there is as much again."""
+"""Bytes of memory from which an instance takes no new batches. The other half remains for its batches to step and read."""
 
 _MODULES = Memo(versions=1, things=64)
-"""The compiled modules of this process: tests, tasks and environments run the same rules on the same widths again."""
+"""The compiled modules of this process: tests, tasks and environments reuse rules and widths."""
 
 
 class WasmProgram:
@@ -37,7 +37,7 @@ class WasmProgram:
         program: the numeric program, whose slots are the state's.
         planes: the same program from `ir.bits.lower_bits`.
         kind: the arrays of its jobs.
-        memo: where the schedules of passes are kept.
+        memo: stores schedules of passes.
     """
 
     def __init__(self, program: Program, planes: Program, kind: ArrayKind, memo: Memo | None = None):
@@ -57,11 +57,8 @@ class WasmProgram:
         return _MODULES.of((self._digest, width), "", make)
 
     def instance(self, worlds: int, rows: int, width: int) -> Instance:
-        """The instance for new batches of a shape: another one when the memory of the last is full.
-
-        Whether lanes are strips depends on the rows and on whether there is one world.
-        """
-        key = (rows, width, worlds == 1)
+        """The instance for new batches of a shape: a new instance when the memory of the last is full."""
+        key = (rows, width, worlds == 1)  # with one world, lanes may be strips
         instance = self._instances.get(key)
         if instance is None or instance.running.memory_size() > ROOM:
             instance = self._instances[key] = Instance(self, width)
@@ -87,9 +84,9 @@ class WasmProgram:
 
 
 class Instance:
-    """An instance of a module, for worlds of one number of rows. As a context, it lets one thread call functions.
+    """An instance of a module, for worlds of one number of rows. As a context manager, it lets one thread call functions.
 
-    Its memory goes when no batch in it is used any more.
+    Its memory is freed when no batch in it is used any more.
     """
 
     def __init__(self, program: WasmProgram, width: int):
@@ -99,10 +96,10 @@ class Instance:
         self.gone: list[tuple[int, int]] = []
         """Batches that nobody uses any more, with their numbers of worlds."""
         self._free: defaultdict[int, list[int]] = defaultdict(list)
-        """By number of worlds: batches to be used again."""
+        """Batches to reuse, by number of worlds."""
         self._lock = RLock()
         self._inputs: tuple[Mapping[str, Array], int, bytes] | None = None
-        """The last parameters, the number of worlds, and what the module takes for them."""
+        """The last parameters, the number of worlds, and the parameters as bytes of the module."""
 
     def __enter__(self) -> Callable[..., int]:
         self._lock.acquire()
@@ -118,7 +115,7 @@ class Instance:
     def transfers(
         self, name: str, size: int, shape: tuple[int, ...], at: int
     ) -> Iterator[tuple[int, int, int, int, int, int]]:
-        """What `load` and `store` take, after the batch, for each piece of an array of cells of `size` bytes."""
+        """The arguments of `load` and `store`, after the batch, for each piece of an array of cells of `size` bytes."""
         plane = shape[-2] * shape[-1] * size
         for piece in self.program.pieces[name]:
             numbers = numbers_of(piece, self.layout, size)
@@ -133,7 +130,7 @@ class Instance:
         return free.pop() if free else self.call("allocate", worlds, rows)
 
     def copy(self, state: WasmState) -> int:
-        """A batch with a state that is here already."""
+        """A batch with a copy of a state of this instance."""
         worlds, rows, _ = shape_of(state)
         batch = self.new(worlds, rows)
         self.call("copy", state.handle, batch)
@@ -143,8 +140,8 @@ class Instance:
         """A batch with a state."""
         worlds, rows, _ = shape_of(state)
         batch = self.new(worlds, rows)
-        for name, given in state.items():
-            value = self.kind.contiguous(given)
+        for name, array in state.items():
+            value = self.kind.contiguous(array)
             if bool(value.any()):  # a new batch holds zeros
                 data = bytes(self.kind.bytes_of(value))
                 at = self.call("scratch", len(data))
@@ -164,7 +161,7 @@ class Instance:
             return self.kind.from_bytes(self.running.read(at, size), dtype, shape)
 
     def input_bytes(self, params: Mapping[str, Array], worlds: int) -> bytes:
-        """What comes after the clocks: bits of parameters, and their values at a multiple of 16 bytes."""
+        """The bytes after the clocks: bits of parameters, and their values at a multiple of 16 bytes."""
         layout = self.layout
         bits, reals = parameters(self.kind.xp, params, layout.param_planes, layout.param_reals, worlds)
         head = bytes(self.kind.bytes_of(bits))[: worlds * len(layout.param_planes)]
@@ -199,7 +196,7 @@ class WasmState(OwnedBatch):
         super().__init__(handle, like)
 
     def release(self, handle: int) -> None:
-        # The collector may come in the middle of a call, of this or another thread: the next call releases it.
+        # The garbage collector may run during a call, in this or another thread, so the next call releases the batch.
         self.instance.gone.append((shape_of(self)[0], handle))
 
     def __copy__(self) -> WasmState:

@@ -51,8 +51,8 @@ def wasm_module(
     """The module of a program on planes, for grids of this width.
 
     Args:
-        face: the module is a world by itself (`standalone`), and exports only what that has.
-        memo: where schedules of passes that have not changed are found.
+        face: if given, the module is a world by itself (`standalone`) and exports only its functions.
+        memo: stores schedules of passes.
     """
     schedules = [_schedule(pass_, memo) for pass_ in program.passes]
     memory = Memory(width, extent_of(schedules), layout_of(program))
@@ -62,8 +62,8 @@ def wasm_module(
         module.define(Pass(schedule, library).write, pass_function_name(schedule.name))
         for schedule in schedules
     ]
-    asked = reduce(or_, map(tested_ids, schedules), 0)
-    calls = Driver(library, program, passes, asked).add(export=face is None)
+    tested = reduce(or_, map(tested_ids, schedules), 0)
+    calls = Driver(library, program, passes, tested).add(export=face is None)
     if face is not None:
         Standalone(library, face, calls).add()
     return module
@@ -73,8 +73,8 @@ def _schedule(pass_: PassGraph, memo: Memo | None) -> Schedule:
     if memo is None:
         return plan(pass_, CPU)
     key = structure(pass_, places=False)
-    kept = memo.of(("schedule", pass_.name), key, lambda: plan(pass_, CPU))
-    return replace(kept, graph=kept.graph.copy())  # emitting code adds nodes to it
+    schedule = memo.of(("schedule", pass_.name), key, lambda: plan(pass_, CPU))
+    return replace(schedule, graph=schedule.graph.copy())  # emitting code adds nodes to it
 
 
 def pass_function_name(name: str) -> str:
@@ -99,13 +99,13 @@ class Pass(Printer):
                 body.leave()
         for slot, var in schedule.inputs:
             at = memory.slot(slot, var.type)
-            if slot in changed:  # nothing else refers to it while the pass runs, so it may be overwritten
+            if slot in changed:  # no other reference exists while the pass runs, so it may be overwritten
                 self.define(var, group[at])
                 group[at] = 0
             else:
                 self.define(var, library.keep(group[at]))
         self.block(schedule.body)
-        values = [body.let(self.kept(node)) for _, node in schedule.outputs]
+        values = [body.let(self.keep(node)) for _, node in schedule.outputs]
         for (slot, node), value in zip(schedule.outputs, values, strict=True):
             at = memory.slot(slot, node.type)
             old = body.let(group[at])
@@ -129,7 +129,7 @@ class Pass(Printer):
         for name in names:
             body.do(self.library.give(self.vars[name]))
 
-    def held(self, node: Node) -> Value:
+    def address(self, node: Node) -> Value:
         """The plane or field of a load or a constant."""
         if node.op == "load":
             return self.of(node)
@@ -137,8 +137,8 @@ class Pass(Printer):
             return self.library.calm
         return self.library.everything if node.attr else self.library.nothing
 
-    def kept(self, node: Node) -> Value:
-        return self.library.keep(self.held(node))
+    def keep(self, node: Node) -> Value:
+        return self.library.keep(self.address(node))
 
     # Answers
 
@@ -146,8 +146,8 @@ class Pass(Printer):
         """A condition: i32, not zero if it holds."""
         match node.op:
             case "any" | "some":
-                asked: list[Value] = [self.of(plane)[SOME] for plane in node.args]
-                return reduce(or_, asked or [ZERO])
+                tests: list[Value] = [self.of(plane)[SOME] for plane in node.args]
+                return reduce(or_, tests or [ZERO])
             case "present":
                 return op("i64.ne", self.library.present & node.attr, 0)
             case "const":
@@ -169,13 +169,13 @@ class Pass(Printer):
 
     @contextmanager
     def where(self, condition: Value, olds: Mapping[Var, Node]) -> Iterator[None]:
-        """Statements that run if a condition holds; if not, variables that they define get other values."""
+        """Statements that run if a condition holds; otherwise, variables that they define get the values `olds`."""
         with body.when(condition):
             yield
             if olds:
                 body.otherwise()
                 for var, value in olds.items():
-                    self.define(var, self.kept(value))
+                    self.define(var, self.keep(value))
 
     def guard(self, guard: Guard) -> None:
         with self.where(self.answer(guard.when), {out.var: out.value for out in guard.outs}):
@@ -193,38 +193,38 @@ class Pass(Printer):
         """A loop over cells, if its region holds anywhere."""
         if is_copy(loop):  # fields are shared
             for out in loop.outs:
-                self.define(out.var, self.kept(out.value))
+                self.define(out.var, self.keep(out.value))
         elif loop.region is None:
             self.run(CellLoop(self.library, loop))
         else:
             parts = alternatives(loop.region)
-            held = (self.of(part.args[0] if part.op == "live" else part) for part in parts)
+            places = (self.of(part.args[0] if part.op == "live" else part) for part in parts)
             olds = {loop.vars[name]: old for name, old in loop.olds.items()}
-            with self.where(reduce(or_, (one[SOME] for one in held), ZERO), olds):
+            with self.where(reduce(or_, (place[SOME] for place in places), ZERO), olds):
                 self.run(CellLoop(self.library, loop))
 
     def words(self, loop: Compute) -> None:
-        """A loop over words that computes all of its planes anew, if they hold anything."""
-        made = WordLoop(self.library, loop)
+        """A loop over words that computes new planes, if its condition holds."""
+        code = WordLoop(self.library, loop)
         if loop.when is None:
-            self.run(made)
+            self.run(code)
             return
         with self.where(self.answer(loop.when), {out.var: self.nothing for out in loop.outs}):
-            self.run(made)
+            self.run(code)
 
-    def run(self, made: CellLoop | WordLoop) -> None:
+    def run(self, code: CellLoop | WordLoop) -> None:
         """Call a loop that writes new planes and fields."""
         library = self.library
-        for out in made.loop.outs:
+        for out in code.loop.outs:
             self.define(out.var, (library.take_field if out.var.type == REAL else library.take)())
-        self.call(made)
+        self.call(code)
 
-    def call(self, made: CellLoop | WordLoop) -> None:
-        """Call a loop with what it reads and what it writes."""
-        for name in made.haloed:
+    def call(self, code: CellLoop | WordLoop) -> None:
+        """Call a loop with the planes and fields that it reads and writes."""
+        for name in code.haloed:
             body.do(self.library.edges(self.vars[name]))
-        function = made.made()
-        args = [*map(self.read, made.reads), *(self.vars[out.var.name] for out in made.loop.outs)]
+        function = code.build()
+        args = [*map(self.read, code.reads), *(self.vars[out.var.name] for out in code.loop.outs)]
         more = self.library.more_params(len(args) - MAX_PARAMS)
         for variable, value in zip(more, args[MAX_PARAMS:], strict=True):
             variable.set(value)
@@ -244,23 +244,23 @@ class Pass(Printer):
         library = self.library
         for out in loop.outs:
             assert out.otherwise is not None
-            self.define(out.var, self.of(out.otherwise) if out.into else self.kept(out.otherwise))
-        made = WordLoop(library, loop)
-        with body.when(reduce(or_, (self.vars[name][SOME] for name in made.mask_names), ZERO)):
+            self.define(out.var, self.of(out.otherwise) if out.into else self.keep(out.otherwise))
+        code = WordLoop(library, loop)
+        with body.when(reduce(or_, (self.vars[name][SOME] for name in code.mask_names), ZERO)):
             for out in loop.outs:
                 plane = self.vars[out.var.name]
                 needed = plane[SOME] if only_clears(out, self.schedule.graph) else ONE  # 0 stays 0
                 with body.when(needed):
                     plane.set(library.own(plane))
-            self.call(made)
+            self.call(code)
 
     def whole(self, out: Out) -> None:
-        """An operation on whole planes that tests for empty ones first."""
+        """An operation on whole planes that tests for empty planes first."""
         value = out.value
-        tests: list[tuple[Node, Node]]  # planes, and what the result is if one is empty
+        tests: list[tuple[Node, Node]]  # planes, each with the result if it is empty
         match value.op:
             case "load" | "const":
-                self.define(out.var, self.kept(value))
+                self.define(out.var, self.keep(value))
                 return
             case "and":
                 stays, gone = difference(value)
@@ -276,7 +276,7 @@ class Pass(Printer):
             self.run(WordLoop(self.library, Compute((out,), over="words")))
 
     def move(self, move: Move) -> None:
-        """Planes that move, or fields that exchange values; those that nothing moves stay as they are."""
+        """Planes that move, or fields that exchange values; planes without movers stay unmodified."""
         library, graph = self.library, self.schedule.graph
         movers, fields = self.of(move.region), move.outs[0].var.type == REAL
         groups = None if fields else groups_in_place(move)
@@ -288,13 +288,13 @@ class Pass(Printer):
             return
         for out in move.outs:
             old = move.olds[out.var.name]
-            held = self.define(out.var, self.of(old) if out.into is not None else self.kept(old))
+            moved = self.define(out.var, self.of(old) if out.into is not None else self.keep(old))
             if fields:
-                with body.when(movers[SOME] & held[SOME]):
-                    held.set(library.own_field(held))
-                    body.do(exchanger(library, move.offset)(movers, held))
+                with body.when(movers[SOME] & moved[SOME]):
+                    moved.set(library.own_field(moved))
+                    body.do(exchanger(library, move.offset)(movers, moved))
         if groups is not None:
             with body.when(movers[SOME]), body.scope():
-                entered = WordLoop(library, target_loop(move, graph)).made()
+                entered = WordLoop(library, target_loop(move, graph)).build()
                 planes = {kind: [self.vars[out.var.name] for out in group] for kind, group in groups.items()}
                 move_groups(library, move, movers, planes, entered)

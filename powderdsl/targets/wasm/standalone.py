@@ -1,7 +1,7 @@
 """A module that is a world: a grid of one size with its elements' defaults, for a page or a game without powderdsl.
 
-Numbers are i32 unless said otherwise; rows and columns count from 0, and boxes end before `bottom` and `right`. What lies
-outside the grid is left out, and values are cut to what rules allow: a host cannot make a world that rules do not know.
+Numbers are i32 unless noted; rows and columns count from 0, and boxes end before `bottom` and `right`. Boxes are cut to the
+grid, and values are clamped to the range of the rules, so that a host cannot make an invalid world.
 
     cells() → address                 the ids, a byte a cell, row by row
     begin(seed)                       the cells there become a new world, at step 0, with the usual values of fields
@@ -37,10 +37,10 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True)
 class Stored:
-    """An array of the state but the element: its parts, how a cell is loaded, its bytes, and the values that cells may have.
+    """An array of the state other than the element: its parts, the instruction that loads a cell, its bytes and range.
 
-    `usual`: by component and id, the value of a fresh cell. `holders`: the ids of elements whose cells can have another
-    one; None for all. `of_element`: it comes and goes with the element.
+    `usual`: by component and id, the value of a fresh cell. `holders`: the ids of elements whose cells can have other
+    values; None for all. `of_element`: the values travel with the element.
     """
 
     name: str
@@ -68,7 +68,7 @@ class Knob:
 
 @dataclass(frozen=True)
 class Face:
-    """What a module needs to stand alone; `about` is for the custom section."""
+    """The data of a standalone module; `about` is for the custom section."""
 
     rows: int
     ids: tuple[int, ...]
@@ -90,7 +90,7 @@ class Standalone(Batches):
         self.valid = self._data(bytes(i if i in face.ids else face.ids[0] for i in range(256)))
         self.cells_at = const("i32", self._place(self.count))
         self.parts = {slot.name: list(self._parts(slot)) for slot in face.fields}
-        """The pieces of fields, where their cells lie for the host, and tables of fresh values."""
+        """The pieces of fields, the addresses of their cells for the host, and tables of fresh values."""
         self.reads: dict[str, Callee] = {}
         self.takes: dict[str, Callee] = {}
 
@@ -101,7 +101,7 @@ class Standalone(Batches):
             yield piece, at + i * self.count * slot.size, table
 
     def _place(self, size: int) -> int:
-        """Static memory, with room for what `store` writes beyond."""
+        """Static memory, with padding for bytes that `store` writes beyond the end."""
         place, self.end = self.end, aligned(self.end + size + 3)
         return place
 
@@ -111,7 +111,7 @@ class Standalone(Batches):
         return place
 
     def add(self) -> None:
-        """Add all functions, and grow the memory by what they need."""
+        """Add all functions, and grow the memory by the size of their buffers."""
         module, define = self.library.module, self.library.module.define
         self.define(self.begin, self.show, self.parameter, export=True)
         for slot in self.face.fields:
@@ -128,7 +128,7 @@ class Standalone(Batches):
     # The world
 
     def _start(self) -> None:
-        """Makes a world of the first element, with seed 0."""
+        """Make a world of the first element, with seed 0."""
         self.batch.set(self.calls["allocate"](1, self.face.rows))
         for number, knob in enumerate(self.face.knobs):
             body.do(self.calls["parameter"](number, const("f64", knob.default)))
@@ -136,7 +136,7 @@ class Standalone(Batches):
         body.do(self.calls["begin"](0))
 
     def begin(self, seed: I32) -> None:
-        """The ids in the buffer become a world of a seed, with fresh cells."""
+        """Turn the ids in the buffer into a world of fresh cells with a seed."""
         with body.each(0, self.count) as i:
             cell = load("i32.load8_u", self.cells_at + i)
             cell.set(load("i32.load8_u", cell, self.valid))
@@ -146,13 +146,13 @@ class Standalone(Batches):
             load("i64.load", self.batch, HEADER + 8 * number).set(start)
 
     def _freshen(self, cell: Value, element: Value, slots: Iterable[Stored]) -> None:
-        """Fields of a cell get the usual values of an element, for the host."""
+        """Set the fields of a cell to the usual values of an element, for the host."""
         for slot in slots:
             for piece, at, usual in self.parts[slot.name]:
                 load(slot.load, cell * slot.size, at).set(_usual(piece, element, usual))
 
     def _put(self, slots: Iterable[Stored]) -> None:
-        """The ids and fields that the host sees become those of the world."""
+        """Load the ids and fields that the host sees into the world."""
         body.do(self._load(self.face.element, self.cells_at, 1))
         for slot in slots:
             for piece, at, _ in self.parts[slot.name]:
@@ -180,12 +180,12 @@ class Standalone(Batches):
     # Fields
 
     def _read(self, slot: Stored) -> None:
-        """Writes the values of a field into its buffer."""
+        """Write the values of a field into its buffer."""
         for piece, at, _ in self.parts[slot.name]:
             body.do(self._store(piece, at, slot.size))
 
     def _take_values(self, slot: Stored) -> None:
-        """The values in a field's buffer become the field's, cut to what cells can have; the ids have been shown."""
+        """Load a field from its buffer, clamped to values that cells can have; `show` must have run before."""
         low, high = slot.low, slot.high
         for piece, at, usual in self.parts[slot.name]:
             with body.scope(), body.each(0, self.count) as i:
@@ -194,7 +194,7 @@ class Standalone(Batches):
                 cell = load(slot.load, place, at)
                 if piece.is_real:
                     value = body.let(_within(cell, low, high))
-                    # Without a number, and for small ones, the comparison does not hold.
+                    # The comparison is false for NaN and for tiny numbers.
                     large = op("f32.ge", op("f32.abs", value), SNAP)
                     cell.set(either(large, value, 0))
                 else:
@@ -226,7 +226,7 @@ class Standalone(Batches):
 
     @contextmanager
     def _each_cell(self, top: Local, bottom: Local, left: Local, right: Local) -> Iterator[Local]:
-        """The cells of a box that lie within the grid; the function ends before, if there are none."""
+        """The cells of a box within the grid; the function returns before, if there are none."""
         for start, stop, most in ((top, bottom, self.face.rows), (left, right, self.memory.width)):
             stop.set(either(op("i32.gt_s", stop, most), most, stop))
             start.set(either(op("i32.lt_s", start, 0), 0, start))
@@ -273,7 +273,7 @@ class Standalone(Batches):
             self._set_knob(knob, value)
 
     def _set_knob(self, knob: Knob, value: Local) -> None:
-        """A parameter's value, cut to its range, becomes bits and floats."""
+        """Store a parameter's value, clamped to its range, as bits and floats."""
         layout = self.layout
         value.set(_within(value, knob.low, knob.high))
         if knob.whole:
@@ -293,7 +293,7 @@ class Standalone(Batches):
 
 
 def _of_number(number: Value, items: Iterable[Item]) -> Iterator[Item]:
-    """Statements for each item, of which those run that are for the item of this number."""
+    """Statements for each item; those of the item with this number run."""
     for i, item in enumerate(items):
         with body.when(number.equals(i)), body.scope():
             yield item
@@ -305,13 +305,13 @@ def _usual(piece: Piece, element: Value, table: int) -> Value:
 
 
 def _within(value: Value, low: float, high: float) -> Value:
-    """A float, cut to a range."""
+    """A float, clamped to a range."""
     kind = value.type
     return op(f"{kind}.min", op(f"{kind}.max", value, low), high)
 
 
 def _limit(value: Value, threshold: Threshold) -> Value:
-    """As `codec.limits`: how many draws lie below a chance, or not above it."""
+    """The number of draws below a chance, or not above it, as in `codec.limits`."""
     count = 1 << threshold.bits
     scaled = op("f64.sub", value * count, 0.5)
     if threshold.strict:

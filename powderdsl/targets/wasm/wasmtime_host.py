@@ -16,10 +16,10 @@ from powderdsl.targets.wasm.host import TOO_LARGE
 
 MOST_ARGUMENTS = 16
 GROWTH = 16 << 20
-"""Bytes of addresses beyond a memory into which it grows without being moved, where addresses are few."""
+"""Address space reserved for growth on machines with little address space."""
 
 _OWNED: WeakSet[Any] = WeakSet()
-"""What wasmtime frees with the objects of Python that own it."""
+"""Python objects that own memory of wasmtime."""
 T = TypeVar("T")
 
 
@@ -30,9 +30,9 @@ def _owned(owner: T) -> T:
 
 @atexit.register
 def _leave() -> None:
-    """Leave everything to the operating system: wasmtime cannot free it when Python has taken its modules apart."""
+    """Leave all memory to the operating system: wasmtime cannot free it while Python shuts down."""
     for owner in list(_OWNED):
-        with suppress(ValueError):  # it was freed before
+        with suppress(ValueError):  # already freed
             owner._consume()
 
 
@@ -47,14 +47,14 @@ def _engine(*, reserve: bool) -> wasmtime.Engine:
 
 
 class WasmtimeModule:
-    """A compiled module, which is instantiated in stores of their own.
+    """A compiled module; each instance has its own store.
 
     wasmtime reserves 4 GiB of addresses for each memory, so that the processor checks accesses. Where addresses are
-    limited (`ulimit -v`), it checks them itself, in code that takes half as long again.
+    limited (`ulimit -v`), generated code checks them, which takes half as long again.
     """
 
     engine = _engine(reserve=True)
-    """That of new modules."""
+    """The engine of new modules."""
 
     def __init__(self, code: bytes):
         self._code = code
@@ -78,7 +78,7 @@ class WasmtimeModule:
 
 
 class WasmtimeInstance:
-    """An instance in a store of its own."""
+    """An instance in its own store."""
 
     def __init__(self, engine: wasmtime.Engine, module: wasmtime.Module):
         self._store = _owned(wasmtime.Store(engine))

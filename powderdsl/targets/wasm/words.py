@@ -18,7 +18,7 @@ from powderdsl.targets.wasm.library import MAX_PARAMS, SOME, WORD, ZERO, Library
 
 
 def plane_name(node: Node, layout: Layout) -> tuple[str, int] | None:
-    """The table, and the number in it, of a plane that a leaf other than a variable stands for."""
+    """The table, and the number in it, of the plane of a coin, coordinate or `inside`; None for other nodes."""
     if is_coin(node):
         return "coins", layout.streams[node.attr[0]]
     if node.op == "inside" or (node.op == "coordinate" and node.attr[0] != "step"):
@@ -27,9 +27,9 @@ def plane_name(node: Node, layout: Layout) -> tuple[str, int] | None:
 
 
 class Loop:
-    """A function with one loop. Its parameters are planes and fields: those that it reads, and those that it writes.
+    """A function with one loop. Its parameters are the planes and fields that it reads and writes.
 
-    `reads` are names of variables, or tables and numbers of planes that are there anyway (`plane_name`).
+    `reads` are names of variables, or tables and numbers of permanent planes (`plane_name`).
     """
 
     kind: str
@@ -40,17 +40,17 @@ class Loop:
         count = len(self.reads) + len(loop.outs)
         self.f = Function(["i32"] * min(count, MAX_PARAMS))
         params = [*self.f.params, *library.more_params(count - MAX_PARAMS)]
-        self.held = dict(zip(self.reads, params, strict=False))
+        self.addresses = dict(zip(self.reads, params, strict=False))
         self.outs = params[len(self.reads) :]
         self.nodes = ordered(out.value for out in loop.outs)
         self.haloed: list[str] = []
-        """The planes of which other rows are read."""
+        """The planes that are read in other rows."""
 
     def write(self) -> None:
         """Write the function."""
         raise NotImplementedError
 
-    def made(self) -> Callee:
+    def build(self) -> Callee:
         """The function in the module, under the name of its place in the rules."""
         with body.of(self.f):
             self.write()
@@ -67,13 +67,13 @@ class WordLoop(Loop):
         self.mask_names = [str(node.attr) for node in alternatives(loop.region)]
         self.updates = loop.region is not None
         olds = {out.into for out in loop.outs if self.updates and out.into is not None}
-        made = (plane_name(node, library.memory.layout) for node in ordered(values))
+        planes = (plane_name(node, library.memory.layout) for node in ordered(values))
         names = (name for name in loaded(values) if name not in olds)
-        super().__init__(library, loop, chain(names, filter(None, made), self.mask_names))
+        super().__init__(library, loop, chain(names, filter(None, planes), self.mask_names))
         self.haloed = list(dict.fromkeys(read.name for read in reads_of(values) if read.dy))
         for out, place in zip(loop.outs, self.outs, strict=True):
-            if out.into in olds:  # what is overwritten holds the old value
-                self.held[str(out.into)] = place
+            if out.into in olds:  # the overwritten plane holds the old value
+                self.addresses[str(out.into)] = place
 
     def write(self) -> None:
         library, memory = self.library, self.memory
@@ -106,7 +106,7 @@ class WordLoop(Loop):
         values = WordValues(self)
         with body.scope(), body.block() as skip:
             if self.updates:
-                wanted = reduce(or_, [(self.held[name] + self.at)[flags] for name in self.mask_names])
+                wanted = reduce(or_, [(self.addresses[name] + self.at)[flags] for name in self.mask_names])
                 body.jump(skip, some(wanted).equals(0))
             new = []
             for out in self.loop.outs:
@@ -173,9 +173,9 @@ class WordValues(Values[Value]):
         raise AssertionError(f"no function for {node.op} of flags")
 
     def plane(self, node: Node) -> Value:
-        """A word of a plane that is there."""
+        """A word of a variable or permanent plane."""
         name = plane_name(node, self.memory.layout) or str(node.attr)
-        return (self.loop.held[name] + self.loop.at)[self.memory.flags]
+        return (self.loop.addresses[name] + self.loop.at)[self.memory.flags]
 
     def lazy(self, node: Node) -> Value:
         """A conjunction whose second part is computed only where the first holds somewhere in the word."""
@@ -187,7 +187,7 @@ class WordValues(Values[Value]):
     def shift(self, node: Node) -> Value:
         dy, dx, wraps = node.attr
         loop, memory = self.loop, self.memory
-        plane = loop.held[str(node.args[0].attr)]
+        plane = loop.addresses[str(node.args[0].attr)]
         offset = memory.base + dy * memory.row
         value: Value = load("v128.load", plane + loop.at, offset)
         if dx:
@@ -200,7 +200,7 @@ class WordValues(Values[Value]):
         return value
 
     def draw(self, node: Node, args: Sequence[Value]) -> Value:
-        """A draw below a limit, which is a number, or is given plane by plane from the highest."""
+        """A draw below a limit: a number, or planes from the highest."""
         layout, memory, bits = self.memory.layout, self.memory, node.attr[1]
         keys = memory.at("keys", layout.streams[node.attr[0]])
         where = drawn_where(node)
