@@ -28,7 +28,7 @@ __all__ = ["CompileError", "Simulator", "World", "compile", "ledger", "load", "l
 
 
 def __getattr__(name: str) -> Any:
-    """Public names are imported when first used: torch only comes in with what needs it."""
+    """Import a public name on first use, so that torch is only imported when it is needed."""
     if name not in _HOMES:
         raise AttributeError(f"module 'powderdsl' has no attribute {name!r}")
     from importlib import import_module

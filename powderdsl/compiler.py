@@ -1,4 +1,4 @@
-"""The sequence: text → located tree → checked model → IR → passes → program. Each stage takes one value and gives one.
+"""The compiler's sequence: text → located tree → checked model → IR → passes → program.
 
 `load` stops at the checked model, `lower` at optimized IR; neither needs torch. `simulation.simulator` continues from there.
 """
@@ -66,11 +66,11 @@ def shipped_rules() -> list[str]:
 @cache
 def shipped_words() -> dict[str, str]:
     """The words that the shipped packs define, each with its pack."""
-    found: dict[str, str] = {}
+    packs: dict[str, str] = {}
     for source in _shipped_sources():
         for word in words_of_tree(parse_yaml(source, Reporter())):
-            found.setdefault(word, Path(source.name).stem)
-    return found
+            packs.setdefault(word, Path(source.name).stem)
+    return packs
 
 
 def _shipped_sources() -> Iterator[Source]:
@@ -81,18 +81,18 @@ def _shipped_sources() -> Iterator[Source]:
 
 
 def shipped_variants() -> set[str]:
-    """The shipped rulesets that extend another one."""
-    found = [_read_once(source)[0] for source in _shipped_sources()]
-    return {decl.name.text for decl in found if isinstance(decl, RulesetDecl) and decl.extends is not None}
+    """The shipped rulesets that extend another ruleset."""
+    decls = [_read_once(source)[0] for source in _shipped_sources()]
+    return {decl.name.text for decl in decls if isinstance(decl, RulesetDecl) and decl.extends is not None}
 
 
 def shipped_tests() -> list[str]:
-    """The shipped rules that stand by themselves: rulesets, and packs that need no other and belong to no ruleset."""
-    found = [decl for source in _shipped_sources() if (decl := _read_once(source)[0])]
-    inside = {scalar.text for decl in found if isinstance(decl, RulesetDecl) for scalar in decl.packs}
+    """The shipped rules that load alone: rulesets, and packs that need no other pack and belong to no ruleset."""
+    decls = [decl for source in _shipped_sources() if (decl := _read_once(source)[0])]
+    inside = {scalar.text for decl in decls if isinstance(decl, RulesetDecl) for scalar in decl.packs}
     return [
         decl.name.text
-        for decl in found
+        for decl in decls
         if isinstance(decl, RulesetDecl) or not (decl.needs or decl.name.text in inside)
     ]
 
@@ -107,12 +107,12 @@ def load(
     Args:
         names: shipped names (``"powderworld"``), paths of rule files, or several joined by ``+``. A name after ``-``
             is left out: ``"name-pack"``.
-        params: other values for parameters, by qualified name: ``{"pack.param": 0.05}``.
-        palette: ids that were recorded, such as a model's: the qualified name of the element of each id, or None.
-            Elements that it does not have get its free ids, then those after its end.
+        params: values that replace the defaults of parameters, by qualified name: ``{"pack.param": 0.05}``.
+        palette: recorded ids, such as a model's: the qualified name of the element of each id, or None. Other elements
+            get its free ids, then the ids after its end.
 
     Raises:
-        CompileError: with everything that is wrong in the files.
+        CompileError: with all mistakes in the files.
     """
     ruleset, _ = load_with_diagnostics(*names, params=params, palette=palette)
     return ruleset
@@ -124,7 +124,7 @@ def load_with_diagnostics(
     params: Mapping[str, Any] | None = None,
     palette: Palette | None = None,
 ) -> tuple[Ruleset, tuple[Diagnostic, ...]]:
-    """Like `load`; the second value has the warnings and notes."""
+    """The checked model, as from `load`, and the warnings and notes."""
     reporter = Reporter()
     packs, ruleset = read(names, reporter)
     reporter.raise_if_errors()
@@ -139,11 +139,8 @@ def load_with_diagnostics(
 def whole_palette(*names: str | Path) -> tuple[str | None, ...]:
     """The slots of a model for the elements of some rules: a qualified name or None each.
 
-    Packs that are left out have slots too. The ids of a ruleset's own packs, or of a list of packs, stay as they
-    are; the elements of packs that are added to a ruleset follow without gaps.
-
-    Raises:
-        CompileError: with what is wrong with the files, their names and ids.
+    Packs that are left out have slots too. The ids of a ruleset's own packs, or of a list of packs, do not change; the
+    elements of packs that are added to a ruleset follow without gaps. Raises CompileError.
     """
     reporter = Reporter()
     packs, ruleset = read([word for name in names for word in split_names(name)[0]], reporter)
@@ -178,21 +175,21 @@ def read(names: Sequence[str | Path], reporter: Reporter) -> tuple[list[PackDecl
     if not rulesets:
         return list(loaded.values()), None
     *beside, last = rulesets
-    for one in last.lineage:
-        for scalar in one.without:  # the ids of their elements stay reserved
-            lister = one.base.members.get(scalar.text) if one.base else None
+    for ruleset in last.lineage:
+        for scalar in ruleset.without:  # the ids of their elements stay reserved
+            lister = ruleset.base.members.get(scalar.text) if ruleset.base else None
             if lister is not None and scalar.text not in last.members:
                 reader.read(scalar.text, lister)
-    members = dict.fromkeys(name for one in last.lineage for name in one.members)
+    members = dict.fromkeys(name for ruleset in last.lineage for name in ruleset.members)
     reserved = {name: packs[name] for name in members if name not in loaded and name in packs}
     return list(loaded.values()), replace(last, beside=tuple(beside), left_out=reserved)
 
 
 def split_names(name: str | Path) -> tuple[list[str], list[str]]:
-    """``a+b-c`` as names to load and names to leave out.
+    """Split ``a+b-c`` into names to load and names to leave out.
 
-    A file that exists is a path, whatever characters it has: of the parts between ``+``, the longest run that names a
-    file is one path. After ``.yaml`` a ``-`` leaves out too.
+    Existing files are paths, even if their names contain ``+`` or ``-``: the longest run of parts between ``+`` that
+    names a file is one path. After ``.yaml``, a ``-`` leaves a pack out, too.
     """
     if isinstance(name, Path):
         return [str(name)], []
@@ -212,7 +209,7 @@ def split_names(name: str | Path) -> tuple[list[str], list[str]]:
 
 
 def _without(part: str) -> tuple[str, list[str]]:
-    """The name in a word without ``+``, and the packs that it leaves out."""
+    """Split a word without ``+`` into the name to load and the packs to leave out."""
     if _is_there(part):
         return part, []
     path = re.fullmatch(r"(.*\.ya?ml)((?:-[^-/\\]*)*)", part, re.DOTALL)
@@ -221,9 +218,9 @@ def _without(part: str) -> tuple[str, list[str]]:
 
 
 def names_in_file(text: str, span: Span, reporter: Reporter) -> list[str] | None:
-    """Names for `read` from rules that a file names at `span`: shipped names, and paths of files beside it or below.
+    """Names for `read` from rules that a file names at `span`: shipped names, and paths in its folder or below.
 
-    Returns None after reporting a path that leads elsewhere (PD112) or an unknown name (PD304).
+    Returns None after reporting a path outside that folder (PD112) or an unknown name (PD304).
     """
     names: list[str] = []
     known, parts = shipped_rules(), text.split("+")
@@ -240,7 +237,7 @@ def names_in_file(text: str, span: Span, reporter: Reporter) -> list[str] | None
 
 
 def _is_there(text: str) -> bool:
-    """Whether a text names something other than a folder: a file, or something that reading will refuse."""
+    """True if a text names an existing path other than a folder."""
     try:
         return os.path.exists(text) and not os.path.isdir(text)
     except (OSError, ValueError):
@@ -248,22 +245,22 @@ def _is_there(text: str) -> bool:
 
 
 def _read_apart(source: Source) -> tuple[PackDecl | RulesetDecl | None, tuple[Diagnostic, ...]]:
-    """The declaration of a file, and what is to be said about it."""
+    """The declaration of a file, and its diagnostics."""
     reporter = Reporter()
-    with suppress(CompileError):  # more errors than are reported
+    with suppress(CompileError):  # more errors than the limit
         return read_file(source, reporter), reporter.diagnostics
     return None, reporter.diagnostics
 
 
 SMALL = 1 << 16
-"""Characters of files that are kept once they are parsed. Larger ones, perhaps a stranger's, take much memory."""
+"""The most characters of files whose declarations are cached; larger files take much memory."""
 
 _read_once = lru_cache(maxsize=128)(_read_apart)
 """Tasks, tests and environments load the same packs again and again."""
 
 
 class _Reader:
-    """Declarations that have been read: each pack and ruleset once, in the order of first mention."""
+    """Reads declarations, each pack and ruleset once, in the order of first mention."""
 
     def __init__(self, reporter: Reporter):
         self.reporter = reporter
@@ -276,13 +273,13 @@ class _Reader:
         if source is None:
             return None
         read_apart = _read_once if len(source.text) <= SMALL else _read_apart
-        decl, found = read_apart(source)
-        for one in found:
-            self.reporter.add(one)
+        decl, diagnostics = read_apart(source)
+        for diagnostic in diagnostics:
+            self.reporter.add(diagnostic)
         return decl
 
     def read(self, word: str, lister: RulesetDecl | None = None) -> None:
-        """Read what a word names; `lister` is the ruleset that lists it."""
+        """Read the pack or ruleset that a word names; `lister` is the ruleset that lists it."""
         if word in self.packs:
             return
         decl = self.declaration(_find(word, self.reporter, lister))
@@ -299,14 +296,14 @@ class _Reader:
             self.reporter.error("PD304", message, span, label, helps=helps)
         elif decl is not None:
             ruleset = self.with_base(decl, (decl,))
-            if ruleset is None or any(one.source.name == ruleset.source.name for one in self.rulesets):
+            if ruleset is None or any(other.source.name == ruleset.source.name for other in self.rulesets):
                 return
             self.rulesets.append(ruleset)
             for member, lister in ruleset.members.items():
                 self.read(member, lister)
 
     def with_base(self, decl: RulesetDecl, path: tuple[RulesetDecl, ...]) -> RulesetDecl | None:
-        """The ruleset with the one that it extends; `path` leads from the first one to this one."""
+        """The ruleset with its base; `path` has the rulesets from the first one to this one."""
         reporter = self.reporter
         if decl.extends is None:
             return decl
@@ -319,13 +316,13 @@ class _Reader:
             )  # fmt: skip
         if not isinstance(base, RulesetDecl):
             return None
-        sources = [one.source.name for one in path]
+        sources = [ruleset.source.name for ruleset in path]
         if base.source.name in sources:
-            cycle = [one.name.text for one in path[sources.index(base.source.name) :]]
+            cycle = [ruleset.name.text for ruleset in path[sources.index(base.source.name) :]]
             reporter.error(
-                "PD314", "rulesets extend each other: " + " extends ".join(f"`{one}`" for one in [*cycle, cycle[0]]),
+                "PD314", "rulesets extend each other: " + " extends ".join(f"`{name}`" for name in [*cycle, cycle[0]]),
                 span, "this leads back" if len(cycle) > 1 else "this is the ruleset itself",
-                secondary=[Label(one.extends.span, "by way of this") for one in path[:-1] if one.extends],
+                secondary=[Label(ruleset.extends.span, "by way of this") for ruleset in path[:-1] if ruleset.extends],
                 helps=["take one `extends` out"],
             )  # fmt: skip
             return None
@@ -365,7 +362,7 @@ def _find(word: str, reporter: Reporter, ruleset: RulesetDecl | None) -> Path | 
 
 
 def _find_beside(word: str, reporter: Reporter, ruleset: RulesetDecl, span: Span | None) -> Path | None:
-    """The file of what a ruleset names at some place: a pack, or the ruleset that it extends."""
+    """The file of a pack, or of the base, that a ruleset names at `span`."""
     if is_path(word):
         helps = ["put the file beside the ruleset and write its name, without `.yaml`"]
         message = f"a ruleset names other files without a path: `{word}`"
@@ -394,7 +391,7 @@ def _report_unknown(word: str, span: Span | None, reporter: Reporter) -> None:
 
 @collection_paused()
 def lower(ruleset: Ruleset, memo: Memo | None = None) -> Program:
-    """The checked model as optimized IR. With a memo, only passes that have changed go through the stages."""
+    """Lower the checked model to optimized IR. With a memo, only passes that have changed go through the stages."""
     from powderdsl.ir.lower import lower_ruleset
     from powderdsl.ir.stages import run_passes
     from powderdsl.ir.text import structure
@@ -406,14 +403,13 @@ def lower(ruleset: Ruleset, memo: Memo | None = None) -> Program:
     def optimized(pass_: PassGraph) -> PassGraph:
         key = program.slots, structure(pass_)
         run = partial(run_passes, replace(program, passes=(pass_,)))
-        (made,) = memo.of(("optimized", pass_.name), key, run).passes
-        return made
+        return memo.of(("optimized", pass_.name), key, run).passes[0]
 
     return replace(program, passes=tuple(map(optimized, program.passes)))
 
 
 def parts(program: Program, memo: Memo | None = None) -> tuple[Segment, ...]:
-    """Optimized IR in segments, on bit planes where they can carry it."""
+    """Split optimized IR into segments, on bit planes if the planes can represent the passes."""
     from powderdsl.ir.segments import PassForm, choose_form, segments
     from powderdsl.ir.text import structure
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from powderdsl.envs.actions import action_form
 from powderdsl.envs.observations import observation_of
 from powderdsl.simulation.simulator import MAX_CELLS
-from powderdsl.simulation.state_checks import given_mapping
+from powderdsl.simulation.state_checks import check_mapping
 from powderdsl.system.random import MASK, mix
 from powderdsl.system.settings import check_choice, check_count
 from powderdsl.tasks.episodes import Episodes, TaskProgram, compile_task, load_task
@@ -220,7 +220,7 @@ class TensorEnv:
         """The parameters after a reset of `mask`."""
         if given is None:
             return self.params
-        whole = self.simulator.parameters(given_mapping("params", given), self.num_envs)
+        whole = self.simulator.parameters(check_mapping("params", given), self.num_envs)
         names = given.keys() if bool(mask.all()) else {**given, **self.params}.keys()
         old = {**self.simulator.parameters({}, self.num_envs), **self.params}
         return {name: torch.where(mask, whole[name], old[name]) for name in names}

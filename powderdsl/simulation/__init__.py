@@ -1,1 +1,1 @@
-"""Running rules: worlds, the simulator, the choice of a target, and observations."""
+"""Runs rules: worlds, the simulator, the choice of a target, and observations."""

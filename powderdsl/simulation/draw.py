@@ -1,4 +1,4 @@
-"""Worlds -> RGB pictures, one pixel a cell. Tensors are taken too; pictures are NumPy arrays."""
+"""Worlds -> RGB pictures, one pixel a cell, from arrays or tensors; pictures are NumPy arrays."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ OUTLINES = ((255, 0, 160), (0, 160, 255), (255, 160, 0), (0, 200, 80))
 
 
 def palette(elements: Sequence[Element]) -> NDArray[np.uint8]:
-    """The elements' colors by id, uint8 [256, 4]: red, green, blue, nothing. Ids that no element has are black."""
+    """The elements' colors by id, uint8 [256, 4]: red, green, blue, 0. Ids without an element are black."""
     table = np.zeros((256, 4), dtype=np.uint8)
     for element in elements:
         table[element.id] = _components(element.color)
@@ -31,8 +31,8 @@ def palette(elements: Sequence[Element]) -> NDArray[np.uint8]:
 class Ramp:
     """The colors of the element `id` by the values of a field: `colors[n]` where n of `starts` are reached.
 
-    `starts` ascend, int32 [n] or float32 [n] as the field; `colors` is uint8 [n + 1, 4], as of
-    `palette`. A picture only compares values, so it is the same on every machine.
+    `starts` ascend, int32 [n] or float32 [n] like the field; `colors` is uint8 [n + 1, 4], as in `palette`. A picture
+    only compares values, so it is the same on every machine.
     """
 
     id: int
@@ -43,15 +43,16 @@ class Ramp:
 
 def ramps(elements: Sequence[Element]) -> tuple[Ramp, ...]:
     """The ramps of the elements that have a ramp, by id."""
-    found = [(element.id, element.ramp) for element in elements if element.ramp is not None]
     return tuple(
-        Ramp(number, ramp.field, *_steps(ramp)) for number, ramp in sorted(found, key=lambda one: one[0])
+        Ramp(element.id, element.ramp.field, *_steps(element.ramp))
+        for element in sorted(elements, key=lambda element: element.id)
+        if element.ramp is not None
     )
 
 
 @dataclass(frozen=True)
 class CellTint:
-    """Cells are tinted by the vectors of a field: toward `color`, float32 in 0..1, by |v| / `full`, at most by `most`."""
+    """A tint of cells by the vectors of a field: toward `color`, float32 in 0..1, by |v| / `full`, at most by `most`."""
 
     field: str
     color: tuple[float, float, float]
@@ -73,7 +74,7 @@ def tints(fields: Sequence[Field]) -> tuple[CellTint, ...]:
 
 
 def looks(elements: Sequence[Element], fields: Sequence[Field]) -> dict[str, Any]:
-    """How `rgb` shows worlds of these elements and fields: its `colors`, `ramps` and `tints`."""
+    """The arguments `colors`, `ramps` and `tints` of `rgb` for worlds of these elements and fields."""
     return {"colors": palette(elements), "ramps": ramps(elements), "tints": tints(fields)}
 
 
@@ -85,7 +86,7 @@ def shown_fields(ruleset: Ruleset) -> tuple[str, ...]:
 
 @lru_cache(maxsize=256)
 def _steps(ramp: ColorRamp) -> tuple[NDArray[Any], NDArray[np.uint8]]:
-    """The values at which the color of a ramp changes, and the colors before, between and behind them."""
+    """The values at which the color of a ramp changes, and the colors before, between and after them."""
     dtype = np.float32 if ramp.real else np.int32
     ends = [_components(color) for color in (ramp.start, ramp.end)]
     parts = [np.array(_first_values(new - old, ramp), dtype) for old, new in zip(*ends, strict=True)]
@@ -100,18 +101,18 @@ def _steps(ramp: ColorRamp) -> tuple[NDArray[Any], NDArray[np.uint8]]:
 def _first_values(change: int, ramp: ColorRamp) -> list[int | float]:
     """The first values, as the field stores them, at which a channel has changed by 1, 2, … to `change`.
 
-    In proportion that is so far along the range: (j - 1/2) / |change|. What falls by more than a half is rounded down.
+    The j-th change is at the fraction (j - 1/2) / |change| of the range. Where a channel falls, it changes just after.
     """
-    found: list[int | float] = []
+    values: list[int | float] = []
     reaches = operator.ge if change > 0 else operator.gt
     for j in range(1, abs(change) + 1):
         place = ramp.lo + Fraction((ramp.hi - ramp.lo) * (2 * j - 1), 2 * abs(change))
         if not ramp.real:
-            found.append(math.ceil(place) if change > 0 else math.floor(place) + 1)
+            values.append(math.ceil(place) if change > 0 else math.floor(place) + 1)
             continue
         value = float(np.float32(float(place)))
-        found.append(value if reaches(value, place) else _above(value))
-    return found
+        values.append(value if reaches(value, place) else _above(value))
+    return values
 
 
 def _above(value: float) -> float:
@@ -135,8 +136,8 @@ def rgb(
     """Pictures uint8 [..., H, W, 3] of ids [..., H, W] in the colors of a `palette`.
 
     With `ramps`, cells of their elements have the color of their value in `fields`, arrays [..., H, W] by name. With
-    `tints`, cells are tinted by vectors in `fields`, float [..., 2, H, W], after that and in order. Everything is of
-    `kind`; without one, ids and fields may be tensors too, and pictures are NumPy arrays.
+    `tints`, cells are then tinted by vectors in `fields`, float [..., 2, H, W], in order. All arrays are of `kind`; without
+    `kind`, ids and fields may be tensors too, and pictures are NumPy arrays.
     """
     values = fields or {}
     if kind is None:
@@ -156,11 +157,11 @@ def rgb(
 def tint_cells(kind: ArrayKind, image: Array, vectors: Array, tint: CellTint) -> None:
     """Tint pictures uint8 [..., H, W, 3] in place by vectors [..., 2, H, W].
 
-    Each operation is one of float32, and bytes are cut off, so that all libraries and the page draw the same bytes.
+    All operations are in float32, and bytes are truncated, so that all libraries and the page draw the same bytes.
     """
     xp = kind.xp
     vectors = xp.asarray(vectors, dtype=xp.float32)
-    if kind.on_cpu and not bool((vectors != 0).any()):  # asking a GPU would mean waiting for it
+    if kind.on_cpu and not bool((vectors != 0).any()):  # on a GPU, the test would wait for it
         return
     row, column = vectors[..., 0, :, :], vectors[..., 1, :, :]
     share = xp.clip(xp.sqrt(row * row + column * column) / tint.full, 0, tint.most)
@@ -207,7 +208,7 @@ def outline(
 
 def to_numpy(image: Array) -> NDArray[Any]:
     """An array, or a tensor on any device, as a NumPy array."""
-    # Asking torch itself would import it for people who only use arrays.
+    # `isinstance` would import torch for people who only use arrays.
     return image.detach().cpu().numpy() if hasattr(image, "detach") else np.asarray(image)
 
 

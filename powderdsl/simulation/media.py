@@ -76,12 +76,15 @@ def _encode(command: list[str], frames: Iterable[NDArray[np.uint8]]) -> None:
     with tempfile.TemporaryFile() as log:
         encoder = None
         try:
-            # A session of its own: Ctrl-C reaches us alone, and we end the encoder. A signal while it starts must wait
-            # until we know it: it would write its file after we removed ours.
+            # In a new session, Ctrl-C reaches only this process, which ends the encoder. A signal must wait until the
+            # encoder has started: otherwise, it would write its file after this process removed it.
             with held_back():
                 encoder = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log, start_new_session=True)
             assert encoder.stdin is not None
-            with suppress(BrokenPipeError), encoder.stdin as pipe:  # the encoder died: its words say why
+            with (
+                suppress(BrokenPipeError),
+                encoder.stdin as pipe,
+            ):  # if the encoder died, its log has the reason
                 for frame in frames:
                     pipe.write(np.ascontiguousarray(frame).data)
             status = encoder.wait()
@@ -97,7 +100,7 @@ def _encode(command: list[str], frames: Iterable[NDArray[np.uint8]]) -> None:
 
 
 def _indexed(images: Any, frame: NDArray[np.uint8]) -> Any:
-    """A frame with a palette of its own, exact where it has at most 256 colors."""
+    """A frame with its own palette, exact if it has at most 256 colors."""
     packed = frame.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], dtype=np.uint32)
     colors, index = np.unique(packed, return_inverse=True)
     if len(colors) > 256:
@@ -108,6 +111,6 @@ def _indexed(images: Any, frame: NDArray[np.uint8]) -> Any:
 
 
 def _even(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """H.264 stores color at half the size, so both sides must be even: the last row or column is doubled."""
+    """The frame with even sides: H.264 stores color at half the size. The last row or column is repeated."""
     height, width = frame.shape[:2]
     return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), "edge")

@@ -1,13 +1,13 @@
 """Native code by the width of grids, compiled when it is worth it.
 
-Each width has a library of its own, or shares one with others (`known_width`). A library is made when the first grid of
-its width is stepped, so that nobody waits for code that is not needed. If the same model was compiled before, its code
-comes from the cache and nothing is lowered. The cache's key depends on the model, on every source file that turns models
-into C++, on the compiler, the processor and the width. Values of parameters are inputs of a step, so they take no part.
+Each width has its own library, or shares one with others (`known_width`). A library is made when the first grid of its
+width is stepped, so that no time is spent on code that is not needed. If the same model was compiled before, its code comes
+from the cache and nothing is lowered. The cache's key depends on the model, on every source file that turns models into
+C++, on the compiler, the processor and the width. Values of parameters are inputs of a step, so the key excludes them.
 
-The backend `auto` starts on WebAssembly, or on torch where wasmtime has no wheel. Once the work done and asked for is
-worth it, a thread compiles. The change comes between two steps, with the same worlds: long calls are cut into slices for
-it. Short scripts never start a compiler.
+The backend `auto` starts on WebAssembly, or on torch where wasmtime has no wheel. Once the work done and requested is
+worth it, a thread compiles. The backend changes between two steps, with the same worlds: long calls are split into slices.
+Short scripts never start a compiler.
 """
 
 from __future__ import annotations
@@ -82,14 +82,14 @@ def generator() -> str:
 
 
 class ByWidth:
-    """Native code for each known width of grids, and for all others (`known_width`), made when the first such grid comes.
+    """Native code for each width of grids (`known_width`), made for the first grid of that width.
 
-    It is built with the settings that are in effect now. What it tells is about the width stepped last.
+    Code is built with the settings in effect now. `running` and `notes` describe the width stepped last.
 
     Args:
-        lowered: the ruleset in IR; the first call does the work.
-        first: for `auto`, the backend that starts at once, and its program, the same at each call.
-        cells: gives the program that runs everything on cells.
+        lowered: returns the ruleset in IR; the first call does the work.
+        first: for `auto`, the backend that starts at once, and a function that returns its program.
+        cells: returns the program that runs everything on cells.
 
     Raises:
         CompileError: PD701 if there is no compiler, unless another backend starts.
@@ -114,38 +114,38 @@ class ByWidth:
                 raise _refusal(error) from None
             code = None
         if code is None:
-            lowered()  # what cannot be lowered is reported here
+            lowered()  # reports rules that cannot be lowered
         if first is not None:
             self._latest = self._of(0 if code is None else code.width)
 
     def _of(self, width: int) -> Runnable:
         if width in self._programs:
             return self._programs[width]
-        recalled, compiled = partial(self._recalled, width), partial(self._compiled, width)
+        recall, compile = partial(self._recall, width), partial(self._compile, width)
         with building(self._how):
             try:
                 program = (
-                    AutoProgram(*self._first, self._cells, recalled, compiled)
+                    AutoProgram(*self._first, self._cells, recall, compile)
                     if self._first is not None
-                    else recalled() or compiled()
+                    else recall() or compile()
                 )
             except NoCompiler as error:
                 raise _refusal(error) from None
             return self._programs.setdefault(width, program)
 
-    def _recalled(self, width: int) -> Runnable | None:
-        """Native code that was compiled before. Raises NoCompiler if none could be made."""
+    def _recall(self, width: int) -> Runnable | None:
+        """Native code that was compiled before, or None. Raises NoCompiler."""
         code = recall(start_key(self._ruleset, width))
         return None if code is None else NativeProgram(code, self._threads)
 
-    def _compiled(self, width: int) -> Runnable:
-        """Native code, compiled now or by another process meanwhile; passes that do not fit bit planes run on cells.
+    def _compile(self, width: int) -> Runnable:
+        """Native code, compiled now or by another process meanwhile. Raises NoCompiler.
 
-        Raises NoCompiler: there is no C++ compiler, or it failed.
+        Passes that do not fit bit planes run on cells.
         """
         key = start_key(self._ruleset, width)
         with turn(current().place(), key):
-            if (program := self._recalled(width)) is not None:
+            if (program := self._recall(width)) is not None:
                 return program
             program = mixed_program(
                 segments(self._lowered()),
@@ -159,12 +159,12 @@ class ByWidth:
 
     @property
     def running(self) -> str:
-        """What the next step runs on: ``wasm``, ``torch`` or ``native``."""
+        """The backend of the next step: ``wasm``, ``torch`` or ``native``."""
         return str(getattr(self._latest, "running", "native"))
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences about which backend ran, and why."""
+        """Sentences that name the backends that ran, and the reasons."""
         return tuple(getattr(self._latest, "notes", ()))
 
     def run(self, job: Job) -> Mapping[str, Array]:
@@ -181,11 +181,11 @@ class AutoProgram:
     """Runs on a backend that starts at once until native code has been compiled.
 
     Args:
-        name: that backend.
-        first: gives its program, the same at each call.
-        large: gives the program for worlds that it has no memory for, if there is no native code.
-        ready: native code that was compiled before, or None; raises NoCompiler if none could be made.
-        make: native code, compiled; raises NoCompiler.
+        name: the backend that starts.
+        first: returns its program, the same at each call.
+        large: returns the program for worlds that do not fit into its memory, if there is no native code.
+        recall: returns native code that was compiled before, or None; raises NoCompiler.
+        make: compiles native code; raises NoCompiler.
     """
 
     def __init__(
@@ -193,7 +193,7 @@ class AutoProgram:
         name: str,
         first: Callable[[], Runnable],
         large: Callable[[], Runnable],
-        ready: Callable[[], Runnable | None],
+        recall: Callable[[], Runnable | None],
         make: Callable[[], Runnable],
     ):
         self._name, self._first, self._large, self._make = name, first, large, make
@@ -205,18 +205,18 @@ class AutoProgram:
         self._pace: tuple[int, float] | None = None  # cells of a batch, seconds a step on the first backend
         self._steps = {"first": 0, "native": 0}
         try:
-            self._native = ready()
+            self._native = recall()
         except NoCompiler as error:
             self._problem = str(error)
 
     @property
     def running(self) -> str:
-        """What the next step runs on: ``wasm``, ``torch`` or ``native``."""
+        """The backend of the next step: ``wasm``, ``torch`` or ``native``."""
         return self._name if self._native is None else "native"
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences about which backend ran, and why."""
+        """Sentences that name the backends that ran, and the reasons."""
         thread, first = self._thread, f"{self._name} for {self._steps['first']} steps"
         if self._native is not None and thread is None:
             return ("native: it was compiled before",)
@@ -238,7 +238,7 @@ class AutoProgram:
             began = time.perf_counter()
             try:
                 state = self._first().run(job._replace(steps=count))
-            except MemoryError:  # of WebAssembly: native code is waited for
+            except MemoryError:  # WebAssembly is too small: wait for native code
                 self._begin()
                 if self._thread is not None:
                     self._thread.join()
@@ -260,12 +260,12 @@ class AutoProgram:
         return min(left, max(1, int(SLICE / max(self._pace[1], 1e-9))))
 
     def _account(self, cells: int, count: int, left: int, seconds: float) -> None:
-        """Count steps that ran on the first backend, and start to compile once that is worth it."""
+        """Count steps that ran on the first backend, and start to compile once compiling is worth it."""
         if count == 0:
             return
         self._steps["first"] += count
         self._spent += seconds
-        # The first step makes what later ones reuse: its duration does not predict theirs.
+        # The first step allocates memory that later steps reuse, so its duration does not predict theirs.
         first = self._pace is None or self._pace[0] != cells
         self._pace = (cells, seconds / count)
         expected = 0.0 if first else left * self._pace[1]
@@ -275,12 +275,12 @@ class AutoProgram:
     def _begin(self) -> None:
         """Start to compile, unless a build has started."""
         if self._problem:
-            _tell_of_compilers(self._problem)
+            _warn_of_compilers(self._problem)
             return
         with self._starting:
-            # A fork has its parent's memory, but not its threads: there the thread has ended and left nothing.
-            known = self._native is not None or bool(self._problem)
-            if not known and (self._thread is None or not self._thread.is_alive()):
+            # A forked child has its parent's memory, but not its threads: there, the thread has ended without a result.
+            finished = self._native is not None or bool(self._problem)
+            if not finished and (self._thread is None or not self._thread.is_alive()):
                 context = copy_context()
                 self._thread = threading.Thread(target=context.run, args=(self._compile,), daemon=True)
                 self._thread.start()
@@ -290,13 +290,13 @@ class AutoProgram:
             self._native = self._make()
         except NoCompiler as error:
             self._problem = str(error)
-        except Exception as error:  # what runs continues; `--backend native` shows what is wrong
+        except Exception as error:  # the first backend continues; `--backend native` shows the error
             self._problem = f"{type(error).__name__}: {error}"
 
 
 @cache
-def _tell_of_compilers(problem: str) -> None:
-    """Warn once in a process if work that is worth compiling meets no compiler. Other problems stand in `notes`."""
+def _warn_of_compilers(problem: str) -> None:
+    """Warn once a process if work is worth compiling and there is no compiler. Other problems appear in `notes`."""
     if problem.startswith(MISSING):
         warnings.warn(
             f"{problem}; native code is many times faster: {INSTALL}", NoCompilerWarning, stacklevel=2

@@ -1,6 +1,6 @@
-"""What worlds show: fields, pictures, the paper's matrix, packed planes, each written into a given buffer or a new one.
+"""Observations of worlds: fields, pictures, the paper's matrix, packed planes, each written into a buffer.
 
-Worlds that are packed in native memory are read from there; all others are tensors. Nothing waits for a GPU.
+Worlds that are packed in native memory are read from there; all others are tensors. No observation waits for a GPU.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ SHIFT = 20
 
 
 class Channel(NamedTuple):
-    """A channel of `matrix`: 1 where the element has the id `one_hot`; the values of a slot, or of its component
-    ``name.row``, if `read`; or else what a table says of the slot's numbers."""
+    """A channel of `matrix`: 1 where the element has the id `one_hot`; if `read`, the values of a slot or its component
+    ``name.row``; otherwise table entries for the slot's numbers."""
 
     slot: str
     one_hot: int | None = None
@@ -39,10 +39,11 @@ class Channel(NamedTuple):
 
 
 class Observer:
-    """Reads the worlds of one ruleset on one device. What follows from the ruleset alone is made once.
+    """Reads the worlds of one ruleset on one device. Tables that depend only on the ruleset are made once.
 
     Methods take a state and, as `out`, None or the buffer to write to: of the result's shape, dtype and device, each
-    of its worlds contiguous, so that a slice of a larger batch serves. They return the buffer.
+    world contiguous, such as a slice of a larger batch. They return the buffer. Raises TypeError or ValueError for other
+    buffers.
     """
 
     def __init__(self, ruleset: Ruleset, device: torch.device):
@@ -52,7 +53,7 @@ class Observer:
 
     @torch.no_grad()
     def read(self, state: State, name: str, out: Any = None) -> Tensor:
-        """A slot."""
+        """A slot in its storage dtype: [B, H, W], or [B, 2, H, W] for vectors."""
         slot, (batch, height, width) = self.slots[name], shape_of(state)
         shape = (batch, 2, height, width) if slot.planes == 2 else (batch, height, width)
         return _write_slot(state, name, self.buffer(out, shape, getattr(torch, slot.dtype)))
@@ -83,8 +84,8 @@ class Observer:
         channels, tables = self._channels
         out = self.buffer(out, (batch, len(channels), height, width), torch.float32)
         if isinstance(state, PackedState):
-            wanted = [_native_channel(channel, at, state) for at, channel in enumerate(channels)]
-            numbers = torch.tensor(wanted, dtype=torch.int32)
+            rows = [_native_channel(channel, at, state) for at, channel in enumerate(channels)]
+            numbers = torch.tensor(rows, dtype=torch.int32)
             return _native(state, "channels", out, len(channels), numbers, tables)
         ids = state["element"].flatten().int()
         for at, channel in enumerate(channels):
@@ -96,7 +97,7 @@ class Observer:
 
     @torch.no_grad()
     def compact(self, state: State, out: Any = None) -> Tensor:
-        """Everything that lasts from step to step, as bytes: uint8 [B, C, H, W], C those of `compact_names`."""
+        """All fields that last from step to step, as bytes: uint8 [B, C, H, W], in the order of `compact_names`."""
         batch, height, width = shape_of(state)
         out = self.buffer(out, (batch, len(self._coded), height, width), torch.uint8)
         for at, (name, slot) in enumerate(self._coded):
@@ -118,25 +119,25 @@ class Observer:
 
     @cached_property
     def compact_names(self) -> tuple[str, ...]:
-        """What the channels of `compact` are: ``element``, fields by name, ``name.row`` and ``name.column``."""
+        """The names of the channels of `compact`: ``element``, fields, ``name.row`` and ``name.column``."""
         return tuple(name for name, _ in self._coded)
 
     @cached_property
     def compact_values(self) -> Tensor:
-        """What the numbers of `compact` stand for: float32 [C, 256]."""
+        """The values that the numbers of `compact` stand for: float32 [C, 256]."""
         return torch.stack([_code_values(slot) for _, slot in self._coded]).to(self.device)
 
     @cached_property
     def matrix_names(self) -> tuple[str, ...]:
-        """What the channels of `matrix` are: elements, properties and fields by name; ``name.row`` of vectors."""
+        """The names of the channels of `matrix`: elements, properties and fields; ``name.row`` of vectors."""
         return tuple(channel.name for channel in self.ruleset.matrix)
 
     @cached_property
     def matrix_tables(self) -> tuple[tuple[int, ...], Tensor]:
-        """How the channels of `matrix` follow from those of `compact`.
+        """The channels of `matrix` in terms of `compact`.
 
-        For each channel, the number of the channel that it is read from; and float32 [n, 256], its value for each
-        byte there. Fields that do not last read as 0.
+        For each channel, the number of a channel of `compact`; and float32 [n, 256], the value for each byte of that
+        channel. Fields that do not last read as 0.
         """
         channels, tables = self._channels
         names, tables = self.compact_names, tables.clone()
@@ -148,14 +149,14 @@ class Observer:
 
     @property
     def plane_names(self) -> tuple[str, ...]:
-        """What each plane is: a flag's name, or ``name:bit`` for integers."""
+        """The names of the planes: a flag's name, or ``name:bit`` for integers."""
         return tuple(
             name if self.slots[name].kind.name == "flag" else f"{name}:{bit}" for name, bit in self._bits
         )
 
     @cached_property
     def _coded(self) -> tuple[tuple[str, Slot], ...]:
-        """The channels of `compact`: names, and the slots that they are codes of, which a step does not restart."""
+        """The channels of `compact`: names, and the slots that they encode, which a step does not restart."""
         lasting = [slot for slot in self.slots.values() if not slot.resets]
         return tuple((name, slot) for slot in lasting for name in part_names(slot.name, slot.kind))
 
@@ -182,7 +183,7 @@ class Observer:
 
     @cached_property
     def _channels(self) -> tuple[tuple[Channel, ...], Tensor]:
-        """The channels of `matrix:`, and a table for each, float32 [C, 256]: what it says of elements.
+        """The channels of `matrix:`, and a table for each, float32 [C, 256]: the values of elements.
 
         Tables of channels that are read, and of names that no loaded pack has, are zero.
         """
@@ -201,15 +202,17 @@ class Observer:
         return tuple(channels), tables.to(self.device)
 
     def buffer(self, out: Any, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-        """The given buffer, if it fits, or a new one."""
+        """`out` if it fits, or a new buffer if it is None. Raises TypeError, ValueError."""
         if out is None:
             return torch.empty(shape, dtype=dtype, device=self.device)
         if not isinstance(out, Tensor):
             raise TypeError(f"out must be a torch tensor, found {type(out).__name__}")
         if (tuple(out.shape), out.dtype, out.device) != (shape, dtype, self.device):
-            wanted = f"{dtype} {list(shape)} on {self.device}"
-            found = f"{out.dtype} {list(out.shape)} on {out.device}"
-            raise ValueError(f"out must be {wanted}, found {found}")
+            wanted, actual = (
+                f"{dtype} {list(shape)} on {self.device}",
+                f"{out.dtype} {list(out.shape)} on {out.device}",
+            )
+            raise ValueError(f"out must be {wanted}, found {actual}")
         if shape[0] and not (out[0].is_contiguous() and (shape[0] == 1 or out.stride(0) >= out[0].numel())):
             raise ValueError(
                 f"each world of out must be contiguous, and worlds apart; found the strides {list(out.stride())}"
@@ -227,8 +230,8 @@ def _write_slot(state: State, name: str, out: Tensor) -> Tensor:
 def _native(state: PackedState, view: str, out: Tensor, *arguments: Any) -> Tensor:
     """Let native code write a view of worlds into `out`; returns it."""
     write = getattr(state.program.library, f"pd_{view}")
-    places = (one.data_ptr() if isinstance(one, Tensor) else one for one in (*arguments, out))
-    write(state.handle, *places, out.stride(0))
+    values = (value.data_ptr() if isinstance(value, Tensor) else value for value in (*arguments, out))
+    write(state.handle, *values, out.stride(0))
     return out
 
 
@@ -239,7 +242,7 @@ def _component(state: State, name: str) -> Tensor:
 
 
 def _native_channel(channel: Channel, number: int, state: PackedState) -> tuple[int, int, int, int]:
-    """A channel as native code has it: kind, first plane or float slot, planes, value."""
+    """A channel for native code: kind, first plane or float slot, planes, value."""
     slot, bits, signed = state.program.homes[channel.slot]
     if not bits:
         return 4, slot, 0, 0
@@ -260,24 +263,24 @@ def _write_codes(state: State, slot: Slot, name: str, out: Tensor) -> None:
         _native(state, "codes", out, state.program.layout.reals[name], floor)
     else:
         value = (_component(state, name) if slot.planes == 2 else state[name]).to(torch.float32)
-        one = torch.tensor(floor, device=out.device).view(torch.int32)
-        size = ((value.abs() + floor).view(torch.int32) - one + (1 << (SHIFT - 1))) >> SHIFT
+        zero = torch.tensor(floor, device=out.device).view(torch.int32)
+        size = ((value.abs() + floor).view(torch.int32) - zero + (1 << (SHIFT - 1))) >> SHIFT
         out.copy_(128 + torch.where(value < 0, -size, size))
 
 
 def _code_values(slot: Slot) -> Tensor:
-    """What each of the 256 codes of a slot stands for: float32 [256].
+    """The values of the 256 codes of a slot: float32 [256].
 
-    Integers in a range of at most 256 are counted from the lowest. Others have a sign and a size: code 128 is 0,
-    and 128 ± n is ±(x − `_floor`), where x grows by an eighth of a power of two with each n: steps of an eighth of the
-    floor near 0, and of an eighth of the value, at most, far from it.
+    Integers in a range of at most 256 are counted from the lowest. Other values have a sign and a size: code 128 is 0,
+    and 128 ± n is ±(x − `_floor`), where x grows by an eighth of a power of two with each n: steps are an eighth of the
+    floor near 0, and at most an eighth of the value far from 0.
     """
     if _is_small(slot):
         return torch.arange(256, dtype=torch.float32) + float(slot.kind.lo)
     floor = _floor(slot)
-    one = torch.tensor(floor).view(torch.int32)
+    zero = torch.tensor(floor).view(torch.int32)
     signed = torch.arange(256, dtype=torch.int32) - 128
-    size = (one + (signed.abs() << SHIFT)).to(torch.int32).view(torch.float32) - floor
+    size = (zero + (signed.abs() << SHIFT)).to(torch.int32).view(torch.float32) - floor
     return torch.where(signed < 0, -size, size)
 
 
@@ -287,5 +290,5 @@ def _floor(slot: Slot) -> float:
 
 
 def _is_small(slot: Slot) -> bool:
-    """Whether eight bits hold every value."""
+    """True if eight bits hold every value."""
     return slot.dtype in ("uint8", "int8")

@@ -1,4 +1,4 @@
-"""Backends by name: which arrays a simulator has, and the program that runs its rules."""
+"""Backends by name: the arrays of a simulator, and the program that runs its rules."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ WITHOUT_TORCH = ("wasm", "reference")
 
 @cache
 def has_torch() -> bool:
-    """Whether torch can be imported. It is not imported."""
+    """True if torch can be imported. It is not imported."""
     try:
         return find_spec("torch") is not None
     except ImportError:
@@ -40,11 +40,10 @@ def has_torch() -> bool:
 def array_kind(backend: str, device: Any, tensors: bool) -> ArrayKind:
     """The arrays of a simulator: torch tensors, or `powderdsl.arrays` where torch is missing or not wanted.
 
-    Args:
-        tensors: use torch wherever it is installed, not only where the backend or the device needs it.
+    `tensors`: use torch wherever it is installed, not only where the backend or the device needs it.
 
     Raises:
-        CompileError: PD701 if the backend or the device is not known, or needs torch, which is missing.
+        CompileError: PD701 if the backend or the device is unknown, or needs torch, which is missing.
     """
     if backend not in BACKENDS:
         raise failure("PD701", f"no backend `{backend}`", helps=("backends: " + ", ".join(BACKENDS),))
@@ -99,8 +98,8 @@ def make_program(
     | tensors | cuda      | cuda                   | torch         | torch       |
     | tensors | torch     | torch                  | torch         | torch       |
 
-    `auto` is wasm and later native code on the CPU, cuda, or else torch, on other devices, and with plain arrays wasm,
-    or else the oracle.
+    `auto` is wasm and later native code on the CPU; on other devices cuda, or torch where that is missing; with plain
+    arrays wasm, or the oracle where that is missing.
 
     Raises:
         CompileError: PD701 if the backend is not available.
@@ -124,7 +123,7 @@ def make_program(
         )
     from powderdsl.targets.torch.program import TorchProgram, packed_program
 
-    # These are made when first needed: native code that was compiled before needs none of them.
+    # Made on first use: native code that was compiled before needs none of them.
     lowered = cache(lambda: lower(ruleset))
     cells = cache(lambda: TorchProgram(lowered(), device))
     wasm = cache(
@@ -157,7 +156,7 @@ def _plain_program(ruleset: Ruleset, kind: ArrayKind, memo: Memo | None) -> Runn
 
 @cache
 def _wasm_problem() -> str:
-    """Why no WebAssembly runs in this process; empty if it does."""
+    """The reason why WebAssembly does not run in this process; empty if it runs."""
     try:
         this_host()
     except (ImportError, OSError, RuntimeError) as error:  # wasmtime can be installed where it does not run
@@ -166,12 +165,12 @@ def _wasm_problem() -> str:
 
 
 class BackendProgram(NamedTuple):
-    """The programs of one backend. `name` is what runs, unless `whole` has a `running` of its own, and `notes` on it."""
+    """The programs of one backend. `name` is the backend that runs, unless `whole` has `running` and `notes`."""
 
     name: str
     whole: Runnable
     rest: Callable[[], Runnable] | None = None
-    """Gives the program for chosen passes and given draws, if that is another one than that of whole steps."""
+    """Returns the program for chosen passes and given draws, if `whole` cannot run them."""
 
     def run(self, job: Job) -> Mapping[str, Array]:
         """The state `job.steps` later."""
@@ -181,10 +180,9 @@ class BackendProgram(NamedTuple):
 
 
 class ReferenceProgram:
-    """The oracle, on arrays of `powderdsl.arrays`, whatever kind those of its jobs are of.
+    """The oracle, which converts the arrays of its jobs to `powderdsl.arrays`.
 
-    Args:
-        part: some passes in a row, if only these run. Only the first ones of a step restart the fields that restart.
+    `part`: consecutive passes, if only these run. Only the first passes of a step restart fields.
     """
 
     def __init__(self, ruleset: Ruleset, kind: ArrayKind, part: Program | None = None):
@@ -199,14 +197,14 @@ class ReferenceProgram:
         host = self._kind.to_numpy
         seed, index, start = map(host, (*job.clock[:2], job.clock.step))
         arrays = {name: host(value) for name, value in job.state.items()}
-        given_params = {name: host(value) for name, value in job.params.items()}
-        numbers = reference.parameters(self._ruleset, len(seed), given_params)
-        given = {name: (host(value) + 0.5) / 2.0 ** self._bits[name] for name, value in job.draws.items()}
+        params = {name: host(value) for name, value in job.params.items()}
+        numbers = reference.parameters(self._ruleset, len(seed), params)
+        draws = {name: (host(value) + 0.5) / 2.0 ** self._bits[name] for name, value in job.draws.items()}
         passes = self._passes if job.passes is None else job.passes
         for i in range(job.steps):
             at = reference.Clock(seed, index, start + i)
             job.tick("")
             arrays = reference.step(
-                self._ruleset, arrays, at, numbers, passes=passes, draws=given, tick=job.tick
+                self._ruleset, arrays, at, numbers, passes=passes, draws=draws, tick=job.tick
             )
         return {name: self._kind.from_numpy(value.copy()) for name, value in arrays.items()}

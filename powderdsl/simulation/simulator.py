@@ -25,9 +25,9 @@ from powderdsl.model.types import Ruleset
 from powderdsl.simulation.programs import array_kind, make_program
 from powderdsl.simulation.state_checks import (
     check_ids,
+    check_mapping,
     checked_parameter,
     checked_values,
-    given_mapping,
     unknown_name,
     unknown_slot,
 )
@@ -40,18 +40,19 @@ if TYPE_CHECKING:
 
 MAX_CELLS = 1 << 31
 BATCH_SIZES = 16
-"""How many batch sizes the default parameters are kept for."""
+"""The number of batch sizes whose default parameters are cached."""
 
 
 @dataclass(frozen=True)
 class World:
     """A batch of worlds of one ruleset, as arrays of the simulator's kind: torch tensors, or arrays without torch.
 
-    `state` has one array a slot; `seed`, `index` and `step` (int64 [B]) decide the random numbers: the same three
-    give the same future, alone or in any batch. The step is `since` steps after `start`.
+    `state` has one array per slot, [B, H, W] or [B, 2, H, W] in the slot's dtype. `seed`, `index` and `step` (int64 [B])
+    determine the random numbers: equal values give the same future, alone or in any batch. `step` is `since` steps after
+    `start`.
 
     Raises:
-        ValueError: a seed, index or start that does not fit.
+        ValueError: a seed, index or start of another shape, dtype or device.
     """
 
     sim: Simulator
@@ -73,7 +74,7 @@ class World:
 
     @property
     def step(self) -> Array:
-        """How many steps each world has made: int64 [B]."""
+        """The number of steps that each world has made: int64 [B]."""
         return self.start + self.since
 
     @property
@@ -97,8 +98,8 @@ class World:
         """`world[name]`, written into `out`.
 
         Args:
-            out: a tensor that is written to and returned, instead of a new one or the world's own: of the same shape,
-                dtype and device, each of its worlds contiguous. The methods below take one too.
+            out: a tensor to write to and return, instead of a new tensor or the world's own: of the same shape, dtype
+                and device, each world contiguous. The methods below take `out` too.
 
         Raises:
             KeyError: an unknown name. TypeError, ValueError: `out` is not a tensor, or does not fit.
@@ -124,19 +125,18 @@ class World:
         return self.sim.observer.rgb(self.state, out)
 
     def compact(self, out: Array | None = None) -> Array:
-        """Everything that lasts from step to step, as bytes: uint8 [B, C, H, W]. `sim.observer.compact_names` has their names."""
+        """All fields that last from step to step, as bytes: uint8 [B, C, H, W], named by `sim.observer.compact_names`."""
         return self.sim.observer.compact(self.state, out)
 
     def planes(self, out: Array | None = None) -> Array:
-        """Flags and integers in bits: int64 [B, P, H, ⌈W/64⌉].
+        """The bit planes of flags and integers: int64 [B, P, H, ⌈W/64⌉], named by `Simulator.plane_names`.
 
-        Bit x % 64 of word x // 64 is column x; bits beyond the width are zero. The planes are those of
-        `Simulator.plane_names`. Fields of floats have none: `read` them.
+        Bit x % 64 of word x // 64 is column x; bits beyond the width are zero. Floats have no planes: `read` them.
         """
         return self.sim.observer.planes(self.state, out)
 
     def with_state(self, state: Mapping[str, Array], **changes: Any) -> World:
-        """These worlds in another state, at the same step with the same random futures, unless `changes` say others.
+        """These worlds with another state; `changes` replaces other fields.
 
         Faster than `dataclasses.replace`, and not checked.
         """
@@ -145,15 +145,14 @@ class World:
         return world
 
     def select(self, worlds: int | slice | Sequence[int] | Array) -> World:
-        """Some worlds of the batch, with their random futures unchanged."""
+        """Some worlds of the batch, by index; their random futures stay the same."""
         keys = [worlds] if isinstance(worlds, int) else worlds
-        chosen = {name: value[keys] for name, value in self.state.items()}
         clock = {name: getattr(self, name)[keys] for name in ("seed", "index", "start")}
-        return self.with_state(chosen, **clock)
+        return self.with_state({name: value[keys] for name, value in self.state.items()}, **clock)
 
 
 class Simulator:
-    """Runs one ruleset on one backend and device. Made by `powderdsl.compile`, which takes the same arguments."""
+    """Runs one ruleset on one backend and device. `powderdsl.compile` makes it and takes the same arguments."""
 
     def __init__(
         self,
@@ -169,14 +168,14 @@ class Simulator:
         self.kind = array_kind(backend, device, tensors)
         self.device = self.kind.device
         self.slot_by_name: dict[str, Slot] = {slot.name: slot for slot in slots(ruleset)}
-        self._how: dict[str, Any] = {"threads": threads, "tensors": tensors, "memo": memo}
+        self._options: dict[str, Any] = {"threads": threads, "tensors": tensors, "memo": memo}
         self._defaults = lru_cache(BATCH_SIZES)(self._default_parameters)
-        """Parameters of a batch: the same mapping for the same size, which programs recognize. Nobody writes to it."""
+        """Parameters by batch size: always the same mapping, whose inputs programs cache. It must not change."""
         self._program = make_program(ruleset, backend, self.kind, threads, memo)
 
     def of(self, ruleset: Ruleset) -> Simulator:
-        """A simulator of other rules on the same backend and device."""
-        return Simulator(ruleset, self.backend, self.device, **self._how)
+        """A simulator of another ruleset on the same backend and device."""
+        return Simulator(ruleset, self.backend, self.device, **self._options)
 
     @property
     def running(self) -> str:
@@ -185,12 +184,12 @@ class Simulator:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """For ``auto``: sentences about which backend ran, and why."""
+        """For ``auto``: sentences that name the backends that ran, and the reasons."""
         return tuple(getattr(self._program.whole, "notes", ()))
 
     @cached_property
     def observer(self) -> Observer:
-        """Reads observations of worlds of tensors."""
+        """The reader of observations. Raises TypeError without torch."""
         from powderdsl.simulation.observe import Observer
 
         if self.kind.xp.__name__ != "torch":
@@ -199,7 +198,7 @@ class Simulator:
 
     @property
     def plane_names(self) -> tuple[str, ...]:
-        """What the planes are: a flag's name, or ``name:bit`` from bit 0; the last bit of a signed number is its sign."""
+        """The names of the planes: a flag's name, or ``name:bit``; the last bit of a signed number is its sign."""
         return self.observer.plane_names
 
     @property
@@ -218,7 +217,7 @@ class Simulator:
         return tuple(self.slot_by_name.values())
 
     def fresh_values(self, slot: Slot) -> Array:
-        """What new cells of elements hold in a slot, by id: of its dtype, [256] or [256, 2]."""
+        """The values of a slot in new cells, by element id: of the slot's dtype, [256] or [256, 2]."""
         return self.kind.put(fresh_values(self.ruleset, slot), slot.dtype)
 
     # Making worlds
@@ -229,23 +228,24 @@ class Simulator:
         Args:
             ids: integers [B, H, W] or [H, W]; NumPy, torch or nested lists.
             seed: one integer for all, or one a world.
-            index: which world of its seed each is; 0, 1, … for one common seed, 0 for seeds of their own.
+            index: the number of each world among those of its seed; by default 0, 1, … for one common seed, 0 for
+                different seeds.
 
         Raises:
             TypeError: ids are not integers. ValueError: wrong shape, or ids that the ruleset does not have.
         """
-        given, xp = self._integers(ids, "ids"), self.kind.xp
-        if given.ndim == 2:
-            given = given[None]
-        shape = tuple(given.shape)
-        if given.ndim != 3 or 0 in shape:
+        array, xp = self._integers(ids, "ids"), self.kind.xp
+        if array.ndim == 2:
+            array = array[None]
+        shape = tuple(array.shape)
+        if array.ndim != 3 or 0 in shape:
             raise ValueError(f"ids must have the shape [worlds, rows, columns], found {list(shape)}")
         batch, height, width = shape
         check_sides(self.ruleset, (height, width))
         if batch * height * width > MAX_CELLS:
             raise ValueError(f"{batch * height * width:,} cells are more than {MAX_CELLS:,}")
-        check_ids(self.kind, given, "ids", self.ruleset)
-        element = xp.asarray(given, dtype=xp.uint8)
+        check_ids(self.kind, array, "ids", self.ruleset)
+        element = xp.asarray(array, dtype=xp.uint8)
         seeds = self._integers(seed, "seed")
         if index is None:
             index = range(batch) if seeds.ndim == 0 else [0] * batch
@@ -262,7 +262,7 @@ class Simulator:
         values = self.kind.entries(self.fresh_values(slot), ids)
         return self.kind.contiguous(self.kind.xp.moveaxis(values, -1, 1)) if slot.planes == 2 else values
 
-    def _renewed(self, state: Mapping[str, Array], ids: Array, cells: Array) -> dict[str, Array]:
+    def _renew(self, state: Mapping[str, Array], ids: Array, cells: Array) -> dict[str, Array]:
         """A state with fresh cells of the elements `ids`, uint8 [B, H, W], where `cells` is set."""
         return {
             name: self._where(slot, cells, self._fresh(slot, ids), state[name])
@@ -281,14 +281,13 @@ class Simulator:
             raise TypeError(f"{name} must be integers, found {array.dtype}")
         return array
 
-    def numbers(self, given: Any, name: str, batch: int) -> Array:
-        """Integers of 0 or more, one for all worlds or one a world: int64 [B] in memory of their own.
+    def numbers(self, values: Any, name: str, batch: int) -> Array:
+        """Integers of 0 or more, one for all worlds or one a world, as a new array int64 [B].
 
-        Raises:
-            TypeError, ValueError: they are not.
+        Raises TypeError, ValueError for other values.
         """
         xp = self.kind.xp
-        array = xp.asarray(self._integers(given, name), dtype=xp.int64)
+        array = xp.asarray(self._integers(values, name), dtype=xp.int64)
         if array.ndim == 0:
             array = xp.broadcast_to(array, (batch,))
         if tuple(array.shape) != (batch,) or bool((array < 0).any()):
@@ -310,20 +309,20 @@ class Simulator:
                 element cannot hold one.
         """
         state, xp = dict(world.state), self.kind.xp
-        given = fields.pop("ids", fields.pop("element", None))
-        if given is not None:
-            ids = self._shaped(self._integers(given, "ids"), "ids", world.shape)
+        new_ids = fields.pop("ids", fields.pop("element", None))
+        if new_ids is not None:
+            ids = self._broadcast(self._integers(new_ids, "ids"), "ids", world.shape)
             check_ids(self.kind, ids, "ids", self.ruleset)
             element = xp.asarray(ids, dtype=xp.uint8)
-            state = self._renewed(state, element, element != state["element"])
+            state = self._renew(state, element, element != state["element"])
         for name, value in fields.items():
-            slot = self._changing(name)
-            array = self._shaped(value, name, world.shape, slot.planes == 2)
+            slot = self._changeable_slot(name)
+            array = self._broadcast(value, name, world.shape, slot.planes == 2)
             ids = state["element"]
             state[name] = checked_values(self.kind, array, ids, self._fresh(slot, ids), slot, self.ruleset)
         return replace(world, state=state)
 
-    def _changing(self, name: str) -> Slot:
+    def _changeable_slot(self, name: str) -> Slot:
         """The slot of a field or property that cells can have values of. Raises KeyError, ValueError."""
         if name in self.slot_by_name:
             return self.slot_by_name[name]
@@ -331,7 +330,7 @@ class Simulator:
             raise unknown_slot(self.ruleset, name)
         raise ValueError(f"`{name}` follows from the element: no rule of {self.ruleset.name} changes it")
 
-    def _shaped(self, value: Any, name: str, shape: tuple[int, ...], vector: bool = False) -> Array:
+    def _broadcast(self, value: Any, name: str, shape: tuple[int, ...], vector: bool = False) -> Array:
         array = self.kind.convert(value, name)
         target = (shape[0], 2, *shape[1:]) if vector else shape
         if vector and array.ndim == 1 and len(array) == 2:
@@ -352,10 +351,10 @@ class Simulator:
             fields: values by field name; vectors as (rows, columns).
 
         Raises:
-            KeyError: an unknown element or field. ValueError: a wrong shape or value.
+            KeyError: an unknown element or field. TypeError, ValueError: a wrong dtype, shape or value.
         """
         xp = self.kind.xp
-        mask = self._shaped(where, "where", world.shape)
+        mask = self._broadcast(where, "where", world.shape)
         if self.kind.sort(mask) != "bool":
             raise TypeError(f"where must be a bool mask, found {mask.dtype}")
         if element is not None:
@@ -363,10 +362,10 @@ class Simulator:
             if painted is None:
                 raise unknown_name("element", element, self.elements)
             element_ids = xp.full_like(world.ids, painted.id)
-            world = replace(world, state=self._renewed(world.state, element_ids, mask))
+            world = replace(world, state=self._renew(world.state, element_ids, mask))
         for name, value in fields.items():
-            slot = self._changing(name)
-            new = self._shaped(value, name, world.shape, slot.planes == 2)
+            slot = self._changeable_slot(name)
+            new = self._broadcast(value, name, world.shape, slot.planes == 2)
             both = (xp.asarray(values, dtype=xp.float64) for values in (new, world.state[name]))
             world = self.replace(world, **{name: self._where(slot, mask, *both)})
         return world
@@ -383,34 +382,34 @@ class Simulator:
         params: Mapping[str, Any] | None = None,
         reuse: bool = False,
     ) -> World:
-        """The world some steps later; the argument stays as it was.
+        """The world some steps later; the argument stays unmodified.
 
         Args:
-            steps: how many, 0 or more.
-            random: draws to use instead of our own, by stream: [B, H, W] in [0, 1). A draw r counts as the draw of
-                the stream's resolution that it falls into. The same draws serve every step.
+            steps: the number of steps, 0 or more.
+            random: draws that replace random numbers, by stream: [B, H, W] in [0, 1), rounded down to the stream's
+                resolution. Every step uses the same draws.
             passes: run only these passes, in the ruleset's order.
-            params: parameter values for this call, one number each or [B] values, one a world.
-            reuse: the memory of `world` may be written to, and it must not be used afterwards: saves a copy.
+            params: parameter values for this call: one number, or [B] values, one a world.
+            reuse: overwrite the memory of `world`, which must not be used afterwards. Saves a copy.
 
         Raises:
-            KeyError: unknown streams, passes or parameters. ValueError: wrong shapes or values.
+            KeyError: unknown streams, passes or parameters. TypeError, ValueError: wrong types, shapes or values.
         """
         self.check(world)
-        steps, batch = _whole_count(steps), world.seed.shape[0]
+        steps, batch = _step_count(steps), world.seed.shape[0]
         values = self._defaults(batch) if params is None else self._parameters(params, batch)
         draws = self._draws(random, world) if random is not None else {}
-        chosen = self._chosen(passes) if passes is not None else None
+        names = self._pass_names(passes) if passes is not None else None
         clock = Clock(world.seed, world.index, world.start, world.since)
-        state = self._program.run(Job(world.state, clock, steps, values, draws, chosen, reuse))
-        # Made without the calls that a frozen dataclass takes.
+        state = self._program.run(Job(world.state, clock, steps, values, draws, names, reuse))
+        # Filled directly: the constructor of a frozen dataclass is slow.
         after = object.__new__(World)
-        known = after.__dict__
-        known.update(world.__dict__)
-        known["sim"], known["state"], known["since"] = self, state, world.since + steps
+        attributes = after.__dict__
+        attributes.update(world.__dict__)
+        attributes["sim"], attributes["state"], attributes["since"] = self, state, world.since + steps
         return after
 
-    def _chosen(self, passes: Sequence[str]) -> frozenset[str]:
+    def _pass_names(self, passes: Sequence[str]) -> frozenset[str]:
         if isinstance(passes, str):
             raise TypeError(f"passes takes a list of names: [{passes!r}]")
         unknown = [name for name in passes if name not in self.passes]
@@ -419,7 +418,7 @@ class Simulator:
         return frozenset(passes)
 
     def check(self, world: Any) -> None:
-        """Raises TypeError for what is not a world of these arrays, ValueError for a world of other rules."""
+        """Raise TypeError unless `world` is a world of these arrays, ValueError if it belongs to other rules."""
         if not isinstance(world, World):
             raise TypeError(f"world must be a World, found {type(world).__name__}")
         if world.sim is self:
@@ -433,40 +432,39 @@ class Simulator:
         """Given draws as integers k below 2^bits, which stand for (k + ½) / 2^bits: int64 [B, H, W]."""
         bits = {stream.name: stream.bits for stream in self.ruleset.streams}
         draws, xp = {}, self.kind.xp
-        for name, value in given_mapping("random", random).items():
+        for name, value in check_mapping("random", random).items():
             if name not in bits:
                 raise unknown_name("stream", name, bits)
-            given = self._shaped(value, f"random[{name!r}]", world.shape)
-            array = xp.asarray(given, dtype=xp.float64)
+            array = xp.asarray(self._broadcast(value, f"random[{name!r}]", world.shape), dtype=xp.float64)
             if not bool(((array >= 0) & (array < 1)).all()):
                 raise ValueError(f"random[{name!r}] must lie in [0, 1)")
             draws[name] = xp.asarray(xp.floor(array * float(1 << bits[name])), dtype=xp.int64)
         return draws
 
     def parameters(self, params: Mapping[str, Any], batch: int) -> dict[str, Array]:
-        """All parameters as float64 [B]: given values, and defaults. Raises KeyError, TypeError, ValueError."""
+        """All parameters as float64 [B]: `params`, and defaults. Raises KeyError, TypeError, ValueError."""
         return {name: self.kind.copied(value) for name, value in self._parameters(params, batch).items()}
 
     def _default_parameters(self, batch: int) -> Mapping[str, Array]:
         params = self.ruleset.params
         return {param.name: self.kind.put([float(param.default)] * batch, "float64") for param in params}
 
-    def _parameters(self, given: Mapping[str, Any], batch: int) -> Mapping[str, Array]:
-        values, known = self._defaults(batch), {param.name: param for param in self.ruleset.params}
-        for name, value in given_mapping("params", given).items():
-            if name not in known:
-                raise unknown_name("parameter", name, known)
-            values = {**values, name: checked_parameter(self.kind, value, known[name], batch)}
+    def _parameters(self, params: Mapping[str, Any], batch: int) -> Mapping[str, Array]:
+        values, by_name = self._defaults(batch), {param.name: param for param in self.ruleset.params}
+        for name, value in check_mapping("params", params).items():
+            if name not in by_name:
+                raise unknown_name("parameter", name, by_name)
+            values = {**values, name: checked_parameter(self.kind, value, by_name[name], batch)}
         return values
 
     def profile(self, world: World, steps: int = 1) -> dict[str, float]:
-        """Seconds that each pass takes over some steps, in the order they run; empty if the backend cannot report them.
+        """The seconds that each pass takes over some steps, in order; empty if the backend cannot measure passes.
 
         Native code counts processor time on one thread.
         """
         timing, params = PassClock(self.device), self._defaults(len(world))
         clock = Clock(world.seed, world.index, world.start, world.since)
-        self._program.run(Job(world.state, clock, _whole_count(steps), params, {}, None, timing=timing))
+        self._program.run(Job(world.state, clock, _step_count(steps), params, {}, None, timing=timing))
         return {name: timing.seconds[name] for name in self.passes} if timing.seconds else {}
 
 
@@ -479,19 +477,20 @@ def compile(
     tensors: bool = True,
     memo: Memo | None = None,
 ) -> Simulator:
-    """A simulator that runs a ruleset.
+    """Compile a ruleset into a simulator.
 
     Args:
-        ruleset: from `load` (or a name to load).
+        ruleset: from `load`, or a name to load.
         backend: one of `BACKENDS`; all give the same worlds, bit for bit.
         device: a torch device: ``"cpu"``, ``"cuda"``, ``"cuda:1"``.
-        threads: for native code, which shares a batch out among them. Torch has its own setting.
-        tensors: worlds have torch tensors wherever torch is installed; otherwise only where the backend or the device
-            needs torch.
-        memo: where passes are kept that other rulesets may have, too.
+        threads: the number of threads of native code, which split a batch. Torch has its own setting.
+        tensors: if true, worlds have torch tensors wherever torch is installed; otherwise, only where the backend or the
+            device needs torch.
+        memo: a cache of compiled passes, to share between rulesets.
 
     Raises:
-        CompileError: PD701 if the backend or the device is not available.
+        CompileError: the rules do not load; PD701 if the backend or the device is not available.
+        TypeError: `ruleset` is neither a ruleset nor a name.
     """
     model = load(ruleset) if isinstance(ruleset, str) else ruleset
     if not isinstance(model, Ruleset):
@@ -499,7 +498,7 @@ def compile(
     return Simulator(model, backend, device, threads, tensors=tensors, memo=memo)
 
 
-def _whole_count(value: Any) -> int:
+def _step_count(value: Any) -> int:
     """An integer of 0 or more, Python's or NumPy's."""
     try:
         number = index(value)

@@ -1,4 +1,4 @@
-"""Rulesets as WebAssembly modules that stand alone, for pages and games: `powderdsl export`. Needs neither torch nor NumPy."""
+"""Standalone WebAssembly modules of rulesets, for pages and games: `powderdsl export`. Needs neither torch nor NumPy."""
 
 from __future__ import annotations
 
@@ -40,10 +40,9 @@ _CELLS = {
 
 
 def standalone_module(ruleset: Ruleset, size: tuple[int, int], memo: Memo | None = None) -> bytes:
-    """A module that is a world of `size` (rows, columns), as `targets.wasm.standalone` describes it.
+    """A module that is a world of `size` (rows, columns), as described in `targets.wasm.standalone`.
 
-    Args:
-        memo: where passes are kept that other rulesets may have, too.
+    `memo` is a cache of compiled passes, to share between rulesets.
 
     Raises:
         CompileError: PD607 if the world is too large or its sides do not fit the rules, PD702 if the rules have a pass
@@ -57,14 +56,14 @@ def standalone_module(ruleset: Ruleset, size: tuple[int, int], memo: Memo | None
     program = lower(ruleset, memo)
     segments = parts(program, memo)
     if len(segments) > 1 or segments[0].planes is None:
-        carried = (choose_form(program, one) for one in program.passes)
-        refused = [one for one in carried if one.planes is None]
-        notes = tuple(f"{one.place}: the pass `{one.cells.name}` needs {one.why}" for one in refused)
+        forms = (choose_form(program, pass_) for pass_ in program.passes)
+        refused = [part for part in forms if part.planes is None]
+        notes = tuple(f"{part.place}: the pass `{part.cells.name}` needs {part.why}" for part in refused)
         helps = ("use smaller numbers or kernels there",)
         raise failure("PD702", f"{ruleset.name} does not fit into WebAssembly", notes=notes, helps=helps)
-    held = pieces(program)
-    (element,) = held["element"]
-    fields = tuple(_stored(slot, ruleset, held[slot.name]) for slot in slots(ruleset)[1:])
+    parts_of = pieces(program)
+    (element,) = parts_of["element"]
+    fields = tuple(_stored(slot, ruleset, parts_of[slot.name]) for slot in slots(ruleset)[1:])
     ids = tuple(sorted(element.id for element in ruleset.elements))
     knobs = tuple(map(_knob, ruleset.params))
     about = json.dumps(_about(ruleset, size, knobs), separators=(",", ":"), ensure_ascii=False).encode()
@@ -97,12 +96,12 @@ def _knob(param: Param) -> Knob:
 
 
 def _about(ruleset: Ruleset, size: tuple[int, int], knobs: Sequence[Knob]) -> dict[str, Any]:
-    """What a page needs to know, in the order of the numbers that functions take."""
+    """The custom section: size, elements, fields and parameters, in the order of their numbers."""
     elements = []
     for element in sorted(ruleset.elements, key=lambda element: element.id):
-        row = _picked(element, "id", "name", "qualified", "color", "glyph")
+        row = _attributes(element, "id", "name", "qualified", "color", "glyph")
         if (ramp := element.ramp) is not None:
-            row["ramp"] = {**_picked(ramp, "field", "start", "end"), "low": ramp.lo, "high": ramp.hi}
+            row["ramp"] = {**_attributes(ramp, "field", "start", "end"), "low": ramp.lo, "high": ramp.hi}
         elements.append(row)
     qualified = qualified_slots(ruleset)
     tints = {field.name: field.tint for field in ruleset.fields}
@@ -111,7 +110,7 @@ def _about(ruleset: Ruleset, size: tuple[int, int], knobs: Sequence[Knob]) -> di
         row = {"name": slot.name, "qualified": qualified.get(slot.name, slot.name), "kind": slot.kind.name}
         row |= {"type": storage(slot.kind), "components": slot.planes}
         if (tint := tints.get(slot.name)) is not None:
-            row["tint"] = _picked(tint, "color", "full", "most")
+            row["tint"] = _attributes(tint, "color", "full", "most")
         fields.append(row)
     parameters = []
     for param, knob in zip(ruleset.params, knobs, strict=True):
@@ -128,5 +127,5 @@ def _about(ruleset: Ruleset, size: tuple[int, int], knobs: Sequence[Knob]) -> di
     }
 
 
-def _picked(value: object, *names: str) -> dict[str, Any]:
+def _attributes(value: object, *names: str) -> dict[str, Any]:
     return {name: getattr(value, name) for name in names}

@@ -1,8 +1,8 @@
-"""Checks of given values. Those of cells are checked in parts: a check takes many times the memory of what it checks."""
+"""Checks of callers' values. Cells are checked in chunks: a check takes many times the memory of the cells."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from powderdsl.diagnostics import suggest
@@ -11,18 +11,18 @@ from powderdsl.model.types import Param, Ruleset
 from powderdsl.targets.array_kind import Array, ArrayKind
 
 CHUNK = 1 << 20
-"""Cells that are looked at together."""
+"""Cells that are checked together."""
 
 
-def given_mapping(name: str, given: Any) -> Mapping[str, Any]:
-    """A mapping from outside. Raises TypeError."""
-    if not isinstance(given, Mapping):
-        raise TypeError(f"{name} takes a mapping from names to values, found {type(given).__name__}")
-    return given
+def check_mapping(name: str, value: Any) -> Mapping[str, Any]:
+    """The value, if it is a mapping. Raises TypeError."""
+    if not isinstance(value, Mapping):
+        raise TypeError(f"{name} takes a mapping from names to values, found {type(value).__name__}")
+    return value
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str], kinds: str = "") -> KeyError:
-    """The error for a name that is not known, with the nearest ones."""
+    """The error for an unknown name, with the nearest names."""
     return KeyError(f"no {kind} `{name}`; {'; '.join(suggest(name, known, kinds or f'{kind}s'))}")
 
 
@@ -35,7 +35,7 @@ def unknown_slot(ruleset: Ruleset, name: str) -> KeyError:
 
 
 def check_ids(kind: ArrayKind, ids: Array, name: str, ruleset: Ruleset) -> None:
-    """Raises ValueError for ids that a ruleset does not have."""
+    """Raise ValueError for ids that a ruleset does not have."""
     xp, known = kind.xp, _flags_by_id(kind, (element.id for element in ruleset.elements))
     flat = ids.reshape(-1)
     for start in range(0, len(flat), CHUNK):
@@ -52,24 +52,18 @@ def check_ids(kind: ArrayKind, ids: Array, name: str, ruleset: Ruleset) -> None:
 
 def _flags_by_id(kind: ArrayKind, ids: Iterable[int]) -> Array:
     """Flags by id: bool [256]."""
-    some = set(ids)
-    return kind.put([number in some for number in range(256)])
-
-
-def _rows(shape: tuple[int, ...]) -> Iterator[slice]:
-    """The rows of worlds [B, H, W] or [B, 2, H, W] in parts."""
-    step = max(1, CHUNK // max(1, shape[0] * shape[-1]))
-    return (slice(start, start + step) for start in range(0, shape[-2], step))
+    members = set(ids)
+    return kind.put([number in members for number in range(256)])
 
 
 def checked_values(
     kind: ArrayKind, array: Array, ids: Array, fresh: Array, slot: Slot, ruleset: Ruleset
 ) -> Array:
-    """Values [B, H, W] or [B, 2, H, W] as a slot holds them, in memory of their own.
+    """Values [B, H, W] or [B, 2, H, W] in a slot's dtype, in new memory.
 
     Args:
-        ids: the elements of the cells, of which some may not have the field or property.
-        fresh: what new cells of these elements hold.
+        ids: the elements of the cells, some of which may lack the field or property.
+        fresh: the values in new cells of these elements.
 
     Raises:
         TypeError, ValueError: values that the slot cannot hold, or not in these cells.
@@ -82,7 +76,9 @@ def checked_values(
     prop = ruleset.property(slot.name)
     limited = slot.of if prop is None else prop.stored
     out = kind.zeros(slot.dtype, tuple(array.shape))
-    for rows in _rows(out.shape):
+    step = max(1, CHUNK // max(1, out.shape[0] * out.shape[-1]))
+    for start in range(0, out.shape[-2], step):
+        rows = slice(start, start + step)
         values = convert(kind, array[..., rows, :], slot, ruleset)
         out[..., rows, :] = values
         if limited is None:
@@ -116,7 +112,7 @@ def _integers(kind: ArrayKind, array: Array, slot: Slot, ruleset: Ruleset) -> Ar
 
 
 def checked_parameter(kind: ArrayKind, value: Any, param: Param, batch: int) -> Array:
-    """Given values of a parameter: float64 [B] in memory of their own. Raises TypeError, ValueError."""
+    """Values of a parameter as a new array float64 [B]. Raises TypeError, ValueError."""
     xp, name = kind.xp, param.name
     lo, hi = stored_range(param.kind)
     array = xp.asarray(kind.convert(value, name), dtype=xp.float64)

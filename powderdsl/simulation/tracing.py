@@ -1,6 +1,6 @@
-"""Why cells hold what they hold.
+"""Explanations of cells: the rules that wrote their values, and the rules that nearly did.
 
-`trace` explains one cell in one step: its writes on the reference interpreter, and the rules that nearly wrote it.
+`trace` explains one cell in one step, by the writes of the reference interpreter.
 
 `Recorder` names the rule that last wrote the element of each cell of a batch, on any backend and device. The rules get one
 more field, and every rule that writes an element sets the field to its number in that cell. Backends need no support for
@@ -58,10 +58,10 @@ _WITHOUT_RULE = {
 
 @dataclass(frozen=True)
 class NumberedRule:
-    """A rule of the checked model. One line of a file makes several under loops and symmetries.
+    """A rule of the checked model. One line of a file makes several rules under loops and symmetries.
 
-    `number` counts from 1 in the order in which they run; `moment` counts the pass's substeps from 1; `label` has the
-    loop variables, such as ``side = left``.
+    `number` counts rules from 1 in the order in which they run; `moment` counts the pass's substeps from 1; `label` has
+    the loop variables, such as ``side = left``.
     """
 
     number: int
@@ -92,14 +92,15 @@ def numbered_rules(ruleset: Ruleset) -> tuple[NumberedRule, ...]:
     )
 
 
-# What happens in a step
+# Substeps and writes
 
 
 @dataclass(frozen=True, eq=False)
 class Substep:
-    """A substep as it happened: what it found, and its rules. Arrays have a batch of one.
+    """A recorded substep: the state before it, and its rules. Arrays have a batch of one.
 
-    `rules` and `masks`, where they happened, are by `id`; `lets` has each `let` so far and the substep that fixed it.
+    `rules`, and `masks` of the cells where they happened, are by `id`; `lets` has each `let` so far and the substep that
+    fixed it.
     """
 
     policy: str
@@ -119,8 +120,8 @@ class Substep:
 
 
 @dataclass(frozen=True)
-class Asked:
-    """A rule of a substep, and the cell in which its condition was asked."""
+class Attempt:
+    """A rule of a substep, and the cell in which its condition was evaluated."""
 
     rule: NumberedRule
     substep: Substep
@@ -137,7 +138,7 @@ class Asked:
 
     @property
     def failed(self) -> tuple[Part, ...]:
-        """The parts that do not hold. If none failed, the rule gave way to another one, or happened."""
+        """The parts that do not hold. If no part failed, the rule happened, or gave way to another rule."""
         return tuple(part for part in self.parts if not part.holds)
 
     @property
@@ -146,13 +147,13 @@ class Asked:
 
     @property
     def gave_way(self) -> str | None:
-        """The policy of `conflicts:` under which it gave way, if it did."""
+        """The policy of `conflicts:` under which the rule gave way, or None."""
         return None if self.happened or self.failed else self.substep.policy
 
 
 @dataclass(frozen=True)
 class Change:
-    """What a slot of the cell held before and after. Values are NumPy numbers, or two of a vector."""
+    """A slot of the cell before and after. Values are NumPy numbers, or two numbers of a vector."""
 
     slot: Slot
     before: Any
@@ -165,21 +166,21 @@ class Change:
 
 @dataclass(frozen=True)
 class Write(Change):
-    """One write to a slot of the cell: by a rule that was asked, or by none.
+    """One write to a slot of the cell, by a rule or by none.
 
-    `source` is where content came from that moved here.
+    `source` is the cell from which content moved here.
     """
 
     how: str
-    asked: Asked | None = None
+    attempt: Attempt | None = None
     source: Cell | None = None
 
 
 class RecordedStep:
     """The next step of a batch of one world, with default parameters: its substeps, and all writes to one cell, in order.
 
-    Writes are those to all slots, scratch fields among them. Each finds what the one before it left; what the last one
-    leaves is what the step leaves. States are the reference's: integers int64, floats float32, [1, H, W] or [1, 2, H, W].
+    All slots count, including scratch fields. Each write starts from the result of the write before it, and the last
+    result is the step's. States are those of the reference: integers int64, floats float32, [1, H, W] or [1, 2, H, W].
     """
 
     def __init__(self, world: World, cell: Cell):
@@ -201,22 +202,22 @@ class RecordedStep:
         self.substeps.append(substep)
 
     def wrote(self, change: reference.Change, before: Array, after: Array, mask: Array | None = None) -> None:
-        """Record a write to the cell. One without a rule counts if it changes something."""
-        asked = source = None
+        """Record a write to the cell. A write without a rule counts if it changes something."""
+        attempt = source = None
         if change.rule is not None and mask is not None:
             if not mask[(0, *self.cell)]:
                 return
             substep = self.substeps[-1]
-            asked = Asked(substep.rules[id(change.rule)], substep, substep.near(self.cell, change.asked))
+            attempt = Attempt(substep.rules[id(change.rule)], substep, substep.near(self.cell, change.asked))
             source = None if change.source is None else substep.near(self.cell, change.source)
         old, new = pick(before, self.cell), pick(after, self.cell)
-        write = Write(change.slot, old, new, change.how, asked, source)
-        if asked or write.changed:
+        write = Write(change.slot, old, new, change.how, attempt, source)
+        if attempt or write.changed:
             self.writes.append(write)
 
 
 def pick(array: Array, cell: Cell) -> Any:
-    """One cell's value of a reference array: a NumPy number, or two of a vector."""
+    """One cell's value of a reference array: a NumPy number, or two numbers of a vector."""
     return array[0, ..., cell[0], cell[1]]
 
 
@@ -225,10 +226,10 @@ def pick(array: Array, cell: Cell) -> Any:
 
 @dataclass(frozen=True)
 class Read:
-    """One value that a condition read. `cell` is where it stands, None for parameters.
+    """One value that a condition read. `cell` is the cell that holds it, None for parameters.
 
-    `value` is plain data, `shown` how a rule file would write it. `element` is what the cell is, where it matters.
-    `counted` are the cells that a count found.
+    `value` is plain data, `shown` the notation of a rule file. `element` is the cell's element, if it matters. `counted` are
+    the cells that a count includes.
     """
 
     text: str
@@ -243,7 +244,7 @@ class Read:
 class Part:
     """One of the conditions that must all hold for a rule to happen, in one cell.
 
-    `substep` has the state that it reads; `let` names the one that it comes from.
+    `substep` has the state that it reads; `let` names the `let` that it comes from.
     """
 
     expr: Expr
@@ -261,7 +262,7 @@ class Part:
 
     @cached_property
     def reads(self) -> tuple[Read, ...]:
-        """Everything that the condition read, each value once."""
+        """All values that the condition read, without repetitions."""
         reads: dict[str, Read] = {}
         for read in _reads(self.expr, self.substep, self.cell, HERE):
             reads.setdefault(read.text, read)
@@ -281,7 +282,7 @@ def _split(part: Part) -> Iterator[Part]:
 
 
 def _reads(expr: Expr, substep: Substep, cell: Cell, offset: Offset) -> Iterator[Read]:
-    """What an expression reads where it is evaluated `offset` away from the cell."""
+    """The values that an expression reads when it is evaluated `offset` away from the cell."""
     if expr.op == "look":
         dy, dx = expr.value
         yield from _reads(expr.args[0], substep, cell, (offset[0] + dy, offset[1] + dx))
@@ -320,14 +321,14 @@ def _read(expr: Expr, substep: Substep, place: Cell, offset: Offset) -> Read:
 
 
 def _written(name: str) -> str:
-    """The name of a `let` in the file: copies under loops are numbered."""
+    """The name of a `let` in the file, without the number of a copy under loops."""
     return name.partition("#")[0]
 
 
 def plain(ruleset: Ruleset, kind: Kind, value: Any) -> Any:
-    """A cell's value as plain data: elements by name, directions as rules name them, the rest as numbers.
+    """A cell's value as plain data: elements and directions by name, other values as numbers.
 
-    JSON has no infinities, which values within a pass may be: these are text.
+    JSON has no infinities, which may occur within a pass, so they become text.
     """
     if kind.name in ("element", "direction"):
         return show_at_cell(ruleset, kind, value)
@@ -336,7 +337,7 @@ def plain(ruleset: Ruleset, kind: Kind, value: Any) -> Any:
 
 
 def show_at_cell(ruleset: Ruleset, kind: Kind, value: Any) -> str:
-    """A cell's value as a rule file would write it; draws in per cent, as chances are."""
+    """A cell's value in the notation of rule files; draws in percent, like chances."""
     number = value.tolist()
     match kind.name:
         case "draw":
@@ -353,10 +354,10 @@ def show_at_cell(ruleset: Ruleset, kind: Kind, value: Any) -> str:
 
 @dataclass(frozen=True)
 class Trace:
-    """One cell in one step, for the slots that were asked for.
+    """One cell in one step, for some slots.
 
-    `slots` say what the step changed, without scratch fields, which live in their pass. `misses` are rules that would
-    have written the cell, and did not happen.
+    `slots` are the slots before and after the step, without scratch fields, which last for one pass. `misses` are rules
+    that would have written the cell, and did not happen.
     """
 
     ruleset: Ruleset
@@ -365,11 +366,11 @@ class Trace:
     step: int
     slots: tuple[Change, ...]
     writes: tuple[Write, ...]
-    misses: tuple[Asked, ...]
+    misses: tuple[Attempt, ...]
 
     def writer(self, slot: str = "element") -> NumberedRule | None:
         """The rule that last wrote a slot; None if no rule did."""
-        rules = [write.asked.rule for write in self.writes if write.slot.name == slot and write.asked]
+        rules = [write.attempt.rule for write in self.writes if write.slot.name == slot and write.attempt]
         return rules[-1] if rules else None
 
 
@@ -383,15 +384,15 @@ def trace(
     of: Iterable[str] | None = None,
     every_rule: bool = False,
 ) -> Trace:
-    """Why a cell holds what it holds after a step.
+    """Explain the values of a cell after a step.
 
     Args:
-        world: the worlds before the first step. All but the last step run on its simulator.
+        world: the worlds before the first step. All but the last step run on their simulator.
         row, column: the cell, from 0.
-        step: which step, from 1: the world after it is explained.
-        number: which world of the batch.
+        step: the number of the step to explain, from 1.
+        number: the index of the world in the batch.
         of: names of slots: the element, fields, scratch fields such as ``pass.name``. All but scratch by default.
-        every_rule: also the rules that missed by more than one part of their condition, or are about other elements.
+        every_rule: include rules that missed by several parts of their condition, or concern other elements.
 
     Raises:
         IndexError: the world has no such cell, or the batch no such world. ValueError: step 0. KeyError: an unknown name.
@@ -409,7 +410,7 @@ def trace(
     writes = tuple(write for write in recorded.writes if write.slot.name in slots)
     misses = _misses(recorded, slots.values(), every_rule)
     if not every_rule:
-        lines = {_line(write.asked.rule) for write in writes if write.asked}
+        lines = {_line(write.attempt.rule) for write in writes if write.attempt}
         misses = tuple(miss for miss in misses if _line(miss.rule) not in lines)
     changes = tuple(
         Change(slot, *(pick(state[name], cell) for state in (recorded.begin, recorded.end)))
@@ -440,30 +441,30 @@ def _line(rule: NumberedRule) -> tuple[Span, str]:
     return rule.span, rule.pass_name
 
 
-def _misses(step: RecordedStep, slots: Iterable[Slot], every_rule: bool) -> tuple[Asked, ...]:
-    """Rules that did not happen where they would have written the cell. Unless all are asked for, a line counts once a cell."""
-    misses: dict[Any, Asked] = {}
+def _misses(step: RecordedStep, slots: Iterable[Slot], every_rule: bool) -> tuple[Attempt, ...]:
+    """Rules that did not happen where they would have written the cell; one a line and cell, unless `every_rule`."""
+    misses: dict[Any, Attempt] = {}
     for substep in step.substeps:
         for numbered in substep.rules.values():
             offsets = [offset for slot in slots for offset in _writes_at(numbered.rule, slot)]
             for place in dict.fromkeys(substep.near(step.cell, offset, -1) for offset in offsets):
-                asked = Asked(numbered, substep, place)
+                attempt = Attempt(numbered, substep, place)
                 key = (numbered.number if every_rule else _line(numbered), place)
-                if key not in misses and not asked.happened and (every_rule or _nearly(asked)):
-                    misses[key] = asked
+                if key not in misses and not attempt.happened and (every_rule or _nearly(attempt)):
+                    misses[key] = attempt
     return tuple(misses.values())
 
 
-def _nearly(asked: Asked) -> bool:
-    """Whether one part of a condition failed, and not the one that asks what element the cell is, or none."""
-    failed = list(islice((part.expr for part in asked.parts if not part.holds), 2))
+def _nearly(attempt: Attempt) -> bool:
+    """True if at most one part of a condition failed, other than the test of the cell's element."""
+    failed = list(islice((part.expr for part in attempt.parts if not part.holds), 2))
     if len(failed) != 1:
         return not failed
-    return len(asked.parts) > 1 and not (failed[0].op == "member" and failed[0].args[0].op == "element")
+    return len(attempt.parts) > 1 and not (failed[0].op == "member" and failed[0].args[0].op == "element")
 
 
 def _writes_at(rule: Rule, slot: Slot) -> Iterator[Offset]:
-    """Where a rule writes a slot, from the cell in which its condition holds."""
+    """The offsets at which a rule writes a slot, from the cell in which its condition holds."""
     assigns = [rule] if isinstance(rule, Assign) else rule.effects
     yield from (assign.offset for assign in assigns if assign.field == slot.name)
     if slot.travels:
@@ -471,7 +472,7 @@ def _writes_at(rule: Rule, slot: Slot) -> Iterator[Offset]:
 
 
 def _element_writes(rule: Rule) -> list[tuple[bool, Offset]]:
-    """Where a rule writes elements and what travels with them, and whether they arrive there: that comes after all else."""
+    """The offsets at which a rule writes elements and their fields; True for arrivals, which come after all else."""
     match rule:
         case Transform():
             return [(False, HERE)]
@@ -491,14 +492,11 @@ MAX_CELLS = 9
 def trace_text(trace: Trace, *, color: bool = False) -> str:
     """The whole trace, without a line break at its end."""
     blocks = [_head(trace)]
-    blocks += [_writes_text(trace, list(writes), color) for _, writes in groupby(trace.writes, _event)]
+    # All writes of one rule in one substep are one block.
+    events = groupby(trace.writes, lambda write: (write.attempt, _WITHOUT_RULE.get(write.how)))
+    blocks += [_writes_text(trace, list(writes), color) for _, writes in events]
     blocks += [_miss_text(trace, miss, color) for miss in trace.misses]
     return "\n\n".join(blocks)
-
-
-def _event(write: Write) -> tuple[Asked | None, str | None]:
-    """A key that is equal for all writes of one rule in one substep."""
-    return write.asked, _WITHOUT_RULE.get(write.how)
 
 
 def _change(trace: Trace, change: Change) -> str:
@@ -512,13 +510,13 @@ def _head(trace: Trace) -> str:
     for slot in trace.slots:
         change, rule = _change(trace, slot), trace.writer(slot.slot.name)
         lines.append(f"  {change}, by {rule.place}" if rule and " -> " in change else f"  {change}")
-    if not any(write.asked for write in trace.writes):
+    if not any(write.attempt for write in trace.writes):
         lines.append("  no rule wrote it")
     return "\n".join(map(printable, lines))
 
 
 def _writes_text(trace: Trace, writes: list[Write], color: bool) -> str:
-    lines, asked = [], writes[0].asked
+    lines, attempt = [], writes[0].attempt
     for write in writes:
         if write.changed:
             moved = f", moved here from {_at(write.source)}" if write.source else ""
@@ -526,12 +524,12 @@ def _writes_text(trace: Trace, writes: list[Write], color: bool) -> str:
     if not lines:
         names = dict.fromkeys(write.slot.name for write in writes)
         lines = [f"{printable(', '.join(names))}: written again, as before"]
-    if asked is None:
+    if attempt is None:
         return "\n".join([*lines, f"  = {_WITHOUT_RULE[writes[0].how]}"])
-    return "\n".join([*lines, *_source(trace, asked, [Label(asked.rule.span)])])
+    return "\n".join([*lines, *_source(trace, attempt, [Label(attempt.rule.span)])])
 
 
-def _miss_text(trace: Trace, miss: Asked, color: bool) -> str:
+def _miss_text(trace: Trace, miss: Attempt, color: bool) -> str:
     span, failed = miss.rule.span, miss.failed
     labels = [Label(part.expr.span or span, _reads_text(part)) for part in failed]
     if not labels:
@@ -543,13 +541,13 @@ def _miss_text(trace: Trace, miss: Asked, color: bool) -> str:
     return "\n".join([f"{head}, but for {printable(but)}", *_source(trace, miss, labels)])
 
 
-def _source(trace: Trace, asked: Asked, labels: list[Label]) -> list[str]:
-    """The source lines of labels, and below them the rule and the parts of its condition that hold."""
-    rule = asked.rule
+def _source(trace: Trace, attempt: Attempt, labels: list[Label]) -> list[str]:
+    """The source lines of labels, then the rule and the parts of its condition that hold."""
+    rule = attempt.rule
     label = f" ({rule.label})" if rule.label else ""
-    where = f", asked at {_at(asked.cell)}" if asked.cell != trace.cell else ""
+    where = f", asked at {_at(attempt.cell)}" if attempt.cell != trace.cell else ""
     notes = [f"pass {rule.pass_name} of {rule.pack}, substep {rule.moment}{label}{where}"]
-    for part in asked.held:
+    for part in attempt.held:
         values, span = _reads_text(part), part.expr.span
         come = f" (`{part.let}`, {place_of(span)})" if part.let and span else ""
         notes.append(f"holds: {part.text}{come}{'; ' if values else ''}{values}")
@@ -585,7 +583,10 @@ SCHEMA = 1
 
 
 def trace_data(trace: Trace) -> dict[str, Any]:
-    """Rows and columns count from 0, steps, lines, columns of text, rules and substeps from 1."""
+    """The trace as plain data for JSON.
+
+    Rows and columns count from 0; steps, lines, columns of text, rules and substeps from 1.
+    """
 
     def values(change: Change) -> dict[str, Any]:
         kind, both = change.slot.kind, {"before": change.before, "after": change.after}
@@ -603,32 +604,32 @@ def trace_data(trace: Trace) -> dict[str, Any]:
         },
         "writes": [
             {"slot": write.slot.name, **values(write), "how": write.how, "source": write.source}
-            | (_picked(write.asked, "rule", "cell", "parts") if write.asked else _NOT_ASKED)
+            | (_attributes(write.attempt, "rule", "cell", "parts") if write.attempt else _NO_ATTEMPT)
             for write in trace.writes
         ],
-        "almost": [_picked(miss, "rule", "cell", "failed", "held", "gave_way") for miss in trace.misses],
+        "almost": [_attributes(miss, "rule", "cell", "failed", "held", "gave_way") for miss in trace.misses],
     }
 
 
-_NOT_ASKED: dict[str, Any] = {"rule": None, "cell": None, "parts": []}
+_NO_ATTEMPT: dict[str, Any] = {"rule": None, "cell": None, "parts": []}
 
 
-def _picked(value: object, *names: str) -> dict[str, Any]:
+def _attributes(value: object, *names: str) -> dict[str, Any]:
     return {name: _data(getattr(value, name)) for name in names}
 
 
 def _data(value: Any) -> Any:
-    """Rules, parts of conditions and what they read, as plain data."""
+    """Rules, parts of conditions and their reads, as plain data."""
     match value:
         case tuple():
             return [_data(item) for item in value]
         case NumberedRule():
-            numbered = _picked(value, "number", "pack", "moment", "label")
+            numbered = _attributes(value, "number", "pack", "moment", "label")
             return numbered | {"pass": value.pass_name, "text": one_line(value.span), **_place(value.span)}
         case Part():
-            return _picked(value, "text", "holds", "let", "reads") | _place(value.expr.span)
+            return _attributes(value, "text", "holds", "let", "reads") | _place(value.expr.span)
         case Read():
-            return _picked(value, "text", "value", "cell", "element", "counted")
+            return _attributes(value, "text", "value", "cell", "element", "counted")
     return value
 
 
@@ -641,15 +642,15 @@ def _place(span: Span | None) -> dict[str, Any]:
 # All cells at once
 
 SLOT = "last writer"
-"""The field of the numbers. Names in rule files have no blanks, so none is the same."""
+"""The field of the numbers. Names in rule files have no blanks, so there is no conflict."""
 
 
 @dataclass(frozen=True)
 class Provenance:
-    """Worlds after a step, and what wrote their elements in it.
+    """Worlds after a step, and the rules that wrote their elements.
 
     `numbers` is int16 [B, H, W] on the worlds' device: the number of the rule in `rules` that last wrote the element
-    of a cell in the last step, 0 where none did. A rule that writes the element that was there counts too.
+    of a cell in the last step, 0 where none did. A rule that writes the same element again counts too.
     """
 
     world: World
@@ -657,13 +658,13 @@ class Provenance:
     rules: tuple[NumberedRule, ...]
 
     def rule_at(self, row: int, column: int, world: int = 0) -> NumberedRule | None:
-        """The rule that last wrote a cell's element; None if there is none. Raises IndexError outside the grid."""
+        """The rule that last wrote a cell's element, or None. Raises IndexError outside the grid."""
         number = int(self.numbers[world, row, column])
         return self.rules[number - 1] if number else None
 
 
 class Recorder:
-    """Steps worlds of a simulator and records which rules wrote their elements. Compiles the rules once more."""
+    """Steps worlds of a simulator and records the rules that wrote their elements. Compiles the rules once more."""
 
     def __init__(self, sim: Simulator):
         self.sim = sim
@@ -671,9 +672,9 @@ class Recorder:
         self._marked = sim.of(_marked(sim.ruleset))
 
     def step(self, world: World, steps: int = 1, **options: Any) -> Provenance:
-        """Like `Simulator.step`, which takes the same options, gives the same worlds and raises the same errors.
+        """Step worlds as `Simulator.step` does, with the same options, results and errors.
 
-        After 0 steps no rule has written.
+        After 0 steps, all numbers are 0.
         """
         self.sim.check(world)
         xp = self.sim.kind.xp
@@ -687,7 +688,7 @@ class Recorder:
 
 
 def _marked(ruleset: Ruleset) -> Ruleset:
-    """The same rules, with a field that holds the number of the rule that last wrote a cell's element in this step."""
+    """The rules with a field for the number of the rule that last wrote a cell's element in this step."""
     numbers, passes = count(1), []
     for pass_ in ruleset.passes:
         moments = []

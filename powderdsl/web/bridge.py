@@ -1,4 +1,4 @@
-"""What the page calls in Pyodide: functions of one session, JSON in, JSON or bytes out."""
+"""The functions of a session that the page calls in Pyodide: JSON in, JSON or bytes out."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ PACK = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,60}")
 
 
 class BadRequest(ValueError):
-    """The page, or a link that it was given, asks for something that the session cannot do."""
+    """The page, or a link to it, requests something that the session cannot do."""
 
 
 @dataclass(frozen=True)
-class Named:
-    """Rule files by name, those of them that the rules are named by, and packs that are left out."""
+class Selection:
+    """Rule files by name; `words`, the files that `load` gets; and `off`, the packs that are left out."""
 
     files: Mapping[str, str]
     words: list[str]
@@ -52,38 +52,38 @@ class Named:
 
 
 class Session:
-    """Rule files in a folder of their own, and the last rules that had no mistakes."""
+    """Rule files in their own folder, and the last rules without mistakes."""
 
     def __init__(self, folder: Path):
         self.folder = folder
         self.memo = Memo(versions=2, things=250)
-        """Of one ruleset with some 60 passes: a page has less memory than a machine."""
+        """Enough for one ruleset of 60 passes: a page has less memory than a machine."""
         self.ruleset: Ruleset | None = None
-        self.good = Named({}, [], [])
-        """What was read for these rules."""
-        self._made: Any = None
+        self.good = Selection({}, [], [])
+        """The files of these rules."""
+        self._sim: Any = None
 
     def check(self, files: Mapping[str, str], off: list[str]) -> dict[str, Any]:
-        """Load the files without the packs in `off`. Rules with mistakes leave the ones before in place.
+        """Load the files without the packs in `off`. If they have mistakes, the previous rules stay.
 
         Diagnostics have the text that `check` prints.
         """
-        named = self._write(files, off)
-        names = [str(self.folder / word) for word in named.words]
-        names[-1] = "-".join([names[-1], *named.off])
+        selection = self._write(files, off)
+        names = [str(self.folder / word) for word in selection.words]
+        names[-1] = "-".join([names[-1], *selection.off])
         packs: list[str] = []
         answer: dict[str, Any] = {"ok": True}
         try:
             packs = [Path(pack.source.name).name for pack in read(names, Reporter())[0]]
             self.ruleset, remarks = load_with_diagnostics(*names)
-            self.good, answer["words"] = named, _words(self.ruleset)
+            self.good, answer["words"] = selection, _words(self.ruleset)
         except CompileError as error:
             answer["ok"], remarks = False, error.diagnostics
         data = [diagnostic_data(remark, utf16=True) | {"text": render_text(remark)} for remark in remarks]
         return answer | {"diagnostics": data, "packs": packs}
 
-    def _write(self, files: Mapping[str, str], off: list[str]) -> Named:
-        """Write the files, and name them as `load` takes them: rulesets, and packs beside them."""
+    def _write(self, files: Mapping[str, str], off: list[str]) -> Selection:
+        """Write the files, and select the names for `load`: rulesets, and packs that no ruleset lists."""
         if not 0 < len(files) <= MAX_FILES or sum(map(len, files.values())) > MAX_TEXT:
             raise BadRequest(f"1 to {MAX_FILES} files with at most {MAX_TEXT:,} characters together")
         for name in files:
@@ -101,20 +101,20 @@ class Session:
             base for name in rulesets for base in re.findall(r"^extends: *(\w+)", files[name], re.MULTILINE)
         }
         tops = [name for name in rulesets if Path(name).stem not in based] or rulesets
-        known: set[str] = set()
+        listed: set[str] = set()
         with suppress(CompileError):  # too many mistakes: reported when the rules are loaded
             packs = read([str(self.folder / name) for name in tops], Reporter())[0] if tops else []
-            known = {Path(pack.source.name).name for pack in packs}
-        beside = [name for name in files if name not in known.union(rulesets)]
-        unread = {Path(name).stem for name in beside}.intersection(off)
-        words = tops + [name for name in beside if Path(name).stem not in unread]
+            listed = {Path(pack.source.name).name for pack in packs}
+        unlisted = [name for name in files if name not in listed.union(rulesets)]
+        unread = {Path(name).stem for name in unlisted}.intersection(off)
+        words = tops + [name for name in unlisted if Path(name).stem not in unread]
         if not words:
             raise BadRequest("every pack is off")
-        taken = {name: text for name, text in files.items() if Path(name).stem not in unread}
-        return Named(taken, words, [name for name in off if name not in unread])
+        used = {name: text for name, text in files.items() if Path(name).stem not in unread}
+        return Selection(used, words, [name for name in off if name not in unread])
 
     def compile(self, rows: int, columns: int) -> bytes:
-        """The last good rules as a module of a world."""
+        """The WebAssembly module of a world of the last good rules."""
         return standalone_module(self._rules(), (int(rows), int(columns)), self.memo)
 
     def _rules(self) -> Ruleset:
@@ -123,23 +123,27 @@ class Session:
         return self.ruleset
 
     def command(self) -> dict[str, Any]:
-        """What the command line needs for the last good rules: `rules` as `run` takes them, and `files` to save.
+        """The arguments of the command line for the last good rules: `rules` for `run`, and `files` to save first.
 
-        Files that are not shipped as they are have to be saved; with a member of a ruleset, which is looked for beside
-        it, the ruleset too.
+        Files that differ from the shipped ones must be saved. If a member of a ruleset is saved, the ruleset is too,
+        since members are looked up in its folder.
         """
         words, off = self.good.words, self.good.off
-        own = {name for name, text in self.good.files.items() if not _is_shipped(name, text)}
+        own = set()
+        for name, text in self.good.files.items():
+            path = shipped("rules") / name
+            if not path.is_file() or path.read_text(encoding="utf-8") != text:
+                own.add(name)
         if own.difference(words):
             own.update(name for name, text in self.good.files.items() if _is_ruleset(text))
-        named = [word if word in own else Path(word).stem for word in words]
+        names = [word if word in own else Path(word).stem for word in words]
         return {
-            "rules": "-".join(["+".join(named), *off]),
+            "rules": "-".join(["+".join(names), *off]),
             "files": [name for name in self.good.files if name in own],
         }
 
     def save_rules(self) -> bytes:
-        """The files that `command` names: one as it is, several in a zip."""
+        """The files that `command` names: a single file unmodified, several as a zip."""
         files = self.command()["files"]
         if len(files) == 1:
             return self.good.files[files[0]].encode()
@@ -150,57 +154,57 @@ class Session:
         return out.getvalue()
 
     def ledger(self) -> str:
-        """What rules create, destroy and conserve, as `check --ledger` prints it."""
+        """The ledger of created, destroyed and conserved elements, as `check --ledger` prints it."""
         from powderdsl.analysis.account import ledger_text
         from powderdsl.analysis.ledger import ledger
 
         return ledger_text(ledger(self._rules()))
 
     def invariants(self) -> list[dict[str, Any]]:
-        """Each invariant: `proven` and why, `tried` on worlds, or `broken` with a small world that breaks it."""
+        """The invariants: `proven` with the reason, `tried` on worlds, or `broken` with a small counterexample."""
         from powderdsl.analysis.ledger import ledger
         from powderdsl.testing.properties.outcomes import counterexample_lines
         from powderdsl.testing.properties.refute import quick_results
 
         rules = self._rules()
         rows = []
-        for one in quick_results(rules, ledger(rules)):
-            status, note = one.status, one.reason
-            if one.counterexample is not None:
-                note = "\n".join(counterexample_lines(one.counterexample, rules))
+        for result in quick_results(rules, ledger(rules)):
+            status, note, prop = result.status, result.reason, result.prop
+            if result.counterexample is not None:
+                note = "\n".join(counterexample_lines(result.counterexample, rules))
             elif status != "proven":
                 status, note = "tried", ""
-            rows.append({"text": one.prop.text, "status": status, "note": note, "owner": one.prop.owner})
+            rows.append({"text": prop.text, "status": status, "note": note, "owner": prop.owner})
         return rows
 
     def tests(self, pack: str) -> list[dict[str, Any]]:
-        """Each test of a pack: its place, and what failed, with the world then."""
+        """The tests of a pack: the place of each, and the problem and the world if it failed."""
         from powderdsl.testing.pack_tests.runner import run_examples
 
         rules = self._rules()
-        own = replace(rules, tests=tuple(one for one in rules.tests if one.pack == pack))
+        own = replace(rules, tests=tuple(test for test in rules.tests if test.pack == pack))
         return [
             {
-                "name": one.example.name,
-                "passed": one.passed,
-                "problem": one.problem,
-                "step": one.step,
-                "after": list(one.after),
-                "legend": dict(one.example.legend),
-                "place": one.example.span.place.rpartition("/")[2],
+                "name": result.example.name,
+                "passed": result.passed,
+                "problem": result.problem,
+                "step": result.step,
+                "after": list(result.after),
+                "legend": dict(result.example.legend),
+                "place": result.example.span.place.rpartition("/")[2],
             }
-            for one in run_examples(own, sim=self._simulator())
+            for result in run_examples(own, sim=self._simulator())
         ]
 
     def trace(self, world: dict[str, Any], row: int, column: int, params: dict[str, float]) -> str:
-        """Why a cell holds what it holds one step after a world, with other values for some parameters."""
+        """The trace of a cell in the next step of a world, with other values for some parameters."""
         from powderdsl.simulation.simulator import Simulator
         from powderdsl.simulation.tracing import trace, trace_text
 
         reporter, sim = Reporter(), self._simulator()
         rules = self._rules()
-        usual = {one.name: float(one.default) for one in rules.params}
-        if changed := {name: value for name, value in params.items() if value != usual.get(name)}:
+        defaults = {param.name: float(param.default) for param in rules.params}
+        if changed := {name: value for name, value in params.items() if value != defaults.get(name)}:
             rules = set_params(rules, changed, reporter)
             reporter.raise_if_errors()
             sim = Simulator(rules, "wasm", tensors=False, memo=self.memo)
@@ -228,16 +232,16 @@ class Session:
             path.unlink()
 
     def _simulator(self) -> Any:
-        """One for each rules: compiling takes a while."""
+        """The simulator of the rules, cached because compiling takes a while."""
         from powderdsl.simulation.simulator import Simulator
 
         rules = self._rules()
-        if self._made is None or self._made.ruleset is not rules:
-            self._made = Simulator(rules, "wasm", tensors=False, memo=self.memo)
-        return self._made
+        if self._sim is None or self._sim.ruleset is not rules:
+            self._sim = Simulator(rules, "wasm", tensors=False, memo=self.memo)
+        return self._sim
 
     def _world(self, data: dict[str, Any], sim: Any) -> Any:
-        """A world as the page writes it, whose ids and fields are those of the rules."""
+        """A world from the page's JSON, with ids and fields of the rules."""
         rules = self._rules()
         ours = {element.qualified: element.id for element in rules.elements}
         shape = int(data["rows"]), int(data["columns"])
@@ -250,12 +254,12 @@ class Session:
             (1, *shape)
         )
         fields: dict[str, Any] = {}
-        known = qualified_slots(rules).values()
-        for name, given in data["fields"].items():
-            if name in known:
-                values = np.frombuffer(base64.b64decode(given["values"]), np.dtype(given["type"]))
-                whole = (1, 2, *shape) if given["components"] == 2 else (1, *shape)
-                fields[slot_name(rules, name)] = values.reshape(whole)
+        names = qualified_slots(rules).values()
+        for name, field in data["fields"].items():
+            if name in names:
+                values = np.frombuffer(base64.b64decode(field["values"]), np.dtype(field["type"]))
+                components = (2,) if field["components"] == 2 else ()
+                fields[slot_name(rules, name)] = values.reshape((1, *components, *shape))
         seed, index, step = (int(number) for number in data["clock"])
         world = sim.replace(sim.world(ids, seed=seed), **fields)
         return replace(world, index=np.full_like(world.index, index), start=np.full_like(world.start, step))
@@ -265,18 +269,13 @@ def _is_ruleset(text: str) -> bool:
     return re.search(r"^ruleset:", text, re.MULTILINE) is not None
 
 
-def _is_shipped(name: str, text: str) -> bool:
-    path = shipped("rules") / name
-    return path.is_file() and path.read_text(encoding="utf-8") == text
-
-
 def _words(ruleset: Ruleset) -> dict[str, list[str]]:
-    """What the editor completes, by kind."""
+    """The words that the editor completes, by kind."""
     rule_records = [kind for kind in RECORDS.values() if kind.__module__ == declarations.__name__]
     return {
-        "element": [one.name for one in ruleset.elements],
-        "field": [*(one.name for one in ruleset.fields), *(one.name for one in ruleset.properties)],
-        "parameter": [one.name.rpartition(".")[2] for one in ruleset.params],
+        "element": [element.name for element in ruleset.elements],
+        "field": [field.name for field in ruleset.fields] + [prop.name for prop in ruleset.properties],
+        "parameter": [param.name.rpartition(".")[2] for param in ruleset.params],
         "function": sorted(FUNCTIONS),
         "keyword": sorted({*reserved_words(), *RESERVED}),
         "key": sorted({key for kind in rule_records for key in keys_of(kind)}),
@@ -292,21 +291,21 @@ def session() -> Session:
 
 
 def call(name: str, arguments: str) -> str | bytes:
-    """Call a method of the session with a JSON list; the result as JSON, or bytes as they are.
+    """Call a method of the session with a JSON list; return the result as JSON, or bytes unmodified.
 
-    What is wrong with the input comes back as {"error": text}, never as an exception.
+    Mistakes in the input are returned as {"error": text}, never raised.
     """
     current = session()
     try:
         method = getattr(current, name, None)
         if method is None:
             raise BadRequest(f"no call {name[:80]!r}")
-        found = {"result": method(*json.loads(arguments))}
+        answer = {"result": method(*json.loads(arguments))}
     except (BadRequest, CompileError) as error:
-        found = {"error": str(error)}
+        answer = {"error": str(error)}
     except (IndexError, KeyError, TypeError, ValueError) as error:
-        found = {"error": f"{type(error).__name__}: {error}"}
-    if isinstance(found.get("result"), bytes):
-        return bytes(found["result"])
-    # Files have the names that the page gave them, wherever a text mentions them.
-    return json.dumps(found).replace(json.dumps(f"{current.folder}/")[1:-1], "")
+        answer = {"error": f"{type(error).__name__}: {error}"}
+    if isinstance(answer.get("result"), bytes):
+        return bytes(answer["result"])
+    # Texts mention files by the page's names, without the folder.
+    return json.dumps(answer).replace(json.dumps(f"{current.folder}/")[1:-1], "")

@@ -1,6 +1,6 @@
 """The playground as files: the page, rules as WebAssembly modules, start worlds, and the compiler for Pyodide.
 
-The server shows them on loopback: only GET, only files of the site, only for pages of this server.
+The server listens on loopback: only GET, only files of the site, only for pages of this server.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from powderdsl.worlds.strewn import frame_element, random_shape, strew
 HERE = Path(__file__).parent
 PAGE = HERE / "page"
 PARTS = HERE / "parts"
-"""What `make web` fetches from npm: Pyodide and CodeMirror, with their licenses. Git ignores the folder."""
+"""Pyodide and CodeMirror, with their licenses, which `make web` fetches from npm. Git ignores the folder."""
 
 MADE = HERE / "made"
 """Files about shipped rules, which `make wheel` compiles, so that the page of an installed wheel opens at once."""
@@ -70,7 +70,7 @@ LIBRARIES = ("click", "lark", "pyyaml")
 
 @dataclass(frozen=True)
 class Entry:
-    """Rules that the page offers. `names` is what `load` takes; `world` is a start world of the user's, which comes first."""
+    """Rules that the page offers. `names` are the arguments of `load`; `world` is the user's start world, offered first."""
 
     key: str
     names: tuple[str, ...]
@@ -83,7 +83,7 @@ class Entry:
 
     @property
     def words(self) -> list[str]:
-        """The rulesets and packs that are named."""
+        """The rulesets and packs in the names."""
         return [word for name in self.names for word in split_names(name)[0]]
 
     @property
@@ -93,36 +93,38 @@ class Entry:
 
     @property
     def about(self) -> str:
-        """The sentence of the last file that is named: a ruleset, or a pack on top of one."""
+        """The sentence of the last named file: a ruleset, or a pack added to one."""
         packs, ruleset = read(self.words[-1:], Reporter())
         return packs[-1].about if ruleset is None else ruleset.about
 
     def files(self) -> dict[str, str]:
-        """The rule files by name, rulesets first; packs are found beside the ruleset that lists them."""
+        """The rule files by name, rulesets first."""
         packs, ruleset = read(self.words, Reporter())
         sources = [pack.source for pack in packs]
         if ruleset is not None:
-            sources = [one.source for whole in (ruleset, *ruleset.beside) for one in whole.lineage] + sources
+            rulesets = [base for top in (ruleset, *ruleset.beside) for base in top.lineage]
+            sources = [*(base.source for base in rulesets), *sources]
         return {Path(source.name).name: source.text for source in sources}
 
     @property
     def is_shipped(self) -> bool:
-        """Whether they are the shipped rules of that name, as they are."""
+        """True if these are the unmodified shipped rules of that name."""
         return self.names == (self.key,) and not self.params and self.world is None
 
 
 def shipped_entries() -> list[Entry]:
-    """The shipped rules that stand by themselves, then each example pack on top of the first ones.
+    """The shipped rules that load alone, except variants, then each example pack added to the first rules.
 
-    Those that most tasks use come first, then those with the most elements. Variants of others, which extend them, are
-    left out.
+    Rules that most tasks use come first, then rules with the most elements.
     """
     tasks = "\n".join(path.read_text(encoding="utf-8") for path in sorted(shipped("tasks").glob("*.yaml")))
     used = Counter(re.findall(r"^rules: *(\S+)", tasks, re.MULTILINE))
     variants = shipped_variants()
-    found = [Entry(name, (name,)) for name in shipped_tests() if name not in variants]
-    found.sort(key=lambda one: (-used[one.key], -len(one.ruleset.elements)))
-    return found + [_example(path.stem, found[0].key) for path in sorted(examples_folder().glob("*.yaml"))]
+    entries = [Entry(name, (name,)) for name in shipped_tests() if name not in variants]
+    entries.sort(key=lambda entry: (-used[entry.key], -len(entry.ruleset.elements)))
+    return entries + [
+        _example(path.stem, entries[0].key) for path in sorted(examples_folder().glob("*.yaml"))
+    ]
 
 
 def _example(stem: str, rules: str) -> Entry:
@@ -139,26 +141,26 @@ Make = Callable[[], bytes]
 
 
 def shipped_files() -> dict[str, Make]:
-    """What makes each file about shipped rules: the catalog, start worlds of tasks, sheets and modules."""
+    """The makers of files about shipped rules: the catalog, start worlds of tasks, sheets and modules."""
     rows = _shipped_rows()
-    found: dict[str, Make] = {"tasks.json": partial(kept, "tasks.json", lambda: _dump(task_worlds()))}
+    makers: dict[str, Make] = {"tasks.json": partial(cached, "tasks.json", lambda: _dump(task_worlds()))}
     memo = Memo()
     for row in rows:
         key = row["key"]
         entry = _example(key, rows[0]["key"]) if row["example"] else Entry(key, (key,))
         for path, make in _files_of(entry, [tuple(size) for size in row["sizes"]], memo).items():
-            found[path] = partial(kept, path, make)
-    return found
+            makers[path] = partial(cached, path, make)
+    return makers
 
 
 def _shipped_rows() -> list[dict[str, Any]]:
     rows: list[dict[str, Any]]
-    rows = json.loads(kept("shipped.json", lambda: _dump([_row(entry) for entry in shipped_entries()])))
+    rows = json.loads(cached("shipped.json", lambda: _dump([_row(entry) for entry in shipped_entries()])))
     return rows
 
 
 def _row(entry: Entry) -> dict[str, Any]:
-    """A row of the catalog: sizes are those for which there is a module, that of the user's world first."""
+    """A row of the catalog: `sizes` are the sizes of modules, first that of the user's world."""
     own = [] if entry.world is None else [(entry.world["rows"], entry.world["columns"])]
     sizes = dict.fromkeys([*own, *((side, side) for side in SIZES)])
     return {
@@ -171,11 +173,11 @@ def _row(entry: Entry) -> dict[str, Any]:
 
 def _files_of(entry: Entry, sizes: list[Size], memo: Memo) -> dict[str, Make]:
     """The files about some rules: a sheet, and a module for each size."""
-    found: dict[str, Make] = {f"rules/{entry.key}.json": lambda: _dump(_sheet(entry))}
+    makers: dict[str, Make] = {f"rules/{entry.key}.json": lambda: _dump(_sheet(entry))}
     for size in sizes:
-        module = partial(lambda one: standalone_module(entry.ruleset, one, memo), size)
-        found[f"rules/{entry.key}-{size[0]}x{size[1]}.wasm"] = module
-    return found
+        module = partial(lambda size: standalone_module(entry.ruleset, size, memo), size)
+        makers[f"rules/{entry.key}-{size[0]}x{size[1]}.wasm"] = module
+    return makers
 
 
 def _sheet(entry: Entry) -> dict[str, Any]:
@@ -196,7 +198,7 @@ def _sheet(entry: Entry) -> dict[str, Any]:
 
 
 class Site:
-    """All files of the page, made when they are asked for. `first`: rules that the page opens with."""
+    """All files of the page, made on request. `first`: the rules that the page opens with."""
 
     def __init__(self, first: Entry | None = None):
         self.first = first
@@ -207,25 +209,25 @@ class Site:
         rows = _shipped_rows()
         if self.first is None:
             return rows
-        known = [row for row in rows if row["key"] == self.first.key]
-        own = known[0] if known and self.first.is_shipped else _row(self.first)
-        return [own, *(row for row in rows if row not in known)]
+        same = [row for row in rows if row["key"] == self.first.key]
+        own = same[0] if same and self.first.is_shipped else _row(self.first)
+        return [own, *(row for row in rows if row not in same)]
 
     @cached_property
     def files(self) -> dict[str, Make]:
-        """What makes each file, by its path in the site."""
-        found: dict[str, Make] = {}
-        for folder, below in ((PAGE, ""), (PARTS, "parts/")):
+        """The makers of files, by path in the site."""
+        makers: dict[str, Make] = {}
+        for folder, prefix in ((PAGE, ""), (PARTS, "parts/")):
             for path in sorted(folder.rglob("*")):
                 if path.is_file():
-                    found[below + path.relative_to(folder).as_posix()] = path.read_bytes
-        found["index.html"], found["python.zip"] = index_page, python_archive
-        found["licenses.txt"] = licenses
-        found |= shipped_files()
-        if self.first is not None and not (self.first.is_shipped and self.start in found):
+                    makers[prefix + path.relative_to(folder).as_posix()] = path.read_bytes
+        makers["index.html"], makers["python.zip"] = index_page, python_archive
+        makers["licenses.txt"] = licenses
+        makers |= shipped_files()
+        if self.first is not None and not (self.first.is_shipped and self.start in makers):
             own = _files_of(self.first, self.rows[0]["sizes"], Memo())
-            found |= {path: cache(make) for path, make in own.items()}
-        return found | {"catalog.json": lambda: _dump({"format": 1, "rules": self.rows})}
+            makers |= {path: cache(make) for path, make in own.items()}
+        return makers | {"catalog.json": lambda: _dump({"format": 1, "rules": self.rows})}
 
     @property
     def start(self) -> str:
@@ -239,14 +241,14 @@ class Site:
         return None if make is None else make()
 
     def write(self, folder: Path) -> int:
-        """Write all files, and return how many there are. Raises CompileError (PD613) where that fails."""
+        """Write all files, and return their number. Raises CompileError (PD613) if a file cannot be written."""
         for name, make in self.files.items():
             _write(folder / name, make())
         return len(self.files)
 
 
 class SiteServer(ThreadingHTTPServer):
-    """Serves one site. A file that takes long to make does not hold others up."""
+    """Serves one site, with a thread for each request, since some files take long to make."""
 
     daemon_threads = True
 
@@ -267,7 +269,9 @@ class _Handler(BaseHTTPRequestHandler):
         own = {f"{name}:{self.server.server_port}" for name in (ADDRESS, "localhost")}
         origin = self.headers.get("Origin")
         # A page elsewhere can neither name this server (Host) nor read it from its own origin (Origin).
-        if self.headers.get("Host") not in own or (origin and origin not in {f"http://{one}" for one in own}):
+        if self.headers.get("Host") not in own or (
+            origin and origin not in {f"http://{host}" for host in own}
+        ):
             self._answer(HTTPStatus.FORBIDDEN, b"this server answers its own page only", "txt")
             return
         path = unquote(urlsplit(self.path).path).lstrip("/") or "index.html"
@@ -315,10 +319,10 @@ def _dump(value: Any) -> bytes:
     return json.dumps(value, ensure_ascii=False, separators=(",", ":")).encode()
 
 
-def kept(name: str, make: Make) -> bytes:
-    """A file about shipped rules, made once for the code as it is."""
+def cached(name: str, make: Make) -> bytes:
+    """A file about shipped rules, made once for a version of the code."""
     try:
-        folder = _store()
+        folder = _cache_folder()
     except OSError:
         return make()
     if not (folder / name).is_file():
@@ -326,10 +330,10 @@ def kept(name: str, make: Make) -> bytes:
     return (folder / name).read_bytes()
 
 
-def _store() -> Path:
-    """The folder of files that this code has made: in the installation, or else in the user's cache.
+def _cache_folder() -> Path:
+    """The folder of files made by this code: in the installation, or else in the user's cache.
 
-    There, those of other code go. Raises OSError if the user has no private cache.
+    Files of other versions are removed from the cache. Raises OSError if the user has no private cache.
     """
     version = MADE / "version.txt"
     if version.is_file() and version.read_text(encoding="utf-8") == code_version():
@@ -351,27 +355,27 @@ def write_made() -> None:
 
 @cache
 def code_version() -> str:
-    """A number that changes with any module of powderdsl, and with the rules, tasks and examples that it has."""
-    found = hashlib.sha256()
+    """A hash of all modules of powderdsl, and of its rules, tasks and examples."""
+    digest = hashlib.sha256()
     code = {*HERE.parent.rglob("*.py"), *HERE.parent.rglob("*.lark")}
     folders = shipped("rules"), shipped("tasks"), examples_folder()
     texts = [path for folder in folders for path in sorted(folder.rglob("*.yaml"))]
     for path in sorted(code) + sorted(texts):
-        found.update(path.read_bytes())
-    return found.hexdigest()[:16]
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def licenses() -> bytes:
-    """The licenses of powderdsl, of the packages beside it in Pyodide, and of the parts from npm."""
-    found = []
+    """The licenses of powderdsl, of the packages that it needs in Pyodide, and of the parts from npm."""
+    sections = []
     for library in ("powderdsl", *LIBRARIES):
         about = metadata.distribution(library)
         files = [file for file in about.files or () if "licenses" in file.parts]
         texts = [Path(str(file.locate())).read_text(encoding="utf-8") for file in files]
-        found.append("\n\n".join([f"{about.name} {about.version}", *texts]))
+        sections.append("\n\n".join([f"{about.name} {about.version}", *texts]))
     for path in sorted((PARTS / "licenses").glob("*.txt")):
-        found.append(f"{path.stem}\n\n{path.read_text(encoding='utf-8')}")
-    return f"\n\n{'-' * 80}\n\n".join(found).encode()
+        sections.append(f"{path.stem}\n\n{path.read_text(encoding='utf-8')}")
+    return f"\n\n{'-' * 80}\n\n".join(sections).encode()
 
 
 ABSENT = (
@@ -385,12 +389,12 @@ ABSENT = (
     "web/parts",
     "web/made",
 )
-"""Parts of powderdsl that need torch, and the page itself: Pyodide does without them."""
+"""Parts of powderdsl that Pyodide does not need: those that require torch, and the page itself."""
 
 
 @cache
 def python_archive() -> bytes:
-    """A zip of powderdsl and the packages that it needs, to be unpacked in Pyodide."""
+    """A zip of powderdsl and the packages that it needs, for Pyodide."""
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
         for path in sorted(HERE.parent.rglob("*")):
@@ -410,7 +414,7 @@ def python_archive() -> bytes:
 
 
 def _add(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
-    """A file with a fixed date: the same files make the same archive."""
+    """Add a file with a fixed date, so that equal files make equal archives."""
     entry = zipfile.ZipInfo(name, (2000, 1, 1, 0, 0, 0))
     entry.compress_type = zipfile.ZIP_DEFLATED
     archive.writestr(entry, data)
@@ -418,32 +422,30 @@ def _add(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
 
 # The start worlds that the page offers with rules
 
-
 SIDE = 64
-"""Rows and columns of worlds that have no size of their own."""
+"""Rows and columns of worlds without a given size."""
 
 OWN_SHAPES = 12
 """Shapes of an added pack's own elements."""
 
 
 def offered_worlds(ruleset: Ruleset, names: Sequence[str]) -> tuple[list[dict[str, Any]], str]:
-    """Worlds with `name`, `about` and what `world_data` has; and the name of the world that shows the rules best.
+    """Worlds with `name`, `about` and the keys of `world_data`; and the name of the world that shows the rules best.
 
-    `names` is what `load` takes: an added pack gets a world with its elements.
+    `names` are the arguments of `load`: an added pack gets a world with its elements.
     """
-    found = [*_scenes(ruleset)]
-    shown = found[-1]["name"] if found else "shapes"
-    found.append(
-        _named("shapes", "Random shapes of all elements.", ruleset, strew(ruleset, (SIDE, SIDE), 1, 0)[0])
-    )
+    worlds = [*_scenes(ruleset)]
+    shown = worlds[-1]["name"] if worlds else "shapes"
+    shapes = strew(ruleset, (SIDE, SIDE), 1, 0)[0]
+    worlds.append(_named("shapes", "Random shapes of all elements.", ruleset, shapes))
     if not unchanging_ids(ruleset):
         noise = Random(0).choices([element.id for element in ruleset.elements], k=SIDE * SIDE)
         ids = np.array(noise, np.uint8).reshape(SIDE, SIDE)
-        found.append(_named("noise", "Every cell at random.", ruleset, ids))
+        worlds.append(_named("noise", "Every cell at random.", ruleset, ids))
     if len(names) > 1:
-        found.append(_own(ruleset))
-        shown = found[-1]["name"]
-    return found, shown
+        worlds.append(_pack_world(ruleset))
+        shown = worlds[-1]["name"]
+    return worlds, shown
 
 
 def _named(name: str, about: str, ruleset: Ruleset, ids: Any, fields: Any = None) -> dict[str, Any]:
@@ -457,24 +459,24 @@ def _scenes(ruleset: Ruleset) -> Iterator[dict[str, Any]]:
             start = draw_start(scene, ruleset)
         except CompileError:
             continue
-        fields = {name: given.values for name, given in start.fields.items()}
+        fields = {name: field.values for name, field in start.fields.items()}
         yield _named(scene.name, scene.about or "", ruleset, start.ids, fields)
 
 
 def task_worlds() -> dict[str, list[dict[str, Any]]]:
     """The first world of each shipped task's first split, by the rules of the tasks."""
     kind = ArrayKind()
-    found: dict[str, list[dict[str, Any]]] = {}
+    worlds: dict[str, list[dict[str, Any]]] = {}
     for name in shipped_tasks():
         task = load_task(name)
-        made = StartWorlds(task, task.splits[0].name, kind).make(np.array([0], np.int64))
-        world = _named(f"task {name}", task.about, task.ruleset, np.asarray(made.ids)[0])
-        found.setdefault("+".join(task.rules), []).append(world)
-    return found
+        starts = StartWorlds(task, task.splits[0].name, kind).make(np.array([0], np.int64))
+        world = _named(f"task {name}", task.about, task.ruleset, np.asarray(starts.ids)[0])
+        worlds.setdefault("+".join(task.rules), []).append(world)
+    return worlds
 
 
-def _own(ruleset: Ruleset) -> dict[str, Any]:
-    """Shapes of all elements, and more of those of the pack that was added last."""
+def _pack_world(ruleset: Ruleset) -> dict[str, Any]:
+    """Shapes of all elements, and more shapes of the pack that was added last."""
     pack = ruleset.packs[-1]
     own = [element.id for element in ruleset.elements if element.pack == pack]
     ids = strew(ruleset, (SIDE, SIDE), 1, 1)[0]

@@ -14,7 +14,7 @@ from powderdsl.system.writing import failure
 from powderdsl.worlds.raster import MAX_CELLS
 
 MAX_BYTES = 4 * MAX_CELLS
-"""The largest file that is read: the largest world, with room between its cells."""
+"""The largest file that is read: the largest world, with whitespace between its cells."""
 
 
 def parse_ascii(
@@ -22,13 +22,14 @@ def parse_ascii(
 ) -> NDArray[np.uint8] | None:
     """The ids uint8 [H, W] of a drawing in a text, or None after reporting mistakes.
 
-    `legend` gives characters to elements by name and wins over their glyphs. Empty lines are skipped. Raises
-    CompileError (PD604) if the legend names an unknown element.
+    `legend` maps characters to names of elements and overrides their glyphs. Empty lines are skipped. Raises CompileError
+    (PD604) if the legend names an unknown element.
     """
     ids = _characters(elements, legend or {})
     rows: list[str] = []
     offset, good = art.start, True
     seen: set[str] = set()
+    names = {element.id: element.name for element in elements}
     for line in art.text.splitlines(keepends=True):
         start, offset = offset, offset + len(line)
         cells = "".join(line.split())
@@ -37,9 +38,9 @@ def parse_ascii(
         unknown = set(cells) - ids.keys()
         for character in sorted(unknown - seen):
             place = start + line.index(character)
-            span, helps = Span(art.source, place, place + 1), [f"known: {_known(ids, elements)}"]
-            message = f"unknown character `{character}`"
-            reporter.error("PD610", message, span, "no element has it", helps=helps)
+            known = "  ".join(f"{character} {names[number]}" for character, number in ids.items())
+            span, message = Span(art.source, place, place + 1), f"unknown character `{character}`"
+            reporter.error("PD610", message, span, "no element has it", helps=[f"known: {known}"])
         seen |= unknown
         uneven = bool(rows) and len(cells) != len(rows[0])
         if uneven:
@@ -80,7 +81,7 @@ def load_ascii(path: str | Path, elements: Sequence[Element]) -> NDArray[np.uint
 
 
 def write_ascii(ids: Any, elements: Sequence[Element]) -> str:
-    """Rows of characters for ids [H, W], each ended by a line break. `read_ascii` reads it back with the same elements."""
+    """Rows of characters for ids [H, W], each with a line break. `read_ascii` with the same elements reverses this."""
     characters = {number: character for character, number in _characters(elements, {}).items()}
     return "".join("".join(map(characters.__getitem__, row)) + "\n" for row in ids.tolist())
 
@@ -92,7 +93,7 @@ def ids_by_name(elements: Sequence[Element]) -> dict[str, int]:
 
 
 def _characters(elements: Sequence[Element], legend: Mapping[str, str]) -> dict[str, int]:
-    """Element ids by character: the legend's, then the glyphs that it does not use."""
+    """Element ids by character: the legend's characters, then glyphs that the legend does not use."""
     by_name = ids_by_name(elements)
     characters: dict[str, int] = {}
     for character, name in legend.items():
@@ -103,8 +104,3 @@ def _characters(elements: Sequence[Element], legend: Mapping[str, str]) -> dict[
     for element in elements:
         characters.setdefault(element.glyph, element.id)
     return characters
-
-
-def _known(ids: Mapping[str, int], elements: Sequence[Element]) -> str:
-    names = {element.id: element.name for element in elements}
-    return "  ".join(f"{character} {names[number]}" for character, number in ids.items())

@@ -19,19 +19,20 @@ from powderdsl.system.writing import failure
 from powderdsl.worlds.raster import MAX_CELLS
 
 MAX_REPORTED = 8
-"""Wrong colors that are named one at a time. A smoothed picture has thousands."""
+"""The most wrong colors that are reported separately. A smoothed picture has thousands."""
 
 _MODES = ("1", "L", "LA", "P", "RGB", "RGBA")
-"""Pixel formats of eight bits or fewer: those with more have colors that no element can have."""
+"""Pixel formats of at most eight bits: other formats have colors that no element can have."""
 
 
 def read_image(path: str | Path, elements: Sequence[Element]) -> NDArray[np.uint8]:
-    """The ids uint8 [H, W] of a PNG file, as `simulation.media.write_png` writes of `simulation.draw.rgb`. Raises CompileError.
+    """The ids uint8 [H, W] of a PNG file, such as `simulation.media.write_png` writes from `simulation.draw.rgb`.
 
     Colors of a ramp mean its element; the values of its field are not read.
 
-    PD609 names every pixel color that is not an element's (and the nearest element), PD607 a picture of too many
-    pixels, which is not decoded, PD602 a file that is not a PNG, PD101 one that cannot be read.
+    Raises:
+        CompileError: PD609 for pixel colors without an element, PD607 for too many pixels, PD602 for a file that is not a
+            PNG, PD101 for a file that cannot be read.
     """
     path = Path(path)
     # Four bytes a pixel as one number: red lowest, opacity highest.
@@ -44,13 +45,13 @@ def read_image(path: str | Path, elements: Sequence[Element]) -> NDArray[np.uint
         for color in sorted({_pack(bytes(row[:3])) for row in ramp.colors} - own):
             owners.setdefault(color, []).append(by_id[ramp.id])
     colors = np.array(sorted(owners), dtype=np.uint32)
-    meant = np.array([owners[color][0].id for color in sorted(owners)], dtype=np.uint8)
-    clear = np.array([len(owners[color]) == 1 for color in sorted(owners)])
+    ids = np.array([owners[color][0].id for color in sorted(owners)], dtype=np.uint8)
+    unique = np.array([len(owners[color]) == 1 for color in sorted(owners)])
     place = np.searchsorted(colors, packed).clip(max=len(colors) - 1)
-    known = (colors[place] == packed) & clear[place]
+    known = (colors[place] == packed) & unique[place]
     if not known.all():
         raise CompileError(_wrong_colors(path, packed, known, owners))
-    return meant[place]
+    return ids[place]
 
 
 def _wrong_colors(
@@ -98,7 +99,7 @@ _BROKEN = (OSError, ValueError, SyntaxError, EOFError, IndexError, OverflowError
 def _decode(file: BinaryIO, path: Path, images: Any) -> NDArray[np.uint8]:
     with warnings.catch_warnings():
         warnings.simplefilter("error", images.DecompressionBombWarning)
-        image = images.open(file, formats=["PNG"])  # reads the header alone
+        image = images.open(file, formats=["PNG"])  # reads only the header
     width, height = image.size
     if height * width > MAX_CELLS:
         raise _too_large(path, f"{height}×{width}")

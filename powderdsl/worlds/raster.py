@@ -1,7 +1,7 @@
-"""Shapes, and which cells of a grid they cover. Rows come first and count downwards; everything is exact.
+"""Shapes, and the cells of a grid that they cover. Rows come first and count downwards; all results are exact.
 
-In each column a shape covers one run of rows, so its formula gives the first row and the one after the last. The
-formulas use only what NumPy and torch call by the same names: one shape of a scene, or one for each world of a batch.
+In each column, a shape covers one run of rows, so its formula returns the first row and the row after the last. The
+formulas use only functions with the same names in NumPy and torch: for one shape, or a shape for each world of a batch.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ MAX_COORDINATE = 1 << 24
 """Coordinates, widths and radii lie within ±MAX_COORDINATE, so that int64 holds every product below."""
 
 FAR = 1 << 40
-"""Beyond every row."""
+"""A number beyond every row."""
 
 MOST = 1 << 62
-"""No number below is larger."""
+"""An upper bound of all numbers below."""
 
 Size = tuple[int, int]
 """(rows, columns)."""
 
 Rows = tuple[Any, Any]
-"""In each column the first row, and the one after the last. Without rows the first is not smaller."""
+"""The first row in each column, and the row after the last. A run is empty if the first is not smaller."""
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A set of cells. `numbers` stand in the order of `scene.statements.NUMBERS`; None is an open end of a range.
+    """A set of cells. `numbers` are in the order of `scene.statements.NUMBERS`; None is an open end of a range.
 
-    Kinds: ``line``, ``disk``, ``square``, ``box``, ``ramp``, ``arch``, ``container`` and ``wave``, as the functions of
-    these names below say; ``frame``, the outermost cells of the grid, whatever its size; ``fill``, all cells.
+    Kinds: ``line``, ``disk``, ``square``, ``box``, ``ramp``, ``arch``, ``container`` and ``wave``, defined by the functions
+    of these names below; ``frame``, the outermost cells of the grid; ``fill``, all cells.
     """
 
     kind: str
@@ -57,7 +57,7 @@ class Paint:
 
 @dataclass(frozen=True)
 class Setting:
-    """A statement that gives the field `name` a value in the cells of `shape`: a word as `model.examples.read_word` reads it."""
+    """A statement that sets the field `name` in the cells of `shape` to a value, a word for `model.examples.read_word`."""
 
     name: str
     value: str
@@ -80,26 +80,23 @@ def mask(shape: Shape, size: Size) -> NDArray[np.bool_]:
 
 
 def covered_rows(xp: Any, kind: str, numbers: Sequence[Any], column: Any, size: Size) -> Rows:
-    """The rows that a shape covers in each column. A frame has no such rows.
+    """The rows that a shape covers in each column, two values that broadcast to int64 [..., W]. Frames are not supported.
 
     Args:
         xp: numpy or torch. numbers: integers, or int64 tensors [..., 1]. column: int64 [W], of the same library.
-
-    Returns:
-        two values that broadcast to int64 [..., W].
     """
-    # An open end of rows or columns reaches to the end of the grid.
+    # An open end of rows or columns is the edge of the grid.
     ends = (0, size[0], 0, size[1])
-    n = [numbers[0] * 0 + ends[place] if one is None else one for place, one in enumerate(numbers)]
+    n = [numbers[0] * 0 + ends[i] if number is None else number for i, number in enumerate(numbers)]
     return _SHAPES[kind](xp, column, n, size)
 
 
 def _line(xp: Any, column: Any, n: Sequence[Any], size: Size) -> Rows:
-    """A thick line from a point to another, both included.
+    """A thick line between two points, both included.
 
-    It covers, at every whole step along its longer axis (the columns, where both are equally long), the cells
-    whose distance from the exact line, along the shorter one, is below ``1 + width·√(1 + slope²)/4``.
-    A line along an axis is thus three cells thick at widths 1 to 4, five at widths 5 to 8.
+    At every integer step along its longer axis (the columns, if both are equally long), it covers the cells whose
+    distance from the exact line, along the shorter axis, is below ``1 + width·√(1 + slope²)/4``. A line along an axis
+    is thus three cells thick at widths 1 to 4, five at widths 5 to 8.
 
     The cross product of a cell with the direction is the distance times the longer length, so a cell is covered where
     4·(|cross| − length) < √(width²·(down² + right²)): integers on the left, so the root may be rounded down.
@@ -110,7 +107,7 @@ def _line(xp: Any, column: Any, n: Sequence[Any], size: Size) -> Rows:
     longer = right + point
     length = xp.maximum(abs(down), abs(longer))
     bound = length + root(xp, width * width * (down * down + longer * longer) - 1) // 4
-    # Turning the line round changes nothing, so the slope may be taken to the right.
+    # Swapping the end points changes nothing, so the slope may be computed to the right.
     across = (column - left) * down * xp.where(right < 0, -1, 1)
     divisor = xp.clip(abs(longer), 1, MOST)
     upright, hit = longer == 0, abs(across) <= bound
@@ -124,7 +121,7 @@ def _line(xp: Any, column: Any, n: Sequence[Any], size: Size) -> Rows:
 
 
 def _disk(xp: Any, column: Any, n: Sequence[Any], size: Size) -> Rows:
-    """The cells nearer to the center than the radius: a disk of radius 1 is one cell."""
+    """The cells closer to the center than the radius: a disk of radius 1 is one cell."""
     row, center, radius = n
     aside = column - center
     left = radius * radius - 1 - aside * aside
@@ -133,7 +130,7 @@ def _disk(xp: Any, column: Any, n: Sequence[Any], size: Size) -> Rows:
 
 
 def _square(xp: Any, column: Any, n: Sequence[Any], size: Size) -> Rows:
-    """Rows and columns from `half` before the center up to, and without, `half` behind it: a side of 2·half."""
+    """A square of side 2·half: rows and columns from center − half to center + half − 1."""
     row, center, half = n
     return _box(xp, column, (row - half, row + half, center - half, center + half), size)
 
@@ -161,8 +158,7 @@ def _container(xp: Any, column: Any, n: Sequence[Any], size: Size) -> Rows:
 
 
 def _ramp(xp: Any, column: Any, n: Sequence[Any], size: Size) -> Rows:
-    """Between the columns of two points, both included: what lies on or below the straight line from one to the
-    other, down to the lower one's row. Points in one column make a bar."""
+    """The cells on or below the line between two points, down to the lower point's row. Points in one column make a bar."""
     top, left, bottom, end = n
     wide = abs(end - left)
     climb = (column - left) * xp.where(end > left, 1, -1) * (bottom - top)
@@ -172,7 +168,7 @@ def _ramp(xp: Any, column: Any, n: Sequence[Any], size: Size) -> Rows:
 
 
 def _wave(xp: Any, column: Any, n: Sequence[Any], size: Size) -> Rows:
-    """What lies on or below a zigzag: at column c it is in row ``row + height·u // length``, where t is c + phase
+    """The cells on or below a zigzag: at column c, it is in row ``row + height·u // length``, where t is c + phase
     modulo `length` and u is the smaller of 2·t and 2·(length − t)."""
     row, height, length, phase = n
     turn = (column + phase) % length
@@ -197,9 +193,10 @@ _SHAPES: dict[str, Callable[[Any, Any, Sequence[Any], Size], Rows]] = {
 
 
 def root(xp: Any, x: Any) -> Any:
-    """The square root of integers of 0 or more, rounded down: of one, or of arrays of numbers up to 2⁵²."""
+    """The square root of nonnegative integers, rounded down: of an int, or of arrays of numbers up to 2⁵²."""
     if isinstance(x, int):
         return isqrt(x)
-    found = xp.asarray(xp.sqrt(xp.asarray(x, dtype=xp.float64)), dtype=xp.int64)
-    found = found - (found * found > x) * 1
-    return found + ((found + 1) * (found + 1) <= x) * 1
+    # The rounded float root may be off by one in either direction.
+    result = xp.asarray(xp.sqrt(xp.asarray(x, dtype=xp.float64)), dtype=xp.int64)
+    result = result - (result * result > x) * 1
+    return result + ((result + 1) * (result + 1) <= x) * 1

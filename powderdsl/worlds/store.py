@@ -1,4 +1,4 @@
-"""Saved worlds: one .npz with a palette of qualified names, so that they load into rulesets with other ids."""
+"""Saved worlds, as .npz or JSON: a palette of qualified names lets them load into rulesets with other ids."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ CLOCK = ("seed", "index", "step")
 MAX_ABOUT = 1 << 20
 """Bytes of the header `about` of a file."""
 MORE = 1 << 24
-"""Bytes that arrays may take beyond those of twice the worlds: fields of packs that are not loaded."""
+"""Bytes of arrays allowed beyond twice the size of the worlds, for fields of packs that are not loaded."""
 
 
 def save(world: World, path: str | Path) -> None:
-    """Write worlds with everything that later steps depend on. The file appears whole or not at all.
+    """Write worlds with their state, seeds, indices and steps. The file appears whole or not at all.
 
     Raises:
-        CompileError: PD613 if the place cannot be written, PD602 if the disk is full, PD607 if there are more than
-            MAX_CELLS cells. TypeError: `world` is not a world.
+        CompileError: PD613 if the folder cannot be written, PD602 if the disk is full, PD607 if there are more than
+            MAX_CELLS cells. TypeError: `world` is not a World.
     """
     if not isinstance(world, World):
         raise TypeError(f"save takes a World, found {type(world).__name__}")
@@ -72,7 +72,7 @@ def load_world(path: str | Path, sim: Simulator) -> World:
     source = Path(path)
     try:
         with open_archive(source) as archive:
-            return _loaded(archive, sim, source)
+            return _load(archive, sim, source)
     except FileNotFoundError:
         raise _bad(source, "does not exist") from None
     except OSError as error:
@@ -81,8 +81,8 @@ def load_world(path: str | Path, sim: Simulator) -> World:
         raise _bad(source, f"is not a saved world: {' '.join(str(error).split())[:200]}") from None
 
 
-def _loaded(archive: Archive, sim: Simulator, source: Path) -> World:
-    """Worlds from an archive. Raises BadArchive, or what follows from values that nothing here has written."""
+def _load(archive: Archive, sim: Simulator, source: Path) -> World:
+    """Worlds from an archive. Raises BadArchive, or LookupError, TypeError or ValueError for malformed values."""
     palette, qualified, saved_in = _about(archive)
     shape = _shape(archive, sim, source)
     clock = {name: sim.kind.from_numpy(_clock(archive, name)) for name in CLOCK}
@@ -92,20 +92,19 @@ def _loaded(archive: Archive, sim: Simulator, source: Path) -> World:
         name = key.removeprefix(SLOT)
         if key in ("about", IDS, *CLOCK):
             continue
-        known = slot_name(sim.ruleset, qualified[name]) if name in qualified else name
-        slot = next((s for s in sim.slots if s.name == known), None)
+        own_name = slot_name(sim.ruleset, qualified[name]) if name in qualified else name
+        slot = sim.slot_by_name.get(own_name)
         if slot is None:
-            if sim.ruleset.property(known) is None and archive.read(key).any():
-                problem = (
-                    f"the field `{qualified.get(name, name)}` of {saved_in} is not in {sim.ruleset.name}"
-                )
+            if sim.ruleset.property(own_name) is None and archive.read(key).any():
+                field = qualified.get(name, name)
+                problem = f"the field `{field}` of {saved_in} is not in {sim.ruleset.name}"
                 raise _mismatch(source, problem, "load the pack that has it")
             continue
         if archive.headers[key].shape != (shape if slot.planes != 2 else (shape[0], 2, *shape[1:])):
             raise BadArchive(f"`{key}` does not fit its elements")
         value = archive.read(key)
-        fields[slot.name] = _translated(palette, value, sim, source) if slot.kind == ELEMENT else value
-    world = sim.replace(sim.world(_translated(palette, ids, sim, source)), **fields)
+        fields[slot.name] = _translate(palette, value, sim, source) if slot.kind == ELEMENT else value
+    world = sim.replace(sim.world(_translate(palette, ids, sim, source)), **fields)
     return World(sim, world.state, *clock.values())
 
 
@@ -123,21 +122,21 @@ def _about(archive: Archive) -> tuple[dict[int, str], dict[str, str], str]:
 
 
 def _shape(archive: Archive, sim: Simulator, path: Path) -> tuple[int, ...]:
-    """[worlds, rows, columns], if the arrays are not larger than those of such worlds can be."""
+    """[worlds, rows, columns]. Raises BadArchive if the arrays are larger than such worlds can be."""
     header = archive.headers.get(IDS)
     if header is None or header.dtype != "uint8" or len(header.shape) != 3 or 0 in header.shape:
         raise BadArchive("it has no elements [worlds, rows, columns]")
     cells = prod(header.shape)
     check_saved(path, header.shape)
-    a_cell = sum(max(1, slot.planes) * np.dtype(slot.dtype).itemsize for slot in sim.slots)
+    cell_size = sum(max(1, slot.planes) * np.dtype(slot.dtype).itemsize for slot in sim.slots)
     size = sum(header.size for header in archive.headers.values())
-    if size > MORE + 2 * cells * a_cell:
+    if size > MORE + 2 * cells * cell_size:
         raise BadArchive(f"it has {size:,} bytes of arrays for {cells:,} cells")
     return header.shape
 
 
 def check_saved(path: Path, shape: tuple[int, ...]) -> None:
-    """Raises CompileError (PD607) for worlds [worlds, rows, columns] that are too many for a file."""
+    """Raise CompileError (PD607) if worlds of shape [worlds, rows, columns] have too many cells for a file."""
     if prod(shape) > MAX_CELLS:
         size = "×".join(f"{side:,}" for side in shape)
         helps = (f"the worlds of a file have at most {MAX_CELLS:,} cells together",)
@@ -155,8 +154,8 @@ def _clock(archive: Archive, name: str) -> Any:
     return values
 
 
-def _translated(palette: dict[int, str], ids: Any, sim: Simulator, path: Path) -> Any:
-    """The file's ids as ours, uint8; reports elements that we do not have."""
+def _translate(palette: dict[int, str], ids: Any, sim: Simulator, path: Path) -> Any:
+    """The file's ids as ids of the simulator's ruleset, uint8. Raises CompileError for missing elements (PD603)."""
     if ids.dtype != np.uint8:
         raise BadArchive(f"elements are bytes, found {ids.dtype}")
     ours = {element.qualified: element.id for element in sim.ruleset.elements}
@@ -181,7 +180,7 @@ def _mismatch(path: Path, problem: str, fix: str) -> CompileError:
     return failure("PD603", f"`{path}` does not fit: {problem}", helps=(fix,))
 
 
-# Worlds as JSON, as the page reads and writes them (`web/page/worlds.js`)
+# Worlds as JSON, for the page (`web/page/worlds.js`)
 
 
 def world_data(

@@ -15,18 +15,18 @@ MAX_TOTAL = 16 * MAX_CELLS
 
 
 def check_cells(batch: int, size: tuple[int, ...]) -> None:
-    """Raises CompileError (PD607) for more cells than are made at once."""
+    """Raise CompileError (PD607) for more than MAX_TOTAL cells."""
     if batch * size[0] * size[1] > MAX_TOTAL:
         many = f"{batch} worlds of {size[0]}×{size[1]} cells"
         raise failure("PD607", many, helps=(f"all worlds together have at most {MAX_TOTAL:,} cells",))
 
 
 def strew(ruleset: Ruleset, size: Size, batch: int, seed: int) -> NDArray[np.uint8]:
-    """Worlds of shapes at random places, uint8 [batch, H, W]: world i depends on `seed` and i alone.
+    """Worlds of shapes at random places, uint8 [batch, H, W]: world i depends only on `seed` and i.
 
-    The ground is the element of the lowest id. On it lie 24 disks, boxes and lines of the other elements,
-    each of them solid, or only half of its cells. If anything in the ruleset moves and some element never
-    changes, the first such element frames the world, so that nothing falls out of it.
+    The ground is the element with the lowest id. Over it are 24 disks, boxes and lines of the other elements, each solid
+    or with a random half of its cells. If any element moves and another never changes, the first unchanging element frames
+    the world, so that nothing falls out of it.
     """
     height, width = size
     check_cells(batch, size)
@@ -67,7 +67,7 @@ def random_shape(random: Random, size: Size, reach: int) -> Shape:
 
 
 def frame_element(ruleset: Ruleset, ground: int) -> int | None:
-    """The id of the element that frames random worlds; None if nothing moves or everything changes."""
+    """The id of the element that frames random worlds; None if nothing moves or all elements change."""
     if not moved_ids(ruleset):
         return None
     return min(unchanging_ids(ruleset) - {ground}, default=None)

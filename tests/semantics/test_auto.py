@@ -194,7 +194,7 @@ def test_without_native_code_the_first_backend_continues(
         lambda: None,
         fails,
     )
-    native._tell_of_compilers.cache_clear()
+    native._warn_of_compilers.cache_clear()
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         for start in range(50):

@@ -12,7 +12,7 @@ import pytest
 from powderdsl.compiler import load
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import World, compile
-from powderdsl.simulation.tracing import Asked, RecordedStep, Trace, pick, trace, trace_data, trace_text
+from powderdsl.simulation.tracing import Attempt, RecordedStep, Trace, pick, trace, trace_data, trace_text
 from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.semantics.test_differential import seeded_ruleset
@@ -59,7 +59,7 @@ def traced(body: str, drawing: str, row: int, column: int, of: str = "element", 
     return trace(world_of(lab(body), drawing, **fields), row, column, of=[of])
 
 
-def only_miss(found: Trace) -> Asked:
+def only_miss(found: Trace) -> Attempt:
     assert len(found.misses) == 1, found.misses
     return found.misses[0]
 
@@ -78,16 +78,16 @@ def test_a_swap_names_its_rule_and_both_sources():
         (write,) = found.writes
         assert write.how == "arrive"
         assert write.source == source
-        assert write.asked is not None
-        assert write.asked.cell == (0, 0)
-        assert write.asked.rule.span.line == line_of(lab(body), "swap below")
-        assert values(write.asked.parts) == {
+        assert write.attempt is not None
+        assert write.attempt.cell == (0, 0)
+        assert write.attempt.rule.span.line == line_of(lab(body), "swap below")
+        assert values(write.attempt.parts) == {
             "element": "rock",
             "weight": 5,
             "below.weight": 1,
             "below": "void",
         }
-        assert found.writer() is write.asked.rule
+        assert found.writer() is write.attempt.rule
 
 
 def test_content_that_moves_brings_its_fields_as_assignments_left_them():
@@ -102,11 +102,11 @@ def test_content_that_moves_brings_its_fields_as_assignments_left_them():
 def test_a_push_and_an_effect_name_the_cell_whose_condition_held():
     found = traced("do: push gale by 3 away from bomb", ".b.", 0, 0, "gale")
     (write,) = found.writes
-    assert write.asked is not None
-    assert write.asked.cell == (0, 1)
+    assert write.attempt is not None
+    assert write.attempt.cell == (0, 1)
     assert write.after.tolist() == [0, -3]
     found = traced("do: rock -> void, then right.mark += 2", "o.", 0, 1, "mark")
-    assert [(one.how, one.asked.cell, int(one.after)) for one in found.writes if one.asked] == [
+    assert [(one.how, one.attempt.cell, int(one.after)) for one in found.writes if one.attempt] == [
         ("effect", (0, 0), 2)
     ]
 
@@ -145,7 +145,7 @@ def test_a_count_names_the_neighbors_it_found():
     assert (read.value, read.counted) == (2, ((0, 0), (1, 2)))
     found = traced("do: rock -> moth if count(bomb) > 2", "b../bob/...", 1, 1)
     assert not found.misses
-    asked = found.writes[0].asked
+    asked = found.writes[0].attempt
     assert asked is not None
     assert asked.parts[1].reads[0].counted == ((0, 0), (1, 0), (1, 2))
 
@@ -153,7 +153,7 @@ def test_a_count_names_the_neighbors_it_found():
 def test_a_let_is_taken_apart_as_it_was_fixed():
     body = "let: {ready: rock and count(bomb) > 0 and below is void}\ndo: bomb -> void\nthen: rock -> moth if ready"
     found = traced(body, "ob/..", 0, 0)
-    asked = found.writes[0].asked
+    asked = found.writes[0].attempt
     assert asked is not None
     assert {part.let for part in asked.parts} == {
         None,
@@ -208,7 +208,7 @@ def test_whatever_happens_can_be_printed(first):
         found = trace(world, seed % 3, seed % 4, 2, every_rule=True)
         data = json.loads(json.dumps(trace_data(found), allow_nan=False))
         assert len(data["writes"]) == len(found.writes)
-        assert all(part.holds for write in found.writes if write.asked for part in write.asked.parts)
+        assert all(part.holds for write in found.writes if write.attempt for part in write.attempt.parts)
         text = trace_text(found)
         assert text.startswith(f"cell {seed % 3},{seed % 4} in step")
         assert text.count("but for") == len(found.misses)
@@ -231,11 +231,11 @@ def explained(ruleset: Ruleset, shape: tuple[int, int, int], seed: int) -> int:
                 for write in writes:
                     if write.slot.name == name:
                         assert np.array_equal(write.before, held), (name, cell, write)
-                        assert write.changed or write.asked is not None
+                        assert write.changed or write.attempt is not None
                         held = write.after
                 assert np.array_equal(held, pick(after[name].numpy(), cell)), (name, cell)
             for write in writes:
-                if write.asked is not None:
-                    assert write.asked.happened
+                if write.attempt is not None:
+                    assert write.attempt.happened
                     count += 1
     return count

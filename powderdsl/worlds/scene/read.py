@@ -59,7 +59,7 @@ SIZE_RULE = f"a world has at least one row and one column, and at most {MAX_CELL
 
 @dataclass(frozen=True)
 class Scene:
-    """A drawn world. Elements are names as written: only `draw_start` needs to know a ruleset."""
+    """A drawn world. Elements are names as written: only `draw_start` needs a ruleset."""
 
     name: str
     about: str
@@ -71,7 +71,7 @@ class Scene:
 
 
 def read_scenes(source: Source, reporter: Reporter) -> tuple[Scene, ...]:
-    """The scenes of a file. Everything but element names is checked; what is wrong goes to the reporter."""
+    """The scenes of a file. All but element names is checked; mistakes go to the reporter."""
     tree = read_tree(source, reporter, "a scene starts with `scene: NAME`")
     if tree is None:
         return ()
@@ -103,16 +103,16 @@ def _read_scene(node: yaml_tree.Node, reader: Reader) -> Scene | None:
     name = node.get("scene") if isinstance(node, yaml_tree.Mapping) else None
     size = None if decl.size is None else _read_size(decl.size, reader.reporter)
     paints = () if decl.draw is None else _read_statements(decl.draw, reader)
-    for one in paints if size else ():
-        if size and not mask(one.shape, size).any():
-            covers_nothing(one.span, "nothing of it lies", size, reader.reporter)
+    for paint in paints if size else ():
+        if size and not mask(paint.shape, size).any():
+            covers_nothing(paint.span, "nothing of it lies", size, reader.reporter)
     if name is None or not (decl.name and size and decl.fill):
         return None
     return Scene(decl.name, decl.about, size, decl.fill.text, paints, name.span, decl.fill.span)
 
 
 def two_integers(node: yaml_tree.Node) -> Size | None:
-    """The numbers of a list of two integers of 0 or more, or None."""
+    """The numbers of a list of two nonnegative integers, or None."""
     items = node.items if isinstance(node, yaml_tree.Sequence) else ()
     words = [item.text for item in items if isinstance(item, yaml_tree.Scalar)]
     numbers = [int(word) for word in words if re.fullmatch(r"[0-9]{1,9}", word)]
@@ -134,7 +134,7 @@ def _read_size(node: yaml_tree.Node, reporter: Reporter) -> Size | None:
 
 
 def covers_nothing(span: Span | None, what: str, size: Size, reporter: Reporter) -> None:
-    """Report a shape of which nothing lies in the world."""
+    """Report a shape that covers no cell of the world."""
     rows, columns = size
     reporter.error(
         "PD608",
@@ -161,11 +161,11 @@ def _read_statements(node: yaml_tree.Node, reader: Reader) -> tuple[Paint | Sett
         spans = _lines(node.content)
     elif not (isinstance(node, yaml_tree.Scalar) and node.text == ""):
         reader.shape(node, "a list of statements", "write `draw:` and below it one `- statement` a line")
-    return tuple(one for span in spans if (one := parse_statement(span, reader.reporter)))
+    return tuple(paint for span in spans if (paint := parse_statement(span, reader.reporter)))
 
 
 def not_a_statement(item: yaml_tree.Mapping, reporter: Reporter, fix: str) -> None:
-    """Report a mapping where a statement should stand."""
+    """Report a mapping in place of a statement."""
     message, label = "YAML reads this statement as a mapping", "a `:` at the end of a word makes it a key"
     reporter.error("PD605", message, first_line(item), label, helps=[fix])
 
@@ -202,7 +202,7 @@ def parse_statement(span: Span, reporter: Reporter) -> Paint | Setting | None:
 
 
 def _fixed(statement: Statement, usage: str, reporter: Reporter) -> Shape | None:
-    """The shape of a statement, or None after reporting what only generators of tasks may say."""
+    """The shape of a statement, or None after reporting syntax that only generators of tasks support."""
     faults: list[tuple[Span, str]] = []
     if statement.choice is not None and statement.choice.kind != "element":
         faults.append((statement.choice.span, "one element, by its name"))
@@ -224,7 +224,7 @@ def _fixed(statement: Statement, usage: str, reporter: Reporter) -> Shape | None
 
 
 def _varies(written: Syntax) -> bool:
-    """Return True if a number is named or drawn."""
+    """True if a number is named or drawn."""
     return written.kind in ("name", "range") or any(map(_varies, written.children))
 
 
@@ -247,8 +247,8 @@ class Start:
 def load_start(path_or_name: str | Path, ruleset: Ruleset, *, size: Size | None = None) -> Start:
     """The start world of a scene: a file, ``FILE#NAME`` for one of several, or a shipped scene's name.
 
-    With another `size` shapes stay where they are, a frame and open ends follow the edge. Raises CompileError
-    with everything that is wrong.
+    With another `size` (rows, columns), shapes keep their cells; frames and open ends follow the edge. Raises CompileError
+    with all mistakes.
     """
     return draw_start(find_scene(path_or_name), ruleset, size=size)
 
@@ -303,8 +303,8 @@ def read_file(path: Path) -> tuple[Scene, ...]:
 def draw_start(scene: Scene, ruleset: Ruleset, *, size: Size | None = None) -> Start:
     """The start world of a scene.
 
-    Statements follow one another: a field is set in the cells of its shape whose element can have it, and an
-    element that is painted later is fresh there.
+    Statements run in order: a field is set in the cells of its shape whose element can have it; painting an element later
+    resets the fields there.
 
     Raises:
         CompileError: unknown elements (PD604) or fields (PD301), values of another kind (PD110) or out of range
@@ -316,63 +316,67 @@ def draw_start(scene: Scene, ruleset: Ruleset, *, size: Size | None = None) -> S
     reporter, ids = Reporter(), ids_by_name(ruleset.elements)
     # Scenes may use qualified names of fields, worlds do not.
     paints = [
-        replace(one, name=slot_name(ruleset, one.name)) if isinstance(one, Setting) else one
-        for one in scene.paints
+        replace(paint, name=slot_name(ruleset, paint.name)) if isinstance(paint, Setting) else paint
+        for paint in scene.paints
     ]
-    used = [(one.element, one.element_span) for one in paints if isinstance(one, Paint)]
+    used = [(paint.element, paint.element_span) for paint in paints if isinstance(paint, Paint)]
     for name, span in ((scene.fill, scene.fill_span), *used):
         if name not in ids:
             helps = suggest(name, {element.name for element in ruleset.elements}, "its elements")
             label = "not an element of this ruleset"
             reporter.error("PD604", f"unknown element `{name}`", span, label, helps=helps)
-    held = {slot.name: slot for slot in slots(ruleset) if slot.name != "element"}
-    values = {one: _value(one, held, ids, ruleset, reporter) for one in paints if isinstance(one, Setting)}
+    slot_of = {slot.name: slot for slot in slots(ruleset) if slot.name != "element"}
+    settings = [paint for paint in paints if isinstance(paint, Setting)]
+    values = {setting: _value(setting, slot_of, ids, ruleset, reporter) for setting in settings}
     reporter.raise_if_errors()
-    found: dict[str, FieldValues] = {}
-    for name in dict.fromkeys(one.name for one in values):
-        slot = held[name]
+    fields: dict[str, FieldValues] = {}
+    for name in dict.fromkeys(setting.name for setting in settings):
+        slot = slot_of[name]
         unset = np.zeros((2, *size) if slot.planes == 2 else size, np.dtype(slot.dtype))
-        found[name] = FieldValues(unset, np.zeros(size, np.bool_))
-    now = np.full(size, ids[scene.fill], dtype=np.uint8)
-    for one in paints:
-        cells = mask(one.shape, size)
-        if isinstance(one, Paint):
-            now[cells] = ids[one.element]
-            for name, field in found.items():
-                if held[name].travels:
+        fields[name] = FieldValues(unset, np.zeros(size, np.bool_))
+    drawn = np.full(size, ids[scene.fill], dtype=np.uint8)
+    for paint in paints:
+        cells = mask(paint.shape, size)
+        if isinstance(paint, Paint):
+            drawn[cells] = ids[paint.element]
+            for name, field in fields.items():
+                if slot_of[name].travels:
                     field.where[cells] = False
             continue
-        prop = ruleset.property(one.name)
-        limited = held[one.name].of if prop is None else prop.stored  # None: all elements have it
-        if limited is not None:
-            cells = cells & np.isin(now, sorted(limited))
+        prop = ruleset.property(paint.name)
+        owners = slot_of[paint.name].of if prop is None else prop.stored  # None: all elements have it
+        if owners is not None:
+            cells = cells & np.isin(drawn, sorted(owners))
         if not cells.any():
-            names = ", ".join(f"`{e.name}`" for e in ruleset.elements if e.id in (limited or ()))
-            label, fix = (
-                f"the shape holds nothing that has `{one.name}`",
-                f"only these have it: {names}; paint them before",
-            )
-            reporter.error("PD608", f"`{one.name}` is set in no cell", one.span, label, helps=[fix])
-        found[one.name].values[..., cells] = np.array(values[one])[:, None]
-        found[one.name].where[cells] = True
+            names = ", ".join(f"`{e.name}`" for e in ruleset.elements if e.id in (owners or ()))
+            label = f"the shape holds nothing that has `{paint.name}`"
+            fix = f"only these have it: {names}; paint them before"
+            reporter.error("PD608", f"`{paint.name}` is set in no cell", paint.span, label, helps=[fix])
+        fields[paint.name].values[..., cells] = np.array(values[paint])[:, None]
+        fields[paint.name].where[cells] = True
     reporter.raise_if_errors()
-    return Start(now, found)
+    return Start(drawn, fields)
 
 
 def _value(
-    one: Setting, held: Mapping[str, Slot], ids: Mapping[str, int], ruleset: Ruleset, reporter: Reporter
+    setting: Setting,
+    slot_of: Mapping[str, Slot],
+    ids: Mapping[str, int],
+    ruleset: Ruleset,
+    reporter: Reporter,
 ) -> tuple[float, ...]:
-    slot = held.get(one.name)
+    """The components of a setting's value; empty after a report."""
+    slot, name = slot_of.get(setting.name), setting.name
     if slot is None:
-        if ruleset.property(one.name) is not None:
+        if ruleset.property(name) is not None:
             label = "it follows from the element"
-            reporter.error("PD407", f"no rule assigns `{one.name}`", one.name_span, label)
+            reporter.error("PD407", f"no rule assigns `{name}`", setting.name_span, label)
         else:
-            helps, label = suggest(one.name, held, "its fields"), "not a field of this ruleset"
-            reporter.error("PD301", f"unknown field `{one.name}`", one.name_span, label, helps=helps)
+            helps, label = suggest(name, slot_of, "its fields"), "not a field of this ruleset"
+            reporter.error("PD301", f"unknown field `{name}`", setting.name_span, label, helps=helps)
         return ()
     try:
-        return tuple(low for low, _ in read_word(one.value, slot.kind, ids))
-    except WordProblem as wrong:
-        reporter.error(wrong.code, wrong.message, one.value_span, wrong.label, helps=wrong.helps)
+        return tuple(low for low, _ in read_word(setting.value, slot.kind, ids))
+    except WordProblem as problem:
+        reporter.error(problem.code, problem.message, setting.value_span, problem.label, helps=problem.helps)
         return ()

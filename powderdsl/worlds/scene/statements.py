@@ -28,7 +28,7 @@ STATEMENTS = {
     "frame": "frame ELEMENT",
     "fill": "fill ELEMENT",
 }
-"""Every statement and how it is written. A box may leave out rows, columns, and the ends of a range."""
+"""The syntax of every statement. A box may omit rows, columns, and the ends of a range."""
 
 GENERATOR_STATEMENTS = {
     **STATEMENTS,
@@ -36,10 +36,10 @@ GENERATOR_STATEMENTS = {
     "stamp": "stamp NAME at (ROW, COLUMN)",
     "part": "part NAME",
 }
-"""Those of a generator, which also has random cells, pictures, and named lists of statements."""
+"""The statements of a generator, which also has random cells, pictures, and named lists of statements."""
 
 SETTING = "FIELD := VALUE in SHAPE"
-"""How a scene gives cells a field's value; without `in`, all cells."""
+"""The statement that sets a field in cells of a scene; without `in`, in all cells."""
 
 _POINT = (("a row", -MAX_COORDINATE), ("a column", -MAX_COORDINATE))
 _ROWS = (("the start of a range", 0), ("the end of a range", 0))
@@ -58,18 +58,18 @@ NUMBERS: dict[str, tuple[tuple[str, int], ...]] = {
     "stamp": _POINT,
     "part": (),
 }
-"""The numbers of each statement in order: what they are called, and their lowest value."""
+"""The numbers of each statement in order: the name in messages, and the lowest value."""
 
 RANGES = {"box": 2, "arch": 2, "container": 2}
-"""How many ranges the first numbers of a statement are: pairs of a start and an end, None for an open end."""
+"""The number of ranges at the start of a statement's numbers: pairs of a start and an end, None for an open end."""
 
 
 @dataclass(frozen=True)
 class Statement:
     """A statement as written. `numbers` are those of NUMBERS; a region's shape has no `choice`.
 
-    `choice` and `over` are choices among elements: the one ``element``, one of ``some``, ``any_element`` but those
-    named, or one of the ``first`` few of those named.
+    `choice` and `over` are choices among elements: a fixed ``element``, one of ``some``, ``any_element`` except the named
+    ones, or one of the ``first`` few named ones.
     """
 
     kind: str
@@ -87,11 +87,7 @@ def amounts_of(
     reporter: Reporter,
     most: int = MAX_COORDINATE,
 ) -> tuple[Expr | None, ...] | None:
-    """The amounts of a statement's numbers, None for open ends. None after a report (PD606, PD802).
-
-    Args:
-        most: numbers lie within ±most.
-    """
+    """The amounts of a statement's numbers, within ±most, None for open ends. None after a report (PD606, PD802)."""
     amounts: list[Expr | None] = []
     fits = True
     for written, (what, lowest) in zip(statement.numbers, NUMBERS[statement.kind], strict=True):
@@ -146,13 +142,13 @@ def read_line(line: Span, start: str, reporter: Reporter) -> Syntax | None:
 def _numbers(tree: Syntax, parts: Sequence[Syntax], reporter: Reporter) -> tuple[Syntax | None, ...] | None:
     """The numbers of a statement in the order of NUMBERS. A missing range is open at both ends."""
     numbers: list[Syntax | None] = []
-    zero, one = (Syntax("integer", (), digit, tree.span) for digit in "01")
+    zero, unit = (Syntax("integer", (), digit, tree.span) for digit in "01")
     ranges = {part.kind: part.children[0] for part in parts if part.kind in ("rows", "columns")}
     for axis in ("rows", "columns")[: RANGES.get(tree.kind, 0)]:
         extent = ranges.get(axis, Syntax("whole", (), "", tree.span))
         match extent.kind, extent.children:
             case "single", (start,):
-                numbers += [start, Syntax("add", (start, one), "", start.span)]
+                numbers += [start, Syntax("add", (start, unit), "", start.span)]
             case "between", (start, stop):
                 if start.kind == stop.kind == "integer" and int(stop.text) <= int(start.text):
                     label = "the end must be above the start: a:b leaves b out"
@@ -189,7 +185,7 @@ def _without_signs(tree: Syntax) -> Syntax:
 
 
 def _usage(line: Span) -> tuple[str, ...]:
-    """How the statement is written, if its first word says which it is; otherwise the word that was meant."""
+    """The syntax of the statement that begins with the line's first word, or similar words."""
     if ":=" in line.text:
         return (SETTING,)
     word = next(iter(line.text.split(maxsplit=1)), "")
@@ -205,8 +201,8 @@ AMOUNTS = {
     "div": "quotient",
     "range": "uniform",
 }
-"""The operation of each kind of syntax. Operands are integers, so `/` rounds down, as `div` does. ``uniform`` draws an
-integer from a range that includes both ends."""
+"""The operation of each kind of syntax. Operands are integers, so `/` rounds down, like `div`. ``uniform`` draws an integer
+from a range that includes both ends."""
 
 MAX_DIGITS = 9
 
