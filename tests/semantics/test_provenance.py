@@ -76,7 +76,9 @@ def assert_traced_alike(ruleset: Ruleset) -> None:
         for number in range(len(world)):
             for cell in np.ndindex(*shape[1:]):
                 step = RecordedStep(world.select([number]), cell)
-                rules = [one.asked and one.asked.rule for one in step.writes if one.slot.name == "element"]
+                rules = [
+                    one.attempt and one.attempt.rule for one in step.writes if one.slot.name == "element"
+                ]
                 assert found.rule_at(*cell, world=number) == (rules[-1] if rules else None)
 
 
