@@ -55,7 +55,7 @@ def test_after_sigkill_nothing_runs_on_and_the_next_command_works(name: str, tmp
     place.run_again(command)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_a_killed_study_resumes_at_once(tmp_path: Path) -> None:
     """What it had started saves where it is and ends; the next call waits for that, and continues there."""
     place, command = Place(tmp_path), COMMANDS["study"]
