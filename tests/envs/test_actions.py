@@ -68,19 +68,6 @@ def test_the_order_of_discrete_actions() -> None:
         assert choice == 2 or (vx, vy) == (1, 1)
 
 
-@pytest.mark.parametrize("task", ["sand-pushing", "destroying", "sort-sand-and-stone", "world-model"])
-def test_shipped_tasks_have_all_forms(task: str) -> None:
-    made = load_task(task).agent
-    full = torch.from_numpy(np.random.default_rng(0).integers(0, made.action_nvec, (500, 5)))
-    for kind in KINDS:
-        form = action_form(kind, made, CPU)
-        # What one form says of an action, all others say of it too: nothing that is read gets lost.
-        canonical = action_form("discrete", made, CPU)
-        assert torch.equal(canonical.encode(form.decode(form.encode(full))), canonical.encode(full))
-        for size in form.nvec:
-            assert size > 1 or kind == "full" or made.choices == (NO_CHANGE,)
-
-
 @pytest.mark.parametrize("kind", ["multidiscrete", "discrete"])
 @pytest.mark.parametrize("may", ["[sand, blow, nothing]", "[sand, water, nothing]", "[blow]", "[wall]"])
 def test_an_action_does_the_same_in_every_form(

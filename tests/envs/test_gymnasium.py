@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.wrappers import TimeLimit, TransformObservation
+from gymnasium.wrappers import TimeLimit
 from gymnasium.wrappers import vector as wrappers
 
 from powderdsl.envs.gym import PowderEnv, PowderVectorEnv
@@ -30,14 +30,6 @@ WRAPPERS: dict[str, Wrap] = {
     "RescaleObservation": lambda env: wrappers.RescaleObservation(env, 0.0, 1.0),
     "DtypeObservation": lambda env: wrappers.DtypeObservation(env, np.float32),
     "TransformObservation": lambda env: wrappers.TransformObservation(env, lambda observed: observed),
-    "VectorizeTransformObservation": lambda env: wrappers.VectorizeTransformObservation(
-        env,
-        TransformObservation,
-        func=lambda observed: observed,
-        observation_space=env.single_observation_space,
-    ),
-    "TransformAction": lambda env: wrappers.TransformAction(env, lambda action: action),
-    "TransformReward": lambda env: wrappers.TransformReward(env, lambda reward: reward),
 }
 
 

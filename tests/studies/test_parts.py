@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 import threading
@@ -19,10 +18,8 @@ from powderdsl.cli.commands.study import command as study_command
 from powderdsl.cli.exits import BadInput
 from powderdsl.experiments.studies.run import StudyRun
 from powderdsl.experiments.studies.study import Point, StudyStep, load_study
-from tests.cli.commands import ROOT, command_line, environment_with, powderdsl
-from tests.cli.endless import TASK
+from tests.cli.commands import ROOT, environment_with, powderdsl
 from tests.processes import started
-from tests.tiers import tiered
 
 STUDY = """
 study: patience
@@ -364,35 +361,3 @@ def test_a_step_waits_for_what_a_killed_study_has_started(
         assert not began.wait(0.5)
     assert began.wait(30)
     thread.join()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("runs", tiered(["of the two", "its own"], ["of the two"]))
-def test_two_processes_and_collect_give_the_table_of_one(runs: str, tmp_path: Path) -> None:
-    """The one has finished runs of the two in its folder, or trains and evaluates itself."""
-    (tmp_path / "dig.yaml").write_text(TASK, encoding="utf-8")
-    text = STUDY.replace("[100, 200, 300]", "[12, 24]").replace("small: [none, some]", "small: [none]")
-    text = text.replace("seeds: 2", "seeds: 1").replace("on: sand-pushing", "on: dig.yaml")
-    text = text.replace("knob: lines=$lines", "preset: small, envs: 4, rollout: 3, batch: 12, backend: torch")
-    text = text.replace("sets: {none: {lines: 0}, some: {lines: 5}}", "sets: {none: {episodes: 4}}")
-    text = text.replace("episodes: 4}\n", "episodes: $episodes}\n")
-    (tmp_path / "study.yaml").write_text(text, encoding="utf-8")
-
-    def begin(*words: str) -> subprocess.Popen[str]:
-        command = command_line("study", *words)
-        quiet = subprocess.DEVNULL
-        return subprocess.Popen(
-            command, cwd=tmp_path, env=environment_with(), text=True, stdout=quiet, stderr=quiet
-        )
-
-    parts = [begin("study.yaml", "--shard", f"{number}/2", "--out", f"part{number}") for number in (1, 2)]
-    assert [one.wait(timeout=240) for one in parts] == [0, 0]
-    assert begin("collect", "part1", "part2", "--out", "all").wait(timeout=60) == 0
-    if runs == "of the two":
-        for number in (2, 1):
-            shutil.copytree(tmp_path / f"part{number}", tmp_path / "whole", dirs_exist_ok=True)
-        for name in RESULTS:
-            (tmp_path / "whole" / name).unlink(missing_ok=True)
-    assert begin("study.yaml", "--out", "whole").wait(timeout=240) == 0
-    for name in RESULTS:
-        assert (tmp_path / "all" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()

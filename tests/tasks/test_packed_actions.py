@@ -133,22 +133,3 @@ def test_packed_worlds_are_measured_alike(torch, size, each, on_planes):
             unpacked = program.simulator.step(episodes.world, steps).state
             program.measured(replace(episodes, world=replace(world, state=unpacked)))
             assert any(unpacked.has(name) for name in unpacked) is not on_planes
-
-
-def test_filling_boxes_of_a_packed_state(torch):
-    from powderdsl.tasks.episodes import compile_task
-
-    program = compile_task("sand-pushing", backend="native")
-    world = program.simulator.step(program.start(torch.arange(9)).world, 2)
-    boxes = torch.tensor(
-        [[0, 64, 0, 64], [3, 4, 63, 64], [5, 5, 0, 64], [5, 9, 7, 7], *[[60, 64, 1, 63]] * 5]
-    )
-    motion = torch.arange(18).float().view(9, 2) - 9
-    filled = world.state.fill(boxes, {"velocity": motion, "momentum": torch.arange(9) - 4}, reuse=False)
-    for name, values in (("velocity", motion), ("momentum", torch.arange(9) - 4)):
-        expected = world.state[name].clone()
-        for number, (top, bottom, left, right) in enumerate(boxes.tolist()):
-            cells = expected[number, ..., top:bottom, left:right]
-            cells.copy_(values[number].view(*values[number].shape, 1, 1).expand_as(cells))
-        assert torch.equal(filled[name], expected), name
-    assert torch.equal(filled["element"], world.state["element"])

@@ -286,6 +286,12 @@ def test_a_killed_builder_harms_nobody(tmp_path: Path, how: int) -> None:
     assert len(calls(tmp_path)) == 2
 
 
+def output_of(program: str, folder: Path) -> str:
+    command = [sys.executable, "-W", "ignore", "-c", program, str(folder)]
+    options = {"env": environment_with(), "capture_output": True, "text": True, "timeout": 60, "check": True}
+    return str(subprocess.run(command, **options).stdout)  # type: ignore[call-overload]
+
+
 def test_a_process_that_exits_ends_its_compilers(tmp_path: Path) -> None:
     program = """
 import sys, threading, time
@@ -295,15 +301,8 @@ threading.Thread(target=run_compilers, args=(Path(sys.argv[1]), ["sleep", "1000"
 time.sleep(1)
 print(*(process.pid for process in _running))
 """
-    run = subprocess.run(
-        [sys.executable, "-c", program, str(tmp_path)],
-        env=environment_with(),
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=True,
-    )
-    assert waited(lambda: not alive(int(run.stdout)), 5)
+    pid = int(output_of(program, tmp_path))
+    assert waited(lambda: not alive(pid), 5)
 
 
 def test_a_fork_that_ends_does_not_end_its_parents_compiler(tmp_path: Path) -> None:
@@ -323,15 +322,7 @@ os.waitpid(pid, 0)
 thread.join()
 print(found)
 """
-    run = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", program, str(tmp_path)],
-        env=environment_with(),
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=True,
-    )
-    assert run.stdout == "[(0, '')]\n"
+    assert output_of(program, tmp_path) == "[(0, '')]\n"
 
 
 def test_what_cannot_be_run_says_so(tmp_path: Path) -> None:

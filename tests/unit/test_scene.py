@@ -130,12 +130,6 @@ def test_the_designed_worlds_are_the_recorded_ones_cell_for_cell():
         assert np.array_equal(load_scene(f"{DESIGNED}#{name}", RULES), expected), name
 
 
-def test_the_garden_has_something_of_everything():
-    ids = load_scene("garden", RULES)
-    assert ids.shape == (64, 64)
-    assert set(np.unique(ids)) == set(ID.values()) - {ID["fire"]}
-
-
 SMALL = """scene: small
 size: [4, 5]
 fill: empty

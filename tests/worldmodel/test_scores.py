@@ -139,19 +139,3 @@ def test_calibration_is_what_a_hand_computes() -> None:
     ]
     assert [round(one["probability"], 5) for one in table["change"]] == [0.1, 0.25]
     assert [one["cells"] for one in table["changed"]] == [1, 1]
-
-
-def test_a_predictor_that_knows_the_probabilities_is_calibrated() -> None:
-    source = torch.Generator().manual_seed(3)
-    chances = torch.rand(1, 4, 64, 64, generator=source).softmax(1) ** 2
-    chances = (chances / chances.sum(1, keepdim=True)).expand(64, -1, -1, -1)
-    flat = chances.permute(0, 2, 3, 1).reshape(-1, 4)
-    ends = torch.multinomial(flat, 1, generator=source).view(64, 64, 64).to(torch.uint8)
-    starts = torch.randint(0, 4, (64, 64, 64), dtype=torch.uint8, generator=source)
-    found = score(lambda ids: chances[: len(ids)].log(), [(starts, ends)], 4)
-    assert found.ece is not None
-    assert found.change_ece is not None
-    assert max(found.ece, found.change_ece) < 0.005
-    sharper = score(lambda ids: 3 * chances[: len(ids)].log(), [(starts, ends)], 4)
-    assert sharper.ece is not None
-    assert sharper.ece > 0.05
