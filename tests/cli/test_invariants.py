@@ -103,7 +103,7 @@ def test_the_same_seed_finds_the_same(folder):
     ("text", "word"),
     [("", "PD602"), ("property: rock never changes\n", "PD602"), ("world: [9 9]\nproperty: x\n", "PD602")],
 )
-def test_files_that_are_no_counterexamples(folder, text, word):
+def test_files_that_are_not_counterexamples_are_refused(folder, text, word):
     (folder / "case.yaml").write_text(text)
     result = powderdsl("test", "yard.yaml", "--replay", "case.yaml")
     assert result.exit_code == 2

@@ -69,10 +69,13 @@ def test_new_works_beside_files_that_are_broken(folder):
     assert powderdsl("new", "salt").exit_code == 0
 
 
-def test_new_writes_elsewhere(folder):
+def test_new_writes_to_a_folder_that_exists(folder):
     (folder / "packs").mkdir()
     assert powderdsl("new", "salt", "--dir", "packs").exit_code == 0
     assert (folder / "packs" / "salt.yaml").exists()
+    result = powderdsl("new", "salt", "--dir", "nowhere")
+    assert result.exit_code == 2
+    assert "PD613" in result.stderr
 
 
 def test_new_never_overwrites(folder):
@@ -97,12 +100,6 @@ def test_names_that_a_pack_cannot_have(folder, name):
     assert result.exit_code == 2
     assert result.stderr.startswith("error: ")
     assert list(folder.iterdir()) == []
-
-
-def test_a_folder_must_be_there(folder):
-    result = powderdsl("new", "salt", "--dir", "nowhere")
-    assert result.exit_code == 2
-    assert "PD613" in result.stderr
 
 
 # test
@@ -147,7 +144,7 @@ def test_a_test_tries_five_seeds_or_its_own(folder):
     assert seeds["seeded"] == (7,)
 
 
-def test_luck_is_not_enough(folder):
+def test_a_test_that_passes_only_by_chance_fails(folder):
     lonely = """\
 tests:
   - a lone grain is gone at once:

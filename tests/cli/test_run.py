@@ -278,7 +278,7 @@ def test_strewn_worlds_have_a_frame_that_stays():
     assert len(np.unique(strew(rules, (64, 64), 16, 0))) == len(rules.elements)
 
 
-def test_where_nothing_moves_nothing_is_framed():
+def test_rules_without_movement_get_no_frame():
     worlds = strew(package.load("life"), (16, 16), 8, 0)
     assert set(np.unique(worlds[:, 0])) == {0, 1}
 
@@ -315,7 +315,7 @@ def test_render_draws_a_world_as_it_stands():
         ("drawing.txt", "--rules", "nonsense", "--out", "x.png"),
     ],
 )
-def test_what_render_cannot_draw(tmp_path, arguments):
+def test_bad_arguments_of_render_are_refused(tmp_path, arguments):
     before = sorted(tmp_path.iterdir())
     result = powderdsl("render", *arguments)
     assert result.exit_code == 2

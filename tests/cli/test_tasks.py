@@ -55,5 +55,5 @@ def test_a_sheet_shows_worlds_and_outlines_regions(tmp_path):
         ("show", "powderworld", "--out", "sheet.png"),
     ],
 )
-def test_what_cannot_be_shown(arguments):
+def test_bad_arguments_of_show_are_refused(arguments):
     assert run(*arguments).exit_code == 2

@@ -58,7 +58,7 @@ def test_train_evaluate_and_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         (("watch", "sand-pushing", "--scale", "32", "--worlds", "64", "--out", "no/x.gif"), "PD613"),
     ],
 )
-def test_what_cannot_be_done(
+def test_bad_arguments_of_training_commands_are_refused(
     arguments: tuple[str, ...], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -94,7 +94,7 @@ RECIPE: list[tuple[str, Any]] = [
 
 
 @pytest.mark.parametrize(("key", "value"), RECIPE)
-def test_values_that_no_recipe_has(key: str, value: Any, folder: Path) -> None:
+def test_invalid_values_of_a_recipe_are_refused(key: str, value: Any, folder: Path) -> None:
     manifest(folder, lambda data: data["recipe"].update({key: value}))
     assert any(key in reason or "channels" in reason or "choices" in reason for reason in reasons(folder))
 
@@ -117,7 +117,9 @@ ROWS: list[tuple[Callable[[Any], Any], str]] = [
 
 
 @pytest.mark.parametrize(("change", "words"), ROWS)
-def test_rows_that_lead_astray(change: Callable[[Any], Any], words: str, folder: Path) -> None:
+def test_invalid_rows_of_a_manifest_are_refused(
+    change: Callable[[Any], Any], words: str, folder: Path
+) -> None:
     manifest(folder, lambda data: change(data["shards"]) and None)
     assert any(words in reason for reason in reasons(folder))
 
@@ -134,7 +136,7 @@ def test_rows_that_lead_astray(change: Callable[[Any], Any], words: str, folder:
         (b'{"format": "powderdsl-dataset", "version": 1, "recipe": {"seed": 1}}', "`recipe.task` is missing"),
     ],
 )
-def test_texts_that_are_no_manifest(text: bytes, words: str, folder: Path) -> None:
+def test_texts_that_are_not_manifests_are_refused(text: bytes, words: str, folder: Path) -> None:
     (folder / "dataset.json").write_bytes(text)
     assert words in "\n".join(reasons(folder))
 
@@ -208,7 +210,9 @@ CONTENTS: list[tuple[Callable[[Arrays], Any], str]] = [
 
 
 @pytest.mark.parametrize(("change", "words"), CONTENTS)
-def test_arrays_that_do_not_fit(change: Callable[[Arrays], Any], words: str, folder: Path) -> None:
+def test_arrays_of_wrong_shapes_or_values_are_refused(
+    change: Callable[[Arrays], Any], words: str, folder: Path
+) -> None:
     arrays = arrays_of(folder)
     change(arrays)
     row = asdict(write_shard(folder, 1, {name: [value] for name, value in arrays.items()}, compress=False))
@@ -246,7 +250,9 @@ MEMBERS: list[tuple[str, bytes, str]] = [
 
 @pytest.mark.parametrize("kind", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
 @pytest.mark.parametrize(("name", "data", "words"), MEMBERS)
-def test_members_that_numpy_would_trust(name: str, data: bytes, words: str, kind: int, folder: Path) -> None:
+def test_invalid_members_of_a_shard_are_refused(
+    name: str, data: bytes, words: str, kind: int, folder: Path
+) -> None:
     path = folder / "shard-000001.npz"
     with zipfile.ZipFile(path) as archive:
         members = {entry: archive.read(entry) for entry in archive.namelist()}

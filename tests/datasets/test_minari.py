@@ -211,7 +211,7 @@ def test_collected_episodes_come_in(small: TaskProgram, kind: str, tmp_path: Pat
             assert [value[0] for value in ends] == [value[step] for value in wanted]
 
 
-def test_strangers_need_a_task(small: TaskProgram, recorded: Dataset, tmp_path: Path) -> None:
+def test_minari_datasets_of_others_need_a_task(small: TaskProgram, recorded: Dataset, tmp_path: Path) -> None:
     collect(small, "full")
     with pytest.raises(CompileError) as caught:
         from_minari(ID, tmp_path / "a")
@@ -281,7 +281,7 @@ def value(name: str, new: Any) -> Any:
         (value("terminations", True), "do not end"),
     ],
 )  # fmt: skip
-def test_damaged_ones_are_refused(
+def test_damaged_minari_datasets_are_refused(
     recorded: Dataset, root: Path, damage: Any, says: str, tmp_path: Path
 ) -> None:
     to_minari(recorded, ID)

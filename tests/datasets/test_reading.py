@@ -154,7 +154,7 @@ def test_workers_get_the_folder(recorded: Dataset) -> None:
     assert torch.equal(again.episode(7).observation, recorded.episode(7).observation)
 
 
-def test_numbers_that_there_are_not(recorded: Dataset) -> None:
+def test_indices_out_of_range_are_refused(recorded: Dataset) -> None:
     for number in (-1, 20):
         with pytest.raises(IndexError, match="there are 20"):
             recorded.episode(number)

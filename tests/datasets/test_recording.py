@@ -56,7 +56,7 @@ def test_episodes_are_what_stepping_gives(observation: str, small: TaskProgram, 
 
 
 @pytest.mark.parametrize("envs", [1, 1000])
-def test_shards_do_not_hang_on_how_many_are_played_at_once(
+def test_shards_do_not_depend_on_the_batch_size(
     envs: int, small: TaskProgram, recorded: Dataset, tmp_path: Path
 ) -> None:
     record(small, "random", tmp_path / "data", episodes=20, seed=3, shard=8, envs=envs)

@@ -248,7 +248,7 @@ def test_parts_have_about_their_fractions(recorded: Dataset, tmp_path: Path) -> 
         assert abs(np.array(sizes) - [2800, 800, 400]).max() < 150
 
 
-def test_splits_that_cannot_be(recorded: Dataset) -> None:
+def test_invalid_splits_are_refused(recorded: Dataset) -> None:
     rows = Transitions(recorded)
     for fractions in ((), (0.5, 0.4), (1.5, -0.5), (1, 0)):
         with pytest.raises(ValueError, match="positive and sum to 1"):

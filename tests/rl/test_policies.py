@@ -123,7 +123,7 @@ def test_doing_nothing_is_what_the_rules_do_alone(program: TaskProgram) -> None:
     assert torch.equal(last[-1]["velocity"], alone["velocity"])
 
 
-def test_draws_of_a_policy_are_even_and_hang_on_seed_episode_and_step() -> None:
+def test_draws_of_a_policy_are_uniform_and_depend_on_seed_episode_and_step() -> None:
     numbers = torch.arange(2000)
     keys = torch.stack([action_keys(seed, numbers, step) for seed in (0, 1) for step in (0, 1)])
     assert len(keys.unique()) == keys.numel()

@@ -109,7 +109,7 @@ def test_only_selects_settings_and_seeds(only: list[str], count: int | str, tmp_
 
 
 @pytest.mark.parametrize("text", ["0/2", "3/2", "1", "1/0", "a/b", "1/2/3", "-1/2", "1/99999999", ""])
-def test_a_wrong_shard_is_told(text: str, steps_run: list[str]) -> None:
+def test_an_invalid_shard_is_refused(text: str, steps_run: list[str]) -> None:
     result = powderdsl("study", "study.yaml", "--shard", text)
     assert result.exit_code == 2
     assert "is not a part: write 1/4" in result.stderr

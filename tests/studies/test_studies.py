@@ -121,7 +121,7 @@ def test_a_value_may_set_several_names() -> None:
         ("paper: [1000, 2000, 4000]", f"paper: [{', '.join(map(str, range(2000)))}]", "PD806", "patience"),
     ],
 )
-def test_a_mistake_is_told_with_its_place(old: str, new: str, code: str, caret: str) -> None:
+def test_a_mistake_is_reported_at_its_place(old: str, new: str, code: str, caret: str) -> None:
     assert old in TEXT
     with pytest.raises(CompileError) as error:
         read(TEXT.replace(old, new, 1))
@@ -129,7 +129,7 @@ def test_a_mistake_is_told_with_its_place(old: str, new: str, code: str, caret: 
     assert (code, caret) in found
 
 
-def test_an_unknown_study_is_told() -> None:
+def test_an_unknown_study_gets_a_suggestion() -> None:
     with pytest.raises(CompileError) as error:
         load_study("start-stats", KNOWN)
     assert error.value.diagnostics[0].helps == ("did you mean `start-states`?",)
@@ -155,7 +155,7 @@ def test_an_interval_is_that_of_student() -> None:
         (250.0, 31.0, "250 ± 31"),
     ],
 )
-def test_numbers_have_the_places_they_deserve(mean: float, half: float, text: str) -> None:
+def test_numbers_are_rounded_by_their_interval(mean: float, half: float, text: str) -> None:
     assert shown(Interval(mean, mean - half, mean + half)) == text
 
 
@@ -163,7 +163,7 @@ def test_factors_are_shown_with_both_ends() -> None:
     assert shown(Interval(0.5, 0.25, 1.0), "log") == "0.500 (0.250 to 1.00)"
 
 
-def test_what_was_found_is_said_as_it_is() -> None:
+def test_verdicts_follow_the_intervals() -> None:
     study = read(TEXT.replace("  squares: [0, 5]\n", "").replace(", squares=$squares", ""))
     (rose,) = findings(study, outcomes(study, {("100",): (1.0, 1.1, 0.9), ("200",): (2.0, 2.1, 2.0)}))
     assert rose.verdict.startswith("rises (last − first: +1.03")

@@ -114,7 +114,7 @@ def test_reused_tensors_give_the_same_episodes(torch, backend):
     assert fresh.acted.tolist() == [4, 2, 4]
 
 
-def test_actions_that_are_none_are_refused(torch, program_of):
+def test_invalid_actions_are_refused(torch, program_of):
     from powderdsl.tasks.episodes import check_actions
 
     program = program_of("agent: {may: [wall, empty], actions: 9, bins: [4, 8]}\n")
@@ -336,7 +336,7 @@ def test_unknown_names(torch):
     assert [one.code for one in caught.value.diagnostics] == ["PD803", "PD803"]
 
 
-def test_nobody_acts_and_all_steps_are_seen(torch, program_of):
+def test_without_actions_every_step_is_reported(torch, program_of):
     text = NOISE + "agent: {may: [sand, blow], speed: 20, actions: 2, steps_per_action: 3, free_steps: 2}\n"
     program = program_of(text + "reward: {each: painted + placed + blown, final: taken}\n")
     episodes = program.start(torch.arange(2))

@@ -197,7 +197,7 @@ def test_everything_is_reported_at_once():
 @pytest.mark.parametrize(
     "text", ["", "just words", "[1, 2]", "task: a", "task: {a: b}\nrules: []\n", "task: &x a"]
 )
-def test_what_is_no_task_at_all(text):
+def test_files_that_are_not_tasks_are_refused(text):
     assert found(text)
 
 

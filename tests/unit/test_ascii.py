@@ -53,7 +53,7 @@ def test_uneven_rows_are_shown_without_the_space_around_them():
 
 
 @pytest.mark.parametrize("text", ["", " \n\t\n"])
-def test_nothing_is_no_world(text):
+def test_an_empty_drawing_is_refused(text):
     assert problems(text) == [("PD607", text[:1])]
 
 

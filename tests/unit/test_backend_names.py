@@ -29,7 +29,7 @@ def test_without_a_compiler_native_names_what_needs_none(monkeypatch: pytest.Mon
         powderdsl.compile("life", backend="native")
 
 
-def test_what_starts_at_once() -> None:
+def test_the_first_backend_needs_no_compiler() -> None:
     assert [starting_backend(name) for name in ("cpu", "cpu:0", "cuda", "cuda:1", "mps")] == [
         *("wasm", "wasm"),
         *("torch", "torch", "torch"),

@@ -65,7 +65,7 @@ def test_no_more_than_the_limit_is_read(tmp_path):
         (("test", "core", "--replay"), ".yaml"),
     ],
 )
-def test_every_command_says_what_is_no_file(words, suffix, kind, tmp_path):
+def test_every_command_refuses_what_is_not_a_regular_file(words, suffix, kind, tmp_path):
     result = command(*words, irregular(tmp_path, suffix)[kind])
     assert result.exit_code == 2
     assert re.search("it is not a regular file|is a (folder|directory)", result.output)

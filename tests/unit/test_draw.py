@@ -79,7 +79,7 @@ def test_tensors_are_drawn_as_arrays(ids, motion):
     assert np.array_equal(rgb(torch.tensor(ids), COLORS), rgb(ids, COLORS))
 
 
-def test_worlds_without_worlds():
+def test_an_empty_batch_is_drawn():
     assert rgb(np.zeros((0, 3, 4), dtype=np.uint8), COLORS).shape == (0, 3, 4, 3)
     assert rgb(torch.zeros((0, 3, 4), dtype=torch.uint8), COLORS).shape == (0, 3, 4, 3)
 

@@ -151,7 +151,7 @@ def test_sixteen_bit_pictures_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("data", [b"", b"GIF89a", b"\x89PNG\r\n\x1a\n", b"scene: a\n", png(0, 0), png(3, 3)])
-def test_files_that_are_no_png(tmp_path, data):
+def test_files_that_are_not_png_pictures_are_refused(tmp_path, data):
     path = tmp_path / "world.png"
     path.write_bytes(data)
     assert [one.code for one in refused(path)] == ["PD602"]

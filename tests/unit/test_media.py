@@ -112,7 +112,7 @@ def test_mp4_needs_its_encoder(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_encoder_that_fails_is_heard(tmp_path, monkeypatch):
+def test_a_failing_encoder_is_reported(tmp_path, monkeypatch):
     monkeypatch.setattr(media, "_ENCODING", "-vcodec no-such-codec -f mp4")
     with pytest.raises(CompileError, match=r"encoder failed \(status \d+\): .*no-such-codec"):
         write_mp4(tmp_path / "x.mp4", [world(seed, 200, 200) for seed in range(20)])

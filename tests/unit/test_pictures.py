@@ -162,7 +162,7 @@ def test_an_interrupt_gives_the_terminal_back_and_goes_on(error):
     assert lines[:2] == ["▀▀▀▀"] * 2
 
 
-def test_no_terminal_gets_plain_text_frame_after_frame():
+def test_without_a_terminal_frames_are_plain_text():
     screen = Screen(False)
     with LiveView(ELEMENTS, screen) as view:
         view.show(np.array([[0, 1], [2, 3]]), caption="step 0")
@@ -170,7 +170,7 @@ def test_no_terminal_gets_plain_text_frame_after_frame():
     assert screen.written == ".#\ns~\nstep 0\n##\n##\nstep 1\n"
 
 
-def test_a_dumb_terminal_is_no_terminal(monkeypatch):
+def test_a_dumb_terminal_gets_plain_text(monkeypatch):
     monkeypatch.setenv("TERM", "dumb")
     screen = Screen(True)
     with LiveView(ELEMENTS, screen) as view:

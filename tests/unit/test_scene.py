@@ -330,7 +330,7 @@ def test_another_size_has_the_same_limits(tmp_path, size):
         (str(ROOT / "tests"), "PD601", ""),
     ],
 )
-def test_scenes_that_are_not_there(name, code, hint):
+def test_unknown_scenes_are_refused(name, code, hint):
     with pytest.raises(CompileError) as caught:
         find_scene(name)
     (found,) = caught.value.diagnostics
@@ -338,7 +338,7 @@ def test_scenes_that_are_not_there(name, code, hint):
     assert hint in "".join(found.helps)
 
 
-def test_files_that_are_no_text(tmp_path):
+def test_files_that_are_not_text_are_refused(tmp_path):
     path = tmp_path / "scene.yaml"
     path.write_bytes(b"scene: \xff\xfe")
     with pytest.raises(CompileError) as caught:

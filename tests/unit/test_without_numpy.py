@@ -187,20 +187,12 @@ def test_backends_that_need_torch_say_so() -> None:
         ("check", "powderworld", "--ledger", "--notes"),
         ("test", "wishes.yaml", "--examples", "32", "--no-keep"),
         ("trace", "powderworld", "--at", "9,9", "--step", "4", "--size", "16x16", "--seed", "2"),
-        pytest.param(("check", "turned.yaml"), marks=pytest.mark.campaign),
-        pytest.param(("test", "turned.yaml", "--examples", "64", "--no-keep"), marks=pytest.mark.campaign),
-        pytest.param(
-            ("trace", "wishes.yaml", "--at", "1,1", "--step", "3", "--size", "6x6", "--all"),
-            marks=pytest.mark.campaign,
-        ),
     ],
     ids=" ".join,
 )
 def test_output_is_that_with_numpy(arguments: tuple[str, ...], tmp_path: Path) -> None:
     """Invariants that a world breaks, tests that fail by chance, fields of all kinds."""
     (tmp_path / "wishes.yaml").write_text(WISHES, encoding="utf-8")
-    turned = "  - mirrored worlds agree\n  - rotated worlds agree\ntests:"
-    (tmp_path / "turned.yaml").write_text(WISHES.replace("tests:", turned), encoding="utf-8")
     programs = (BLOCKED, BLOCKED.removeprefix(BLOCK))
     ended = [
         subprocess.run([sys.executable, "-c", one, *arguments], capture_output=True, text=True, cwd=tmp_path)

@@ -20,7 +20,8 @@ from powderdsl.worldmodel.networks import NO_ELEMENT, ActionChannels, without_ac
 from powderdsl.worldmodel.recordings import Recording, open_recording
 from powderdsl.worldmodel.training import finetuned
 from tests.cli.commands import powderdsl as run
-from tests.worldmodel.test_training import same, weights
+from tests.states import same
+from tests.worldmodel.test_training import weights
 
 HERE = Machine(backend="torch")
 

@@ -109,7 +109,7 @@ def test_disk_holds_what_memory_holds(dunes: str, tmp_path: Path) -> None:
     assert not list(tmp_path.glob("replay-*"))  # a killed process would leave them
 
 
-def test_batches_hang_on_seed_and_iteration_alone(dunes: str) -> None:
+def test_batches_depend_on_seed_and_iteration_alone(dunes: str) -> None:
     config = DataConfig(task=dunes, states=50, steps=1, pairs=4, capacity=200)
     worlds = worlds_of(config)
     one, other = Replay(worlds, config, seed=1), Replay(worlds, config, seed=2)

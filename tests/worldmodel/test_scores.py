@@ -72,7 +72,7 @@ def test_grids_of_any_size_keep_it(size: tuple[int, int]) -> None:
     assert fresh_unet(6, 3, 0)(ids).shape == (2, 6, *size)
 
 
-def test_what_lies_beyond_a_grid_is_no_element() -> None:
+def test_cells_beyond_a_grid_hold_no_element() -> None:
     """A grid whose sides are no multiple of four is seen as one that ends there, not as one of element 0 beyond."""
     network = fresh_unet(4, 4, 0)
     ids = torch.ones((1, 8, 8), dtype=torch.uint8)
@@ -92,7 +92,7 @@ def test_the_network_is_the_papers() -> None:
     assert sum(isinstance(layer, nn.ReLU) for layer in network.modules()) == 10
 
 
-def test_weights_hang_on_the_seed_alone() -> None:
+def test_weights_depend_on_the_seed_alone() -> None:
     torch.manual_seed(5)
     one = fresh_unet(4, 2, 7).state_dict()
     before = torch.random.get_rng_state()

@@ -31,6 +31,7 @@ from powderdsl.worldmodel.evaluation import unseen_worlds
 from powderdsl.worldmodel.training import TrainingProgress
 from powderdsl.worldmodel.worlds import VALIDATION_SEEDS, VALIDATION_WORLDS, validation_pairs
 from tests.processes import started, waited
+from tests.states import same
 
 HERE = Machine(backend="torch")
 
@@ -54,10 +55,6 @@ def few(config: TrainConfig) -> TrainConfig:
 def weights(run: RunFolder) -> dict[str, Tensor]:
     found: dict[str, Tensor] = run.checkpoint().state["model"]
     return found
-
-
-def same(one: dict[str, Tensor], other: dict[str, Tensor]) -> bool:
-    return one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
 
 
 def lines(run: RunFolder) -> list[tuple[int, float]]:
