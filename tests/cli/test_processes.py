@@ -129,26 +129,3 @@ def test_pages_are_laid_out_on_terminals():
     assert status == 0
     assert "\x1b[" in shown
     assert "PD301" in shown
-
-
-@pytest.mark.parametrize("name", ["x.gif", "x.mp4"])
-def test_ctrl_c_leaves_nothing_behind(tmp_path, name):
-    if name.endswith("mp4"):
-        pytest.importorskip("imageio_ffmpeg")
-    with started(
-        command_line("run", "life", *SMALL, "--steps", "100000000", "--out", str(tmp_path / name)),
-        env=environment_with(),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-    ) as running:
-        deadline = time.monotonic() + 60
-        while not list(tmp_path.iterdir()):
-            assert time.monotonic() < deadline, "no file was begun"
-            assert running.poll() is None, running.stderr.read()
-            time.sleep(0.05)
-        time.sleep(0.2)
-        running.send_signal(signal.SIGINT)
-        _, errors = running.communicate(timeout=240)
-    assert running.returncode == 130
-    assert "Traceback" not in errors
-    assert list(tmp_path.iterdir()) == []

@@ -167,13 +167,6 @@ def test_workers_share_the_minibatches(
         assert all(torch.equal(a, b) for a, b in zip(found, one, strict=True))
 
 
-def test_sequences_are_shared_too(recorded: Dataset) -> None:
-    data, wanted = (recorded.sequences(2, 4, seed=1) for _ in range(2))
-    batches = loader(data, (3, "fork"), batch_size=None)
-    for found, one in zip(islice(batches, 5), wanted, strict=False):
-        assert torch.equal(found.observation, one.observation)
-
-
 # A loader that is left early ends its workers while their queues still hold tensors. Python 3.11 then ends the queue's
 # thread inside torch's C++ code, which aborts the worker, and the loader reports that when it is collected.
 @pytest.mark.filterwarnings("ignore:.*_MultiProcessingDataLoaderIter:pytest.PytestUnraisableExceptionWarning")
