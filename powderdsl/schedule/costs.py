@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 
 from powderdsl.ir.ops import FLAG, Graph, Node, Offset, ordered, taken
 from powderdsl.schedule.floats import of_floats
@@ -103,15 +104,20 @@ def float_cost(node: Node, is_stored: IsStored) -> int:
     return float_cost(node.args[0], is_stored) if node.op == "shift" and node.attr[2] else FAR
 
 
-def stored_parts(source: Node, is_stored: IsStored, most: int) -> list[Node]:
+def stored_parts(source: Node, is_stored: IsStored, most: int) -> tuple[Node, ...]:
     """The nodes to store so that a float can be recomputed at a neighbor: the float, or its costly parts."""
-    if float_cost(source, is_stored) <= most:
-        return []
-    if source.op in ARITHMETIC:
-        parts = [part for arg in source.args for part in stored_parts(arg, is_stored, most)]
-        if float_cost(source, lambda node: is_stored(node) or node in parts) <= most:
-            return parts
-    return [source]
+
+    @cache  # graphs share nodes: following all paths would take forever
+    def parts_of(node: Node) -> tuple[Node, ...]:
+        if float_cost(node, is_stored) <= most:
+            return ()
+        if node.op in ARITHMETIC:
+            parts = tuple(dict.fromkeys(part for arg in node.args for part in parts_of(arg)))
+            if float_cost(node, lambda inner: is_stored(inner) or inner in parts) <= most:
+                return parts
+        return (node,)
+
+    return parts_of(source)
 
 
 FEW_BITS = 2

@@ -440,9 +440,8 @@ class _Cutter:
             elif top.op == "shift":
                 source = top.args[0]
                 if not self.is_stored(source):
-                    parts = (
-                        stored_parts(source, self.is_stored, self.costs.floats) if top.attr[2] else [source]
-                    )
+                    wraps, most = top.attr[2], self.costs.floats
+                    parts = stored_parts(source, self.is_stored, most) if wraps else (source,)
                     needs |= dict.fromkeys(parts)
                     stack.extend([] if parts else [source])
             else:
