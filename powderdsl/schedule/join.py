@@ -25,6 +25,7 @@ from powderdsl.schedule.types import (
     combined,
     connected,
     field_reads,
+    flat,
     in_order,
     is_zero,
     load,
@@ -74,17 +75,21 @@ def _mask_fields(schedule: Schedule) -> Schedule:
             flags = {shifted[name][0] for name in names if name in shifted and shifted[name][1] == where}
             flags |= names if where == HERE else set()
             masks_of[field.attr] = masks_of.get(field.attr, flags) & flags
-    defined = set(schedule.input_slots)
+    place_of = dict.fromkeys(schedule.input_slots, -1)
+    """By variable: the number of the statement that computes it, nested or not."""
+    for number, statement in enumerate(flat(schedule.body)):
+        if not isinstance(statement, Guard):  # which only passes on what its body computes
+            place_of |= dict.fromkeys(statement.vars, number)
 
     def change(loop: Compute) -> list[Statement]:
         outs = []
         for out in loop.outs:
-            flags = in_order(masks_of.get(out.var.name, set()) & defined)
+            earlier = {name for name, place in place_of.items() if place < place_of[out.var.name]}
+            flags = in_order(masks_of.get(out.var.name, set()) & earlier)
             if loop.over == "cells" and out.var.type == REAL and out.var.means is None and flags:
                 args = graph.node("load", FLAG, (), flags[0]), out.value, graph.real(0.0)
                 out = replace(out, value=graph.node("select", REAL, args))
             outs.append(out)
-        defined.update(loop.vars)
         return [replace(loop, outs=tuple(outs))]
 
     return map_each(schedule, Compute, change)
