@@ -18,7 +18,7 @@ from powderdsl.diagnostics.printable import (
     PrintableStream,
     printable,
     printable_streams,
-    spelled,
+    spell,
     styled,
     unguarded,
 )
@@ -69,7 +69,7 @@ def test_only_colors_pass_as_styles():
     ],
 )
 def test_look_alikes_are_spelled_out(word, shown):
-    assert spelled(word) == shown
+    assert spell(word) == shown
 
 
 def test_a_stream_escapes_whatever_writes_to_it(capsys):
