@@ -14,7 +14,7 @@ from PIL import Image
 
 from powderdsl.diagnostics import CompileError
 from powderdsl.simulation import media
-from powderdsl.simulation.draw import CellTint, palette, rgb, scale
+from powderdsl.simulation.draw import CellTint, contact_sheet, palette, rgb, scale
 from powderdsl.simulation.media import write_gif, write_mp4, write_png
 from tests.unit.elements import ELEMENTS
 
@@ -43,7 +43,7 @@ def mp4_frames(path, width: int, height: int) -> np.ndarray:
 
 
 def test_gif_keeps_every_color_of_worlds(tmp_path):
-    frames = [world(seed) for seed in range(5)]
+    frames = [contact_sheet(scale(np.stack([world(seed), world(seed + 5)]), 3)) for seed in range(5)]
     write_gif(tmp_path / "x.gif", iter(frames), fps=20)
     found = gif_frames(tmp_path / "x.gif")
     assert len(found) == 5
