@@ -1,4 +1,8 @@
-"""Physics as data, compiled to tensor kernels, trained on."""
+"""Physics as data, compiled to tensor kernels, trained on.
+
+`load` reads rules, and `compile` makes a `Simulator` of them, which makes, changes and steps a `World`. `save` and
+`load_world` store worlds. `ledger` says what rules create, destroy and move. `CompileError` has the mistakes in files.
+"""
 
 from __future__ import annotations
 

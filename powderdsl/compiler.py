@@ -111,8 +111,13 @@ def load(
         palette: recorded ids, such as a model's: the qualified name of the element of each id, or None. Other elements
             get its free ids, then the ids after its end.
 
+    Returns:
+        The checked model, which `powderdsl.compile` takes.
+
     Raises:
-        CompileError: with all mistakes in the files.
+        CompileError: all mistakes in the files; PD304 for an unknown name, PD101 or PD102 for a file that cannot be
+            read, PD309 for an unknown parameter, PD402 for a value that it cannot have.
+        TypeError: `params` is not a mapping.
     """
     ruleset, _ = load_with_diagnostics(*names, params=params, palette=palette)
     return ruleset
@@ -124,7 +129,7 @@ def load_with_diagnostics(
     params: Mapping[str, Any] | None = None,
     palette: Palette | None = None,
 ) -> tuple[Ruleset, tuple[Diagnostic, ...]]:
-    """The checked model, as from `load`, and the warnings and notes."""
+    """Read rule files as `load` does; return the checked model, and its warnings and notes in source order."""
     reporter = Reporter()
     packs, ruleset = read(names, reporter)
     reporter.raise_if_errors()
@@ -140,7 +145,7 @@ def whole_palette(*names: str | Path) -> tuple[str | None, ...]:
     """The slots of a model for the elements of some rules: a qualified name or None each.
 
     Packs that are left out have slots too. The ids of a ruleset's own packs, or of a list of packs, do not change; the
-    elements of packs that are added to a ruleset follow without gaps. Raises CompileError.
+    elements of packs that are added to a ruleset follow without gaps. Raises CompileError as `load`.
     """
     reporter = Reporter()
     packs, ruleset = read([word for name in names for word in split_names(name)[0]], reporter)
@@ -155,7 +160,7 @@ def whole_palette(*names: str | Path) -> tuple[str | None, ...]:
 
 
 def read(names: Sequence[str | Path], reporter: Reporter) -> tuple[list[PackDecl], RulesetDecl | None]:
-    """Declarations of everything named, each pack once, in the order of first mention."""
+    """Read the declarations of everything named, each pack once, in the order of first mention; report mistakes."""
     reader = _Reader(reporter)
     packs, rulesets = reader.packs, reader.rulesets
     left_out: dict[str, None] = {}
@@ -391,7 +396,7 @@ def _report_unknown(word: str, span: Span | None, reporter: Reporter) -> None:
 
 @collection_paused()
 def lower(ruleset: Ruleset, memo: Memo | None = None) -> Program:
-    """Lower the checked model to optimized IR. With a memo, only passes that have changed go through the stages."""
+    """Lower the checked model to optimized IR. With a `memo`, only passes that have changed go through the stages."""
     from powderdsl.ir.lower import lower_ruleset
     from powderdsl.ir.stages import run_passes
     from powderdsl.ir.text import structure
@@ -409,7 +414,7 @@ def lower(ruleset: Ruleset, memo: Memo | None = None) -> Program:
 
 
 def parts(program: Program, memo: Memo | None = None) -> tuple[Segment, ...]:
-    """Split optimized IR into segments, on bit planes if the planes can represent the passes."""
+    """Split optimized IR into segments, on bit planes if the planes can represent the passes. `memo` as in `lower`."""
     from powderdsl.ir.segments import PassForm, choose_form, segments
     from powderdsl.ir.text import structure
 

@@ -133,11 +133,18 @@ def rgb(
     fields: Mapping[str, Array] | None = None,
     kind: ArrayKind | None = None,
 ) -> Array:
-    """Pictures uint8 [..., H, W, 3] of ids [..., H, W] in the colors of a `palette`.
+    """Pictures uint8 [..., H, W, 3] of element ids, a pixel a cell.
 
-    With `ramps`, cells of their elements have the color of their value in `fields`, arrays [..., H, W] by name. With
-    `tints`, cells are then tinted by vectors in `fields`, float [..., 2, H, W], in order. All arrays are of `kind`; without
-    `kind`, ids and fields may be tensors too, and pictures are NumPy arrays.
+    Args:
+        ids: uint8 [..., H, W].
+        colors: a `palette`; `looks` has it, the ramps and the tints of a ruleset.
+        ramps: cells of their elements have the color of their value in `fields`.
+        tints: cells are then tinted by vectors in `fields`, in order.
+        fields: by name: [..., H, W], or float [..., 2, H, W].
+        kind: of all arrays. Without it, ids and fields may be tensors too, and pictures are NumPy arrays.
+
+    Raises:
+        KeyError: a ramp or a tint follows a field that `fields` lacks.
     """
     values = fields or {}
     if kind is None:
@@ -173,16 +180,18 @@ def tint_cells(kind: ArrayKind, image: Array, vectors: Array, tint: CellTint) ->
 
 
 def scale(image: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
-    """Every pixel of [..., H, W, 3] as a square of `factor` by `factor`."""
+    """Every pixel of pictures uint8 [..., H, W, 3] as a square of `factor` by `factor`."""
     return np.repeat(np.repeat(image, factor, axis=-3), factor, axis=-2)
 
 
 def contact_sheet(
     images: Array | Sequence[Array], *, columns: int | None = None, gap: int = 2
 ) -> NDArray[np.uint8]:
-    """Pictures of one size, uint8 [N, H, W, 3], side by side on one, uint8 [H', W', 3], row by row.
+    """Pictures of one size, at least one, uint8 [N, H, W, 3], side by side on one, uint8 [H', W', 3], row by row.
 
-    `columns` defaults to a square of pictures; `gap` white pixels stand between and around them.
+    Args:
+        columns: pictures in a row; by default, as many as there are rows, or one more.
+        gap: white pixels between and around pictures.
     """
     pictures = [to_numpy(image) for image in images]
     height, width = pictures[0].shape[:2]

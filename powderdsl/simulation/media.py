@@ -21,7 +21,11 @@ MIN_GIF_DELAY = 20
 
 
 def write_png(path: str | Path, image: Any) -> None:
-    """Write one picture, uint8 [H, W, 3] (array or tensor)."""
+    """Write one picture, uint8 [H, W, 3] (array or tensor).
+
+    Raises:
+        CompileError: PD612 if Pillow is not installed, PD613 if the file cannot be written.
+    """
     images, frame = require("PIL.Image", "writing a picture", "pip install pillow"), to_numpy(image)
     with replacing(Path(path), follow=True) as temporary:
         picture = images.frombytes("RGB", (frame.shape[1], frame.shape[0]), frame.tobytes())
@@ -29,9 +33,16 @@ def write_png(path: str | Path, image: Any) -> None:
 
 
 def write_gif(path: str | Path, frames: Iterable[Any], *, fps: float = 30) -> None:
-    """Write an endless animation as GIF, from an iterable that may be lazy. At most 50 frames a second.
+    """Write an endless animation as GIF.
 
     Frames of up to 256 colors keep them exactly; others are reduced, without dithering.
+
+    Args:
+        frames: at least one, arrays or tensors, from an iterable that may be lazy.
+        fps: frames a second; above 50 counts as 50.
+
+    Raises:
+        CompileError: PD612 if NumPy or Pillow is not installed, PD613 if the file cannot be written.
     """
     delay = max(round(100 / fps) * 10, MIN_GIF_DELAY)  # GIF counts hundredths of a second
     require("numpy", "writing an animation", "pip install numpy")
@@ -45,9 +56,14 @@ def write_gif(path: str | Path, frames: Iterable[Any], *, fps: float = 30) -> No
 
 
 def write_mp4(path: str | Path, frames: Iterable[Any], *, fps: float = 30) -> None:
-    """Write an animation as H.264, from an iterable that may be lazy. Odd sizes grow by one row or column.
+    """Write an animation as H.264. Odd sizes grow by one row or column.
 
-    Raises CompileError: PD612 if imageio-ffmpeg is not installed, PD613 with the encoder's own words if it fails.
+    Args:
+        frames: as in `write_gif`.
+        fps: frames a second.
+
+    Raises:
+        CompileError: PD612 if imageio-ffmpeg is not installed, PD613 with the encoder's own words if it fails.
     """
     helps = ("pip install 'powderdsl[video]'", "or write a .gif, which needs nothing")
     ffmpeg = require("imageio_ffmpeg", "writing MP4", *helps).get_ffmpeg_exe()

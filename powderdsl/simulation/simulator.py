@@ -47,9 +47,9 @@ BATCH_SIZES = 16
 class World:
     """A batch of worlds of one ruleset, as arrays of the simulator's kind: torch tensors, or arrays without torch.
 
-    `state` has one array per slot, [B, H, W] or [B, 2, H, W] in the slot's dtype. `seed`, `index` and `step` (int64 [B])
-    determine the random numbers: equal values give the same future, alone or in any batch. `step` is `since` steps after
-    `start`.
+    `Simulator.world` makes them. `sim` is their simulator. `state` has one array per slot, [B, H, W] or [B, 2, H, W] in
+    the slot's dtype. `seed`, `index` and `step` (int64 [B]) determine the random numbers: equal values give the same
+    future, alone or in any batch. `step` is `since` steps after `start`.
 
     Raises:
         ValueError: a seed, index or start of another shape, dtype or device.
@@ -88,21 +88,25 @@ class World:
         return shape_of(self.state)
 
     def __len__(self) -> int:
+        """The number of worlds, B."""
         return int(self.seed.shape[0])  # without unpacking anything, nor torch's Python
 
     def __getitem__(self, name: str) -> Array:
-        """A field or property by name, or KeyError: [B, H, W], or float32 [B, 2, H, W] as (rows, columns) of vectors."""
+        """A field or property by name: see `read`."""
         return self.read(name)
 
     def read(self, name: str, out: Array | None = None) -> Array:
-        """`world[name]`, written into `out`.
+        """Read a field or property: [B, H, W] in its dtype, or float32 [B, 2, H, W] as (rows, columns) of vectors.
 
         Args:
+            name: plain or qualified.
             out: a tensor to write to and return, instead of a new tensor or the world's own: of the same shape, dtype
-                and device, each world contiguous. The methods below take `out` too.
+                and device, each world contiguous.
 
         Raises:
-            KeyError: an unknown name. TypeError, ValueError: `out` is not a tensor, or does not fit.
+            KeyError: an unknown name.
+            TypeError: `out` is not a tensor, or worlds are not.
+            ValueError: `out` does not fit.
         """
         sim = self.sim
         if name not in sim.slot_by_name:
@@ -117,21 +121,28 @@ class World:
         return values if out is None else sim.observer.buffer(out, self.shape, values.dtype).copy_(values)
 
     def matrix(self, out: Array | None = None) -> Array:
-        """All channels of the ruleset's `matrix:` as float32 [B, C, H, W]: elements one-hot, then fields."""
+        """All channels of the ruleset's `matrix:`: float32 [B, C, H, W], named by `sim.observer.matrix_names`.
+
+        Elements are one-hot. `out` and errors: as in `read`.
+        """
         return self.sim.observer.matrix(self.state, out)
 
     def rgb(self, out: Array | None = None) -> Array:
-        """Pictures in the elements' colors, a pixel a cell: uint8 [B, H, W, 3]."""
+        """Pictures in the elements' colors, a pixel a cell: uint8 [B, H, W, 3]. `out` and errors: as in `read`."""
         return self.sim.observer.rgb(self.state, out)
 
     def compact(self, out: Array | None = None) -> Array:
-        """All fields that last from step to step, as bytes: uint8 [B, C, H, W], named by `sim.observer.compact_names`."""
+        """All fields that last from step to step, as bytes: uint8 [B, C, H, W], named by `sim.observer.compact_names`.
+
+        `sim.observer.compact_values` has what they stand for. `out` and errors: as in `read`.
+        """
         return self.sim.observer.compact(self.state, out)
 
     def planes(self, out: Array | None = None) -> Array:
         """The bit planes of flags and integers: int64 [B, P, H, ⌈W/64⌉], named by `Simulator.plane_names`.
 
         Bit x % 64 of word x // 64 is column x; bits beyond the width are zero. Floats have no planes: `read` them.
+        `out` and errors: as in `read`.
         """
         return self.sim.observer.planes(self.state, out)
 
@@ -145,14 +156,29 @@ class World:
         return world
 
     def select(self, worlds: int | slice | Sequence[int] | Array) -> World:
-        """Some worlds of the batch, by index; their random futures stay the same."""
+        """Some worlds of the batch as a new batch; their random futures stay the same.
+
+        Args:
+            worlds: an index, a slice, indices, or flags, bool [B]. A negative index counts from the end.
+
+        Raises:
+            IndexError: the batch has no such world.
+        """
         keys = [worlds] if isinstance(worlds, int) else worlds
         clock = {name: getattr(self, name)[keys] for name in ("seed", "index", "start")}
         return self.with_state({name: value[keys] for name, value in self.state.items()}, **clock)
 
 
 class Simulator:
-    """Runs one ruleset on one backend and device. `powderdsl.compile` makes it and takes the same arguments."""
+    """Runs one ruleset on one backend and device. `powderdsl.compile` makes it and takes the same arguments.
+
+    Attributes:
+        ruleset: the checked model.
+        backend: the backend that was asked for; `running` is the one that runs.
+        device: the torch device of its worlds, or ``"cpu"`` without torch.
+        kind: the kind of its worlds' arrays: torch tensors, or arrays without torch.
+        slot_by_name: the arrays of a world's state, by name.
+    """
 
     def __init__(
         self,
@@ -189,7 +215,7 @@ class Simulator:
 
     @cached_property
     def observer(self) -> Observer:
-        """The reader of observations. Raises TypeError without torch."""
+        """The reader of observations. Raises TypeError if worlds are not torch tensors."""
         from powderdsl.simulation.observe import Observer
 
         if self.kind.xp.__name__ != "torch":
@@ -227,12 +253,14 @@ class Simulator:
 
         Args:
             ids: integers [B, H, W] or [H, W]; NumPy, torch or nested lists.
-            seed: one integer for all, or one a world.
+            seed: one integer of 0 or more for all, or one a world.
             index: the number of each world among those of its seed; by default 0, 1, … for one common seed, 0 for
                 different seeds.
 
         Raises:
-            TypeError: ids are not integers. ValueError: wrong shape, or ids that the ruleset does not have.
+            TypeError: ids, seeds or indices are not integers.
+            ValueError: a wrong shape, ids that the ruleset does not have, sides that it does not allow, or more than
+                MAX_CELLS cells; negative seeds or indices.
         """
         array, xp = self._integers(ids, "ids"), self.kind.xp
         if array.ndim == 2:
@@ -284,7 +312,9 @@ class Simulator:
     def numbers(self, values: Any, name: str, batch: int) -> Array:
         """Integers of 0 or more, one for all worlds or one a world, as a new array int64 [B].
 
-        Raises TypeError, ValueError for other values.
+        Raises:
+            TypeError: they are not integers.
+            ValueError: a wrong shape, or a negative number. Messages call them `name`.
         """
         xp = self.kind.xp
         array = xp.asarray(self._integers(values, name), dtype=xp.int64)
@@ -302,11 +332,14 @@ class Simulator:
         """The world with these fields set. New ids make fresh cells; other fields are set after that.
 
         Args:
-            fields: by name: [B, H, W] (or [H, W], or one number for all); vectors [B, 2, H, W] as (rows, columns).
+            fields: by plain name, `ids` for the element: [B, H, W] (or [H, W], or one number for all); vectors
+                [B, 2, H, W] as (rows, columns). Floats are cut off at the field's bounds.
 
         Raises:
-            KeyError: an unknown field. TypeError, ValueError: wrong dtype, shape, range, NaN, or a value where the
-                element cannot hold one.
+            KeyError: an unknown field.
+            TypeError: a wrong dtype.
+            ValueError: a wrong shape, integers out of range, NaN or infinity, a value where the element cannot hold
+                one, or a property that no rule changes.
         """
         state, xp = dict(world.state), self.kind.xp
         new_ids = fields.pop("ids", fields.pop("element", None))
@@ -351,7 +384,9 @@ class Simulator:
             fields: values by field name; vectors as (rows, columns).
 
         Raises:
-            KeyError: an unknown element or field. TypeError, ValueError: a wrong dtype, shape or value.
+            KeyError: an unknown element or field.
+            TypeError: `where` is not bool, or a wrong dtype.
+            ValueError: a wrong shape or value, as in `replace`.
         """
         xp = self.kind.xp
         mask = self._broadcast(where, "where", world.shape)
@@ -393,7 +428,9 @@ class Simulator:
             reuse: overwrite the memory of `world`, which must not be used afterwards. Saves a copy.
 
         Raises:
-            KeyError: unknown streams, passes or parameters. TypeError, ValueError: wrong types, shapes or values.
+            KeyError: unknown streams, passes or parameters.
+            TypeError: an argument of a wrong type; worlds whose arrays are of another kind.
+            ValueError: a wrong shape or value; worlds of other rules.
         """
         self.check(world)
         steps, batch = _step_count(steps), world.seed.shape[0]
@@ -442,7 +479,11 @@ class Simulator:
         return draws
 
     def parameters(self, params: Mapping[str, Any], batch: int) -> dict[str, Array]:
-        """All parameters as float64 [B]: `params`, and defaults. Raises KeyError, TypeError, ValueError."""
+        """All parameters of `batch` worlds by name, new arrays float64 [B]: `params`, as in `step`, and defaults.
+
+        Raises:
+            KeyError, TypeError, ValueError: as in `step`.
+        """
         return {name: self.kind.copied(value) for name, value in self._parameters(params, batch).items()}
 
     def _default_parameters(self, batch: int) -> Mapping[str, Array]:
@@ -460,7 +501,7 @@ class Simulator:
     def profile(self, world: World, steps: int = 1) -> dict[str, float]:
         """The seconds that each pass takes over some steps, in order; empty if the backend cannot measure passes.
 
-        Native code counts processor time on one thread.
+        Native code counts processor time on one thread. Raises ValueError if `steps` is not an integer of 0 or more.
         """
         timing, params = PassClock(self.device), self._defaults(len(world))
         clock = Clock(world.seed, world.index, world.start, world.since)
@@ -489,7 +530,7 @@ def compile(
         memo: a cache of compiled passes, to share between rulesets.
 
     Raises:
-        CompileError: the rules do not load; PD701 if the backend or the device is not available.
+        CompileError: as `load`; PD701 if the backend or the device is not available.
         TypeError: `ruleset` is neither a ruleset nor a name.
     """
     model = load(ruleset) if isinstance(ruleset, str) else ruleset

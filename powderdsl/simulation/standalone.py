@@ -40,9 +40,9 @@ _CELLS = {
 
 
 def standalone_module(ruleset: Ruleset, size: tuple[int, int], memo: Memo | None = None) -> bytes:
-    """A module that is a world of `size` (rows, columns), as described in `targets.wasm.standalone`.
+    """The bytes of a module that is a world of `size` (rows, columns), as described in `targets.wasm.standalone`.
 
-    `memo` is a cache of compiled passes, to share between rulesets.
+    `memo` is as in `powderdsl.compile`.
 
     Raises:
         CompileError: PD607 if the world is too large or its sides do not fit the rules, PD702 if the rules have a pass

@@ -73,11 +73,12 @@ class NumberedRule:
 
     @property
     def span(self) -> Span:
+        """The rule's place in its file."""
         return self.rule.span
 
     @property
     def place(self) -> str:
-        """`file:line`."""
+        """The same as text: `file:line`."""
         return place_of(self.span)
 
 
@@ -129,6 +130,7 @@ class Attempt:
 
     @property
     def happened(self) -> bool:
+        """True if the rule happened there."""
         return bool(self.substep.masks[id(self.rule.rule)][(0, *self.cell)])
 
     @cached_property
@@ -143,6 +145,7 @@ class Attempt:
 
     @property
     def held(self) -> tuple[Part, ...]:
+        """The parts that hold."""
         return tuple(part for part in self.parts if part.holds)
 
     @property
@@ -161,6 +164,7 @@ class Change:
 
     @property
     def changed(self) -> bool:
+        """True if the values differ."""
         return not np.array_equal(self.before, self.after)
 
 
@@ -254,10 +258,12 @@ class Part:
 
     @property
     def text(self) -> str:
+        """The condition in the notation of rule files."""
         return show_expr(self.substep.at.ruleset, self.expr)
 
     @cached_property
     def holds(self) -> bool:
+        """True if the condition is met in the cell."""
         return bool(self.substep.value(self.expr, self.cell))
 
     @cached_property
@@ -388,14 +394,17 @@ def trace(
 
     Args:
         world: the worlds before the first step. All but the last step run on their simulator.
-        row, column: the cell, from 0.
+        row: the cell's row, from 0.
+        column: its column, from 0.
         step: the number of the step to explain, from 1.
         number: the index of the world in the batch.
         of: names of slots: the element, fields, scratch fields such as ``pass.name``. All but scratch by default.
         every_rule: include rules that missed by several parts of their condition, or concern other elements.
 
     Raises:
-        IndexError: the world has no such cell, or the batch no such world. ValueError: step 0. KeyError: an unknown name.
+        IndexError: the world has no such cell, or the batch no such world.
+        ValueError: a step below 1.
+        KeyError: an unknown name, or a property that follows from the element.
     """
     batch, height, width = world.shape
     if not 0 <= number < batch:
@@ -490,7 +499,7 @@ MAX_CELLS = 9
 
 
 def trace_text(trace: Trace, *, color: bool = False) -> str:
-    """The whole trace, without a line break at its end."""
+    """The whole trace as text, without a line break at its end. `color`: with the escape codes of terminals."""
     blocks = [_head(trace)]
     # All writes of one rule in one substep are one block.
     events = groupby(trace.writes, lambda write: (write.attempt, _WITHOUT_RULE.get(write.how)))
@@ -583,7 +592,7 @@ SCHEMA = 1
 
 
 def trace_data(trace: Trace) -> dict[str, Any]:
-    """The trace as plain data for JSON.
+    """The trace as plain data for JSON; docs/tracing.md describes its keys.
 
     Rows and columns count from 0; steps, lines, columns of text, rules and substeps from 1.
     """
@@ -658,7 +667,7 @@ class Provenance:
     rules: tuple[NumberedRule, ...]
 
     def rule_at(self, row: int, column: int, world: int = 0) -> NumberedRule | None:
-        """The rule that last wrote a cell's element, or None. Raises IndexError outside the grid."""
+        """The rule that last wrote a cell's element, or None. Raises IndexError beyond the grid or batch."""
         number = int(self.numbers[world, row, column])
         return self.rules[number - 1] if number else None
 

@@ -12,22 +12,33 @@ from typing import TYPE_CHECKING
 from powderdsl.system.packages import importing
 
 if TYPE_CHECKING:
-    from powderdsl.worldmodel.config import DataConfig as DataConfig
-    from powderdsl.worldmodel.config import Machine as Machine
-    from powderdsl.worldmodel.config import TrainConfig as TrainConfig
-    from powderdsl.worldmodel.evaluation import evaluate as evaluate
-    from powderdsl.worldmodel.evaluation import evaluate_recording as evaluate_recording
-    from powderdsl.worldmodel.networks import UNet as UNet
-    from powderdsl.worldmodel.networks import custom_network as custom_network
-    from powderdsl.worldmodel.recordings import open_recording as open_recording
-    from powderdsl.worldmodel.replay import Replay as Replay
-    from powderdsl.worldmodel.scores import score as score
-    from powderdsl.worldmodel.training import finetuned as finetuned
-    from powderdsl.worldmodel.training import load_trained as load_trained
-    from powderdsl.worldmodel.training import train as train
-    from powderdsl.worldmodel.worlds import pairs_of as pairs_of
-    from powderdsl.worldmodel.worlds import task_worlds as task_worlds
-    from powderdsl.worldmodel.worlds import unseen_seeds as unseen_seeds
+    from powderdsl.worldmodel.config import DataConfig, Machine, TrainConfig
+    from powderdsl.worldmodel.evaluation import evaluate, evaluate_recording
+    from powderdsl.worldmodel.networks import UNet, custom_network
+    from powderdsl.worldmodel.recordings import open_recording
+    from powderdsl.worldmodel.replay import Replay
+    from powderdsl.worldmodel.scores import score
+    from powderdsl.worldmodel.training import finetuned, load_trained, train
+    from powderdsl.worldmodel.worlds import pairs_of, task_worlds, unseen_seeds
+
+__all__ = [
+    "DataConfig",
+    "Machine",
+    "Replay",
+    "TrainConfig",
+    "UNet",
+    "custom_network",
+    "evaluate",
+    "evaluate_recording",
+    "finetuned",
+    "load_trained",
+    "open_recording",
+    "pairs_of",
+    "score",
+    "task_worlds",
+    "train",
+    "unseen_seeds",
+]
 
 __getattr__ = importing(
     "powderdsl.worldmodel",

@@ -1,0 +1,1 @@
+"""Start worlds from shapes, scenes, drawings and pictures; saved worlds."""

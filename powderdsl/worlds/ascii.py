@@ -22,8 +22,13 @@ def parse_ascii(
 ) -> NDArray[np.uint8] | None:
     """The ids uint8 [H, W] of a drawing in a text, or None after reporting mistakes.
 
-    `legend` maps characters to names of elements and overrides their glyphs. Empty lines are skipped. Raises CompileError
-    (PD604) if the legend names an unknown element.
+    Empty lines are skipped. Reports unknown characters (PD610), uneven rows (PD611), no cells or too many (PD607).
+
+    Args:
+        legend: names of elements by character, which override their glyphs.
+
+    Raises:
+        CompileError: PD604 if the legend names an unknown element.
     """
     ids = _characters(elements, legend or {})
     rows: list[str] = []
@@ -63,7 +68,7 @@ def parse_ascii(
 
 
 def read_ascii(text: str, elements: Sequence[Element], *, name: str = "<drawing>") -> NDArray[np.uint8]:
-    """The ids uint8 [H, W] of a drawing. `name` stands for the text in messages. Raises CompileError."""
+    """The ids uint8 [H, W] of a drawing, called `name` in messages. Raises CompileError: what `parse_ascii` reports."""
     reporter = Reporter()
     ids = parse_ascii(Span(Source(name, text), 0, len(text)), elements, reporter)
     reporter.raise_if_errors()
@@ -72,7 +77,7 @@ def read_ascii(text: str, elements: Sequence[Element], *, name: str = "<drawing>
 
 
 def load_ascii(path: str | Path, elements: Sequence[Element]) -> NDArray[np.uint8]:
-    """The ids uint8 [H, W] of a text file. Raises CompileError."""
+    """The ids uint8 [H, W] of a text file. Raises CompileError as `read_ascii`; PD101, PD102 if it cannot be read."""
     reporter = Reporter()
     source = read_source(Path(path), reporter, limit=MAX_BYTES)
     reporter.raise_if_errors()

@@ -32,7 +32,7 @@ def read_image(path: str | Path, elements: Sequence[Element]) -> NDArray[np.uint
 
     Raises:
         CompileError: PD609 for pixel colors without an element, PD607 for too many pixels, PD602 for a file that is not a
-            PNG, PD101 for a file that cannot be read.
+            PNG, PD101 for a file that cannot be read; PD612 if Pillow or NumPy is missing.
     """
     path = Path(path)
     # Four bytes a pixel as one number: red lowest, opacity highest.

@@ -83,7 +83,9 @@ def covered_rows(xp: Any, kind: str, numbers: Sequence[Any], column: Any, size: 
     """The rows that a shape covers in each column, two values that broadcast to int64 [..., W]. Frames are not supported.
 
     Args:
-        xp: numpy or torch. numbers: integers, or int64 tensors [..., 1]. column: int64 [W], of the same library.
+        xp: numpy or torch.
+        numbers: integers, or int64 tensors [..., 1].
+        column: int64 [W], of the same library.
     """
     # An open end of rows or columns is the edge of the grid.
     ends = (0, size[0], 0, size[1])

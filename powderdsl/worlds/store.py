@@ -30,11 +30,12 @@ MORE = 1 << 24
 
 
 def save(world: World, path: str | Path) -> None:
-    """Write worlds with their state, seeds, indices and steps. The file appears whole or not at all.
+    """Write worlds with their state, seeds, indices and steps as .npz. The file appears whole or not at all.
 
     Raises:
         CompileError: PD613 if the folder cannot be written, PD602 if the disk is full, PD607 if there are more than
-            MAX_CELLS cells. TypeError: `world` is not a World.
+            MAX_CELLS cells.
+        TypeError: `world` is not a World.
     """
     if not isinstance(world, World):
         raise TypeError(f"save takes a World, found {type(world).__name__}")
@@ -65,7 +66,8 @@ def load_world(path: str | Path, sim: Simulator) -> World:
 
     Raises:
         CompileError: PD602 if the file is not a saved world; PD603 if the ruleset lacks one of its elements or fields;
-            PD607 if it has more than MAX_CELLS cells. TypeError: `sim` is not a simulator.
+            PD607 if it has more than MAX_CELLS cells.
+        TypeError: `sim` is not a simulator.
     """
     if not isinstance(sim, Simulator):
         raise TypeError(f"load_world takes a Simulator, from powderdsl.compile; found {type(sim).__name__}")
@@ -186,7 +188,7 @@ def _mismatch(path: Path, problem: str, fix: str) -> CompileError:
 def world_data(
     ruleset: Ruleset, ids: Any, fields: Mapping[str, Any], clock: tuple[int, int, int]
 ) -> dict[str, Any]:
-    """A world as JSON: ids [H, W] and whole fields [H, W] or [2, H, W], by qualified names."""
+    """A world as JSON: ids [H, W], whole fields [H, W] or [2, H, W] by qualified name, seed, index and step."""
     qualified = qualified_slots(ruleset)
     return {
         "rows": int(ids.shape[0]),

@@ -26,7 +26,7 @@ def strew(ruleset: Ruleset, size: Size, batch: int, seed: int) -> NDArray[np.uin
 
     The ground is the element with the lowest id. Over it are 24 disks, boxes and lines of the other elements, each solid
     or with a random half of its cells. If any element moves and another never changes, the first unchanging element frames
-    the world, so that nothing falls out of it.
+    the world, so that nothing falls out of it. Raises CompileError as `check_cells`.
     """
     height, width = size
     check_cells(batch, size)

@@ -245,16 +245,24 @@ class Start:
 
 
 def load_start(path_or_name: str | Path, ruleset: Ruleset, *, size: Size | None = None) -> Start:
-    """The start world of a scene: a file, ``FILE#NAME`` for one of several, or a shipped scene's name.
+    """The start world of a scene.
 
-    With another `size` (rows, columns), shapes keep their cells; frames and open ends follow the edge. Raises CompileError
-    with all mistakes.
+    Args:
+        path_or_name: a file, ``FILE#NAME`` for one of several scenes, or a shipped scene's name.
+        size: (rows, columns) instead of the scene's: shapes keep their cells; frames and open ends follow the edge.
+
+    Raises:
+        CompileError: all mistakes: what `find_scene` and `draw_start` raise.
     """
     return draw_start(find_scene(path_or_name), ruleset, size=size)
 
 
 def find_scene(path_or_name: str | Path) -> Scene:
-    """A scene from a file, or a shipped one by name. Raises CompileError (PD601 for an unknown name)."""
+    """A scene from a file, or a shipped one by name, as in `load_start`.
+
+    Raises:
+        CompileError: PD601 for an unknown name, PD101 or PD102 for a file that cannot be read, and mistakes in it.
+    """
     text = str(path_or_name)
     file, _, name = text.rpartition("#") if "#" in text else (text, "", "")
     if file.lower().endswith((".yaml", ".yml")) or os.path.isfile(file):
@@ -292,7 +300,7 @@ def _scenes_of(source: Source) -> tuple[Scene, ...]:
 
 
 def read_file(path: Path) -> tuple[Scene, ...]:
-    """The scenes of a file. Raises CompileError."""
+    """The scenes of a file. Raises CompileError: PD101 or PD102 if it cannot be read, and mistakes in it."""
     reporter = Reporter()
     source = read_source(path, reporter)
     scenes = read_scenes(source, reporter) if source else ()
