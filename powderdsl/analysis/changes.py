@@ -269,7 +269,7 @@ class Requirements:
 
 
 def find_requirements(ruleset: Ruleset, facts: Facts) -> dict[RuleLine, Requirements]:
-    """The needs of each line that may happen."""
+    """The requirements of each line that may happen."""
     named_ids = named_by_fields(ruleset)
     by_line: dict[RuleLine, Requirements] = {}
     for pass_ in ruleset.passes:

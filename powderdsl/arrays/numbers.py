@@ -129,7 +129,8 @@ def pack_exactly(numbers: Iterable[Any], kind: Type) -> Values:
 
 
 def convert(values: Values, old: Type, new: Type) -> Values:
-    """Values of another type. Raises OverflowError or ValueError for floats that no integer of the type stands for."""
+    """Values of another type. Raises OverflowError or ValueError for floats that no integer of the type stands for, and
+    OverflowError for integers that float32 would round twice."""
     if old is new or (isinstance(values, bytes) and new.kind in "iu" and new.high > 254):
         return values
     if new is bool_:

@@ -62,7 +62,7 @@ def progress(title: str, total: float, *, lines: bool = False, resumes: Path | N
     Args:
         total: the final value of `done`.
         lines: where stderr is not a terminal, write a line every `SECONDS`; otherwise nothing.
-        resumes: the folder in which the same command continues after an interruption, which says so.
+        resumes: the folder in which the same command continues after an interruption; a line then says so.
     """
     try:
         with _bar(title, total, lines) as show:

@@ -182,12 +182,12 @@ class _Recording:
         recipe, recorded = self.recipe, {row.number for row in self.manifest.shards}
         shards = [number for number in range(recipe.shards) if number not in recorded]
         numbers = np.array([episode for number in shards for episode in recipe.episodes_of(number)], np.int64)
-        many = max(1, min(envs, PLAYING_BYTES // episode_bytes(recipe)))
+        batch = max(1, min(envs, PLAYING_BYTES // episode_bytes(recipe)))
         progress(recipe.episodes - len(numbers), recipe.episodes)
         episodes: list[dict[str, Array]] = []
-        for first in range(0, len(numbers), many):
+        for first in range(0, len(numbers), batch):
             done = recipe.episodes - len(numbers) + first
-            episodes += self.played(numbers[first : first + many], done, progress)
+            episodes += self.played(numbers[first : first + batch], done, progress)
             while shards and len(episodes) >= len(recipe.episodes_of(shards[0])):
                 count = len(recipe.episodes_of(shards[0]))
                 parts = {name: [episode[name] for episode in episodes[:count]] for name in DTYPES}

@@ -109,6 +109,7 @@ class Diagnostic:
 
     @property
     def sort_key(self) -> tuple[str, int, int, str]:
+        """The file, the place in it, and the code. Diagnostics without a place come first."""
         span = self.primary.span
         return (span.source.name, span.start, span.end, self.code) if span else ("", 0, 0, self.code)
 

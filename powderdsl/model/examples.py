@@ -133,6 +133,7 @@ class _ExampleReader:
         self.composition = typer.symbols
         self.legend = self._legend()
         self.given: tuple[str, ...] = ()
+        """The rows of the first world, once they are read."""
 
     def example(self) -> Example:
         decl, typer, name, place = self.decl, self.typer, self.decl.name.text, self.decl.name.span
@@ -216,7 +217,7 @@ class _ExampleReader:
         return legend
 
     def _check_sides(self, drawing: Scalar) -> None:
-        """Refuse a world of sides that the packs do not allow; where an unknown pack does not, the test is inactive."""
+        """Refuse sides that the test's pack and its needs do not allow; if only other packs do not, it is inactive."""
         multiple, sides = self.composition.side_multiple, (len(self.given), len(self.given[0]))
         if not any(side % multiple for side in sides):
             return

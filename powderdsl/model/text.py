@@ -86,7 +86,7 @@ def _tree_lines(key: str, value: object, indent: str) -> Iterator[str]:
 
 
 def place_of(span: Span) -> str:
-    """`file:line`."""
+    """The place of a span as text: `file:line`."""
     return f"{span.source.name}:{span.line}"
 
 

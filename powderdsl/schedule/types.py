@@ -417,7 +417,7 @@ def read_elsewhere(values: Iterable[Node]) -> set[str]:
 
 
 def planes_at_neighbors(schedule: Schedule) -> dict[str, tuple[str, tuple[int, int, bool]]]:
-    """Map each variable that is just a shifted copy to its source and offset."""
+    """Map each variable that is just a shifted copy to its source and its shift: rows, columns, and if it wraps."""
     return {
         out.var.name: (out.value.args[0].attr, out.value.attr)
         for statement in flat(schedule.body)

@@ -87,6 +87,7 @@ class GoalChecker:
     # Arithmetic on numbers of the whole world
 
     def scalar(self, syntax: Syntax) -> Expr:
+        """The checked expression of a number or a flag. Raises Poisoned after a report, Unresolved without a pack."""
         kind, parts = syntax.kind, syntax.children
         match kind:
             case "integer" | "decimal" | "percent":

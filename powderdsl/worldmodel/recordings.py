@@ -67,7 +67,7 @@ class Recording:
         return Recorded(digest, recipe.channels, agent.steps_per_action, agent.speed)
 
     def configured(self, config: TrainConfig) -> TrainConfig:
-        """A configuration that trains on this dataset. Whether it ignores actions stays."""
+        """A configuration changed to train on this dataset. Whether it uses recorded actions stays."""
         recipe = self.dataset.recipe
         data = DataConfig(
             task=self.name,

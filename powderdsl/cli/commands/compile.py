@@ -138,7 +138,7 @@ def _check_known(what: str, name: str, known: Sequence[str], plural: str) -> Non
 
 
 def _tree(rules: str, pass_name: str | None) -> str:
-    """The packs as parsed, before they are checked."""
+    """The packs as parsed, before they are checked, as text."""
     reporter = Reporter()
     packs, _ = read([rules], reporter)
     reporter.raise_if_errors()

@@ -175,6 +175,7 @@ class Typer:
         self.empty.clear()
 
     def condition(self, syntax: Syntax, scope: Scope) -> Expr:
+        """The value of syntax as a flag: elements alone are a test of the element here."""
         return self.flag(self.evaluate(syntax, scope), syntax.span)
 
     def value_of(self, syntax: Syntax, scope: Scope) -> Expr:

@@ -50,6 +50,7 @@ class Budget:
     """For one question."""
 
     def spend(self, nodes: int) -> None:
+        """Take work from what is left. Raises _Exhausted if there is too little."""
         self.left -= nodes
         if self.left < 0:
             raise _Exhausted

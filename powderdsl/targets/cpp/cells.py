@@ -165,6 +165,7 @@ class _Loop(CellValues[str]):
             yield on_all("const Plane* const", planes, f"mark_rows(c, {self.number}, all, {len(planes)});")
 
     def turns(self) -> str:
+        """A call that stores the masks of choices lane by lane."""
         masks = self.plan.masks
         call = f"turn_masks(c, all, {len(masks)}, {self.plan.first_mask});"
         return on_all("const Plane* const", masks, call)

@@ -565,7 +565,7 @@ def _listing(code: BytesIO, names: Sequence[str]) -> str:
 
 
 def _read(code: BytesIO, *, signed: bool = False) -> int:
-    """A number in LEB128."""
+    """Read a number in LEB128."""
     number = shift = 0
     while True:
         (octet,) = code.read(1)

@@ -24,6 +24,7 @@ T = TypeVar("T")
 
 
 def _owned(owner: T) -> T:
+    """The same object, remembered in `_OWNED`."""
     _OWNED.add(owner)
     return owner
 
