@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from powderdsl.ir.ops import Graph, Node, PassGraph, SubstepGraph, Type, needed, nodes_of
+from powderdsl.ir.ops import Graph, Node, PassGraph, Program, SubstepGraph, Type, needed, nodes_of
 from powderdsl.schedule.types import (
     ANSWER,
     Compute,
@@ -18,8 +18,8 @@ from powderdsl.schedule.types import (
 )
 
 
-def lower(pass_: PassGraph) -> Schedule:
-    """The schedule of a pass on bit planes.
+def lower(program: Program, pass_: PassGraph) -> Schedule:
+    """The schedule of a pass of a program on bit planes.
 
     A substep changes nothing if its masks hold nowhere, so a guard contains its writes and keeps the old values.
     Writes without an old value (the first one of a scratch field) are computed unconditionally.
@@ -29,7 +29,9 @@ def lower(pass_: PassGraph) -> Schedule:
         lowering.substep(step)
     lowering.compute(dict(pass_.outputs).values())
     outputs = tuple((slot, lowering.value(node)) for slot, node in pass_.outputs)
-    return Schedule(pass_.name, tuple(lowering.inputs.items()), tuple(lowering.body), outputs, lowering.graph)
+    bits = sum(slot.name.startswith("element:") for slot in program.slots)
+    inputs, body = tuple(lowering.inputs.items()), tuple(lowering.body)
+    return Schedule(pass_.name, inputs, body, outputs, lowering.graph, element_bits=bits)
 
 
 class _Lowering:

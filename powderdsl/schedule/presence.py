@@ -67,7 +67,9 @@ def check_presence(schedule: Schedule) -> Schedule:
 
 
 def _element_bits(schedule: Schedule) -> dict[str, int]:
-    """The bit of the element that each variable holds. Empty if there are more than MAX_PLANES bits."""
+    """The bit of the element that each variable holds. Empty if the element has more than MAX_PLANES bits."""
+    if schedule.element_bits > MAX_PLANES:
+        return {}
     bits: dict[str, int] = {}
     ends = [(node.attr, slot) for slot, node in schedule.outputs if node.op == "load"]
     for name, slot in (*schedule.input_slots.items(), *ends):
@@ -79,7 +81,7 @@ def _element_bits(schedule: Schedule) -> dict[str, int]:
             for source, target in ((old.attr, new), (new, old.attr)):
                 if source in bits:
                     bits.setdefault(target, bits[source])
-    return bits if max(bits.values(), default=MAX_PLANES) < MAX_PLANES else {}
+    return bits
 
 
 def _times(schedule: Schedule, bits: dict[str, int]) -> dict[str, Time]:
@@ -169,7 +171,8 @@ class _Needs:
     def __init__(self, schedule: Schedule, bits: dict[str, int], times: dict[str, Time]):
         self.graph, self.bits, self.times = schedule.graph, bits, times
         self.known: dict[Node, _Ids] = {}
-        self.codes = range(1 << 1 + max(bits.values()))
+        # Also of bits that the pass does not read: targets look for whole ids.
+        self.codes = range(1 << schedule.element_bits)
         self.everything = (1 << len(self.codes)) - 1
 
     def condition(self, masks: list[Node]) -> Node | None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Literal
 
-from powderdsl.ir.ops import PassGraph
+from powderdsl.ir.ops import PassGraph, Program
 from powderdsl.schedule.costs import Costs, compare_parameters, condition_draws
 from powderdsl.schedule.cut import cut
 from powderdsl.schedule.floats import inline_floats, lead_comparisons, shift_choices
@@ -69,19 +69,19 @@ PLANNERS = {"native": CPU, "wasm": CPU, "cuda": CUDA}
 """The stages of each backend that prints schedules."""
 
 
-def plan(pass_: PassGraph, stages: tuple[Stage, ...]) -> Schedule:
-    """The schedule of a pass on bit planes.
+def plan(program: Program, pass_: PassGraph, stages: tuple[Stage, ...]) -> Schedule:
+    """The schedule of a pass of a program on bit planes.
 
     Only the last schedule is verified: verifying each one takes as long as making them. Tests verify all.
     """
-    *_, (_, schedule) = steps(pass_, stages)
+    *_, (_, schedule) = steps(program, pass_, stages)
     verify(schedule, stages[-1].name)
     return schedule
 
 
-def steps(pass_: PassGraph, stages: tuple[Stage, ...]) -> Iterator[tuple[str, Schedule]]:
+def steps(program: Program, pass_: PassGraph, stages: tuple[Stage, ...]) -> Iterator[tuple[str, Schedule]]:
     """The schedule of a pass after each stage, with the stage's name."""
-    schedule = lower(pass_)
+    schedule = lower(program, pass_)
     yield "lower", schedule
     for stage in stages:
         schedule = stage.apply(schedule)

@@ -222,6 +222,8 @@ class Schedule:
     """An answer: if it is false, the pass changes nothing."""
     buffers: tuple[tuple[str, tuple[str, int]], ...] = ()
     """The kind and number of each variable's buffer, for targets that number buffers."""
+    element_bits: int = 0
+    """The number of planes of the element in the program, also of those that the pass does not read."""
 
     @cached_property
     def input_slots(self) -> dict[str, str]:

@@ -17,8 +17,8 @@ from tests.schedule.test_stages import packed_passes, run_stages
 
 def planned(name: str) -> Schedule:
     """The pass of that name in powderworld, as native code runs it."""
-    (found,) = (pass_ for _, pass_ in packed_passes(load("powderworld")) if pass_.name == name)
-    return plan(found, CPU)
+    ((part, found),) = (pair for pair in packed_passes(load("powderworld")) if pair[1].name == name)
+    return plan(part.planes, found, CPU)
 
 
 def test_box_sums_follow_choices() -> None:
@@ -76,8 +76,8 @@ passes:
 def test_fields_are_exchanged_where_planes_are(policy: str, place: str) -> None:
     rules = load_text(SINKING.replace("POLICY", policy).replace("OFFSET", place), "sinking.yaml")
     run_stages(rules, CPU)
-    ((_, fall),) = packed_passes(rules)
-    statements = list(flat(plan(fall, CPU).body))
+    ((part, fall),) = packed_passes(rules)
+    statements = list(flat(plan(part.planes, fall, CPU).body))
     moves = [(one.op, one.offset, one.outs[0].var.type) for one in statements if isinstance(one, Move)]
     fields = [(op, offset) for op, offset, type in moves if type == REAL]
     assert fields == [(op, offset) for op, offset, type in moves if type != REAL]
@@ -89,5 +89,7 @@ def test_fields_are_exchanged_where_planes_are(policy: str, place: str) -> None:
 def test_exchanges_that_share_cells_are_computed() -> None:
     rules = load_text(SINKING.replace("POLICY", "overwrite").replace("OFFSET", "left"), "sinking.yaml")
     run_stages(rules, CPU)
-    ((_, fall),) = packed_passes(rules)
-    assert not any(isinstance(one, Move) and one.op == "swap" for one in flat(plan(fall, CPU).body))
+    ((part, fall),) = packed_passes(rules)
+    assert not any(
+        isinstance(one, Move) and one.op == "swap" for one in flat(plan(part.planes, fall, CPU).body)
+    )

@@ -38,7 +38,7 @@ def planes(rules: str) -> tuple[Program, ...]:
 
 
 def schedules(rules: str, backend: str) -> list[Schedule]:
-    return [plan(pass_, PLANNERS[backend]) for part in planes(rules) for pass_ in part.passes]
+    return [plan(part, pass_, PLANNERS[backend]) for part in planes(rules) for pass_ in part.passes]
 
 
 def work(nodes: Iterable[Node]) -> dict[str, int]:

@@ -11,7 +11,7 @@ from powderdsl.compiler import load, lower
 from powderdsl.diagnostics import CompileError
 from powderdsl.ir.bits import plane_slots
 from powderdsl.ir.ops import PassGraph, Program, plane_name
-from powderdsl.ir.segments import segments
+from powderdsl.ir.segments import Segment, segments
 from powderdsl.model.state import slots as state_slots
 from powderdsl.model.types import Ruleset
 from powderdsl.schedule.lifetimes import Pending, Pool, assign_buffers, insert_barriers
@@ -26,11 +26,11 @@ from tests.tiers import tiered
 WORLDS = 4
 
 
-def packed_passes(rules: Ruleset) -> Iterator[tuple[Program, PassGraph]]:
+def packed_passes(rules: Ruleset) -> Iterator[tuple[Segment, PassGraph]]:
     for part in segments(lower(rules)):
         if part.planes is not None:
             for pass_ in part.planes.passes:
-                yield part.program, pass_
+                yield part, pass_
 
 
 def random_world(rules: Ruleset, program: Program, seed: int) -> World:
@@ -136,10 +136,10 @@ def test_many_random_rulesets(stages: tuple[Stage, ...]) -> None:
 
 
 def run_stages(rules: Ruleset, stages: tuple[Stage, ...]) -> None:
-    for program, pass_ in packed_passes(rules):
-        worlds = [random_world(rules, program, seed) for seed in range(WORLDS)]
+    for part, pass_ in packed_passes(rules):
+        worlds = [random_world(rules, part.program, seed) for seed in range(WORLDS)]
         truths = [run_graph(pass_, world) for world in worlds]
-        for stage, schedule in steps(pass_, stages):
+        for stage, schedule in steps(part.planes, pass_, stages):
             verify(schedule, stage)
             for world, truth in zip(worlds, truths, strict=True):
                 compare(pass_, schedule, world, truth)
@@ -151,19 +151,19 @@ def test_buffers(rules: str, in_place: bool) -> None:
     """No variable is read after its buffer has been written over; values end in their slots' own buffers."""
     pool: Pool | None = None
     loaded = load(rules)
-    for program, pass_ in packed_passes(loaded):
-        planes = plane_slots(program.slots)
+    for part, pass_ in packed_passes(loaded):
+        planes = plane_slots(part.program.slots)
         kinds = {slot.name: "real" if slot.type.name == "real" else "flag" for slot in planes}
         homes = {name: [n for n in kinds if kinds[n] == kinds[name]].index(name) for name in kinds}
         own = {kind: sum(1 for one in kinds.values() if one == kind) for kind in ("flag", "real")}
         pool = pool or Pool(own, dict(own))
-        *_, (_, schedule) = steps(pass_, CUDA)
+        *_, (_, schedule) = steps(part.planes, pass_, CUDA)
         schedule = insert_barriers(assign_buffers(schedule, homes, pool, in_place=in_place), Pending())
         verify(schedule, "buffers")
         ends = dict(schedule.buffers)
         assert all(ends[node.attr][1] == homes[slot] for slot, node in schedule.outputs)
         for seed in range(WORLDS):
-            world = random_world(loaded, program, seed)
+            world = random_world(loaded, part.program, seed)
             compare(pass_, schedule, world, run_graph(pass_, world))
 
 

@@ -90,9 +90,11 @@ def _schedules(
     last = after or names[-1]
     _check_known("stage", last, names, "stages")
     for part in parts:
-        for pass_ in part.planes.passes if part.planes else ():
+        if part.planes is None:
+            continue
+        for pass_ in part.planes.passes:
             if pass_name in (None, pass_.name):
-                yield print_schedule(dict(steps(pass_, stages))[last])
+                yield print_schedule(dict(steps(part.planes, pass_, stages))[last])
 
 
 SHOWN_SHARED = 227 << 10

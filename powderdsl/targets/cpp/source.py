@@ -51,7 +51,7 @@ def native_source(program: Program, width: int = 0) -> NativeSource:
     layout, tested = native_layout(program), 0
     passes, calls = [], []
     for number, pass_ in enumerate(program.passes):
-        schedule = plan(pass_, CPU)
+        schedule = plan(program, pass_, CPU)
         tested |= tested_ids(schedule)
         passes.append(pass_text(schedule, number, layout))
         calls.append(f"  pass_{number}(c); TICK({number})")

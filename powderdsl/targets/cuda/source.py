@@ -67,7 +67,7 @@ def cuda_source(program: Program, height: int, width: int, shared_limit: int) ->
     in_place = -(-group * words // threads) <= HELD
     passes = []
     for number, pass_ in enumerate(program.passes):
-        schedule = assign_buffers(plan(pass_, CUDA), homes, pool, in_place=in_place)
+        schedule = assign_buffers(plan(program, pass_, CUDA), homes, pool, in_place=in_place)
         body = pass_text(insert_barriers(schedule, pending), layout)
         passes.append(f"DEVICE void pass_{number}(const Block& c) {{\n(void)c;\n{body}\n}}")
     numbers = len(layout.step_planes) + len(layout.param_planes) + len(layout.param_reals)

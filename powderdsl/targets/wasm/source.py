@@ -54,7 +54,7 @@ def wasm_module(
         face: if given, the module is a world by itself (`standalone`) and exports only its functions.
         memo: stores schedules of passes.
     """
-    schedules = [_schedule(pass_, memo) for pass_ in program.passes]
+    schedules = [_schedule(program, pass_, memo) for pass_ in program.passes]
     memory = Memory(width, extent_of(schedules), layout_of(program))
     module = Module(memory.top // PAGE + 1, PAGES)
     library = Library(memory, module)
@@ -69,11 +69,11 @@ def wasm_module(
     return module
 
 
-def _schedule(pass_: PassGraph, memo: Memo | None) -> Schedule:
+def _schedule(program: Program, pass_: PassGraph, memo: Memo | None) -> Schedule:
     if memo is None:
-        return plan(pass_, CPU)
-    key = structure(pass_, places=False)
-    schedule = memo.of(("schedule", pass_.name), key, lambda: plan(pass_, CPU))
+        return plan(program, pass_, CPU)
+    key = program.slots, structure(pass_, places=False)
+    schedule = memo.of(("schedule", pass_.name), key, lambda: plan(program, pass_, CPU))
     return replace(schedule, graph=schedule.graph.copy())  # emitting code adds nodes to it
 
 
