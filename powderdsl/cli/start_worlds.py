@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from powderdsl.arrays import np
 from powderdsl.cli.exits import BadInput, user_values
+from powderdsl.compiler import lower, parts
 from powderdsl.model.state import fitting
 from powderdsl.model.types import Ruleset
+from powderdsl.system.memo import Memo
 from powderdsl.system.writing import failure
 from powderdsl.worlds.raster import Size
 from powderdsl.worlds.scene import Start, load_start
@@ -20,15 +22,28 @@ if TYPE_CHECKING:
 
 DEFAULT_SIDE = 64
 
+FEW = 1 << 27
+"""Cells times steps that WebAssembly runs in about a second, the time that it takes to import torch. Also, 100 times the
+number of cells: larger worlds may not fit into the memory of WebAssembly."""
+
 KINDS = "worlds are .npz, .png, .txt and .yaml files, FILE.yaml#NAME, or a shipped scene's name"
 
 
 def start(
-    ruleset: Ruleset, name: str | None, size: Size | None, batch: int | None, seed: int | None, **how: Any
+    ruleset: Ruleset,
+    name: str | None,
+    size: Size | None,
+    batch: int | None,
+    seed: int | None,
+    *,
+    backend: str = "auto",
+    steps: int = 0,
+    **how: Any,
 ) -> World:
     """The worlds that a run starts from; each has random numbers of its own.
 
     Args:
+        steps: the number of steps that follow. `auto` imports torch, and may compile native code, only if they are many.
         how: passed on to `simulator.compile`.
 
     Raises CompileError for files and names that cannot be used, BadInput for options that do not go together.
@@ -37,7 +52,10 @@ def start(
     drawn = start_drawn(ruleset, name, size, batch, seed)
     from powderdsl.simulation.simulator import compile
 
-    sim = compile(ruleset, tensors=False, **how)
+    memo = Memo()  # what is lowered here is not lowered again
+    many = drawn is None or drawn.ids.size * max(steps, 100) > FEW
+    tensors = backend == "auto" and (many or not _fits_planes(ruleset, memo))
+    sim = compile(ruleset, backend, tensors=tensors, memo=memo, **how)
     with user_values():
         if drawn is None:
             from powderdsl.worlds.store import load_world
@@ -48,6 +66,11 @@ def start(
             values: dict[str, Any] = {key: given.values}
             world = sim.paint(world, where=given.where, **values)
         return world
+
+
+def _fits_planes(ruleset: Ruleset, memo: Memo) -> bool:
+    """True if bit planes carry all passes. WebAssembly runs only these; without torch, the slow oracle runs the rest."""
+    return all(part.planes is not None for part in parts(lower(ruleset, memo), memo))
 
 
 def start_drawn(

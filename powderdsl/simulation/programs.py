@@ -40,14 +40,16 @@ def has_torch() -> bool:
 def array_kind(backend: str, device: Any, tensors: bool) -> ArrayKind:
     """The arrays of a simulator: torch tensors, or `powderdsl.arrays` where torch is missing or not wanted.
 
-    `tensors`: use torch wherever it is installed, not only where the backend or the device needs it.
+    `tensors`: use torch wherever it is installed, not only where the backend or the device needs it. Without, `auto` is
+    WebAssembly on the CPU.
 
     Raises:
         CompileError: PD701 if the backend or the device is unknown, or needs torch, which is missing.
     """
     if backend not in BACKENDS:
         raise failure("PD701", f"no backend `{backend}`", helps=("backends: " + ", ".join(BACKENDS),))
-    needed = backend not in WITHOUT_TORCH or str(device) != "cpu"
+    plain = backend in WITHOUT_TORCH or (backend == "auto" and not _wasm_problem())
+    needed = not plain or str(device) != "cpu"
     if has_torch() and (tensors or needed):
         from powderdsl.targets.tensor_kind import Tensors
 

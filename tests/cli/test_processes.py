@@ -24,6 +24,8 @@ from tests.processes import started
         (["explain", "PD301"], {"torch", "numpy", "rich", "lark", "yaml", "PIL"}),
         (["check", "--quick", "powderworld"], {"torch", "numpy", "rich", "PIL"}),
         (["check", "powderworld"], {"torch", "rich", "PIL"}),
+        (["run", "core", "--steps", "2", "--size", "8x8"], {"torch", "rich", "PIL"}),
+        (["trace", "core", "--at", "1,1", "--step", "1", "--size", "8x8"], {"torch", "rich", "PIL"}),
         (["show", "powderworld"], {"torch", "numpy", "rich", "PIL"}),
         (["compile", "powderworld", "--emit", "model"], {"torch", "numpy", "rich", "PIL"}),
         (["compile", "powderworld", "--emit", "ir"], {"torch", "rich", "PIL"}),

@@ -10,13 +10,15 @@ from PIL import Image
 
 import powderdsl as package
 from powderdsl.analysis.changes import unchanging_ids
-from powderdsl.cli.start_worlds import start_drawn
+from powderdsl.cli.start_worlds import start, start_drawn
 from powderdsl.compiler import shipped_tests
 from powderdsl.diagnostics import CompileError
+from powderdsl.testing.generators.cases import load_text
 from powderdsl.worlds.raster import Paint
 from powderdsl.worlds.scene import shipped_scenes
 from powderdsl.worlds.strewn import strew
 from tests.cli.commands import PACK, powderdsl
+from tests.semantics.test_mixed import HEAVY
 
 FAST = ("--backend", "reference", "--size", "12x20", "--steps", "3")
 """Small and without a compiler: how rules run is tested elsewhere."""
@@ -117,6 +119,16 @@ def test_settings_change_what_happens():
 def test_verbose_tells_the_speed():
     result = powderdsl("run", "core+grit.yaml", *FAST, "-v")
     assert "cells/s; reference on cpu" in result.stderr
+
+
+def test_auto_takes_torch_for_many_steps_large_worlds_and_passes_on_cells():
+    core, heavy = package.load("core"), load_text(HEAVY, "heavy.yaml")
+
+    def library(rules, side=8, steps=10):
+        return start(rules, None, (side, side), 1, 0, steps=steps).sim.kind.xp.__name__
+
+    assert library(core) == "numpy"
+    assert library(core, steps=10**8) == library(core, side=1200) == library(heavy) == "torch"
 
 
 def test_threads_are_set():

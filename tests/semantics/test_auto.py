@@ -379,7 +379,7 @@ def test_run_says_what_ran_and_why(tmp_path: Path) -> None:
     )
     assert quick.exit_code == 0
     assert "wasm on cpu" in quick.stderr
-    assert "  wasm: no C++ compiler: $CXX is `no-such`, which cannot be run" in quick.stderr
+    assert "  wasm: native code takes torch and more work, or --backend native" in quick.stderr
     native = command("run", "life", "--size", "8x8", "--backend", "native", CXX="no-such")
     assert native.exit_code == 2
     assert "PD701" in native.stderr

@@ -80,7 +80,8 @@ def command(
     plan = Playback(**playback)
     from powderdsl.cli.start_worlds import start
 
-    first = start(ruleset, world, size, batch, seed, backend=backend, device=device, threads=threads)
+    how: dict[str, Any] = {"backend": backend, "device": device, "threads": threads}
+    first = start(ruleset, world, size, batch, seed, steps=plan.steps, **how)
     if plan.out is not None and plan.suffix == ".npz":
         from powderdsl.worlds.store import check_saved
 

@@ -61,7 +61,7 @@ def command(
     from powderdsl.cli.start_worlds import start
     from powderdsl.simulation.tracing import trace, trace_data, trace_text
 
-    begun = start(ruleset, world, size, None, seed, backend=backend)
+    begun = start(ruleset, world, size, None, seed, backend=backend, steps=step)
     with user_values():
         history = trace(begun, *cell, step, every_rule=every_rule, of=of or None, **how)
     if as_json:
