@@ -18,7 +18,7 @@ from powderdsl.diagnostics.printable import shown_character
 from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.hints import CUT, character_help, expected_words, token_help, was_cut
 from powderdsl.syntax.yaml_tree import Node, Scalar
-from powderdsl.system.user_cache import cache_folder
+from powderdsl.system.writing import cache_folder
 
 MAX_LENGTH = 2000
 MAX_DEPTH = 48

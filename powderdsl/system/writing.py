@@ -1,8 +1,9 @@
-"""Writing files whole or not at all, and errors about files. `powderdsl.system.reading` reads them."""
+"""Writing files whole or not at all, the user's private cache, and errors about files. `system.reading` reads them."""
 
 from __future__ import annotations
 
 import os
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -97,3 +98,31 @@ def not_writable(path: Path, error: Exception) -> CompileError:
     """PD613, with the reason that the system gave."""
     reason = getattr(error, "strerror", None) or str(error)
     return failure("PD613", f"cannot write {path}", notes=(reason,))
+
+
+def cache_folder(name: str) -> Path:
+    """A folder of the user's cache, made with mode 0700. Its contents are loaded and executed.
+
+    Raises:
+        OSError: it cannot be made, belongs to somebody else, or others may write to it; or there is no home folder.
+    """
+    try:
+        top = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "powderdsl"
+    except RuntimeError as error:
+        raise OSError(str(error)) from None
+    for folder in (top, top / name):
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        check_private(folder)
+    return top / name
+
+
+def check_private(folder: Path) -> None:
+    """Refuse a folder to which another user may write. Raises PermissionError."""
+    if not hasattr(os, "getuid"):
+        return
+    # A link is checked too: its owner decides where it leads.
+    for status in (folder.lstat(), folder.stat()):
+        if status.st_uid != os.getuid():
+            raise PermissionError(f"{folder} belongs to another user")
+    if folder.stat().st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        raise PermissionError(f"others may write to {folder}: empty it, then `chmod 700` it")

@@ -32,8 +32,7 @@ from powderdsl.model.state import fits
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.standalone import standalone_module
 from powderdsl.system.memo import Memo
-from powderdsl.system.user_cache import cache_folder
-from powderdsl.system.writing import replacing
+from powderdsl.system.writing import cache_folder, replacing
 from powderdsl.targets.array_kind import ArrayKind
 from powderdsl.tasks.shipped import load_task, shipped_tasks
 from powderdsl.tasks.tensors.generator import StartWorlds

@@ -334,7 +334,7 @@ def test_what_cannot_be_run_says_so(tmp_path: Path) -> None:
 
 
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from powderdsl.system.user_cache import cache_folder
+    from powderdsl.system.writing import cache_folder
     from tests.cli.commands import powderdsl
 
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from powderdsl.system.user_cache import cache_folder, check_private
+from powderdsl.system.writing import cache_folder, check_private
 
 
 @pytest.fixture(autouse=True)

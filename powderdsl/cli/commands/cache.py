@@ -57,7 +57,7 @@ def print_path() -> None:
 
 def _folder() -> Path:
     """The folder of compiled code. An OSError, if others may write to it, ends the command with its message."""
-    from powderdsl.system.user_cache import cache_folder
+    from powderdsl.system.writing import cache_folder
 
     return cache_folder("native")
 

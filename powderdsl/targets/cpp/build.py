@@ -21,8 +21,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryFile
 
-from powderdsl.system.user_cache import cache_folder
-from powderdsl.system.writing import scratch_folder
+from powderdsl.system.writing import cache_folder, scratch_folder
 from powderdsl.targets import cache
 
 INSTALL = "install g++ or clang++, or `pip install powderdsl[native]`"

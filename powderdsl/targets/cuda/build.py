@@ -16,7 +16,7 @@ from pathlib import Path
 
 import torch
 
-from powderdsl.system.user_cache import cache_folder
+from powderdsl.system.writing import cache_folder
 from powderdsl.targets import cache as native_cache
 from powderdsl.targets.cuda.source import KernelSource
 
