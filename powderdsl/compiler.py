@@ -30,8 +30,8 @@ from powderdsl.system.reading import inside, is_path
 
 if TYPE_CHECKING:
     from powderdsl.diagnostics import Diagnostic
+    from powderdsl.ir.bits import Segment
     from powderdsl.ir.ops import PassGraph, Program
-    from powderdsl.ir.segments import Segment
 
 BACKENDS = {
     "auto": "`wasm` at once, and `native` once that is compiled; `cuda`, or else `torch`, on other devices",
@@ -415,7 +415,7 @@ def lower(ruleset: Ruleset, memo: Memo | None = None) -> Program:
 
 def parts(program: Program, memo: Memo | None = None) -> tuple[Segment, ...]:
     """Split optimized IR into segments, on bit planes if the planes can represent the passes. `memo` as in `lower`."""
-    from powderdsl.ir.segments import PassForm, choose_form, segments
+    from powderdsl.ir.bits import PassForm, choose_form, segments
     from powderdsl.ir.text import structure
 
     def form_of(whole: Program, pass_: PassGraph) -> PassForm:

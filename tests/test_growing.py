@@ -88,7 +88,7 @@ ROWS = {
 RUN = """\
 import torch
 from powderdsl.ir.ops import REAL, Graph, PassGraph, Program, SlotType, SubstepGraph, integer
-from powderdsl.ir.segments import choose_form, segments
+from powderdsl.ir.bits import choose_form, segments
 from powderdsl.ir.stages import run_passes
 from powderdsl.targets.cpp.source import native_source
 from powderdsl.targets.cuda.source import cuda_source

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 
+from powderdsl.ir.bits import PassForm, choose_form
 from powderdsl.ir.ops import OPS, REAL, Offset, PassGraph, Program, nodes_of
-from powderdsl.ir.segments import PassForm, choose_form
 
 WEIGHTS = {"gates": 1.0, "shifts": 4.0, "moves": 8.0, "random_bits": 8.0, "reals": 32.0, "dense": 200.0}
 """The cost of one of each, in vector operations on 512 cells: sixteen floats fill the vector that holds 512 flags, a

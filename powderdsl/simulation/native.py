@@ -26,8 +26,8 @@ from pathlib import Path
 import torch
 
 from powderdsl.diagnostics import CompileError
+from powderdsl.ir.bits import segments
 from powderdsl.ir.ops import Program
-from powderdsl.ir.segments import segments
 from powderdsl.model.types import Ruleset
 from powderdsl.system.fingerprint import fingerprint
 from powderdsl.targets.array_kind import Array

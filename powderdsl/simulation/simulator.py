@@ -441,12 +441,7 @@ class Simulator:
         names = self._pass_names(passes) if passes is not None else None
         clock = Clock(world.seed, world.index, world.start, world.since)
         state = self._program.run(Job(world.state, clock, steps, values, draws, names, reuse))
-        # Filled directly: the constructor of a frozen dataclass is slow.
-        after = object.__new__(World)
-        attributes = after.__dict__
-        attributes.update(world.__dict__)
-        attributes["sim"], attributes["state"], attributes["since"] = self, state, world.since + steps
-        return after
+        return world.with_state(state, sim=self, since=world.since + steps)
 
     def _pass_names(self, passes: Sequence[str]) -> frozenset[str]:
         if isinstance(passes, str):

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from powderdsl.compiler import lower, parts
-from powderdsl.ir.segments import choose_form
+from powderdsl.ir.bits import choose_form
 from powderdsl.model.state import (
     Slot,
     fits,

@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, Self
 
 from powderdsl.diagnostics import CompileError
+from powderdsl.ir.bits import Segment
 from powderdsl.ir.ops import Program
-from powderdsl.ir.segments import Segment
 from powderdsl.system.writing import failure
 from powderdsl.targets.array_kind import Array
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 from powderdsl.compiler import lower
+from powderdsl.ir.bits import segments
 from powderdsl.ir.ops import OPS as IR_OPS
 from powderdsl.ir.ops import Node, Program, nodes_of
-from powderdsl.ir.segments import segments
 from powderdsl.model.builtins import KIND_WORDS
 from powderdsl.model.operations import OPERATIONS
 from powderdsl.model.types import Assign, Expr, Ruleset

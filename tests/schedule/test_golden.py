@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from powderdsl.compiler import load, lower
+from powderdsl.ir.bits import segments
 from powderdsl.ir.ops import REAL, Node, Program, nodes_of, ordered
-from powderdsl.ir.segments import segments
 from powderdsl.ir.text import print_program
 from powderdsl.schedule.stages import PLANNERS, plan
 from powderdsl.schedule.text import print_schedule

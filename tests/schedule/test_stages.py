@@ -9,9 +9,8 @@ import pytest
 
 from powderdsl.compiler import load, lower
 from powderdsl.diagnostics import CompileError
-from powderdsl.ir.bits import plane_slots
+from powderdsl.ir.bits import Segment, plane_slots, segments
 from powderdsl.ir.ops import PassGraph, Program, plane_name
-from powderdsl.ir.segments import Segment, segments
 from powderdsl.model.state import slots as state_slots
 from powderdsl.model.types import Ruleset
 from powderdsl.schedule.lifetimes import Pending, Pool, assign_buffers, insert_barriers

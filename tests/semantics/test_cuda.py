@@ -11,7 +11,7 @@ import pytest
 import powderdsl
 from powderdsl.compiler import load, lower, shipped_tests, shipped_variants
 from powderdsl.diagnostics import CompileError
-from powderdsl.ir.segments import segments
+from powderdsl.ir.bits import segments
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.targets.cuda.source import KernelSource, cuda_source

@@ -7,8 +7,8 @@ import pytest
 import powderdsl
 from powderdsl.compiler import lower
 from powderdsl.ir import bits
+from powderdsl.ir.bits import PassForm, choose_form, segments
 from powderdsl.ir.ops import PassGraph, Program
-from powderdsl.ir.segments import PassForm, choose_form, segments
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.programs import BackendProgram
 from powderdsl.simulation.simulator import Simulator

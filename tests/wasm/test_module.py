@@ -13,7 +13,7 @@ import wasmtime
 
 import powderdsl
 from powderdsl.compiler import lower
-from powderdsl.ir.segments import segments
+from powderdsl.ir.bits import segments
 from powderdsl.system.memo import Memo
 from powderdsl.targets.tensor_kind import Tensors
 from powderdsl.targets.wasm import program

@@ -15,8 +15,8 @@ from powderdsl.model.text import print_model, print_tree
 from powderdsl.model.types import Ruleset
 
 if TYPE_CHECKING:
+    from powderdsl.ir.bits import Segment
     from powderdsl.ir.ops import Program
-    from powderdsl.ir.segments import Segment
 
 STAGES = ("tree", "model", "ir", "planes", "schedule", "kernels")
 
@@ -60,7 +60,7 @@ def _checked(ruleset: Ruleset, stage: str, backend: str, after: str | None, pass
     if stage == "model":
         return print_model(ruleset, None if pass_name is None else [pass_name])
     program = lower(ruleset)
-    from powderdsl.ir.segments import segments
+    from powderdsl.ir.bits import segments
     from powderdsl.ir.text import print_program
 
     match stage:
@@ -106,7 +106,7 @@ SHOWN_WIDTH = 64
 
 def _kernels(program: Program, backend: str, pass_name: str | None) -> Iterator[str]:
     """The generated source of a backend: part by part, where planes cannot carry all passes."""
-    from powderdsl.ir.segments import segments
+    from powderdsl.ir.bits import segments
     from powderdsl.targets.torch.source import kernel_source
 
     if backend == "reference":

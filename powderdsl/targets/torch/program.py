@@ -14,8 +14,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from powderdsl.ir.bits import segments
 from powderdsl.ir.ops import SNAP, Program, Threshold, kernel_rows
-from powderdsl.ir.segments import segments
 from powderdsl.system.memo import collection_paused
 from powderdsl.system.random import MASK, base_keys, mix
 from powderdsl.targets.codec import limits, pieces
