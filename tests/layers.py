@@ -16,8 +16,8 @@ _STEPS = (
     "simulation.observe",
     "simulation.simulator",
 )
-_SIMULATION = (*_STEPS, "simulation.tracing", "simulation.media")
-_WORLDS = ("worlds", "worlds.store")
+_SIMULATION = (*_STEPS, "simulation.tracing")
+_WORLDS = ("worlds", "worlds.media", "worlds.store")
 _SCREEN = (*_BACK, *_SIMULATION, *_WORLDS)
 _TESTING = (
     "testing.generators",
@@ -77,7 +77,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "targets",
         "simulation.simulator",
     ),  # explains by what the oracle does
-    "simulation.media": ("arrays", "system", "simulation.draw"),
+    "worlds.media": ("arrays", "system", "simulation.draw"),
     "worlds": (*_FRONT, "analysis", "simulation.draw"),
     "worlds.store": (*_FRONT, "worlds", "simulation.simulator"),  # saved worlds are values of the simulator
     "testing.generators": _SCREEN,
@@ -160,7 +160,7 @@ THIRD_PARTIES: dict[str, Home] = {
             "targets.job",
             "simulation.programs",
             "simulation.draw",
-            "simulation.media",
+            "worlds.media",
             "experiments.bench",
             "cli",
         ),

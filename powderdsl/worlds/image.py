@@ -26,7 +26,7 @@ _MODES = ("1", "L", "LA", "P", "RGB", "RGBA")
 
 
 def read_image(path: str | Path, elements: Sequence[Element]) -> NDArray[np.uint8]:
-    """The ids uint8 [H, W] of a PNG file, such as `simulation.media.write_png` writes from `simulation.draw.rgb`.
+    """The ids uint8 [H, W] of a PNG file, such as `worlds.media.write_png` writes from `simulation.draw.rgb`.
 
     Colors of a ramp mean its element; the values of its field are not read.
 

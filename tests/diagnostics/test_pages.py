@@ -224,7 +224,7 @@ def read_a_soft_picture() -> None:
 
 
 def write_a_film_without_the_package() -> None:
-    from powderdsl.simulation.media import write_mp4
+    from powderdsl.worlds.media import write_mp4
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(sys.modules, "imageio_ffmpeg", None)

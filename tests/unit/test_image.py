@@ -17,8 +17,8 @@ from PIL import Image
 
 from powderdsl.diagnostics import CompileError
 from powderdsl.simulation.draw import palette, rgb
-from powderdsl.simulation.media import write_png
 from powderdsl.worlds.image import MAX_REPORTED, read_image
+from powderdsl.worlds.media import write_png
 from tests.unit.elements import ELEMENTS
 
 IDS = np.arange(14, dtype=np.uint8).reshape(2, 7)

@@ -13,9 +13,9 @@ import pytest
 from PIL import Image
 
 from powderdsl.diagnostics import CompileError
-from powderdsl.simulation import media
 from powderdsl.simulation.draw import CellTint, contact_sheet, palette, rgb, scale
-from powderdsl.simulation.media import write_gif, write_mp4, write_png
+from powderdsl.worlds import media
+from powderdsl.worlds.media import write_gif, write_mp4, write_png
 from tests.unit.elements import ELEMENTS
 
 COLORS = palette(ELEMENTS)

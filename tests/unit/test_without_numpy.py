@@ -13,8 +13,8 @@ import powderdsl
 from powderdsl.cli.pictures import pictures
 from powderdsl.cli.start_worlds import start
 from powderdsl.compiler import BACKENDS
-from powderdsl.simulation.media import write_png
 from powderdsl.worlds.ascii import write_ascii
+from powderdsl.worlds.media import write_png
 from powderdsl.worlds.strewn import strew
 
 SCENE = """\

@@ -24,7 +24,7 @@ def command(world: str, rules: str, out: Path, size: tuple[int, int] | None, sca
     ruleset = opt.load_rules(rules, {})
     from powderdsl.cli.pictures import pictures
     from powderdsl.cli.start_worlds import start
-    from powderdsl.simulation.media import write_png
+    from powderdsl.worlds.media import write_png
 
     # Nothing runs, so the backend that takes no compiling will do.
     shown = start(ruleset, world, size, None, None, backend="reference")

@@ -145,7 +145,7 @@ def play(start: World, plan: Playback) -> World:
                 bar(step)
 
         if plan.out is not None and plan.suffix in ANIMATIONS:
-            from powderdsl.simulation import media  # brings Pillow
+            from powderdsl.worlds import media  # brings Pillow
 
             write = media.write_gif if plan.suffix == ".gif" else media.write_mp4
             with user_values():
@@ -158,7 +158,7 @@ def play(start: World, plan: Playback) -> World:
             with LiveView(ruleset.elements, fields=ruleset.fields) as view:
                 view.show(**first_world(world))
     elif plan.suffix == ".png":
-        from powderdsl.simulation.media import write_png
+        from powderdsl.worlds.media import write_png
 
         write_png(plan.out, picture(world))
     elif plan.suffix == ".npz":

@@ -271,8 +271,8 @@ def _write_sheet(task: Task, split: str, seeds: int, out: Path) -> None:
 
     from powderdsl.cli.pictures import MAX_SIDE, USUAL_SIDE
     from powderdsl.simulation.draw import OUTLINES, contact_sheet, outline, scale
-    from powderdsl.simulation.media import write_png
     from powderdsl.tasks.episodes import compile_task
+    from powderdsl.worlds.media import write_png
 
     program = compile_task(task, split=split, backend="torch")
     episodes = program.start(torch.arange(seeds))

@@ -192,7 +192,7 @@ class _Report:
         if counterexample is not None:
             self.say(*(f"      {line}" for line in counterexample_lines(counterexample, ruleset)))
             if self.picture is not None:
-                from powderdsl.simulation.media import write_png  # brings Pillow
+                from powderdsl.worlds.media import write_png  # brings Pillow
 
                 write_png(self.picture, picture(counterexample, ruleset))
                 self.say(f"      drawn: {self.picture}")

@@ -66,8 +66,8 @@ def command(
         raise BadInput("such a picture is too large: choose a smaller --scale, or fewer --worlds")
     import torch
 
-    from powderdsl.simulation.media import write_gif, write_mp4
     from powderdsl.tasks.episodes import compile_task
+    from powderdsl.worlds.media import write_gif, write_mp4
 
     program = compile_task(task, split=split, backend=backend or config.backend)
     with user_values():

@@ -255,8 +255,8 @@ def show_command(run: str, out: Path, curve: bool, scale: int, **values: Any) ->
 
 def _show(strips: list[Strip], rules: Ruleset, out: Path, scale: int) -> None:
     """Draw strips, and count what is wrong in each."""
-    from powderdsl.simulation.media import write_png
     from powderdsl.worldmodel.evaluation import sheet
+    from powderdsl.worlds.media import write_png
 
     write_png(out, sheet(strips, rules, factor=scale))
     for number, strip in enumerate(strips, 1):
