@@ -84,13 +84,12 @@ def read(page: Path) -> str:
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty working directory that sees the repository's folders."""
     for name in ("docs", "rules", "tasks"):
-        (tmp_path / name).symlink_to(ROOT / name)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
-    return tmp_path
+        (folder / name).symlink_to(ROOT / name)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(folder / "minari"))
+    return folder
 
 
 # --- what runs each language
@@ -289,8 +288,6 @@ def headings(text: str) -> set[str]:
 @pytest.fixture(scope="module")
 def generate() -> Any:
     spec = importlib.util.spec_from_file_location("generate", DOCS / "generate.py")
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

@@ -35,8 +35,6 @@ def sim_module() -> Any:
     """Its module `sim`, alone: the package also imports an old `gym`."""
     path = Path(os.environ["POWDERWORLD_2023"]) / "powderworld" / "sim.py"
     spec = spec_from_file_location("powderworld_2023_sim", path)
-    assert spec is not None
-    assert spec.loader is not None
     module = module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

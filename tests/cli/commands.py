@@ -29,12 +29,13 @@ passes:
 """A pack without a mistake, for tests to change."""
 
 
-def powderdsl(*arguments: object, **environment: str) -> Result:
-    """Run in this process. `stdout`, `stderr` and `exit_code` say what came of it."""
+def powderdsl(*arguments: object, exits: int | None = None, **environment: str) -> Result:
+    """Run in this process, and end as said. `stdout`, `stderr` and `exit_code` tell what came of it."""
     command, words = (fuzz, arguments[1:]) if arguments[:1] == ("fuzz",) else (main, arguments)
     result = CliRunner().invoke(command, [str(word) for word in words], env=environment)
     assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
     assert "Traceback" not in result.output
+    assert exits in (None, result.exit_code), result.output
     return result
 
 

@@ -14,9 +14,7 @@ QUICK = ("bench", "life", "--size", "6x8", "--rounds", "2", "--seconds", "0.001"
 TORCH = (*QUICK, "--backend", "torch", "--batch", "2")
 
 
-@pytest.fixture(autouse=True)
-def _folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("folder")
 
 
 def test_all_combinations_are_measured():
@@ -24,8 +22,7 @@ def test_all_combinations_are_measured():
     data = json.loads(powderdsl(*given, "--json").stdout)
     measured = [(cell["backend"], cell["batch"]) for cell in data["cells"]]
     assert measured == [("torch", 2), ("torch", 3), ("reference", 2), ("reference", 3)]
-    result = powderdsl(*given)
-    assert result.exit_code == 0
+    result = powderdsl(*given, exits=0)
     lines = result.stdout.splitlines()
     assert [tuple(line.split()[:3]) for line in lines if line.startswith(("torch", "reference"))] == [
         (backend, str(batch), "6×8") for backend, batch in measured
@@ -37,7 +34,7 @@ def test_all_combinations_are_measured():
 
 
 def test_parameters_can_be_set():
-    assert powderdsl(*TORCH, "--set", "life.nonsense=3").exit_code == exits.BAD_INPUT
+    powderdsl(*TORCH, "--set", "life.nonsense=3", exits=exits.BAD_INPUT)
 
 
 @pytest.mark.parametrize(
@@ -57,9 +54,7 @@ def test_parameters_can_be_set():
     ],
 )
 def test_what_cannot_be_measured_is_refused(arguments, words):
-    result = powderdsl("bench", *arguments)
-    assert result.exit_code == exits.BAD_INPUT
-    assert words in result.stderr
+    assert words in powderdsl("bench", *arguments, exits=exits.BAD_INPUT).stderr
 
 
 def test_without_a_compiler_webassembly_is_measured(monkeypatch):
@@ -67,8 +62,7 @@ def test_without_a_compiler_webassembly_is_measured(monkeypatch):
         raise bench_command.NoCompiler("no C++ compiler found")
 
     monkeypatch.setattr(bench_command, "find_compiler", none)
-    result = powderdsl(*QUICK, "--batch", "1")
-    assert result.exit_code == 0
+    result = powderdsl(*QUICK, "--batch", "1", exits=0)
     assert "no C++ compiler found" in result.stderr
     assert "\nwasm " in result.stdout
     assert "\nnative " not in result.stdout
@@ -95,9 +89,7 @@ def load(state):
 
 def test_a_program_is_measured_beside_a_backend(tmp_path):
     (tmp_path / "mine.py").write_text(PROGRAM)
-    result = powderdsl(*TORCH, "--beside", "mine.py")
-    assert result.exit_code == 0, result.stderr
-    assert "÷ mine" in result.stdout
+    assert "÷ mine" in powderdsl(*TORCH, "--beside", "mine.py", exits=0).stdout
     data = json.loads(powderdsl(*TORCH, "--beside", "mine.py", "--json").stdout)
     torch, mine = data["cells"]
     assert (torch["backend"], mine["backend"]) == ("torch", "mine")
@@ -122,14 +114,11 @@ def test_a_program_is_measured_beside_a_backend(tmp_path):
 )
 def test_a_program_with_a_mistake_is_named_with_its_line(tmp_path, text, words):
     (tmp_path / "bad.py").write_text(text)
-    result = powderdsl(*TORCH, "--beside", "bad.py")
-    assert result.exit_code == exits.BAD_INPUT
-    assert words in result.stderr
+    assert words in powderdsl(*TORCH, "--beside", "bad.py", exits=exits.BAD_INPUT).stderr
 
 
 def test_a_program_cannot_be_named_as_a_backend(tmp_path):
     (tmp_path / "torch.py").write_text(PROGRAM)
-    result = powderdsl(*TORCH, "--beside", "torch.py")
-    assert result.exit_code == exits.BAD_INPUT
+    result = powderdsl(*TORCH, "--beside", "torch.py", exits=exits.BAD_INPUT)
     assert "`torch` is the name of another program or of a backend" in result.stderr
-    assert powderdsl(*TORCH, "--beside", "missing.py").exit_code == exits.BAD_INPUT
+    powderdsl(*TORCH, "--beside", "missing.py", exits=exits.BAD_INPUT)

@@ -10,28 +10,27 @@ from tests.cli.commands import PACK, powderdsl
 
 
 @pytest.fixture
-def pack(tmp_path, monkeypatch):
+def pack(folder):
     """Writes a changed PACK; the name to check it under."""
-    monkeypatch.chdir(tmp_path)
 
     def write(old: str = "", new: str = "", name: str = "grit.yaml") -> str:
         assert old in PACK
-        (tmp_path / name).write_text(PACK.replace(old, new) if old else PACK)
+        (folder / name).write_text(PACK.replace(old, new) if old else PACK)
         return f"core+{name}"
 
     return write
 
 
 def test_a_clean_ruleset_is_one_line():
-    result = powderdsl("check", "powderworld")
-    assert result.exit_code == 0
+    result = powderdsl("check", "powderworld", exits=0)
     assert result.stdout == "powderworld: 14 elements, 12 passes, no errors\n"
     assert result.stderr == ""
 
 
 def test_all_errors_come_at_once(pack):
-    result = powderdsl("check", pack("count(grit) == 1 and interact < vanish", "count(grid) == vanis"))
-    assert result.exit_code == 2
+    result = powderdsl(
+        "check", pack("count(grit) == 1 and interact < vanish", "count(grid) == vanis"), exits=2
+    )
     assert "error[PD301]" in result.stdout
     assert "grit.yaml:10" in result.stdout
     assert "^" in result.stdout
@@ -41,12 +40,11 @@ def test_all_errors_come_at_once(pack):
 
 def test_warnings_are_errors_only_on_request(pack):
     rules = pack("do: ", "do: grit -> empty if grit and not grit\n    then: ")
-    result = powderdsl("check", rules)
-    assert result.exit_code == 0
+    result = powderdsl("check", rules, exits=0)
     assert "warning[PD503]" in result.stdout
     assert ", no errors, " in result.stdout
-    assert powderdsl("check", rules, "--warnings-as-errors").exit_code == 1
-    assert powderdsl("check", rules, "nope", "--warnings-as-errors").exit_code == 2
+    powderdsl("check", rules, "--warnings-as-errors", exits=1)
+    powderdsl("check", rules, "nope", "--warnings-as-errors", exits=2)
 
 
 def test_notes_are_shown_on_request(pack):
@@ -60,8 +58,7 @@ def test_notes_are_shown_on_request(pack):
 
 
 def test_json_is_one_list(pack):
-    result = powderdsl("check", pack("vanish: 20%", "vanish: 120%"), "nope", "--json")
-    assert result.exit_code == 2
+    result = powderdsl("check", pack("vanish: 20%", "vanish: 120%"), "nope", "--json", exits=2)
     found = json.loads(result.stdout)
     assert {one["severity"] for one in found} == {"error"}
     assert found[-1]["code"] == "PD304"
@@ -73,8 +70,7 @@ def test_json_of_clean_rules_is_empty():
 
 
 def test_several_rulesets_are_checked_one_by_one(pack):
-    result = powderdsl("check", "powderworld", pack(), "nope")
-    assert result.exit_code == 2
+    result = powderdsl("check", "powderworld", pack(), "nope", exits=2)
     assert "powderworld: 14 elements" in result.stdout
     assert "core+grit: 3 elements" in result.stdout
     assert "nope: 1 error" in result.stdout
@@ -82,22 +78,20 @@ def test_several_rulesets_are_checked_one_by_one(pack):
 
 def test_files_that_are_not_there(tmp_path):
     assert "PD101" in powderdsl("check", tmp_path / "none.yaml").stdout
-    assert powderdsl("check", tmp_path).exit_code == 2
-    assert powderdsl("check", "").exit_code == 2
-    assert powderdsl("check", "core+").exit_code == 2
+    powderdsl("check", tmp_path, exits=2)
+    powderdsl("check", "", exits=2)
+    powderdsl("check", "core+", exits=2)
 
 
 def test_the_ledger_follows_the_summary(pack):
-    result = powderdsl("check", pack(), "--ledger")
-    assert result.exit_code == 0
+    result = powderdsl("check", pack(), "--ledger", exits=0)
     assert "ledger of core+grit: 3 elements" in result.stdout
     assert "  becomes empty: grit.yaml:10 (grit)\n" in result.stdout
     assert "  never rises  grit\n" in result.stdout
 
 
 def test_the_ledger_as_json(pack):
-    result = powderdsl("check", rules := pack(), "life", "--ledger", "--json")
-    data = json.loads(result.stdout)
+    data = json.loads(powderdsl("check", rules := pack(), "life", "--ledger", "--json").stdout)
     assert list(data) == ["diagnostics", "ledger"]
     ledger = data["ledger"][rules]
     assert list(ledger) == [
@@ -122,8 +116,7 @@ def test_the_ledger_as_json(pack):
 
 def test_an_invariant_that_is_easily_broken_is_an_error(pack):
     rules = pack("passes:", "invariants: [count(grit) never falls]\npasses:")
-    result = powderdsl("check", rules)
-    assert result.exit_code == 2
+    result = powderdsl("check", rules, exits=2)
     assert "error[PD512]: this invariant is broken after 1 step" in result.stdout
     assert "11 |     do: grit -> empty" in result.stdout  # the rule that breaks it
     assert "= note: before   after" in result.stdout

@@ -10,16 +10,14 @@ from tests.cli.commands import powderdsl
 
 
 def test_without_a_code_all_are_listed():
-    result = powderdsl("explain")
-    assert result.exit_code == 0
+    result = powderdsl("explain", exits=0)
     assert [line.split()[0] for line in result.stdout.splitlines()] == list(CODES)
 
 
 @pytest.mark.parametrize("word", ["PD301", "pd301", "301", "unknown-name", "Unknown_Name", "[PD301]"])
 def test_codes_and_slugs_are_accepted(word):
     assert find_code(word) is CODES["PD301"]
-    result = powderdsl("explain", word)
-    assert result.exit_code == 0
+    result = powderdsl("explain", word, exits=0)
     assert "PD301" in result.stdout
     assert "\x1b" not in result.stdout
 
@@ -30,14 +28,11 @@ def test_codes_and_slugs_are_accepted(word):
 )
 def test_unknown_codes_get_a_suggestion(word, meant):
     assert meant in similar(word)
-    result = powderdsl("explain", word)
-    assert result.exit_code == 2
+    result = powderdsl("explain", word, exits=2)
     assert meant in result.stderr
     assert result.stdout == ""
 
 
 @pytest.mark.parametrize("word", ["", "zzzzzzzz", "PD", "\N{SNOWMAN}"])
 def test_anything_else_gets_the_list(word):
-    result = powderdsl("explain", word)
-    assert result.exit_code == 2
-    assert result.stderr.startswith("error: no code")
+    assert powderdsl("explain", word, exits=2).stderr.startswith("error: no code")

@@ -25,11 +25,8 @@ def listed(names: tuple[str, ...]) -> str:
 def test_every_target_is_compared_unless_some_are_named(tmp_path: Path) -> None:
     skip_without_compiler()
     given = ("fuzz", "--jobs", 1, "--worlds", 1, "--steps", 1, "--seeds", "0..1", "--save", tmp_path)
-    every = powderdsl(*given)
-    assert every.exit_code == 0, every.stderr
-    assert f": {listed(COMPARED)} against the reference" in every.stdout
-    some = powderdsl(*given, "--backends", "reference,cuda-emulated")
-    assert some.exit_code == 0, some.stderr
+    assert f": {listed(COMPARED)} against the reference" in powderdsl(*given, exits=0).stdout
+    some = powderdsl(*given, "--backends", "reference,cuda-emulated", exits=0)
     assert ": cuda-emulated against the reference" in some.stdout
 
 
@@ -75,12 +72,10 @@ def test_a_wrong_backend_is_found_reduced_and_replayed(
     assert len(small.text) < len(finding.case.text) / 2
     write_case(tmp_path / "case.yaml", small, finding.problem)
     assert "fields" not in (tmp_path / "case.yaml").read_text() or small.start.fields
-    replayed = powderdsl("fuzz", "--replay", tmp_path / "case.yaml")
-    assert replayed.exit_code == 1
+    replayed = powderdsl("fuzz", "--replay", tmp_path / "case.yaml", exits=1)
     assert "wasm differs after step 1: `element`" in replayed.stdout
     monkeypatch.setattr(differential, "_compiled", compiled)
     differential._simulator.cache_clear()
-    replayed = powderdsl("fuzz", "--replay", tmp_path / "case.yaml")
-    assert replayed.exit_code == 0
+    replayed = powderdsl("fuzz", "--replay", tmp_path / "case.yaml", exits=0)
     assert "wasm and the reference agree" in replayed.stdout
     assert read_case(tmp_path / "case.yaml").text == small.text

@@ -40,17 +40,14 @@ tests:
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def folder(folder, monkeypatch):
     monkeypatch.delenv("CI", raising=False)
-    (tmp_path / "yard.yaml").write_text(PACK)
-    return tmp_path
+    (folder / "yard.yaml").write_text(PACK)
+    return folder
 
 
 def test_invariants_are_proven_or_broken_by_small_worlds(folder):
-    result = powderdsl("test", "yard.yaml", "--json")
-    assert result.exit_code == 1
-    (found,) = json.loads(result.stdout).values()
+    (found,) = json.loads(powderdsl("test", "yard.yaml", "--json", exits=1).stdout).values()
     status = {one["property"]: one["status"] for one in found["properties"] if one["pack"] == "yard"}
     assert status == {
         "count(weed) never falls": "proven",
@@ -72,25 +69,22 @@ def test_invariants_are_proven_or_broken_by_small_worlds(folder):
 
 
 def test_what_is_broken_is_drawn_kept_and_tried_again(folder):
-    result = powderdsl("test", "yard.yaml", "--picture", "rock.png")
-    assert result.exit_code == 1
+    result = powderdsl("test", "yard.yaml", "--picture", "rock.png", exits=1)
     assert "by yard.yaml:12: rock -> soil if count(weed) > 2" in result.stdout
     assert "before" in result.stdout
     assert result.stdout.endswith("1 test, 6 invariants, 3 broken\n")
     assert (folder / "rock.png").stat().st_size > 100
     (kept,) = folder.glob(".powderdsl/*rock-never-changes*.yaml")
     assert f"--replay .powderdsl/{kept.name}" in kept.read_text()
-    replayed = powderdsl("test", "yard.yaml", "--replay", str(kept))
-    assert replayed.exit_code == 1
+    replayed = powderdsl("test", "yard.yaml", "--replay", str(kept), exits=1)
     assert "BROKEN    yard: rock never changes" in replayed.stdout
     (folder / "yard.yaml").write_text(PACK.replace("count(weed) > 2", "count(weed) > 8"))
-    mended = powderdsl("test", "yard.yaml", "--replay", str(kept))
-    assert mended.exit_code == 0, mended.stdout
+    powderdsl("test", "yard.yaml", "--replay", str(kept), exits=0)
 
 
 def test_nothing_is_kept_where_tests_are_thrown_away(folder, monkeypatch):
     monkeypatch.setenv("CI", "true")
-    assert powderdsl("test", "yard.yaml", "--examples", "64").exit_code == 1
+    powderdsl("test", "yard.yaml", "--examples", "64", exits=1)
     assert not (folder / ".powderdsl").exists()
 
 
@@ -105,15 +99,13 @@ def test_the_same_seed_finds_the_same(folder):
 )
 def test_files_that_are_not_counterexamples_are_refused(folder, text, word):
     (folder / "case.yaml").write_text(text)
-    result = powderdsl("test", "yard.yaml", "--replay", "case.yaml")
-    assert result.exit_code == 2
-    assert word in result.stderr
+    assert word in powderdsl("test", "yard.yaml", "--replay", "case.yaml", exits=2).stderr
 
 
 def test_a_replay_needs_one_name(folder):
     (folder / "case.yaml").write_text("x: y\n")
-    assert powderdsl("test", "--replay", "case.yaml").exit_code == 2
-    assert powderdsl("test", "yard.yaml", "--picture", "rock.gif").exit_code == 2
+    powderdsl("test", "--replay", "case.yaml", exits=2)
+    powderdsl("test", "yard.yaml", "--picture", "rock.gif", exits=2)
 
 
 def test_packs_under_pytest(folder):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 
 import click
 import pytest
@@ -11,20 +12,17 @@ from click.testing import CliRunner
 from powderdsl.cli import exits, main, output
 from powderdsl.cli.dispatch import COMMANDS
 from powderdsl.diagnostics import CODES, CompileError, Diagnostic, Label
-from tests.cli.commands import powderdsl, process
+from tests.cli.commands import command_line, environment_with, powderdsl, process
 
 
 def test_help_lists_every_command():
-    result = powderdsl("--help")
-    assert result.exit_code == 0
+    result = powderdsl("--help", exits=0)
     assert all(f"\n  {name} " in result.stdout for name in COMMANDS)
 
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_help_and_its_name(name):
-    result = powderdsl(name, "--help")
-    assert result.exit_code == 0
-    assert result.stdout.startswith(f"Usage: powderdsl {name}")
+    assert powderdsl(name, "--help", exits=0).stdout.startswith(f"Usage: powderdsl {name}")
     assert main.get_command(click.Context(main), name).name == name
 
 
@@ -33,13 +31,11 @@ def test_version():
 
 
 def test_no_command_is_a_usage_error():
-    assert powderdsl().exit_code == exits.BAD_INPUT
+    powderdsl(exits=exits.BAD_INPUT)
 
 
 def test_an_unknown_command_gets_a_suggestion():
-    result = powderdsl("chek", "core")
-    assert result.exit_code == exits.BAD_INPUT
-    assert "did you mean `check`?" in result.stderr
+    assert "did you mean `check`?" in powderdsl("chek", "core", exits=exits.BAD_INPUT).stderr
 
 
 def test_python_m_powderdsl():
@@ -73,8 +69,7 @@ def test_python_m_powderdsl():
     ],
 )
 def test_bad_usage_exits_with_2_and_says_how(arguments):
-    result = powderdsl(*arguments)
-    assert result.exit_code == exits.BAD_INPUT
+    result = powderdsl(*arguments, exits=exits.BAD_INPUT)
     assert result.stderr.startswith("Usage: powderdsl")
     assert result.stdout == ""
 
@@ -162,10 +157,6 @@ def test_a_terminal_without_the_characters_gets_others():
 
 @pytest.mark.skipif(not hasattr(os, "pipe2"), reason="needs a shell")
 def test_a_closed_pipe_is_no_mistake():
-    import subprocess
-
-    from tests.cli.commands import command_line, environment_with
-
     with subprocess.Popen(
         command_line("compile", "powderworld", "--emit", "model"),
         env=environment_with(),

@@ -30,19 +30,17 @@ tests:
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "spread.yaml").write_text(PACK)
-    return tmp_path
+def folder(folder):
+    (folder / "spread.yaml").write_text(PACK)
+    return folder
 
 
-def mutate(*arguments):
-    return powderdsl("test", "--mutate", "--jobs", "1", *arguments)
+def mutate(*arguments, **options):
+    return powderdsl("test", "--mutate", "--jobs", "1", *arguments, **options)
 
 
 def test_survivors_are_listed_with_a_test_to_paste(folder):
-    result = mutate("spread.yaml")
-    assert result.exit_code == 1
+    result = mutate("spread.yaml", exits=1)
     assert "survived  spread.yaml:7:23: neighbor" in result.stdout
     assert "- generated " in result.stdout
 
@@ -56,7 +54,7 @@ def test_written_tests_pass_and_notice_what_survived_before(folder):
     assert text.endswith("# the end\n")
     rules = package.load("spread.yaml")
     assert len(rules.tests) > 1
-    assert powderdsl("test", "spread.yaml", "--no-keep", "--examples", "10").exit_code == 0
+    powderdsl("test", "spread.yaml", "--no-keep", "--examples", "10", exits=0)
     after = json.loads(mutate("spread.yaml", "--json").stdout)["spread.yaml"]
     assert after["mutants"] == before["mutants"]
     assert after["survived"] == 0
@@ -72,16 +70,12 @@ def test_a_sample_is_in_proportion_and_the_same_again():
 
 
 def test_an_unknown_pack_is_refused(folder):
-    result = mutate("spread.yaml", "--pack", "nowhere")
-    assert result.exit_code == 2
-    assert "spread" in result.stderr
+    assert "spread" in mutate("spread.yaml", "--pack", "nowhere", exits=2).stderr
 
 
 @pytest.mark.parametrize("arguments", [("--write",), ("--pack", "life"), ("--mutants", "3"), ("--jobs", "1")])
 def test_options_of_mutations_need_them(folder, arguments):
-    result = powderdsl("test", "life", *arguments)
-    assert result.exit_code == 2
-    assert "--mutate" in result.stderr
+    assert "--mutate" in powderdsl("test", "life", *arguments, exits=2).stderr
 
 
 def test_mutants_run_with_other_parameters(folder):
@@ -93,6 +87,4 @@ def test_mutants_run_with_other_parameters(folder):
     usual = json.loads(mutate("spread.yaml", "--json").stdout)["spread.yaml"]
     set_ = json.loads(mutate("spread.yaml", "--json", "--set", "spread.speed=100%").stdout)["spread.yaml"]
     assert set_["test"] > usual["test"], "by chance, the second test fails without any mistake"
-    result = mutate("spread.yaml", "--set", "spread.nothing=1")
-    assert result.exit_code == 2
-    assert "PD309" in result.stderr
+    assert "PD309" in mutate("spread.yaml", "--set", "spread.nothing=1", exits=2).stderr

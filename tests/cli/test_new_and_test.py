@@ -28,12 +28,6 @@ tests:
 """
 
 
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 def run_tests(text: str, folder):
     (folder / "grit.yaml").write_text(PACK + text)
     return powderdsl("test", "core+grit.yaml")
@@ -44,20 +38,16 @@ def run_tests(text: str, folder):
 
 @pytest.mark.parametrize("name", ["salt", "Salt2", "x", "a_name_of_exactly_forty_characters_xxxxx"])
 def test_a_new_pack_checks_runs_and_passes_its_test(folder, name):
-    result = powderdsl("new", name)
-    assert result.exit_code == 0
-    assert f"core+{name}.yaml" in result.stdout
+    assert f"core+{name}.yaml" in powderdsl("new", name, exits=0).stdout
     assert [path.name for path in folder.iterdir()] == [f"{name}.yaml"]
     rules = f"core+{name}.yaml"
-    assert powderdsl("check", rules).exit_code == 0
-    tested = powderdsl("test", rules)
-    assert tested.exit_code == 0
-    assert f"ok    {name}: " in tested.stdout
+    powderdsl("check", rules, exits=0)
+    assert f"ok    {name}: " in powderdsl("test", rules, exits=0).stdout
 
 
 def test_new_elements_have_free_ids_and_colors_of_their_own(folder):
     for name in ("salt", "pepper", "chalk"):
-        assert powderdsl("new", name).exit_code == 0
+        powderdsl("new", name, exits=0)
     everything = package.load("powderworld", "salt.yaml", "pepper.yaml", "chalk.yaml")
     assert [element.name for element in everything.elements[-3:]] == ["salt", "pepper", "chalk"]
     assert len({element.color for element in everything.elements}) == len(everything.elements)
@@ -66,25 +56,21 @@ def test_new_elements_have_free_ids_and_colors_of_their_own(folder):
 def test_new_works_beside_files_that_are_broken(folder):
     (folder / "broken.yaml").write_text("pack: [")
     (folder / "other.yaml").write_bytes(b"\xff")
-    assert powderdsl("new", "salt").exit_code == 0
+    powderdsl("new", "salt", exits=0)
 
 
 def test_new_writes_to_a_folder_that_exists(folder):
     (folder / "packs").mkdir()
-    assert powderdsl("new", "salt", "--dir", "packs").exit_code == 0
+    powderdsl("new", "salt", "--dir", "packs", exits=0)
     assert (folder / "packs" / "salt.yaml").exists()
-    result = powderdsl("new", "salt", "--dir", "nowhere")
-    assert result.exit_code == 2
-    assert "PD613" in result.stderr
+    assert "PD613" in powderdsl("new", "salt", "--dir", "nowhere", exits=2).stderr
 
 
 def test_new_never_overwrites(folder):
     (folder / "salt.yaml").write_text("precious")
     (folder / "link.yaml").symlink_to("nowhere")
     for name in ("salt", "link"):
-        result = powderdsl("new", name)
-        assert result.exit_code == 2
-        assert "exists already" in result.stderr
+        assert "exists already" in powderdsl("new", name, exits=2).stderr
     assert (folder / "salt.yaml").read_text() == "precious"
 
 
@@ -96,9 +82,7 @@ def test_new_never_overwrites(folder):
     ],
 )
 def test_names_that_a_pack_cannot_have(folder, name):
-    result = powderdsl("new", name)
-    assert result.exit_code == 2
-    assert result.stderr.startswith("error: ")
+    assert powderdsl("new", name, exits=2).stderr.startswith("error: ")
     assert list(folder.iterdir()) == []
 
 
@@ -185,14 +169,12 @@ def test_both_backends_agree(folder):
 
 
 def test_no_tests_are_no_failure(folder):
-    result = powderdsl("test", "life")
-    assert result.exit_code == 0
+    powderdsl("test", "life", exits=0)
 
 
 @pytest.mark.slow
 def test_the_tests_in_the_shipped_packs_pass():
-    result = powderdsl("test", "powderworld", "--examples", "100")
-    assert result.exit_code == 0, result.stdout
+    powderdsl("test", "powderworld", "--examples", "100", exits=0)
 
 
 def test_rules_that_are_wrong_are_not_tested(folder):

@@ -34,18 +34,16 @@ def test_a_dataset_is_recorded_and_verified(task: Path, tmp_path: Path) -> None:
     few = ("--episodes", 10, "--shard", 4, "--seed", 2, "--backend", "wasm")
     command = ("record", task, "--out", out, *few)
     more = ("--knob", "disks=2", "--set", "water.melt=50%", "--split", "test", "--worlds", 5)
-    done = powderdsl(*command, *more, "--policy", "nothing", "--observation", "compact", "--compress")
-    assert done.exit_code == 0, done.stderr
+    done = powderdsl(
+        *command, *more, "--policy", "nothing", "--observation", "compact", "--compress", exits=0
+    )
     assert done.stderr.startswith(f"{out}: 10 episodes of small (test, nothing), ")
     recipe = Dataset.open(out).recipe
     assert (recipe.knobs["disks"], recipe.params["water.melt"]) == (2, 0.5)
     assert (recipe.split, recipe.worlds, recipe.policy, recipe.seed) == ("test", 5, "nothing", 2)
     assert (recipe.observation, recipe.compress, recipe.shard) == ("compact", True, 4)
-    verified = powderdsl("record", "--verify", out)
-    assert verified.exit_code == 0
-    assert ", all as recorded" in verified.stderr
-    refused = powderdsl(*command, *more)
-    assert refused.exit_code == 2
+    assert ", all as recorded" in powderdsl("record", "--verify", out, exits=0).stderr
+    refused = powderdsl(*command, *more, exits=2)
     for line in (
         '`policy` is "nothing" there, "random" here',
         '`observation` is "compact" there, "ids" here',
@@ -53,9 +51,7 @@ def test_a_dataset_is_recorded_and_verified(task: Path, tmp_path: Path) -> None:
     ):
         assert line in refused.stderr
     (out / "shard-000001.npz").write_bytes(b"no shard")
-    broken = powderdsl("record", "--verify", out)
-    assert broken.exit_code == 2
-    assert "shard-000001.npz is damaged" in broken.stderr
+    assert "shard-000001.npz is damaged" in powderdsl("record", "--verify", out, exits=2).stderr
 
 
 def test_what_is_missing_is_named(task: Path) -> None:
@@ -76,14 +72,9 @@ def test_what_is_missing_is_named(task: Path) -> None:
         (("destroying", "--out", "d", "--episodes", "1", "--policy", "nothing"), "may neither `blow`"),
     ],
 )
-def test_bad_values(
-    arguments: tuple[str, ...], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    found = powderdsl("record", *arguments)
-    assert found.exit_code == 2
-    assert words in found.stderr
-    assert list(tmp_path.iterdir()) == []
+def test_bad_values(arguments: tuple[str, ...], words: str, folder: Path) -> None:
+    assert words in powderdsl("record", *arguments, exits=2).stderr
+    assert list(folder.iterdir()) == []
 
 
 EPISODES = 240
@@ -124,10 +115,9 @@ def test_a_trained_agent_is_recorded(task: Path, tmp_path: Path) -> None:
     """It acts as it does elsewhere: on what it was trained to see, by the keys of the episode."""
     run, out = tmp_path / "dunes", tmp_path / "data"
     few = ("--preset", "small", "--observation", "compact", "--envs", 2, "--rollout", 4, "--batch", 8)
-    trained = powderdsl("train", task, "--run", run, *few, "--steps", 8, "--epochs", 1, "--backend", "wasm")
-    assert trained.exit_code == 0, trained.stderr
+    powderdsl("train", task, "--run", run, *few, "--steps", 8, "--epochs", 1, "--backend", "wasm", exits=0)
     command = ("record", task, "--out", out, "--episodes", 3, "--backend", "wasm", "--policy", run)
-    assert powderdsl(*command).exit_code == 0
+    powderdsl(*command, exits=0)
     data = Dataset.open(out)
     assert data.recipe.policy.startswith("dunes, checkpoint 000000000008-")
     env = TensorEnv(str(task), 1, observation="compact", backend="wasm", autoreset_mode="disabled")
@@ -147,13 +137,11 @@ def test_a_dataset_goes_to_minari_and_back(
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     out, again, third = tmp_path / "data", tmp_path / "again", tmp_path / "third"
     data = record(str(task), "random", out, episodes=3, backend="wasm")
-    written = powderdsl("record", "--out", out, "--to-minari", "me/small-v0")
-    assert written.exit_code == 0, written.stderr
+    written = powderdsl("record", "--out", out, "--to-minari", "me/small-v0", exits=0)
     assert f"me/small-v0: 3 episodes of small (train, random), {data.steps} transitions" in written.stderr
-    assert powderdsl("record", "--out", again, "--from-minari", "me/small-v0").exit_code == 0
+    powderdsl("record", "--out", again, "--from-minari", "me/small-v0", exits=0)
     assert (again / "shard-000000.npz").read_bytes() == (out / "shard-000000.npz").read_bytes()
-    done = powderdsl("record", task, "--out", third, "--from-minari", "me/small-v0", "--backend", "wasm")
-    assert done.exit_code == 0, done.stderr
+    powderdsl("record", task, "--out", third, "--from-minari", "me/small-v0", "--backend", "wasm", exits=0)
     assert (third / "shard-000000.npz").read_bytes() == (out / "shard-000000.npz").read_bytes()
     for words, says in (
         (("--out", out, "--to-minari", "me/small-v0"), "there is a Minari dataset me/small-v0"),
@@ -166,6 +154,4 @@ def test_a_dataset_goes_to_minari_and_back(
         ((task, "--out", out, "--to-minari", "me/a-v0"), "--to-minari does not go with TASK"),
         (("--out", tmp_path / "no", "--from-minari", "me/none-v0"), "cannot be imported"),
     ):
-        refused = powderdsl("record", *words)
-        assert refused.exit_code == 2
-        assert says in refused.stderr
+        assert says in powderdsl("record", *words, exits=2).stderr

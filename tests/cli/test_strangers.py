@@ -86,17 +86,14 @@ PACKS = {"slime": ELEMENT, "heat": FIELD, "crab": CREATURE, "bugs": AUTOMATON}
 
 
 @pytest.fixture(autouse=True)
-def _files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def _files(folder: Path) -> None:
     for name, text in PACKS.items():
         Path(f"{name}.yaml").write_text(text)
     Path("pool.yaml").write_text(TASK)
 
 
 def run(*words: str) -> str:
-    result = powderdsl(*words)
-    assert result.exit_code == 0, result.stderr
-    return str(result.stdout)
+    return str(powderdsl(*words, exits=0).stdout)
 
 
 @pytest.mark.slow
@@ -130,8 +127,7 @@ def test_two_packs_with_one_id_and_one_that_has_no_room(tmp_path: Path) -> None:
     ids = {one["name"]: one["id"] for one in shown["elements"]}
     assert (ids["slime"], ids["ooze"]) == (14, 15)
     run("train", "pool.yaml", *AGENT, "--slots", "15", "--run", "agent")
-    result = powderdsl("evaluate", "agent", "--packs", "slime.yaml", "ooze.yaml", "--episodes", "2")
-    assert result.exit_code == 2
+    result = powderdsl("evaluate", "agent", "--packs", "slime.yaml", "ooze.yaml", "--episodes", "2", exits=2)
     assert "PD623" in result.stderr
     assert "--slots 16" in result.stderr
 

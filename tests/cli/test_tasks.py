@@ -16,8 +16,7 @@ def test_tasks_are_checked_beside_rules(tmp_path):
     bad.write_text(
         "# A task\ntask: bad\nrules: core\nsize: [8, 8]\nfill: emty\nagent: {may: any, actions: 0}\n"
     )
-    result = run("check", "sand-pushing", str(bad), "core")
-    assert result.exit_code == 2
+    result = run("check", "sand-pushing", str(bad), "core", exits=2)
     assert "PD604" in result.output
     assert "PD402" in result.output
     assert "sand-pushing: 3 splits, no errors" in result.output
@@ -56,4 +55,4 @@ def test_a_sheet_shows_worlds_and_outlines_regions(tmp_path):
     ],
 )
 def test_bad_arguments_of_show_are_refused(arguments):
-    assert run(*arguments).exit_code == 2
+    run(*arguments, exits=2)

@@ -13,15 +13,12 @@ FAST = ("--backend", "reference", "--world", "world.txt")
 
 
 @pytest.fixture(autouse=True)
-def _folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "world.txt").write_text("# s #\n# . #\n# ~ #\n# # #\n")
+def _folder(folder):
+    (folder / "world.txt").write_text("# s #\n# . #\n# ~ #\n# # #\n")
 
 
 def test_the_text_names_the_rule_the_source_and_what_it_read():
-    result = powderdsl("trace", RULES, *FAST, "--at", "1,1", "--step", 1, "--of", "element")
-    assert result.exit_code == 0
-    text = result.stdout
+    text = powderdsl("trace", RULES, *FAST, "--at", "1,1", "--step", 1, "--of", "element", exits=0).stdout
     assert "element: empty -> sand, moved here from 0,1" in text
     assert "swap below if density == d > below.density" in text
     assert "^^^^" in text
@@ -38,8 +35,7 @@ def test_a_near_miss_has_the_caret_under_the_part_that_failed():
 
 
 def test_json_has_a_stable_form():
-    result = powderdsl("trace", RULES, *FAST, "--at", "1,1", "--step", 1, "--json", "--all")
-    data = json.loads(result.stdout)
+    data = json.loads(powderdsl("trace", RULES, *FAST, "--at", "1,1", "--step", 1, "--json", "--all").stdout)
     assert list(data) == ["schema", "ruleset", "world", "cell", "step", "slots", "writes", "almost"]
     assert (data["schema"], data["cell"], data["step"]) == (1, [1, 1], 1)
     element = data["slots"]["element"]
@@ -56,10 +52,21 @@ def test_json_has_a_stable_form():
 
 
 def test_a_saved_world_has_several_to_choose_from():
-    saved = powderdsl(
-        "run", RULES, "--backend", "reference", "--batch", 2, "--size", "4x5", "--steps", 3, "--out", "w.npz"
+    powderdsl(
+        "run",
+        RULES,
+        "--backend",
+        "reference",
+        "--batch",
+        2,
+        "--size",
+        "4x5",
+        "--steps",
+        3,
+        "--out",
+        "w.npz",
+        exits=0,
     )
-    assert saved.exit_code == 0
     options = ("--backend", "reference", "--world", "w.npz", "--at", "0,0", "--step", 1, "--json")
     data = [json.loads(powderdsl("trace", RULES, *options, "--number", one).stdout) for one in (0, 1)]
     assert [one["world"] for one in data] == [0, 1]
@@ -79,6 +86,4 @@ def test_a_saved_world_has_several_to_choose_from():
     ],
 )
 def test_bad_questions_end_with_exit_code_two(options, words):
-    result = powderdsl("trace", RULES, *FAST, *options)
-    assert result.exit_code == 2
-    assert words in result.stderr
+    assert words in powderdsl("trace", RULES, *FAST, *options, exits=2).stderr

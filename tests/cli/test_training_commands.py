@@ -18,16 +18,15 @@ from tests.rl.tiny_tasks import write_task
 QUICK = shlex.split("--preset small --envs 4 --rollout 8 --batch 16 --epochs 1 --features 8")
 
 
-def test_train_evaluate_and_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    write_task(tmp_path)
-    trained = run("train", "task.yaml", *QUICK, "--backend", "wasm", "--steps", "0.4e2", "--knob", "size=3")
-    assert trained.exit_code == 0, trained.output
+def test_train_evaluate_and_go_on(folder: Path) -> None:
+    write_task(folder)
+    trained = run(
+        "train", "task.yaml", *QUICK, "--backend", "wasm", "--steps", "0.4e2", "--knob", "size=3", exits=0
+    )
     assert "runs/task-seed0: 64 interactions" in trained.output
     about = json.loads(Path("runs/task-seed0/run.json").read_text())
     assert about["config"]["knobs"] == {"size": 3}
-    more = run("train", "--resume", "task-seed0", "--steps", "1e2")
-    assert "128 interactions" in more.output
+    assert "128 interactions" in run("train", "--resume", "task-seed0", "--steps", "1e2").output
     table = run("evaluate", "task-seed0", "--episodes", "4", "--splits", "test").output
     assert "after 128 interactions" in table
     assert [line.split()[1] for line in table.splitlines()[-3:]] == ["trained", "random", "nothing"]
@@ -59,13 +58,10 @@ def test_train_evaluate_and_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     ],
 )
 def test_bad_arguments_of_training_commands_are_refused(
-    arguments: tuple[str, ...], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    arguments: tuple[str, ...], said: str, folder: Path
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    result = run(*arguments)
-    assert result.exit_code == 2, result.output
-    assert said in result.output
-    assert not list(tmp_path.rglob("*.safetensors"))
+    assert said in run(*arguments, exits=2).output
+    assert not list(folder.rglob("*.safetensors"))
 
 
 @pytest.mark.slow

@@ -16,6 +16,7 @@ from powderdsl.datasets import Dataset, from_minari, record, to_minari
 from powderdsl.diagnostics import CompileError
 from powderdsl.envs import PowderEnv, TensorEnv
 from powderdsl.tasks.episodes import TaskProgram
+from tests.refusals import refusal
 
 pytest.importorskip("minari")
 h5py = pytest.importorskip("h5py")
@@ -128,9 +129,7 @@ def test_a_shipped_task_is_recovered(tmp_path: Path, params: dict[str, float]) -
 
 def test_an_id_is_taken_once(recorded: Dataset, root: Path) -> None:
     to_minari(recorded, ID)
-    with pytest.raises(CompileError) as caught:
-        to_minari(recorded, ID)
-    assert caught.value.diagnostics[0].code == "PD613"
+    assert refusal(to_minari, recorded, ID)[0].code == "PD613"
     for wrong in ("small", "../small-v0", "a b-v0", ""):
         with pytest.raises(ValueError, match="namespace/name-v0"):
             to_minari(recorded, wrong)
@@ -213,9 +212,7 @@ def test_collected_episodes_come_in(small: TaskProgram, kind: str, tmp_path: Pat
 
 def test_minari_datasets_of_others_need_a_task(small: TaskProgram, recorded: Dataset, tmp_path: Path) -> None:
     collect(small, "full")
-    with pytest.raises(CompileError) as caught:
-        from_minari(ID, tmp_path / "a")
-    (found,) = caught.value.diagnostics
+    (found,) = refusal(from_minari, ID, tmp_path / "a")
     assert found.code == "PD630"
     assert "task=" in found.helps[0]
     with pytest.raises(CompileError, match="its observations are not uint8"):
@@ -366,8 +363,6 @@ def test_without_minari_there_is_a_plain_error(
 
     monkeypatch.setitem(sys.modules, "minari", None)
     for call in (lambda: to_minari(recorded, ID), lambda: from_minari(ID, tmp_path / "a")):
-        with pytest.raises(CompileError) as caught:
-            call()
-        (found,) = caught.value.diagnostics
+        (found,) = refusal(call)
         assert found.code == "PD612"
         assert found.helps == ("pip install 'powderdsl[minari]'",)

@@ -18,6 +18,7 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.envs import TensorEnv
 from powderdsl.envs.acting import action_keys, random_policy
 from powderdsl.tasks.episodes import TaskProgram
+from tests.refusals import refusal
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -163,9 +164,9 @@ def test_doing_nothing_is_one_action(small: TaskProgram, tmp_path: Path) -> None
 
 
 def test_another_recipe_is_refused(small: TaskProgram, recorded: Dataset) -> None:
-    with pytest.raises(CompileError) as caught:
-        record(small, "random", recorded.folder, episodes=21, seed=4, shard=8, observation="compact")
-    (found,) = caught.value.diagnostics
+    (found,) = refusal(
+        record, small, "random", recorded.folder, episodes=21, seed=4, shard=8, observation="compact"
+    )
     assert found.code == "PD631"
     names = "seed episodes observation channels shape"
     assert {note.split("`")[1] for note in found.notes} == set(names.split())

@@ -46,6 +46,7 @@ from powderdsl.worldmodel.networks import custom_network
 from powderdsl.worlds.ascii import read_ascii
 from powderdsl.worlds.image import read_image
 from powderdsl.worlds.scene import draw_start, find_scene
+from tests.refusals import refusal
 from tests.semantics.test_mixed import spread
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -124,9 +125,7 @@ def diagnostics_of(one: Example) -> tuple[Diagnostic, ...]:
         return error.diagnostics
 
 
-@pytest.fixture(autouse=True)
-def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("folder")
 
 
 # The lock: codes, pages, examples, and the places that raise them
@@ -178,7 +177,6 @@ def test_a_wrong_example_gives_its_code_and_nothing_else(code: str) -> None:
         found = tuple(one for one in found if one.code == code or one.severity is not Severity.NOTE)
     assert [one.code for one in found] == [code]
     span = found[0].primary.span
-    assert span is not None
     caret = WITHOUT_COMMENT.get(code) or WRONG[code].caret
     if caret is not None:
         assert span.text.split("\n")[0] == caret
@@ -209,7 +207,6 @@ def test_the_message_of_a_wrong_example(code: str, golden: Callable[[Path, str],
 def save_a_world_of_more_elements() -> None:
     full, less = powderdsl.load("powderworld"), powderdsl.load("powderworld-gas")
     element = full.element("gas")
-    assert element is not None
     simulator = powderdsl.compile(full, backend="reference")
     powderdsl.save(simulator.world([[[element.id]]]), "yard.npz")
     powderdsl.load_world("yard.npz", powderdsl.compile(less, backend="reference"))
@@ -326,9 +323,7 @@ def test_every_message_has_a_situation() -> None:
 
 @pytest.mark.parametrize("code", SITUATIONS)
 def test_a_page_shows_the_message_as_it_is(code: str) -> None:
-    with pytest.raises(CompileError) as caught:
-        SITUATIONS[code]()
-    (found,) = caught.value.diagnostics
+    (found,) = refusal(SITUATIONS[code])
     shown = SYSTEM_WORDS.sub("", MESSAGES[code].text)
     assert SYSTEM_WORDS.sub("", render_text(found) + "\n") == shown
     assert ("= note" in MESSAGES[code].text) == bool(found.notes)

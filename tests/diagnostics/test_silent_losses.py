@@ -9,10 +9,7 @@ import pytest
 from powderdsl.compiler import load_with_diagnostics
 from powderdsl.model.types import Ruleset
 
-
-@pytest.fixture(autouse=True)
-def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("folder")
 
 
 def loaded(rules: str, **packs: str) -> tuple[Ruleset, list[tuple[str, str]]]:
@@ -84,8 +81,6 @@ def test_a_question_mark_in_a_world_is_no_name() -> None:
 
 def value(ruleset: Ruleset, name: str, element: str) -> object:
     prop, found = ruleset.property(name), ruleset.element(element)
-    assert prop is not None
-    assert found is not None
     return prop.values[found.id]
 
 
@@ -133,8 +128,6 @@ def test_defaults_of_fields_follow_the_same_rules() -> None:
     hot, warm = ("needs: [core, heat]\nalso:\n  sand?: {heat: %d}\n" % n for n in (5, 4))  # noqa: UP031
     ruleset, found = loaded("core+sand+heat.yaml+hot.yaml+warm.yaml", heat=heat, hot=hot, warm=warm)
     field, sand = ruleset.field("heat"), ruleset.element("sand")
-    assert field is not None
-    assert sand is not None
     assert field.own == ((sand.id, 3),)
     assert {code for code, _ in found} == {"PD316"}
 
@@ -150,7 +143,6 @@ FLOATS = """elements:
 def test_an_element_that_overrides_keeps_nothing_but_the_id() -> None:
     ruleset, found = loaded("core+sand+floats.yaml", floats=FLOATS.format(id="", tags=""))
     sand = ruleset.element("sand")
-    assert sand is not None
     assert (sand.id, sand.tags, found) == (2, frozenset(), [])
 
 
@@ -161,14 +153,12 @@ def test_tags_that_third_packs_give_stay() -> None:
         third="needs: [core, sand]\nalso:\n  sand: acid_proof\n",
     )
     sand = ruleset.element("sand")
-    assert sand is not None
     assert sand.tags == {"fluid", "acid_proof"}
 
 
 def test_another_id_is_told() -> None:
     ruleset, found = loaded("core+sand+floats.yaml", floats=FLOATS.format(id="id: 33, ", tags=""))
     sand = ruleset.element("sand")
-    assert sand is not None
     assert sand.id == 33
     assert found == [("PD318", "33")]
     assert loaded("core+sand+floats.yaml", floats=FLOATS.format(id="id: 2, ", tags=""))[1] == []

@@ -17,6 +17,7 @@ from stable_baselines3.common.env_checker import check_env as check_sb3
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+import powderdsl.envs  # noqa: F401
 from powderdsl.envs.actions import KINDS as ACTIONS
 from powderdsl.envs.features import Expand, paper_policy
 from powderdsl.envs.gym import GoalEnv, PowderEnv, PowderVectorEnv
@@ -55,8 +56,6 @@ def test_both_checkers_pass_without_a_warning(name: str, simulators: dict[str, S
 
 
 def test_the_checkers_look_at_rendering_and_specs_too() -> None:
-    import powderdsl.envs  # noqa: F401
-
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         env = gymnasium.make("powderdsl/SandPushing-v0", backend="wasm", render_mode="ansi")
@@ -152,7 +151,6 @@ def test_compact_expands_to_the_matrix(small: TaskProgram) -> None:
     env.reset(seed=0)
     for action in actions:
         observed = env.step(action)[0]
-    assert env.episodes is not None
     wanted = env.episodes.world.matrix()
     expand = Expand(*env.simulator.observer.matrix_tables)
     for given in (observed, observed.float()):  # SB3 hands over floats

@@ -14,6 +14,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.wrappers import TimeLimit
 from gymnasium.wrappers import vector as wrappers
 
+import powderdsl.envs  # noqa: F401
 from powderdsl.envs.gym import PowderEnv, PowderVectorEnv
 from powderdsl.envs.sb3 import PowderVecEnv
 from powderdsl.tasks.episodes import TaskProgram
@@ -111,8 +112,6 @@ def test_one_world_has_the_same_keys_in_reset_and_steps(small: TaskProgram) -> N
 
 
 def test_specs_say_how_many_actions_an_episode_has(small: TaskProgram) -> None:
-    import powderdsl.envs  # noqa: F401
-
     name, how = "powderdsl/Destroying-v0", {"backend": "torch"}
     made = gymnasium.make(name, **how)
     task = made.unwrapped.tensors.task

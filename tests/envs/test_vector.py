@@ -14,10 +14,13 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode
 
+import powderdsl.envs  # noqa: F401
 from powderdsl.diagnostics import CompileError
+from powderdsl.envs import env_id
 from powderdsl.envs.gym import PowderEnv, PowderVectorEnv
 from powderdsl.envs.tensor_env import TensorEnv, world_seeds
 from powderdsl.tasks.episodes import TaskProgram, compile_task, load_task
+from powderdsl.tasks.shipped import shipped_tasks
 from tests.states import same
 
 ENVS, STEPS = 5, 16
@@ -282,10 +285,6 @@ def test_it_renders(small: TaskProgram) -> None:
 
 
 def test_every_shipped_task_is_registered_and_batched() -> None:
-    import powderdsl.envs  # noqa: F401
-    from powderdsl.envs import env_id
-    from powderdsl.tasks.shipped import shipped_tasks
-
     assert all(env_id(task) in gymnasium.registry for task in shipped_tasks())
     env = gymnasium.make_vec("powderdsl/SandPushing-v0", num_envs=3, backend="torch", observation="compact")
     assert isinstance(env.unwrapped, PowderVectorEnv)
@@ -318,7 +317,6 @@ def test_a_saved_environment_goes_on_as_it_would_have(small: TaskProgram, mode: 
     for action in actions[:4]:
         over = torch.logical_or(*stepped(first, action, over)[2:4])
     saved = first.state()
-    assert first.episodes is not None
     assert torch.equal(second.restore(copy.deepcopy(saved)), first.observation.of(first.episodes.world))
     third.restore(saved)
     for action in actions[4:]:

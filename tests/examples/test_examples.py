@@ -43,10 +43,9 @@ splits:
 
 
 @pytest.fixture
-def task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def task(folder: Path) -> Path:
     """The file of a tiny task, in an empty working directory."""
-    monkeypatch.chdir(tmp_path)
-    path = tmp_path / "dig.yaml"
+    path = folder / "dig.yaml"
     path.write_text(DIG, encoding="utf-8")
     return path
 
@@ -54,8 +53,6 @@ def task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def script(name: str) -> Callable[[list[str]], dict[str, float]]:
     """The main function of a script."""
     spec = importlib.util.spec_from_file_location(f"example_{name}", EXAMPLES / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     main: Callable[[list[str]], dict[str, float]] = module.main

@@ -53,31 +53,25 @@ def test_counted_by_hand() -> None:
 
 @pytest.mark.golden
 def test_golden_cost(golden) -> None:  # type: ignore[no-untyped-def]
-    result = powderdsl("check", "powderworld", "--cost")
-    assert result.exit_code == 0
+    result = powderdsl("check", "powderworld", "--cost", exits=0)
     golden(Path(__file__).parent / "golden" / "powderworld.cost.txt", result.stdout)
 
 
-def test_json_has_the_same_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "small.yaml").write_text(PACK)
-    (tmp_path / "bad.yaml").write_text(PACK.replace("above is", "above i"))
-    result = powderdsl("check", "small.yaml", "bad.yaml", "--cost", "--json")
-    assert result.exit_code == 2
-    data = json.loads(result.stdout)
+def test_json_has_the_same_numbers(folder: Path) -> None:
+    (folder / "small.yaml").write_text(PACK)
+    (folder / "bad.yaml").write_text(PACK.replace("above is", "above i"))
+    data = json.loads(powderdsl("check", "small.yaml", "bad.yaml", "--cost", "--json", exits=2).stdout)
     assert [one["code"] for one in data["diagnostics"]]
     assert list(data["cost"]) == ["small.yaml"]
     assert {one["name"]: PassCost(**one) for one in data["cost"]["small.yaml"]} == by_name(PACK)
 
 
-def test_passes_on_cells_say_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_passes_on_cells_say_why(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bits, "MAX_GATES", 15)
-    (tmp_path / "small.yaml").write_text(
+    (folder / "small.yaml").write_text(
         PACK.replace("dust swaps", "dust swaps left if left is air and count(dust) > 3\n    then: dust swaps")
     )
-    result = powderdsl("check", "small.yaml", "--cost")
-    assert result.exit_code == 0
+    result = powderdsl("check", "small.yaml", "--cost", exits=0)
     (line,) = (one for one in result.stdout.splitlines() if "not on planes" in one)
     assert line.startswith("fall: ")
     assert line.endswith("operations on cells, not on planes: more than 15 gates (small.yaml:12)")

@@ -83,7 +83,6 @@ def follow_planes(folder: Path, level: str) -> int:
                     assert (shown == recorded["stage_observations"][at]).all()
                 episodes.step(np.array([action], dtype=np.int64))
         world = episodes.world
-        assert world is not None
         for name, field in (
             ("ids", "element"),
             ("gravity", "gravity"),

@@ -23,6 +23,8 @@ from powderdsl.simulation.draw import OUTLINES
 from powderdsl.simulation.simulator import World
 from powderdsl.tasks.episodes import TaskProgram, compile_task
 from powderdsl.tasks.shipped import load_task
+from tests.cli.commands import powderdsl
+from tests.refusals import refusal
 from tests.rl.tiny_tasks import quick, write_task
 
 
@@ -149,12 +151,8 @@ def test_sampled_actions_follow_the_policy(run: RunFolder, program: TaskProgram)
 
 
 def test_a_policy_of_another_environment_is_refused(run: RunFolder, program: TaskProgram) -> None:
-    with pytest.raises(CompileError) as error:
-        load_policy(run, TensorEnv(program, 1, observation="compact"))
-    assert error.value.diagnostics[0].code == "PD623"
-    with pytest.raises(CompileError) as error:
-        load_policy(run, TensorEnv("keep-ice", 1, backend="wasm"))
-    assert error.value.diagnostics[0].code == "PD623"
+    assert refusal(load_policy, run, TensorEnv(program, 1, observation="compact"))[0].code == "PD623"
+    assert refusal(load_policy, run, TensorEnv("keep-ice", 1, backend="wasm"))[0].code == "PD623"
 
 
 def test_a_film_has_each_action_and_each_step(program: TaskProgram) -> None:
@@ -183,10 +181,7 @@ def test_films_show_regions(tmp_path: Path) -> None:
 
 
 def test_a_film_is_written(run: RunFolder, tmp_path: Path) -> None:
-    from tests.cli.commands import powderdsl
-
-    result = powderdsl("watch", str(run.path), "--worlds", "2", "--backend", "wasm", "--scale", "2")
-    assert result.exit_code == 0, result.output
+    powderdsl("watch", str(run.path), "--worlds", "2", "--backend", "wasm", "--scale", "2", exits=0)
     with Image.open(run.path / "watch.gif") as image:
         assert image.n_frames == 1 + 4 * (1 + 2) + 3  # type: ignore[attr-defined]
 
@@ -214,10 +209,7 @@ def test_films_show_fields(tmp_path: Path) -> None:
 
 
 def test_start_worlds_of_a_task_show_fields(tmp_path: Path) -> None:
-    from tests.cli.commands import powderdsl
-
     out = tmp_path / "sheet.png"
-    result = powderdsl("show", warm_task(tmp_path, start=9), "--seeds", "1", "--out", str(out))
-    assert result.exit_code == 0, result.output
+    powderdsl("show", warm_task(tmp_path, start=9), "--seeds", "1", "--out", str(out), exits=0)
     with Image.open(out) as image:
         assert image.convert("RGB").getpixel((9, 9)) == (255, 48, 0)

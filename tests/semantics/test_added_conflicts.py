@@ -9,11 +9,12 @@ import pytest
 
 import powderdsl
 from powderdsl.compiler import load_with_diagnostics
-from powderdsl.diagnostics import CompileError, Diagnostic
+from powderdsl.diagnostics import Diagnostic
 from powderdsl.model.types import Ruleset
 from powderdsl.testing.generators.cases import random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.compilers import skip_without_compiler
+from tests.refusals import refusal
 
 TREES = """\
 pack: trees
@@ -41,9 +42,7 @@ elements:
 """
 
 
-@pytest.fixture(autouse=True)
-def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("folder")
 
 
 def load(passes: str, added: str, trees: str = TREES) -> tuple[Ruleset, list[Diagnostic]]:
@@ -54,14 +53,11 @@ def load(passes: str, added: str, trees: str = TREES) -> tuple[Ruleset, list[Dia
 
 
 def refused(passes: str, added: str, trees: str = TREES) -> tuple[Diagnostic, ...]:
-    with pytest.raises(CompileError) as caught:
-        load(passes, added, trees)
-    return caught.value.diagnostics
+    return refusal(load, passes, added, trees)
 
 
 def under_caret(one: Diagnostic) -> tuple[str, str]:
     span = one.primary.span
-    assert span is not None
     return Path(span.source.name).name, span.text
 
 
@@ -77,7 +73,6 @@ def test_the_rule_that_stands_first_holds(backend: str, torch) -> None:  # type:
     ]
     sim = powderdsl.compile(ruleset, backend=backend)
     geyser = ruleset.element("geyser")
-    assert geyser is not None
     world = sim.world([[[0, 0, 0], [geyser.id, 3, 4]]])
     assert sim.step(world).ids[0, 1].tolist() == [1, 1, 2]
 
@@ -103,7 +98,6 @@ def test_of_two_assignments_the_last_holds(torch) -> None:  # type: ignore[no-un
     ruleset, (warning,) = load(passes, GEYSER)
     assert any("stands last" in one for one in warning.notes)
     geyser = ruleset.element("geyser")
-    assert geyser is not None
     for backend in ("reference", "torch", "wasm"):
         sim = powderdsl.compile(ruleset, backend=backend)
         assert sim.step(sim.world([[[geyser.id, 3, 4, 0]]]))["age"][0, 0].tolist() == [5, 3, 5, 0]
@@ -117,9 +111,7 @@ def test_packs_that_know_each_other_conflict_as_before() -> None:
     load(CHANGE, GEYSER)
     Path("geyser.yaml").write_text(GEYSER)
     Path("grove.yaml").write_text("ruleset: grove\npacks: [trees, geyser]\n")
-    with pytest.raises(CompileError) as caught:
-        powderdsl.load("grove.yaml")
-    assert "PD502" in {one.code for one in caught.value.diagnostics}
+    assert "PD502" in {one.code for one in refusal(powderdsl.load, "grove.yaml")}
 
 
 def test_where_a_policy_would_change_more_the_tag_is_an_error() -> None:

@@ -95,34 +95,28 @@ def contents(world) -> np.ndarray:
     return np.sort((to_numpy(world.ids).astype(int) * 100 + to_numpy(world["mark"])).reshape(2, -1))
 
 
-def test_other_sizes_are_refused_everywhere(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "blocks.yaml").write_text(pack(MARGOLUS, 2))
+def test_other_sizes_are_refused_everywhere(folder):
+    (folder / "blocks.yaml").write_text(pack(MARGOLUS, 2))
     sim = simulator(pack(MARGOLUS, 2))
     with pytest.raises(ValueError, match="rows and columns must be a multiple of 2"):
         sim.world(np.zeros((5, 4), np.uint8))
     for arguments in (["run", "blocks.yaml", "--size", "7x8"], ["bench", "blocks.yaml", "--size", "7x8"]):
-        result = command(*arguments, *(["--steps", "1"] if arguments[0] == "run" else []))
-        assert result.exit_code == 2
+        result = command(*arguments, *(["--steps", "1"] if arguments[0] == "run" else []), exits=2)
         assert "multiple of 2" in result.stderr
-    assert command("run", "blocks.yaml", "--steps", "1").exit_code == 0
-    (tmp_path / "task.yaml").write_text(
+    command("run", "blocks.yaml", "--steps", "1", exits=0)
+    (folder / "task.yaml").write_text(
         "task: odd\nrules: blocks.yaml\nsize: [63, 64]\nfill: a\nagent: {may: [b], speed: 1, actions: 4}\n"
         "reward: {each: count(b)}\n"
     )
-    result = command("check", "task.yaml")
-    assert result.exit_code == 2
-    assert "PD607" in result.output
+    assert "PD607" in command("check", "task.yaml", exits=2).output
     test = "tests: [{odd: {given: b c b, after: 1 step, expect: b c b}}]\n"
-    (tmp_path / "blocks.yaml").write_text(pack(MARGOLUS, 2) + test)
+    (folder / "blocks.yaml").write_text(pack(MARGOLUS, 2) + test)
     assert "multiples of 2" in command("check", "blocks.yaml").output
 
 
-def test_invariants_are_tried_on_worlds_that_fit(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_invariants_are_tried_on_worlds_that_fit(folder):
     invariants = "invariants: [count(b) is constant, b never changes]\n"
-    (tmp_path / "blocks.yaml").write_text(pack(MARGOLUS, 2) + invariants)
-    result = command("check", "blocks.yaml")
-    assert result.exit_code == 2
+    (folder / "blocks.yaml").write_text(pack(MARGOLUS, 2) + invariants)
+    result = command("check", "blocks.yaml", exits=2)
     assert result.output.count("error[PD512]") == 1
     assert "b never changes" in result.output

@@ -133,11 +133,10 @@ def test_an_invariant_meets_every_fresh_cell():
 
 
 @pytest.mark.parametrize("backend", ["reference", "wasm"])
-def test_tasks_make_fresh_cells(tmp_path, torch, backend, monkeypatch):
+def test_tasks_make_fresh_cells(folder, torch, backend):
     """Worlds of tasks are drawn and acted on by code of their own."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "hunt.yaml").write_text(PACK.replace("energy > 4", "energy > 9"))
-    (tmp_path / "task.yaml").write_text(
+    (folder / "hunt.yaml").write_text(PACK.replace("energy > 4", "energy > 9"))
+    (folder / "task.yaml").write_text(
         "task: hunting\nrules: hunt.yaml\nsize: [64, 64]\nfill: grass\ngenerate: [box fox rows 0:4]\n"
         "agent: {may: [rabbit, fox], speed: 9, actions: 4, steps_per_action: 0}\n"
         "reward: {each: count(rabbit)}\n"

@@ -33,8 +33,7 @@ passes:
 
 
 @pytest.fixture(autouse=True)
-def _packs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def _packs(folder: Path) -> None:
     for name, more, what in (
         ("ground", "about: firm", "soil -> sky if above is soil"),
         ("moor", "provides: ground", "soil -> sky if below is soil"),
@@ -66,7 +65,6 @@ def stepped(rules: str, ids: list[list[int]]) -> list[list[int]]:
 def test_a_pack_stands_in_where_another_is_needed(ground: str) -> None:
     rules = powderdsl.load(f"{ground}.yaml+seed.yaml")
     seed = rules.element("seed")
-    assert seed is not None
     assert stepped(f"{ground}.yaml+seed.yaml", [[seed.id, 0, 0]])[0] == [seed.id, seed.id, 0]
     assert [one.name for one in rules.passes] == ["settle", "sprout"]
 
@@ -139,7 +137,6 @@ def ruleset(also: str) -> str:
 def weights(*names: str) -> tuple[object, ...]:
     """The weight of each element, by id."""
     prop = powderdsl.load(*names).property("weight")
-    assert prop is not None
     return prop.values
 
 
@@ -150,7 +147,6 @@ def test_a_ruleset_gives_values_tags_and_colors_without_a_warning() -> None:
     name = ruleset('  seed: {weight: 5, tags: dry, color: "#102030"}\n  soil: {weight: 1}')
     rules, remarks = load_with_diagnostics(name)
     seed = rules.element("seed")
-    assert seed is not None
     assert weights(name) == (0, 1, 5)
     assert (seed.color, seed.tags) == ("#102030", frozenset({"dry"}))
     assert not {one.code for one in remarks} & {"PD316", "PD317"}

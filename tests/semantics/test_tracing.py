@@ -78,7 +78,6 @@ def test_a_swap_names_its_rule_and_both_sources():
         (write,) = found.writes
         assert write.how == "arrive"
         assert write.source == source
-        assert write.attempt is not None
         assert write.attempt.cell == (0, 0)
         assert write.attempt.rule.span.line == line_of(lab(body), "swap below")
         assert values(write.attempt.parts) == {
@@ -102,7 +101,6 @@ def test_content_that_moves_brings_its_fields_as_assignments_left_them():
 def test_a_push_and_an_effect_name_the_cell_whose_condition_held():
     found = traced("do: push gale by 3 away from bomb", ".b.", 0, 0, "gale")
     (write,) = found.writes
-    assert write.attempt is not None
     assert write.attempt.cell == (0, 1)
     assert write.after.tolist() == [0, -3]
     found = traced("do: rock -> void, then right.mark += 2", "o.", 0, 1, "mark")
@@ -134,7 +132,6 @@ def test_a_chance_that_failed_shows_the_draw_and_the_chance():
     clock = world_of(lab("do: rock -> bomb if coin < luck"), "o")
     step = RecordedStep(clock, (0, 0))
     assert read["draw(coin)"] == float(step.substeps[0].at.draws["coin"][0, 0, 0])
-    assert part.expr.span is not None
     assert part.expr.span.text == "coin < luck"
 
 
@@ -146,7 +143,6 @@ def test_a_count_names_the_neighbors_it_found():
     found = traced("do: rock -> moth if count(bomb) > 2", "b../bob/...", 1, 1)
     assert not found.misses
     asked = found.writes[0].attempt
-    assert asked is not None
     assert asked.parts[1].reads[0].counted == ((0, 0), (1, 0), (1, 2))
 
 
@@ -154,7 +150,6 @@ def test_a_let_is_taken_apart_as_it_was_fixed():
     body = "let: {ready: rock and count(bomb) > 0 and below is void}\ndo: bomb -> void\nthen: rock -> moth if ready"
     found = traced(body, "ob/..", 0, 0)
     asked = found.writes[0].attempt
-    assert asked is not None
     assert {part.let for part in asked.parts} == {
         None,
         "ready",
@@ -162,7 +157,6 @@ def test_a_let_is_taken_apart_as_it_was_fixed():
     miss = only_miss(traced(body, "ob/oo", 0, 0))
     (part,) = miss.failed
     assert (part.let, values([part])) == ("ready", {"below": "rock"})
-    assert part.expr.span is not None
     assert part.expr.span.line == line_of(lab(body), "let:")
 
 
@@ -188,14 +182,14 @@ def test_shipped_rules_are_explained(name):
     assert explained(load(name), (1, 5, 6), 1) > 0
 
 
-@pytest.mark.parametrize("first", [0, 10, 20])
+@pytest.mark.parametrize("first", [0, 10])
 def test_random_rules_are_explained(first):
     """Writes follow on each other, end in what the step left, and every change has one; so does every shape."""
     rulesets = [one for seed in range(first, first + 10) if (one := seeded_ruleset(seed)) is not None]
     assert sum(explained(one, shape, first) for one in rulesets for shape in ((2, 3, 4), (1, 1, 2))) > 100
 
 
-@pytest.mark.parametrize("first", [50, 60])
+@pytest.mark.parametrize("first", [60])
 def test_whatever_happens_can_be_printed(first):
     """Text and JSON of random cells under random rules; a failed part never holds, a happening has none."""
     printed = 0

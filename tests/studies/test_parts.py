@@ -110,9 +110,7 @@ def test_only_selects_settings_and_seeds(only: list[str], count: int | str, tmp_
 
 @pytest.mark.parametrize("text", ["0/2", "3/2", "1", "1/0", "a/b", "1/2/3", "-1/2", "1/99999999", ""])
 def test_an_invalid_shard_is_refused(text: str, steps_run: list[str]) -> None:
-    result = powderdsl("study", "study.yaml", "--shard", text)
-    assert result.exit_code == 2
-    assert "is not a part: write 1/4" in result.stderr
+    assert "is not a part: write 1/4" in powderdsl("study", "study.yaml", "--shard", text, exits=2).stderr
     assert steps_run == []
 
 
@@ -120,21 +118,17 @@ def test_an_invalid_shard_is_refused(text: str, steps_run: list[str]) -> None:
 
 
 def test_shards_in_folders_of_their_own_are_collected(steps_run: list[str]) -> None:
-    whole = powderdsl("study", "study.yaml", "--out", "whole")
-    assert whole.exit_code == 0
+    whole = powderdsl("study", "study.yaml", "--out", "whole", exits=0)
     assert len(steps_run) == POINTS
     for number in (1, 2, 3):
-        found = powderdsl("study", "study.yaml", "--shard", f"{number}/3", "--out", f"part{number}")
-        assert found.exit_code == 0
+        found = powderdsl("study", "study.yaml", "--shard", f"{number}/3", "--out", f"part{number}", exits=0)
         assert "other parts have 8 combinations that are not done in part" in found.stdout
         assert not Path(f"part{number}/results.md").exists()
     assert len(steps_run) == 2 * POINTS
-    collected = powderdsl("study", "collect", "part2", "part1", "part3", "--out", "all")
-    assert collected.exit_code == 0
+    collected = powderdsl("study", "collect", "part2", "part1", "part3", "--out", "all", exits=0)
     assert contents("all") == contents("whole")
     assert collected.stdout == whole.stdout.replace("whole/", "all/")
-    again = powderdsl("study", "collect", "part2", "part1", "part3", "whole")
-    assert again.exit_code == 0
+    powderdsl("study", "collect", "part2", "part1", "part3", "whole", exits=0)
     assert contents("part2") == contents("whole")  # the first folder
 
 
@@ -142,23 +136,22 @@ def test_the_last_shard_in_a_common_folder_writes_the_table(steps_run: list[str]
     powderdsl("study", "study.yaml", "--out", "whole")
     for number in (2, 1):
         assert not Path("common/results.md").exists()
-        assert powderdsl("study", "study.yaml", "--shard", f"{number}/2", "--out", "common").exit_code == 0
+        powderdsl("study", "study.yaml", "--shard", f"{number}/2", "--out", "common", exits=0)
     assert contents("common") == contents("whole")
 
 
 def test_collect_takes_the_same_selection(steps_run: list[str]) -> None:
     chosen = ("--only", "steps=100,300", "--seeds", "3")
-    assert powderdsl("study", "study.yaml", "--out", "whole", *chosen).exit_code == 0
+    powderdsl("study", "study.yaml", "--out", "whole", *chosen, exits=0)
     for number in (1, 2):
         powderdsl("study", "study.yaml", "--out", f"part{number}", "--shard", f"{number}/2", *chosen)
-    assert powderdsl("study", "collect", "part1", "part2", "--out", "all", *chosen).exit_code == 0
+    powderdsl("study", "collect", "part1", "part2", "--out", "all", *chosen, exits=0)
     assert contents("all") == contents("whole")
 
 
 def test_collect_tells_what_is_missing(steps_run: list[str], quick: None) -> None:
     powderdsl("study", "study.yaml", "--out", "part", "--shard", "1/2")
-    result = powderdsl("study", "collect", "part", "--out", "all")
-    assert result.exit_code == 1
+    result = powderdsl("study", "collect", "part", "--out", "all", exits=1)
     assert "6 combinations did not finish" in result.stderr
     text = Path("all/results.md").read_text(encoding="utf-8")
     assert text.count("not done in any of these folders") == 6
@@ -174,10 +167,8 @@ def test_collect_needs_results_of_one_study(steps_run: list[str], quick: None) -
         (("plain",), "PD620"),
         (("one", "nowhere"), "PD620"),
     ):
-        result = powderdsl("study", "collect", *folders, "--out", "all")
-        assert result.exit_code == 2
-        assert f"error[{code}]" in result.stderr
-    assert powderdsl("study", "collect").exit_code == 2
+        assert f"error[{code}]" in powderdsl("study", "collect", *folders, "--out", "all", exits=2).stderr
+    powderdsl("study", "collect", exits=2)
     assert not Path("all").exists()
 
 
@@ -188,8 +179,7 @@ def test_collect_refuses_two_results_of_one_point(steps_run: list[str], quick: N
     path.write_text(
         json.dumps({"trained": {"splits": {"test": {"trained": {"mean": 99.0}}}}}), encoding="utf-8"
     )
-    result = powderdsl("study", "collect", "one", "two", "--out", "all")
-    assert result.exit_code == 2
+    result = powderdsl("study", "collect", "one", "two", "--out", "all", exits=2)
     assert (
         "error[PD627]: one and two have different results of steps=200,obstacles=some,seed=1" in result.stderr
     )
@@ -204,8 +194,7 @@ def test_results_of_strangers_are_numbers(value: str, quick: None) -> None:
     about = f'{{"trained": {{"splits": {{"test": {{"trained": {{"mean": {value}}}}}}}}}}}'
     path.write_text(about, encoding="utf-8")
     for words in (("collect", "one"), ("study.yaml", "--out", "one")):
-        result = powderdsl("study", *words)
-        assert result.exit_code == 1
+        powderdsl("study", *words, exits=1)
         assert "is not a finite number" in Path("one/results.md").read_text(encoding="utf-8")
 
 
@@ -228,8 +217,7 @@ def test_results_of_strangers_have_a_right_study(old: str, new: str, quick: None
     text = path.read_text(encoding="utf-8")
     assert old in text
     path.write_text(text.replace(old, new), encoding="utf-8")
-    result = powderdsl("study", "collect", "one", "--out", "all")
-    assert result.exit_code == 2
+    result = powderdsl("study", "collect", "one", "--out", "all", exits=2)
     assert "error[PD" in result.stderr
     assert "\x1b" not in result.stderr
     assert not Path("all").exists()
@@ -239,9 +227,7 @@ def test_collect_follows_no_link_out_of_a_folder(quick: None, tmp_path: Path) ->
     powderdsl("study", "study.yaml", "--out", "one")
     os.rename("one/done", "elsewhere")
     Path("one/done").symlink_to(tmp_path / "elsewhere")
-    result = powderdsl("study", "collect", "one")
-    assert result.exit_code == 2
-    assert "PD112" in result.stderr
+    assert "PD112" in powderdsl("study", "collect", "one", exits=2).stderr
 
 
 # Points that others hold
@@ -252,14 +238,13 @@ def test_points_that_others_hold_are_left_to_them(steps_run: list[str], quick: N
     place = Path("out/runs/steps=200,obstacles=none,seed=1")
     place.mkdir()
     with FileLock(place / ".lock"):
-        result = powderdsl("study", "study.yaml", "--out", "out")
-        assert result.exit_code == 1
+        result = powderdsl("study", "study.yaml", "--out", "out", exits=1)
         assert "the study is not complete: other processes hold 1 combination" in result.stderr
         assert f"{place.name}: another process works on it" in result.stderr
         assert len(steps_run) == POINTS - 1
         assert place.name not in steps_run
         assert not Path("out/results.md").exists()
-    assert powderdsl("study", "study.yaml", "--out", "out").exit_code == 0
+    powderdsl("study", "study.yaml", "--out", "out", exits=0)
     assert steps_run[-1] == place.name
     assert len(steps_run) == POINTS
 
@@ -299,7 +284,6 @@ def test_a_point_is_free_once_the_process_that_holds_it_is_killed(steps_run: lis
     study, point, place = prepared("out")
     command = [sys.executable, "-c", HOLD, str(place / ".lock")]
     with started(command, stdout=subprocess.PIPE, env=environment_with()) as running:
-        assert running.stdout is not None
         assert running.stdout.readline() == "held\n"
         (outcome,) = study.run([point], 1)
         assert outcome.held
@@ -340,10 +324,9 @@ def test_the_recipe_for_slurm_runs_each_combination_once(tmp_path: Path) -> None
 
 
 def test_a_step_waits_for_what_a_killed_study_has_started(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The run's own lock outlives the study, in the process that saves its last checkpoint."""
-    monkeypatch.chdir(tmp_path)
     Path("study.yaml").write_text(STUDY, encoding="utf-8")
     study, point, place = prepared("out")
     (place / "trained").mkdir()

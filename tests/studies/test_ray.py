@@ -93,27 +93,19 @@ def test_what_a_node_refuses_is_a_problem_of_the_run(tmp_path: Path) -> None:
     assert "the path `dig.yaml` leaves the study's folder" in str(found.problem)
 
 
-def test_without_ray_the_user_learns_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    written(tmp_path, 1, [12])
+def test_without_ray_the_user_learns_what_to_install(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    written(folder, 1, [12])
     monkeypatch.setitem(sys.modules, "ray", None)
-    result = powderdsl("study", "study.yaml", "--ray", "auto")
-    assert result.exit_code == 2
-    assert "pip install 'powderdsl[ray]'" in result.stderr
-    assert not (tmp_path / "studies").exists()
+    assert "pip install 'powderdsl[ray]'" in powderdsl("study", "study.yaml", "--ray", "auto", exits=2).stderr
+    assert not (folder / "studies").exists()
 
 
 @needs_ray
 @pytest.mark.parametrize("address", ["nonsense", "127.0.0.1:1", "127.0.0.1:99999", "", "ray://"])
-def test_where_no_cluster_is_the_user_is_told_at_once(
-    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    written(tmp_path, 1, [12])
-    result = powderdsl("study", "study.yaml", "--ray", address)
-    assert result.exit_code == 2
-    assert "error[PD626]" in result.stderr
-    assert not (tmp_path / "studies").exists()
+def test_where_no_cluster_is_the_user_is_told_at_once(address: str, folder: Path) -> None:
+    written(folder, 1, [12])
+    assert "error[PD626]" in powderdsl("study", "study.yaml", "--ray", address, exits=2).stderr
+    assert not (folder / "studies").exists()
 
 
 @pytest.mark.slow

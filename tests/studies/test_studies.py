@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from powderdsl.cli.commands.study import commands
-from powderdsl.diagnostics import CompileError, Reporter, Source
+from powderdsl.diagnostics import Reporter, Source
 from powderdsl.experiments.studies.results import (
     Interval,
     as_data,
@@ -31,6 +31,7 @@ from powderdsl.experiments.studies.study import (
     load_study,
     read_study,
 )
+from tests.refusals import refusal
 
 KNOWN: Mapping[tuple[str, ...], Mapping[str, str]] = {
     ("train",): {"on": TASK, **dict.fromkeys(("run", "seed", "steps", "knob"), TEXT)},
@@ -123,16 +124,13 @@ def test_a_value_may_set_several_names() -> None:
 )
 def test_a_mistake_is_reported_at_its_place(old: str, new: str, code: str, caret: str) -> None:
     assert old in TEXT
-    with pytest.raises(CompileError) as error:
-        read(TEXT.replace(old, new, 1))
-    found = [(one.code, one.primary.span.text if one.primary.span else "") for one in error.value.diagnostics]
+    errors = refusal(read, TEXT.replace(old, new, 1))
+    found = [(one.code, one.primary.span.text if one.primary.span else "") for one in errors]
     assert (code, caret) in found
 
 
 def test_an_unknown_study_gets_a_suggestion() -> None:
-    with pytest.raises(CompileError) as error:
-        load_study("start-stats", KNOWN)
-    assert error.value.diagnostics[0].helps == ("did you mean `start-states`?",)
+    assert refusal(load_study, "start-stats", KNOWN)[0].helps == ("did you mean `start-states`?",)
 
 
 def test_an_interval_is_that_of_student() -> None:
@@ -233,8 +231,7 @@ splits: {test: {generate: [frame wall]}}
 """
 
 
-def test_a_study_runs_goes_on_and_refuses_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_a_study_runs_goes_on_and_refuses_another(folder: Path) -> None:
     Path("dig.yaml").write_text(TINY, encoding="utf-8")
     text = """
 study: tiny
@@ -249,14 +246,14 @@ measures:
 """
     study = read_study(Source("study.yaml", text), Reporter(), commands())
     points = list(study.points("small"))
-    run = StudyRun(study, tmp_path / "out", "small")
+    run = StudyRun(study, folder / "out", "small")
     run.prepare()
     found = run.run(points, jobs=2)
     assert [one.problem for one in found] == [None, None]
     assert all(1.0 <= one.values["reward"] <= 12.0 for one in found)
-    logs = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("*.log")}
+    logs = {path: path.stat().st_mtime_ns for path in (folder / "out").rglob("*.log")}
     assert len(logs) == 4
-    again = StudyRun(study, tmp_path / "out", "small")
+    again = StudyRun(study, folder / "out", "small")
     again.prepare()
     assert again.run(points, jobs=1) == found
     assert {path: path.stat().st_mtime_ns for path in logs} == logs
@@ -264,7 +261,7 @@ measures:
     def changed(old: str, new: str) -> StudyRun:
         assert old in text
         file = Source("study.yaml", text.replace(old, new))
-        return StudyRun(read_study(file, Reporter(), commands()), tmp_path / "out", "small")
+        return StudyRun(read_study(file, Reporter(), commands()), folder / "out", "small")
 
     renamed = changed("reward:", "mean: {of: trained, value: splits/test/random/mean, scale: log}\n  reward:")
     renamed.prepare()
@@ -272,9 +269,7 @@ measures:
     assert [one.values["reward"] for one in more] == [one.values["reward"] for one in found]
     assert all(one.values["mean"] > 0 for one in more)
     assert {path: path.stat().st_mtime_ns for path in logs} == logs
-    with pytest.raises(CompileError) as error:
-        changed("episodes: 4", "episodes: 5").prepare()
-    assert error.value.diagnostics[0].code == "PD621"
+    assert refusal(changed("episodes: 4", "episodes: 5").prepare)[0].code == "PD621"
 
 
 def test_a_step_that_fails_is_told_with_its_last_words(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from powderdsl.cli.study.checks import agent_keys, check_study, model_keys
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Source
 from powderdsl.experiments.studies.study import Study, load_study, read_study, shipped_studies
 from tests.cli.commands import powderdsl
+from tests.refusals import refusal
 
 AGENTS = """
 study: patience
@@ -50,9 +51,7 @@ def read(text: str, name: str = "study.yaml") -> Study:
 
 def refused(text: str) -> list[tuple[str, str]]:
     """The code and the text under the caret of everything that is said of a study."""
-    with pytest.raises(CompileError) as caught:
-        read(text)
-    return [(one.code, under(one)) for one in caught.value.diagnostics]
+    return [(one.code, under(one)) for one in refusal(read, text)]
 
 
 def under(one: Diagnostic) -> str:
@@ -132,11 +131,8 @@ def test_consequences_are_told_too_where_they_are_mistakes_of_their_own() -> Non
 
 
 def test_a_value_is_shown_where_it_is_written_and_used() -> None:
-    with pytest.raises(CompileError) as caught:
-        read(AGENTS.replace("[100, 200]", "[100, lots]"))
-    (one,) = caught.value.diagnostics
+    (one,) = refusal(read, AGENTS.replace("[100, 200]", "[100, lots]"))
     (used,) = one.secondary
-    assert used.span is not None
     assert (used.span.text, used.text) == ("$steps", "as `lots`")
 
 
@@ -160,9 +156,8 @@ def test_mistakes_in_a_task_file_are_shown_there(tmp_path: Path) -> None:
         "task: dig\nrules: core+sadn\nsize: [8, 8]\nfill: empty\n", encoding="utf-8"
     )
     text = AGENTS.replace("[sand-pushing, destroying]", "[dig.yaml]")
-    with pytest.raises(CompileError) as caught:
-        read(text, str(tmp_path / "study.yaml"))
-    places = {Path(one.primary.span.source.name).name for one in caught.value.diagnostics if one.primary.span}
+    errors = refusal(read, text, str(tmp_path / "study.yaml"))
+    places = {Path(one.primary.span.source.name).name for one in errors if one.primary.span}
     assert "dig.yaml" in places
 
 
@@ -189,8 +184,7 @@ def numbers(tree: Any, keys: tuple[str, ...] = ()) -> Iterator[str]:
 
 
 @pytest.mark.slow
-def test_known_keys_are_those_of_real_evaluations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_known_keys_are_those_of_real_evaluations(folder: Path) -> None:
     few = [
         "--preset",
         "small",
@@ -205,8 +199,8 @@ def test_known_keys_are_those_of_real_evaluations(tmp_path: Path, monkeypatch: p
         "--steps",
         "12",
     ]
-    assert powderdsl("train", "sand-pushing", "--run", "agent", *few).exit_code == 0
-    assert powderdsl("evaluate", "agent", "--episodes", 2).exit_code == 0
+    powderdsl("train", "sand-pushing", "--run", "agent", *few, exits=0)
+    powderdsl("evaluate", "agent", "--episodes", 2, exits=0)
     found = json.loads(Path("agent/evaluation.json").read_text())
     splits = list(found["splits"])
     real = set(numbers(found))
@@ -216,24 +210,20 @@ def test_known_keys_are_those_of_real_evaluations(tmp_path: Path, monkeypatch: p
     assert known - unset <= real <= known
 
     quick = ("--width", 4, "--batch", 4, "--buffer", 8, "--refresh", 2, "--states", 8, "--iterations", 1)
-    trained = powderdsl("wm", "train", "--run", "model", *quick, "--backend", "wasm")
-    assert trained.exit_code == 0, trained.output
-    tested = powderdsl("wm", "eval", "model", "--split", "held_out", "--worlds", 1, "--backend", "wasm")
-    assert tested.exit_code == 0, tested.output
+    powderdsl("wm", "train", "--run", "model", *quick, "--backend", "wasm", exits=0)
+    powderdsl("wm", "eval", "model", "--split", "held_out", "--worlds", 1, "--backend", "wasm", exits=0)
     real = set(numbers(json.loads(Path("model/evaluation.json").read_text())))
     known = set(model_keys())
     unset = {key for key in known if key.endswith("/change_precision")}  # null where no change is predicted
     assert known - unset <= real <= known
 
 
-def test_a_dry_run_prints_what_a_shell_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_a_dry_run_prints_what_a_shell_takes(folder: Path) -> None:
     text = AGENTS.replace("episodes: 4", "episodes: 4, deterministic: yes").replace(
         'splits: "test,train"', 'splits: "test, train"'
     )
     Path("my study.yaml").write_text(text, encoding="utf-8")
-    result = powderdsl("study", "my study.yaml", "--dry-run", "--seeds", 1, "--out", "it's here")
-    assert result.exit_code == 0, result.output
+    result = powderdsl("study", "my study.yaml", "--dry-run", "--seeds", 1, "--out", "it's here", exits=0)
     lines = result.stdout.splitlines()
     assert len(lines) == 2 * 2 * 2
     words = shlex.split(lines[1])
@@ -243,24 +233,17 @@ def test_a_dry_run_prints_what_a_shell_takes(tmp_path: Path, monkeypatch: pytest
     assert words[3:] == shlex.split(options)
 
 
-def test_nothing_is_written_for_a_study_that_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_nothing_is_written_for_a_study_that_is_refused(folder: Path) -> None:
     Path("study.yaml").write_text(AGENTS.replace("splits/test", "splits/tset"), encoding="utf-8")
-    result = powderdsl("study", "study.yaml")
-    assert result.exit_code == 2
-    assert "study.yaml:13:" in result.stderr
-    assert [path.name for path in tmp_path.iterdir()] == ["study.yaml"]
+    assert "study.yaml:13:" in powderdsl("study", "study.yaml", exits=2).stderr
+    assert [path.name for path in folder.iterdir()] == ["study.yaml"]
 
 
 @pytest.mark.parametrize(("study", "right"), [(AGENTS, "trained"), (MODELS, "tuned")])
 def test_a_measure_of_the_step_that_evaluates_is_led_to_the_run(study: str, right: str) -> None:
     """What the message proposes is accepted."""
     wrong = study.replace(f"{{of: {right},", "{of: tested,")
-    with pytest.raises(CompileError) as caught:
-        read(wrong)
-    (found,) = caught.value.diagnostics
+    (found,) = refusal(read, wrong)
     assert (found.code, under(found)) == ("PD806", "tested")
     assert f"`of: {right}`" in found.helps[0]
     assert read(study.replace("{of: tested,", f"{{of: {right},")).measures[0].of.text == right

@@ -8,9 +8,9 @@ import click
 import pytest
 
 from powderdsl.cli.commands.study import CALLED, NOT_FOR_STUDIES, commands
-from powderdsl.diagnostics import CompileError
 from powderdsl.experiments.studies.study import FILE, READ, RULES, RUN_OR_TASK, TASK, confined, load_study
 from tests.cli.commands import powderdsl
+from tests.refusals import refused_codes
 
 STUDY = """
 study: odd
@@ -38,9 +38,7 @@ ELSEWHERE = (
 
 def errors(path: Path, text: str) -> list[str]:
     path.write_text(text, encoding="utf-8")
-    with pytest.raises(CompileError) as caught:
-        load_study(str(path), commands())
-    return [one.code for one in caught.value.diagnostics]
+    return refused_codes(load_study, str(path), commands())
 
 
 @pytest.mark.parametrize("name", ELSEWHERE)
@@ -119,9 +117,7 @@ def test_results_with_a_link_that_leads_out_are_refused(tmp_path):
     victim.mkdir()
     (tmp_path / "results").mkdir()
     (tmp_path / "results" / "runs").symlink_to(victim)
-    result = powderdsl("study", tmp_path / "s.yaml", "--out", tmp_path / "results")
-    assert result.exit_code == 2
-    assert "PD112" in result.stderr
+    assert "PD112" in powderdsl("study", tmp_path / "s.yaml", "--out", tmp_path / "results", exits=2).stderr
     assert list(victim.iterdir()) == []
 
 

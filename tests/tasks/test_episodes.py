@@ -7,9 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from powderdsl.diagnostics import CompileError, Reporter, Source
+from powderdsl.compiler import load
+from powderdsl.diagnostics import Reporter, Source
+from powderdsl.simulation.simulator import compile as compile_rules
+from powderdsl.tasks.episodes import TaskProgram, check_actions, compile_task
 from powderdsl.tasks.file import read_task
 from powderdsl.tasks.shipped import load_task
+from tests.refusals import refusal, refused_codes
 
 HEAD = "task: test\nrules: powderworld\nsize: [64, 64]\nfill: empty\n"
 NOISE = "generate:\n" + "".join(
@@ -28,10 +32,6 @@ def task_of(text: str):
 @pytest.fixture(scope="module")
 def program_of():
     """Programs of tasks on one simulator: they all have the same rules."""
-    from powderdsl.compiler import load
-    from powderdsl.simulation.simulator import compile as compile_rules
-    from powderdsl.tasks.episodes import TaskProgram
-
     simulator = compile_rules(load("powderworld"), "wasm")
     return lambda text: TaskProgram(task_of(text), "train", simulator)
 
@@ -40,8 +40,6 @@ def program_of():
 
 
 def test_blowing_sets_the_speed_in_a_block_of_ten(torch, program_of):
-    from powderdsl.tasks.episodes import check_actions
-
     program = program_of(NOISE + "agent: {may: blow, speed: 20, actions: 9, steps_per_action: 0}\n")
     assert program.action_nvec == (16, 16, 1, 3, 3)
     episodes = program.start(torch.arange(4))
@@ -96,8 +94,6 @@ def test_an_element_fills_the_block_with_fresh_cells(torch, program_of):
 
 @pytest.mark.parametrize("backend", ["wasm", "torch"])
 def test_reused_tensors_give_the_same_episodes(torch, backend):
-    from powderdsl.tasks.episodes import compile_task
-
     program = compile_task(load_task("path-building", knobs={"complexity": 2}), backend=backend)
     fresh = reused = program.start(torch.arange(3))
     random = torch.Generator().manual_seed(3)
@@ -115,8 +111,6 @@ def test_reused_tensors_give_the_same_episodes(torch, backend):
 
 
 def test_invalid_actions_are_refused(torch, program_of):
-    from powderdsl.tasks.episodes import check_actions
-
     program = program_of("agent: {may: [wall, empty], actions: 9, bins: [4, 8]}\n")
     assert program.action_nvec == (8, 4, 2, 3, 3)
     good = np.array([[7, 3, 1, 2, 2], [0, 0, 0, 0, 0]])
@@ -275,8 +269,6 @@ def test_conditions_end_an_episode(torch, program_of):
 
 
 def test_restart_touches_the_masked_worlds_only(torch):
-    from powderdsl.tasks.episodes import compile_task
-
     program = compile_task("sand-pushing", backend="wasm")
     episodes = program.start(torch.arange(5))
     for _ in range(2):
@@ -299,8 +291,6 @@ def test_restart_touches_the_masked_worlds_only(torch):
 
 
 def test_stands_follow_their_seeds(torch):
-    from powderdsl.tasks.episodes import compile_task
-
     program = compile_task("sand-pushing", split="handmade", backend="wasm")
     episodes = program.start(torch.arange(20))
     assert torch.equal(episodes.world.ids[:8], episodes.world.ids[8:16])
@@ -309,8 +299,6 @@ def test_stands_follow_their_seeds(torch):
 
 
 def test_a_start_is_what_the_simulator_makes_of_its_ids(torch):
-    from powderdsl.tasks.episodes import compile_task
-
     program = compile_task("destroying", backend="wasm")
     episodes = program.start(torch.tensor([5, 9, 2**40]))
     world = program.simulator.world(episodes.world.ids, seed=[5, 9, 2**40])
@@ -322,18 +310,11 @@ def test_a_start_is_what_the_simulator_makes_of_its_ids(torch):
 
 
 def test_unknown_names(torch):
-    from powderdsl.tasks.episodes import compile_task
-
     for wrong, code in (("sand-pulling", "PD801"), ("gone.yaml", "PD101")):
-        with pytest.raises(CompileError) as caught:
-            compile_task(wrong)
-        assert [one.code for one in caught.value.diagnostics] == [code]
-    with pytest.raises(CompileError) as caught:
-        compile_task("destroying", split="tset")
-    assert caught.value.diagnostics[0].helps == ("did you mean `test`?",)
-    with pytest.raises(CompileError) as caught:
-        load_task("destroying", knobs={"lnies": 3, "disks": 65})
-    assert [one.code for one in caught.value.diagnostics] == ["PD803", "PD803"]
+        assert refused_codes(compile_task, wrong) == [code]
+    assert refusal(compile_task, "destroying", split="tset")[0].helps == ("did you mean `test`?",)
+    errors = refusal(load_task, "destroying", knobs={"lnies": 3, "disks": 65})
+    assert [one.code for one in errors] == ["PD803", "PD803"]
 
 
 def test_without_actions_every_step_is_reported(torch, program_of):

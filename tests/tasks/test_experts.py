@@ -208,5 +208,4 @@ def test_what_is_wrong_is_reported_at_its_place(expert: str) -> None:
     code, place = WRONG[expert]
     assert [one.code for one in errors] == [code]
     span = errors[0].primary.span
-    assert span is not None
     assert place in span.text

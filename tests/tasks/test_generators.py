@@ -10,8 +10,11 @@ import numpy as np
 import pytest
 
 from powderdsl.diagnostics import Reporter, Source
+from powderdsl.targets.tensor_kind import Tensors
 from powderdsl.tasks.file import read_task
 from powderdsl.tasks.shipped import load_task, shipped_tasks
+from powderdsl.tasks.tensors import generator
+from powderdsl.tasks.tensors.generator import WorldMaker
 from powderdsl.worlds.raster import Shape, mask
 from powderdsl.worlds.scene.read import read_file
 
@@ -27,9 +30,6 @@ def task_of(text: str):
 
 
 def maker(torch, task, split: str = "train", variant: int = 0):
-    from powderdsl.targets.tensor_kind import Tensors
-    from powderdsl.tasks.tensors.generator import WorldMaker
-
     return WorldMaker(task.split(split).variants[variant], task.size, Tensors())
 
 
@@ -81,8 +81,6 @@ def test_a_region_without_shapes_covers_nothing(torch):
 
 
 def test_a_world_is_the_same_alone_and_in_any_batch(torch, monkeypatch):
-    from powderdsl.tasks.tensors import generator
-
     one = maker(torch, task_of(EVERYTHING))
     seeds = torch.tensor([0, 7, 2**40, 3, 12_345, 2**62])
     together = one.make(seeds)

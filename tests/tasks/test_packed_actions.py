@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from powderdsl.diagnostics import Reporter, Source
+from powderdsl.tasks.episodes import compile_task
 from powderdsl.tasks.file import read_task
 
 TASK = """task: packed
@@ -29,8 +32,6 @@ reward: {each: painted + count(sand) + 100 * placed}
 )
 def test_packed_worlds_are_acted_on_alike(torch, size, each):
     """Few worlds are cut into strips in native code, many are not; 70 columns are more than one word."""
-    from powderdsl.tasks.episodes import compile_task
-
     text = TASK.replace("SIZE", size).replace("painted + count(sand) + 100 * placed", each)
     task = read_task(Source("packed.yaml", text), Reporter())
     native, plain = (compile_task(task, backend=backend) for backend in ("native", "wasm"))
@@ -58,8 +59,6 @@ def test_packed_worlds_are_acted_on_alike(torch, size, each):
 
 @pytest.mark.parametrize("size", ["[64, 64]", "[20, 70]"])
 def test_packed_worlds_restart_alike(torch, size):
-    from powderdsl.tasks.episodes import compile_task
-
     task = read_task(Source("packed.yaml", TASK.replace("SIZE", size)), Reporter())
     native, plain = (compile_task(task, backend=backend) for backend in ("native", "wasm"))
     for batch, reuse in ((3, True), (3, False), (20, True)):
@@ -115,10 +114,6 @@ reward: {each: EACH}
 )
 def test_packed_worlds_are_measured_alike(torch, size, each, on_planes):
     """In strips (few worlds of 24 rows) and side by side, in words that are not full."""
-    from dataclasses import replace
-
-    from powderdsl.tasks.episodes import compile_task
-
     text = MEASURES.replace("SIZE", size).replace("EACH", each)
     program = compile_task(read_task(Source("measured.yaml", text), Reporter()), backend="native")
     for batch in (1, 20):

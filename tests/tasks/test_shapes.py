@@ -9,7 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from powderdsl.worlds.raster import Shape, mask
+from powderdsl.targets.tensor_kind import Tensors
+from powderdsl.tasks.tensors.generator import shape_cells
+from powderdsl.worlds.raster import Shape, mask, root
 
 PLACE = st.integers(-12, 90)
 SIZES = st.sampled_from([(1, 1), (7, 9), (64, 64), (65, 30), (130, 12)])
@@ -95,9 +97,6 @@ def definition(kind: str, n: list[Any], size: tuple[int, int]) -> np.ndarray:
 
 @pytest.mark.parametrize("kind", NUMBERS)
 def test_batches_cover_the_same_cells(torch, kind):
-    from powderdsl.targets.tensor_kind import Tensors
-    from powderdsl.tasks.tensors.generator import shape_cells
-
     @settings(max_examples=60, deadline=None, derandomize=True)
     @given(batch=st.lists(NUMBERS[kind], min_size=1, max_size=6), size=SIZES)
     def compare(batch, size):
@@ -114,8 +113,6 @@ def test_batches_cover_the_same_cells(torch, kind):
 
 
 def test_whole_roots_are_exact(torch):
-    from powderdsl.worlds.raster import root
-
     n = torch.tensor([0, 1, 2, 3, 4, 2**26, 2**25 - 1, 67_108_863])
     assert torch.equal(root(torch, n * n), n)
     assert torch.equal(root(torch, (n * n - 1).clamp(min=0)), (n - 1).clamp(min=0))

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from powderdsl.targets.array_kind import ArrayKind
+from powderdsl.targets.tensor_kind import Tensors
 from powderdsl.tasks.shipped import load_task, shipped_tasks
 from powderdsl.tasks.tensors.generator import Made, StartWorlds
 from tests.unit.test_without_numpy import BLOCK
@@ -40,8 +41,6 @@ def values(made: Made) -> dict[str, Any]:
 
 @pytest.mark.parametrize("name", shipped_tasks())
 def test_arrays_make_the_worlds_of_tensors(torch, name):
-    from powderdsl.targets.tensor_kind import Tensors
-
     task = load_task(name)
     for split in task.splits:
         starts = [StartWorlds(task, split.name, kind) for kind in (ArrayKind(), Tensors())]

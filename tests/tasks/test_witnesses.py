@@ -7,9 +7,13 @@ from functools import cache
 
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 
+import powderdsl
 from powderdsl.compiler import shipped
+from powderdsl.tasks.episodes import TaskProgram, check_actions
+from powderdsl.tasks.players import ExpertPlayer
 from powderdsl.tasks.shipped import load_task, shipped_tasks
 from tests.tasks.witnesses import WITNESSES, Act, Seen
 from tests.tiers import tiered
@@ -31,18 +35,11 @@ class Played:
 
 @cache
 def simulator(rules: str):  # type: ignore[no-untyped-def]
-    import powderdsl
-
     return powderdsl.compile(rules, backend="wasm")
 
 
 def play(name: str, split: str) -> dict[str, Played]:
     """The same `WORLDS` worlds, three times side by side in one batch: once for each of `PLAYERS`."""
-    import torch
-
-    from powderdsl.tasks.episodes import TaskProgram, check_actions
-    from powderdsl.tasks.players import ExpertPlayer
-
     task = load_task(name)
     program = TaskProgram(task, split, simulator(*task.rules))
     agent = program.task.agent

@@ -19,13 +19,12 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.experiments.runs import STATE, RunFolder
 from powderdsl.system.archives import BadArchive, open_archive, write_archive
 from powderdsl.worlds.raster import MAX_CELLS
+from tests.refusals import refused_codes
 
 
 def codes(path: Path) -> list[str]:
     sim = powderdsl.compile("core", backend="reference")
-    with pytest.raises(CompileError) as caught:
-        powderdsl.load_world(path, sim)
-    return [one.code for one in caught.value.diagnostics]
+    return refused_codes(powderdsl.load_world, path, sim)
 
 
 def test_a_small_file_with_a_large_world_is_not_unpacked(tmp_path):
@@ -34,7 +33,7 @@ def test_a_small_file_with_a_large_world_is_not_unpacked(tmp_path):
     with np.load(tmp_path / "w.npz") as data:
         arrays = dict(data)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    side = 30_000
+    side = 12_000
     header = f"{{'descr': '|u1', 'fortran_order': False, 'shape': (1, {side}, {side}), }}".encode()
     header += b" " * (-(len(header) + 11) % 64) + b"\n"
     with zipfile.ZipFile(tmp_path / "w.npz", "w", zipfile.ZIP_DEFLATED) as archive:
@@ -46,7 +45,7 @@ def test_a_small_file_with_a_large_world_is_not_unpacked(tmp_path):
                 member.write(b"\x93NUMPY\1\0" + struct.pack("<H", len(header)) + header)
                 for _ in range(side):
                     member.write(bytes(side))
-    assert (tmp_path / "w.npz").stat().st_size < 2_000_000
+    assert (tmp_path / "w.npz").stat().st_size < 1_000_000
     assert codes(tmp_path / "w.npz") == ["PD607"]
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # KiB
 
@@ -131,7 +130,6 @@ def test_what_training_saves_is_read(tmp_path):
     run = RunFolder(tmp_path, "toy", {}, {})
     run.save_checkpoint(3, state)
     found = run.latest_checkpoint()
-    assert found is not None
     model = found.state.pop("model")
     assert found.state == {"recent": state["recent"], "optimizer": state["optimizer"]}
     assert list(model) == list(weights)
@@ -179,6 +177,4 @@ CRAFTED = {
 @pytest.mark.parametrize("name", CRAFTED)
 def test_a_crafted_checkpoint_is_refused(name, tmp_path):
     crafted(tmp_path / "checkpoints", CRAFTED[name])
-    with pytest.raises(CompileError) as caught:
-        RunFolder(tmp_path, "toy", {}, {}).latest_checkpoint()
-    assert [one.code for one in caught.value.diagnostics] == ["PD620"]
+    assert refused_codes(RunFolder(tmp_path, "toy", {}, {}).latest_checkpoint) == ["PD620"]

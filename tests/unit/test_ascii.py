@@ -11,15 +11,14 @@ from hypothesis.extra.numpy import array_shapes, arrays
 from powderdsl.diagnostics import CompileError, Reporter, Source, Span
 from powderdsl.worlds import ascii as ascii_art
 from powderdsl.worlds.ascii import load_ascii, parse_ascii, read_ascii, write_ascii
+from tests.refusals import refusal
 from tests.unit.elements import ELEMENTS
 
 WORLDS = arrays(np.uint8, array_shapes(min_dims=2, max_dims=2, max_side=9), elements=st.integers(0, 13))
 
 
 def problems(text: str, **options) -> list[tuple[str, str]]:
-    with pytest.raises(CompileError) as caught:
-        read_ascii(text, ELEMENTS, **options)
-    return [(one.code, one.primary.span.text) for one in caught.value.diagnostics]
+    return [(one.code, one.primary.span.text) for one in refusal(read_ascii, text, ELEMENTS, **options)]
 
 
 def test_glyphs_are_cells_and_whitespace_is_nothing():

@@ -63,7 +63,6 @@ def differs(text: str, monkeypatch: pytest.MonkeyPatch) -> bool:
     assert any(re.search(pattern, text) for pattern in WORDED_BY_PYYAML.values()), repr(text)
     for diagnostic in pure[1]:
         span = diagnostic.primary.span
-        assert span is not None
         assert 0 <= span.start < span.end <= max(len(text), 1) + 1, repr(text)
     return True
 

@@ -10,15 +10,15 @@ import pytest
 
 import powderdsl as library
 from powderdsl.compiler import MAX_BASES, load_with_diagnostics
-from powderdsl.diagnostics import CompileError, Severity
+from powderdsl.diagnostics import Severity
 from tests.cli.commands import PACK, powderdsl
+from tests.refusals import refusal
 
 MEADOW = "ruleset: meadow\nextends: powderworld\nwithout: gas\npacks: grit\nparams: {water.melt: 10%}\n"
 
 
 @pytest.fixture(autouse=True)
-def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def _folder(folder: Path) -> None:
     write({"grit": PACK, "meadow": MEADOW})
 
 
@@ -29,9 +29,7 @@ def write(files: Mapping[str, str]) -> None:
 
 def errors_of(rules: str) -> list[tuple[str, str, int]]:
     """Code, file and line of each error, or code and nothing."""
-    with pytest.raises(CompileError) as caught:
-        library.load(rules)
-    spans = [(one.code, one.primary.span) for one in caught.value.diagnostics]
+    spans = [(one.code, one.primary.span) for one in refusal(library.load, rules)]
     return [(code, span.source.name, span.line) if span else (code, "", 0) for code, span in spans]
 
 
@@ -201,7 +199,7 @@ def test_warnings_about_a_pack_that_others_bring_about_are_notes() -> None:
         "with `soak`, this rule is always overruled: pool.yaml:12",
         "with `soak`, `count(mud) never falls without wet` can no longer hold",
     }
-    assert powderdsl("check", "pool.yaml+soak.yaml", "--warnings-as-errors").exit_code == 0
+    powderdsl("check", "pool.yaml+soak.yaml", "--warnings-as-errors", exits=0)
 
 
 def test_warnings_that_a_pack_deserves_stay_warnings() -> None:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import powderdsl
-from powderdsl.diagnostics import CompileError
 from powderdsl.worlds.scene import load_start
 from tests.cli.commands import powderdsl as command
+from tests.refusals import refusal
 
 RULES = powderdsl.load("powderworld")
 HEAD = "scene: small\nsize: [4, 6]\nfill: empty\ndraw:\n"
@@ -41,7 +41,6 @@ def test_fields_are_set_in_shapes(tmp_path):
     assert found["velocity"].values[:, 1, 1].tolist() == [0, 2.5]
     assert found["velocity"].values[:, 3, 4].tolist() == [-1, 0]
     ice = RULES.element("ice")
-    assert ice is not None
     assert (found["clone"].where == (np.arange(6) == 5)).all()
     assert (found["clone"].values[:, 5] == ice.id).all()
 
@@ -64,10 +63,9 @@ def test_an_element_painted_later_is_fresh_and_a_place_keeps_its_value(tmp_path)
 def test_a_run_starts_with_the_fields_of_its_scene(tmp_path):
     path = written(tmp_path, "fill sand", "momentum := 7 in box columns 1")
     out = tmp_path / "out.npz"
-    result = command(
-        "run", "powderworld", "--world", str(path), "--steps", "0", "--batch", "2", "--out", str(out)
+    command(
+        "run", "powderworld", "--world", str(path), "--steps", "0", "--batch", "2", "--out", str(out), exits=0
     )
-    assert result.exit_code == 0, result.output
     world = powderdsl.load_world(out, powderdsl.compile(RULES, backend="reference"))
     assert world["momentum"][:, :, 1].eq(7).all()
     assert int(world["momentum"].sum()) == 2 * 4 * 7
@@ -91,9 +89,7 @@ def test_a_run_starts_with_the_fields_of_its_scene(tmp_path):
     ],
 )
 def test_a_bad_setting(tmp_path, statement, code, under):
-    with pytest.raises(CompileError) as raised:
-        load_start(written(tmp_path, statement), RULES)
-    (found,) = raised.value.diagnostics
+    (found,) = refusal(load_start, written(tmp_path, statement), RULES)
     assert found.code == code
     assert under is None or found.primary.span.text == under
 
@@ -105,7 +101,6 @@ def test_a_picture_of_a_task_sets_no_fields(tmp_path):
         "task: stamped\nrules: powderworld\nsize: [64, 64]\nfill: empty\nstamps: {hill: {scene: small.yaml}}\n"
         "generate: [stamp hill at (3, 3)]\nagent: {may: [sand], speed: 20, actions: 64}\nreward: {each: count(sand)}\n"
     )
-    result = command("check", str(task))
-    assert result.exit_code == 2
+    result = command("check", str(task), exits=2)
     assert "PD605" in result.output
     assert "sets `momentum`" in result.output

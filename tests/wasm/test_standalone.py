@@ -229,10 +229,9 @@ def test_the_page_of_the_documentation_shows_falling_sand(tmp_path: Path) -> Non
     html = page.partition("```html\n")[2].partition("```")[0]
     assert len(html.partition("<script")[2].strip().splitlines()) <= 17  # fifteen, and the two of the element
     (tmp_path / "index.html").write_text(f"<!doctype html><body style='margin: 0'>{html}")
-    assert command("export", "powderworld", "--out", str(tmp_path / "rules.wasm")).exit_code == 0
+    command("export", "powderworld", "--out", str(tmp_path / "rules.wasm"), exits=0)
     picture = np.asarray(screenshot(tmp_path, (512, 512)).convert("RGB"))
     sand = powderdsl.load("powderworld").element("sand")
-    assert sand is not None
     grains = (picture == np.array([int(sand.color[i : i + 2], 16) for i in (1, 3, 5)])).all(-1)
     assert grains[16:].sum() >= 4 * 64  # cells of 8×8 pixels that have fallen
 
@@ -249,9 +248,7 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
         (("life", "--out", str(tmp_path / "world.js")), "must end in .wasm"),
         (("life",), "--out"),
     ):
-        done = command("export", *given)
-        assert done.exit_code == 2
-        assert words in done.stderr
+        assert words in command("export", *given, exits=2).stderr
     assert list(tmp_path.iterdir()) == [pack]
 
 

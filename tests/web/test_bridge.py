@@ -16,7 +16,7 @@ import wasmtime
 import powderdsl
 from powderdsl.web import bridge
 from powderdsl.web.site import Entry, shipped_entries
-from powderdsl.worlds.store import world_data
+from powderdsl.worlds.store import load_world, world_data
 
 
 @pytest.fixture
@@ -42,7 +42,6 @@ def test_the_files_of_rules_are_the_rules(session: bridge.Session, names: tuple[
     found = call("check", files(*names), [])["result"]
     assert (found["ok"], found["diagnostics"]) == (True, [])
     wanted, ruleset = powderdsl.load(*names), session.ruleset
-    assert ruleset is not None
     assert (ruleset.name, ruleset.palette, ruleset.passes) == (wanted.name, wanted.palette, wanted.passes)
     module = call("compile", 16, 64)
     wasmtime.Module.validate(wasmtime.Engine(), module)
@@ -69,7 +68,6 @@ def test_packs_are_left_out(session: bridge.Session) -> None:
     found = call("check", files("powderworld"), ["acid", "wind"])["result"]
     assert found["ok"]
     assert {"acid.yaml", "wind.yaml"}.isdisjoint(found["packs"])
-    assert session.ruleset is not None
     assert session.ruleset.packs == powderdsl.load("powderworld-acid-wind").packs
     assert not call("check", files("powderworld"), ["core"])["result"]["ok"]
 
@@ -148,8 +146,6 @@ def test_worlds_are_saved_and_opened(session: bridge.Session, tmp_path: Path) ->
     saved = call("save", data)
     path = tmp_path / "world.npz"
     path.write_bytes(saved)
-    from powderdsl.worlds.store import load_world
-
     loaded = load_world(path, sim)
     later = [sim.step(one, 5) for one in (world, loaded)]
     for name, values in later[0].state.items():
@@ -182,7 +178,6 @@ def test_traces_are_those_of_the_world(session: bridge.Session) -> None:
     ruleset = powderdsl.load("powderworld")
     ids = np.zeros((8, 8), np.uint8)
     sand = ruleset.element("sand")
-    assert sand is not None
     ids[2, 3] = sand.id
     data = world_data(ruleset, ids, {}, (0, 0, 0))
     assert "cell 3,3 in step 1 of powderworld" in call("trace", data, 3, 3, {})["result"]

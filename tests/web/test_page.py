@@ -41,7 +41,6 @@ def played(scripts: Path, folder: Path) -> Iterator[str]:
     with subprocess.Popen(
         command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     ) as server:
-        assert server.stdout is not None
         try:
             yield server.stdout.readline().split()[0]
         finally:

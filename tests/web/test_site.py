@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import http.client
 import json
 import re
@@ -103,12 +105,8 @@ class _Page(HTMLParser):
 
 
 def test_the_page_allows_its_own_code_alone(site: Site) -> None:
-    import base64
-    import hashlib
-
     page = _Page()
     text = site.read("index.html")
-    assert text is not None
     page.feed(text.decode())
     rules = dict(part.strip().split(" ", 1) for part in page.policy.split(";"))
     assert rules["default-src"] == "'none'"
@@ -183,7 +181,6 @@ def test_without_its_parts_the_command_says_what_to_do(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(site_module, "PARTS", tmp_path / "none")
-    done = command("play", "--no-open")
-    assert done.exit_code == 2
+    done = command("play", "--no-open", exits=2)
     assert "make web" in done.stderr
     assert "Traceback" not in done.stderr

@@ -14,6 +14,7 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.worldmodel import DataConfig, Machine, TrainConfig, custom_network, load_trained, train
 from powderdsl.worldmodel.networks import ActionChannels, CustomNetwork, is_network_name
 from tests.cli.commands import powderdsl as run
+from tests.refusals import refusal
 from tests.states import same
 from tests.worldmodel.test_training import weights
 
@@ -75,11 +76,10 @@ number = 3
 
 
 @pytest.fixture(autouse=True)
-def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def _folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     torch.set_num_threads(1)
-    Path(tmp_path, "nets.py").write_text(NETS, encoding="utf-8")
-    Path(tmp_path, "faulty.py").write_text("import nowhere\n", encoding="utf-8")
-    monkeypatch.chdir(tmp_path)
+    Path(folder, "nets.py").write_text(NETS, encoding="utf-8")
+    Path(folder, "faulty.py").write_text("import nowhere\n", encoding="utf-8")
     monkeypatch.setattr(sys, "path", [*sys.path])
     sys.modules.pop("nets", None)
     yield
@@ -104,18 +104,15 @@ def tiny(task: str) -> TrainConfig:
 @pytest.mark.parametrize("name", ["nets:Wide", "nets:made"])
 def test_a_network_of_ones_own_is_trained_and_tested(name: str, dunes: str) -> None:
     words = ("wm", "train", "--task", dunes, "--run", "run", *QUICK, "--iterations", 3)
-    trained = run(*words, "--network", name)
-    assert trained.exit_code == 0, trained.output
+    run(*words, "--network", name, exits=0)
     config = json.loads(Path("run/run.json").read_text())["config"]
     assert config["network"] == name
-    tested = run(
-        "wm", "eval", "run", "--network", name, "--split", "two", "--worlds", 1, "--backend", "torch"
+    run(
+        "wm", "eval", "run", "--network", name, "--split", "two", "--worlds", 1, "--backend", "torch", exits=0
     )
-    assert tested.exit_code == 0, tested.output
     out = ("--out", "strips.png", "--backend", "torch", "--split", "two")
-    assert run("wm", "show", "run", "--network", name, *out).exit_code == 0
-    again = run(*words, "--network", name)
-    assert again.exit_code == 0, again.output
+    run("wm", "show", "run", "--network", name, *out, exits=0)
+    run(*words, "--network", name, exits=0)
 
 
 def test_an_interrupted_run_ends_with_the_same_weights(dunes: str) -> None:
@@ -156,16 +153,13 @@ def test_an_interrupted_run_ends_with_the_same_weights(dunes: str) -> None:
 )
 def test_networks_that_cannot_be_trained_are_refused(name: str, said: str) -> None:
     encoder = ActionChannels(10)
-    with pytest.raises(CompileError) as error:
-        custom_network(name).check(encoder, (14, 18), 0)
-    (found,) = error.value.diagnostics
+    (found,) = refusal(lambda: custom_network(name).check(encoder, (14, 18), 0))
     assert found.code == "PD625"
     assert said in " ".join([found.message, *found.notes, *found.helps])
 
 
 def test_they_are_refused_before_a_run_begins(dunes: str) -> None:
-    result = run("wm", "train", "--task", dunes, "--run", "run", *QUICK, "--network", "nets:Broken")
-    assert result.exit_code == 2, result.output
+    result = run("wm", "train", "--task", dunes, "--run", "run", *QUICK, "--network", "nets:Broken", exits=2)
     line = NETS[: NETS.index("no such layer")].count("\n") + 1
     assert f"nets.py:{line}" in result.output
     assert not Path("run").exists()
@@ -177,7 +171,7 @@ def test_they_are_refused_before_a_run_begins(dunes: str) -> None:
 @pytest.fixture
 def trained(dunes: str) -> Path:
     words = ("wm", "train", "--task", dunes, "--run", "run", *QUICK, "--iterations", 1)
-    assert run(*words, "--network", "nets:Wide").exit_code == 0
+    run(*words, "--network", "nets:Wide", exits=0)
     return Path("run")
 
 
@@ -215,18 +209,16 @@ def test_training_that_continues_needs_the_same_network(trained: Path, dunes: st
 
 def test_a_run_of_the_u_net_refuses_another_network(dunes: str) -> None:
     words = ("wm", "train", "--task", dunes, "--run", "run", *QUICK, "--width", 2, "--iterations", 1)
-    assert run(*words).exit_code == 0
+    run(*words, exits=0)
     assert "network" not in json.loads(Path("run/run.json").read_text())["config"]
-    result = run("wm", "eval", "run", "--network", "nets:Wide", "--backend", "torch")
-    assert result.exit_code == 2
+    result = run("wm", "eval", "run", "--network", "nets:Wide", "--backend", "torch", exits=2)
     assert "it was trained with the paper's U-net, not with `nets:Wide`" in result.output
-    both = run(*words, "--network", "nets:Wide")
-    assert "--width is that of the U-net" in both.output
+    assert "--width is that of the U-net" in run(*words, "--network", "nets:Wide").output
 
 
 def test_hostile_names_in_a_run_are_text(dunes: str) -> None:
     words = ("wm", "train", "--task", dunes, "--run", "run", *QUICK, "--width", 2, "--iterations", 1)
-    assert run(*words).exit_code == 0
+    run(*words, exits=0)
     about = json.loads(Path("run/run.json").read_text())
     for name in ("nets:Wide", 3, ["nets:Wide"], "nets", "os:system('x')", "a" * 5000 + ":b"):
         about["config"]["network"] = name

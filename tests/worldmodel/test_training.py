@@ -13,7 +13,6 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from powderdsl.diagnostics import CompileError
 from powderdsl.experiments.runs import RunFolder, read_metrics
 from powderdsl.worldmodel import (
     DataConfig,
@@ -31,6 +30,7 @@ from powderdsl.worldmodel.evaluation import unseen_worlds
 from powderdsl.worldmodel.training import TrainingProgress
 from powderdsl.worldmodel.worlds import VALIDATION_SEEDS, VALIDATION_WORLDS, validation_pairs
 from tests.processes import started, waited
+from tests.refusals import refusal, refused_codes
 from tests.states import same
 
 HERE = Machine(backend="torch")
@@ -59,10 +59,6 @@ def weights(run: RunFolder) -> dict[str, Tensor]:
 
 def lines(run: RunFolder) -> list[tuple[int, float]]:
     return [(line["step"], line["loss/train"]) for line in read_metrics(run.path)]
-
-
-def codes(error: pytest.ExceptionInfo[CompileError]) -> list[str]:
-    return [one.code for one in error.value.diagnostics]
 
 
 def test_a_network_learns_what_baselines_cannot_know(garden: str, tmp_path: Path) -> None:
@@ -172,10 +168,9 @@ def test_a_killed_run_ends_with_the_same_weights(dunes: str, tmp_path: Path) -> 
 def test_a_run_can_go_on_longer_only_as_another(dunes: str, tmp_path: Path) -> None:
     config = tiny(dunes, iterations=2)
     train(config, tmp_path / "run", machine=HERE)
-    with pytest.raises(CompileError) as error:
-        train(replace(config, seed=4, width=5), tmp_path / "run", machine=HERE)
-    assert codes(error) == ["PD621"]
-    assert error.value.diagnostics[0].notes == (
+    errors = refusal(train, replace(config, seed=4, width=5), tmp_path / "run", machine=HERE)
+    assert errors[0].code == "PD621"
+    assert errors[0].notes == (
         "`seed` is 3 there, 4 here",
         "`width` is 4 there, 5 here",
     )
@@ -186,10 +181,9 @@ def test_a_changed_task_file_is_another_run(dunes: str, tmp_path: Path) -> None:
     train(config, tmp_path / "run", machine=HERE)
     path = Path(dunes)
     path.write_text(path.read_text(encoding="utf-8").replace("half 1..4", "half 1..5"), encoding="utf-8")
-    with pytest.raises(CompileError) as error:
-        train(config, tmp_path / "run", machine=HERE)
-    assert codes(error) == ["PD621"]
-    assert "`worlds`" in error.value.diagnostics[0].notes[0]
+    errors = refusal(train, config, tmp_path / "run", machine=HERE)
+    assert errors[0].code == "PD621"
+    assert "`worlds`" in errors[0].notes[0]
 
 
 class Own(nn.Module):
@@ -213,10 +207,9 @@ def test_other_networks_are_trained_and_tested_too(dunes: str, tmp_path: Path) -
     assert tested.mean("model") == pytest.approx(tested.mean("most frequent outcome"), rel=0.25)
     with pytest.raises(ValueError, match=r"logits \[4, 10, 14, 18\], found \[4, 9, 14, 18\]"):
         train(config, tmp_path / "other", machine=HERE, network=Own(9))
-    with pytest.raises(CompileError) as error:
-        load_trained(run)
-    assert codes(error) == ["PD623"]
-    assert "weights are those of another network" in error.value.diagnostics[0].notes[0]
+    errors = refusal(load_trained, run)
+    assert errors[0].code == "PD623"
+    assert "weights are those of another network" in errors[0].notes[0]
 
 
 def test_held_out_packs_are_plugged_in(dunes: str, tmp_path: Path) -> None:
@@ -265,11 +258,10 @@ def test_other_elements_get_free_slots_and_are_refused_where_none_are_left(
     moss.write_text(moss.read_text(encoding="utf-8").replace("id: 5", "id: 2"), encoding="utf-8")
     found = unseen_worlds(trained, split="train", rules=f"core+{moss}", machine=HERE)
     assert found.rules.element("moss.moss").id == 4  # 2 is another's in this network
-    with pytest.raises(CompileError) as error:
-        evaluate(trained, split="train", rules="core+lava+cloner+fire", machine=HERE)
-    assert codes(error) == ["PD623"]
-    assert error.value.diagnostics[0].notes == ("there is no free slot for `fire.dust`: the network has 10",)
-    assert "--slots 11" in error.value.diagnostics[0].helps[0]
+    errors = refusal(evaluate, trained, split="train", rules="core+lava+cloner+fire", machine=HERE)
+    assert errors[0].code == "PD623"
+    assert errors[0].notes == ("there is no free slot for `fire.dust`: the network has 10",)
+    assert "--slots 11" in errors[0].helps[0]
 
 
 def test_damaged_runs_are_refused(dunes: str, tmp_path: Path) -> None:
@@ -277,27 +269,18 @@ def test_damaged_runs_are_refused(dunes: str, tmp_path: Path) -> None:
     (path,) = (run.path / "checkpoints").glob("*.safetensors")
     data = path.read_bytes()
     path.write_bytes(data[:-20])
-    with pytest.raises(CompileError) as error:
-        load_trained(run.path)
-    assert codes(error) == ["PD620"]
+    errors = refusal(load_trained, run.path)
+    assert errors[0].code == "PD620"
     path.write_bytes(data)
     about = json.loads((run.path / "run.json").read_text())
     for change in ({"width": 8}, {"palette": ["a", "b"]}):
         (run.path / "run.json").write_text(json.dumps({**about, "config": {**about["config"], **change}}))
-        with pytest.raises(CompileError) as error:
-            load_trained(run.path)
-        assert codes(error) == ["PD623"]
+        assert refused_codes(load_trained, run.path) == ["PD623"]
     for change in ({"width": "wide"}, {"data": 3}, {"palette": 1}, {"width": 10**9}):
         (run.path / "run.json").write_text(json.dumps({**about, "config": {**about["config"], **change}}))
-        with pytest.raises(CompileError) as error:
-            load_trained(run.path)
-        assert codes(error) == ["PD620"]
-    with pytest.raises(CompileError) as error:
-        load_trained(tmp_path / "nowhere")
-    assert codes(error) == ["PD620"]
+        assert refused_codes(load_trained, run.path) == ["PD620"]
+    assert refused_codes(load_trained, tmp_path / "nowhere") == ["PD620"]
 
 
 def test_a_loss_that_is_no_number_ends_a_run(dunes: str, tmp_path: Path) -> None:
-    with pytest.raises(CompileError) as error:
-        train(tiny(dunes, learning_rate=1e30), tmp_path / "run", machine=HERE)
-    assert codes(error) == ["PD624"]
+    assert refused_codes(train, tiny(dunes, learning_rate=1e30), tmp_path / "run", machine=HERE) == ["PD624"]

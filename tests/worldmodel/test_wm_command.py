@@ -27,8 +27,7 @@ def begin(task: str, folder: Path, *more: object) -> tuple[object, ...]:
 
 def test_train_eval_finetune_and_show(dunes: str, tmp_path: Path) -> None:
     folder, tuned = tmp_path / "run", tmp_path / "tuned"
-    trained = run(*begin(dunes, folder, "--held-out", "stone", "--iterations", 5, "--knob", "squares=2"))
-    assert trained.exit_code == 0, trained.output
+    run(*begin(dunes, folder, "--held-out", "stone", "--iterations", 5, "--knob", "squares=2"), exits=0)
     about = json.loads((folder / "run.json").read_text())
     assert load(about["config"]["data"]["rules"]).packs == ("core", "sand", "water")
     assert about["config"]["data"]["knobs"] == {"squares": 2}
@@ -36,16 +35,14 @@ def test_train_eval_finetune_and_show(dunes: str, tmp_path: Path) -> None:
     assert about["versions"]["torch"]
     assert (folder / "metrics.jsonl").read_text().count("loss/train") == 1
 
-    told = run("wm", "eval", folder, "--split", "two", "--worlds", 1, "--backend", "torch")
-    assert told.exit_code == 0, told.output
+    told = run("wm", "eval", folder, "--split", "two", "--worlds", 1, "--backend", "torch", exits=0)
     assert "falling" in told.stdout
     assert "left out: lying, which needs stone" in told.stdout
     kept = json.loads((folder / "evaluation.json").read_text())
     assert list(kept["tests"]) == ["falling"]
 
     words = f"wm finetune {folder} --packs stone --iterations 3 --run {tuned} --backend torch"
-    result = run(*words.split())
-    assert result.exit_code == 0, result.output
+    run(*words.split(), exits=0)
     about = json.loads((tuned / "run.json").read_text())
     assert about["config"]["data"]["only"] == ["stone"]
     assert about["config"]["parent"] in {path.name for path in (folder / "checkpoints").iterdir()}
@@ -56,8 +53,9 @@ def test_train_eval_finetune_and_show(dunes: str, tmp_path: Path) -> None:
     assert set(data["mean"]) == {"model", "nothing changes", "most frequent outcome"}
 
     out = tmp_path / "strips.png"
-    shown = run("wm", "show", tuned, "--split", "two", "--steps", 16, "--out", out, "--backend", "torch")
-    assert shown.exit_code == 0, shown.output
+    shown = run(
+        "wm", "show", tuned, "--split", "two", "--steps", 16, "--out", out, "--backend", "torch", exits=0
+    )
     assert [line.split(":")[0] for line in shown.stdout.splitlines()] == ["1  falling", "2  lying"]
     # Two strips of four pictures of 14×18 cells, two pixels a cell, four between and around.
     assert np.asarray(Image.open(out)).shape == (2 * 32 + 4, 4 * 40 + 4, 3)
@@ -65,25 +63,21 @@ def test_train_eval_finetune_and_show(dunes: str, tmp_path: Path) -> None:
 
 def test_the_curve_of_a_training(dunes: str, tmp_path: Path) -> None:
     folder, out = tmp_path / "run", tmp_path / "curve.png"
-    assert run(*begin(dunes, folder, "--iterations", 20, "--validate-every", 5)).exit_code == 0
-    shown = run("wm", "show", folder, "--curve", "--out", out)
-    assert shown.exit_code == 0, shown.output
+    run(*begin(dunes, folder, "--iterations", 20, "--validate-every", 5), exits=0)
+    run("wm", "show", folder, "--curve", "--out", out, exits=0)
     assert np.asarray(Image.open(out)).shape[:2] == (630, 975)
     lines = folder / "metrics.jsonl"
     lines.write_text(
         lines.read_text() + '{"step": 30, "loss/train": "x", "loss/validation": null}\n', encoding="utf-8"
     )
-    assert run("wm", "show", folder, "--curve", "--out", out).exit_code == 0
+    run("wm", "show", folder, "--curve", "--out", out, exits=0)
     lines.unlink()
-    missing = run("wm", "show", folder, "--curve", "--out", out)
-    assert missing.exit_code == 2
-    assert "has no losses yet" in missing.output
+    assert "has no losses yet" in run("wm", "show", folder, "--curve", "--out", out, exits=2).output
 
 
 def test_packs_take_all_words_up_to_the_next_option(dunes: str, tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    result = run(*begin(dunes, folder, "--packs", "core", "sand", "--iterations", 1))
-    assert result.exit_code == 0, result.output
+    run(*begin(dunes, folder, "--packs", "core", "sand", "--iterations", 1), exits=0)
     data = json.loads((folder / "run.json").read_text())["config"]["data"]
     assert load(data["rules"]).packs == ("core", "sand")
 
@@ -117,14 +111,11 @@ def test_preset_and_options_make_the_configuration(tmp_path: Path, dunes: str) -
     ],
 )
 def test_bad_input_is_said_and_nothing_is_begun(
-    words: tuple[str, ...], said: str, dunes: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    words: tuple[str, ...], said: str, dunes: str, folder: Path
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     task = ("--task", dunes) if words[0] == "train" else ()
-    result = run("wm", *words, *task)
-    assert result.exit_code == 2, result.output
-    assert said in result.output
-    assert not (tmp_path / "runs").exists()
+    assert said in run("wm", *words, *task, exits=2).output
+    assert not (folder / "runs").exists()
 
 
 @pytest.mark.slow
