@@ -1,6 +1,6 @@
-"""For testing rules: random rulesets and worlds, tests of packs, invariants, mutants.
+"""For testing rules: random start worlds, tests of packs, invariants, mutants.
 
-`worlds` and `rulesets` are strategies for Hypothesis, which nothing else here needs.
+`worlds` is a strategy for Hypothesis, which nothing else here needs.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 from powderdsl.system.packages import importing
 
 if TYPE_CHECKING:
-    from powderdsl.testing.generators.strategies import rulesets, worlds
+    from powderdsl.testing.generators.strategies import worlds
 
-__all__ = ["rulesets", "worlds"]
+__all__ = ["worlds"]
 
 
-__getattr__ = importing("powderdsl.testing.generators", strategies="rulesets worlds")
+__getattr__ = importing("powderdsl.testing.generators", strategies="worlds")

@@ -13,8 +13,8 @@ import pytest
 from powderdsl.diagnostics import CompileError
 from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
-from powderdsl.testing.generators.rulemaker import random_ruleset_text
 from powderdsl.testing.properties.running import Oracle
+from tests.fuzz.rulemaker import random_ruleset_text
 
 BLOCKED = f"""
 import sys

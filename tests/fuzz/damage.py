@@ -23,8 +23,8 @@ from powderdsl.model.types import Ruleset
 from powderdsl.system.reports import as_json
 from powderdsl.system.writing import replacing
 from powderdsl.testing.generators.choices import Choices
-from powderdsl.testing.generators.rulemaker import Manner, ruleset_text
 from tests.fuzz.crew import Lost, Tell, work_through
+from tests.fuzz.rulemaker import Manner, ruleset_text
 
 HANGS = 300.0
 """Seconds after which an input counts as one that never ends: by the clock, so a busy machine needs some."""

@@ -18,7 +18,7 @@ from powderdsl.schedule.stages import CPU, CUDA, Stage, steps
 from powderdsl.schedule.types import Schedule
 from powderdsl.schedule.verify import verify
 from powderdsl.testing.generators.cases import load_text
-from powderdsl.testing.generators.rulemaker import random_ruleset_text
+from tests.fuzz.rulemaker import random_ruleset_text
 from tests.schedule.interpreter import SNAP, World, run_graph, run_schedule
 from tests.tiers import tiered
 

@@ -17,9 +17,9 @@ from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.targets.cuda.source import KernelSource, cuda_source
 from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
-from powderdsl.testing.generators.rulemaker import random_ruleset_text
 from tests.fuzz.compare import assert_same
 from tests.fuzz.cuda_emulation import EmulatedSimulator
+from tests.fuzz.rulemaker import random_ruleset_text
 from tests.refusals import refusal
 from tests.tiers import tiered
 

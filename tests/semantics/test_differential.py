@@ -24,12 +24,12 @@ from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.targets.cpp.build import Building
 from powderdsl.testing.generators.cases import Start, load_text, random_start
 from powderdsl.testing.generators.choices import Choices
-from powderdsl.testing.generators.rulemaker import random_ruleset_text
 from tests.compilers import skip_without_compiler
 from tests.fuzz import COMPARED, STARTS_AT_ONCE, differential
 from tests.fuzz.compare import assert_same, find_difference
 from tests.fuzz.differential import Outcome, Plan, run_seed
 from tests.fuzz.exercised import constructs, missing, operations
+from tests.fuzz.rulemaker import random_ruleset_text
 from tests.tiers import tiered
 
 BACKENDS = ("reference", *STARTS_AT_ONCE)

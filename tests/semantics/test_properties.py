@@ -27,8 +27,8 @@ from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.testing.generators.cases import Start, load_text, random_start
 from powderdsl.testing.generators.choices import Choices
-from powderdsl.testing.generators.rulemaker import Manner, random_ruleset_text
 from tests.fuzz.compare import find_difference
+from tests.fuzz.rulemaker import Manner, random_ruleset_text
 
 ANYTHING = Manner()
 STEADY = Manner(draws=False, borders=False, symmetry=False)

@@ -19,9 +19,9 @@ from powderdsl.targets.cpp.build import (
 )
 from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
-from powderdsl.testing.generators.rulemaker import random_ruleset_text
 from tests.compilers import skip_without_compiler
 from tests.fuzz.compare import assert_same
+from tests.fuzz.rulemaker import random_ruleset_text
 from tests.tiers import tiered
 
 STRIPS = [(1, 8, 8), (2, 16, 70), (1, 64, 64), (3, 128, 65), (1, 256, 256), (9, 520, 20), (2, 8, 1)]

@@ -20,7 +20,7 @@ from powderdsl.targets.wasm import program
 from powderdsl.targets.wasm.binary import Module
 from powderdsl.targets.wasm.program import Instance, WasmProgram, WasmState
 from powderdsl.targets.wasm.source import wasm_module
-from powderdsl.testing.generators.rulemaker import random_ruleset_text
+from tests.fuzz.rulemaker import random_ruleset_text
 
 
 def module_of(name: str, width: int) -> Module:

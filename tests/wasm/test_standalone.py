@@ -21,9 +21,9 @@ from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.simulation.standalone import standalone_module
 from powderdsl.testing.generators.cases import Start, load_text, random_start
 from powderdsl.testing.generators.choices import Choices
-from powderdsl.testing.generators.rulemaker import random_ruleset_text
 from tests.cli.commands import powderdsl as command
 from tests.compilers import skip_without_compiler
+from tests.fuzz.rulemaker import random_ruleset_text
 from tests.semantics.test_mixed import spread
 from tests.tiers import tiered
 from tests.wasm.standalone_world import (

@@ -1,19 +1,16 @@
-"""Hypothesis strategies for rulesets and start worlds. Hypothesis shrinks the examples that fail."""
+"""Hypothesis strategies for start worlds. Hypothesis shrinks the examples that fail."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import TypeVar
 
-from hypothesis import reject
 from hypothesis import strategies as st
 
 from powderdsl.compiler import load
-from powderdsl.diagnostics import CompileError
 from powderdsl.model.types import Ruleset
-from powderdsl.testing.generators.cases import Start, load_text, random_start
+from powderdsl.testing.generators.cases import Start, random_start
 from powderdsl.testing.generators.choices import Choices
-from powderdsl.testing.generators.rulemaker import Manner, ruleset_text
 
 T = TypeVar("T")
 
@@ -31,24 +28,6 @@ def worlds(
     """
     ruleset = load(rules) if isinstance(rules, str) else rules
     return chosen(lambda choices: random_start(ruleset, choices, shape, max_batch, max_side))
-
-
-def rulesets(manner: Manner | None = None) -> st.SearchStrategy[Ruleset]:
-    """Return a strategy for random rulesets, which are made as text and read by the whole front end.
-
-    About one text in seventy is refused by the static checks, and skipped.
-
-    Args:
-        manner: parts of the language to leave out.
-    """
-
-    def make(choices: Choices) -> Ruleset:
-        try:
-            return load_text(ruleset_text(choices, manner or Manner()))
-        except CompileError:
-            reject()
-
-    return chosen(make)
 
 
 def chosen(make: Callable[[Choices], T]) -> st.SearchStrategy[T]:

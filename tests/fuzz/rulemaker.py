@@ -9,7 +9,8 @@ from functools import partial
 from powderdsl.model.builtins import KERNEL_SHAPES, KERNELS, shaped_kernel
 from powderdsl.model.types import CHANCE, DIRECTION, ELEMENT, FLAG, REAL, VEC2, Kind, integer
 from powderdsl.testing.generators.choices import Choices
-from powderdsl.testing.generators.grammar import (
+from powderdsl.testing.generators.trees import Tree, write_yaml
+from tests.fuzz.grammar import (
     EXPRESSIONS,
     RULES,
     WORDS,
@@ -19,7 +20,6 @@ from powderdsl.testing.generators.grammar import (
     flag_of_a_loop,
     productions,
 )
-from powderdsl.testing.generators.trees import Tree, write_yaml
 
 RANGES = (
     (0, 1), (0, 3), (-2, 2), (0, 7), (-1, 1), (0, 0), (-5, -2), (3, 9), (-128, 127), (0, 127), (-129, 5), (0, 128),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from powderdsl.model.operations import FUNCTIONS
-from powderdsl.testing.generators.grammar import EXPRESSIONS, WORDS
+from tests.fuzz.grammar import EXPRESSIONS, WORDS
 
 
 def test_random_rules_call_every_function() -> None:
