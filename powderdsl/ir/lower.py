@@ -374,27 +374,6 @@ def live_passes(ruleset: Ruleset) -> tuple[Pass, ...]:
     return tuple([replace(pass_, moments=tuple(map(live, pass_.moments))) for pass_ in ruleset.passes])
 
 
-def lower_pass(ruleset: Ruleset, pass_: Pass, graph: Graph) -> dict[str, Node]:
-    """The nodes of the slots that a pass writes, in a graph that several passes may share."""
-    return dict(_PassLowering(ruleset, pass_, graph).lower().outputs)
-
-
-def lower_substep(ruleset: Ruleset, pass_: Pass, number: int, graph: Graph) -> dict[str, Node]:
-    """The nodes that one substep of a pass writes, as functions of the world before the substep.
-
-    Scratch fields and values that `let` fixed in earlier substeps are inputs too, the latter as ``let NAME``; values
-    that this substep fixes are among the results.
-    """
-    lowering = _PassLowering(ruleset, pass_, graph)
-    for let in (let for moment in pass_.moments[:number] for let in moment.lets):
-        type = ir_type(let.value.kind, ruleset.slots)
-        for name in part_names(f"let {let.name}", let.value.kind):
-            lowering.state[name] = lowering.build.input(name, type)
-    before = dict(lowering.state)
-    lowering.substep(pass_.moments[number])
-    return {name: node for name, node in lowering.state.items() if before.get(name) is not node}
-
-
 class _PassLowering:
     """Lowers one pass; `state` has the current node of every slot and let."""
 

@@ -100,7 +100,7 @@ def test_invariants_about_properties_and_tags_are_asked_where_no_world_differs(t
     path = tmp_path / "rocks.yaml"
     path.write_text(ROCK)
     mutant = load_text(ROCK.replace(right, wrong))
-    broken, _ = broken_invariant(Original.of(str(path)), compile(mutant, backend="wasm"))
+    broken = broken_invariant(Original.of(str(path)), compile(mutant, backend="wasm"))
     assert broken.span.text == claim
 
 

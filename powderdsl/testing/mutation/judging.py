@@ -1,6 +1,6 @@
-"""Judges mutants: the checker, an invariant that a world breaks, or a test notices one, or a proof that nothing can.
+"""Judges mutants: by the checker, by the invariants on random worlds, and by the tests of packs.
 
-Mutants are held against the composition without any mistake, which is loaded and run once. Several processes judge.
+The original composition is loaded and run once, and mutants are compared with it. Several processes judge.
 """
 
 from __future__ import annotations
@@ -36,7 +36,6 @@ from powderdsl.simulation.simulator import Simulator, compile
 from powderdsl.system.fingerprint import fingerprint
 from powderdsl.system.interrupts import held_back
 from powderdsl.testing.generators.cases import Array, Start
-from powderdsl.testing.mutation.equivalence import proven_equal
 from powderdsl.testing.mutation.mutants import Mutant
 from powderdsl.testing.mutation.operators import mutants_of
 from powderdsl.testing.mutation.written import GENERATED, GeneratedTest, distinguish, written_test
@@ -203,8 +202,8 @@ PAIRED = 6
 class Verdict:
     """The verdict on a mutant.
 
-    `status` is ``killed``, ``survived``, ``equivalent`` (proven) or ``invalid`` (not a rule file); `by` is one of NOTICED
-    or how it was proven; `detail` is a code, an invariant's words or a test's name. `test` shows a survivor, by a world
+    `status` is ``killed``, ``survived``, ``equivalent`` (the same model or program) or ``invalid`` (not a rule file); `by`
+    is one of NOTICED or what is the same; `detail` is a code, an invariant's words or a test's name. `test` shows a survivor, by a world
     that differs in the slot `differs_in`.
     """
 
@@ -230,10 +229,9 @@ def judge(original: Original, mutant: Mutant) -> Verdict:
     if meaning(ruleset) == original.meaning:
         return Verdict("equivalent", "the same model")
     sim = compile(ruleset, backend=AT_ONCE)
-    differs = True
     failed = failed_test(original, sim, mutant.pack, quick=True)
     if failed is None:
-        broken, differs = broken_invariant(original, sim)
+        broken = broken_invariant(original, sim)
         if broken is not None:
             return Verdict("killed", "invariant", one_line(broken.span))
         sim = compile(ruleset, backend=starting_backend("cpu"))
@@ -241,11 +239,8 @@ def judge(original: Original, mutant: Mutant) -> Verdict:
     if failed is not None:
         by = "generated" if is_generated(failed) else "test"
         return Verdict("killed", by, f"{failed.pack}: {failed.name}")
-    if not differs:  # proofs come last: few mutants need them
-        if lowered(ruleset) == original.lowered:
-            return Verdict("equivalent", "the same program")
-        if proven_equal(original.ruleset, ruleset):
-            return Verdict("equivalent", "the same in every case")
+    if lowered(ruleset) == original.lowered:  # after the tests: few mutants come this far
+        return Verdict("equivalent", "the same program")
     return Verdict("survived")
 
 
@@ -274,29 +269,24 @@ def failed_test(original: Original, sim: Simulator, pack: str, *, quick: bool) -
 # Invariants
 
 
-def broken_invariant(original: Original, sim: Simulator) -> tuple[Invariant | None, bool]:
-    """An invariant of the mutant that some world breaks, and whether any world ended otherwise than before.
+def broken_invariant(original: Original, sim: Simulator) -> Invariant | None:
+    """An invariant of the mutant that some world breaks.
 
-    Only such worlds are asked about the invariants, unless elements have other properties or tags than before.
+    Worlds that end as in the original are skipped, unless elements have other properties or tags.
     """
     ruleset = sim.ruleset
     alike = _declared(ruleset) == _declared(original.ruleset)
-    known = {invariant.span.text for invariant in original.broken}
-    kept = [invariant for invariant in ruleset.invariants if invariant.span.text not in known]
-    any_differs = False
+    broken_before = {invariant.span.text for invariant in original.broken}
+    invariants = [invariant for invariant in ruleset.invariants if invariant.span.text not in broken_before]
     params = [[param.name for param in rules.params] for rules in (original.ruleset, ruleset)]
-    if slots(original.ruleset) == slots(ruleset) and params[0] == params[1]:  # worlds hold the same
-        for batch in original.batches():
-            states, _ = run_sample(sim, batch.sample, batch.steps)
-            differs = first_difference(batch.states, states) > 0
-            any_differs |= bool(differs.any())
-            broken = _broken_in(batch, ruleset, kept, states, differs if alike else None)
-            if broken is not None:
-                return broken, True
-            if any_differs and not kept:
-                break
-    broken = next((invariant for invariant in kept if _is_broken(invariant, original, sim)), None)
-    return broken, any_differs or broken is not None
+    comparable = slots(original.ruleset) == slots(ruleset) and params[0] == params[1]
+    for batch in original.batches() if invariants and comparable else ():
+        states, _ = run_sample(sim, batch.sample, batch.steps)
+        differs = first_difference(batch.states, states) > 0
+        broken = _broken_in(batch, ruleset, invariants, states, differs if alike else None)
+        if broken is not None:
+            return broken
+    return next((invariant for invariant in invariants if _is_broken(invariant, original, sim)), None)
 
 
 def _declared(ruleset: Ruleset) -> tuple[object, ...]:
@@ -370,10 +360,9 @@ def run_campaign(
     worlds: bool = True,
     settings: Settings = (),
 ) -> Generator[tuple[int, Verdict]]:
-    """Numbers of mutants with their verdicts, in the order in which they come.
+    """Yield numbers of mutants with their verdicts as they are judged.
 
-    Nothing is cut short by a clock: `check`, proofs and searches end by work, worlds and tests have a size. So verdicts
-    are the same on a slow or busy machine.
+    Nothing is cut short by a clock: `check` and searches end by work, so verdicts are the same on a slow or busy machine.
 
     Args:
         numbers: places of the mutants among those of `Original.mutants`.
@@ -462,9 +451,9 @@ def tally(verdicts: Iterable[Verdict]) -> dict[str, int]:
 
 
 def noticed_share(counts: dict[str, int]) -> float:
-    """The part of the mutants that are not proven equivalent which something notices; 1 if there are none."""
-    real = counts["mutants"] - counts["equivalent"]
-    return counts["killed"] / real if real else 1.0
+    """The share of noticed mutants among those that are not equivalent; 1 if there are none."""
+    different = counts["mutants"] - counts["equivalent"]
+    return counts["killed"] / different if different else 1.0
 
 
 def by_hand_share(counts: dict[str, int]) -> float:
