@@ -58,8 +58,8 @@ web: tests/web/node_modules  ## fetch Pyodide and the editor, for `powderdsl pla
 test: $(VENV)/.ready  ## run the tests (ARGS=... for pytest, JOBS=0 for one process)
 	@$(BIN)/python -m pytest --numprocesses $(JOBS) --maxprocesses 4 --dist worksteal $(ARGS)
 
-test-all: $(VENV)/.ready  ## run the tests and all campaigns: long searches for mistakes (hours)
-	@$(BIN)/python -m pytest --campaigns --numprocesses $(JOBS) --maxprocesses 4 --dist worksteal --durations 20 $(ARGS)
+test-all: $(VENV)/.ready  ## run the slow tests too: long searches for mistakes (hours)
+	@$(BIN)/python -m pytest --slow --numprocesses $(JOBS) --maxprocesses 4 --dist worksteal --durations 20 $(ARGS)
 
 check: lint types test  ## lint, types and test
 

@@ -23,24 +23,22 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--update-golden", action="store_true", help="write golden files again instead of comparing with them"
     )
-    parser.addoption(
-        "--campaigns", action="store_true", help="also run the long tests, which are marked `campaign`"
-    )
+    parser.addoption("--slow", action="store_true", help="also run the tests that are marked `slow`")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave campaigns out, unless ``--campaigns``, ``-m campaign`` or the id of a test asks for them.
+    """Leave slow tests out, unless ``--slow``, ``-m slow`` or the id of a test selects them.
 
     Wheels come first: each takes a minute, for which another process would have nothing to do at the end.
     """
-    items.sort(key=lambda one: one.get_closest_marker("wheel") is None)
-    if config.getoption("--campaigns") or "campaign" in config.getoption("-m"):
+    items.sort(key=lambda item: item.get_closest_marker("wheel") is None)
+    if config.getoption("--slow") or "slow" in config.getoption("-m"):
         return
-    named = tuple(argument for argument in config.args if "::" in argument)
-    long = {one for one in items if one.get_closest_marker("campaign") and not one.nodeid.startswith(named)}
-    if long:
-        config.hook.pytest_deselected(items=[one for one in items if one in long])
-        items[:] = [one for one in items if one not in long]
+    ids = tuple(argument for argument in config.args if "::" in argument)
+    slow = {item for item in items if item.get_closest_marker("slow") and not item.nodeid.startswith(ids)}
+    if slow:
+        config.hook.pytest_deselected(items=[item for item in items if item in slow])
+        items[:] = [item for item in items if item not in slow]
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -91,7 +91,7 @@ def test_check_prints_the_same_under_all_hash_seeds(tmp_path: Path) -> None:
     assert all(code in text for code in ("PD201", "PD301", "PD304", "PD305", "PD501", "PD502"))
 
 
-@pytest.mark.campaign
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "rules", [*compositions(), *(f"powderworld+{path.relative_to(ROOT)}" for path in EXAMPLES)]
 )

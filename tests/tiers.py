@@ -1,4 +1,4 @@
-"""Test tiers: `make test` runs a smoke test of each campaign, `make test-all` the whole campaign."""
+"""Test tiers: `make test` runs a few parameters of a slow test, `make test-all` all of them."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import pytest
 
 
 def tiered(values: Iterable[Any], smoke: Iterable[Any]) -> list[Any]:
-    """Parameters for `pytest.mark.parametrize`: those not in `smoke` are marked `campaign`.
+    """Parameters for `pytest.mark.parametrize`: those not in `smoke` are marked `slow`.
 
     Raises:
         ValueError: a value of `smoke` is not one of `values`, so that a renamed one cannot vanish from `make test`.
     """
-    every, first = list(values), list(smoke)
-    if not first or any(one not in every for one in first):
-        raise ValueError(f"{first} must be some of {every}")
-    return [one if one in first else pytest.param(one, marks=pytest.mark.campaign) for one in every]
+    all_values, quick = list(values), list(smoke)
+    if not quick or any(value not in all_values for value in quick):
+        raise ValueError(f"{quick} must be some of {all_values}")
+    return [value if value in quick else pytest.param(value, marks=pytest.mark.slow) for value in all_values]

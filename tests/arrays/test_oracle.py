@@ -48,7 +48,7 @@ def digests(first: int, stop: int) -> Iterator[str]:
 
 @pytest.mark.parametrize(
     ("first", "stop"),
-    [(0, 8), *(pytest.param(seed, seed + 50, marks=pytest.mark.campaign) for seed in range(8, 308, 50))],
+    [(0, 8), *(pytest.param(seed, seed + 50, marks=pytest.mark.slow) for seed in range(8, 308, 50))],
 )
 def test_random_rules(first: int, stop: int) -> None:
     command = [sys.executable, "-c", BLOCKED, str(first), str(stop)]

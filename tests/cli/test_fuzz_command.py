@@ -21,7 +21,6 @@ def listed(names: tuple[str, ...]) -> str:
     return f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-@pytest.mark.slow
 def test_every_target_is_compared_unless_some_are_named(tmp_path: Path) -> None:
     skip_without_compiler()
     given = ("fuzz", "--jobs", 1, "--worlds", 1, "--steps", 1, "--seeds", "0..1", "--save", tmp_path)
@@ -30,7 +29,6 @@ def test_every_target_is_compared_unless_some_are_named(tmp_path: Path) -> None:
     assert ": cuda-emulated against the reference" in some.stdout
 
 
-@pytest.mark.slow
 def test_damaged_files(tmp_path: Path) -> None:
     # A process of its own: the memory that loading takes is the peak of the process, which tests raise as well.
     line = command_line("fuzz", "--front-end", "--seeds", "0..30", "--jobs", 1, "--save", tmp_path)
@@ -40,7 +38,6 @@ def test_damaged_files(tmp_path: Path) -> None:
     assert "no problems found" in result.stdout
 
 
-@pytest.mark.slow
 def test_a_wrong_backend_is_found_reduced_and_replayed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -21,7 +21,6 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", tiered(COMMANDS, ["video", "compile", "train", "wm train", "fuzz"]))
 def test_sigterm_ends_a_command_cleanly(name: str, tmp_path: Path) -> None:
     if name == "video":
@@ -41,7 +40,6 @@ def test_sigterm_ends_a_command_cleanly(name: str, tmp_path: Path) -> None:
         assert place.checkpoint_steps()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", tiered(["video", "fuzz", "mutate", "wm train"], ["video", "mutate"]))
 def test_after_sigkill_nothing_runs_on_and_the_next_command_works(name: str, tmp_path: Path) -> None:
     if name == "video":
@@ -55,7 +53,7 @@ def test_after_sigkill_nothing_runs_on_and_the_next_command_works(name: str, tmp
     place.run_again(command)
 
 
-@pytest.mark.campaign
+@pytest.mark.slow
 def test_a_killed_study_resumes_at_once(tmp_path: Path) -> None:
     """What it had started saves where it is and ends; the next call waits for that, and continues there."""
     place, command = Place(tmp_path), COMMANDS["study"]
@@ -138,7 +136,7 @@ def test_a_signal_is_never_lost(case: str, said: list[str]) -> None:
     assert run.stderr == ""
 
 
-@pytest.mark.campaign
+@pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL], ids=["SIGTERM", "SIGKILL"])
 @pytest.mark.parametrize("name", COMMANDS)
 def test_signals_at_any_moment(name: str, how: signal.Signals, tmp_path: Path) -> None:

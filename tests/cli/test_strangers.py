@@ -96,7 +96,6 @@ def run(*words: str) -> str:
     return str(powderdsl(*words, exits=0).stdout)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", tiered(PACKS, ["crab"]))
 def test_a_pack_of_each_kind_goes_through_every_command(name: str) -> None:
     file = f"{name}.yaml"

@@ -1,7 +1,7 @@
 """Random damage to rule files: loading raises nothing but CompileError, and what it raises can be printed.
 
 `python -m tests.fuzz --front-end --seeds 0..20000` looks harder, and at time and memory; so do the campaign, which reduces
-what it finds, and ``FUZZ_EXAMPLES=20000 pytest --campaigns tests/diagnostics/test_fuzz.py``.
+what it finds, and ``FUZZ_EXAMPLES=20000 pytest --slow tests/diagnostics/test_fuzz.py``.
 """
 
 from __future__ import annotations
@@ -62,7 +62,6 @@ def test_any_text(examples: int) -> None:
     run()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("seeds", tiered((SEEDS, 20 * SEEDS), [SEEDS]))
 def test_seeded_damage(seeds: int) -> None:
     """The first inputs of `python -m tests.fuzz --front-end`: of every kind, and not all of them refused at once."""

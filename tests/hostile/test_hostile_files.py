@@ -79,7 +79,7 @@ def test_a_few_hostile_files(valid: Path, tmp_path: Path) -> None:
     check({kind.name: range(SMOKE) for kind in KINDS}, valid, tmp_path)
 
 
-@pytest.mark.campaign
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
 def test_many_hostile_files(kind: Kind, valid: Path, tmp_path: Path) -> None:
     check({kind.name: range(100, 100 + kind.many)}, valid, tmp_path)

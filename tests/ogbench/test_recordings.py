@@ -141,7 +141,7 @@ def first_successes(episodes: Episodes, number: int) -> np.ndarray:
     return first
 
 
-@pytest.mark.campaign
+@pytest.mark.slow
 @pytest.mark.parametrize("randomness", ["counter", "ogbench"])
 @pytest.mark.parametrize("level", LEVELS)
 def test_replayed_goals_succeed_when_ogbenchs_do(torch: Any, level: str, randomness: str) -> None:
@@ -169,7 +169,7 @@ def test_goals_are_ogbenchs(torch: Any, level: str, number: int) -> None:
     follow_goal(EXCERPTS, level, number)
 
 
-@pytest.mark.campaign
+@pytest.mark.slow
 @pytest.mark.parametrize("level", LEVELS)
 def test_all_recordings_are_followed(torch: Any, level: str) -> None:
     folder = whole_recordings()

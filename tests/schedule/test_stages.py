@@ -123,7 +123,7 @@ def test_a_mask_may_depend_on_a_cell_before_and_after_it_changed(stages: tuple[S
     run_stages(load_text(BEFORE_AND_AFTER, "marks.yaml"), stages)
 
 
-@pytest.mark.campaign
+@pytest.mark.slow
 @pytest.mark.parametrize("stages", [CPU, CUDA], ids=("cpu", "cuda"))
 def test_many_random_rulesets(stages: tuple[Stage, ...]) -> None:
     for seed in range(12, 600):

@@ -107,7 +107,6 @@ def test_without_a_gpu_it_is_refused(device: str, torch) -> None:  # type: ignor
     assert found[0].helps
 
 
-@pytest.mark.slow
 @pytest.mark.cuda
 @pytest.mark.parametrize("name", ["margolus", "powderworld"])
 def test_kernels_compile_for_a_gpu(name: str, tmp_path: Path) -> None:

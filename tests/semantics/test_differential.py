@@ -3,7 +3,7 @@
 A pair is one ruleset with one world. The random pairs are the same in every run: they come from seeds. `make test`
 takes the first of them, `make test-all` all. `python -m tests.fuzz` tries others and reduces what fails. Or:
 
-    POWDERDSL_SEEDS=1000..3000 pytest --campaigns tests/semantics/test_differential.py -k random
+    POWDERDSL_SEEDS=1000..3000 pytest --slow tests/semantics/test_differential.py -k random
 """
 
 from __future__ import annotations
@@ -169,15 +169,14 @@ def test_random_rulesets(first: int) -> None:
     assert agreed(run_seed(seed, Plan(worlds=4, steps=2)) for seed in seeds) >= 3 * len(seeds)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seeds", "level"),
     [
         (range(40, 42), "-O0"),
         (range(46, 47), "-O1"),
-        pytest.param(range(42, 46), "-O0", marks=pytest.mark.campaign),
-        pytest.param(range(47, 48), "-O1", marks=pytest.mark.campaign),
-        pytest.param(range(48, 60), "-O2", marks=pytest.mark.campaign),
+        pytest.param(range(42, 46), "-O0", marks=pytest.mark.slow),
+        pytest.param(range(47, 48), "-O1", marks=pytest.mark.slow),
+        pytest.param(range(48, 60), "-O2", marks=pytest.mark.slow),
     ],
 )
 def test_random_rulesets_as_native_code(seeds: range, level: str, tmp_path: Path) -> None:
@@ -187,10 +186,9 @@ def test_random_rulesets_as_native_code(seeds: range, level: str, tmp_path: Path
     assert agreed(run_seed(seed, plan) for seed in seeds) >= 4
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "seeds",
-    [range(60, 63), *(pytest.param(range(a, a + 10), marks=pytest.mark.campaign) for a in (63, 73, 83))],
+    [range(60, 63), *(pytest.param(range(a, a + 10), marks=pytest.mark.slow) for a in (63, 73, 83))],
 )
 def test_random_rulesets_as_emulated_kernels(seeds: range, tmp_path: Path) -> None:
     """The kernels of `cuda`, compiled for the CPU."""
@@ -237,7 +235,6 @@ def test_draws_from_outside() -> None:
 # What the random rulesets are made of
 
 
-@pytest.mark.slow
 def test_random_rulesets_use_all_that_targets_see() -> None:
     """Every construct and every operation, on numbers and on bit planes; the lists come from the compiler's tables."""
     used: set[tuple[str, str]] = set()

@@ -223,7 +223,7 @@ def test_random_worlds_do_not_contradict_the_ledger_of_random_rules(
         assert sampled(ruleset, 2, worlds=20, side=6, steps=2, backend="reference") == [], ruleset.name
 
 
-@pytest.mark.campaign
+@pytest.mark.slow
 @pytest.mark.parametrize("name", compositions())
 def test_thousands_of_worlds_do_not_contradict_the_ledger_of_shipped_rules(name: str) -> None:
     assert sampled(load(name), WORLDS // 100, worlds=100, side=16, steps=3, backend="wasm") == []

@@ -58,7 +58,7 @@ def test_every_pack_is_in_the_table():
     }
 
 
-@pytest.mark.campaign
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "rules", [pytest.param(rules, id=rules.rpartition("/")[2]) for rules in table().compositions()]
 )

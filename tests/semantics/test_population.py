@@ -32,8 +32,6 @@ DEALS = 99_999
 FALSE_ALARM = 5e-5
 SEED = 2022
 
-pytestmark = pytest.mark.slow  # 8,192 world-steps on a CPU
-
 Counts = npt.NDArray[np.int64]  # [step, world, run, element]
 
 

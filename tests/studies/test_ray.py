@@ -108,7 +108,6 @@ def test_where_no_cluster_is_the_user_is_told_at_once(address: str, folder: Path
     assert not (folder / "studies").exists()
 
 
-@pytest.mark.slow
 @needs_ray
 @needs_proc
 def test_a_cluster_runs_a_study_and_sigterm_ends_one(tmp_path: Path) -> None:
@@ -139,7 +138,7 @@ def test_a_cluster_runs_a_study_and_sigterm_ends_one(tmp_path: Path) -> None:
 KILLS = ("worker", "worker", "worker", "worker", "node", "node", "node", "driver", "driver", "driver")
 
 
-@pytest.mark.campaign
+@pytest.mark.slow
 @needs_ray
 @needs_proc
 def test_ten_deaths_change_no_number(tmp_path: Path) -> None:

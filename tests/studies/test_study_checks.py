@@ -183,7 +183,6 @@ def numbers(tree: Any, keys: tuple[str, ...] = ()) -> Iterator[str]:
         yield "/".join((keys[0], "*", *keys[2:]) if keys[0] in ("tests", "elements") else keys)
 
 
-@pytest.mark.slow
 def test_known_keys_are_those_of_real_evaluations(folder: Path) -> None:
     few = [
         "--preset",

@@ -166,7 +166,7 @@ def test_layout(seen: dict[str, Any]) -> None:
     assert not seen["tooWide"]
 
 
-@pytest.mark.campaign
+@pytest.mark.slow
 def test_damaged_packs_links_and_files_give_messages(scripts: Path, tmp_path: Path) -> None:
     if words := needed():
         pytest.skip(words)
