@@ -10,9 +10,9 @@ from powderdsl.compiler import load
 from powderdsl.ir.ops import REAL, InvalidIR
 from powderdsl.schedule.stages import CPU, plan
 from powderdsl.schedule.types import Compute, Move, Schedule, Sweeps, field_reads, flat
-from powderdsl.schedule.verify import verify
 from powderdsl.testing.generators.cases import load_text
 from tests.schedule.test_stages import packed_passes, run_stages
+from tests.schedule.verify import verify
 
 
 def planned(name: str) -> Schedule:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from powderdsl.ir.ops import FLAG, OPS, REAL, InvalidIR, Node, Type, demand, ordered
 from powderdsl.schedule.types import (
     ANSWER,
+    SCHEDULE_OPS,
     Compute,
     Guard,
     Move,
@@ -113,13 +114,3 @@ def _check_order(sweeps: Sweeps) -> None:
             demand(not late, f"{out.into} is written over before it is read")
         seen += [(read.name, lag - read.dy) for read in field_reads(loop)]
         made |= {name: (part, lag, var.type) for name, var in loop.vars.items()}
-
-
-SCHEDULE_OPS = frozenset({"load", "below_param", "any", "some", "when", "led", "live", "present"})
-"""Operations that only schedules have.
-
-`load`: the value of a variable. `below_param`: a draw below a parameter. `any` (flag): true if the flag holds in some
-cell; `some` (flags): true if any of them does. `when` (flag, flag): both, the second computed only in words where the
-first holds somewhere; `led` (comparison, comparison): the same in cells. `live` (field), attribute (rows, reach): true if
-the field may be nonzero that many rows down, within `reach` columns. `present`, attribute ids: true if one of them is
-present."""
