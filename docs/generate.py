@@ -246,7 +246,7 @@ def mutation_operators() -> str:
 
 def mutation_testing() -> str:
     """What `docs/mutation_table.py` has counted, a line a pack, and the sum."""
-    from powderdsl.testing.mutation.judging import COUNTED, by_hand_share, noticed_share
+    from powderdsl.testing.mutation.judging import COUNTED, handwritten_share, noticed_share
 
     path = DOCS / "mutation.json"
     measured = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
@@ -264,7 +264,7 @@ def mutation_testing() -> str:
                 name,
                 *(str(counts[key]) for key in shown),
                 f"{100 * noticed_share(counts):.1f} %",
-                f"{100 * by_hand_share(counts):.0f} %",
+                f"{100 * handwritten_share(counts):.0f} %",
             )
             for name, counts in [*rows, ("**all**", total)]
         ),

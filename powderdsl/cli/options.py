@@ -184,7 +184,7 @@ def _setting(field: Field[Any]) -> Option:
     return option(f"--{name}", kind, about, to=field.name, multiple=isinstance(field.default, tuple))
 
 
-def given(values: Mapping[str, Any], names: Iterable[str]) -> dict[str, Any]:
+def given_options(values: Mapping[str, Any], names: Iterable[str]) -> dict[str, Any]:
     """The values of some options, if they were given."""
     return {name: values[name] for name in names if values.get(name) not in (None, (), {})}
 

@@ -13,7 +13,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 import click
 
-from powderdsl.diagnostics.printable import printable, printable_streams, unguarded, write_styled
+from powderdsl.diagnostics.printable import printable, printable_streams, raw_stream, write_styled
 from powderdsl.system.reports import as_json
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ def _bar(title: str, total: float, lines: bool) -> Iterator[Show]:
 
     clock = TimeRemainingColumn(elapsed_when_finished=True)
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), clock)
-    console = Console(file=unguarded(sys.stderr), highlight=False, soft_wrap=True)
+    console = Console(file=raw_stream(sys.stderr), highlight=False, soft_wrap=True)
     shown = TextColumn("{task.fields[words]}", markup=False)
     # Inside, stderr is rich's, which prints above the bar: what goes there is escaped as well.
     with Progress(*columns, shown, console=console, transient=True) as bar, printable_streams():

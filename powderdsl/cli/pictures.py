@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 from powderdsl.arrays import NDArray, np
 from powderdsl.cli.exits import BadInput
 from powderdsl.cli.output import color_wanted
-from powderdsl.diagnostics.printable import printable, unguarded
+from powderdsl.diagnostics.printable import printable, raw_stream
 from powderdsl.model.types import Element, Field
 from powderdsl.simulation.draw import contact_sheet, looks, rgb, scale, shown_fields, to_numpy
 from powderdsl.worlds.ascii import write_ascii
@@ -108,7 +108,7 @@ class LiveView:
         fields: Sequence[Field] = (),
         fps: int | None = None,
     ):
-        self.stream: TextIO = unguarded(sys.stdout if stream is None else stream)
+        self.stream: TextIO = raw_stream(sys.stdout if stream is None else stream)
         self.elements = elements
         self.in_place = self.stream.isatty() and os.environ.get("TERM") != "dumb"
         self.color = color_wanted(self.stream)

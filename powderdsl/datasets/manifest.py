@@ -164,9 +164,9 @@ def _checked(path: Path, data: Any) -> Manifest:
     problems: list[str] = []
     manifest = read_record(Manifest, data, problems)
     if manifest is not None:
-        problems += _misfits(manifest.recipe, manifest.shards)
+        problems += _contradictions(manifest.recipe, manifest.shards)
     if manifest is None or problems:
-        raise many_damaged(path, problems)
+        raise damage_errors(path, problems)
     return manifest
 
 
@@ -194,7 +194,7 @@ def damaged(message: str, reason: str, *helps: str) -> CompileError:
 
 
 @contextmanager
-def reported(message: str, *helps: str) -> Iterator[None]:
+def reporting_damage(message: str, *helps: str) -> Iterator[None]:
     """Turn whatever reading damaged files raises, as codecs like, into CompileError (PD630)."""
     try:
         yield
@@ -204,7 +204,7 @@ def reported(message: str, *helps: str) -> Iterator[None]:
         raise damaged(message, reason, *helps) from None
 
 
-def many_damaged(path: Path, problems: list[str]) -> CompileError:
+def damage_errors(path: Path, problems: list[str]) -> CompileError:
     """PD630, one for each problem, 20 at most."""
     return CompileError(
         [
@@ -275,7 +275,7 @@ def recipe_of(
         shard = max(1, min(USUAL_SHARD, USUAL_SHARD_BYTES // each), -(-episodes // MAX_SHARDS))
     recipe = replace(recipe, shard=shard)
     check_settings(recipe)
-    problems = _misfits(recipe, ())
+    problems = _contradictions(recipe, ())
     if shard * each > MAX_SHARD_BYTES:
         problems.append(
             f"a shard of {shard} episodes may take {shard * each:,} bytes, more than {MAX_SHARD_BYTES:,}: "
@@ -291,7 +291,7 @@ def episode_bytes(recipe: Recipe) -> int:
     return (recipe.actions + 1) * (prod(recipe.shape) + 32)
 
 
-def _misfits(recipe: Recipe, shards: Sequence[ShardRow]) -> list[str]:
+def _contradictions(recipe: Recipe, shards: Sequence[ShardRow]) -> list[str]:
     """Contradictions between the values of a recipe, and with the rows of shards."""
     problems, numbers = [], set()
     if len(recipe.channels) != recipe.shape[0]:

@@ -16,8 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from powderdsl.datasets.dataset import Dataset
-from powderdsl.datasets.manifest import Recipe, changed_params, damaged, read_recipe, recipe_of, reported
-from powderdsl.datasets.recorder import add_shard, begun, held_place
+from powderdsl.datasets.manifest import (
+    Recipe,
+    changed_params,
+    damaged,
+    read_recipe,
+    recipe_of,
+    reporting_damage,
+)
+from powderdsl.datasets.recorder import add_shard, begin_manifest, lock_place
 from powderdsl.datasets.shards import DTYPES, check_episodes, knows_ids, row_shape
 from powderdsl.diagnostics import CompileError
 from powderdsl.envs import env_id
@@ -214,8 +221,8 @@ def from_minari(
         policy = str(source.storage.metadata.get("algorithm_name") or f"Minari {dataset_id}")[:500]
         recipe = recipe_of(env, policy=policy, episodes=source.total_episodes, shard=shard, compress=compress)
     place = Path(folder)
-    with held_place(place):
-        manifest = begun(place, recipe)
+    with lock_place(place):
+        manifest = begin_manifest(place, recipe)
         recorded = {row.number for row in manifest.shards}
         for number in range(recipe.shards):
             if number not in recorded:
@@ -228,7 +235,7 @@ def _opened(folder: Path) -> minari.MinariDataset:
     from minari import MinariDataset
     from minari.dataset.minari_storage import MinariStorage, is_image_space
 
-    with reported(f"{folder} cannot be imported"):
+    with reporting_damage(f"{folder} cannot be imported"):
         # Minari makes an environment to get spaces that are missing, with whatever function the file names.
         missing = {"observation_space", "action_space"} - MinariStorage.read_raw_metadata(folder).keys()
         if missing:
@@ -254,7 +261,7 @@ def _exported_recipe(source: minari.MinariDataset) -> Recipe:
 
 def _form(source: minari.MinariDataset, env: TensorEnv) -> ActionForm:
     """The form of the actions. Raises CompileError (PD630) for actions or observations that are not an environment's."""
-    with reported(f"{source.storage.data_path} cannot be imported"):
+    with reporting_damage(f"{source.storage.data_path} cannot be imported"):
         space = env.observation.space
         if source.observation_space != space:
             raise ValueError(f"its observations are not {space.dtype} {list(space.shape)}")
@@ -271,7 +278,7 @@ def _shard(
     """The arrays of a shard, in parts, all checked. Raises CompileError (PD630)."""
     parts: dict[str, list[Array]] = {name: [] for name in DTYPES}
     for episode in recipe.episodes_of(number):
-        with reported(f"episode_{episode}: {source.storage.data_path} cannot be imported"):
+        with reporting_damage(f"episode_{episode}: {source.storage.data_path} cannot be imported"):
             for name, value in _episode(source, episode, recipe, form).items():
                 parts[name].append(value)
     return parts

@@ -28,7 +28,7 @@ from powderdsl.datasets.shards import DTYPES, is_whole, row_shape, write_shard
 from powderdsl.envs.acting import FrameStack, Policy, action_keys, random_policy
 from powderdsl.envs.observations import Observation, observation_of
 from powderdsl.envs.tensor_env import TensorEnv
-from powderdsl.experiments.runs import differences, held
+from powderdsl.experiments.runs import differences, lock_folder
 from powderdsl.system.settings import check_count
 from powderdsl.system.writing import failure, not_writable
 from powderdsl.tasks.episodes import TaskProgram
@@ -43,7 +43,7 @@ PLAYING_BYTES = 1 << 30
 """Memory limit for the episodes that are being played."""
 
 
-def nothing_policy(program: TaskProgram) -> Policy:
+def idle_policy(program: TaskProgram) -> Policy:
     """A policy that repeats `still_action`. Raises ValueError if the task has none."""
     action = torch.tensor(still_action(program.task), device=program.simulator.device)
     return lambda observed, keys: action.expand(len(observed), 5)
@@ -52,7 +52,7 @@ def nothing_policy(program: TaskProgram) -> Policy:
 SCRIPTED: dict[str, Callable[[TaskProgram], Policy | ExpertPlayer]] = {
     "expert": ExpertPlayer,
     "random": lambda program: random_policy(program.action_nvec),
-    "nothing": nothing_policy,
+    "nothing": idle_policy,
 }
 """Policies that need no training, by name."""
 
@@ -111,8 +111,8 @@ def record(
     sight = observation_of(sees or observation, env.simulator, env.task.size)
     act = SCRIPTED[policy](env.program) if isinstance(policy, str) else policy
     place = Path(folder)
-    with held_place(place):
-        recording = _Recording(env.program, act, sight, place, begun(place, recipe))
+    with lock_place(place):
+        recording = _Recording(env.program, act, sight, place, begin_manifest(place, recipe))
         recording.play(envs, progress or (lambda done, total: None))
     return Dataset.open(place)
 
@@ -121,18 +121,18 @@ def record(
 
 
 @contextmanager
-def held_place(folder: Path) -> Iterator[None]:
+def lock_place(folder: Path) -> Iterator[None]:
     """Make the folder and lock it."""
     check_place(folder)
     try:
         folder.mkdir(exist_ok=True)
     except (OSError, ValueError) as error:
         raise not_writable(folder, error) from None
-    with held(folder):
+    with lock_folder(folder):
         yield
 
 
-def begun(folder: Path, recipe: Recipe) -> Manifest:
+def begin_manifest(folder: Path, recipe: Recipe) -> Manifest:
     """The manifest to continue with: a new one, or the one of the same recipe with its intact shards."""
     if not (folder / FILE).exists():
         manifest = Manifest(recipe, datetime.now(UTC).isoformat(timespec="seconds"), ())

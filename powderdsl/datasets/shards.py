@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from powderdsl.datasets.manifest import Recipe, ShardRow, reported, shard_file
+from powderdsl.datasets.manifest import Recipe, ShardRow, reporting_damage, shard_file
 from powderdsl.system.archives import BadArchive, Parts, open_archive, write_archive
 from powderdsl.system.reading import open_regular
 from powderdsl.system.writing import replacing
@@ -132,7 +132,7 @@ def read_episodes(folder: Path, recipe: Recipe, row: ShardRow) -> tuple[Array, A
 
 
 def _damage(path: Path) -> AbstractContextManager[None]:
-    return reported(f"the shard {path} is damaged", "the command that recorded it records it again")
+    return reporting_damage(f"the shard {path} is damaged", "the command that recorded it records it again")
 
 
 def _read(path: Path, expected: dict[str, tuple[int, ...]], only: tuple[str, ...] = tuple(DTYPES)) -> Shard:

@@ -100,7 +100,7 @@ class PrintableStream:
     """A text stream that escapes what is written to it. It has no `buffer`, so nothing passes it by."""
 
     def __init__(self, stream: TextIO):
-        self.unguarded: TextIO = unguarded(stream)
+        self.unguarded: TextIO = raw_stream(stream)
 
     def write(self, text: str) -> int:
         self.unguarded.write(printable(text, lines=True))
@@ -127,11 +127,11 @@ def printable_streams() -> Iterator[None]:
         sys.stdout, sys.stderr = before
 
 
-def unguarded(stream: Any) -> Any:
+def raw_stream(stream: Any) -> Any:
     """The stream behind a `PrintableStream`, for code that draws on a terminal; any other stream unchanged."""
     return stream.unguarded if isinstance(stream, PrintableStream) else stream
 
 
 def write_styled(stream: Any, text: str) -> None:
     """Write a text that has colors of ours to any stream: see `styled`."""
-    unguarded(stream).write(styled(text))
+    raw_stream(stream).write(styled(text))

@@ -224,7 +224,7 @@ class RunFolder:
         """The newest intact checkpoint. Raises CompileError (PD620) if there is none."""
         checkpoint = self.latest_checkpoint()
         if checkpoint is None:
-            raise no_run(self.path, "it has no checkpoint that can be read")
+            raise not_a_run(self.path, "it has no checkpoint that can be read")
         return checkpoint
 
     def save_checkpoint(self, step: int, state: Any) -> Path:
@@ -284,7 +284,7 @@ def open_run(
 
 
 @contextmanager
-def held(folder: Path, patience: float = 0.0) -> Iterator[None]:
+def lock_folder(folder: Path, patience: float = 0.0) -> Iterator[None]:
     """Keep other processes from writing to a folder, after waiting for them for `patience` seconds.
 
     The lock of a process that dies is gone with it. Raises CompileError: PD622 if another process has it, PD613 if the
@@ -319,14 +319,14 @@ def read_run(path: str | Path, kind: str | None = None) -> RunFolder:
     """An existing run. Raises CompileError (PD620) if there is none, it is damaged, or of another kind than `kind`."""
     folder = Path(path)
     if not (folder / ABOUT).exists():
-        raise no_run(folder, f"it has no {ABOUT}" if folder.is_dir() else "there is no such folder")
+        raise not_a_run(folder, f"it has no {ABOUT}" if folder.is_dir() else "there is no such folder")
     check_folder(folder)
     match about := read_json(folder / ABOUT):
         case {"kind": str(found), "config": dict(config)}:
             if kind not in (None, found):
-                raise no_run(folder, f"it is a run of the kind `{found}`; `{kind}` is needed here")
+                raise not_a_run(folder, f"it is a run of the kind `{found}`; `{kind}` is needed here")
             return RunFolder(folder, found, config, about)
-    raise no_run(folder, f"its {ABOUT} is damaged")
+    raise not_a_run(folder, f"its {ABOUT} is damaged")
 
 
 def find_run(text: str | Path | RunFolder, kind: str | None = None) -> RunFolder:
@@ -338,7 +338,7 @@ def find_run(text: str | Path | RunFolder, kind: str | None = None) -> RunFolder
         if (kept / text / ABOUT).exists():
             return read_run(kept / text, kind)
         names = sorted(about.parent.name for about in kept.glob(f"*/{ABOUT}"))
-        raise no_run(folder, "there is no such folder", suggest(str(text), names, "runs"))
+        raise not_a_run(folder, "there is no such folder", suggest(str(text), names, "runs"))
     return read_run(folder, kind)
 
 
@@ -351,21 +351,21 @@ def check_folder(folder: Path) -> None:
         raise failure("PD112", f"{error.filename}: {error.strerror}", helps=helps) from None
 
 
-def does_not_fit(folder: Path, *why: str, helps: tuple[str, ...] = ()) -> CompileError:
+def misfit(folder: Path, *why: str, helps: tuple[str, ...] = ()) -> CompileError:
     """The error for a run whose model or data was made for something else (PD623)."""
     return failure("PD623", f"{folder} does not fit", notes=why, helps=helps)
 
 
 @contextmanager
-def fitting(path: Path, what: str) -> Iterator[None]:
+def reporting_misfits(path: Path, what: str) -> Iterator[None]:
     """Report what raises where a checkpoint, which may hold anything, is given to a model (PD623)."""
     try:
         yield
     except (RuntimeError, TypeError, ValueError, AttributeError, LookupError) as error:
-        raise does_not_fit(path, f"{what}: {' '.join(str(error).split())[:300]}") from None
+        raise misfit(path, f"{what}: {' '.join(str(error).split())[:300]}") from None
 
 
-def no_run(folder: Path, why: str, helps: tuple[str, ...] = ()) -> CompileError:
+def not_a_run(folder: Path, why: str, helps: tuple[str, ...] = ()) -> CompileError:
     """The error for a folder that is not a run, or one that cannot be used (PD620)."""
     return failure("PD620", f"{folder} is not a run that can be used here", notes=(why,), helps=helps)
 
@@ -406,7 +406,7 @@ def recorded_palette(run: RunFolder) -> tuple[str | None, ...]:
     """The palette of a run. Raises CompileError (PD620) if it is damaged."""
     palette = run.config.get("palette")
     if not isinstance(palette, list) or not 1 <= len(palette) <= MAX_SLOTS:
-        raise no_run(run.path, "it has no palette that a network can have")
+        raise not_a_run(run.path, "it has no palette that a network can have")
     return tuple(None if name is None else str(name) for name in palette)
 
 
@@ -427,4 +427,4 @@ def check_palette(
             why.append(f"id {number} is `{palette[number]}` there, `{name}` here")
     if why:
         more = f"train with `--slots {len(palette) + lacking}` to leave room for packs that come later"
-        raise does_not_fit(folder, *why, helps=(more, *helps) if lacking else ())
+        raise misfit(folder, *why, helps=(more, *helps) if lacking else ())

@@ -252,8 +252,8 @@ def _value(prop: Property, syntax: Syntax, pack: str, typer: Typer) -> Value | s
     """A property's value as a pack gives it. It may name a parameter, which stays changeable."""
     scope, kind = Scope(pack, {}), prop.kind
     if syntax.kind == "name" and typer.find(syntax.text, syntax.span, scope) is None:
-        message, label = f"`{syntax.text}` is no value of `{prop.name}`", f"expected {in_words(kind)}"
-        fix = f"write {in_words(kind)}, or a parameter of this pack"
+        message, label = f"`{syntax.text}` is no value of `{prop.name}`", f"expected {describe_kind(kind)}"
+        fix = f"write {describe_kind(kind)}, or a parameter of this pack"
         typer.fail("PD110", message, syntax.span, label, fix)
         return default_of(kind)
     with suppress(Poisoned, Unresolved):
@@ -343,14 +343,14 @@ def set_params(ruleset: Ruleset, values: Mapping[str, Any], reporter: Reporter) 
         kind = known[name].kind
         number = param_value(kind, value)
         if number is None:
-            helps = (f"write {in_words(kind)}",)
+            helps = (f"write {describe_kind(kind)}",)
             reporter.error("PD402", f"parameter `{name}` cannot be `{value}`", None, helps=helps)
         else:
             checked_values[name] = number
     return ruleset.with_params(checked_values)
 
 
-def in_words(kind: Kind) -> str:
+def describe_kind(kind: Kind) -> str:
     """The values of a kind, for a message that asks for one."""
     wanted = f"{'an integer' if kind.name == 'int' else 'a number'} from {kind.lo:g} to {kind.hi:g}"
     return {"flag": "`yes` or `no`", "chance": "a chance from 0% to 100%"}.get(kind.name, wanted)

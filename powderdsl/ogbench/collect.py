@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from powderdsl.experiments.runs import held
+from powderdsl.experiments.runs import lock_folder
 from powderdsl.ogbench.datasets import FAMILY, VERSION
 from powderdsl.ogbench.episodes import LevelProgram, keyed
 from powderdsl.ogbench.levels import Level
@@ -125,7 +125,7 @@ def collect(
         if progress is not None:
             progress(done, train + few)
 
-    with held(place):
+    with lock_folder(place):
         for path, recipe in recipes.items():
             _write(program, path, recipe, report)
     return list(recipes)

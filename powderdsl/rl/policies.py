@@ -19,10 +19,10 @@ from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.experiments.runs import (
     RunFolder,
     check_palette,
-    does_not_fit,
     find_run,
-    fitting,
+    misfit,
     recorded_palette,
+    reporting_misfits,
 )
 from powderdsl.rl.config import TrainConfig, from_json
 from powderdsl.rl.fcn import BinDistribution, BinPolicy, fcn_policy
@@ -105,7 +105,7 @@ def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: b
     config = config_of(folder)
     if env.observation.kind != config.observation:
         why = f"it sees `{config.observation}`; the environment shows `{env.observation.kind}`"
-        raise does_not_fit(folder.path, why)
+        raise misfit(folder.path, why)
     own = _own_env(folder, config, env)
     checkpoint = folder.checkpoint()
     kind, how = policy_of(config, own)
@@ -116,7 +116,7 @@ def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: b
         )
     actions, rate = MultiDiscrete(np.array(own.action_nvec)), config.learning_rate
     network = kind(space, actions, lambda _: rate, **how | {"optimizer_class": _NoOptimizer})
-    with fitting(folder.path, "its network is another"):
+    with reporting_misfits(folder.path, "its network is another"):
         network.load_state_dict(checkpoint.state["policy"])
     network.to(env.device).set_training_mode(False)
     channels = len(own.observation.channels)

@@ -35,10 +35,10 @@ from powderdsl.envs.tensor_env import check_cells
 from powderdsl.experiments.runs import (
     Metrics,
     RunFolder,
-    fitting,
-    held,
+    lock_folder,
     mean_and_interval,
     open_run,
+    reporting_misfits,
     write_json,
 )
 from powderdsl.rl.config import TrainConfig, check_config, check_task
@@ -101,7 +101,7 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
     if trained_on is not task:
         plain["shaped_fingerprint"] = fingerprint(trained_on)
     run = open_run(folder, KIND, plain)
-    with held(run.path), _own_random_numbers(config.threads):
+    with lock_folder(run.path), _own_random_numbers(config.threads):
         write_json(run.path / ASKED, config.as_json())
         checkpoint = run.latest_checkpoint()
         step = 0 if checkpoint is None else checkpoint.step
@@ -118,7 +118,7 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
         with Metrics(run.path, step) as metrics:
             learner.model.set_logger(Logger(None, [_MetricsWriter(metrics)]))
             if checkpoint is not None:
-                with fitting(checkpoint.path, "its state is that of another run"):
+                with reporting_misfits(checkpoint.path, "its state is that of another run"):
                     learner.restore(checkpoint.state)
             elif config.init_from or config.init_expert:
                 _clone(learner, run, config, metrics)

@@ -110,7 +110,7 @@ class Substep:
     at: reference.Context
     lets: dict[str, tuple[Let, Substep]]
 
-    def near(self, cell: Cell, offset: Offset, way: int = 1) -> Cell:
+    def neighbor_of(self, cell: Cell, offset: Offset, way: int = 1) -> Cell:
         """The neighbor of a cell, or, with -1, the cell whose neighbor it is; the grid wraps around."""
         _, height, width = self.at.shape
         return (cell[0] + way * offset[0]) % height, (cell[1] + way * offset[1]) % width
@@ -212,8 +212,10 @@ class RecordedStep:
             if not mask[(0, *self.cell)]:
                 return
             substep = self.substeps[-1]
-            attempt = Attempt(substep.rules[id(change.rule)], substep, substep.near(self.cell, change.asked))
-            source = None if change.source is None else substep.near(self.cell, change.source)
+            attempt = Attempt(
+                substep.rules[id(change.rule)], substep, substep.neighbor_of(self.cell, change.asked)
+            )
+            source = None if change.source is None else substep.neighbor_of(self.cell, change.source)
         old, new = pick(before, self.cell), pick(after, self.cell)
         write = Write(change.slot, old, new, change.how, attempt, source)
         if attempt or write.changed:
@@ -296,7 +298,7 @@ def _reads(expr: Expr, substep: Substep, cell: Cell, offset: Offset) -> Iterator
         for arg in expr.args:
             yield from _reads(arg, substep, cell, offset)
     elif expr.op != "const":
-        yield _read(expr, substep, substep.near(cell, offset), offset)
+        yield _read(expr, substep, substep.neighbor_of(cell, offset), offset)
         if expr.op == "let":
             let, fixed = substep.lets[expr.value]
             yield from _reads(let.value, fixed, cell, offset)
@@ -310,7 +312,7 @@ def _read(expr: Expr, substep: Substep, place: Cell, offset: Offset) -> Read:
     if expr.op == "count":  # the neighbors with a weight where the argument holds
         holds, kernel = reference.evaluate(expr.args[0], substep.at), expr.value
         for dy, dx, weight in kernel.weights:
-            there = substep.near(place, (dy, dx))
+            there = substep.neighbor_of(place, (dy, dx))
             inside = there == (place[0] + dy, place[1] + dx)
             if weight and (inside or kernel.wrap) and pick(holds, there):
                 counted.append(there)
@@ -456,7 +458,7 @@ def _misses(step: RecordedStep, slots: Iterable[Slot], every_rule: bool) -> tupl
     for substep in step.substeps:
         for numbered in substep.rules.values():
             offsets = [offset for slot in slots for offset in _writes_at(numbered.rule, slot)]
-            for place in dict.fromkeys(substep.near(step.cell, offset, -1) for offset in offsets):
+            for place in dict.fromkeys(substep.neighbor_of(step.cell, offset, -1) for offset in offsets):
                 attempt = Attempt(numbered, substep, place)
                 key = (numbered.number if every_rule else _line(numbered), place)
                 if key not in misses and not attempt.happened and (every_rule or _nearly(attempt)):
@@ -678,7 +680,7 @@ class Recorder:
     def __init__(self, sim: Simulator):
         self.sim = sim
         self.rules = numbered_rules(sim.ruleset)
-        self._marked = sim.of(_marked(sim.ruleset))
+        self._marked = sim.of(_with_rule_marks(sim.ruleset))
 
     def step(self, world: World, steps: int = 1, **options: Any) -> Provenance:
         """Step worlds as `Simulator.step` does, with the same options, results and errors.
@@ -696,7 +698,7 @@ class Recorder:
         return Provenance(replace(end, sim=self.sim, state=state), numbers, self.rules)
 
 
-def _marked(ruleset: Ruleset) -> Ruleset:
+def _with_rule_marks(ruleset: Ruleset) -> Ruleset:
     """The rules with a field for the number of the rule that last wrote a cell's element in this step."""
     numbers, passes = count(1), []
     for pass_ in ruleset.passes:

@@ -46,12 +46,12 @@ def interruptible() -> Iterator[None]:
     def terminate(number: int, frame: FrameType | None) -> None:
         raise Terminated(number)
 
-    with _handled(_once(terminate), lambda usual: usual == signal.SIG_DFL):
+    with _handlers(_ignoring_repeats(terminate), lambda usual: usual == signal.SIG_DFL):
         yield
 
 
 @contextmanager
-def held_back() -> Iterator[Callable[[], bool]]:
+def delay_signal() -> Iterator[Callable[[], bool]]:
     """Hold the first signal back until the end of the block, which raises then; a second one raises at once.
 
     Yields a function that says whether one has come. Threads other than the main one receive no signals.
@@ -63,7 +63,7 @@ def held_back() -> Iterator[Callable[[], bool]]:
         if len(pending) > 1:
             usual[number](number, frame)
 
-    with _handled(_once(hold), callable) as usual:
+    with _handlers(_ignoring_repeats(hold), callable) as usual:
         try:
             yield lambda: bool(pending)
         finally:
@@ -82,7 +82,7 @@ def end_with_stdin() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def _once(handler: Handler) -> Handler:
+def _ignoring_repeats(handler: Handler) -> Handler:
     """A handler that ignores a SIGTERM or SIGHUP that comes again within REPEATED."""
     last: dict[int, float] = {}
 
@@ -97,7 +97,7 @@ def _once(handler: Handler) -> Handler:
 
 
 @contextmanager
-def _handled(handler: Handler, replaces: Callable[[Any], bool]) -> Iterator[dict[int, Any]]:
+def _handlers(handler: Handler, replaces: Callable[[Any], bool]) -> Iterator[dict[int, Any]]:
     """Handle signals in place of the handlers that are to be replaced; yields these."""
     in_main = threading.current_thread() is threading.main_thread()
     handlers = {number: signal.getsignal(number) for number in SIGNALS if in_main}

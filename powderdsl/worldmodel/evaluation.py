@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from powderdsl.experiments.runs import differences, does_not_fit
+from powderdsl.experiments.runs import differences, misfit
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.draw import contact_sheet, palette, rgb, scale
 from powderdsl.worldmodel.config import HERE, DataConfig, Machine
@@ -121,13 +121,13 @@ def evaluate_recording(trained: Trained, recording: Recording, *, machine: Machi
     """
     known, here = trained.config.recorded, recording.recorded
     if known is None:
-        raise does_not_fit(trained.run.path, "it learned from worlds, without actions")
+        raise misfit(trained.run.path, "it learned from worlds, without actions")
     check_slots(trained.run.path, trained.palette, recording.rules)
     seen, shown = (
         {name: getattr(meaning, name) for name in ("channels", "steps", "speed")} for meaning in (known, here)
     )
     if why := differences(seen, shown):
-        raise does_not_fit(trained.run.path, *why)
+        raise misfit(trained.run.path, *why)
     slots, predictors = len(trained.palette), dict[str, Network]({MODEL: trained.network})
     if known.actions:
         predictors[BLIND] = lambda inputs: trained.network(without_actions(inputs))
@@ -164,7 +164,7 @@ def unseen_worlds(trained: Trained, *, machine: Machine = HERE, **tested_on: Any
             learned from a dataset.
     """
     if trained.config.recorded is not None:
-        raise does_not_fit(trained.run.path, "it predicts recorded transitions, with actions")
+        raise misfit(trained.run.path, "it predicts recorded transitions, with actions")
     data = unseen_data(trained.config.data, **tested_on)
     check_slots(trained.run.path, trained.palette, load_rules_of(data, trained.palette))
     return task_worlds(data, **machine.simulation, partly=True, palette=trained.palette)

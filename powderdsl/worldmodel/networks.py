@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from powderdsl.diagnostics import suggest
-from powderdsl.experiments.runs import Checkpoint, fitting
+from powderdsl.experiments.runs import Checkpoint, reporting_misfits
 from powderdsl.system.writing import failure
 from powderdsl.worldmodel.config import TrainConfig
 
@@ -179,7 +179,7 @@ class CustomNetwork:
         Raises:
             CompileError: PD625 if it is not a module, or making it fails.
         """
-        with torch.random.fork_rng(devices=[]), _told(self.name, "cannot be made"):
+        with torch.random.fork_rng(devices=[]), _reporting_user_errors(self.name, "cannot be made"):
             torch.manual_seed(seed)
             network = self.make(encoder.channels, encoder.slots)
             if not isinstance(network, nn.Module):
@@ -196,7 +196,7 @@ class CustomNetwork:
         state = (encoder.observed + 3,) if encoder.observed else ()
         inputs = torch.zeros(2, *state, *size, dtype=torch.uint8)
         expected = [2, encoder.slots, *size]
-        with torch.random.fork_rng(devices=[]), _told(self.name, "cannot be trained"):
+        with torch.random.fork_rng(devices=[]), _reporting_user_errors(self.name, "cannot be trained"):
             logits: Any = network(inputs)
             shape = (
                 f"{list(logits.shape)} of {logits.dtype}"
@@ -223,7 +223,7 @@ def custom_network(name: str) -> CustomNetwork:
     """
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # behind all others: nothing that is installed is replaced
-    with _told(name, "cannot be imported"):
+    with _reporting_user_errors(name, "cannot be imported"):
         if not is_network_name(name):
             raise ValueError("write MODULE:CLASS, such as nets:Deep")
         make = pkgutil.resolve_name(name)
@@ -238,7 +238,7 @@ def is_network_name(text: str) -> bool:
 
 
 @contextmanager
-def _told(name: str, what: str) -> Iterator[None]:
+def _reporting_user_errors(name: str, what: str) -> Iterator[None]:
     """Report exceptions as PD625, with the line of the user's code that raised them."""
     try:
         yield
@@ -286,7 +286,7 @@ def fit_weights(model: nn.Module, checkpoint: Checkpoint, *, grow: bool = False)
     Raises:
         CompileError: PD623 if they are those of another network.
     """
-    with fitting(checkpoint.path, "its weights are those of another network"):
+    with reporting_misfits(checkpoint.path, "its weights are those of another network"):
         weights = dict(checkpoint.state["model"])
         model.load_state_dict(_grown(weights, model) if grow else weights)
 

@@ -1,7 +1,7 @@
 """The replay buffer: pairs as uint8, the oldest replaced as training continues.
 
 What it holds in an iteration, and which pairs a batch has, are functions of the configuration, the run's seed and the
-iteration. So a checkpoint needs no copy of it: `Replay.go_to` makes it again, cell by cell the same.
+iteration. So a checkpoint needs no copy of it: `Replay.advance_to` makes it again, cell by cell the same.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Replay:
         self.iteration = -1
         self._live: Any = None
 
-    def go_to(self, iteration: int) -> None:
+    def advance_to(self, iteration: int) -> None:
         """Make the buffer's contents before an iteration, counted from 0."""
         config = self.config
         back = -(-self.size // config.refresh)  # what older iterations brought has been overwritten

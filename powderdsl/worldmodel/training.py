@@ -22,19 +22,19 @@ from powderdsl.experiments.runs import (
     Metrics,
     RunFolder,
     check_palette,
-    does_not_fit,
     find_run,
-    fitting,
-    held,
-    no_run,
+    lock_folder,
+    misfit,
+    not_a_run,
     open_run,
     read_run,
     recorded_palette,
+    reporting_misfits,
 )
 from powderdsl.model.composition.compose import Palette
 from powderdsl.model.types import Ruleset
 from powderdsl.system.fingerprint import fingerprint
-from powderdsl.system.interrupts import held_back
+from powderdsl.system.interrupts import delay_signal
 from powderdsl.system.random import base_keys, mix
 from powderdsl.system.writing import failure
 from powderdsl.tasks.shipped import load_task
@@ -118,7 +118,7 @@ def train(
         config = recording.configured(config)
         note["dataset"] = str(recording.dataset.folder)
     elif config.recorded is not None:
-        raise does_not_fit(path, "it learns from a dataset, which is not given")
+        raise misfit(path, "it learns from a dataset, which is not given")
     palette = _palette_for(config, path, worlds)
     identity: dict[str, Any] = {}
     if recording is None and worlds is None:
@@ -131,7 +131,7 @@ def train(
     if isinstance(network, CustomNetwork):
         network.check(encoder_of(config, slots), given.size, config.seed)
     run = open_run(path, KIND, {**config.plain, **identity}, note=note)
-    with held(run.path):
+    with lock_folder(run.path):
         model = network_of(config, slots, network)
         trainer = _Trainer(config, machine, run, model.to(machine.device), slots)
         trainer.restore(parent)
@@ -146,7 +146,7 @@ def train(
             replay = Replay(
                 given, config.data, seed=config.seed, device=machine.device, store=machine.store, folder=path
             )
-            replay.go_to(trainer.done)
+            replay.advance_to(trainer.done)
             trainer.batch, trainer.advance = replay.batch, replay.advance
             if validate_every:
                 trainer.held_out = validation_pairs(given, config.data, machine.device)
@@ -182,7 +182,7 @@ class _Trainer:
                 fit_weights(self.model, parent, grow=True)
             return
         fit_weights(self.model, checkpoint)
-        with fitting(checkpoint.path, "its state is that of another run"):
+        with reporting_misfits(checkpoint.path, "its state is that of another run"):
             self.optimizer.load_state_dict(checkpoint.state["optimizer"])
             self.done, self.recent = checkpoint.step, [float(loss) for loss in checkpoint.state["recent"]]
 
@@ -193,7 +193,7 @@ class _Trainer:
         saved = since = time.monotonic()
         self.model.train()
         # An iteration is never left half done.
-        with Metrics(self.run.path, self.done) as metrics, held_back() as interrupted:
+        with Metrics(self.run.path, self.done) as metrics, delay_signal() as interrupted:
             while self.done < total and not interrupted():
                 self.recent.append(self.step(*self.batch(self.done, config.batch)))
                 began = time.monotonic()
@@ -271,7 +271,7 @@ def network_missing(folder: Path, name: str) -> CompileError:
     """The error for a run whose network has to be given, for the run's files must not decide what is executed (PD623)."""
     why = f"it was trained with a network of its own, which it calls `{name}`"
     helps = ("if you trust that code, give `--network` as in training; it is not imported otherwise",)
-    return does_not_fit(folder, why, helps=helps)
+    return misfit(folder, why, helps=helps)
 
 
 def load_rules_of(config: DataConfig, palette: Palette) -> Ruleset:
@@ -348,13 +348,13 @@ def load_trained(
     try:
         config = TrainConfig.of(run.config)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise no_run(run.path, str(error)) from None
+        raise not_a_run(run.path, str(error)) from None
     palette = recorded_palette(run)
     if network is None and config.network is not None:
         raise network_missing(run.path, config.network)
     if isinstance(network, CustomNetwork) and network.name != config.network:
         there = "the paper's U-net" if config.network is None else f"`{config.network}`"
-        raise does_not_fit(run.path, f"it was trained with {there}, not with `{network.name}`")
+        raise misfit(run.path, f"it was trained with {there}, not with `{network.name}`")
     checkpoint, model = run.checkpoint(), network_of(config, len(palette), network)
     fit_weights(model, checkpoint)
     return Trained(run, config, palette, model.to(device).eval(), checkpoint)
@@ -384,7 +384,7 @@ def finetuned(
     """
     config = trained.config
     if config.recorded is not None:
-        raise does_not_fit(trained.run.path, "it learned from a dataset, and other packs are not in it")
+        raise misfit(trained.run.path, "it learned from a dataset, and other packs are not in it")
     data = config.data
     data = with_packs(data, data.rules or "+".join(load_task(data.task).rules), packs)
     palette = extended_palette(trained.palette, load_rules_of(data, trained.palette))
@@ -415,7 +415,7 @@ def pack_names(rules: str, words: Iterable[str]) -> tuple[str, ...]:
 
     A name of a pack of the rules, left out or not, stands for that pack.
     """
-    known = _known(rules)
+    known = _packs_named(rules)
     packs: dict[str, None] = {}
     for word in words:
         packs |= dict.fromkeys([word] if word in known else _names_of(word))
@@ -431,7 +431,7 @@ def leave_out(rules: str, packs: Iterable[str]) -> str:
 def add(rules: str, packs: Iterable[str]) -> str:
     """The rules with some packs, by name or as files: those that were left out come back, others are added."""
     plus, minus = split_names(rules)
-    known = _known(rules)
+    known = _packs_named(rules)
     for word in packs:
         names = [word] if word in known else _names_of(word)
         minus = [name for name in minus if name not in names]
@@ -447,7 +447,7 @@ def keep(rules: str, packs: Sequence[str]) -> str:
     return add(leave_out(rules, gone), packs)
 
 
-def _known(rules: str) -> tuple[str, ...]:
+def _packs_named(rules: str) -> tuple[str, ...]:
     """The packs that rules name, including those that are left out."""
     return _names_of(*split_names(rules)[0])
 

@@ -253,7 +253,7 @@ def watch(
         else:
             variants.append(narrowed)
     if missing and not (partly and variants):
-        raise _lacking(task, rules, missing, only)
+        raise _missing_elements(task, rules, missing, only)
     agent = replace(task.agent, choices=(NO_CHANGE,), speed_field=None)
     watched = Split(given.name, given.about, tuple(variants))
     nothing = Goal(None, None, None, None)
@@ -320,7 +320,9 @@ class _Narrowing:
         self.span = self.span or span
 
 
-def _lacking(task: Task, rules: Ruleset, missing: Sequence[Missing], only: Collection[str]) -> CompileError:
+def _missing_elements(
+    task: Task, rules: Ruleset, missing: Sequence[Missing], only: Collection[str]
+) -> CompileError:
     reporter = Reporter()
     under = f"{rules.name} with {', '.join(sorted(only))} alone" if only else rules.name
     for name, elements, span in missing:

@@ -12,7 +12,7 @@ from typing import Any
 
 from powderdsl.arrays import NDArray, np
 from powderdsl.simulation.draw import to_numpy
-from powderdsl.system.interrupts import held_back
+from powderdsl.system.interrupts import delay_signal
 from powderdsl.system.packages import require
 from powderdsl.system.writing import replacing
 
@@ -94,7 +94,7 @@ def _encode(command: list[str], frames: Iterable[NDArray[np.uint8]]) -> None:
         try:
             # In a new session, Ctrl-C reaches only this process, which ends the encoder. A signal must wait until the
             # encoder has started: otherwise, it would write its file after this process removed it.
-            with held_back():
+            with delay_signal():
                 encoder = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log, start_new_session=True)
             assert encoder.stdin is not None
             with (

@@ -58,7 +58,7 @@ def save(world: World, path: str | Path) -> None:
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:
-            raise _bad(target, f"cannot be written: {error.strerror}") from None
+            raise _unreadable(target, f"cannot be written: {error.strerror}") from None
 
 
 def load_world(path: str | Path, sim: Simulator) -> World:
@@ -76,11 +76,11 @@ def load_world(path: str | Path, sim: Simulator) -> World:
         with open_archive(source) as archive:
             return _load(archive, sim, source)
     except FileNotFoundError:
-        raise _bad(source, "does not exist") from None
+        raise _unreadable(source, "does not exist") from None
     except OSError as error:
-        raise _bad(source, f"cannot be read: {error.strerror or error}") from None
+        raise _unreadable(source, f"cannot be read: {error.strerror or error}") from None
     except (BadArchive, AttributeError, LookupError, TypeError, ValueError) as error:
-        raise _bad(source, f"is not a saved world: {' '.join(str(error).split())[:200]}") from None
+        raise _unreadable(source, f"is not a saved world: {' '.join(str(error).split())[:200]}") from None
 
 
 def _load(archive: Archive, sim: Simulator, source: Path) -> World:
@@ -174,7 +174,7 @@ def _translate(palette: dict[int, str], ids: Any, sim: Simulator, path: Path) ->
     return np.frombuffer(data.translate(table), np.uint8).reshape(ids.shape)
 
 
-def _bad(path: Path, problem: str) -> CompileError:
+def _unreadable(path: Path, problem: str) -> CompileError:
     return failure("PD602", f"`{path}` {problem}")
 
 

@@ -81,10 +81,10 @@ def test_a_killed_study_resumes_at_once(tmp_path: Path) -> None:
 
 CAUGHT = """
 import os, signal, sys, time
-from powderdsl.system.interrupts import Terminated, held_back, interruptible
+from powderdsl.system.interrupts import Terminated, delay_signal, interruptible
 
 def twice():
-    with held_back() as asked:
+    with delay_signal() as asked:
         os.kill(os.getpid(), signal.SIGTERM)
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(0.01)
@@ -92,7 +92,7 @@ def twice():
 
 def held_in_a_failure():
     try:
-        with held_back():
+        with delay_signal():
             os.kill(os.getpid(), signal.SIGTERM)
             raise OSError
     except OSError:
@@ -100,7 +100,7 @@ def held_in_a_failure():
 
 def again():
     try:
-        with held_back():
+        with delay_signal():
             os.kill(os.getpid(), signal.SIGINT)
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(10)

@@ -32,7 +32,7 @@ from powderdsl.datasets.manifest import read_manifest
 from powderdsl.diagnostics import CODES, CompileError, Diagnostic, Reporter, Severity, Source
 from powderdsl.diagnostics.codes import page
 from powderdsl.diagnostics.diagnostic import render_text
-from powderdsl.experiments.runs import does_not_fit, find_run, held, open_run
+from powderdsl.experiments.runs import find_run, lock_folder, misfit, open_run
 from powderdsl.experiments.studies.run import StudyRun, check_cluster, collected, read_folders
 from powderdsl.experiments.studies.study import TEXT, load_study, read_study
 from powderdsl.rl import preset
@@ -258,12 +258,12 @@ def open_a_run_of_another_seed() -> None:
 
 def train_in_one_folder_twice() -> None:
     run = open_run("runs/dunes", "ppo", {})
-    with held(run.path), held(run.path):
+    with lock_folder(run.path), lock_folder(run.path):
         pass
 
 
 def use_a_run_that_does_not_fit() -> None:
-    raise does_not_fit(Path("runs/dunes"), "id 3 is `core.wall` there, nothing here")
+    raise misfit(Path("runs/dunes"), "id 3 is `core.wall` there, nothing here")
 
 
 def learn_too_fast() -> None:

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from powderdsl.diagnostics import CompileError
-from powderdsl.experiments.runs import Metrics, find_run, held, open_run, read_metrics, read_run
+from powderdsl.experiments.runs import Metrics, find_run, lock_folder, open_run, read_metrics, read_run
 from tests.processes import waited
 from tests.refusals import refusal, refused_codes
 
@@ -134,11 +134,11 @@ def test_metrics_after_the_last_checkpoint_are_written_once(tmp_path: Path) -> N
 
 SAVING = """
 import sys, torch
-from powderdsl.experiments.runs import held, open_run
+from powderdsl.experiments.runs import lock_folder, open_run
 run = open_run(sys.argv[1], "toy", {})
 found = run.latest_checkpoint()
 step = found.step if found else 0
-with held(run.path):
+with lock_folder(run.path):
     while True:
         step += 1
         run.save_checkpoint(step, {"step": step, "weights": torch.full((20_000,), step)})
@@ -171,7 +171,7 @@ def test_one_process_at_a_time(tmp_path: Path) -> None:
     child = subprocess.Popen([sys.executable, "-c", SAVING, str(run.path)], stdout=subprocess.PIPE, text=True)
     try:
         assert child.stdout.readline() == "1\n"
-        with pytest.raises(CompileError, match="PD622"), held(run.path):
+        with pytest.raises(CompileError, match="PD622"), lock_folder(run.path):
             pass
     finally:
         child.kill()
@@ -179,7 +179,7 @@ def test_one_process_at_a_time(tmp_path: Path) -> None:
 
     def free() -> bool:
         try:
-            with held(run.path):
+            with lock_folder(run.path):
                 return True
         except CompileError:
             return False

@@ -19,7 +19,7 @@ from powderdsl.testing.mutation.judging import (
     COUNTED,
     Original,
     broken_invariant,
-    by_hand_share,
+    handwritten_share,
     noticed_share,
     run_campaign,
 )
@@ -49,7 +49,7 @@ def test_the_counts_add_up():
             assert counts["mutants"] == counts["equivalent"] + counts["killed"] + counts["survived"]
             assert counts["killed"] == sum(counts[key] for key in ("check", "invariant", "test", "generated"))
             assert 0 <= noticed_share(counts) <= 1
-            assert 0 <= by_hand_share(counts) <= 1
+            assert 0 <= handwritten_share(counts) <= 1
 
 
 def test_every_pack_is_in_the_table():

@@ -17,7 +17,7 @@ from powderdsl.experiments.studies.results import (
     as_markdown,
     findings,
     interval,
-    shown,
+    show_interval,
     write_figure,
 )
 from powderdsl.experiments.studies.run import Outcome, StudyRun
@@ -154,11 +154,11 @@ def test_an_interval_is_that_of_student() -> None:
     ],
 )
 def test_numbers_are_rounded_by_their_interval(mean: float, half: float, text: str) -> None:
-    assert shown(Interval(mean, mean - half, mean + half)) == text
+    assert show_interval(Interval(mean, mean - half, mean + half)) == text
 
 
 def test_factors_are_shown_with_both_ends() -> None:
-    assert shown(Interval(0.5, 0.25, 1.0), "log") == "0.500 (0.250 to 1.00)"
+    assert show_interval(Interval(0.5, 0.25, 1.0), "log") == "0.500 (0.250 to 1.00)"
 
 
 def test_verdicts_follow_the_intervals() -> None:

@@ -18,9 +18,9 @@ from powderdsl.diagnostics.printable import (
     PrintableStream,
     printable,
     printable_streams,
+    raw_stream,
     spell,
     styled,
-    unguarded,
 )
 from tests.cli.commands import powderdsl
 
@@ -90,7 +90,7 @@ def test_no_way_leads_around_a_stream():
     with pytest.raises(TypeError):
         stream.write(b"\x1b")  # type: ignore[arg-type]
     outer = PrintableStream(stream)  # type: ignore[arg-type]
-    assert outer.unguarded is stream.unguarded is unguarded(outer)
+    assert outer.unguarded is stream.unguarded is raw_stream(outer)
 
 
 def test_diagnostics_escape_every_part():

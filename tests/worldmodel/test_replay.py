@@ -46,7 +46,7 @@ def as_bytes(pairs: list[tuple[Tensor, Tensor]]) -> list[bytes]:
 def test_n_states_are_exactly_those_worlds_and_each_goes_on_in_time(dunes: str) -> None:
     config = DataConfig(task=dunes, states=3, steps=2, pairs=4, capacity=100, refresh=5)
     replay = Replay(worlds_of(config), config, seed=9)
-    replay.go_to(0)
+    replay.advance_to(0)
     expected = as_bytes([pair for seed in range(3) for pair in by_hand(dunes, seed, config)])
     assert replay.size == 12
     assert pairs_in(replay) == expected
@@ -64,7 +64,7 @@ def test_n_states_are_exactly_those_worlds_and_each_goes_on_in_time(dunes: str) 
 def test_the_oldest_pairs_give_way_to_the_next_worlds(dunes: str) -> None:
     config = DataConfig(task=dunes, states=1000, steps=2, pairs=4, capacity=24, refresh=3)
     replay = Replay(worlds_of(config), config, seed=4)
-    replay.go_to(0)
+    replay.advance_to(0)
     seed = replay._first
     assert 0 < seed < 1000
     worlds = [by_hand(dunes, (seed + number) % 1000, config) for number in range(12)]
@@ -81,11 +81,11 @@ def test_any_iteration_can_be_gone_to(dunes: str, capacity: int, refresh: int) -
     config = DataConfig(task=dunes, states=500, steps=1, pairs=4, capacity=capacity, refresh=refresh)
     worlds = worlds_of(config)
     walked = Replay(worlds, config, seed=1)
-    walked.go_to(0)
+    walked.advance_to(0)
     for iteration in range(31):
         if iteration in (1, 5, 8, 19, 30):
             jumped = Replay(worlds, config, seed=1)
-            jumped.go_to(iteration)
+            jumped.advance_to(iteration)
             assert torch.equal(jumped.starts, walked.starts), iteration
             assert torch.equal(jumped.ends, walked.ends), iteration
             jumped.advance()
@@ -101,7 +101,7 @@ def test_disk_holds_what_memory_holds(dunes: str, tmp_path: Path) -> None:
     memory = Replay(worlds, config, store="memory")
     disk = Replay(worlds, config, store="disk", folder=tmp_path)
     for replay in (memory, disk):
-        replay.go_to(3)
+        replay.advance_to(3)
         replay.advance()
     assert torch.equal(memory.starts, disk.starts)
     assert torch.equal(memory.ends, disk.ends)
@@ -113,8 +113,8 @@ def test_batches_depend_on_seed_and_iteration_alone(dunes: str) -> None:
     config = DataConfig(task=dunes, states=50, steps=1, pairs=4, capacity=200)
     worlds = worlds_of(config)
     one, other = Replay(worlds, config, seed=1), Replay(worlds, config, seed=2)
-    one.go_to(0)
-    other.go_to(0)
+    one.advance_to(0)
+    other.advance_to(0)
     assert torch.equal(one.batch(7, 32)[0], one.batch(7, 32)[0])
     assert not torch.equal(one.batch(7, 32)[0], one.batch(8, 32)[0])
     assert not torch.equal(one.batch(7, 32)[0], other.batch(7, 32)[0])

@@ -9,7 +9,7 @@ import click
 from powderdsl.cli.exits import BadInput
 from powderdsl.cli.output import color_wanted
 from powderdsl.diagnostics.codes import CODES, find_code, page, similar
-from powderdsl.diagnostics.printable import unguarded
+from powderdsl.diagnostics.printable import raw_stream
 
 PAGE_WIDTH = 100
 
@@ -37,5 +37,5 @@ def command(code: str | None) -> None:
     from rich.console import Console
     from rich.markdown import Markdown
 
-    console = Console(file=unguarded(sys.stdout))  # our own pages
+    console = Console(file=raw_stream(sys.stdout))  # our own pages
     console.print(Markdown(text), width=min(console.width, PAGE_WIDTH))

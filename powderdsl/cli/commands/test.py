@@ -167,7 +167,7 @@ class _Report:
 
     def _properties(self, name: str, runner: Runner) -> list[Result]:
         search = InvariantSearch.of(runner, self.plan)
-        properties = {trial.prop.text: trial.prop for trial in search.waiting}
+        properties = {trial.prop.text: trial.prop for trial in search.undecided}
         if self.keep:
             for prop, sample, steps in kept_examples(runner.ruleset, properties, name):
                 search.try_sample(sample, steps)
@@ -211,7 +211,7 @@ class _Report:
         if breaks(result.prop.claim, runner, sample, steps).first.any():
             result.sample, result.steps = sample, steps
             result.counterexample = counterexample(result.prop.claim, runner, sample, steps)
-            search.tell_apart()
+            search.report_differences()
         self._tell(result, ruleset)
         self.failed |= not result.holds
         self.data[name] = {"properties": [result_data(result)]}

@@ -108,8 +108,8 @@ def train_command(folder: Path | None, ignore_actions: bool, **values: Any) -> N
         config = new_config(values, rules_of)
         _run(config, folder or Path("runs") / (Path(config.data.task).stem or "run"), values)
         return
-    _refuse(values)
-    recording = _opened(values["data"], values["task"])
+    _refuse_world_options(values)
+    recording = _open_recording(values["data"], values["task"])
     recorded = replace(recording.recorded, actions=not ignore_actions)
     with user_values():
         config = replace(PRESETS[values["preset"]], recorded=recorded, **given_settings(values, TrainConfig))
@@ -134,7 +134,7 @@ def new_config(values: Mapping[str, Any], rules_of: Callable[..., str]) -> Train
     with user_values():
         config = replace(PRESETS[values["preset"]], **given_settings(values, TrainConfig))
         rules, task = values["rules"] or "", values["task"] or config.data.task
-        short = opt.given(values, KNOBS)
+        short = opt.given_options(values, KNOBS)
         changes = {
             **given_settings(values, DataConfig),
             "rules": rules_of(rules, task, packs, held_out) if packs or held_out else rules,
@@ -163,7 +163,7 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
     """
     from powderdsl.worldmodel.training import finetuned, load_trained
 
-    network = _own_network(values["network_name"])
+    network = _import_network(values["network_name"])
     trained = load_trained(run, device="cpu", network=network)
     with user_values():
         config = finetuned(trained, packs, **given_settings(values, TrainConfig))
@@ -195,7 +195,7 @@ def eval_command(run: str, as_json: bool, out: Path | None, **values: Any) -> No
     from powderdsl.experiments.runs import write_json
     from powderdsl.worldmodel.evaluation import evaluate, evaluate_recording
 
-    trained, recording, machine = _loaded(run, values)
+    trained, recording, machine = _load_network(run, values)
     if recording is not None:
         tested = evaluate_recording(trained, recording, machine=machine)
     else:
@@ -207,7 +207,7 @@ def eval_command(run: str, as_json: bool, out: Path | None, **values: Any) -> No
     if as_json:
         print_json(plain)
     else:
-        click.echo("\n".join(_told(tested, plain)))
+        click.echo("\n".join(_result_tables(tested, plain)))
 
 
 @command.command("show", cls=opt.ManyWords)
@@ -236,7 +236,7 @@ def show_command(run: str, out: Path, curve: bool, scale: int, **values: Any) ->
         return
     from powderdsl.worldmodel.evaluation import recorded_strips, strips, unseen_worlds
 
-    trained, recording, machine = _loaded(run, values)
+    trained, recording, machine = _load_network(run, values)
     if recording is not None:
         _show(recorded_strips(trained.network, recording), recording.rules, out, scale)
         return
@@ -265,12 +265,12 @@ def _show(strips: list[Strip], rules: Ruleset, out: Path, scale: int) -> None:
 
 def tested_on(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the options that choose the worlds of a test."""
-    return opt.given(values, ("task", "split", "rules", "only", "knobs", "rulesets"))
+    return opt.given_options(values, ("task", "split", "rules", "only", "knobs", "rulesets"))
 
 
 def given_settings(values: Mapping[str, Any], config: type) -> dict[str, Any]:
     """The settings of a dataclass that were given as options."""
-    return opt.given(values, [setting.name for setting in fields(config)])
+    return opt.given_options(values, [setting.name for setting in fields(config)])
 
 
 def _machine(values: dict[str, Any]) -> Machine:
@@ -285,14 +285,14 @@ def _machine(values: dict[str, Any]) -> Machine:
     return Machine(**{name: values.pop(name) for name in MACHINE if name in values})
 
 
-def _refuse(values: Mapping[str, Any]) -> None:
+def _refuse_world_options(values: Mapping[str, Any]) -> None:
     """Refuse options that select worlds: a dataset has its own."""
     for option in click.get_current_context().command.params:
-        if option.name in opt.given(values, OF_WORLDS):
+        if option.name in opt.given_options(values, OF_WORLDS):
             raise BadInput(f"{option.opts[0]} selects worlds, and --data has its own")
 
 
-def _opened(folder: Path, task: str | None) -> Recording:
+def _open_recording(folder: Path, task: str | None) -> Recording:
     """The recording in a dataset's folder."""
     from powderdsl.cli.commands.record import require_gymnasium
 
@@ -302,25 +302,25 @@ def _opened(folder: Path, task: str | None) -> Recording:
     return open_recording(folder, task)
 
 
-def _loaded(run: str, values: dict[str, Any]) -> tuple[Trained, Recording | None, Machine]:
+def _load_network(run: str, values: dict[str, Any]) -> tuple[Trained, Recording | None, Machine]:
     """The network of a run, the recording that it is tested on if it has actions, and where to compute."""
     from powderdsl.worldmodel.training import load_trained
 
     machine, folder = _machine(values), values["data"]
-    trained = load_trained(run, device=machine.device, network=_own_network(values["network_name"]))
+    trained = load_trained(run, device=machine.device, network=_import_network(values["network_name"]))
     if trained.config.recorded is None:
         if folder is not None:
             raise BadInput("--data is for networks that learned from a dataset")
         return trained, None, machine
-    _refuse(values)
+    _refuse_world_options(values)
     recorded = trained.run.about.get("dataset")
     if folder is None and not isinstance(recorded, str):
         raise BadInput("--data: say which dataset")
     task = values["task"] or trained.config.data.task
-    return trained, _opened(folder or Path(str(recorded)), task), machine
+    return trained, _open_recording(folder or Path(str(recorded)), task), machine
 
 
-def _own_network(name: str | None) -> CustomNetwork | None:
+def _import_network(name: str | None) -> CustomNetwork | None:
     """The network that the user names, imported."""
     if name is None:
         return None
@@ -342,7 +342,7 @@ def _run(config: TrainConfig, folder: Path, values: dict[str, Any], **more: Any)
     """Train, and show the progress."""
     from powderdsl.worldmodel.training import train
 
-    machine, network = _machine(values), _own_network(values["network_name"])
+    machine, network = _machine(values), _import_network(values["network_name"])
     began = time.monotonic()
     with progress("wm", config.iterations, lines=True, resumes=folder) as show:
 
@@ -369,7 +369,7 @@ def _run(config: TrainConfig, folder: Path, values: dict[str, Any], **more: Any)
 # Reports
 
 
-def _told(tested: Tested, plain: Mapping[str, Any]) -> Iterator[str]:
+def _result_tables(tested: Tested, plain: Mapping[str, Any]) -> Iterator[str]:
     """The results of a test as tables. `plain` has them for JSON."""
     yield f"{tested.rules}, {tested.task}/{tested.split}, after {plain['iterations']:,} iterations"
     rows = [["test", "predictor", *next(iter(plain["mean"].values()))]]

@@ -104,7 +104,7 @@ def _verdict(measure: Measure, label: str, cells: Sequence[Cell]) -> str:
     sure = f", but the interval holds {same}" if held and change.low <= same <= change.high else ""
     plus = "+" if not log and change.mean > 0 else ""
     start = f"{label}: " if label else ""
-    return f"{start}{does}{sure} (last {'/' if log else '−'} first: {plus}{shown(change, measure.scale)})"
+    return f"{start}{does}{sure} (last {'/' if log else '−'} first: {plus}{show_interval(change, measure.scale)})"
 
 
 def _lines(cells: Sequence[Cell]) -> dict[str, list[Cell]]:
@@ -146,7 +146,8 @@ def as_markdown(study: Study, size: str, outcomes: Sequence[Outcome]) -> str:
     rows = [[*(axis.name for axis in study.axes), *(finding.measure.about for finding in measured), "seeds"]]
     for cells in zip(*(finding.cells for finding in measured), strict=True):
         numbers = [
-            shown(cell.over_seeds, measure.scale) for cell, measure in zip(cells, study.measures, strict=True)
+            show_interval(cell.over_seeds, measure.scale)
+            for cell, measure in zip(cells, study.measures, strict=True)
         ]
         rows.append([*cells[0].values.values(), *numbers, str(len(cells[0].by_seed))])
     verdicts = [
@@ -164,7 +165,7 @@ def markdown(rows: Sequence[Sequence[str]]) -> str:
     return "\n".join([titles, "|" + "---|" * len(rows[0]), *others]) + "\n"
 
 
-def shown(number: Interval, scale: str = "linear") -> str:
+def show_interval(number: Interval, scale: str = "linear") -> str:
     """`0.1234 ± 0.0056`, as many places as the interval deserves; `0.123 (0.118 to 0.129)` on the scale ``log``."""
     half = (number.high - number.low) / 2
     if not math.isfinite(half):

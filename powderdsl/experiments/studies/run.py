@@ -24,7 +24,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from powderdsl.diagnostics import CompileError, Reporter, Source
-from powderdsl.experiments.runs import ABOUT, check_folder, held, new_folder, no_run, write_json
+from powderdsl.experiments.runs import ABOUT, check_folder, lock_folder, new_folder, not_a_run, write_json
 from powderdsl.experiments.studies.study import SIZES, Commands, Measure, Point, Study, StudyStep, read_study
 from powderdsl.system.interrupts import GRACE, LIFELINE, SIGNALS
 from powderdsl.system.packages import require
@@ -75,7 +75,7 @@ class StudyRun:
         except CompileError:
             if not path.exists():  # else another process has just begun the same study
                 raise
-        with held(self.folder, GRACE):
+        with lock_folder(self.folder, GRACE):
             if path.exists() and not self.is_prepared():
                 what = "another study, or this one as it was before its steps changed"
                 helps = ("choose another folder with `--out`",)
@@ -144,7 +144,7 @@ class StudyRun:
         own = {"OMP_NUM_THREADS": str(self.threads), "PYTHONUNBUFFERED": "1", "NO_COLOR": "1", LIFELINE: "1"}
         if (place / step.name / ABOUT).exists():
             # The process of a study that was killed may still be saving its last checkpoint.
-            with suppress(CompileError), held(place / step.name, GRACE):
+            with suppress(CompileError), lock_folder(place / step.name, GRACE):
                 pass
         with log.open("ab") as file:
             process = subprocess.Popen(
@@ -262,14 +262,14 @@ def _read(folder: Path, commands: Commands) -> StudyRun:
     path = folder / ABOUT_STUDY
     if not path.exists():
         why = f"it has no {ABOUT_STUDY}" if folder.is_dir() else "there is no such folder"
-        raise no_run(folder, why, ("give folders of results, those that `powderdsl study --out` named",))
+        raise not_a_run(folder, why, ("give folders of results, those that `powderdsl study --out` named",))
     check_folder(folder)
     match read_json(path):
         case {"text": str(text), "size": str(size)} if size in SIZES:
             run = StudyRun(read_study(Source(str(path), text), Reporter(), commands), folder, size)
             if run.is_prepared():
                 return run
-    raise no_run(folder, f"its {ABOUT_STUDY} is damaged")
+    raise not_a_run(folder, f"its {ABOUT_STUDY} is damaged")
 
 
 # Ray

@@ -365,9 +365,9 @@ class Driver(Batches):
                     key: Value = const("i32", start)
                     for part in parts:
                         key = library.mix(key + part)
-                    self._twice(key, memory.at("worlds", i) + 8 * lane)
+                    self._store_twice(key, memory.at("worlds", i) + 8 * lane)
 
-    def _twice(self, number: Value, at: int) -> None:
+    def _store_twice(self, number: Value, at: int) -> None:
         """Store a number twice, for both hashes of a lane's word."""
         load("i64.load", 0, at).set(counted(number) * (1 << 32 | 1))
 
@@ -378,7 +378,7 @@ class Driver(Batches):
             with body.scope():
                 start = self.clock_of(batch, 2, self.world_of(batch, number, lane))
                 step = body.let(start + counted(done))
-                self._twice(op("i32.wrap_i64", step), memory.at("clock") + 8 * lane)
+                self._store_twice(op("i32.wrap_i64", step), memory.at("clock") + 8 * lane)
                 for (modulus, bit), i in self.layout.step_planes.items():
                     flag = (op("i64.rem_u", step, modulus) >> bit) & 1
                     load("i64.load", 0, memory.at("steps", i) + 8 * lane).set(0 - flag)
@@ -416,7 +416,7 @@ class Driver(Batches):
                     place.set(library.keep(same))
         names = [name for name in self.layout.planes if name.startswith("element:")]
         if ids := [code for code in range(1 << len(names)) if self.tested >> code & 1]:
-            look = library.module.define(partial(self._look, names, ids), "look")
+            look = library.module.define(partial(self._find_ids, names, ids), "look")
             with body.when(library.present.equals(-1)):
                 body.do(look())
 
@@ -433,7 +433,7 @@ class Driver(Batches):
             library.finish_line(start)
         return field
 
-    def _look(self, names: Sequence[str], ids: Sequence[int]) -> None:
+    def _find_ids(self, names: Sequence[str], ids: Sequence[int]) -> None:
         """Find the ids that are present, from products of the planes of their bits."""
         library, memory = self.library, self.memory
         planes = [body.let(library.group[memory.slot(name, None)]) for name in names]

@@ -149,7 +149,7 @@ class Standalone(Batches):
         """Set the fields of a cell to the usual values of an element, for the host."""
         for slot in slots:
             for piece, at, usual in self.parts[slot.name]:
-                load(slot.load, cell * slot.size, at).set(_usual(piece, element, usual))
+                load(slot.load, cell * slot.size, at).set(_fresh_value(piece, element, usual))
 
     def _put(self, slots: Iterable[Stored]) -> None:
         """Load the ids and fields that the host sees into the world."""
@@ -208,7 +208,7 @@ class Standalone(Batches):
                 if slot.holders is not None:
                     holders = self._data(bytes(i in slot.holders for i in range(256)))
                     with body.when(load("i32.load8_u", identity, holders).equals(0)):
-                        cell.set(_usual(piece, identity, usual))
+                        cell.set(_fresh_value(piece, identity, usual))
             body.do(self._load(piece, at, slot.size))
 
     def field(self, number: I32) -> int:
@@ -299,7 +299,7 @@ def _of_number(number: Value, items: Iterable[Item]) -> Iterator[Item]:
             yield item
 
 
-def _usual(piece: Piece, element: Value, table: int) -> Value:
+def _fresh_value(piece: Piece, element: Value, table: int) -> Value:
     """The value that fresh cells of an element have."""
     return load("f32.load" if piece.is_real else "i32.load", element << 2, table)
 

@@ -23,14 +23,14 @@ _OWNED: WeakSet[Any] = WeakSet()
 T = TypeVar("T")
 
 
-def _owned(owner: T) -> T:
+def _keep_alive(owner: T) -> T:
     """The same object, remembered in `_OWNED`."""
     _OWNED.add(owner)
     return owner
 
 
 @atexit.register
-def _leave() -> None:
+def _leave_memory() -> None:
     """Leave all memory to the operating system: wasmtime cannot free it while Python shuts down."""
     for owner in list(_OWNED):
         with suppress(ValueError):  # already freed
@@ -44,7 +44,7 @@ def _engine(*, reserve: bool) -> wasmtime.Engine:
         config.memory_reservation = 0
         config.memory_reservation_for_growth = GROWTH
         config.memory_guard_size = 0
-    return _owned(wasmtime.Engine(config))
+    return _keep_alive(wasmtime.Engine(config))
 
 
 class WasmtimeModule:
@@ -63,7 +63,7 @@ class WasmtimeModule:
 
     def _compile(self) -> None:
         self._engine = self.engine
-        self._module = _owned(wasmtime.Module(self.engine, self._code))
+        self._module = _keep_alive(wasmtime.Module(self.engine, self._code))
 
     def __call__(self) -> WasmtimeInstance:
         """A new instance. Raises MemoryError where there is no room for its memory."""
@@ -82,7 +82,7 @@ class WasmtimeInstance:
     """An instance in its own store."""
 
     def __init__(self, engine: wasmtime.Engine, module: wasmtime.Module):
-        self._store = _owned(wasmtime.Store(engine))
+        self._store = _keep_alive(wasmtime.Store(engine))
         exports: dict[str, Any] = dict(
             wasmtime.Instance(self._store, module, []).exports(self._store).items()
         )

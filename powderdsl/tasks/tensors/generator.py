@@ -86,7 +86,7 @@ class Made:
     targets: Mapping[str, Array]
 
 
-def joined(kind: ArrayKind, parts: Sequence[Made], fixed: Mapping[str, Array]) -> Made:
+def join_worlds(kind: ArrayKind, parts: Sequence[Made], fixed: Mapping[str, Array]) -> Made:
     """The worlds of all parts in a row. Regions of `fixed` are the same in all worlds."""
     xp, regions = kind.xp, dict(fixed)
     for name in (name for name in parts[0].regions if name not in fixed):
@@ -186,7 +186,7 @@ class WorldMaker:
         if self.kind.on_cpu:
             chunk = max(1, CHUNK_CELLS // (self.size[0] * self.size[1]))
         made = [self._chunk(seeds[i : i + chunk]) for i in range(0, max(1, len(seeds)), chunk)]
-        return made[0] if len(made) == 1 else joined(self.kind, made, self.fixed_cells)
+        return made[0] if len(made) == 1 else join_worlds(self.kind, made, self.fixed_cells)
 
     def _chunk(self, seeds: Array) -> Made:
         hashes = Hashes(seeds, self.kind)
@@ -369,7 +369,7 @@ class StartWorlds:
         variants = variant.tolist()
         numbers = sorted(set(variants)) or [0]
         parts = [self._makers[number].make(seeds[variant == number]) for number in numbers]
-        made = joined(self.kind, parts, self.fixed)
+        made = join_worlds(self.kind, parts, self.fixed)
         # Back from the order of variants to that of the seeds.
         worlds = sorted(range(len(variants)), key=variants.__getitem__)
         order = self.kind.put(sorted(worlds, key=worlds.__getitem__), "int64")

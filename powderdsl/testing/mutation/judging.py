@@ -34,13 +34,13 @@ from powderdsl.model.types import Example, Invariant, Local, Ruleset, Symmetric
 from powderdsl.simulation.programs import starting_backend
 from powderdsl.simulation.simulator import Simulator, compile
 from powderdsl.system.fingerprint import fingerprint
-from powderdsl.system.interrupts import held_back
+from powderdsl.system.interrupts import delay_signal
 from powderdsl.testing.generators.cases import Array, Start
 from powderdsl.testing.mutation.mutants import Mutant
 from powderdsl.testing.mutation.operators import mutants_of
 from powderdsl.testing.mutation.written import GENERATED, GeneratedTest, distinguish, written_test
 from powderdsl.testing.pack_tests.runner import run_examples
-from powderdsl.testing.properties.breaks import breaks, is_paired, look, steps_for
+from powderdsl.testing.properties.breaks import breaks, find_breaks, is_paired, steps_for
 from powderdsl.testing.properties.running import Runner, State, first_difference, random_samples, run_sample
 from powderdsl.testing.properties.search import STEPS
 
@@ -326,7 +326,7 @@ def _broken_in(
         if (
             fits
             and not is_paired(invariant.claim)
-            and look(invariant.claim, ruleset, sample, states).first.any()
+            and find_breaks(invariant.claim, ruleset, sample, states).first.any()
         ):
             return invariant
     return None
@@ -380,7 +380,7 @@ def run_campaign(
     # A fork of a process with threads of torch's may hang.
     pool = ProcessPoolExecutor(jobs, get_context("spawn"), _begin_process)
     try:
-        with held_back():  # a process whose start is cut short ends with a traceback
+        with delay_signal():  # a process whose start is cut short ends with a traceback
             results = [pool.submit(judged, number) for number in numbers]
         for result in as_completed(results):
             yield result.result()
@@ -456,7 +456,7 @@ def noticed_share(counts: dict[str, int]) -> float:
     return counts["killed"] / different if different else 1.0
 
 
-def by_hand_share(counts: dict[str, int]) -> float:
+def handwritten_share(counts: dict[str, int]) -> float:
     """Of the mutants that invariants and tests notice, the part that those written by hand notice; 1 if there are none."""
     tested = counts["invariant"] + counts["test"] + counts["generated"]
     return (tested - counts["generated"]) / tested if tested else 1.0

@@ -60,7 +60,7 @@ class Mutant:
     def diff(self) -> str:
         """The lines that differ, before and after, each on one line; `(nothing)` where there are none."""
         old, new = self.source.text.splitlines(), self.text.splitlines()
-        before, after = (" ".join(" ".join(lines).split()) for lines in unlike(old, new)[1:])
+        before, after = (" ".join(" ".join(lines).split()) for lines in split_common_ends(old, new)[1:])
         return f"{before or '(nothing)'}  ⇒  {after or '(nothing)'}"
 
     @property
@@ -99,7 +99,7 @@ OPERATORS: dict[str, str] = {
 """Kinds of mistakes, and a line about each."""
 
 
-def unlike(old: list[str], new: list[str]) -> tuple[list[str], list[str], list[str]]:
+def split_common_ends(old: list[str], new: list[str]) -> tuple[list[str], list[str], list[str]]:
     """Split two lists into their common beginning and the parts of each before their common end."""
     head = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(old, new, strict=False)))
     ends = zip(reversed(old[head:]), reversed(new[head:]), strict=False)
@@ -107,18 +107,18 @@ def unlike(old: list[str], new: list[str]) -> tuple[list[str], list[str], list[s
     return old[:head], old[head : len(old) - tail], new[head : len(new) - tail]
 
 
-def written(operator: str, span: Span, text: str) -> Change:
+def replace_text(operator: str, span: Span, text: str) -> Change:
     """Another text at a place; words that stay the same at its ends are left alone."""
     old, new = (re.findall(r"[\w.%]+|\s+|[^\w\s.%]+", words) for words in (span.text, text))
-    head, before, after = ("".join(words) for words in unlike(old, new))
+    head, before, after = ("".join(words) for words in split_common_ends(old, new))
     start = span.start + len(head)
     return Change(operator, start, start + len(before), after)
 
 
-def exchanged(operator: str, first: Span, second: Span) -> Change:
+def exchange_texts(operator: str, first: Span, second: Span) -> Change:
     """Two texts in each other's place."""
     between = first.source.text[first.end : second.start]
-    return written(operator, first.to(second), f"{second.text}{between}{first.text}")
+    return replace_text(operator, first.to(second), f"{second.text}{between}{first.text}")
 
 
 # Cutting entries out of located YAML, and putting some in: the rest of the file stays as it is

@@ -20,12 +20,12 @@ from powderdsl.testing.mutation.mutants import (
     Mutant,
     Names,
     Path,
-    exchanged,
+    exchange_texts,
     inserted,
     names_of,
     removed,
+    replace_text,
     without,
-    written,
 )
 
 
@@ -96,7 +96,9 @@ def word_changes(line: Span, names: Names) -> Changes:
     for match in WORD.finditer(line.text):
         word = match[0]
         if word[0].isdigit():
-            operator, others = ("chance", near_chances(word)) if word[-1] == "%" else ("constant", near(word))
+            operator, others = (
+                ("chance", near_chances(word)) if word[-1] == "%" else ("constant", near_numbers(word))
+            )
         elif word in SIMILAR:
             operator, *others = SIMILAR[word]
         else:
@@ -108,7 +110,7 @@ def word_changes(line: Span, names: Names) -> Changes:
             yield Change(operator, start, start + len(word), other)
 
 
-def near(text: str) -> list[str]:
+def near_numbers(text: str) -> list[str]:
     """Integers one off; of a large one twice as large and half. Of a decimal half, and twice as far from 1 or from 0."""
     if text.isdigit():
         number = int(text)
@@ -128,7 +130,7 @@ def near_chances(text: str) -> list[str]:
 
 def near_bounds(text: str) -> list[str]:
     """Other bounds for a declared kind: one off, or half of a large one."""
-    return near(text)[:2] if int(text) <= 20 else [str(int(text) // 2)]
+    return near_numbers(text)[:2] if int(text) <= 20 else [str(int(text) // 2)]
 
 
 def near_weights(text: str) -> list[str]:
@@ -152,7 +154,7 @@ def syntax_changes(node: Syntax, names: Names) -> Changes:
     for template in templates:
         if template == "{1}" and node.children[0].kind == node.kind:
             continue  # the same as a part's second operand
-        yield written(operator, node.span, template.format(*(part.text for part in extents(node))))
+        yield replace_text(operator, node.span, template.format(*(part.text for part in extents(node))))
     if node.kind in MISTAKES:
         yield from MISTAKES[node.kind](node, names)
     for child in node.children:
@@ -185,9 +187,9 @@ def _attribute(node: Syntax, names: Names) -> Changes:
     """The neighbor alone, or the value here."""
     before = node.children[0].span.text
     if is_neighbor(node.text) or not (node.text in SIMILAR or names.kind(node.text)):
-        yield written("neighbor", node.span, before)
+        yield replace_text("neighbor", node.span, before)
     if node.text not in SIMILAR or (is_neighbor(node.text) and is_neighbor(before)):
-        yield written("neighbor", node.span, node.text)
+        yield replace_text("neighbor", node.span, node.text)
 
 
 def _call(node: Syntax, names: Names) -> Changes:
@@ -199,7 +201,7 @@ def _call(node: Syntax, names: Names) -> Changes:
     if node.text in ("count", "sum") and not has_kernel:
         text = counted.text if re.fullmatch(r"[\w.?]+|\(.*\)", counted.text) else f"({counted.text})"
         for kernel in ("ring", "cross"):
-            yield written("kernel", counted, f"{text} in {kernel}")
+            yield replace_text("kernel", counted, f"{text} in {kernel}")
 
 
 def _tuple(node: Syntax, names: Names) -> Changes:
@@ -213,17 +215,17 @@ def _binding(node: Syntax, names: Names) -> Changes:
     """A loop in another order."""
     domain = node.children[1]
     if domain.kind == "tuple":
-        yield exchanged("order", extents(domain)[0], extents(domain)[-1])
+        yield exchange_texts("order", extents(domain)[0], extents(domain)[-1])
 
 
 def _rule(node: Syntax, names: Names) -> Changes:
     """A rule without its condition or its chance, or the other way round."""
     sides = node.children[:2]
     if node.kind == "transform" and {side.kind for side in sides} <= {"name", "optional_name"}:
-        yield exchanged("element", sides[0].span, sides[1].span)
+        yield exchange_texts("element", sides[0].span, sides[1].span)
     for clause in node.children:
         if clause.kind in ("condition", "where", "chance"):
-            yield written("guard", clause.span, "")
+            yield replace_text("guard", clause.span, "")
         if clause.kind in ("condition", "where"):
             yield from _negations(clause.children[0])
 
@@ -239,7 +241,7 @@ def _negations(node: Syntax) -> Changes:
 
 def _effects(node: Syntax, names: Names) -> Changes:
     if len(node.children) == 1:
-        yield written("effect", node.span, "")
+        yield replace_text("effect", node.span, "")
         return
     for number in range(len(node.children)):
         yield without("effect", [child.span for child in node.children], number)
@@ -303,7 +305,7 @@ class Entry:
     def instead(self, operator: str, text: str) -> Change:
         """Another value for its scalar."""
         assert isinstance(self.node, Scalar)
-        return written(operator, self.node.content, text)
+        return replace_text(operator, self.node.content, text)
 
     def added(self, operator: str, line: str) -> Change:
         """One more entry at the end of its mapping."""
@@ -395,7 +397,7 @@ def _kernel(entry: Entry) -> Changes:
     if parts and "edges" not in parts:
         yield entry.added("kernel", "edges: wrap")
     elif entry.node.span.text[:1] == "[":
-        yield written("kernel", entry.node.span, f"{{rows: {entry.node.span.text}, edges: wrap}}")
+        yield replace_text("kernel", entry.node.span, f"{{rows: {entry.node.span.text}, edges: wrap}}")
 
 
 def _element(entry: Entry) -> Changes:
@@ -423,9 +425,9 @@ def _tags(entry: Entry) -> Changes:
         if other is not None:
             yield item.instead("tag", f"{other}?")
             if isinstance(node, Scalar):
-                yield written("tag", node.span, f"[{node.text}, {other}?]")
+                yield replace_text("tag", node.span, f"[{node.text}, {other}?]")
             elif number == 0 and node.span.text[0] == "[":
-                yield written("tag", node.span, f"[{other}?, {node.span.text[1:]}")
+                yield replace_text("tag", node.span, f"[{other}?, {node.span.text[1:]}")
 
 
 def _order(entry: Entry) -> Changes:
@@ -433,7 +435,7 @@ def _order(entry: Entry) -> Changes:
         yield item.lost("order")
     other = "before" if entry.key.text == "after" else "after"
     if other not in entry.siblings:
-        yield written("order", entry.key.span, other)
+        yield replace_text("order", entry.key.span, other)
 
 
 def _action(entry: Entry) -> Changes:
@@ -448,11 +450,11 @@ def _action(entry: Entry) -> Changes:
         yield removed("rule", entry.path[:-1])
     elif "then" in entry.siblings and key.text != "then":
         then, node = entry.siblings["then"]
-        yield written("rule", key.span.to(then.span), "do")
+        yield replace_text("rule", key.span.to(then.span), "do")
         if key.text == "do" and rules and lines_of(node):  # one substep where there were two
             indent = "\n" + " " * (key.span.column - 1) + "  - "
             lines = [" ".join(rule.span.text.split()) for rule in (*rules, *lines_of(node))]
-            yield written("order", key.span.to(node.span), indent.join(["do:", *lines]))
+            yield replace_text("order", key.span.to(node.span), indent.join(["do:", *lines]))
     for item in items:
         if len(items) > 1:
             yield item.lost("rule")
@@ -461,13 +463,13 @@ def _action(entry: Entry) -> Changes:
         return
     spans = [rule.span for rule in rules]
     for first, second in itertools.pairwise(spans):  # neighbors exchanged
-        yield exchanged("order", first, second)
+        yield exchange_texts("order", first, second)
     if entry.node.span.text[:1] != "[":  # one after the other instead of at once
         source, end = spans[0].source, spans[-1].end
         text = ""
         for first, second in itertools.pairwise([*spans, Span(source, end, end)]):
             text += f"do: {' '.join(first.text.split())}{source.text[first.end : second.start]}"
-        yield written("order", spans[0].to(spans[-1]), text)
+        yield replace_text("order", spans[0].to(spans[-1]), text)
 
 
 PLACES: dict[str, tuple[EntryMistake, ...]] = {

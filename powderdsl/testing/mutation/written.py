@@ -27,7 +27,13 @@ from powderdsl.system.writing import write_text
 from powderdsl.testing.generators.cases import Array, Start
 from powderdsl.testing.mutation.mutants import Mutant
 from powderdsl.testing.pack_tests.runner import ANYTHING, SEEDS, field_rows
-from powderdsl.testing.properties.running import State, first_difference, framed, random_samples, run_sample
+from powderdsl.testing.properties.running import (
+    State,
+    first_difference,
+    frame_worlds,
+    random_samples,
+    run_sample,
+)
 from powderdsl.testing.properties.shrink import Work, shrink_while
 
 GENERATED = "generated "
@@ -283,5 +289,5 @@ def fresh_samples(ruleset: Ruleset, focus: Sequence[int], seed: int) -> Iterator
                 [*dict.fromkeys(palette)][:kinds], (GROUP, rows, columns)
             )
         if frames and min(rows, columns) > 2:
-            ids[worlds // 2 :] = framed(ids[worlds // 2 :], frames[0])
+            ids[worlds // 2 :] = frame_worlds(ids[worlds // 2 :], frames[0])
         yield Start.fresh(ids).seeded(), steps

@@ -18,7 +18,7 @@ from powderdsl.testing.generators.cases import Start
 from powderdsl.testing.pack_tests.runner import ExampleResult, start_of
 from powderdsl.testing.properties.breaks import Agreement, Alike, Tested, breaks, is_paired
 from powderdsl.testing.properties.outcomes import Counterexample, Property
-from powderdsl.testing.properties.running import MARK, Oracle, Runner, marked, rule_spans
+from powderdsl.testing.properties.running import MARK, Oracle, Runner, rule_spans, with_line_marks
 
 MOST = 8
 """Added packs that are left out in turn, to see which of them matter."""
@@ -86,8 +86,8 @@ def difference(prop: Property, ruleset: Ruleset, counterexample: Counterexample)
             tuple(pack for pack in added[:MOST] if not _still(prop, ruleset, counterexample, pack)) or added
         )
         if not is_paired(prop.claim):
-            last = Oracle(marked(ruleset)).states(counterexample.sample, counterexample.steps)[-1]
-            causes = _rules(ruleset, _happened(ruleset, last), packs)
+            last = Oracle(with_line_marks(ruleset)).states(counterexample.sample, counterexample.steps)[-1]
+            causes = _rules(ruleset, _lines_that_happened(ruleset, last), packs)
     fields = (
         counterexample.sample.fields.get(slot.name) for slot in slots(ruleset) if slot.kind.name == "element"
     )
@@ -98,7 +98,7 @@ def difference(prop: Property, ruleset: Ruleset, counterexample: Counterexample)
     )
     there = {int(number) for cells in grids for number in np.unique(cells)}
     near = frozenset(element.name for element in ruleset.elements if element.id in there)
-    causes = causes or [cause for pack in packs for cause in doings(pack, ruleset, near)]
+    causes = causes or [cause for pack in packs for cause in pack_changes(pack, ruleset, near)]
     named = {cause.pack for cause in causes}
     return Difference(tuple(pack for pack in packs if pack in named) or packs, tuple(causes))
 
@@ -109,15 +109,17 @@ def difference_of_test(result: ExampleResult, runner: Runner) -> Difference | No
         return None
     ruleset, example, sim = runner.ruleset, result.example, runner.sim
     world = sim.step(start_of(example, sim, result.seed), steps=max(result.step, 1))
-    causes = _rules(ruleset, _happened(ruleset, world.state), result.added)
+    causes = _rules(ruleset, _lines_that_happened(ruleset, world.state), result.added)
     drawn = {char for rows in (example.given, example.expect or (), result.after) for char in "".join(rows)}
     near = frozenset(name for char, name in example.legend if char in drawn)
     named = {cause.pack for cause in causes}
-    causes += [cause for pack in result.added if pack not in named for cause in doings(pack, ruleset, near)]
+    causes += [
+        cause for pack in result.added if pack not in named for cause in pack_changes(pack, ruleset, near)
+    ]
     return Difference(result.added, tuple(causes))
 
 
-def _happened(ruleset: Ruleset, state: Mapping[str, Any]) -> list[Span]:
+def _lines_that_happened(ruleset: Ruleset, state: Mapping[str, Any]) -> list[Span]:
     """The lines that happened on the way to a state, by its marks."""
     return [span for number, span in enumerate(rule_spans(ruleset)) if state[f"{MARK}{number}"].any()]
 
@@ -144,7 +146,7 @@ def _still(prop: Property, ruleset: Ruleset, counterexample: Counterexample, pac
     return bool(breaks(claim, Oracle(fewer), sample, counterexample.steps).first.any())
 
 
-def doings(pack: str, ruleset: Ruleset, near: frozenset[str]) -> list[Cause]:
+def pack_changes(pack: str, ruleset: Ruleset, near: frozenset[str]) -> list[Cause]:
     """Up to three changes that a pack makes, besides its rules: to some elements, or else to others, or else passes."""
     changes = list(_changes(pack, ruleset))
     close = [cause for name, cause in changes if name in near]

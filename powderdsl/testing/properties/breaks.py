@@ -77,9 +77,9 @@ def breaks(claim: Tested, runs: Runs, sample: Start, steps: int) -> Breaks:
     """Run the worlds and return where they break the claim."""
     match claim:
         case Local():
-            other, mask = touched(runs.ruleset, sample)
+            other, mask = vary_one_cell(runs.ruleset, sample)
             first, second = (runs.states(start, 1)[-1] for start in (sample, other))
-            return _breaks_of([differences(first, second) & ~near(mask, claim.radius)])
+            return _breaks_of([differences(first, second) & ~cells_within(mask, claim.radius)])
         case Symmetric():
             return _breaks_of([_symmetric(claim, runs, sample)])
         case Alike():
@@ -87,7 +87,7 @@ def breaks(claim: Tested, runs: Runs, sample: Start, steps: int) -> Breaks:
         case Agreement():
             pairs = zip(runs.states(sample, steps), Oracle(runs.ruleset).states(sample, steps), strict=True)
             return _breaks_of([differences(a, b) for a, b in pairs][1:])
-    return look(claim, runs.ruleset, sample, runs.states(sample, steps))
+    return find_breaks(claim, runs.ruleset, sample, runs.states(sample, steps))
 
 
 def is_paired(claim: Tested) -> bool:
@@ -95,7 +95,7 @@ def is_paired(claim: Tested) -> bool:
     return isinstance(claim, Local | Symmetric | Alike | Agreement)
 
 
-def look(claim: Tested, ruleset: Ruleset, sample: Start, states: list[State]) -> Breaks:
+def find_breaks(claim: Tested, ruleset: Ruleset, sample: Start, states: list[State]) -> Breaks:
     """Return where worlds with these states break a claim that needs one run only."""
     ids = [state["element"] for state in states]
 
@@ -156,7 +156,7 @@ def _breaks_of(by_step: list[Array], counts: Array | None = None) -> Breaks:
 # Claims about two runs
 
 
-def touched(ruleset: Ruleset, sample: Start) -> tuple[Start, Array]:
+def vary_one_cell(ruleset: Ruleset, sample: Start) -> tuple[Start, Array]:
     """The same worlds with another fresh element in one cell each, by their seeds; and which cells: bool [B, H, W]."""
     height, width = sample.shape
     known = np.array([element.id for element in ruleset.elements])
@@ -176,7 +176,7 @@ def touched(ruleset: Ruleset, sample: Start) -> tuple[Start, Array]:
     return replace(sample, ids=ids, fields=fields), mask
 
 
-def near(mask: Array, radius: int) -> Array:
+def cells_within(mask: Array, radius: int) -> Array:
     """Cells within `radius` rows and columns of a mask [B, H, W], across the edges too."""
     for axis in (1, 2):
         reach = min(radius, mask.shape[axis] // 2)

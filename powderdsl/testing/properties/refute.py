@@ -99,10 +99,10 @@ class QuickSearch(InvariantSearch):
     def try_random(self) -> None:
         """Run a few worlds."""
         for number, sample in enumerate(random_samples(self.runner.ruleset, SEED, WORLDS)):
-            if not self.waiting:
+            if not self.undecided:
                 return
             self.try_sample(sample, STEPS)
-            for trial in self.waiting if number < FOCUSED else ():
+            for trial in self.undecided if number < FOCUSED else ():
                 kinds = _concerned(self, trial.doubts)
                 if kinds:
                     ids = np.array(kinds, np.uint8)[sample.ids % len(kinds)]

@@ -45,7 +45,7 @@ class Runner:
     @cached_property
     def sim(self) -> Simulator:
         """Runs the rules and sets flags for the lines that happen."""
-        return compile(marked(self.ruleset), self.backend, tensors=False)
+        return compile(with_line_marks(self.ruleset), self.backend, tensors=False)
 
     def of(self, ruleset: Ruleset) -> Runner:
         """Runs other rules in the same way."""
@@ -159,7 +159,7 @@ def rule_spans(ruleset: Ruleset) -> tuple[Span, ...]:
     )
 
 
-def marked(ruleset: Ruleset) -> Ruleset:
+def with_line_marks(ruleset: Ruleset) -> Ruleset:
     """The same rules, each of which also sets a flag of its line where it happens; nothing reads the flags."""
     names = {span: f"{MARK}{number}" for number, span in enumerate(rule_spans(ruleset))}
     home = ruleset.elements[0]
@@ -190,7 +190,7 @@ ALIKE = 8
 """Worlds that are drawn from the same elements."""
 
 
-def joined(samples: Sequence[Start], ruleset: Ruleset) -> Start:
+def join_starts(samples: Sequence[Start], ruleset: Ruleset) -> Start:
     """Starts of one shape as one batch."""
     names = {name for sample in samples for name in sample.fields}
     table = {slot.name: slot for slot in slots(ruleset)}
@@ -242,16 +242,16 @@ def random_samples(ruleset: Ruleset, seed: int, count: int) -> Iterator[Start]:
             if group % 2:
                 sample = replace(sample, fields={}, params={})
             if group % 4 == 1 and frames and min(shape) > 2:
-                sample = replace(sample, ids=framed(sample.ids, choices.pick(frames)))
+                sample = replace(sample, ids=frame_worlds(sample.ids, choices.pick(frames)))
             groups.append(sample)
-        yield joined(groups, ruleset)
+        yield join_starts(groups, ruleset)
         left -= batch
         number += 1
     choices = Choices.seeded(seed)
     yield random_start(ruleset, choices, (4, *LARGE)).seeded()
 
 
-def framed(ids: Array, number: int) -> Array:
+def frame_worlds(ids: Array, number: int) -> Array:
     """Worlds with one element in all cells at their edges."""
     ids = ids.copy()
     ids[:, [0, -1], :] = number

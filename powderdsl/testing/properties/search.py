@@ -24,8 +24,8 @@ from powderdsl.testing.properties.breaks import (
     KnownIds,
     Tested,
     breaks,
+    find_breaks,
     is_paired,
-    look,
     steps_for,
 )
 from powderdsl.testing.properties.outcomes import Counterexample, Property, Result
@@ -91,13 +91,13 @@ class InvariantSearch:
         return search
 
     @property
-    def waiting(self) -> list[Result]:
+    def undecided(self) -> list[Result]:
         """The trials of properties that are neither proven nor broken."""
         return [trial for trial in self.trials if not trial.is_proven and trial.sample is None]
 
     def only(self, texts: Collection[str]) -> Self:
         """The same search for some properties alone that are not proven."""
-        return replace(self, trials=[replace(trial) for trial in self.waiting if trial.prop.text in texts])
+        return replace(self, trials=[replace(trial) for trial in self.undecided if trial.prop.text in texts])
 
     def try_random(self) -> None:
         """Try random worlds until there are enough of them, or time is up."""
@@ -105,14 +105,14 @@ class InvariantSearch:
         for number, sample in enumerate(
             random_samples(self.runner.ruleset, self.plan.seed, self.plan.examples)
         ):
-            if monotonic() > until or not self.waiting:
+            if monotonic() > until or not self.undecided:
                 return
             self.try_sample(sample, STEPS[number % len(STEPS)])
 
     def try_sample(self, sample: Start, steps: int) -> None:
         """Check all properties that are not broken yet on some worlds."""
         waiting: dict[frozenset[int], list[Result]] = {}
-        for trial in self.waiting:
+        for trial in self.undecided:
             waiting.setdefault(trial.prop.without, []).append(trial)
         for without, trials in waiting.items():
             self._try_without(trials, sample.without(without, self.runner.ruleset), steps)
@@ -125,7 +125,7 @@ class InvariantSearch:
         if shared:
             states = self.runner.states(sample, steps)
             for trial in shared:
-                self._note(trial, sample, look(trial.prop.claim, self.runner.ruleset, sample, states))
+                self._note(trial, sample, find_breaks(trial.prop.claim, self.runner.ruleset, sample, states))
         for trial in trials:
             if trial in shared:
                 continue
@@ -160,10 +160,10 @@ class InvariantSearch:
             work = Work(self.runner.ruleset, self.work // len(broken))
             small = shrink(trial.prop.claim, self.runner, trial.sample, trial.steps, work, trial.prop.without)
             trial.counterexample = counterexample(trial.prop.claim, self.runner, *small)
-        self.tell_apart()
+        self.report_differences()
         return self.trials
 
-    def tell_apart(self) -> None:
+    def report_differences(self) -> None:
         """Say of each broken invariant that holds in its scope, without added packs, how these break it."""
         ruleset = self.runner.ruleset
         broken = [(trial, trial.counterexample) for trial in self.trials if trial.counterexample is not None]

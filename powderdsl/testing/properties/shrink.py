@@ -16,7 +16,7 @@ from powderdsl.arrays import np
 from powderdsl.model.types import Ruleset
 from powderdsl.testing.generators.cases import Array, Start
 from powderdsl.testing.properties.breaks import Agreement, Alike, Tested, breaks, is_paired, steps_for
-from powderdsl.testing.properties.running import Runs, joined
+from powderdsl.testing.properties.running import Runs, join_starts
 
 SEEDS = 24
 """How many seeds each smaller world is tried with, its own first."""
@@ -136,7 +136,7 @@ def _first(
             for start in candidates[at : at + most]
             for number in range(tries)
         ]
-        batch = joined(some, work.ruleset)
+        batch = join_starts(some, work.ruleset)
         work.spend(batch, steps)
         first = judge(batch, steps)
         broken = np.nonzero(first)[0]
