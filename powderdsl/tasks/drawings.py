@@ -77,9 +77,9 @@ def shape_in(node: yaml_tree.Node | None, reader: Reader) -> Statement | None:
 
 
 def limited(node: yaml_tree.Sequence, most: int, what: str, reporter: Reporter) -> bool:
-    """Return True if a list has at most so many items; report one that has more."""
+    """Return True if a list has at most `most` items; report one that has more."""
     if len(node.items) > most:
-        reporter.error("PD508", f"{what.format(len(node.items))}", first_line(node), f"the limit is {most:,}")
+        reporter.error("PD508", what.format(len(node.items)), first_line(node), f"the limit is {most:,}")
     return len(node.items) <= most
 
 

@@ -64,7 +64,7 @@ def sweeps_text(sweeps: Sweeps, layout: NativeLayout, reaches: Mapping[str, int]
             lines.append(f"for (int step = 0; step < rows + {last}; step++) {{")
         lines.append(f"if (const int y = step - {lag}; (u32)y < (u32)rows) {{\n{loop.text()}\n}}")
         if loop.passing and lag < last:
-            lines.append(f"else if (y >= rows) {{ {loop.gone()} }}")
+            lines.append(f"else if (y >= rows) {{ {loop.forget_rings()} }}")
     lines += ["} }", *(loop.after() for loop in loops)]
     # In a separate function, fewer values compete for registers.
     text = "\n".join(["[&]() __attribute__((noinline)) {", *lines, "}();"])
@@ -153,6 +153,7 @@ class _Loop(CellValues[str]):
         layout.cover(marks=number + 1 if plan.marked else 0, marked=len(plan.marked))
 
     def before(self) -> Iterator[str]:
+        """Statements before the loop: memory for what it writes, and the marks of its rows."""
         for out in self.lasting:
             field = f"overtaken(c, {out.into})" if out.into else "take_field(c)"
             yield f"{out.var.name} = {field}; bool some{out.var.name} = false; no_rows(c, {out.var.name});"
@@ -171,11 +172,12 @@ class _Loop(CellValues[str]):
         return on_all("const Plane* const", masks, call)
 
     def after(self) -> str:
+        """Statements after the loop."""
         ends = [f"{out.var.name}->still = !some{out.var.name};" for out in self.lasting]
         return " ".join([*ends, *(f"close_plane(c, {name});" for name in self.flags)])
 
     def text(self) -> str:
-        return "\n".join(self.laid() if self.plan.chains else self.swept())
+        return "\n".join(self.choice_row() if self.plan.chains else self.cell_row())
 
     # Rows that are written
 
@@ -183,7 +185,7 @@ class _Loop(CellValues[str]):
         """The pointer to a buffered row; to zeros if the row is empty."""
         return f"at{name}[(y + {dy}) & {self.rows.rings[name].depth - 1}]"
 
-    def gone(self) -> str:
+    def forget_rings(self) -> str:
         return " ".join(f"{self.at(name, 0)} = nothing;" for name in self.passing)
 
     def starts(self) -> Iterator[str]:
@@ -207,7 +209,7 @@ class _Loop(CellValues[str]):
                 reach = self.rows.reaches.get(name, 0)
                 yield f"finish_row<{'REACH' if reach == ANY_PASS else reach}>(c, o{name});"
 
-    def quiet(self) -> Iterator[str]:
+    def row_outside_region(self) -> Iterator[str]:
         """The values of a row outside the region."""
         for name, value in self.plan.loop.olds.items():
             if name in self.rows.rings:
@@ -221,7 +223,7 @@ class _Loop(CellValues[str]):
 
     # Rows, chunk by chunk
 
-    def swept(self) -> Iterator[str]:
+    def cell_row(self) -> Iterator[str]:
         """A row of a loop over cells."""
         texts = [(out, self.of(out.value)) for out in self.outs]
         stores, counts, lives = [], [], []
@@ -241,7 +243,7 @@ class _Loop(CellValues[str]):
         if self.plan.loop.region is not None:
             fields, planes = region_of(self.plan.loop)
             marked = self.plan.marked
-            tests = [self.busy(field) for field in fields]
+            tests = [self.is_row_live(field) for field in fields]
             tests += [f"(c.marks[{self.number} * height + row] >> lane & 1)"] if marked else []
             scans = [
                 f"some |= row_bits(v{name}, row * words, words, lane);"
@@ -250,7 +252,7 @@ class _Loop(CellValues[str]):
             ]
             busy = " || ".join(tests) or "false"
             yield f"Word some = {busy};" + (f" if (!some) {{ {' '.join(scans)} }}" if scans else "")
-            yield f"if (!some) {{ {' '.join(self.quiet())} }} else {{"
+            yield f"if (!some) {{ {' '.join(self.row_outside_region())} }} else {{"
         yield " ".join([*self.rows_read(), *self.starts(), *counts])
         yield from (f"if (!WIDTH) o{name}[(words - 1) * LANES] = 0;" for name in self.flags)
         words = [
@@ -266,14 +268,14 @@ class _Loop(CellValues[str]):
     def rows_read(self) -> list[str]:
         return [f"const float* {name} = {call};" for call, name in self.pointers.items()]
 
-    def busy(self, live: Node) -> str:
+    def is_row_live(self, live: Node) -> str:
         """A test that a field is nonzero in a row."""
         name, dy = str(live.args[0].attr), live.attr[0]
         if name in self.rows.rings:
             return f"{self.at(name, dy)} != nothing"
         return f"v{name}.live[base + {f'lines[y + {dy}]' if dy else 'y'}]"
 
-    def laid(self) -> Iterator[str]:
+    def choice_row(self) -> Iterator[str]:
         """A row of all choices: the columns of a word stay in registers while its choices are applied."""
         chains, count = self.plan.chains, len(self.plan.masks)
         heads = [f"g{number}[k]" for number in range(len(chains))]
@@ -308,7 +310,7 @@ class _Loop(CellValues[str]):
         yield " ".join(
             f"some{out.var.name} |= v{out.var.name}.live[base + y] = some;" for out in self.lasting
         )
-        yield f"if (!some) {{ {self.gone()} }} else {{"
+        yield f"if (!some) {{ {self.forget_rings()} }} else {{"
         yield " ".join(self.starts())
         yield f"for (int w = 0; w < words; w++) {{ const Word* masks = turned + w * c.masks; const u64 which = which_turned(masks, {count});"
         yield " ".join(f"F g{number}[BITS / CHUNK];" for number in range(len(chains)))

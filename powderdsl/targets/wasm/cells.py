@@ -35,11 +35,13 @@ BITS = struct.pack("<4I", 1, 2, 4, 8)
 
 
 def _best(instruction: str, a: Value, b: Value) -> Value:
+    """The smaller or larger number; NaN if either is one, as NumPy's minimum and maximum have it."""
     a, b = (arg if isinstance(arg, Local) else body.let(arg) for arg in (a, b))
     return choose(op("f32x4.ne", a, a), a, op(instruction, b, a))
 
 
 def _settled(value: Value, low: float, high: float) -> Value:
+    """A number that may be stored: clamped, 0 for a NaN and for what is too small."""
     x = body.let(value)
     x &= op("f32x4.eq", x, x)
     x.set(op("f32x4.pmin", op("f32x4.pmax", x, floats(low)), floats(high)))
@@ -85,7 +87,7 @@ class CellLoop(Loop):
                 with body.scope(), body.block() as skip:
                     self.skip = skip
                     self.starts = {}
-                    self.lay() if self.loop.over == "choices" else self.sweep()
+                    self.write_choices() if self.loop.over == "choices" else self.write_cells()
                 line += 1
         for out, place, some_live in zip(self.loop.outs, self.outs, self.somewhere, strict=True):
             place[SOME] = some_live
@@ -104,9 +106,11 @@ class CellLoop(Loop):
                 self.starts[key] = body.let(self.library.line(self.addresses[read.name], line))
 
     def live(self, field: Value, line: Value | None = None) -> Value:
+        """A flag: the line of a field has a nonzero number; without `line`, the current one."""
         return (field + (self.line if line is None else line))[LIVE]
 
     def set_live(self, place: int, value: Value) -> None:
+        """Note if the current line of an output has a nonzero number."""
         value = body.let(value)
         (self.outs[place] + self.line)[LIVE] = value
         self.somewhere[place] |= value
@@ -156,7 +160,7 @@ class CellLoop(Loop):
 
     # Values, chunk by chunk
 
-    def skipped(self) -> None:
+    def skip_outside_region(self) -> None:
         """Skip a line outside the region."""
         if self.loop.region is None:
             return
@@ -167,9 +171,9 @@ class CellLoop(Loop):
             busy = busy | self.live(self.addresses[str(live.args[0].attr)], line)
         self.skip_unless(busy, [out.otherwise for out in self.loop.outs])
 
-    def sweep(self) -> None:
+    def write_cells(self) -> None:
         memory, library = self.memory, self.library
-        self.skipped()
+        self.skip_outside_region()
         self.find_starts()
         fields = [i for i, out in enumerate(self.loop.outs) if out.var.type == REAL]
         flags = [i for i, out in enumerate(self.loop.outs) if out.var.type != REAL]
@@ -221,8 +225,8 @@ class CellLoop(Loop):
 
     # Chains of choices
 
-    def lay(self) -> None:
-        """A line of all choices: one choice after the other, each in the chunks in which it holds.
+    def write_choices(self) -> None:
+        """Write a line, one choice after the other, each in the chunks in which it holds.
 
         Operations on the results come last, if the results are not the new fields themselves.
         """
