@@ -9,14 +9,16 @@ import os
 import re
 import signal
 from collections import Counter
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Collection, Generator, Iterable, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
-from itertools import product
+from itertools import cycle
+from math import inf
 from multiprocessing import active_children, get_context, parent_process
 from threading import Thread
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -28,21 +30,18 @@ from powderdsl.model.check import check
 from powderdsl.model.declarations import PackDecl, RulesetDecl
 from powderdsl.model.definitions import set_params
 from powderdsl.model.packs import read_file
-from powderdsl.model.state import slots
-from powderdsl.model.text import one_line
-from powderdsl.model.types import Example, Invariant, Local, Ruleset, Symmetric
+from powderdsl.model.types import Example, Local, Ruleset, Symmetric
 from powderdsl.simulation.programs import starting_backend
 from powderdsl.simulation.simulator import Simulator, compile
 from powderdsl.system.fingerprint import fingerprint
 from powderdsl.system.interrupts import delay_signal
-from powderdsl.testing.generators.cases import Array, Start
 from powderdsl.testing.mutation.mutants import Mutant
 from powderdsl.testing.mutation.operators import mutants_of
 from powderdsl.testing.mutation.written import GENERATED, GeneratedTest, distinguish, written_test
 from powderdsl.testing.pack_tests.runner import run_examples
-from powderdsl.testing.properties.breaks import breaks, find_breaks, is_paired, steps_for
-from powderdsl.testing.properties.running import Runner, State, first_difference, random_samples, run_sample
-from powderdsl.testing.properties.search import STEPS
+from powderdsl.testing.properties.outcomes import Property, Result
+from powderdsl.testing.properties.running import Runner, random_samples
+from powderdsl.testing.properties.search import STEPS, InvariantSearch, SearchPlan
 
 Settings = tuple[tuple[str, str], ...]
 """Parameters and their values as text."""
@@ -56,16 +55,6 @@ def is_generated(example: Example) -> bool:
     return example.name.startswith(GENERATED)
 
 
-@dataclass(frozen=True)
-class Batch:
-    """Start worlds of one shape `without` some elements; `states`: the original's, at the start and after each step."""
-
-    sample: Start
-    steps: int
-    without: frozenset[int]
-    states: list[State]
-
-
 @dataclass(eq=False)
 class Original:
     """A composition, loaded once for all its mutants."""
@@ -76,7 +65,6 @@ class Original:
     declaration: RulesetDecl | None
     ruleset: Ruleset
     warnings: Counter[str]
-    _batches: list[Batch] = field(default_factory=list)
 
     @classmethod
     def of(cls, rules: str, settings: Settings = ()) -> Original:
@@ -128,34 +116,11 @@ class Original:
         return lowered(self.ruleset)
 
     @cached_property
-    def withouts(self) -> tuple[frozenset[int], ...]:
-        """The sets of elements that invariants leave out; the empty one comes first."""
-        return tuple(
-            dict.fromkeys([frozenset[int](), *(invariant.without for invariant in self.ruleset.invariants)])
-        )
-
-    @cached_property
-    def samples(self) -> list[Start]:
-        """The worlds that `powderdsl test` tries first."""
-        return list(random_samples(self.ruleset, 0, WORLDS))
-
-    @cached_property
-    def broken(self) -> list[Invariant]:
-        """Invariants that it breaks itself: what more packs change says nothing about a mutant."""
-        return [
-            invariant
-            for invariant in self.ruleset.invariants
-            if _is_broken(invariant, self, self.sim)
-            or any(_broken_in(batch, self.ruleset, [invariant], batch.states) for batch in self.batches())
-        ]
-
-    def batches(self) -> Iterator[Batch]:
-        """The samples without each set with the original's states, which are kept: the first use runs them."""
-        for place, (number, gone) in enumerate(product(range(len(self.samples)), self.withouts)):
-            if place == len(self._batches):
-                sample, steps = self.samples[number].without(gone, self.ruleset), STEPS[number % len(STEPS)]
-                self._batches.append(Batch(sample, steps, gone, run_sample(self.sim, sample, steps)[0]))
-            yield self._batches[place]
+    def broken(self) -> frozenset[str]:
+        """The words of invariants that it breaks itself: what more packs change says nothing about a mutant."""
+        search = InvariantTrials.on(self.sim)
+        search.try_random()
+        return frozenset(trial.prop.text for trial in search.trials if trial.sample is not None)
 
 
 def warnings_of(diagnostics: tuple[Diagnostic, ...]) -> Counter[str]:
@@ -195,7 +160,7 @@ FEW_STEPS = 20
 """Tests of at most this many steps run before longer ones."""
 
 PAIRED = 6
-"""Batches on which invariants are tried that need more than one run of a world."""
+"""Batches of worlds on which invariants are tried that compare several runs."""
 
 
 @dataclass(frozen=True)
@@ -233,7 +198,7 @@ def judge(original: Original, mutant: Mutant) -> Verdict:
     if failed is None:
         broken = broken_invariant(original, sim)
         if broken is not None:
-            return Verdict("killed", "invariant", one_line(broken.span))
+            return Verdict("killed", "invariant", broken.text)
         sim = compile(ruleset, backend=starting_backend("cpu"))
         failed = failed_test(original, sim, mutant.pack, quick=False)
     if failed is not None:
@@ -269,66 +234,36 @@ def failed_test(original: Original, sim: Simulator, pack: str, *, quick: bool) -
 # Invariants
 
 
-def broken_invariant(original: Original, sim: Simulator) -> Invariant | None:
-    """An invariant of the mutant that some world breaks.
+class InvariantTrials(InvariantSearch):
+    """Tries all invariants of a simulator's rules, proven or not, on the worlds that `powderdsl test` tries first."""
 
-    Worlds that end as in the original are skipped, unless elements have other properties or tags.
-    """
-    ruleset = sim.ruleset
-    alike = _declared(ruleset) == _declared(original.ruleset)
-    broken_before = {invariant.span.text for invariant in original.broken}
-    invariants = [invariant for invariant in ruleset.invariants if invariant.span.text not in broken_before]
-    params = [[param.name for param in rules.params] for rules in (original.ruleset, ruleset)]
-    comparable = slots(original.ruleset) == slots(ruleset) and params[0] == params[1]
-    for batch in original.batches() if invariants and comparable else ():
-        states, _ = run_sample(sim, batch.sample, batch.steps)
-        differs = first_difference(batch.states, states) > 0
-        broken = _broken_in(batch, ruleset, invariants, states, differs if alike else None)
+    few: ClassVar[Mapping[type, int]] = {**InvariantSearch.few, Local: PAIRED, Symmetric: PAIRED}
+
+    @classmethod
+    def on(cls, sim: Simulator, without: Collection[str] = ()) -> Self:
+        """The search, `without` some invariants by their words. What follows from the reach of rules is not tried.
+
+        Nor are mirrors of rules that draw: mirrored worlds may then only be alike in thousands of runs.
+        """
+        ruleset, trials = sim.ruleset, []
+        for prop in map(Property.of, ruleset.invariants):
+            claim = prop.claim
+            holds = isinstance(claim, Local) and horizon(ruleset) <= claim.radius
+            drawn = isinstance(claim, Symmetric) and ruleset.streams
+            if not holds and not drawn and prop.text not in without:
+                trials.append(Result(prop))
+        return cls(Runner(ruleset, sim=sim), SearchPlan(WORLDS, inf), trials)
+
+
+def broken_invariant(original: Original, sim: Simulator) -> Property | None:
+    """An invariant of the mutant that some random world breaks."""
+    search = InvariantTrials.on(sim, original.broken)
+    samples = random_samples(sim.ruleset, search.plan.seed, WORLDS) if search.trials else ()
+    for sample, steps in zip(samples, cycle(STEPS), strict=False):
+        search.try_sample(sample, steps)
+        broken = next((trial.prop for trial in search.trials if trial.sample is not None), None)
         if broken is not None:
             return broken
-    return next((invariant for invariant in invariants if _is_broken(invariant, original, sim)), None)
-
-
-def _declared(ruleset: Ruleset) -> tuple[object, ...]:
-    """Properties and tags of elements: conditions read them, and no world holds them."""
-    return (
-        [(prop.name, prop.values) for prop in ruleset.properties],
-        [(element.name, element.tags) for element in ruleset.elements],
-    )
-
-
-def _is_broken(invariant: Invariant, original: Original, sim: Simulator) -> bool:
-    """True if some world breaks an invariant that compares several runs."""
-    ruleset, claim = sim.ruleset, invariant.claim
-    if not is_paired(claim) or (isinstance(claim, Local) and horizon(ruleset) <= claim.radius):
-        return False
-    if isinstance(claim, Symmetric) and ruleset.streams:
-        return False  # the same draws may be used in another way, and frequencies take thousands of worlds
-    runs = Runner(ruleset, sim=sim)
-    samples = (sample.without(invariant.without, ruleset) for sample in original.samples[:PAIRED])
-    return any(bool(breaks(claim, runs, sample, 1).first.any()) for sample in samples)
-
-
-def _broken_in(
-    batch: Batch,
-    ruleset: Ruleset,
-    invariants: list[Invariant],
-    states: list[State],
-    asked: Array | None = None,
-) -> Invariant | None:
-    """The first of some invariants of one run that a world breaks; only those `asked`, bool [B], if that is given."""
-    sample = batch.sample
-    if asked is not None:
-        sample = sample.select(asked)
-        states = [{name: values[asked] for name, values in state.items()} for state in states]
-    for invariant in invariants if len(sample) else ():
-        fits = invariant.without == batch.without and steps_for(invariant.claim, batch.steps) <= batch.steps
-        if (
-            fits
-            and not is_paired(invariant.claim)
-            and find_breaks(invariant.claim, ruleset, sample, states).first.any()
-        ):
-            return invariant
     return None
 
 

@@ -7,17 +7,15 @@ import re
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain
+from itertools import cycle
 from pathlib import Path
 from textwrap import indent
 
 import numpy as np
 
-from powderdsl.analysis.changes import unchanging_ids
 from powderdsl.diagnostics import Reporter, Source
 from powderdsl.model.composition.names import needs_of
 from powderdsl.model.declarations import PackDecl
-from powderdsl.model.state import fitting
 from powderdsl.model.types import Element, Ruleset
 from powderdsl.simulation.draw import to_numpy
 from powderdsl.simulation.simulator import Simulator, World
@@ -27,13 +25,7 @@ from powderdsl.system.writing import write_text
 from powderdsl.testing.generators.cases import Array, Start
 from powderdsl.testing.mutation.mutants import Mutant
 from powderdsl.testing.pack_tests.runner import ANYTHING, SEEDS, field_rows
-from powderdsl.testing.properties.running import (
-    State,
-    first_difference,
-    frame_worlds,
-    random_samples,
-    run_sample,
-)
+from powderdsl.testing.properties.running import State, first_difference, random_samples, run_sample
 from powderdsl.testing.properties.shrink import Work, shrink_while
 
 GENERATED = "generated "
@@ -184,27 +176,11 @@ def add_tests(path: Path, tests: Sequence[GeneratedTest]) -> None:
     write_text(path, with_tests(Source(str(path), path.read_text(encoding="utf-8")), tests))
 
 
-ROUNDS = (
-    # rows, columns, worlds, steps
-    (3, 3, 1024, 2),
-    (3, 4, 1024, 4),
-    (5, 4, 1024, 8),
-    (2, 2, 512, 4),
-    (1, 6, 512, 6),
-    (6, 6, 1024, 12),
-    (5, 7, 1024, 24),
-    (8, 8, 512, 48),
-)
-"""Batches of worlds that are tried one after the other, small and short ones first."""
+WORLDS = 6144
+"""Random worlds on which a mutant is compared with the original."""
 
-KINDS = (2, 3, 2, 4, 3, 6)
-"""How many elements the worlds of a group are made of."""
-
-FIELDED = 768
-"""Worlds with fields that are not fresh."""
-
-GROUP = 8
-"""Worlds that are made of the same elements."""
+STEPS = (2, 4, 8, 16, 48)
+"""How many steps batches run, one after the other."""
 
 TRIED_SEEDS = 16
 """With how many seeds a smaller world is tried."""
@@ -233,7 +209,7 @@ def distinguish(
     """A small world on which two simulators differ, or None if none was found.
 
     Args:
-        focus: ids of elements that are likely to matter: they are in most of the worlds.
+        focus: ids of elements that are likely to matter: half of the worlds are made of them.
         seed: other worlds for another seed, the same for the same.
     """
     known = {slot.name for slot in second.slots}
@@ -247,12 +223,7 @@ def distinguish(
         return first_difference(*states(sample, steps), compared)
 
     for compared in (names[:1], names):  # the worlds' elements show more than their fields
-        # Worlds whose fields hold anything that they can, with the usual parameters.
-        fielded = (
-            random_samples(first.ruleset, seed, FIELDED) if set(first.slots) == set(second.slots) else ()
-        )
-        plain = ((replace(drawn, params={}, step=np.zeros_like(drawn.step)), 2) for drawn in fielded)
-        for sample, steps in chain(fresh_samples(first.ruleset, focus, seed), plain):
+        for sample, steps in _samples(first, second, focus, seed):
             when = differs(compared, sample, steps)
             if not when.any():
                 continue
@@ -272,22 +243,14 @@ def distinguish(
     return None
 
 
-def fresh_samples(ruleset: Ruleset, focus: Sequence[int], seed: int) -> Iterator[tuple[Start, int]]:
-    """Worlds and how many steps they run, small ones first."""
-    known = np.array([element.id for element in ruleset.elements])
-    frames = sorted(unchanging_ids(ruleset))
-    for number, (least_rows, least_columns, worlds, steps) in enumerate(ROUNDS):
-        rows, columns = fitting(ruleset, least_rows), fitting(ruleset, least_columns)
-        random = np.random.default_rng([seed, number])
-        ids = np.empty((worlds, rows, columns), np.uint8)
-        for group in range(0, worlds, GROUP):
-            kinds = KINDS[group // GROUP % len(KINDS)]
-            palette = random.permutation(known).tolist()
-            if len(focus) and random.random() < 0.8:
-                palette = [*random.permutation(focus).tolist()[: max(1, kinds - 1)], *palette]
-            ids[group : group + GROUP] = random.choice(
-                [*dict.fromkeys(palette)][:kinds], (GROUP, rows, columns)
-            )
-        if frames and min(rows, columns) > 2:
-            ids[worlds // 2 :] = frame_worlds(ids[worlds // 2 :], frames[0])
-        yield Start.fresh(ids).seeded(), steps
+def _samples(
+    first: Simulator, second: Simulator, focus: Sequence[int], seed: int
+) -> Iterator[tuple[Start, int]]:
+    """Worlds with the usual parameters, and how many steps they run. Every other batch is made of `focus` alone."""
+    kinds, same = np.array(focus, np.uint8), set(first.slots) == set(second.slots)
+    batches = zip(random_samples(first.ruleset, seed, WORLDS), cycle(STEPS), strict=False)
+    for number, (sample, steps) in enumerate(batches):
+        sample = replace(sample, params={}, step=np.zeros_like(sample.step))
+        if number % 2 and len(kinds) > 1:
+            sample = replace(sample, ids=kinds[sample.ids % len(kinds)], fields={})
+        yield sample if same else replace(sample, fields={}), steps

@@ -119,7 +119,7 @@ def quick_results(ruleset: Ruleset, ledger: Ledger) -> list[Result]:
 def _concerned(search: InvariantSearch, lines: tuple[RuleLine, ...]) -> list[int]:
     """Ids of the elements that some lines need, change or move."""
     names: set[str] = set()
-    for entry in search.ledger.rules:
+    for entry in search.ledger.rules if search.ledger else ():
         if entry.rule in lines:
             names |= {name for some in entry.needs if len(some) < FEW for name in some}
             names |= {name for pair in entry.changes[:FEW] for name in pair}

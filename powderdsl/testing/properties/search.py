@@ -56,8 +56,8 @@ class InvariantSearch:
 
     runner: Runs
     plan: SearchPlan
-    ledger: Ledger
     trials: list[Result] = field(default_factory=list)
+    ledger: Ledger | None = None
 
     few: ClassVar[Mapping[type, int]] = {Agreement: 2, Alike: 2, Never: 8}
     """Batches for claims that are expensive to check: by the oracle, in many copies, over many steps."""
@@ -77,7 +77,7 @@ class InvariantSearch:
         `ledger`: that of the rules, if it is known already.
         """
         ledger = ledger or make_ledger(runner.ruleset)
-        search = cls(runner, plan, ledger)
+        search = cls(runner, plan, ledger=ledger)
         for prop in properties_of(runner.ruleset, ledger):
             if prop.owner == AUTOMATIC:
                 search.trials += [] if declared_only else [Result(prop)]
