@@ -11,7 +11,7 @@ from dataclasses import MISSING, field
 from powderdsl.diagnostics import Source, Span
 from powderdsl.model.builtins import MAX_SIDE_MULTIPLE
 from powderdsl.model.schema import Entry, Form, Record, keyed
-from powderdsl.syntax.ast import Syntax
+from powderdsl.syntax.parse import Syntax
 from powderdsl.syntax.yaml_tree import Scalar
 
 Pair = tuple[Scalar, Syntax]

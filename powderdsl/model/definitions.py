@@ -33,7 +33,7 @@ from powderdsl.model.types import (
     Tint,
     Value,
 )
-from powderdsl.syntax.ast import Syntax
+from powderdsl.syntax.parse import Syntax
 
 ORDERED = ("int", "flag", "real")
 """Kinds of fields that a color can follow: their values have an order."""

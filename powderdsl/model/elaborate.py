@@ -46,7 +46,7 @@ from powderdsl.model.types import (
     Swap,
     Transform,
 )
-from powderdsl.syntax.ast import Syntax
+from powderdsl.syntax.parse import Syntax
 from powderdsl.system.random import name_number
 
 MAX_MOMENTS = 1000

@@ -37,7 +37,7 @@ from powderdsl.model.types import (
     Total,
     Unchanging,
 )
-from powderdsl.syntax.ast import Syntax
+from powderdsl.syntax.parse import Syntax
 
 MAX_STEPS = 1000
 """Steps in a row that `never … for N steps` may ask for: each test runs them all."""

@@ -20,7 +20,7 @@ from powderdsl.model.declarations import (
     TestDecl,
 )
 from powderdsl.model.schema import E, R, Reader, first_line, keys_of, read_tree
-from powderdsl.syntax.ast import Syntax
+from powderdsl.syntax.parse import Syntax
 from powderdsl.syntax.yaml_tree import Mapping, Node, Scalar, Sequence
 
 SIDES = range(1, 2 * MAX_RADIUS + 2, 2)

@@ -11,8 +11,7 @@ from typing import Any, ClassVar, TypeVar, dataclass_transform, get_args, get_or
 
 from powderdsl.diagnostics import Reporter, Source, Span, suggest
 from powderdsl.diagnostics.printable import look_alikes, shown_character, spell
-from powderdsl.syntax.ast import Syntax
-from powderdsl.syntax.parse import parse_scalar
+from powderdsl.syntax.parse import Syntax, parse_scalar
 from powderdsl.syntax.yaml_tree import Mapping, Node, Scalar, Sequence, parse_yaml
 
 RECORDS: dict[str, type[Record]] = {}

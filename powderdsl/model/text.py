@@ -30,7 +30,7 @@ from powderdsl.model.types import (
     Transform,
     Value,
 )
-from powderdsl.syntax.ast import Syntax
+from powderdsl.syntax.parse import Syntax
 from powderdsl.syntax.yaml_tree import Scalar
 
 _ATOM = 9

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -15,13 +15,34 @@ from lark.utils import TextSlice
 
 from powderdsl.diagnostics import Reporter, Source, Span
 from powderdsl.diagnostics.printable import shown_character
-from powderdsl.syntax.ast import Syntax
 from powderdsl.syntax.hints import CUT, character_help, expected_words, token_help, was_cut
 from powderdsl.syntax.yaml_tree import Node, Scalar
 from powderdsl.system.writing import cache_folder
 
 MAX_LENGTH = 2000
 MAX_DEPTH = 48
+
+
+@dataclass(frozen=True)
+class Syntax:
+    """A node. `kind` is the grammar's rule or alias name; `text` is the token's text of leaves and operators.
+
+    Spans take no part in equality, so trees compare by meaning.
+    """
+
+    kind: str
+    children: tuple[Syntax, ...]
+    text: str
+    span: Span = field(compare=False, repr=False)
+
+    def child(self, kind: str) -> Syntax | None:
+        """The first child of a kind."""
+        return next((child for child in self.children if child.kind == kind), None)
+
+    def dump(self, indent: str = "") -> str:
+        """The tree as indented text, one node a line."""
+        head = f"{indent}{self.kind}" + (f" {self.text}" if self.text else "")
+        return "\n".join([head, *(child.dump(indent + "  ") for child in self.children)])
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from powderdsl.model.schema import Entry, Form, Reader, Record, first_line, keye
 from powderdsl.model.state import slot_name
 from powderdsl.model.types import DIRECTION, Expr, Ruleset
 from powderdsl.syntax import yaml_tree
-from powderdsl.syntax.ast import Syntax
+from powderdsl.syntax.parse import Syntax
 from powderdsl.syntax.yaml_tree import Node, Scalar
 from powderdsl.tasks.drawings import choice_ids, element_ids, limited, line_in, shape_in
 from powderdsl.tasks.goals import GoalChecker, parts_of

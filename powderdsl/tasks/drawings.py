@@ -11,8 +11,7 @@ from powderdsl.diagnostics import CompileError, Reporter, Span, suggest
 from powderdsl.model.schema import Entry, Reader, first_line, keyed
 from powderdsl.model.types import Element, Expr, Ruleset
 from powderdsl.syntax import yaml_tree
-from powderdsl.syntax.ast import Syntax
-from powderdsl.syntax.parse import line_of
+from powderdsl.syntax.parse import Syntax, line_of
 from powderdsl.syntax.sources import path_beside
 from powderdsl.tasks.task import (
     MAX_NUMBER,

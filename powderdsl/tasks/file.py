@@ -17,8 +17,7 @@ from powderdsl.model.schema import NAME_FORM, Entry, Reader, Record, first_line,
 from powderdsl.model.state import fits, size_problem
 from powderdsl.model.types import Ruleset
 from powderdsl.syntax import yaml_tree
-from powderdsl.syntax.ast import Syntax
-from powderdsl.syntax.parse import STATEMENTS, reserved_words
+from powderdsl.syntax.parse import STATEMENTS, Syntax, reserved_words
 from powderdsl.syntax.yaml_tree import Node, Scalar
 from powderdsl.tasks.agents import AgentDecl, read_agent, read_expert
 from powderdsl.tasks.drawings import (

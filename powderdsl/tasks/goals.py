@@ -13,7 +13,7 @@ from powderdsl.model.expressions.symbols import read_number
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.operations import COMPARISONS
 from powderdsl.model.types import FLAG, REAL, Expr
-from powderdsl.syntax.ast import Syntax
+from powderdsl.syntax.parse import Syntax
 from powderdsl.tasks.task import Measure
 
 MEASURES = {

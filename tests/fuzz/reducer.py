@@ -7,8 +7,7 @@ from dataclasses import replace
 from itertools import islice
 
 from powderdsl.diagnostics import Reporter, Source, Span
-from powderdsl.syntax.ast import Syntax
-from powderdsl.syntax.parse import parse_text
+from powderdsl.syntax.parse import Syntax, parse_text
 from powderdsl.syntax.yaml_tree import parse_yaml
 from powderdsl.testing.generators.cases import Start
 from powderdsl.testing.generators.trees import Tree, to_tree, write_yaml

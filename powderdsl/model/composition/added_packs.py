@@ -16,7 +16,7 @@ from powderdsl.model.composition.compose import Composition
 from powderdsl.model.composition.names import listed, words_of
 from powderdsl.model.declarations import PackDecl
 from powderdsl.model.types import ColorRamp
-from powderdsl.syntax.ast import Syntax
+from powderdsl.syntax.parse import Syntax
 
 CODES = ("PD501", "PD502")
 

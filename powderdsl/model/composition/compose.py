@@ -48,8 +48,7 @@ from powderdsl.model.types import (
     substeps,
     writes_of,
 )
-from powderdsl.syntax.ast import Syntax
-from powderdsl.syntax.parse import reserved_words
+from powderdsl.syntax.parse import Syntax, reserved_words
 from powderdsl.syntax.yaml_tree import Scalar
 
 if TYPE_CHECKING:

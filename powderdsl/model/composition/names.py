@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 
 from powderdsl.diagnostics import Label, Reporter, Span, suggest
 from powderdsl.model.declarations import SHARED, Definition, PackDecl, PassDecl, RulesetDecl, TestDecl
-from powderdsl.syntax.ast import Syntax
+from powderdsl.syntax.parse import Syntax
 from powderdsl.syntax.yaml_tree import Mapping as MappingNode
 from powderdsl.syntax.yaml_tree import Node, Scalar
 

@@ -35,8 +35,7 @@ from powderdsl.model.types import (
     Offset,
     integer,
 )
-from powderdsl.syntax.ast import Syntax
-from powderdsl.syntax.parse import parse_text
+from powderdsl.syntax.parse import Syntax, parse_text
 
 if TYPE_CHECKING:
     from powderdsl.model.expressions.typer import Typer

@@ -23,7 +23,7 @@ from powderdsl.model.expressions.operators import Items, Place, SetOf
 from powderdsl.model.operations import FUNCTIONS
 from powderdsl.model.state import SNAP
 from powderdsl.model.types import CHANCE, DIRECTION, ELEMENT, FLAG, Kind, Stream, Value, integer
-from powderdsl.syntax.ast import Syntax
+from powderdsl.syntax.parse import Syntax
 from powderdsl.system.random import name_number
 
 if TYPE_CHECKING:

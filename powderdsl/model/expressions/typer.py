@@ -63,7 +63,7 @@ from powderdsl.model.types import (
     plus,
 )
 from powderdsl.model.types import Value as Constant
-from powderdsl.syntax.ast import Syntax
+from powderdsl.syntax.parse import Syntax
 from powderdsl.syntax.yaml_tree import Scalar
 
 MAX_ROUNDS = 4096

@@ -39,7 +39,7 @@ from powderdsl.model.types import (
     substeps,
     writes_of,
 )
-from powderdsl.syntax.ast import Syntax
+from powderdsl.syntax.parse import Syntax
 
 if TYPE_CHECKING:
     from powderdsl.model.expressions.typer import Typer

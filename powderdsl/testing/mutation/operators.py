@@ -12,8 +12,7 @@ from powderdsl.diagnostics import Reporter, Span
 from powderdsl.model.builtins import DIRECTION_SETS, KERNEL_SHAPES
 from powderdsl.model.declarations import PackDecl
 from powderdsl.syntax import yaml_tree
-from powderdsl.syntax.ast import Syntax
-from powderdsl.syntax.parse import parse_scalar
+from powderdsl.syntax.parse import Syntax, parse_scalar
 from powderdsl.syntax.yaml_tree import Node, Scalar, Sequence, parse_yaml
 from powderdsl.testing.mutation.mutants import (
     Change,

@@ -17,8 +17,7 @@ from powderdsl.model.schema import NAME_FORM, Reader, Record, first_line, keyed,
 from powderdsl.model.state import Slot, slot_name, slots
 from powderdsl.model.types import Ruleset
 from powderdsl.syntax import yaml_tree
-from powderdsl.syntax.ast import Syntax
-from powderdsl.syntax.parse import line_of
+from powderdsl.syntax.parse import Syntax, line_of
 from powderdsl.syntax.sources import read_source
 from powderdsl.system.writing import failure
 from powderdsl.worlds.ascii import ids_by_name

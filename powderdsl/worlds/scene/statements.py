@@ -11,8 +11,7 @@ from dataclasses import dataclass, field, replace
 from powderdsl.diagnostics import Reporter, Span, suggest
 from powderdsl.model.operations import OPERATIONS
 from powderdsl.model.types import Expr, integer
-from powderdsl.syntax.ast import Syntax
-from powderdsl.syntax.parse import parse_text
+from powderdsl.syntax.parse import Syntax, parse_text
 from powderdsl.syntax.yaml_tree import Scalar
 from powderdsl.worlds.raster import MAX_COORDINATE
 
