@@ -339,10 +339,11 @@ class Simulator:
 
         Raises:
             KeyError: an unknown field.
-            TypeError: a wrong dtype.
+            TypeError: a wrong dtype; worlds whose arrays are of another kind.
             ValueError: a wrong shape, integers out of range, NaN or infinity, a value where the element cannot hold
-                one, or a property that no rule changes.
+                one, a property that no rule changes, or worlds of other rules.
         """
+        self.check(world)
         state, xp = dict(world.state), self.kind.xp
         new_ids = fields.pop("ids", fields.pop("element", None))
         if new_ids is not None:
@@ -498,8 +499,9 @@ class Simulator:
     def profile(self, world: World, steps: int = 1) -> dict[str, float]:
         """The seconds that each pass takes over some steps, in order; empty if the backend cannot measure passes.
 
-        Native code counts processor time on one thread. Raises ValueError if `steps` is not an integer of 0 or more.
+        Native code counts processor time on one thread. Raises TypeError and ValueError as `step` does.
         """
+        self.check(world)
         timing, params = PassClock(self.device), self._defaults(len(world))
         clock = Clock(world.seed, world.index, world.start, world.since)
         self._program.run(Job(world.state, clock, _step_count(steps), params, {}, None, timing=timing))

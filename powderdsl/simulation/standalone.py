@@ -45,13 +45,13 @@ def standalone_module(ruleset: Ruleset, size: tuple[int, int], memo: Memo | None
     `memo` is as in `powderdsl.compile`.
 
     Raises:
-        CompileError: PD607 if the world is too large or its sides do not fit the rules, PD702 if the rules have a pass
+        CompileError: PD607 if the world is empty or too large, or its sides do not fit the rules, PD702 if the rules have a pass
             that WebAssembly cannot run.
     """
     if not fits(ruleset, size):
         raise failure("PD607", size_problem(ruleset, size))
-    if size[0] * size[1] > MAX_CELLS:
-        helps = (f"a module holds at most {MAX_CELLS:,} cells",)
+    if min(size) < 1 or size[0] * size[1] > MAX_CELLS:
+        helps = (f"a module holds 1 to {MAX_CELLS:,} cells",)
         raise failure("PD607", f"a world of {size[0]}×{size[1]} cells", helps=helps)
     program = lower(ruleset, memo)
     segments = parts(program, memo)

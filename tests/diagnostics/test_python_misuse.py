@@ -27,8 +27,8 @@ def simulator() -> Any:
 
 
 @cache
-def simulator_of(library: str) -> Any:
-    ruleset = powderdsl.load("powderworld")
+def simulator_of(library: str, rules: str = "powderworld") -> Any:
+    ruleset = powderdsl.load(rules)
     if library == "arrays":
         return Simulator(ruleset, backend="reference", tensors=False)
     return powderdsl.compile(ruleset, backend="reference")
@@ -41,6 +41,10 @@ def world() -> Any:
 @cache
 def world_of(library: str) -> Any:
     return simulator_of(library).world(np.zeros(SHAPE, np.uint8))
+
+
+def life() -> Any:
+    return simulator_of(LIBRARY[0], "life").world(np.zeros(SHAPE, np.uint8))
 
 
 @pytest.fixture(params=["torch", "arrays"])
@@ -118,6 +122,8 @@ ROWS: list[tuple[str, Callable[[], Any], type[Exception], str]] = [
     ("a clone where none can be", replace(clone=full(2)), ValueError, "clone can only differ"),
     ("gravity where it is fixed", replace(gravity=full(0)), ValueError, "gravity can only differ"),
     ("a density", replace(density=full(0)), ValueError, "`density` follows from the element"),
+    ("ids of other rules", lambda: simulator().replace(life(), ids=0), ValueError, "belongs to life"),
+    ("the time of other rules", lambda: simulator().profile(life()), ValueError, "belongs to life"),
     ("an unknown element", paint(element="snd"), KeyError, "did you mean `sand`?"),
     ("a mask of numbers", paint(where=full(1.0, 4, 5), element="sand"), TypeError, "where"),
     ("a mask of another size", paint(where=full(True, 4, 6), element="sand"), ValueError, "where"),

@@ -240,6 +240,8 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CompileError, match="heavy does not fit into WebAssembly") as found:
         standalone_module(spread("heavy"), (8, 8))
     assert "heavy.yaml:" in str(found.value)
+    with pytest.raises(CompileError, match="a world of 0×64 cells"):
+        standalone_module(load("life"), (0, 64))
     out, pack = str(tmp_path / "world.wasm"), tmp_path / "holders.yaml"
     pack.write_text(HOLDERS.replace("pack: holders", "pack: holders\nside_multiple: 2"))
     for given, words in (
