@@ -21,6 +21,7 @@ def listed(names: tuple[str, ...]) -> str:
     return f"{', '.join(names[:-1])} and {names[-1]}"
 
 
+@pytest.mark.slow
 def test_every_target_is_compared_unless_some_are_named(tmp_path: Path) -> None:
     skip_without_compiler()
     given = ("fuzz", "--jobs", 1, "--worlds", 1, "--steps", 1, "--seeds", "0..1", "--save", tmp_path)
@@ -38,6 +39,7 @@ def test_damaged_files(tmp_path: Path) -> None:
     assert "no problems found" in result.stdout
 
 
+@pytest.mark.slow
 def test_a_wrong_backend_is_found_reduced_and_replayed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

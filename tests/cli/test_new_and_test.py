@@ -172,6 +172,7 @@ def test_no_tests_are_no_failure(folder):
     powderdsl("test", "life", exits=0)
 
 
+@pytest.mark.slow
 def test_the_tests_in_the_shipped_packs_pass():
     powderdsl("test", "powderworld", "--examples", "100", exits=0)
 

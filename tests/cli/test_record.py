@@ -91,6 +91,7 @@ def recording(task: Path, out: Path) -> Iterator[subprocess.Popen[str]]:
         yield running
 
 
+@pytest.mark.slow
 def test_killed_and_interrupted_recordings_go_on(task: Path, tmp_path: Path) -> None:
     """Ctrl-C, SIGKILL at several substeps, then what is left: the same bytes as without any of it."""
     out, other = tmp_path / "data", tmp_path / "other"

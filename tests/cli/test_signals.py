@@ -21,7 +21,7 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-@pytest.mark.parametrize("name", tiered(COMMANDS, ["video", "compile", "train", "wm train", "fuzz"]))
+@pytest.mark.parametrize("name", tiered(COMMANDS, ["video", "train"]))
 def test_sigterm_ends_a_command_cleanly(name: str, tmp_path: Path) -> None:
     if name == "video":
         pytest.importorskip("imageio_ffmpeg")
@@ -40,7 +40,7 @@ def test_sigterm_ends_a_command_cleanly(name: str, tmp_path: Path) -> None:
         assert place.checkpoint_steps()
 
 
-@pytest.mark.parametrize("name", tiered(["video", "fuzz", "mutate", "wm train"], ["video", "mutate"]))
+@pytest.mark.parametrize("name", tiered(["video", "fuzz", "mutate", "wm train"], ["video"]))
 def test_after_sigkill_nothing_runs_on_and_the_next_command_works(name: str, tmp_path: Path) -> None:
     if name == "video":
         pytest.importorskip("imageio_ffmpeg")

@@ -96,6 +96,7 @@ def run(*words: str) -> str:
     return str(powderdsl(*words, exits=0).stdout)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", tiered(PACKS, ["crab"]))
 def test_a_pack_of_each_kind_goes_through_every_command(name: str) -> None:
     file = f"{name}.yaml"
@@ -120,6 +121,7 @@ def test_a_pack_of_each_kind_goes_through_every_command(name: str) -> None:
     assert palettes[0][14:] == added
 
 
+@pytest.mark.slow
 def test_two_packs_with_one_id_and_one_that_has_no_room(tmp_path: Path) -> None:
     Path("ooze.yaml").write_text(ELEMENT.replace("slime", "ooze"))
     shown = json.loads(run("show", "powderworld+slime.yaml+ooze.yaml", "--json"))

@@ -168,6 +168,7 @@ def test_workers_share_the_minibatches(
 
 # A loader that is left early ends its workers while their queues still hold tensors. Python 3.11 then ends the queue's
 # thread inside torch's C++ code, which aborts the worker, and the loader reports that when it is collected.
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*_MultiProcessingDataLoaderIter:pytest.PytestUnraisableExceptionWarning")
 def test_workers_that_are_spawned_get_the_same(recorded: Dataset) -> None:
     rows = Transitions(recorded)

@@ -20,14 +20,14 @@ from tests.fuzz.damage import (
 )
 from tests.tiers import tiered
 
-SMOKE = 50
+SMOKE = 20
 EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "2000"))
 """Examples of each kind in the smoke test and in the campaign."""
 
 FEWER = {"heavy": 10, "text": 3, "random rules": 3}
 """Kinds that take long, or many choices: so many times fewer examples."""
 
-SEEDS = 200
+SEEDS = 60
 
 
 @pytest.mark.parametrize("examples", tiered((SMOKE, EXAMPLES), [SMOKE]))

@@ -85,6 +85,7 @@ def test_behavior_cloning_imitates_on_worlds_it_has_not_seen(
     assert f"{found['clone']:.2f}" in printed
 
 
+@pytest.mark.slow
 def test_ppo_rises_above_random_play(torch: Any, task: Path, tmp_path: Path) -> None:
     out = tmp_path / "curve.csv"
     options = ["--steps", "6000", "--envs", "16", "--rollout", "16", "--batch", "64", "--lr", "0.003"]
@@ -96,6 +97,7 @@ def test_ppo_rises_above_random_play(torch: Any, task: Path, tmp_path: Path) -> 
     assert curve[-1]["return"] > curve[0]["return"]
 
 
+@pytest.mark.slow
 def test_iql_plays_better_than_its_data(torch: Any, task: Path, tmp_path: Path) -> None:
     record(str(task), "random", "random", episodes=200, backend="wasm")
     record(str(task), "expert", "expert", episodes=20, backend="wasm")
@@ -106,6 +108,7 @@ def test_iql_plays_better_than_its_data(torch: Any, task: Path, tmp_path: Path) 
     assert rows_of(out)[-1]["update"] == 250
 
 
+@pytest.mark.slow
 def test_goals_help_to_predict_actions(torch: Any, tmp_path: Path) -> None:
     level = find_level("easy")
     collect(LevelProgram(level, backend="wasm"), tmp_path, episodes=2, validation=1)
@@ -120,6 +123,7 @@ def test_goals_help_to_predict_actions(torch: Any, tmp_path: Path) -> None:
     assert curve[-1]["held_out_loss"] < 1.9  # of the frequencies of actions alone it would be 1.94
 
 
+@pytest.mark.slow
 def test_the_notebook_runs_from_top_to_bottom(torch: Any, capsys: pytest.CaptureFixture[str]) -> None:
     notebook = json.loads((EXAMPLES / "tour.ipynb").read_text(encoding="utf-8"))
     cells = [one for one in notebook["cells"] if one["cell_type"] == "code"]

@@ -9,7 +9,7 @@ import pytest
 
 from powderdsl.targets.cpp.build import Building
 from tests.compilers import skip_without_compiler
-from tests.fuzz import COMPARED
+from tests.fuzz import COMPARED, COMPILED
 from tests.fuzz.cases import read_case
 from tests.fuzz.differential import check_case
 
@@ -21,7 +21,8 @@ def cases() -> list:
     found = []
     for path in FILES:
         for backend in COMPARED:
-            found.append(pytest.param(path, backend, id=f"{path.stem}-{backend}"))
+            marks = [pytest.mark.slow] if backend in COMPILED else []
+            found.append(pytest.param(path, backend, id=f"{path.stem}-{backend}", marks=marks))
     return found
 
 

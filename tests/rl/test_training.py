@@ -93,6 +93,7 @@ train(from_json(json.loads(sys.argv[2])), sys.argv[1], progress=lambda step, mea
 """
 
 
+@pytest.mark.slow
 def test_a_run_that_is_killed_ends_as_if_it_had_not_been(task: Path, tmp_path: Path) -> None:
     config, chance = quick(task, steps=640), random.Random(3)
     folder, gone_on = tmp_path / "killed", []

@@ -62,6 +62,7 @@ def test_packs_hold_their_tests_alone(rules: str) -> None:
     assert failures(loaded, loaded.packs[-1]) == []
 
 
+@pytest.mark.slow
 def test_packs_and_examples_hold_their_tests_together() -> None:
     rules = powderdsl.load("powderworld", *(EXAMPLES / f"{name}.yaml" for name in NAMES))
     assert rules.packs[-len(NAMES) :] == tuple(NAMES)

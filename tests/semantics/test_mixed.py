@@ -20,6 +20,7 @@ from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.compilers import skip_without_compiler
 from tests.fuzz.compare import assert_same, find_difference
+from tests.tiers import tiered
 
 ROWS = "\n".join("      - " + " ".join(str(1 + (5 * i + 3 * j) % 7) for j in range(21)) for i in range(21))
 
@@ -78,7 +79,7 @@ def test_a_pass_of_too_many_gates_runs_on_cells() -> None:
     assert [any(slot.resets for slot in part.program.slots) for part in parts] == [True, False, False]
 
 
-@pytest.mark.parametrize("backend", ["native", "wasm"])
+@pytest.mark.parametrize("backend", tiered(["native", "wasm"], ["wasm"]))
 def test_the_oracles_worlds(backend: str) -> None:
     """Two backends on rules of which one pass runs on cells, against the oracle, over steps taken one at a time."""
     rules = spread("heavy")
@@ -88,7 +89,7 @@ def test_the_oracles_worlds(backend: str) -> None:
         assert_same(rules, random_start(rules, Choices.seeded(number), shape), steps=3, simulators=sims)
 
 
-@pytest.mark.parametrize("name", ["powderworld", "heavy"])
+@pytest.mark.parametrize("name", tiered(["powderworld", "heavy"], ["heavy"]))
 def test_any_passes_on_cells(name: str, torch) -> None:  # type: ignore[no-untyped-def]
     """Whichever passes are kept from planes: several steps at once, with given draws, with chosen passes."""
     rules = spread(name)

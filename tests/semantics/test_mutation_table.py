@@ -104,6 +104,7 @@ def test_invariants_about_properties_and_tags_are_asked_where_no_world_differs(t
     assert broken.span.text == claim
 
 
+@pytest.mark.slow
 def test_several_processes_change_no_outcome():
     numbers = [0, 7, 14, 21, 28]
     alone = dict(run_campaign("wireworld", (), numbers, jobs=1, seed=0))

@@ -14,11 +14,17 @@ MAX_CELLS, MAX_STEPS = 9, 2
 """How large a world that shows a mistake may be."""
 
 
-def named(found: list[Mutation]) -> list:  # type: ignore[type-arg]
-    return [pytest.param(one, id=f"{one.pack}: {one.mistake}") for one in found]
+def named(rows: list[Mutation]) -> list:  # type: ignore[type-arg]
+    """Parameters: all mistakes in `make test-all`, and those in one pack in `make test`."""
+    return [
+        pytest.param(
+            row, id=f"{row.pack}: {row.mistake}", marks=[] if row.pack == "water" else pytest.mark.slow
+        )
+        for row in rows
+    ]
 
 
-@pytest.mark.parametrize("mutation", named([one for one in ALL if one.check]))
+@pytest.mark.parametrize("mutation", named([row for row in ALL if row.check]))
 def test_the_checker_notices(mutation: Mutation, tmp_path: Path) -> None:
     caught = try_mutation(mutation, tmp_path)
     assert mutation.check.partition(":")[0] in caught.codes
@@ -28,7 +34,7 @@ def test_the_checker_notices(mutation: Mutation, tmp_path: Path) -> None:
         assert steps <= MAX_STEPS
 
 
-@pytest.mark.parametrize("mutation", named([one for one in ALL if one.test]))
+@pytest.mark.parametrize("mutation", named([row for row in ALL if row.test]))
 def test_worlds_show(mutation: Mutation, tmp_path: Path) -> None:
     caught = try_mutation(mutation, tmp_path)
     assert caught.codes == ()

@@ -58,7 +58,7 @@ def assert_equal(first: World, second: World) -> None:
     assert difference is None, f"{difference}\n{first.sim.ruleset.name}"
 
 
-CASES = [("wasm", range(12)), ("torch", range(30, 36)), ("reference", range(45, 48))]
+CASES = [("wasm", range(6)), ("torch", range(30, 33)), ("reference", range(45, 47))]
 
 
 # Batches and steps
@@ -207,7 +207,7 @@ def cells(world: World, names: list[str]) -> list[list[tuple[float, ...]]]:
 # Ranges
 
 
-@pytest.mark.parametrize(("backend", "seeds"), [("wasm", range(200, 220)), ("reference", range(260, 264))])
+@pytest.mark.parametrize(("backend", "seeds"), [("wasm", range(200, 210)), ("reference", range(260, 262))])
 def test_every_value_is_one_that_was_declared(backend: str, seeds: range) -> None:
     for number, simulator in enumerate(simulators(ANYTHING, seeds, backend)):
         ruleset = simulator.ruleset

@@ -52,14 +52,16 @@ def assert_alike(
     return written
 
 
-@pytest.mark.parametrize("name", tiered(compositions(), ["core", "core2", "core+bird", *WHOLE]))
+@pytest.mark.parametrize("name", tiered(compositions(), ["core+bird", "langtons_ant"]))
 def test_shipped_rules_on_all_backends(name):
     ruleset = load(name)
     # Of empty space and walls alone nothing moves.
     assert (assert_alike(ruleset, SHAPES, 1) == 0) == (name in ("core", "core2", "core+bird"))
 
 
-@pytest.mark.parametrize("name", ["powderworld", "langtons_ant", "cyclic"])
+@pytest.mark.parametrize(
+    "name", tiered(["powderworld", "langtons_ant", "cyclic"], ["langtons_ant", "cyclic"])
+)
 def test_the_writers_of_shipped_rules_are_those_of_the_trace(name):
     assert_traced_alike(load(name))
 

@@ -61,6 +61,7 @@ def level(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> st
     return name
 
 
+@pytest.mark.slow
 def test_worlds_do_not_depend_on_vectors(level: str, tmp_path: Path) -> None:
     shipped, drawn = load("core+sand+water+wind"), load_text(random_ruleset_text(61), "seed61.yaml")
     assert any(one.replace("_", "-") == f"-march={level}" for one in flags_for(find_compiler(), "-O0"))

@@ -108,6 +108,7 @@ def test_where_no_cluster_is_the_user_is_told_at_once(address: str, folder: Path
     assert not (folder / "studies").exists()
 
 
+@pytest.mark.slow
 @needs_ray
 @needs_proc
 def test_a_cluster_runs_a_study_and_sigterm_ends_one(tmp_path: Path) -> None:

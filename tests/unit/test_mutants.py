@@ -117,7 +117,9 @@ def test_mutants_differ_and_each_says_where():
 
 
 @pytest.mark.parametrize("every", tiered([1, 10], [10]))
-@pytest.mark.parametrize("rules", sorted(set(shipped_tests()) - shipped_variants()))
+@pytest.mark.parametrize(
+    "rules", tiered(sorted(set(shipped_tests()) - shipped_variants()), ["life", "powderworld"])
+)
 def test_shipped_mutants_are_rule_files(rules, every):
     packs, _ = read([rules], Reporter())
     for pack in packs:

@@ -37,6 +37,7 @@ def test_metadata_asks_only_for_pure_packages(wheel: Path) -> None:
         assert set(needed_in_pyodide(written.requires)) == PACKAGES
 
 
+@pytest.mark.slow
 def test_the_same_code_and_worlds(wheel: Path, tmp_path: Path, torch) -> None:  # type: ignore[no-untyped-def]
     node = shutil.which("node")
     if node is None or not (HERE / "node_modules" / "pyodide").is_dir():

@@ -147,6 +147,7 @@ train(config, sys.argv[2], machine=Machine(backend="torch"), save_seconds=0.1, t
 """
 
 
+@pytest.mark.slow
 def test_a_killed_run_ends_with_the_same_weights(dunes: str, tmp_path: Path) -> None:
     config = tiny(dunes, iterations=100)
     folder = tmp_path / "killed"
