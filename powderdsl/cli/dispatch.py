@@ -84,9 +84,9 @@ class CommandGroup(GuardedCommand, click.Group):
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command:
         if cmd_name not in COMMANDS:
-            from powderdsl.diagnostics import suggest
+            from powderdsl.diagnostics import with_suggestion
 
-            ctx.fail("; ".join([f"no command `{cmd_name}`", *suggest(cmd_name, COMMANDS, "commands")]))
+            ctx.fail(with_suggestion(f"no command `{cmd_name}`", cmd_name, COMMANDS, "commands"))
         command: click.Command = import_module(f"powderdsl.cli.commands.{cmd_name}").command
         return command
 

@@ -251,14 +251,15 @@ class Transitions(torch.utils.data.Dataset[Batch]):
         self.datasets = (data,) if isinstance(data, Dataset) else tuple(data)
         if not self.datasets:
             raise ValueError("Transitions needs at least one dataset")
-        for one in self.datasets[1:]:
-            one.require_equal(self.datasets[0].recipe, MEANING, self.datasets[0].folder)
+        first, *others = self.datasets
+        for other in others:
+            other.require_equal(first.recipe, MEANING, first.folder)
         if length is not None:
             check_count("length", length, max(dataset.recipe.actions for dataset in self.datasets))
         self.length = length
         parts = []
-        for number, one in enumerate(self.datasets):
-            lengths, worlds = one.lengths_and_worlds()
+        for number, dataset in enumerate(self.datasets):
+            lengths, worlds = dataset.lengths_and_worlds()
             parts.append((np.full(len(lengths), number), np.arange(len(lengths)), worlds, lengths))
         self._select(_Episodes(*map(np.concatenate, zip(*parts, strict=True))))
         if not len(self):

@@ -1,7 +1,16 @@
 """Diagnostics: the mistake, its place, and the fix. Used by every stage; depends on nothing."""
 
 from powderdsl.diagnostics.codes import CODES, Code, Severity
-from powderdsl.diagnostics.diagnostic import CompileError, Diagnostic, Label, Reporter, Source, Span, suggest
+from powderdsl.diagnostics.diagnostic import (
+    CompileError,
+    Diagnostic,
+    Label,
+    Reporter,
+    Source,
+    Span,
+    suggest,
+    with_suggestion,
+)
 
 __all__ = [
     "CODES",
@@ -14,4 +23,5 @@ __all__ = [
     "Source",
     "Span",
     "suggest",
+    "with_suggestion",
 ]

@@ -289,3 +289,8 @@ def suggest(word: str, candidates: Iterable[str], kind: str = "") -> tuple[str, 
         names = ", ".join(f"`{name}`" for name in known)
         return (f"{kind or 'known here'}: {names}",)
     return ()
+
+
+def with_suggestion(message: str, word: str, candidates: Iterable[str], kind: str = "") -> str:
+    """A message about an unknown word in one line, followed by the help of `suggest` if there is any."""
+    return "; ".join([message, *suggest(word, candidates, kind)])

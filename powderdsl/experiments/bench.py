@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from powderdsl.analysis.changes import moved_ids
 from powderdsl.compiler import BACKENDS
-from powderdsl.diagnostics import suggest
+from powderdsl.diagnostics import with_suggestion
 from powderdsl.model.state import check_sides
 from powderdsl.model.types import Element, Field, Ruleset
 from powderdsl.system.reports import table
@@ -116,7 +116,7 @@ class Plan:
         known = [element.name for element in self.ruleset.elements]
         for name in self.only:
             if self.ruleset.element(name) is None:
-                raise ValueError("; ".join([f"no element `{name}`", *suggest(name, known, "elements")]))
+                raise ValueError(with_suggestion(f"no element `{name}`", name, known, "elements"))
 
     @cached_property
     def cells(self) -> tuple[Cell, ...]:

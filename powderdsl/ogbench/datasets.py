@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from powderdsl.diagnostics import suggest
+from powderdsl.diagnostics import with_suggestion
 from powderdsl.ogbench.levels import shipped_levels
 from powderdsl.system.archives import BadArchive, open_archive
 
@@ -61,8 +61,8 @@ def make_env_and_datasets(
     named = re.fullmatch(rf"{FAMILY}-({'|'.join(levels)})-[^-]+-{VERSION}", dataset_name)
     if named is None:
         known = [f"{FAMILY}-{name}-play-{VERSION}" for name in levels]
-        helps = suggest(dataset_name, known, "data sets")
-        raise ValueError("; ".join([f"no data set named {dataset_name!r}", *helps]))
+        message = f"no data set named {dataset_name!r}"
+        raise ValueError(with_suggestion(message, dataset_name, known, "data sets"))
     level = named[1]
     env = None
     if env_only or not dataset_only:

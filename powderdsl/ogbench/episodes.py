@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from powderdsl.compiler import load, lower
-from powderdsl.diagnostics import suggest
+from powderdsl.diagnostics import with_suggestion
 from powderdsl.model.types import Ruleset
 from powderdsl.ogbench.levels import GoalTask, Level, read_task
 from powderdsl.simulation.draw import palette
@@ -125,8 +125,8 @@ class LevelProgram:
 def _number(ruleset: Ruleset, name: str) -> int:
     element = ruleset.element(name)
     if element is None:
-        helps = suggest(name, [one.name for one in ruleset.elements], "elements")
-        raise ValueError("; ".join([f"no element {name!r} in {ruleset.name}", *helps]))
+        names = [element.name for element in ruleset.elements]
+        raise ValueError(with_suggestion(f"no element {name!r} in {ruleset.name}", name, names, "elements"))
     return element.id
 
 

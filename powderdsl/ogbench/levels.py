@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-from powderdsl.diagnostics import suggest
+from powderdsl.diagnostics import with_suggestion
 from powderdsl.system.reading import is_path, parse_json, read_bytes
 from powderdsl.system.settings import Limits, checked_record
 
@@ -102,8 +102,8 @@ class Level:
         triples = []
         for at, (element, x, y) in enumerate(task.actions):
             if element not in self.elements:
-                helps = "; ".join(suggest(element, self.elements, "elements here"))
-                raise ValueError(f"action {at} of `{task.name}`: no element {element!r} to paint; {helps}")
+                message = f"action {at} of `{task.name}`: no element {element!r} to paint"
+                raise ValueError(with_suggestion(message, element, self.elements, "elements here"))
             if not (0 <= x < self.places and 0 <= y < self.places):
                 most = self.places - 1
                 raise ValueError(
@@ -127,8 +127,8 @@ def find_level(level: str | Path | Level) -> Level:
         return read_level(Path(level))
     path = FOLDER / f"{level}.json"
     if not path.is_file():
-        helps = suggest(level, [path.stem for path in sorted(FOLDER.glob("*.json"))], "levels")
-        raise ValueError("; ".join([f"no level {level!r}", *helps]))
+        known = [path.stem for path in FOLDER.glob("*.json")]
+        raise ValueError(with_suggestion(f"no level {level!r}", level, known, "levels"))
     return read_level(path)
 
 

@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from powderdsl.compiler import BACKENDS
-from powderdsl.diagnostics import CompileError, Diagnostic, Label, suggest
+from powderdsl.diagnostics import CompileError, Diagnostic, Label, with_suggestion
 from powderdsl.system.settings import read_record, setting
 from powderdsl.tasks.shipped import check_split
 
@@ -160,7 +160,7 @@ def preset(name: str, task: str, **changes: Any) -> TrainConfig:
     """
     problems = []
     if name not in PRESETS:
-        problems.append("; ".join([f"there is no preset `{name}`", *suggest(str(name), PRESETS, "presets")]))
+        problems.append(with_suggestion(f"there is no preset `{name}`", name, PRESETS, "presets"))
     values = {"task": task, **PRESETS.get(name, {}), **changes}
     # The usual observation depends on the network.
     if "observation" not in changes and changes.get("network") in USUAL_OBSERVATION:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from powderdsl.diagnostics import suggest
+from powderdsl.diagnostics import with_suggestion
 from powderdsl.model.state import SNAP, Slot, slots, stored_range
 from powderdsl.model.types import Param, Ruleset
 from powderdsl.targets.array_kind import Array, ArrayKind
@@ -23,14 +23,14 @@ def check_mapping(name: str, value: Any) -> Mapping[str, Any]:
 
 def unknown_name(kind: str, name: str, known: Iterable[str], kinds: str = "") -> KeyError:
     """The error for an unknown name, with the nearest names."""
-    return KeyError(f"no {kind} `{name}`; {'; '.join(suggest(name, known, kinds or f'{kind}s'))}")
+    return KeyError(with_suggestion(f"no {kind} `{name}`", name, known, kinds or f"{kind}s"))
 
 
 def unknown_slot(ruleset: Ruleset, name: str) -> KeyError:
     """The error for a name that is neither a field nor a property."""
     known = [*(slot.name for slot in slots(ruleset)), *(prop.name for prop in ruleset.properties)]
     return KeyError(
-        f"{ruleset.name} has no field or property `{name}`; {'; '.join(suggest(name, known, 'it has'))}"
+        with_suggestion(f"{ruleset.name} has no field or property `{name}`", name, known, "it has")
     )
 
 

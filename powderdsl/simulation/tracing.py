@@ -17,7 +17,7 @@ from math import isfinite
 from typing import Any
 
 from powderdsl.arrays import np
-from powderdsl.diagnostics import Label, Span, suggest
+from powderdsl.diagnostics import Label, Span, with_suggestion
 from powderdsl.diagnostics.diagnostic import source_lines
 from powderdsl.diagnostics.printable import printable
 from powderdsl.model import reference
@@ -443,7 +443,7 @@ def _slots(world: World, names: Iterable[str] | None) -> dict[str, Slot]:
         if name not in known and ruleset.property(name) is not None:
             raise KeyError(f"`{name}` follows from the element: ask for `element`")
         if name not in known:
-            raise KeyError("; ".join([f"no field `{name}`", *suggest(name, known, "fields")]))
+            raise KeyError(with_suggestion(f"no field `{name}`", name, known, "fields"))
     return {name: known[name] for name in wanted}
 
 

@@ -16,7 +16,7 @@ from operator import index
 from types import NoneType, UnionType
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
-from powderdsl.diagnostics import suggest
+from powderdsl.diagnostics import with_suggestion
 
 Record = TypeVar("Record")
 
@@ -107,8 +107,7 @@ def read_record(kind: type[Record], data: Any, problems: list[str], path: str = 
         elif required:
             problems.append(f"`{start}{name}` is missing")
     for key in sorted(str(key) for key in data if key not in declared):
-        helps = suggest(key, declared, "keys here")
-        problems.append("; ".join([f"unknown key `{start}{key[:80]}`", *helps]))
+        problems.append(with_suggestion(f"unknown key `{start}{key[:80]}`", key, declared, "keys here"))
     return None if len(problems) > before else kind(**values)
 
 

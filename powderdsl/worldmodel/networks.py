@@ -103,14 +103,14 @@ class UNet(nn.Module):
     def __init__(self, slots: int, width: int = 32, channels: int | None = None):
         super().__init__()
         self.slots, self.width = slots, width
-        one, two, four = width, 2 * width, 4 * width
-        self.down_1, self.down_2 = _block(channels or slots, one), _block(one, two)
-        self.middle = _block(two, four)
+        double, quadruple = 2 * width, 4 * width
+        self.down_1, self.down_2 = _block(channels or slots, width), _block(width, double)
+        self.middle = _block(double, quadruple)
         self.pool = nn.MaxPool2d(2)
-        self.up_2 = nn.ConvTranspose2d(four, two, 2, stride=2)
-        self.up_1 = nn.ConvTranspose2d(two, one, 2, stride=2)
-        self.back_2, self.back_1 = _block(2 * two, two), _block(2 * one, one)
-        self.head = nn.Conv2d(one, slots, 1)
+        self.up_2 = nn.ConvTranspose2d(quadruple, double, 2, stride=2)
+        self.up_1 = nn.ConvTranspose2d(double, width, 2, stride=2)
+        self.back_2, self.back_1 = _block(quadruple, double), _block(double, width)
+        self.head = nn.Conv2d(width, slots, 1)
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, inputs: Tensor) -> Tensor:

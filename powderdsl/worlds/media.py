@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from itertools import chain
 from pathlib import Path
@@ -43,12 +43,13 @@ def write_gif(path: str | Path, frames: Iterable[Any], *, fps: float = 30) -> No
 
     Raises:
         CompileError: PD612 if NumPy or Pillow is not installed, PD613 if the file cannot be written.
+        ValueError: there is no frame.
     """
     delay = max(round(100 / fps) * 10, MIN_GIF_DELAY)  # GIF counts hundredths of a second
     require("numpy", "writing an animation", "pip install numpy")
     module = require("PIL.Image", "writing an animation", "pip install pillow")
     images = (_indexed(module, to_numpy(frame)) for frame in frames)
-    first = next(images)
+    first = _first(images)
     with replacing(Path(path), follow=True) as temporary:
         first.save(
             temporary, "GIF", save_all=True, append_images=images, duration=delay, optimize=False, loop=0
@@ -64,16 +65,24 @@ def write_mp4(path: str | Path, frames: Iterable[Any], *, fps: float = 30) -> No
 
     Raises:
         CompileError: PD612 if imageio-ffmpeg is not installed, PD613 with the encoder's own words if it fails.
+        ValueError: there is no frame.
     """
     helps = ("pip install 'powderdsl[video]'", "or write a .gif, which needs nothing")
     ffmpeg = require("imageio_ffmpeg", "writing MP4", *helps).get_ffmpeg_exe()
     pictures = (_even(to_numpy(frame)) for frame in frames)
-    first = next(pictures)
+    first = _first(pictures)
     size = f"{first.shape[1]}x{first.shape[0]}"
     command = [ffmpeg, "-v", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"]
     command += ["-s", size, "-r", str(fps), "-i", "-", *_ENCODING.split()]
     with replacing(Path(path), follow=True) as temporary:
         _encode([*command, str(temporary)], chain([first], pictures))
+
+
+def _first(pictures: Iterator[Any]) -> Any:
+    """The first picture of an animation. Raises ValueError if there is none."""
+    for picture in pictures:
+        return picture
+    raise ValueError("an animation needs at least one frame")
 
 
 _ENCODING = (

@@ -125,6 +125,7 @@ ROWS: list[tuple[str, Callable[[], Any], type[Exception], str]] = [
     ("ids of other rules", lambda: simulator().replace(life(), ids=0), ValueError, "belongs to life"),
     ("the time of other rules", lambda: simulator().profile(life()), ValueError, "belongs to life"),
     ("an unknown element", paint(element="snd"), KeyError, "did you mean `sand`?"),
+    ("an element unlike all others", paint(element="zzzzzz"), KeyError, "no element `zzzzzz`"),
     ("a mask of numbers", paint(where=full(1.0, 4, 5), element="sand"), TypeError, "where"),
     ("a mask of another size", paint(where=full(True, 4, 6), element="sand"), ValueError, "where"),
     ("a painted velocity of NaN", paint(velocity=(NAN, 0)), ValueError, "velocity"),
@@ -172,6 +173,7 @@ def test_a_wrong_argument_is_named(call: Callable[[], Any], kind: type[Exception
     assert caught.type is kind
     assert words in caught.value.args[0]
     assert "\n" not in caught.value.args[0]
+    assert not caught.value.args[0].endswith("; ")
 
 
 @pytest.mark.parametrize(("call", "code"), [pytest.param(*row[1:], id=row[0]) for row in DIAGNOSTICS])

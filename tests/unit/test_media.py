@@ -54,6 +54,13 @@ def test_gif_keeps_every_color_of_worlds(tmp_path):
         assert image.info["loop"] == 0
 
 
+@pytest.mark.parametrize(("write", "name"), [(write_gif, "x.gif"), (write_mp4, "x.mp4")])
+def test_an_animation_has_a_frame(write, name, tmp_path):
+    with pytest.raises(ValueError, match="at least one frame"):
+        write(tmp_path / name, iter([]))
+    assert not list(tmp_path.iterdir())
+
+
 def test_gif_keeps_exactly_256_colors_and_comes_close_with_more(tmp_path):
     levels = np.arange(256, dtype=np.uint8).reshape(16, 16)
     frame = np.stack([levels, 255 - levels, levels // 2], axis=-1)

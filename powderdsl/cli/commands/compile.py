@@ -10,7 +10,7 @@ import click
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput
 from powderdsl.compiler import lower, read
-from powderdsl.diagnostics import Reporter, suggest
+from powderdsl.diagnostics import Reporter, with_suggestion
 from powderdsl.model.text import print_model, print_tree
 from powderdsl.model.types import Ruleset
 
@@ -136,7 +136,7 @@ def _kernels(program: Program, backend: str, pass_name: str | None) -> Iterator[
 
 def _check_known(what: str, name: str, known: Sequence[str], plural: str) -> None:
     if name not in known:
-        raise BadInput("; ".join([f"no {what} `{name}`", *suggest(name, known, plural)]))
+        raise BadInput(with_suggestion(f"no {what} `{name}`", name, known, plural))
 
 
 def _tree(rules: str, pass_name: str | None) -> str:

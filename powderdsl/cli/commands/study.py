@@ -17,7 +17,7 @@ from powderdsl.cli import options as opt
 from powderdsl.cli.exits import FAILED, OK, BadInput
 from powderdsl.cli.output import counted, progress
 from powderdsl.cli.study.checks import called, check_study
-from powderdsl.diagnostics import suggest
+from powderdsl.diagnostics import suggest, with_suggestion
 from powderdsl.diagnostics.printable import printable
 from powderdsl.experiments.studies.run import (
     Outcome,
@@ -93,9 +93,8 @@ def selected(study: Study, size: str, seeds: int | None, only: Mapping[str, str]
     for name, text in only.items():
         known = {point.names[name] for point in every if name in point.names and name != SIZE}
         if not known:
-            raise BadInput(
-                f"--only: no setting is called `{name}`; {', '.join(suggest(name, every[0].names))}"
-            )
+            message = f"--only: no setting is called `{name}`"
+            raise BadInput(with_suggestion(message, name, every[0].names, "settings"))
         for value in sorted({*text.split(",")} - known):
             there = suggest(value, known) or (f"it has {', '.join(sorted(known)[:20])}",)
             raise BadInput(f"--only: `{name}` has no value `{value}` here; {there[0]}")

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 KNOBS = ("kinds", "lines", "disks", "squares")
 """Knobs of the shipped task that have options of their own."""
-OF_WORLDS = {one.name for one in (*fields(DataConfig), *fields(Variety))} - {"task"}
+OF_WORLDS = {field.name for field in (*fields(DataConfig), *fields(Variety))} - {"task"}
 OF_WORLDS |= {*KNOBS, "packs", "held_out", "settings", "worlds", "after"}
 """Options that select worlds: a dataset has its own."""
 MACHINE = ("device", "threads", "backend", "store")
