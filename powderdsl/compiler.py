@@ -23,7 +23,7 @@ from powderdsl.model.declarations import PackDecl, RulesetDecl
 from powderdsl.model.definitions import set_params
 from powderdsl.model.packs import read_file
 from powderdsl.model.types import Ruleset
-from powderdsl.syntax.sources import path_beside, read_source
+from powderdsl.syntax.sources import path_beside, read_source, shipped, shipped_names
 from powderdsl.syntax.yaml_tree import parse_yaml
 from powderdsl.system.memo import Memo, collection_paused
 from powderdsl.system.reading import inside, is_path
@@ -51,16 +51,9 @@ MAX_PLUSES = 16
 """Maximum number of `+` characters in one path."""
 
 
-def shipped(folder: str) -> Path:
-    """The folder `rules` or `tasks` that comes with powderdsl: inside the installed package, or in the repository."""
-    here = Path(__file__).resolve().parent
-    inside = here / "data" / folder
-    return inside if inside.is_dir() else here.parent / folder
-
-
 def shipped_rules() -> list[str]:
     """Names of the packs and rulesets that come with powderdsl."""
-    return sorted(path.stem for path in shipped("rules").glob("*.yaml"))
+    return shipped_names("rules")
 
 
 @cache

@@ -40,13 +40,20 @@ def read_source(path: Path, reporter: Reporter, *, limit: int = MAX_BYTES) -> So
     return Source(name, text)
 
 
-def shipped_names(folder: Path) -> list[str]:
+def shipped(folder: str) -> Path:
+    """The folder `rules` or `tasks` that comes with powderdsl, or one below it: in the installed package or the repository."""
+    package = Path(__file__).resolve().parents[1]
+    installed = package / "data" / folder
+    return installed if installed.is_dir() else package.parent / folder
+
+
+def shipped_names(folder: str) -> list[str]:
     """Names of the YAML files in a folder that comes with powderdsl."""
-    return sorted(path.stem for path in folder.glob("*.yaml"))
+    return sorted(path.stem for path in shipped(folder).glob("*.yaml"))
 
 
-def find_source(text: str, folder: Path, noun: str, reporter: Reporter) -> Source:
-    """A shipped file of a folder by name, or a file by its path. `noun` says what it is, for messages.
+def find_source(text: str, folder: str, noun: str, reporter: Reporter) -> Source:
+    """A file of a shipped folder by name, or a file by its path. `noun` says what it is, for messages.
 
     Raises:
         CompileError: PD801 for an unknown name, PD101 or PD102 for what cannot be read.
@@ -55,7 +62,7 @@ def find_source(text: str, folder: Path, noun: str, reporter: Reporter) -> Sourc
     if text not in known and not text.lower().endswith((".yaml", ".yml")):
         helps = suggest(text, known) or ("shipped: " + ", ".join(known),)
         raise failure("PD801", f"no {noun} `{text[:80]}`", helps=helps)
-    source = read_source(folder / f"{text}.yaml" if text in known else Path(text), reporter)
+    source = read_source(shipped(folder) / f"{text}.yaml" if text in known else Path(text), reporter)
     reporter.raise_if_errors()
     assert source is not None
     return source

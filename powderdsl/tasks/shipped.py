@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from powderdsl.compiler import shipped
 from powderdsl.diagnostics import Diagnostic, Reporter, Severity, suggest
 from powderdsl.syntax.sources import find_source, shipped_names
 from powderdsl.system.reading import open_regular
@@ -22,7 +21,7 @@ MAX_HEAD = 1 << 16
 
 def shipped_tasks() -> list[str]:
     """Names of the tasks that come with powderdsl."""
-    return shipped_names(shipped("tasks"))
+    return shipped_names("tasks")
 
 
 def is_task(name: str) -> bool:
@@ -67,7 +66,7 @@ def load_task(
     for name, value in (knobs or {}).items():
         if isinstance(value, bool) or not isinstance(value, int):
             raise TypeError(f"the knob `{name}` takes an integer, found {value!r}")
-    source = find_source(str(name_or_path), shipped("tasks"), "task", reporter)
+    source = find_source(str(name_or_path), "tasks", "task", reporter)
     return read_task(source, reporter, knobs=knobs, params=params, packs=packs, palette=palette)
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from powderdsl.arrays import np
-from powderdsl.compiler import load_with_diagnostics, read, shipped
+from powderdsl.compiler import load_with_diagnostics, read
 from powderdsl.diagnostics import CompileError, Reporter
 from powderdsl.diagnostics.diagnostic import diagnostic_data, render_text
 from powderdsl.model import declarations
@@ -28,6 +28,7 @@ from powderdsl.model.state import qualified_slots, slot_name
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.standalone import standalone_module
 from powderdsl.syntax.parse import reserved_words
+from powderdsl.syntax.sources import shipped
 from powderdsl.system.memo import Memo
 
 MAX_FILES = 64

@@ -26,11 +26,12 @@ from urllib.parse import unquote, urlsplit
 
 from powderdsl.analysis.changes import unchanging_ids
 from powderdsl.arrays import np
-from powderdsl.compiler import load, read, shipped, shipped_tests, shipped_variants, split_names
+from powderdsl.compiler import load, read, shipped_tests, shipped_variants, split_names
 from powderdsl.diagnostics import CompileError, Reporter
 from powderdsl.model.state import fits
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.standalone import standalone_module
+from powderdsl.syntax.sources import shipped
 from powderdsl.system.memo import Memo
 from powderdsl.system.writing import cache_folder, replacing
 from powderdsl.targets.array_kind import ArrayKind

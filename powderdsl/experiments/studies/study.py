@@ -11,7 +11,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from powderdsl.compiler import shipped, shipped_rules
+from powderdsl.compiler import shipped_rules
 from powderdsl.diagnostics import CompileError, Diagnostic, Label, Reporter, Source, Span, suggest
 from powderdsl.model.schema import NAME_FORM, Entry, Form, Reader, Record, first_line, keyed, read_tree
 from powderdsl.syntax.sources import find_source, shipped_names
@@ -222,8 +222,8 @@ def confined(means: str, text: str, folder: Path, results: Path) -> str:
         return str(inside(results, text))
     if means in (RULES, PACKS):
         return "+".join(_pack(part, folder) for part in text.split("+"))
-    is_shipped = (shipped("tasks") / f"{text}.yaml").is_file()
-    may_be_path = means == RUN or (means == RUN_OR_TASK and not is_shipped) or is_path(text)
+    is_shipped_task = text in shipped_names("tasks")
+    may_be_path = means == RUN or (means == RUN_OR_TASK and not is_shipped_task) or is_path(text)
     return str(inside(folder, text)) if means in READ and may_be_path else text
 
 
@@ -237,7 +237,7 @@ def _pack(text: str, folder: Path) -> str:
 
 def shipped_studies() -> list[str]:
     """Names of the studies that come with powderdsl."""
-    return shipped_names(shipped("tasks") / "studies")
+    return shipped_names("tasks/studies")
 
 
 Check = Callable[[Study, Reporter], None]
@@ -257,7 +257,7 @@ def check_paths(study: Study, reporter: Reporter) -> None:
 def load_study(name_or_path: str, commands: Commands, check: Check = check_paths) -> Study:
     """A shipped study by name, or a file. Raises CompileError with everything that is wrong."""
     reporter = Reporter()
-    source = find_source(name_or_path, shipped("tasks") / "studies", "study", reporter)
+    source = find_source(name_or_path, "tasks/studies", "study", reporter)
     return read_study(source, reporter, commands, check)
 
 

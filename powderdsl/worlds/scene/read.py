@@ -18,7 +18,7 @@ from powderdsl.model.state import Slot, slot_name, slots
 from powderdsl.model.types import Ruleset
 from powderdsl.syntax import yaml_tree
 from powderdsl.syntax.parse import Syntax, line_of
-from powderdsl.syntax.sources import read_source
+from powderdsl.syntax.sources import read_source, shipped
 from powderdsl.system.writing import failure
 from powderdsl.worlds.ascii import ids_by_name
 from powderdsl.worlds.raster import MAX_CELLS, Paint, Setting, Shape, Size, mask
@@ -282,10 +282,7 @@ def find_scene(path_or_name: str | Path) -> Scene:
 
 def shipped_scenes() -> tuple[Scene, ...]:
     """The scenes that come with the package, files in alphabetical order."""
-    package = Path(__file__).resolve().parents[2]
-    installed = package / "data" / "tasks" / "scenes"
-    directory = installed if installed.is_dir() else package.parent / "tasks" / "scenes"
-    sources = [read_source(path, Reporter()) for path in sorted(directory.glob("*.yaml"))]
+    sources = [read_source(path, Reporter()) for path in sorted(shipped("tasks/scenes").glob("*.yaml"))]
     return tuple(scene for source in filter(None, sources) for scene in _scenes_of(source))
 
 
