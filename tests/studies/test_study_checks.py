@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import shlex
-from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from powderdsl.cli.commands.study import commands
-from powderdsl.cli.study.checks import agent_keys, check_study, model_keys
+from powderdsl.cli.study.checks import check_study
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Source
 from powderdsl.experiments.studies.study import Study, load_study, read_study, shipped_studies
 from tests.cli.commands import powderdsl
@@ -106,10 +103,6 @@ def test_shipped_studies_pass(name: str) -> None:
         (MODELS, "split: held_out", "rules: powderwolrd", "PD304", "powderwolrd"),
         (MODELS, "held-out: [gas, acid]", "task: world-modle", "PD801", "world-modle"),
         # measures
-        (AGENTS, "value: splits/test", "value: test", "PD806", "test/trained/above/random/mean"),
-        (AGENTS, "value: splits/test", "value: splits/tset", "PD806", "splits/tset/trained/above/random/mean"),
-        (AGENTS, "/above/random/mean", "", "PD806", "splits/test/trained"),
-        (MODELS, "mean/model/loss", "mean/modle/loss", "PD806", "mean/modle/loss"),
         (MODELS, "of: tuned", "of: trained", "PD806", "trained"),
         # what makes no difference
         (AGENTS, ", steps: $steps", "", "PD806", "steps"),
@@ -174,49 +167,6 @@ def test_files_elsewhere_are_not_even_read(tmp_path: Path) -> None:
     assert "secret" not in str(caught.value)
 
 
-def numbers(tree: Any, keys: tuple[str, ...] = ()) -> Iterator[str]:
-    """The keys of all numbers in what JSON gave back; names that are drawn are `*`."""
-    if isinstance(tree, Mapping):
-        for key, value in tree.items():
-            yield from numbers(value, (*keys, key))
-    elif isinstance(tree, int | float) and not isinstance(tree, bool):
-        yield "/".join((keys[0], "*", *keys[2:]) if keys[0] in ("tests", "elements") else keys)
-
-
-def test_known_keys_are_those_of_real_evaluations(folder: Path) -> None:
-    few = [
-        "--preset",
-        "small",
-        "--envs",
-        "4",
-        "--rollout",
-        "3",
-        "--batch",
-        "12",
-        "--backend",
-        "wasm",
-        "--steps",
-        "12",
-    ]
-    powderdsl("train", "sand-pushing", "--run", "agent", *few, exits=0)
-    powderdsl("evaluate", "agent", "--episodes", 2, exits=0)
-    found = json.loads(Path("agent/evaluation.json").read_text())
-    splits = list(found["splits"])
-    real = set(numbers(found))
-    policies = ("trained", "expert", "random", "nothing")
-    known = set(agent_keys(splits, policies))
-    unset = {keys for keys in known if keys.endswith("success") or keys.startswith("seen/train/")}
-    assert known - unset <= real <= known
-
-    quick = ("--width", 4, "--batch", 4, "--buffer", 8, "--refresh", 2, "--states", 8, "--iterations", 1)
-    powderdsl("wm", "train", "--run", "model", *quick, "--backend", "wasm", exits=0)
-    powderdsl("wm", "eval", "model", "--split", "held_out", "--worlds", 1, "--backend", "wasm", exits=0)
-    real = set(numbers(json.loads(Path("model/evaluation.json").read_text())))
-    known = set(model_keys())
-    unset = {key for key in known if key.endswith("/change_precision")}  # null where no change is predicted
-    assert known - unset <= real <= known
-
-
 def test_a_dry_run_prints_what_a_shell_takes(folder: Path) -> None:
     text = AGENTS.replace("episodes: 4", "episodes: 4, deterministic: yes").replace(
         'splits: "test,train"', 'splits: "test, train"'
@@ -233,8 +183,8 @@ def test_a_dry_run_prints_what_a_shell_takes(folder: Path) -> None:
 
 
 def test_nothing_is_written_for_a_study_that_is_refused(folder: Path) -> None:
-    Path("study.yaml").write_text(AGENTS.replace("splits/test", "splits/tset"), encoding="utf-8")
-    assert "study.yaml:13:" in powderdsl("study", "study.yaml", exits=2).stderr
+    Path("study.yaml").write_text(AGENTS.replace("preset: $size", "preset: smal"), encoding="utf-8")
+    assert "study.yaml:10:" in powderdsl("study", "study.yaml", exits=2).stderr
     assert [path.name for path in folder.iterdir()] == ["study.yaml"]
 
 

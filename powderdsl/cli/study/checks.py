@@ -8,7 +8,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from fnmatch import fnmatchcase
 from functools import cache, lru_cache
 from importlib import import_module
 from itertools import product
@@ -25,7 +24,7 @@ from powderdsl.compiler import load
 from powderdsl.diagnostics import CompileError, Diagnostic, Label, Reporter, suggest
 from powderdsl.experiments.runs import find_run
 from powderdsl.experiments.studies.study import FLAG, READ, SIZES, Measure, Point, Study, StudyStep
-from powderdsl.rl.config import BASELINES, TrainConfig, check_task, chosen_policies
+from powderdsl.rl.config import TrainConfig, check_task, chosen_policies
 from powderdsl.syntax.yaml_tree import Scalar
 from powderdsl.system.reading import is_path
 from powderdsl.tasks.shipped import check_split, load_task
@@ -51,12 +50,13 @@ def called(words: tuple[str, ...]) -> click.Command:
 
 
 def check_study(study: Study, reporter: Reporter, *, devices: bool = True) -> None:
-    """Report what a study's commands would refuse, and measures that lead to no number.
+    """Report what a study's commands would refuse, and measures of runs that no step evaluates.
 
     `devices`: whether it runs on this machine."""
     check = _StudyCheck(study, reporter, devices)
-    for step, point in product(study.steps, check.points):
-        check.result(step, point)
+    points = [point for size in SIZES for point in study.points(size, 1)]
+    for step, point in product(study.steps, points):
+        check.run_of(step, point)
     for measure in study.measures:
         check.measure(measure)
 
@@ -66,8 +66,7 @@ class _StudyCheck:
 
     def __init__(self, study: Study, reporter: Reporter, devices: bool):
         self.study, self.reporter, self.devices = study, reporter, devices
-        self.points = [point for size in SIZES for point in study.points(size, 1)]
-        self.results: dict[tuple[object, ...], Any] = {}
+        self.runs: dict[tuple[object, ...], Any] = {}
         self.refused: set[tuple[str, str, str]] = set()
         """Words that are to blame for mistakes, by step and option."""
         self.wrong = {step.name for step in study.steps if step.is_wrong}
@@ -75,34 +74,34 @@ class _StudyCheck:
         self.rules = cache(lambda rules, params: load(rules, params=dict(params)))
         self.changed_rules = cache(lambda rules, *more: wm.rules_of(rules or _rules_of(more[0]), *more))
 
-    def result(self, step: StudyStep, point: Point) -> Any:
-        """Return the settings of a step's run, or patterns of keys of its results; None if they are not known."""
+    def run_of(self, step: StudyStep, point: Point) -> Any:
+        """Return the settings of the run that a step makes; None if it makes none, or after reporting its mistakes."""
         maker = self.study.works_on(step)
-        run = None if maker is None else self.result(maker, point)
+        run = None if maker is None else self.run_of(maker, point)
         if step.is_wrong or (run is None and maker is not None):
             return None
         key = (step.name, id(run), *(point.filled(word) for _, word in step.words))
-        if key not in self.results:
-            self.results[key] = self.checked(step, point, run)
-        return self.results[key]
+        if key not in self.runs:
+            self.runs[key] = self.checked(step, point, run)
+        return self.runs[key]
 
     def checked(self, step: StudyStep, point: Point, run: Any) -> Any:
-        """The result of a step; None after reporting all mistakes in its words.
+        """The settings of a step's run; None after reporting all mistakes in its words.
 
         Words with mistakes are left out, which shows what is wrong with others.
         """
-        rest, told = self.unrefused(step, point), set[str]()
+        rest, reported = self.unrefused(step, point), set[str]()
         while rest.on == step.on:
-            result, mistakes = self.attempt(rest, point, run)
+            settings, mistakes = self.attempt(rest, point, run)
             if not mistakes:
-                return result if rest == step else None
+                return settings if rest == step else None
             self.wrong.add(step.name)
             for mistake in mistakes:
                 name, word = _blamed(mistake, rest, point)
                 self.report(mistake, step, point, name, word)
-                if word is None or mistake.message in told:
+                if word is None or mistake.message in reported:
                     return None
-                told.add(mistake.message)
+                reported.add(mistake.message)
                 self.refused.add((step.name, name, point.filled(word)))
             rest = self.unrefused(rest, point)
         return None
@@ -115,7 +114,7 @@ class _StudyCheck:
         return replace(step, words=tuple(words))
 
     def attempt(self, step: StudyStep, point: Point, run: Any) -> tuple[Any, Sequence[Diagnostic]]:
-        """The result of a step, and the mistakes in its words."""
+        """The settings of a step's run, and the mistakes in its words."""
         try:
             return self.call(step, point, run), ()
         except CompileError as error:
@@ -151,38 +150,38 @@ class _StudyCheck:
         self.reporter.add(replace(mistake, primary=Label(span or word.span), secondary=used))
 
     def call(self, step: StudyStep, point: Point, run: Any) -> Any:
-        """The result of a step. Raises what its command would raise before it begins to work."""
+        """The settings of a step's run. Raises what its command would raise before it begins to work."""
         command, arguments = called(step.command), self.study.command(step, point, self.study.folder)
         several = {name[2:] for option in command.params if option.multiple for name in option.opts}
-        given = set[str]()
+        names = set[str]()
         for name, word in step.words:
             text = point.filled(word)
             if step.means.get(name) == FLAG and text not in ("yes", "no"):
                 raise ValueError(f"`{name}` is `yes` or `no`, found `{text}`")
-            if name in given and name not in several:
+            if name in names and name not in several:
                 raise ValueError(f"`{name}` takes one value, found `{text}` too")
-            given.add(name)
+            names.add(name)
         maker, needs = self.study.works_on(step), WORKS_ON.get(step.command)
         if step.on is not None and step.on_step and (maker is None or MAKES[maker.command] != needs):
             works_on = f"the run of {needs}" if needs else "no run"
             raise ValueError(f"`{' '.join(step.command)}` works on {works_on}, not on `{step.on.text}`")
         context = command.make_context(" ".join(step.command), arguments[len(step.command) :])
-        if self.devices and "device" in given:
+        if self.devices and "device" in names:
             from powderdsl.simulation.programs import find_device  # imports torch
 
             find_device(context.params["device"])
-        return self.made(step.command, context, run)
+        return self.settings(step.command, context.params, run)
 
-    def made(self, command: tuple[str, ...], context: click.Context, run: Any) -> Any:
-        """Return what a command would make with these options. Raises the errors that it raises before it works."""
-        values = context.params
+    def settings(self, command: tuple[str, ...], values: Mapping[str, Any], run: Any) -> Any:
+        """The settings of the run that a command makes with these options; None for a command that evaluates `run`."""
         match command:
             case ("train",):
                 config = train.new_config(values)
                 check_task(config, _task(config.task, config.knobs, config.params, config.packs))
                 return config
             case ("evaluate",):
-                return _evaluation(values, run)
+                _check_evaluation(values, run)
+                return None
             case ("wm", "train"):
                 model = wm.new_config(values, self.changed_rules)
                 self.check_data(model.data)
@@ -199,7 +198,7 @@ class _StudyCheck:
             self.check_data(run.data)
             return run
         self.check_data(unseen_data(run.data, **wm.tested_on(values)))
-        return model_keys()
+        return None
 
     def check_data(self, data: DataConfig) -> None:
         from powderdsl.worldmodel.worlds import check_data
@@ -211,39 +210,30 @@ class _StudyCheck:
     # Measures
 
     def measure(self, measure: Measure) -> None:
-        """Report a measure whose keys do not lead to a number in the last evaluation of its run."""
-        made = next((step for step in self.study.steps if step.name == measure.of.text), None)
-        if made is None or made.command not in MAKES:
+        """Report a measure of a run that no step evaluates."""
+        maker = next((step for step in self.study.steps if step.name == measure.of.text), None)
+        if maker is None or maker.command not in MAKES:
             return  # reported by the reader
         tests = [step for step in self.study.steps if not step.makes_run]
-        steps = [step for step in tests if self.study.works_on(step) == made]
-        if not steps and not any(step.name in self.wrong for step in tests):
-            command = "evaluate" if MAKES[made.command] == AGENT else "wm eval"
-            helps = [f"add a step such as `tested: {{command: {command}, on: {made.name}}}`"]
-            self.reporter.error("PD806", f"no step evaluates `{made.name}`", measure.of.span, helps=helps)
-        for point in self.points if steps else ():
-            known, keys = self.result(steps[-1], point), point.filled(measure.keys)
-            if known is not None and not any(fnmatchcase(keys, pattern) for pattern in known):
-                message = f"the evaluation of `{made.name}` has no number `{keys}`"
-                inner = [pattern for pattern in known if pattern.startswith(f"{keys}/")]
-                close = [f"such as `{inner[0]}`"] if inner else suggest(keys, known)
-                self.reporter.error("PD806", message, measure.keys.span, helps=close)
+        if not any(self.study.works_on(step) == maker or step.name in self.wrong for step in tests):
+            command = "evaluate" if MAKES[maker.command] == AGENT else "wm eval"
+            helps = [f"add a step such as `tested: {{command: {command}, on: {maker.name}}}`"]
+            self.reporter.error("PD806", f"no step evaluates `{maker.name}`", measure.of.span, helps=helps)
 
 
-def _evaluation(values: Mapping[str, Any], run: TrainConfig | None) -> Sequence[str] | None:
-    """The keys of what `evaluate` writes; None for a run that the study does not make."""
+def _check_evaluation(values: Mapping[str, Any], run: TrainConfig | None) -> None:
+    """Raise what `evaluate` raises before it plays. Of runs that the study does not make, only the path is checked."""
     if run is None:
         task = find_played(values["run"], values["knobs"], values["settings"], values["packs"])
         if not isinstance(task, Task):
-            return None
+            return
     elif values["knobs"] or values["settings"]:
         raise BadInput("--knob and --set go with a task: a run has its own")
     else:
         task = _task(run.task, run.knobs, run.params, (*run.packs, *values["packs"]))
-    splits = values["splits"] or [split.name for split in task.splits]
-    for split in splits:
+    for split in values["splits"] or ():
         check_split(task, split)
-    return agent_keys(splits, chosen_policies(values["policies"], task, trained=run is not None))
+    chosen_policies(values["policies"], task, trained=run is not None)
 
 
 def _task(name: str, knobs: Mapping[str, int], params: Mapping[str, Any], packs: Sequence[str]) -> Task:
@@ -273,34 +263,8 @@ def _blamed(mistake: Diagnostic, step: StudyStep, point: Point) -> tuple[str, Sc
     suspects: list[tuple[int, str, Scalar]] = []
     for name, word in step.words:
         text = point.filled(word)
-        told = {name, variables.get(name), text, *re.split("[-,=+]", text)}
-        suspects.append((len(told & named), name, word))
+        parts = {name, variables.get(name), text, *re.split("[-,=+]", text)}
+        suspects.append((len(parts & named), name, word))
     most = max(score for score, _, _ in [*suspects, (1, "", step.key)])
     best = {name: word for score, name, word in suspects if score == most}
     return next(iter(best.items())) if len(best) == 1 else ("", None)
-
-
-def agent_keys(splits: Sequence[str], policies: Sequence[str]) -> list[str]:
-    """The keys of numbers that `evaluate` may write. A test compares them with real ones."""
-    normalized = ["normalized/"] if {"expert", "nothing"} <= {*policies} else []
-    keys = ["seed", "step"]
-    for split in splits:
-        keys += [f"unchanged/{split}", f"seen/{split}/worlds"]
-        for policy in policies:
-            above = [f"above/{other}/" for other in BASELINES if other != policy and other in policies]
-            means = [f"{scale}{name}" for scale in ("", *above, *normalized) for name in ("mean", "interval")]
-            numbers = [*means, "episodes", "length", "success"]
-            keys += [f"splits/{split}/{policy}/{number}" for number in numbers]
-            keys += [f"seen/{split}/without/{policy}/{number}" for number in means[:2]]
-    return keys
-
-
-def model_keys() -> list[str]:
-    """Patterns of the keys of numbers that `wm eval` writes. A test compares them with real ones."""
-    from powderdsl.worldmodel.evaluation import FREQUENT, MODEL, STILL
-    from powderdsl.worldmodel.scores import MEASURES
-
-    predictors = [f"{group}/{name}" for group in ("mean", "tests/*") for name in (MODEL, STILL, FREQUENT)]
-    keys = [f"{predictor}/{measure}" for predictor in predictors for measure in MEASURES]
-    elements = [f"elements/*/{name}" for name in ("cells", "recall", "precision")]
-    return ["worlds_each", "iterations", *keys, *elements]
