@@ -62,9 +62,9 @@ def start(
 
             return load_world(str(name), sim)
         world = sim.world(drawn.ids, seed=seed or 0)
-        for key, given in drawn.fields.items():
-            values: dict[str, Any] = {key: given.values}
-            world = sim.paint(world, where=given.where, **values)
+        for key, field in drawn.fields.items():
+            values: dict[str, Any] = {key: field.values}
+            world = sim.paint(world, where=field.where, **values)
         return world
 
 

@@ -199,8 +199,8 @@ class Dataset:
             at = (shard.starts[place[rows]] + first[rows])[:, None] + np.arange(length)
             shown = at + place[rows][:, None]  # each episode before has one observation more than actions
             for name, of in stored.items():
-                taken = shown + (name != of) if of == "observation" else at
-                out[name][rows] = shard.arrays[of][taken]
+                index = shown + (name != of) if of == "observation" else at
+                out[name][rows] = shard.arrays[of][index]
         return list(out.values())
 
     def lengths_and_worlds(self) -> tuple[Array, Array]:

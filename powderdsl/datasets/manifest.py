@@ -166,7 +166,10 @@ def _checked(path: Path, data: Any) -> Manifest:
     if manifest is not None:
         problems += _contradictions(manifest.recipe, manifest.shards)
     if manifest is None or problems:
-        raise damage_errors(path, problems)
+        message, place = f"{path} is damaged", Label(None)
+        raise CompileError(
+            [Diagnostic("PD630", message, place, notes=(problem,)) for problem in problems[:20]]
+        )
     return manifest
 
 
@@ -202,16 +205,6 @@ def reporting_damage(message: str, *helps: str) -> Iterator[None]:
         words = (error.strerror if isinstance(error, OSError) else None) or str(error)
         reason = " ".join(words.split())[:200] or type(error).__name__
         raise damaged(message, reason, *helps) from None
-
-
-def damage_errors(path: Path, problems: list[str]) -> CompileError:
-    """PD630, one for each problem, 20 at most."""
-    return CompileError(
-        [
-            Diagnostic("PD630", f"{path} is damaged", Label(None), notes=(problem,))
-            for problem in problems[:20]
-        ]
-    )
 
 
 def choice_names(task: Task) -> tuple[str, ...]:

@@ -211,7 +211,7 @@ class _Recording:
             for name, dtype in DTYPES.items()
             if name not in ("length", "world")
         }
-        worlds, length = _worlds(recipe, numbers), np.zeros(count, np.int64)
+        worlds, length = (recipe.seed + numbers) % recipe.worlds, np.zeros(count, np.int64)
         stack, episodes = (
             FrameStack(getattr(self.policy, "frames", 1)),
             torch.from_numpy(numbers).to(env.device),
@@ -228,8 +228,8 @@ class _Recording:
                 with torch.no_grad():
                     actions = torch.as_tensor(self.policy(shown, action_keys(recipe.seed, episodes, step)))
             observed, reward, terminated, truncated, info = env.step(actions)
-            given = {"action": actions, "reward": reward, "terminated": terminated, "truncated": truncated}
-            for name, value in {**given, "success": info["success"]}.items():
+            values = {"action": actions, "reward": reward, "terminated": terminated, "truncated": truncated}
+            for name, value in {**values, "success": info["success"]}.items():
                 tape[name][:, step] = value.cpu().numpy()
             tape["observation"][:, step + 1] = observed.cpu().numpy()
             length[(terminated | truncated).cpu().numpy() & (length == 0)] = step + 1
@@ -238,15 +238,11 @@ class _Recording:
             if not going:
                 break
         ends = [
-            {"length": np.array([taken]), "world": np.array([world])}
-            for taken, world in zip(length, worlds, strict=True)
+            {"length": np.array([steps]), "world": np.array([world])}
+            for steps, world in zip(length, worlds, strict=True)
         ]
         return [
             {name: rows[slot, : length[slot] + (name == "observation")].copy() for name, rows in tape.items()}
             | end
             for slot, end in enumerate(ends)
         ]
-
-
-def _worlds(recipe: Recipe, episode: Array) -> Array:
-    return np.asarray((recipe.seed + episode) % recipe.worlds)

@@ -278,12 +278,12 @@ class GoalEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     ) -> tuple[dict[str, Array], dict[str, Any]]:
         """Begin an episode. ``options["goal"]``, [n], replaces the drawn goal."""
         rest = dict(options or {})
-        given = rest.pop("goal", None)
-        if given is not None and np.shape(given) != self.low.shape:
-            raise ValueError(f"a goal has the shape {list(self.low.shape)}, found {list(np.shape(given))}")
+        goal = rest.pop("goal", None)
+        if goal is not None and np.shape(goal) != self.low.shape:
+            raise ValueError(f"a goal has the shape {list(self.low.shape)}, found {list(np.shape(goal))}")
         observed, info = self.env.reset(seed=seed, options=rest)
         drawn = self.env.unwrapped.np_random.uniform(self.low, self.high)
-        self.goal = np.asarray(drawn if given is None else given, np.float32)
+        self.goal = np.asarray(drawn if goal is None else goal, np.float32)
         return self._with_goals(observed), info
 
     def step(self, action: Any) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:

@@ -158,17 +158,17 @@ class TensorEnv:
             ValueError: a seed or an option is out of range, or has the wrong shape.
             KeyError: there is no such option or parameter.
         """
-        given = dict(options or {})
-        check_options(given, OPTIONS)
-        mask = reset_mask(given.get("reset_mask"), self.num_envs, self.episodes is not None, self.device)
+        settings = dict(options or {})
+        check_options(settings, OPTIONS)
+        mask = reset_mask(settings.get("reset_mask"), self.num_envs, self.episodes is not None, self.device)
         base, seeded = self._bases(seed)
-        params = self._new_params(given.get("params"), mask)
+        params = self._new_params(settings.get("params"), mask)
         episode = torch.where(mask, torch.where(seeded, 0, self._episode + 1), self._episode)
         if self._base is not None:
             base = torch.where(mask, base, self._base)
         worlds = world_seeds(base, episode, self.worlds)
-        if "worlds" in given:
-            worlds = self.simulator.numbers(given["worlds"], "worlds", self.num_envs)
+        if "worlds" in settings:
+            worlds = self.simulator.numbers(settings["worlds"], "worlds", self.num_envs)
         if self.episodes is None:
             self.episodes = self.program.start(worlds)
         else:
@@ -213,15 +213,15 @@ class TensorEnv:
             old = torch.arange(first, first + self.num_envs, device=self.device)
         seeds = seeds_of(seed, self.num_envs)
         new = torch.tensor([number or 0 for number in seeds], device=self.device)
-        given = torch.tensor([number is not None for number in seeds], device=self.device)
-        return torch.where(given, new, old), given
+        is_new = torch.tensor([number is not None for number in seeds], device=self.device)
+        return torch.where(is_new, new, old), is_new
 
-    def _new_params(self, given: Any, mask: Tensor) -> dict[str, Tensor]:
+    def _new_params(self, changes: Any, mask: Tensor) -> dict[str, Tensor]:
         """The parameters after a reset of `mask`."""
-        if given is None:
+        if changes is None:
             return self.params
-        whole = self.simulator.parameters(check_mapping("params", given), self.num_envs)
-        names = given.keys() if bool(mask.all()) else {**given, **self.params}.keys()
+        whole = self.simulator.parameters(check_mapping("params", changes), self.num_envs)
+        names = changes.keys() if bool(mask.all()) else {**changes, **self.params}.keys()
         old = {**self.simulator.parameters({}, self.num_envs), **self.params}
         return {name: torch.where(mask, whole[name], old[name]) for name in names}
 

@@ -121,9 +121,9 @@ class Metrics:
 
     def __init__(self, folder: Path, step: int = 0):
         self._lines = folder / LINES
-        kept = [json.dumps(line) for line in read_metrics(folder) if line["step"] <= step]
+        lines = [json.dumps(line) for line in read_metrics(folder) if line["step"] <= step]
         with replacing(self._lines) as temporary:
-            temporary.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
+            temporary.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
         self._file = self._lines.open("a", encoding="utf-8")
         self._events = None
         with suppress(ImportError):  # without TensorBoard, the lines hold the same
@@ -333,11 +333,11 @@ def find_run(text: str | Path | RunFolder, kind: str | None = None) -> RunFolder
     """A run by the path of its folder, or by its name in ``runs/``. Raises CompileError (PD620)."""
     if isinstance(text, RunFolder):
         return text
-    folder, kept = Path(text), Path("runs")
-    if not folder.exists() and folder.name == str(text) and kept.is_dir():
-        if (kept / text / ABOUT).exists():
-            return read_run(kept / text, kind)
-        names = sorted(about.parent.name for about in kept.glob(f"*/{ABOUT}"))
+    folder, usual = Path(text), Path("runs")
+    if not folder.exists() and folder.name == str(text) and usual.is_dir():
+        if (usual / text / ABOUT).exists():
+            return read_run(usual / text, kind)
+        names = sorted(about.parent.name for about in usual.glob(f"*/{ABOUT}"))
         raise not_a_run(folder, "there is no such folder", suggest(str(text), names, "runs"))
     return read_run(folder, kind)
 

@@ -135,8 +135,8 @@ def _write(program: LevelProgram, path: Path, recipe: Recipe, report: Callable[[
     about, parts = path.with_suffix(".json"), path.with_suffix(".parts")
     written = read_json(about)
     if written is not None and written != asdict(recipe):
-        given = asdict(recipe)
-        changed = next((key for key in given if written.get(key) != given[key]), "form")
+        own = asdict(recipe)
+        changed = next((key for key in own if written.get(key) != own[key]), "form")
         changed = {"count": "number of episodes", "rows": "number of rows"}.get(changed, changed)
         raise ValueError(
             f"{path} was collected with another {changed}: choose another folder, or remove it and {about.name}"

@@ -160,17 +160,17 @@ class PowderworldEnv(_Face, gymnasium.Env[Array, Any], EzPickle):
             TypeError: an option has the wrong type.
             ValueError: the level has no such task.
         """
-        given = dict(options or {})
-        check_options(given, OPTIONS)
-        self.episodes.begin(np.zeros(1, dtype=np.int64), [self._task(given)], seeds_of(seed, 1))
+        settings = dict(options or {})
+        check_options(settings, OPTIONS)
+        self.episodes.begin(np.zeros(1, dtype=np.int64), [self._task(settings)], seeds_of(seed, 1))
         super().reset(seed=None if seed is None else int(seed))
         if self.episodes.mode != "task":
             return self._observations()[0], {}
         number = int(self.episodes.task_number[0])
         self.cur_task_id = number or None
-        self.cur_task_info = self.task_infos[number - 1] if number else dict(given["task_info"])
+        self.cur_task_info = self.task_infos[number - 1] if number else dict(settings["task_info"])
         info = {"goal": array(self.episodes.goals()[0])}
-        if given.get("render_goal"):
+        if settings.get("render_goal"):
             info["goal_rendered"] = self._options.picture(info["goal"])
         return self._observations()[0], info
 
@@ -262,11 +262,11 @@ class PowderworldVectorEnv(_Face, VectorEnv[Any, Any, Any]):
             TypeError: a seed or an option has the wrong type.
             ValueError: a seed or an option is out of range, or has the wrong length.
         """
-        given = dict(options or {})
-        check_options(given, BATCH_OPTIONS)
+        settings = dict(options or {})
+        check_options(settings, BATCH_OPTIONS)
         begun, cpu = self.episodes.world is not None, torch.device("cpu")
-        mask = reset_mask(given.get("reset_mask"), self.num_envs, begun, cpu).numpy()
-        tasks, seeds = self._tasks(given), seeds_of(seed, self.num_envs)
+        mask = reset_mask(settings.get("reset_mask"), self.num_envs, begun, cpu).numpy()
+        tasks, seeds = self._tasks(settings), seeds_of(seed, self.num_envs)
         if isinstance(seed, int):
             super().reset(seed=seed)
         which = np.flatnonzero(mask)
@@ -274,13 +274,13 @@ class PowderworldVectorEnv(_Face, VectorEnv[Any, Any, Any]):
         self._over[mask] = False
         return self._observations(), self._begun(mask)
 
-    def _tasks(self, given: Mapping[str, Any]) -> list[int | GoalTask | None]:
-        ids = np.asarray(given.get("task_id"))
+    def _tasks(self, options: Mapping[str, Any]) -> list[int | GoalTask | None]:
+        ids = np.asarray(options.get("task_id"))
         if ids.ndim != 1:
-            return [self._task(given)] * self.num_envs
+            return [self._task(options)] * self.num_envs
         if len(ids) != self.num_envs:
             raise ValueError(f"task_id has {len(ids)} numbers for {self.num_envs} environments")
-        return [self._task({**given, "task_id": number}) for number in ids.tolist()]
+        return [self._task({**options, "task_id": number}) for number in ids.tolist()]
 
     def step(self, actions: Any) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """Make one choice in every episode: integers [B]. Invalid choices are replaced by random valid ones.
@@ -294,15 +294,15 @@ class PowderworldVectorEnv(_Face, VectorEnv[Any, Any, Any]):
             ResetNeeded: before the first reset, or under DISABLED in an episode that has ended.
             ValueError: actions of another type or shape.
         """
-        given = np.asarray(actions)
-        if given.shape != (self.num_envs,) or given.dtype.kind not in "iu":
+        choices = np.asarray(actions)
+        if choices.shape != (self.num_envs,) or choices.dtype.kind not in "iu":
             raise ValueError(
-                f"actions must be integers [{self.num_envs}], found {given.dtype} {list(given.shape)}"
+                f"actions must be integers [{self.num_envs}], found {choices.dtype} {list(choices.shape)}"
             )
         waiting = self._over.copy()
         if self.autoreset_mode is AutoresetMode.DISABLED:
             check_going(torch.from_numpy(waiting))
-        success = self.episodes.step(given.astype(np.int64), ~waiting) & ~waiting
+        success = self.episodes.step(choices.astype(np.int64), ~waiting) & ~waiting
         truncated = (self.episodes.elapsed >= self.max_episode_steps) & ~success & ~waiting
         ended = success | truncated
         info: dict[str, Any] = {}

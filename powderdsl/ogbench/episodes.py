@@ -306,8 +306,8 @@ class Episodes:
         of = self.seeds[which] if fixed else which
         keys = [(int(number), task) for number, task in zip(of, tasks, strict=True)]
         missing = [at for at, key in enumerate(keys) if key not in self._goals]
-        made = self.play_goals(which[missing], [tasks[at] for at in missing])
-        self._goals |= zip([keys[at] for at in missing], made, strict=True)
+        new_goals = self.play_goals(which[missing], [tasks[at] for at in missing])
+        self._goals |= zip([keys[at] for at in missing], new_goals, strict=True)
         goals = [self._goals[key] for key in keys]
         places = torch.from_numpy(which).to(self.program.device)
         self.goal_ids[places] = torch.stack([goal.ids for goal in goals])
@@ -349,15 +349,15 @@ class Episodes:
         part, which = self._world, np.arange(self.count) if active is None else np.flatnonzero(active)
         stages = self.stage[which]
         choices = np.where(stages == 0, self.level.choices(0), self.level.choices(1))
-        given = actions[which]
-        invalid = (given < 0) | (given >= choices)
+        parts = actions[which]
+        invalid = (parts < 0) | (parts >= choices)
         if invalid.any():
-            given = given.copy()
+            parts = parts.copy()
             for stage in range(3):
                 bad = np.flatnonzero(invalid & (stages == stage))
                 if len(bad):
-                    given[bad] = self._drawn(which[bad], "ogbench invalid", self.level.choices(stage))
-        self._chosen[which, stages] = given
+                    parts[bad] = self._drawn(which[bad], "ogbench invalid", self.level.choices(stage))
+        self._chosen[which, stages] = parts
         self.stage[which] = (stages + 1) % 3
         self.elapsed[which] += 1
         painting = which[stages == 2]

@@ -108,8 +108,8 @@ class TrainConfig:
     @property
     def identity(self) -> dict[str, Any]:
         """The settings that the result depends on: all but those of HOW. A falling learning rate depends on `steps`."""
-        kept = {name: value for name, value in self.as_json().items() if name not in HOW}
-        return kept if self.schedule == "constant" else {**kept, "steps": self.steps}
+        settings = {name: value for name, value in self.as_json().items() if name not in HOW}
+        return settings if self.schedule == "constant" else {**settings, "steps": self.steps}
 
 
 HOW = tuple(field.name for field in fields(TrainConfig) if field.metadata.get("may_change"))
@@ -165,20 +165,15 @@ def preset(name: str, task: str, **changes: Any) -> TrainConfig:
     # The usual observation depends on the network.
     if "observation" not in changes and changes.get("network") in USUAL_OBSERVATION:
         values["observation"] = USUAL_OBSERVATION[changes["network"]]
-    return _checked(values, problems)
+    return from_json(values, problems)
 
 
-def from_json(values: Mapping[str, Any]) -> TrainConfig:
-    """Read the settings that `TrainConfig.as_json` gave; missing ones get their defaults. Raises CompileError (PD640)."""
-    return _checked(values, [])
+def from_json(values: Mapping[str, Any], mistakes: Sequence[str] = ()) -> TrainConfig:
+    """Read the settings that `TrainConfig.as_json` gave; missing ones get their defaults.
 
-
-def check_config(config: TrainConfig) -> None:
-    """Raise CompileError (PD640) with everything that is wrong in settings."""
-    _checked(config.as_json(), [])
-
-
-def _checked(values: Mapping[str, Any], problems: list[str]) -> TrainConfig:
+    Raises CompileError (PD640) with everything that is wrong in them, after `mistakes` that are known already.
+    """
+    problems = [*mistakes]
     config = read_record(TrainConfig, values, problems)
     if config is not None:
         problems += _contradictions(config)

@@ -68,15 +68,15 @@ class TrainedPolicy:
         joint = isinstance(distribution, BinDistribution)
         choices = [distribution.distribution] if joint else distribution.distribution
         if self.deterministic:
-            picked = [choice.probs.argmax(1) for choice in choices]
+            indices = [choice.probs.argmax(1) for choice in choices]
         else:
             drawn = uniforms(keys, len(choices))
             below = [choice.probs.double().cumsum(1) for choice in choices]
-            picked = [
+            indices = [
                 (drawn[:, column, None] * bounds[:, -1:] >= bounds).sum(1)
                 for column, bounds in enumerate(below)
             ]
-        actions: Tensor = distribution.action(picked[0]) if joint else torch.stack(picked, 1)
+        actions: Tensor = distribution.action(indices[0]) if joint else torch.stack(indices, 1)
         return actions
 
 

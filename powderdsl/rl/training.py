@@ -41,7 +41,7 @@ from powderdsl.experiments.runs import (
     reporting_misfits,
     write_json,
 )
-from powderdsl.rl.config import TrainConfig, check_config, check_task
+from powderdsl.rl.config import TrainConfig, check_task, from_json
 from powderdsl.rl.evaluation import play
 from powderdsl.rl.policies import TrainedPolicy, policy_of
 from powderdsl.simulation.observe import Observer
@@ -81,7 +81,7 @@ def train(config: TrainConfig, folder: str | Path, *, progress: Progress | None 
             another run; PD622 if another process trains there.
         KeyboardInterrupt: after the state before the rollout that was in progress has been saved.
     """
-    check_config(config)
+    from_json(config.as_json())  # raises what is wrong in settings that were made without `preset`
     how: dict[str, Any] = {name: getattr(config, name) for name in ("knobs", "params", "packs")}
     used = whole_palette(*load_task(config.task, **how).rules)
     palette = (*used, *[None] * (config.slots - len(used)))  # slots that the rules need, and free ones
@@ -291,9 +291,9 @@ def clone(policy: ActorCriticPolicy, dataset: Dataset, config: TrainConfig) -> f
         batch = rows[numbers]
         observed = batch.observation.to(policy.device)
         actions = batch.action.long().to(policy.device)
-        wanted = torch.from_numpy(returns[numbers]).to(policy.device)
+        targets = torch.from_numpy(returns[numbers]).to(policy.device)
         values, likelihood, _ = policy.evaluate_actions(observed, actions)
-        error = (values.flatten() - wanted).square().mean()
+        error = (values.flatten() - targets).square().mean()
         loss = -likelihood.mean() + config.vf_coef * error / spread
         optimizer.zero_grad()
         loss.backward()

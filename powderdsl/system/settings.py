@@ -144,9 +144,9 @@ def _read(kind: Any, value: Any, path: str, problems: list[str]) -> Any:
         return read_record(kind, value, problems, path)  # type: ignore[arg-type]  # it is a type, not an instance
     if kind is int and hasattr(value, "__index__") and not isinstance(value, bool):
         value = index(value)  # also of NumPy's integers
-    fits, wanted = _check(kind, value, limits)
+    fits, expected = _check(kind, value, limits)
     if not fits:
-        problems.append(f"`{path}` must be {wanted}, found {value!r:.80}")
+        problems.append(f"`{path}` must be {expected}, found {value!r:.80}")
         return None
     if names := getattr(kind, "_fields", ()):
         hints = get_type_hints(kind, include_extras=True)
@@ -166,12 +166,12 @@ def _check(kind: Any, value: Any, limits: Limits) -> tuple[bool, str]:
     names = getattr(kind, "_fields", ())
     low, high = (len(names), len(names)) if names else limits.length
     if names or get_origin(kind) is tuple:
-        wanted = f"[{', '.join(names)}]" if names else f"a list of {low:,} to {high:,} values"
-        return isinstance(value, list | tuple) and low <= len(value) <= high, wanted
+        expected = f"[{', '.join(names)}]" if names else f"a list of {low:,} to {high:,} values"
+        return isinstance(value, list | tuple) and low <= len(value) <= high, expected
     if get_origin(kind) is Mapping:
         fits = isinstance(value, Mapping) and low <= len(value) <= high
-        wanted = f"a mapping of {low:,} to {high:,} values, with keys that match {limits.keys}"
-        return fits and all(re.fullmatch(limits.keys, str(key)) for key in value), wanted
+        expected = f"a mapping of {low:,} to {high:,} values, with keys that match {limits.keys}"
+        return fits and all(re.fullmatch(limits.keys, str(key)) for key in value), expected
     if kind is bool:
         return isinstance(value, bool), "true or false"
     if limits.choices:
@@ -182,7 +182,7 @@ def _check(kind: Any, value: Any, limits: Limits) -> tuple[bool, str]:
     most = math.inf if limits.high is None else limits.high
     fits = isinstance(value, int if kind is int else int | float) and not isinstance(value, bool)
     written = "," if kind is int else "g"
-    wanted = "an integer" if kind is int else "a number"
-    wanted += f" from {least:{written}}" if least > -math.inf else ""
-    wanted += f" to {most:{written}}" if most < math.inf else ""
-    return fits and least <= value <= most, wanted
+    expected = "an integer" if kind is int else "a number"
+    expected += f" from {least:{written}}" if least > -math.inf else ""
+    expected += f" to {most:{written}}" if most < math.inf else ""
+    return fits and least <= value <= most, expected

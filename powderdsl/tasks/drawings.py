@@ -17,6 +17,7 @@ from powderdsl.tasks.task import (
     MAX_NUMBER,
     MAX_REPEATS,
     MAX_SIDE,
+    NOTHING,
     Drawing,
     Generator,
     Group,
@@ -27,8 +28,8 @@ from powderdsl.tasks.task import (
 from powderdsl.worlds.ascii import load_ascii, parse_ascii
 from powderdsl.worlds.image import read_image
 from powderdsl.worlds.raster import Setting, Shape, Size, mask
-from powderdsl.worlds.scene import draw_start, find_scene, shipped_scenes
-from powderdsl.worlds.scene.read import covers_nothing, not_a_statement
+from powderdsl.worlds.scene import draw_start, find_scene
+from powderdsl.worlds.scene.read import covers_nothing, not_a_statement, shipped_scene
 from powderdsl.worlds.scene.statements import (
     RANGES,
     Statement,
@@ -342,10 +343,6 @@ def element_ids(word: Written, ruleset: Ruleset, reporter: Reporter) -> tuple[in
     return tagged
 
 
-LEAVE = 255
-"""In a stamp: the cell stays as it is."""
-
-
 class StampDecl(Entry, noun="a stamp"):
     art: yaml_tree.Scalar | None = keyed("ASCII art; `?` leaves a cell as it is", shape="text")
     legend: tuple[tuple[yaml_tree.Scalar, yaml_tree.Scalar], ...] = keyed(
@@ -373,7 +370,7 @@ def read_stamp(decl: StampDecl, reader: Reader, ruleset: Ruleset) -> Stamp:
     if ids is not None and max(ids.shape) > MAX_SIDE:
         message = f"a stamp of {ids.shape[0]}×{ids.shape[1]} cells"
         reader.reporter.error("PD607", message, key.span, "too large")
-    return Stamp(key.text, ((LEAVE,),) if ids is None else tuple(map(tuple, ids.tolist())))
+    return Stamp(key.text, ((NOTHING,),) if ids is None else tuple(map(tuple, ids.tolist())))
 
 
 def _drawn(
@@ -384,8 +381,8 @@ def _drawn(
         if len(key.text) != 1:
             reader.reporter.error("PD110", "a legend has single characters", key.span, "not one character")
     legend = {key.text: value.text for key, value in decl.legend if len(key.text) == 1}
-    hole = replace(ruleset.elements[0], name="?", pack="?", id=LEAVE, glyph="?")
-    elements: list[Element] = [element for element in ruleset.elements if element.id != LEAVE]
+    hole = replace(ruleset.elements[0], name="?", pack="?", id=NOTHING, glyph="?")
+    elements: list[Element] = [element for element in ruleset.elements if element.id != NOTHING]
     if art.style == "quoted" and art.content.text.split() != art.text.split():
         helps = ["write `art: |`, and the rows below it"]
         reader.reporter.error("PD107", "art with escapes", art.span, "quoted, on one line", helps=helps)
@@ -397,17 +394,15 @@ def _named(word: yaml_tree.Scalar, reader: Reader, ruleset: Ruleset) -> NDArray[
     """A shipped scene, or a file beside the task's: .yaml, .png or .txt."""
     file, sign, name = word.text.partition("#")
     suffix = Path(file).suffix.lower()
-    known = [scene.name for scene in shipped_scenes()]
-    if word.text not in known and suffix not in (".png", ".txt", ".yaml", ".yml"):
-        helps = suggest(word.text, known) or ("shipped: " + ", ".join(known),)
-        reader.reporter.error("PD601", f"unknown scene `{word.text[:80]}`", word.span, helps=helps)
-        return None
-    path = word.text if word.text in known else path_beside(file, word.span, reader.reporter)
-    if path is None:
-        return None
-    if suffix in (".png", ".txt"):
-        return (read_image if suffix == ".png" else load_ascii)(f"{path}{sign}{name}", ruleset.elements)
-    scene = find_scene(f"{path}{sign}{name}")
+    if suffix in (".png", ".txt", ".yaml", ".yml"):
+        path = path_beside(file, word.span, reader.reporter)
+        if path is None:
+            return None
+        if suffix in (".png", ".txt"):
+            return (read_image if suffix == ".png" else load_ascii)(f"{path}{sign}{name}", ruleset.elements)
+        scene = find_scene(f"{path}{sign}{name}")
+    else:
+        scene = shipped_scene(word.text)
     setting = next((statement for statement in scene.paints if isinstance(statement, Setting)), None)
     if setting is not None:
         message = f"the scene `{scene.name}` sets `{setting.name}`"

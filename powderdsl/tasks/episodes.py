@@ -89,13 +89,13 @@ class TaskProgram:
     def start(self, seeds: Tensor) -> Episodes:
         """New episodes of the worlds `seeds`, int64 [B], 0 or more each."""
         seeds = torch.as_tensor(seeds, dtype=torch.int64, device=self.simulator.device)
-        made = self._starts.make(seeds)
+        starts = self._starts.make(seeds)
         nothing = torch.zeros_like(seeds)
         clock = (seeds, nothing.clone(), nothing.clone())
-        world = World(self.simulator, self._hands.fresh_state(made.ids), *clock)
-        measured = self._meter.take(world, made.regions, made.targets, None)
+        world = World(self.simulator, self._hands.fresh_state(starts.ids), *clock)
+        measured = self._meter.take(world, starts.regions, starts.targets, None)
         return Episodes(
-            world, seeds, nothing.clone(), nothing.bool(), made.regions, made.targets, measured, measured
+            world, seeds, nothing.clone(), nothing.bool(), starts.regions, starts.targets, measured, measured
         )
 
     def restart(self, episodes: Episodes, mask: Tensor, seeds: Tensor, *, reuse: bool = False) -> Episodes:
@@ -276,10 +276,10 @@ def compile_task(
     return TaskProgram(loaded, split, simulator)
 
 
-def integer_tensor(name: str, values: Any, device: torch.device | None = None) -> Tensor:
+def integer_tensor(name: str, values: Any) -> Tensor:
     """Values from outside as int64. Raises TypeError if they are not integers."""
     try:
-        tensor = torch.as_tensor(values, device=device)
+        tensor = torch.as_tensor(values)
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(f"{name}: {' '.join(str(error).split())}") from None
     if tensor.is_floating_point() or tensor.is_complex() or tensor.dtype == torch.bool:

@@ -165,10 +165,10 @@ class _TaskReader:
         ruleset: Ruleset,
         typer: Typer,
         rules: tuple[str, ...],
-        given: Mapping[str, int],
+        values: Mapping[str, int],
     ):
         self.reader, self.reporter, self.decl = reader, reader.reporter, decl
-        self.ruleset, self.typer, self.rules, self.given = ruleset, typer, rules, given
+        self.ruleset, self.typer, self.rules, self.values = ruleset, typer, rules, values
         own, _ = read(rules[:1], Reporter())
         self.own = {pack.name.text for pack in own}
         """The packs of the task's own rules: it does not know the names of added ones."""
@@ -272,7 +272,7 @@ class _TaskReader:
             if knob is not None:
                 self.broken.discard(knob.name)
                 knobs[knob.name] = knob
-        for name in self.given:
+        for name in self.values:
             if name not in self.taken:
                 helps = suggest(name, knobs, "knobs") or ("the task has no knobs",)
                 self.reporter.error("PD803", f"no knob `{name}`", None, helps=helps)
@@ -295,10 +295,10 @@ class _TaskReader:
             self.reporter.error("PD803", f"the default of `{key.text}`", default.span, "not an integer")
             return None
         low, high, usual = int(ends.kind.lo), int(ends.kind.hi), int(amount.value)
-        chosen = int(self.given.get(key.text, usual))
+        chosen = int(self.values.get(key.text, usual))
         for value, span in (
             (usual, default.span),
-            (chosen, None if key.text in self.given else default.span),
+            (chosen, None if key.text in self.values else default.span),
         ):
             if not low <= value <= high:
                 message = f"the knob `{key.text}` must lie in {low}..{high}"

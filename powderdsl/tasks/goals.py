@@ -168,8 +168,8 @@ class GoalChecker:
             raise self.typer.fail("PD301", f"unknown function `{name}`", span, "not a function", *helps)
         least, most = (2, MAX_VALUES) if name in ("min", "max") else (1, 1)
         if not least <= len(parts) <= most:
-            wanted = "1 value" if most == 1 else f"{least} to {most} values"
-            message = f"`{name}` takes {wanted}, found {len(parts)}"
+            expected = "1 value" if most == 1 else f"{least} to {most} values"
+            message = f"`{name}` takes {expected}, found {len(parts)}"
             usage = (f"write `{FUNCTIONS[name]}`",)
             raise self.typer.fail("PD406", message, syntax.span, "", *usage)
         if name in ARITHMETIC:

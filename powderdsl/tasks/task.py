@@ -28,6 +28,9 @@ MAX_NUMBER = 4096
 MAX_REPEATS = 256
 """Repetitions of one group."""
 
+NOTHING = 255
+"""In stamps and targets: no element. A stamp leaves such a cell as it is."""
+
 
 @dataclass(frozen=True)
 class Knob:
@@ -85,7 +88,7 @@ class Region:
 
 @dataclass(frozen=True)
 class Stamp:
-    """A drawn or saved picture: rows of ids; 255 leaves a cell as it is."""
+    """A drawn or saved picture: rows of ids, or NOTHING."""
 
     name: str
     rows: tuple[tuple[int, ...], ...]

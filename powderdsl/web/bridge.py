@@ -102,11 +102,11 @@ class Session:
             base for name in rulesets for base in re.findall(r"^extends: *(\w+)", files[name], re.MULTILINE)
         }
         tops = [name for name in rulesets if Path(name).stem not in based] or rulesets
-        listed: set[str] = set()
+        members: set[str] = set()
         with suppress(CompileError):  # too many mistakes: reported when the rules are loaded
             packs = read([str(self.folder / name) for name in tops], Reporter())[0] if tops else []
-            listed = {Path(pack.source.name).name for pack in packs}
-        unlisted = [name for name in files if name not in listed.union(rulesets)]
+            members = {Path(pack.source.name).name for pack in packs}
+        unlisted = [name for name in files if name not in members.union(rulesets)]
         unread = {Path(name).stem for name in unlisted}.intersection(off)
         words = tops + [name for name in unlisted if Path(name).stem not in unread]
         if not words:

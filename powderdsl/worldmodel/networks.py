@@ -204,8 +204,8 @@ class CustomNetwork:
                 else type(logits).__name__
             )
             if not (shape.startswith(str(expected)) and logits.is_floating_point()):
-                given = [2, encoder.channels, *size]
-                raise ValueError(f"it must give logits {expected}, found {shape}, for channels {given}")
+                channels = [2, encoder.channels, *size]
+                raise ValueError(f"it must give logits {expected}, found {shape}, for channels {channels}")
             weights = [weight for weight in network.parameters() if weight.requires_grad]
             if logits.requires_grad and weights:
                 F.cross_entropy(logits.float(), torch.zeros(2, *size, dtype=torch.int64)).backward()
@@ -265,13 +265,13 @@ def encoder_of(config: TrainConfig, slots: int) -> ActionChannels:
     return ActionChannels(slots, len(config.recorded.channels), config.recorded.actions)
 
 
-def network_of(config: TrainConfig, slots: int, given: nn.Module | CustomNetwork | None) -> nn.Module:
+def network_of(config: TrainConfig, slots: int, own: nn.Module | CustomNetwork | None) -> nn.Module:
     """The network that is given, or the paper's, which encodes worlds without actions by itself."""
     encoder = encoder_of(config, slots)
-    if isinstance(given, CustomNetwork):
-        return given.build(encoder, config.seed)
-    if given is not None:
-        return given
+    if isinstance(own, CustomNetwork):
+        return own.build(encoder, config.seed)
+    if own is not None:
+        return own
     if config.recorded is None:
         return fresh_unet(slots, config.width, config.seed)
     return Encoded(encoder, fresh_unet(slots, config.width, config.seed, encoder.channels))

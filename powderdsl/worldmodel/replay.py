@@ -119,8 +119,8 @@ class Replay:
         place = place.to(self.starts.device)
         for room, ids in zip((self.starts, self.ends), pair, strict=True):
             # If one iteration brings more pairs than fit, the newest stay.
-            kept = slice(max(0, len(place) - self.size), None)
-            room[place[kept]] = ids[kept].to(room.device)
+            newest = slice(max(0, len(place) - self.size), None)
+            room[place[newest]] = ids[newest].to(room.device)
 
 
 def memory_of(device: torch.device) -> int:

@@ -124,12 +124,12 @@ def train(
     if recording is None and worlds is None:
         worlds = own_worlds = task_worlds(config.data, **machine.simulation, palette=palette)
         identity["worlds"] = own_worlds.fingerprint
-    given: Any = recording or worlds
-    check_slots(path, palette, given.rules)
-    identity |= {"palette": palette, "rules_fingerprint": fingerprint(given.rules)}
+    source: Any = recording or worlds
+    check_slots(path, palette, source.rules)
+    identity |= {"palette": palette, "rules_fingerprint": fingerprint(source.rules)}
     slots = len(palette)
     if isinstance(network, CustomNetwork):
-        network.check(encoder_of(config, slots), given.size, config.seed)
+        network.check(encoder_of(config, slots), source.size, config.seed)
     run = open_run(path, KIND, {**config.plain, **identity}, note=note)
     with lock_folder(run.path):
         model = network_of(config, slots, network)
@@ -144,12 +144,12 @@ def train(
                 trainer.held_out = recording.spread(recording.parts[1], VALIDATED, machine.device)
         else:
             replay = Replay(
-                given, config.data, seed=config.seed, device=machine.device, store=machine.store, folder=path
+                source, config.data, seed=config.seed, device=machine.device, store=machine.store, folder=path
             )
             replay.advance_to(trainer.done)
             trainer.batch, trainer.advance = replay.batch, replay.advance
             if validate_every:
-                trainer.held_out = validation_pairs(given, config.data, machine.device)
+                trainer.held_out = validation_pairs(source, config.data, machine.device)
         with _random_numbers_kept(torch.device(machine.device)):
             trainer.train(tell, save_seconds)
     return run
@@ -211,12 +211,12 @@ class _Trainer:
                             notes=(f"in {self.run.path}",),
                             helps=(f"choose a smaller learning rate than {config.learning_rate:g}",),
                         )
-                    took = time.monotonic() - since
-                    speed = LOG_EVERY * config.batch / took
+                    seconds = time.monotonic() - since
+                    speed = LOG_EVERY * config.batch / seconds
                     values = {
                         "loss/train": loss,
                         "time/pairs_a_second": speed,
-                        "time/simulation": making / took,
+                        "time/simulation": making / seconds,
                     }
                     since, making = time.monotonic(), 0.0
                 every = self.validate_every
@@ -442,9 +442,9 @@ def add(rules: str, packs: Iterable[str]) -> str:
 
 def keep(rules: str, packs: Sequence[str]) -> str:
     """The rules with these packs alone. Those that the rules do not have are added."""
-    kept = pack_names(rules, packs)
-    gone = [pack for pack in load(rules).packs if pack not in kept]
-    return add(leave_out(rules, gone), packs)
+    names = pack_names(rules, packs)
+    others = [pack for pack in load(rules).packs if pack not in names]
+    return add(leave_out(rules, others), packs)
 
 
 def _packs_named(rules: str) -> tuple[str, ...]:

@@ -19,7 +19,7 @@ from powderdsl.system.fingerprint import fingerprint
 from powderdsl.system.writing import failure
 from powderdsl.tasks.episodes import TaskProgram, compile_task
 from powderdsl.tasks.shipped import check_split, load_task
-from powderdsl.tasks.task import NO_CHANGE, Drawing, Generator, Goal, Split, Stamp, Task
+from powderdsl.tasks.task import NO_CHANGE, NOTHING, Drawing, Generator, Goal, Split, Stamp, Task
 from powderdsl.worldmodel.config import TEST_SEEDS, DataConfig
 from powderdsl.worldmodel.rulesets import Drawn, RulesetSource, check_properties
 
@@ -28,9 +28,6 @@ VALIDATION_SEEDS = 1 << 33
 
 VALIDATION_WORLDS = 64
 """The worlds that models are validated on, each at one time."""
-
-NOTHING = 255
-"""In stamps: leave the cell as it is."""
 
 Pairs = tuple[Tensor, Tensor]
 """Start and end, element ids uint8 [B, H, W] each."""
@@ -242,9 +239,9 @@ def watch(
     Raises:
         CompileError: PD604 if worlds need elements that the rules do not have.
     """
-    given = task.split(split)
+    original = task.split(split)
     variants, missing = [], []
-    for variant in given.variants:
+    for variant in original.variants:
         narrowing = _Narrowing(task.ruleset, rules, only)
         narrowed = narrowing.generator(variant)
         if narrowing.missing:
@@ -255,7 +252,7 @@ def watch(
     if missing and not (partly and variants):
         raise _missing_elements(task, rules, missing, only)
     agent = replace(task.agent, choices=(NO_CHANGE,), speed_field=None)
-    watched = Split(given.name, given.about, tuple(variants))
+    watched = Split(original.name, original.about, tuple(variants))
     nothing = Goal(None, None, None, None)
     return replace(task, ruleset=rules, agent=agent, goal=nothing, splits=(watched,)), tuple(missing)
 
@@ -280,15 +277,16 @@ class _Narrowing:
         self.missing: list[str] = []
         self.span: Span | None = None
 
-    def generator(self, given: Generator) -> Generator:
-        drawn = {drawing.stamp for group in given.groups for drawing in group.drawings}
+    def generator(self, generator: Generator) -> Generator:
+        drawn = {drawing.stamp for group in generator.groups for drawing in group.drawings}
         return replace(
-            given,
-            fill=self.id(given.fill),
+            generator,
+            fill=self.id(generator.fill),
             groups=tuple(
-                replace(group, drawings=tuple(map(self.drawing, group.drawings))) for group in given.groups
+                replace(group, drawings=tuple(map(self.drawing, group.drawings)))
+                for group in generator.groups
             ),
-            stamps=tuple(self.stamp(stamp) for stamp in given.stamps if stamp.name in drawn),
+            stamps=tuple(self.stamp(stamp) for stamp in generator.stamps if stamp.name in drawn),
             targets=(),
         )
 

@@ -13,13 +13,14 @@ from functools import cache
 from itertools import islice
 from pathlib import Path
 
-from powderdsl.compiler import shipped, shipped_rules
+from powderdsl.compiler import shipped_rules
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Source
 from powderdsl.diagnostics.diagnostic import diagnostic_data, render_text
 from powderdsl.model.check import check
 from powderdsl.model.declarations import PackDecl, RulesetDecl
 from powderdsl.model.packs import read_file
 from powderdsl.model.types import Ruleset
+from powderdsl.syntax.sources import shipped
 from powderdsl.system.reports import as_json
 from powderdsl.system.writing import replacing
 from powderdsl.testing.generators.choices import Choices

@@ -10,13 +10,13 @@ import pytest
 import torch
 from stable_baselines3.common.vec_env import VecFrameStack
 
-from powderdsl.compiler import shipped
 from powderdsl.datasets import Dataset, record
 from powderdsl.envs.acting import FrameStack
 from powderdsl.envs.sb3 import PowderVecEnv
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.rl import evaluate, load_policy, train
 from powderdsl.rl.fcn import BinPolicy, fcn_policy
+from powderdsl.syntax.sources import shipped
 from powderdsl.system.fingerprint import fingerprint
 from powderdsl.tasks.episodes import compile_task
 from powderdsl.tasks.shipped import load_task, shipped_tasks

@@ -17,10 +17,11 @@ import numpy as np
 import pytest
 
 from powderdsl.compiler import BACKENDS as powderdsl_backends
-from powderdsl.compiler import load, shipped, shipped_rules, shipped_tests, shipped_variants
+from powderdsl.compiler import load, shipped_rules, shipped_tests, shipped_variants
 from powderdsl.diagnostics import CompileError
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import compile as compile_ruleset
+from powderdsl.syntax.sources import shipped
 from powderdsl.targets.cpp.build import Building
 from powderdsl.testing.generators.cases import Start, load_text, random_start
 from powderdsl.testing.generators.choices import Choices

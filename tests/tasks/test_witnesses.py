@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 import powderdsl
-from powderdsl.compiler import shipped
+from powderdsl.syntax.sources import shipped
 from powderdsl.tasks.episodes import TaskProgram, check_actions
 from powderdsl.tasks.players import ExpertPlayer
 from powderdsl.tasks.shipped import load_task, shipped_tasks

@@ -11,9 +11,10 @@ from pathlib import Path
 import pytest
 
 from powderdsl import compiler
-from powderdsl.compiler import load_with_diagnostics, lower, parts, shipped
+from powderdsl.compiler import load_with_diagnostics, lower, parts
 from powderdsl.diagnostics import CompileError
 from powderdsl.simulation.standalone import standalone_module
+from powderdsl.syntax.sources import shipped
 from powderdsl.system.memo import Memo
 from powderdsl.targets.wasm import source
 from powderdsl.targets.wasm.source import wasm_module

@@ -11,9 +11,10 @@ from js import cpu
 
 begin, began = cpu(), time.perf_counter()
 from powderdsl.arrays import np  # noqa: E402
-from powderdsl.compiler import load_with_diagnostics, shipped  # noqa: E402
+from powderdsl.compiler import load_with_diagnostics  # noqa: E402
 from powderdsl.simulation.simulator import Simulator  # noqa: E402
 from powderdsl.syntax.parse import parser  # noqa: E402
+from powderdsl.syntax.sources import shipped  # noqa: E402
 from powderdsl.system.memo import Memo  # noqa: E402
 
 REPEATS = 5

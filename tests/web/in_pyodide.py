@@ -9,8 +9,9 @@ from pathlib import Path
 
 from powderdsl.arrays import np
 from powderdsl.cli.dispatch import main
-from powderdsl.compiler import load, lower, parts, shipped
+from powderdsl.compiler import load, lower, parts
 from powderdsl.simulation.simulator import Simulator
+from powderdsl.syntax.sources import shipped
 from powderdsl.system.memo import Memo
 from powderdsl.targets.array_kind import ArrayKind
 from powderdsl.targets.wasm.source import wasm_module

@@ -44,7 +44,7 @@ def command(
     packs: tuple[str, ...],
     as_json: bool,
     out: Path | None,
-    **asked: Any,
+    **how: Any,
 ) -> None:
     """Mean return and 95 % interval of the agent of a RUN, on each split, in the same worlds as the other policies.
 
@@ -56,7 +56,7 @@ def command(
     from powderdsl.rl.evaluation import evaluate
 
     with user_values():
-        evaluation = evaluate(played, packs=packs, **asked)
+        evaluation = evaluate(played, packs=packs, **how)
     if out is not None:
         write_json(out, evaluation.as_json(), follow=True)
     if as_json:

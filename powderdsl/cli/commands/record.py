@@ -71,11 +71,11 @@ def command(
     modes = {"--verify": verify, "--to-minari": to_minari, "--from-minari": from_minari}
     mode, *others = [name for name, value in modes.items() if value is not None] or [""]
     needs, takes = NEEDS[mode]
-    asked = {"TASK": task, "--out": out, "--episodes": episodes}
-    given = [*others, *(name for name, value in asked.items() if value is not None)]
-    if extra := [name for name in given if name not in takes]:
+    values = {"TASK": task, "--out": out, "--episodes": episodes}
+    arguments = [*others, *(name for name, value in values.items() if value is not None)]
+    if extra := [name for name in arguments if name not in takes]:
         raise BadInput(f"{mode} does not go with {', '.join(extra)}")
-    if missing := [name for name in needs if name not in given]:
+    if missing := [name for name in needs if name not in arguments]:
         raise BadInput(f"missing {', '.join(missing)}")
     require_gymnasium()
     from powderdsl.datasets.dataset import Dataset

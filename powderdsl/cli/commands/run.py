@@ -92,13 +92,11 @@ def command(
         torch.set_num_threads(threads)
     began = time.perf_counter()
     last = play(first, plan)
-    took = time.perf_counter() - began
+    seconds = time.perf_counter() - began
     count, height, width = last.shape
-    head = (
-        f"{ruleset.name}: {counted(count, 'world')} of {height}×{width}, {plan.steps} steps in {took:.2f} s"
-    )
+    head = f"{ruleset.name}: {counted(count, 'world')} of {height}×{width}, {plan.steps} steps in {seconds:.2f} s"
     if verbose:
-        rate = count * height * width * plan.steps / max(took, 1e-9)
+        rate = count * height * width * plan.steps / max(seconds, 1e-9)
         head += (
             f" ({rate:,.0f} cells/s; {last.sim.running} on {last.sim.device}, {counted(threads, 'thread')})"
         )

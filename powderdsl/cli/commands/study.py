@@ -194,15 +194,15 @@ def command(
     run.prepare()
     outcomes = {outcome.point: outcome for outcome in _with_progress(run, points, jobs, ray)}
     finished = [outcomes.get(point) or run.finished(point) for point in every]
-    held, missing = sum(outcome.held for outcome in outcomes.values()), finished.count(None)
-    if held:
+    locked, missing = sum(outcome.held for outcome in outcomes.values()), finished.count(None)
+    if locked:
         click.echo(
-            f"the study is not complete: other processes hold {counted(held, 'combination')}", err=True
+            f"the study is not complete: other processes hold {counted(locked, 'combination')}", err=True
         )
     if missing:
         name = shlex.quote(str(folder))
         click.echo(f"other parts have {counted(missing, 'combination')} that are not done in {name}")
-    if held or missing:  # whoever finishes last writes the table, or `collect`
+    if locked or missing:  # whoever finishes last writes the table, or `collect`
         return _status([*outcomes.values()])
     return _report(loaded, size, folder, [outcome for outcome in finished if outcome is not None])
 

@@ -160,8 +160,8 @@ class _Report:
             "different with added packs": sum(bool(test.added) for test in tests)
             + sum(result.status == "differs" for result in results),
         }
-        told = [f"{number} {word}" for word, number in counts.items() if number]
-        self.say(f"{ruleset.name}: {', '.join([*parts, *(told or ['all passed'])])}")
+        faults = [f"{number} {word}" for word, number in counts.items() if number]
+        self.say(f"{ruleset.name}: {', '.join([*parts, *(faults or ['all passed'])])}")
         self.failed |= bool(counts["failed"] or counts["broken"])
         self.data[name] = _data(tests, results, runner.lines, missed)
 

@@ -61,9 +61,9 @@ def command(
     from powderdsl.cli.start_worlds import start
     from powderdsl.simulation.tracing import trace, trace_data, trace_text
 
-    begun = start(ruleset, world, size, None, seed, backend=backend, steps=step)
+    worlds = start(ruleset, world, size, None, seed, backend=backend, steps=step)
     with user_values():
-        history = trace(begun, *cell, step, every_rule=every_rule, of=of or None, **how)
+        history = trace(worlds, *cell, step, every_rule=every_rule, of=of or None, **how)
     if as_json:
         print_json(trace_data(history))
     else:

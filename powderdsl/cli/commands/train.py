@@ -72,13 +72,13 @@ def new_config(values: Mapping[str, Any]) -> TrainConfig:
     if task is None:
         raise BadInput("say which TASK, or --resume DIR")
     names = [setting.name for setting in fields(TrainConfig) if setting.name not in (*WHAT, "task")]
-    given = opt.given_options(values, names)
-    if "init_from" in given:
-        given["init_from"] = str(given["init_from"].absolute())
+    settings = opt.given_options(values, names)
+    if "init_from" in settings:
+        settings["init_from"] = str(settings["init_from"].absolute())
     knobs = values["knobs"] | opt.given_options(values, ("lines", "disks", "complexity"))
     name = str(Path(task).absolute()) if Path(task).suffix else task
     more = {"knobs": knobs, "params": values["settings"], "packs": values["packs"]}
-    return preset(values["preset_name"], name, **given, **more)
+    return preset(values["preset_name"], name, **settings, **more)
 
 
 def _config_of(folder: Path, values: Mapping[str, Any]) -> TrainConfig:
@@ -88,12 +88,12 @@ def _config_of(folder: Path, values: Mapping[str, Any]) -> TrainConfig:
     from powderdsl.rl.policies import config_of
     from powderdsl.rl.training import ASKED, KIND
 
-    given = opt.given_options(
+    settings = opt.given_options(
         values, [setting.name for setting in fields(TrainConfig) if setting.name not in WHAT]
     )
-    if any(name not in HOW for name in given) or opt.given_options(values, WHAT):
+    if any(name not in HOW for name in settings) or opt.given_options(values, WHAT):
         raise BadInput(f"--resume keeps what is trained; only {', '.join(HOW)} may change")
     run = find_run(folder, KIND)
     latest = read_json(run.path / ASKED) or {}
     how = {name: latest[name] for name in HOW if name in latest}
-    return from_json({**config_of(run).as_json(), **how, **given})
+    return from_json({**config_of(run).as_json(), **how, **settings})

@@ -347,8 +347,8 @@ def _run(config: TrainConfig, folder: Path, values: dict[str, Any], **more: Any)
     with progress("wm", config.iterations, lines=True, resumes=folder) as show:
 
         def tell(now: TrainingProgress) -> None:
-            said = [("loss", now.loss), ("held out", now.validation)]
-            show(now.done, ", ".join(f"{name} {loss:.4f}" for name, loss in said if loss is not None))
+            losses = [("loss", now.loss), ("held out", now.validation)]
+            show(now.done, ", ".join(f"{name} {loss:.4f}" for name, loss in losses if loss is not None))
 
         run = train(
             config,
@@ -360,9 +360,9 @@ def _run(config: TrainConfig, folder: Path, values: dict[str, Any], **more: Any)
             validate_every=values["validate_every"],
             **more,
         )
-    took = time.monotonic() - began
+    seconds = time.monotonic() - began
     click.echo(
-        f"{run.path}: {config.iterations:,} iterations, {took:.0f} s here; powderdsl wm eval {run.path}"
+        f"{run.path}: {config.iterations:,} iterations, {seconds:.0f} s here; powderdsl wm eval {run.path}"
     )
 
 

@@ -99,9 +99,9 @@ def _verdict(measure: Measure, label: str, cells: Sequence[Cell]) -> str:
     log = measure.scale == "log"
     changes = [last[seed] / first[seed] if log else last[seed] - first[seed] for seed in both]
     change, same = interval(changes, measure.scale), 1 if log else 0
-    held = change.mean > same if measure.expect == "rises" else change.mean < same
-    does = measure.expect if held else f"does not {measure.expect[:-1]}"
-    sure = f", but the interval holds {same}" if held and change.low <= same <= change.high else ""
+    is_expected = change.mean > same if measure.expect == "rises" else change.mean < same
+    does = measure.expect if is_expected else f"does not {measure.expect[:-1]}"
+    sure = f", but the interval holds {same}" if is_expected and change.low <= same <= change.high else ""
     plus = "+" if not log and change.mean > 0 else ""
     start = f"{label}: " if label else ""
     return f"{start}{does}{sure} (last {'/' if log else '−'} first: {plus}{show_interval(change, measure.scale)})"

@@ -301,8 +301,8 @@ class _StudyReader:
                 self.error("PD806", message, places.get("study", first_line(tree)), f"at most {MAX_POINTS:,}")
         names = {SEED: places["seeds"]} if decl.seeds > 1 else {}
         for axis in axes:
-            given = next(iter(axis.sets.values()), {}) or {axis.name: axis.key}
-            names |= {name: given[name].span for name in given}
+            settings = next(iter(axis.sets.values()), {}) or {axis.name: axis.key}
+            names |= {name: settings[name].span for name in settings}
         for name, span in names.items():
             if not (self.is_hidden or name in self.used):
                 helps = (f"write `${name}` in a step, or leave it out",)

@@ -17,7 +17,7 @@ from typing import Any
 from powderdsl.model.types import Expr
 from powderdsl.system.random import MASK, base_keys, mix, name_number
 from powderdsl.targets.array_kind import Array, ArrayKind
-from powderdsl.tasks.task import Drawing, Generator, Group, Region, Task
+from powderdsl.tasks.task import NOTHING, Drawing, Generator, Group, Region, Task
 from powderdsl.worlds.raster import Shape, Size, covered_rows, mask
 from powderdsl.worlds.scene.statements import constants
 
@@ -34,8 +34,8 @@ def shape_rows(
     kind: ArrayKind, shape: str, numbers: Sequence[Array | None], size: Size
 ) -> tuple[Array, Array]:
     """The first row that shapes cover in each column and the one after the last: [..., W], of the type of `_row_type`."""
-    given = [None if number is None else number[..., None] for number in numbers]
-    edges = covered_rows(kind.xp, shape, given, kind.arange(size[1]), size)
+    columns = [None if number is None else number[..., None] for number in numbers]
+    edges = covered_rows(kind.xp, shape, columns, kind.arange(size[1]), size)
     first, last = (
         kind.xp.asarray(kind.xp.clip(edge, 0, size[0]), dtype=_row_type(kind, size)) for edge in edges
     )
@@ -58,9 +58,6 @@ def cells_between(kind: ArrayKind, first: Array, last: Array, size: Size) -> Arr
     row = _row_numbers(kind, size)
     return (row >= first[..., None, :]) & (row < last[..., None, :])
 
-
-NOTHING = 255
-"""In targets and stamps: no element."""
 
 CHUNK_CELLS = 1 << 18
 """Cells of the worlds that are made together on the CPU: they fit its cache."""
@@ -137,10 +134,10 @@ class _Draws:
     ):
         self.names, kind = names, hashes.kind
         parts = [part for amount in amounts if amount is not None for part in amount.walk()]
-        wanted = sum(part.op == "uniform" for part in parts) + (choices > 1)
+        count = sum(part.op == "uniform" for part in parts) + (choices > 1)
         self.drawn: Iterator[Array] = iter(())
-        if wanted:
-            counters = kind.arange(repeats)[:, None] * _NUMBERS + kind.arange(wanted)
+        if count:
+            counters = kind.arange(repeats)[:, None] * _NUMBERS + kind.arange(count)
             drawn = hashes.draw(statement, counters.reshape(-1)).reshape(-1, *counters.shape)
             self.drawn = iter(kind.xp.moveaxis(drawn, -1, 0))
         self.choice = self.uniform(0, choices - 1) if choices > 1 else None
@@ -185,8 +182,8 @@ class WorldMaker:
         chunk = max(1, len(seeds))
         if self.kind.on_cpu:
             chunk = max(1, CHUNK_CELLS // (self.size[0] * self.size[1]))
-        made = [self._chunk(seeds[i : i + chunk]) for i in range(0, max(1, len(seeds)), chunk)]
-        return made[0] if len(made) == 1 else join_worlds(self.kind, made, self.fixed_cells)
+        chunks = [self._chunk(seeds[i : i + chunk]) for i in range(0, max(1, len(seeds)), chunk)]
+        return chunks[0] if len(chunks) == 1 else join_worlds(self.kind, chunks, self.fixed_cells)
 
     def _chunk(self, seeds: Array) -> Made:
         hashes = Hashes(seeds, self.kind)
@@ -369,11 +366,15 @@ class StartWorlds:
         variants = variant.tolist()
         numbers = sorted(set(variants)) or [0]
         parts = [self._makers[number].make(seeds[variant == number]) for number in numbers]
-        made = join_worlds(self.kind, parts, self.fixed)
+        batch = join_worlds(self.kind, parts, self.fixed)
         # Back from the order of variants to that of the seeds.
         worlds = sorted(range(len(variants)), key=variants.__getitem__)
         order = self.kind.put(sorted(worlds, key=worlds.__getitem__), "int64")
         regions = {
-            name: cells if name in self.fixed else cells[order] for name, cells in made.regions.items()
+            name: cells if name in self.fixed else cells[order] for name, cells in batch.regions.items()
         }
-        return Made(made.ids[order], regions, {name: target[order] for name, target in made.targets.items()})
+        return Made(
+            batch.ids[order],
+            regions,
+            {name: target[order] for name, target in batch.targets.items()},
+        )

@@ -22,8 +22,7 @@ from powderdsl.targets.tensor_kind import pack
 from powderdsl.targets.torch.program import Kernels, PassFunction, compiled
 from powderdsl.targets.torch.source import pass_source
 from powderdsl.tasks.goals import REGION_LET, parts_of
-from powderdsl.tasks.task import Goal, Measure
-from powderdsl.tasks.tensors.generator import NOTHING
+from powderdsl.tasks.task import NOTHING, Goal, Measure
 from powderdsl.worlds.raster import Size
 
 
@@ -81,9 +80,9 @@ class Meter:
                 columns.append(self._reduced(measure, cells[number], regions))
                 continue
             target = targets[measure.target]
-            wanted = (target != NOTHING).sum((1, 2)).double()
+            size = (target != NOTHING).sum((1, 2)).double()
             same = (world.state["element"] == target).sum((1, 2)).double()
-            columns.append(same / wanted.clamp(min=1))
+            columns.append(same / size.clamp(min=1))
         if not columns:
             return torch.zeros(batch, 0, dtype=torch.float64, device=self.device)
         return torch.stack([column.expand(batch) for column in columns], 1)

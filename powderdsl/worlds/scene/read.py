@@ -273,33 +273,38 @@ def find_scene(path_or_name: str | Path) -> Scene:
         message = f"no scene `{name}` in {file}" if name else f"{file} has {len(scenes)} scenes"
         which = f"say which: {file}#{next(iter(scenes), 'NAME')}"
         raise failure("PD601", message, helps=suggest(name, scenes) if name else (which,))
-    shipped = {scene.name: scene for scene in shipped_scenes()}
-    if text in shipped:
-        return shipped[text]
-    helps = suggest(text, shipped) or ("shipped: " + ", ".join(shipped),)
-    raise failure("PD601", f"unknown scene `{text[:80]}`", helps=helps)
+    return shipped_scene(text)
+
+
+def shipped_scene(name: str) -> Scene:
+    """A scene that comes with the package. Raises CompileError (PD601) for an unknown name."""
+    scenes = {scene.name: scene for scene in shipped_scenes()}
+    if name not in scenes:
+        helps = suggest(name, scenes) or ("shipped: " + ", ".join(scenes),)
+        raise failure("PD601", f"unknown scene `{name[:80]}`", helps=helps)
+    return scenes[name]
 
 
 def shipped_scenes() -> tuple[Scene, ...]:
     """The scenes that come with the package, files in alphabetical order."""
-    sources = [read_source(path, Reporter()) for path in sorted(shipped("tasks/scenes").glob("*.yaml"))]
-    return tuple(scene for source in filter(None, sources) for scene in _scenes_of(source))
-
-
-@lru_cache(maxsize=32)
-def _scenes_of(source: Source) -> tuple[Scene, ...]:
-    """The scenes of a shipped file, which tasks and tests look up again and again. Raises CompileError."""
-    reporter = Reporter()
-    scenes = read_scenes(source, reporter)
-    reporter.raise_if_errors()
-    return scenes
+    paths = sorted(shipped("tasks/scenes").glob("*.yaml"))
+    return tuple(scene for path in paths for scene in read_file(path))
 
 
 def read_file(path: Path) -> tuple[Scene, ...]:
     """The scenes of a file. Raises CompileError: PD101 or PD102 if it cannot be read, and mistakes in it."""
     reporter = Reporter()
     source = read_source(path, reporter)
-    scenes = read_scenes(source, reporter) if source else ()
+    reporter.raise_if_errors()
+    assert source is not None
+    return _checked_scenes(source)
+
+
+@lru_cache(maxsize=32)
+def _checked_scenes(source: Source) -> tuple[Scene, ...]:
+    """The scenes of a text: tasks look up those of shipped files again and again. Raises CompileError."""
+    reporter = Reporter()
+    scenes = read_scenes(source, reporter)
     reporter.raise_if_errors()
     return scenes
 
