@@ -105,12 +105,12 @@ def option(name: str, kind: Any, about: str, default: Any = None, *, to: str = "
 
 
 def path(name: str, metavar: str, about: str, **more: Any) -> Option:
-    """A file or folder."""
+    """An option for a file or folder."""
     return option(name, click.Path(path_type=Path), about, metavar=metavar, **more)
 
 
 class OutputFile(click.Path):
-    """A file to write: its suffix is one of some, if any are given, and its folder can be written to."""
+    """A file to write, in a folder that can be written to. Its suffix is one of `suffixes`, if there are any."""
 
     def __init__(self, suffixes: Collection[str]):
         super().__init__(path_type=Path)
@@ -125,7 +125,7 @@ class OutputFile(click.Path):
 
 
 def output(name: str, metavar: str, about: str, *suffixes: str, **more: Any) -> Option:
-    """A file to write. Whether that is possible is checked before the command begins: CompileError (PD613)."""
+    """An option for a file to write, which is checked before the command begins. Raises CompileError (PD613)."""
     return option(name, OutputFile(suffixes), about, metavar=metavar, **more)
 
 
@@ -145,7 +145,7 @@ def pairs(name: str, metavar: str, about: str, to: str, value: str = ".+", read:
 
 
 def knobs(about: str) -> Option:
-    """Values for knobs of a task, as a mapping."""
+    """An option for the knobs of a task: values by name."""
     return pairs("--knob", "NAME=N", about, "knobs", "-?[0-9]{1,6}", int)
 
 

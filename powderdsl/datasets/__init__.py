@@ -15,7 +15,5 @@ __all__ = ["Dataset", "Transitions", "from_minari", "record", "split", "to_minar
 
 __getattr__ = importing(
     "powderdsl.datasets",
-    dataset="Dataset Transitions split",
-    minari="from_minari to_minari",
-    recorder="record",
+    {"dataset": "Dataset Transitions split", "minari": "from_minari to_minari", "recorder": "record"},
 )

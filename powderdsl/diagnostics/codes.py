@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 
 class Severity(Enum):
-    """An error stops; a warning is probably a mistake; a note is worth knowing."""
+    """The weight of a diagnostic: an error stops, a warning is probably a mistake, a note is worth knowing."""
 
     ERROR = "error"
     WARNING = "warning"

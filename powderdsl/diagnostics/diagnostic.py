@@ -262,7 +262,7 @@ class Reporter:
 
     @property
     def diagnostics(self) -> tuple[Diagnostic, ...]:
-        """Everything found so far, in source order, without repetitions."""
+        """The diagnostics so far, in source order, without repetitions."""
         return tuple(sorted(self._diagnostics, key=lambda diagnostic: diagnostic.sort_key))
 
     @property
@@ -270,7 +270,7 @@ class Reporter:
         return self._errors > 0
 
     def raise_if_errors(self) -> None:
-        """Raise CompileError with the errors found (warnings and notes stay with the reporter)."""
+        """Raise CompileError with the errors so far (warnings and notes stay with the reporter)."""
         if self.has_errors:
             errors = [d for d in self.diagnostics if d.severity is Severity.ERROR]
             raise CompileError(errors)

@@ -37,4 +37,6 @@ for _task in shipped_tasks():
         )
 
 
-__getattr__ = importing("powderdsl.envs", gym="GoalEnv PowderEnv PowderVectorEnv", tensor_env="TensorEnv")
+__getattr__ = importing(
+    "powderdsl.envs", {"gym": "GoalEnv PowderEnv PowderVectorEnv", "tensor_env": "TensorEnv"}
+)

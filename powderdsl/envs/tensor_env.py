@@ -183,14 +183,14 @@ class TensorEnv:
         return self.observation.of(self.episodes.world), info
 
     def _add_ended(self, info: Info, ended: Tensor) -> None:
-        """Add what is known of episodes where `ended`, bool [B], is set; zeros elsewhere."""
+        """Add return and length of the episodes where `ended`, bool [B], is set; zeros elsewhere."""
         assert self.episodes is not None
         info["episode_return"] = (self._returned * ended).float()
         info["episode_length"] = self.episodes.acted * ended
         info["_episode_return"] = info["_episode_length"] = ended.clone()
 
     def _add_shown(self, info: Info, mask: Tensor) -> None:
-        """Add what is known of the worlds that are shown, where `mask`, bool [B], is set."""
+        """Add the numbers of the shown worlds and their action masks, valid where `mask`, bool [B], is set."""
         assert self.episodes is not None
         info["world"], info["_world"] = self.episodes.seed.clone(), mask.clone()
         if self.shows_mask:

@@ -120,7 +120,7 @@ class Plan:
 
     @cached_property
     def cells(self) -> tuple[Cell, ...]:
-        """Each combination once."""
+        """The combinations to measure, each once."""
         names = [*self.backends, *(program.name for program in self.programs)]
         return tuple(dict.fromkeys(map(Cell._make, product(names, self.sizes, self.threads, self.batches))))
 

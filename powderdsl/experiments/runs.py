@@ -358,7 +358,7 @@ def misfit(folder: Path, *why: str, helps: tuple[str, ...] = ()) -> CompileError
 
 @contextmanager
 def reporting_misfits(path: Path, what: str) -> Iterator[None]:
-    """Report what raises where a checkpoint, which may hold anything, is given to a model (PD623)."""
+    """Report errors of the block, in which a checkpoint with any contents is given to a model, as PD623."""
     try:
         yield
     except (RuntimeError, TypeError, ValueError, AttributeError, LookupError) as error:

@@ -38,6 +38,8 @@ _register()
 
 __getattr__ = importing(
     "powderdsl.ogbench",
-    env="PowderworldEnv PowderworldVectorEnv",
-    datasets="load_dataset make_env_and_datasets",
+    {
+        "datasets": "load_dataset make_env_and_datasets",
+        "env": "PowderworldEnv PowderworldVectorEnv",
+    },
 )

@@ -32,7 +32,7 @@ Numbers = NDArray[np.int64]
 
 
 class _WithoutSnap(Simulator):
-    """On torch, keeping every magnitude of float fields."""
+    """A simulator on torch that keeps every magnitude of float fields."""
 
     def __init__(self, ruleset: Ruleset, device: str | torch.device):
         super().__init__(ruleset, "torch", device)

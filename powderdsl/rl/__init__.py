@@ -17,4 +17,6 @@ if TYPE_CHECKING:
 
 __all__ = ["TrainConfig", "evaluate", "load_policy", "preset", "train"]
 
-__getattr__ = importing("powderdsl.rl", training="train", evaluation="evaluate", policies="load_policy")
+__getattr__ = importing(
+    "powderdsl.rl", {"evaluation": "evaluate", "policies": "load_policy", "training": "train"}
+)

@@ -89,7 +89,7 @@ class Evaluation:
     seen: Mapping[str, Seen]
 
     def as_json(self) -> dict[str, Any]:
-        """For JSON: scores by split and policy."""
+        """The evaluation as plain values, for JSON: scores by split and policy."""
         data = asdict(self)
         splits: dict[str, dict[str, Any]] = {}
         for score in data.pop("scores"):
@@ -359,12 +359,12 @@ class Film:
         self._looks, self._font = looks(task.ruleset.elements, task.ruleset.fields), ImageFont.load_default()
 
     def begin(self, episodes: Episodes) -> None:
-        """The worlds at their start."""
+        """Keep the worlds at their start."""
         self.regions = {name: value.cpu().numpy() for name, value in episodes.regions.items()}
         self.see(episodes.world)
 
     def see(self, world: World) -> None:
-        """The worlds after an action, or a step."""
+        """Keep the worlds after an action, or a step."""
         fields = {name: world[name].cpu().numpy().copy() for name in self._fields}
         ids = world.ids.cpu().numpy().copy()
         self.scenes.append(FilmScene(ids, fields, self.actions, self._returns, self._over))

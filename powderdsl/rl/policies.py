@@ -81,7 +81,7 @@ class TrainedPolicy:
 
 
 class _NoOptimizer:
-    """For networks that only act: the first optimizer of a process imports torch's compiler, which takes a second."""
+    """No optimizer, for networks that only act: a process's first one imports torch's compiler, which takes a second."""
 
     def __init__(self, *_: object, **__: object):
         pass

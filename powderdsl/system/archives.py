@@ -53,7 +53,7 @@ class Header:
 
     @property
     def size(self) -> int:
-        """Bytes."""
+        """The bytes of the values."""
         return prod(self.shape) * self.itemsize
 
 

@@ -32,7 +32,7 @@ Handler = Callable[[int, FrameType | None], None]
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM or SIGHUP came. `number` is the signal's."""
+    """The interrupt by SIGTERM or SIGHUP. `number` is the signal's."""
 
     def __init__(self, number: int):
         super().__init__(f"terminated by {signal.Signals(number).name}")

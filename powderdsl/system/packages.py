@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Any
-
-from powderdsl.system.writing import failure
 
 
 def require(module: str, work: str, *helps: str) -> Any:
@@ -21,12 +19,14 @@ def require(module: str, work: str, *helps: str) -> Any:
     try:
         return import_module(module)
     except ImportError as error:
+        from powderdsl.system.writing import failure
+
         missing = error.name or module
         raise failure("PD612", f"{work} needs {missing}, which is not installed", helps=helps) from None
 
 
-def importing(package: str, **homes: str) -> Callable[[str], Any]:
-    """The ``__getattr__`` of a package; `homes` are its modules, each with the public names that are in it."""
+def importing(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
+    """The ``__getattr__`` of a package that imports a public name on first use. `homes` has the names in each module."""
 
     def import_name(name: str) -> Any:
         for module, names in homes.items():

@@ -162,7 +162,7 @@ def read_expert(
 
 @dataclass(frozen=True)
 class _Move:
-    """Reads moves."""
+    """A reader of the moves of an expert."""
 
     reader: Reader
     agent: Agent

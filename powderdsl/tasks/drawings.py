@@ -197,7 +197,7 @@ class Drawer:
         )
 
     def lets(self, written: Lets, names: dict[str, Expr | None]) -> tuple[tuple[str, Expr], ...]:
-        """Named numbers in order, which `names` gets."""
+        """The amounts of named numbers, in order. They are added to `names`."""
         lets = []
         for word, syntax in written:
             amount = None if syntax is None else read_amount(syntax, names, self.reporter)
@@ -412,7 +412,7 @@ def _named(word: yaml_tree.Scalar, reader: Reader, ruleset: Ruleset) -> NDArray[
 
 
 def pass_on(error: CompileError, reporter: Reporter, place: Span) -> None:
-    """Report what is wrong with something that a task names, there if it has no place of its own."""
+    """Report the mistakes in a file that a task names, those without a place at the name."""
     for mistake in error.diagnostics:
         span, label = mistake.primary.span or place, mistake.primary.text
         reporter.error(mistake.code, mistake.message, span, label, notes=mistake.notes, helps=mistake.helps)

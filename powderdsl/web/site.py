@@ -430,7 +430,9 @@ OWN_SHAPES = 12
 
 
 def offered_worlds(ruleset: Ruleset, names: Sequence[str]) -> tuple[list[dict[str, Any]], str]:
-    """Worlds with `name`, `about` and the keys of `world_data`; and the name of the world that shows the rules best.
+    """The worlds that the page offers with some rules, and the name of the one that shows the rules best.
+
+    A world has `name`, `about` and the keys of `world_data`.
 
     `names` are the arguments of `load`: an added pack gets a world with its elements.
     """

@@ -42,12 +42,14 @@ __all__ = [
 
 __getattr__ = importing(
     "powderdsl.worldmodel",
-    config="DataConfig Machine TrainConfig",
-    replay="Replay",
-    networks="UNet custom_network",
-    evaluation="evaluate evaluate_recording",
-    recordings="open_recording",
-    worlds="pairs_of task_worlds unseen_seeds",
-    scores="score",
-    training="finetuned load_trained train",
+    {
+        "config": "DataConfig Machine TrainConfig",
+        "evaluation": "evaluate evaluate_recording",
+        "networks": "UNet custom_network",
+        "recordings": "open_recording",
+        "replay": "Replay",
+        "scores": "score",
+        "training": "finetuned load_trained train",
+        "worlds": "pairs_of task_worlds unseen_seeds",
+    },
 )

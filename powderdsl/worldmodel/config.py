@@ -110,7 +110,7 @@ class TrainConfig(Checked):
 
     @property
     def plain(self) -> dict[str, Any]:
-        """For ``run.json``: the settings that are used."""
+        """The settings that are used, as ``run.json`` has them."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
     @staticmethod

@@ -53,7 +53,7 @@ class Tested:
         return sum(scores[predictor].loss for scores in self.scores.values()) / len(self.scores)
 
     def plain(self) -> dict[str, Any]:
-        """For JSON."""
+        """The results as plain values, for JSON."""
         names = list(next(iter(self.scores.values())))
         total = {name: reduce(add, [scores[name] for scores in self.scores.values()]) for name in names}
         return {

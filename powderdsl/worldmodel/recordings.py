@@ -105,7 +105,7 @@ class Recording:
         return torch.stack([placed, *speed], 1).to(torch.uint8)
 
     def spread(self, rows: Transitions, most: int, device: str | torch.device = "cpu") -> list[Pairs]:
-        """At most so many transitions, evenly spread, in batches."""
+        """Up to `most` transitions, evenly spread, in batches."""
         numbers = self.eligible(rows)
         numbers = numbers[torch.arange(min(most, len(numbers))) * len(numbers) // min(most, len(numbers))]
         return [self.pairs(rows, some, device) for some in numbers.split(64)]
@@ -154,7 +154,7 @@ def open_recording(folder: str | Path, task: str | None = None) -> Recording:
 
 
 def _differences(recipe: Recipe, task: Task) -> tuple[str, ...]:
-    """Why a recipe is not one of a task."""
+    """The differences between a recipe and a task, none if the task was recorded with it."""
     there = {"size": recipe.shape[1:], "actions": recipe.action_nvec, "choices": recipe.choices}
     here = {"size": task.size, "actions": task.agent.action_nvec, "choices": choice_names(task)}
     if changes := differences(there, here):

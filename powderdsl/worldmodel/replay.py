@@ -28,7 +28,7 @@ _BATCH, _FIRST = 0x57A7, 0x0FF5
 
 
 class Replay:
-    """`starts` and `ends` are uint8 [size, H, W]; ``iteration`` is the one that they are ready for.
+    """A buffer of pairs: `starts` and `ends`, uint8 [size, H, W], as the iteration `iteration` needs them.
 
     Args:
         seed: the run's. It decides which world comes first, and which pairs a batch has.

@@ -43,7 +43,7 @@ class Drawn:
 
     @property
     def structure(self) -> tuple[Any, ...]:
-        """The part that decides the compiled code; parameters are inputs of each world."""
+        """The changes that decide the compiled code. Parameters, which are inputs of each world, are not among them."""
         return self.left_out, self.swapped
 
 

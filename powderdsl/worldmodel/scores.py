@@ -54,7 +54,7 @@ class Score:
         return int(self.confusion.sum())
 
     def plain(self) -> dict[str, float | int | None]:
-        """For JSON."""
+        """The numbers of `MEASURES` by name, for JSON."""
         return {name: getattr(self, name) for name in MEASURES}
 
     @property
@@ -248,5 +248,5 @@ def elements_of(total: Score, palette: tuple[str | None, ...]) -> dict[str, dict
 
 
 def _share(part: int, whole: int) -> float | None:
-    """A ratio; None of nothing."""
+    """The ratio of two counts; None if the second is 0."""
     return part / whole if whole else None

@@ -107,7 +107,7 @@ def command(
 
 
 def play(start: World, plan: Playback) -> World:
-    """Run to the end; the last world. Nothing half-written stays behind when it is interrupted."""
+    """Run a world to the end, show or write it, and return it. An interrupted run leaves no incomplete file."""
     from powderdsl.cli.pictures import LiveView, first_world, pictures
 
     ruleset, world = start.sim.ruleset, start

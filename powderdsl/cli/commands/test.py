@@ -114,7 +114,7 @@ def command(
 
 @dataclass
 class _Report:
-    """One call of the command: what was asked for, and what came of it so far.
+    """One call of the command: its options, and its results so far.
 
     `keep`: whether counterexamples are kept. `picture`: where the first one is drawn.
     """
@@ -199,7 +199,7 @@ class _Report:
                 self.picture = None
 
     def replay(self, name: str, ruleset: Ruleset, path: Path) -> None:
-        """Try one counterexample again, as it is."""
+        """Try one counterexample again, unmodified."""
         text, sample, steps = read_example(path, ruleset)
         runner = Runner(ruleset, self.backend)
         search = InvariantSearch.of(runner, self.plan)

@@ -62,7 +62,7 @@ def check_study(study: Study, reporter: Reporter, *, devices: bool = True) -> No
 
 
 class _StudyCheck:
-    """The check of one study. What is loaded is loaded once."""
+    """The check of one study, which loads each task and ruleset once."""
 
     def __init__(self, study: Study, reporter: Reporter, devices: bool):
         self.study, self.reporter, self.devices = study, reporter, devices

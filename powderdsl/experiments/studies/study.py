@@ -97,7 +97,7 @@ class StudyStep:
 
     @property
     def name(self) -> str:
-        """Also the name of the folder of its run."""
+        """The step's name, which the folder of its run has too."""
         return self.key.text
 
     @property
@@ -124,7 +124,7 @@ class Axis:
 
     @property
     def name(self) -> str:
-        """It stands for the value."""
+        """The setting's name. In words, ``$NAME`` stands for its value."""
         return self.key.text
 
 
@@ -161,7 +161,7 @@ class Study:
     folder: Path
 
     def points(self, size: str, seeds: int | None = None) -> Iterator[Point]:
-        """All combinations, each with every seed. Seeds vary slowest, so that early ends leave whole sets."""
+        """Yield all combinations, each with every seed. Seeds vary slowest, so that early ends leave whole sets."""
         for seed in range(self.seeds if seeds is None else seeds):
             for values in itertools.product(*(axis.values[size] for axis in self.axes)):
                 words: dict[str, Scalar] = {}

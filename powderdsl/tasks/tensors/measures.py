@@ -235,13 +235,13 @@ class Facts:
 
 
 def scalar_value(scalar: Expr, facts: Facts) -> Tensor:
-    """float64 [B]; conditions are 0 or 1."""
+    """The value of an expression in each world: float64 [B]; conditions are 0 or 1."""
     value = _value(scalar, facts)
     return value if value.ndim else value.expand(len(facts.now)).clone()
 
 
 def _value(scalar: Expr, facts: Facts) -> Tensor:
-    """The same, or float64 [] where all worlds have the same."""
+    """The value as `scalar_value` gives it, or float64 [] where all worlds have the same."""
     match scalar.op:
         case "const":
             return torch.full((), float(scalar.value), dtype=torch.float64, device=facts.now.device)
