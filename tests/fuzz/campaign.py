@@ -17,12 +17,12 @@ import torch
 from powderdsl.system.writing import scratch_folder
 from powderdsl.testing.generators.cases import load_text
 from tests.fuzz.cases import Case, write_case
-from tests.fuzz.crew import Done, Lost, Tell, work_through
+from tests.fuzz.crew import Done, Lost, work_through
 from tests.fuzz.differential import Finding, Outcome, Plan, run_seed, seeded_starts, still_fails
 from tests.fuzz.reducer import reduce_case
 from tests.fuzz.rulemaker import random_ruleset_text
 
-SEED_LIMIT = 600.0
+SEED_LIMIT = 600
 """Seconds that a seed may take before it counts as one that hangs."""
 
 REDUCE_SECONDS = 120.0
@@ -66,7 +66,7 @@ def run_campaign(
         for heard in work_through(tasks, work, jobs, SEED_LIMIT):
             findings: tuple[Finding, ...] = ()
             if isinstance(heard, Lost):
-                findings = () if isinstance(heard.task, Finding) else (_lost(plan, heard),)
+                findings = () if isinstance(heard.task, Finding) else (_lost(plan, scratch, heard),)
             elif isinstance(heard.result, Outcome):
                 tally.count(heard.result)
                 findings = heard.result.findings
@@ -91,22 +91,31 @@ def file_name(finding: Finding) -> str:
     return f"seed{finding.seed}-{finding.case.backend}.yaml"
 
 
-def perform(plan: Plan, scratch: Path, task: int | Finding, tell: Tell) -> Outcome | Finding:
+def perform(plan: Plan, scratch: Path, task: int | Finding) -> Outcome | Finding:
     """What a process does with a task: runs a seed, or makes a finding small."""
     torch.set_num_threads(1)
     folder = scratch / str(os.getpid())  # each its own, so that none removes what another has just built
     folder.mkdir(exist_ok=True)
     how = replace(plan.building, folder=folder)
     if isinstance(task, int):
-        return run_seed(task, replace(plan, building=how), tell)
+        note = _note(scratch, task)
+        outcome = run_seed(task, replace(plan, building=how), lambda at: note.write_text(f"{at[0]} {at[1]}"))
+        note.unlink(missing_ok=True)
+        return outcome
     end = time.monotonic() + REDUCE_SECONDS
     fails = still_fails(task, how)
     return replace(task, case=reduce_case(task.case, lambda case: time.monotonic() < end and fails(case)))
 
 
-def _lost(plan: Plan, lost: Lost) -> Finding:
+def _note(scratch: Path, seed: int) -> Path:
+    """Where a process writes the backend and the start that it runs, in case it dies of them."""
+    return scratch / f"seed{seed}.txt"
+
+
+def _lost(plan: Plan, scratch: Path, lost: Lost) -> Finding:
     """What a process was at when it died or was ended, as a finding: not made small, since it would die again."""
     text = random_ruleset_text(lost.task)
-    backend, number = lost.told or (plan.backends[0], 0)
+    note = _note(scratch, lost.task)
+    backend, number = note.read_text().split() if note.exists() else (plan.backends[0], "0")
     starts = list(seeded_starts(load_text(text), lost.task, plan.worlds))
-    return Finding(lost.task, Case(text, starts[number], plan.steps, backend), "lost", lost.reason)
+    return Finding(lost.task, Case(text, starts[int(number)], plan.steps, backend), "lost", lost.reason)

@@ -24,10 +24,10 @@ from powderdsl.syntax.sources import shipped
 from powderdsl.system.reports import as_json
 from powderdsl.system.writing import replacing
 from powderdsl.testing.generators.choices import Choices
-from tests.fuzz.crew import Lost, Tell, work_through
+from tests.fuzz.crew import Lost, work_through
 from tests.fuzz.rulemaker import Manner, ruleset_text
 
-HANGS = 300.0
+HANGS = 300
 """Seconds after which an input counts as one that never ends: by the clock, so a busy machine needs some."""
 
 TOKEN = re.compile(r"\w+|\s+|.", re.DOTALL)
@@ -254,7 +254,7 @@ def run_trials(seeds: Iterator[int], jobs: int, folder: Path, until: float) -> G
         until: the end, on `time.monotonic`'s clock.
     """
     tasks: deque[int] = deque(islice(seeds, 2 * jobs))
-    for heard in work_through(tasks, perform_trial, jobs, HANGS, recycle=2000):
+    for heard in work_through(tasks, run_trial, jobs, HANGS, recycle=2000):
         if isinstance(heard, Lost):
             trial = Trial(heard.task, damaged_text(heard.task)[0], False, 0.0, 0.0, heard.reason)
         else:
@@ -268,11 +268,6 @@ def run_trials(seeds: Iterator[int], jobs: int, folder: Path, until: float) -> G
             tasks.extend(islice(seeds, max(0, 2 * jobs - len(tasks))))
         else:
             tasks.clear()
-
-
-def perform_trial(seed: int, tell: Tell) -> Trial:
-    """What a process does with a seed."""
-    return run_trial(seed)
 
 
 def run_trial(seed: int) -> Trial:

@@ -92,7 +92,9 @@ def seeded_starts(ruleset: Ruleset, seed: int, worlds: int) -> Iterator[Start]:
         yield random_start(ruleset, choices, (1, STRIPS * choices.integer(1, 3), choices.pick(WIDTHS)))
 
 
-def run_seed(seed: int, plan: Plan, tell: Callable[[tuple[str, int]], None] = lambda place: None) -> Outcome:
+def run_seed(
+    seed: int, plan: Plan, tell: Callable[[tuple[str, int]], object] = lambda place: None
+) -> Outcome:
     """Compare all backends of a plan on the rules and worlds of a seed.
 
     Args:
