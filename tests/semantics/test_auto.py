@@ -20,11 +20,9 @@ import torch
 
 import powderdsl
 from powderdsl.cli.dispatch import plain_warning
-from powderdsl.compiler import lower
-from powderdsl.ir.text import print_program
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation import native
-from powderdsl.simulation.native import AutoProgram, start_key
+from powderdsl.simulation.native import AutoProgram
 from powderdsl.simulation.programs import BackendProgram
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.targets import cache
@@ -82,23 +80,40 @@ def job(steps: int, start: int = 0, **changes: Any) -> Job:
 
 
 class Compiler:
-    """Gives a program when it is told to."""
+    """Gives a program when it is told to, or raises."""
 
-    def __init__(self, program: Counter):
-        self.program, self.go, self.asked = program, threading.Event(), 0
+    def __init__(self, program: Counter, problem: Exception | None = None):
+        self.program, self.problem, self.go, self.asked = program, problem, threading.Event(), 0
 
     def __call__(self) -> Counter:
         self.asked += 1
+        if self.problem is not None:
+            raise self.problem
         assert self.go.wait(60)
         return self.program
 
 
-def auto_program(seconds: float) -> tuple[AutoProgram, Compiler, list[tuple[str, int, int]]]:
-    log: list[tuple[str, int, int]] = []
-    first = Counter("wasm", seconds, log)
-    compiler = Compiler(Counter("native", 0, log))
+Log = list[tuple[str, int, int]]
+
+
+def auto_program(
+    seconds: float,
+    problem: Exception | None = None,
+    is_compiled: bool = False,
+    first: type[Counter] = Counter,
+) -> tuple[AutoProgram, Compiler, Log]:
+    """A program of `auto` whose first backend takes some seconds a step, its compiler, and the log of what ran."""
+    log: Log = []
+    names = {name: Counter(name, 0, log) for name in ("torch", "native")}
+    compiler = Compiler(names["native"], problem)
     return (
-        AutoProgram("wasm", lambda: first, lambda: Counter("torch", 0, log), lambda: None, compiler),
+        AutoProgram(
+            "wasm",
+            lambda: first("wasm", seconds, log),
+            lambda: names["torch"],
+            lambda: names["native"] if is_compiled else None,
+            compiler,
+        ),
         compiler,
         log,
     )
@@ -141,33 +156,18 @@ class Full(Counter):
         raise MemoryError
 
 
-def test_worlds_too_large_for_webassembly_wait_for_native_code() -> None:
-    log: list[tuple[str, int, int]] = []
-
-    def fails() -> Counter:
-        raise NoCompiler("g++ does not run")
-
-    for make in (lambda: Counter("native", 0, log), fails):
-        first, cells = Full("wasm"), Counter("torch", 0, log)
-        program = AutoProgram(
-            "wasm", lambda first=first: first, lambda cells=cells: cells, lambda: None, make
-        )
-        program.run(job(3))
-        program.run(job(4, 3))
-    assert log == [("native", 0, 3), ("native", 3, 4), ("torch", 0, 3), ("torch", 3, 4)]
+@pytest.mark.parametrize(("problem", "runs"), [(None, "native"), (NoCompiler("g++ does not run"), "torch")])
+def test_worlds_too_large_for_webassembly_wait_for_native_code(problem: Exception | None, runs: str) -> None:
+    program, compiler, log = auto_program(0, problem, first=Full)
+    compiler.go.set()
+    program.run(job(3))
+    program.run(job(4, 3))
+    assert log == [(runs, 0, 3), (runs, 3, 4)]
 
 
 def test_given_draws_and_chosen_passes_stay_with_torch() -> None:
-    log: list[tuple[str, int, int]] = []
-    cells = Counter("torch", 0, log)
-    auto = AutoProgram(
-        "wasm",
-        lambda: Counter("wasm", 0, log),
-        lambda: cells,
-        lambda: Counter("native", 0, log),
-        lambda: Counter("", 0, log),
-    )
-    program = BackendProgram("", auto, lambda: cells)
+    auto, _, log = auto_program(0, is_compiled=True)
+    program = BackendProgram("", auto, lambda: Counter("torch", 0, log))
     program.run(job(3))
     program.run(job(4, draws={"coin": torch.zeros(1, 2, 2)}))
     program.run(job(5, passes=frozenset({"fall"})))
@@ -180,20 +180,7 @@ def test_without_native_code_the_first_backend_continues(
     problem: Exception, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(native, "WORTH", 0.0)
-    log: list[tuple[str, int, int]] = []
-    asked = []
-
-    def fails() -> Counter:
-        asked.append(1)
-        raise problem
-
-    program = AutoProgram(
-        "wasm",
-        lambda: Counter("wasm", 0.001, log),
-        lambda: Counter("torch", 0, log),
-        lambda: None,
-        fails,
-    )
+    program, compiler, _ = auto_program(0.001, problem)
     native._warn_of_compilers.cache_clear()
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
@@ -202,7 +189,7 @@ def test_without_native_code_the_first_backend_continues(
     wanted = "no C++ compiler: tried g++; native code is many times faster: install g++ or clang++, or "
     sentences = [wanted + "`pip install powderdsl[native]`"] if isinstance(problem, NoCompiler) else []
     assert [str(one.message) for one in told] == sentences, "once"
-    assert len(asked) == 1
+    assert compiler.asked == 1
     assert str(problem) in program.notes[0]
     assert "pip install powderdsl[native]" in program.notes[1]
 
@@ -359,18 +346,6 @@ with building(Building('-O0', Path(sys.argv[1]))):
     environment = environment_with(OMP_NUM_THREADS="1")
     run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
     assert (run.returncode, run.stdout) == (0, "wasm\nnative\n"), run.stderr
-
-
-# --- what it depends on
-
-
-@needs_compiler
-@pytest.mark.parametrize("name", ["powderworld", "forest_fire"])
-def test_values_of_parameters_take_no_part_in_what_is_compiled(name: str) -> None:
-    ruleset = powderdsl.load(name)
-    changed = ruleset.with_params({param.name: param.kind.hi or 1 for param in ruleset.params})
-    assert start_key(changed) == start_key(ruleset)
-    assert print_program(lower(changed)) == print_program(lower(ruleset))
 
 
 def test_run_says_what_ran_and_why(tmp_path: Path) -> None:
