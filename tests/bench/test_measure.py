@@ -102,8 +102,8 @@ def test_rounds_are_interleaved_and_loading_is_not_timed(rules, torch):
     assert max(slow) < 0.2
 
 
-def test_all_cells_are_ready_before_the_first_round_and_costs_come_last(rules, torch):
-    plan = Plan(rules, backends=["torch", "wasm"], profile=True, **TINY)
+def test_all_cells_are_ready_before_the_first_round_and_costs_come_last(torch):
+    plan = Plan(powderdsl.load("life"), backends=["torch", "wasm"], profile=True, **TINY)
     kinds = [kind for kind, _ in measuring(plan, [])]
     assert kinds == ["compile"] * 4 + ["measure"] * 8 + ["profile"] * 4
 
