@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from powderdsl.model.types import Ruleset
-from powderdsl.simulation.simulator import compile as compile_ruleset
-from powderdsl.testing.generators.cases import Start, load_text
-from tests.fuzz import STARTS_AT_ONCE
+from powderdsl.testing.generators.cases import Start, random_start
+from powderdsl.testing.generators.choices import Choices
 
 if TYPE_CHECKING:
     from powderdsl.simulation.simulator import Simulator
-
-BACKENDS = ("reference", *STARTS_AT_ONCE)
-"""What random rulesets are compared on: native code and emulated kernels take seconds to compile."""
 
 
 @dataclass(frozen=True)
@@ -55,39 +51,37 @@ def find_difference(first: Mapping[str, Any], second: Mapping[str, Any]) -> Diff
     return None
 
 
-def assert_same(
-    ruleset: Ruleset | str,
-    start: Start,
-    backends: Sequence[str] = BACKENDS,
-    steps: int = 1,
-    *,
-    simulators: Sequence[Simulator] | None = None,
-    random: Mapping[str, Any] | None = None,
+def assert_same_worlds(
+    simulators: Sequence[Simulator], shapes: Iterable[tuple[int, int, int]], steps: int
 ) -> None:
-    """Run the same worlds on several backends and compare every slot after every step.
+    """Compare the simulators of a ruleset on random worlds of some shapes, as `assert_same` does."""
+    for seed, shape in enumerate(shapes):
+        assert_same(random_start(simulators[0].ruleset, Choices.seeded(seed), shape), simulators, steps)
+
+
+def assert_same(
+    start: Start, simulators: Sequence[Simulator], steps: int = 1, random: Mapping[str, Any] | None = None
+) -> None:
+    """Run the same worlds on the simulators of a ruleset and compare every slot after every step.
 
     Args:
-        ruleset: a checked model, or a pack's text.
         start: the worlds at the start.
-        simulators: of this ruleset, if there are some already: one a backend.
         random: draws for all streams, as `Simulator.step` takes them.
 
     Raises:
         AssertionError: they differ. The message says where first, and has the text of the rules.
     """
-    rules = load_text(ruleset) if isinstance(ruleset, str) else ruleset
-    sims = list(simulators or (compile_ruleset(rules, backend=backend) for backend in backends))
-    worlds = [start.world(sim) for sim in sims]
+    worlds = [start.world(sim) for sim in simulators]
     options: dict[str, Any] = {"params": start.params or None, "random": random}
     for step in range(steps + 1):
         for world in worlds[1:]:
             difference = find_difference(worlds[0].state, world.state)
             if difference is not None:
-                names = " and ".join(sim.backend for sim in sims)
+                names = " and ".join(sim.backend for sim in simulators)
                 problem = f"{names} differ after step {step}: {difference}"
-                raise AssertionError("\n".join([problem, str(start), source_text(rules)]))
+                raise AssertionError("\n".join([problem, str(start), source_text(simulators[0].ruleset)]))
         if step < steps:
-            worlds = [sim.step(world, **options) for sim, world in zip(sims, worlds, strict=True)]
+            worlds = [sim.step(world, **options) for sim, world in zip(simulators, worlds, strict=True)]
 
 
 def source_text(ruleset: Ruleset) -> str:

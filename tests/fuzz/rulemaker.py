@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cache, partial
 
+from powderdsl.diagnostics import CompileError
 from powderdsl.model.builtins import KERNEL_SHAPES, KERNELS, shaped_kernel
-from powderdsl.model.types import CHANCE, DIRECTION, ELEMENT, FLAG, REAL, VEC2, Kind, integer
+from powderdsl.model.types import CHANCE, DIRECTION, ELEMENT, FLAG, REAL, VEC2, Kind, Ruleset, integer
+from powderdsl.testing.generators.cases import load_text
 from powderdsl.testing.generators.choices import Choices
 from powderdsl.testing.generators.trees import Tree, write_yaml
 from tests.fuzz.grammar import (
@@ -200,6 +202,15 @@ WEIGHTS = {"transform": 4, "swap": 4, "move": 3, "assign": 3, "push": 1}
 
 ADDED = {"int": ("integer",), "real": ("real", "real", "integer", "flag", "draw"), "vec2": ("vec2",)}
 """What can be added to fields of numeric kinds."""
+
+
+@cache
+def random_ruleset(seed: int, manner: Manner | None = None) -> Ruleset | None:
+    """The random ruleset of a seed; None if the static checks refuse it."""
+    try:
+        return load_text(random_ruleset_text(seed, manner), f"seed{seed}.yaml")
+    except CompileError:
+        return None
 
 
 def random_ruleset_text(seed: int, manner: Manner | None = None) -> str:

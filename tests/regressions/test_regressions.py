@@ -12,26 +12,18 @@ from tests.compilers import skip_without_compiler
 from tests.fuzz import COMPARED, COMPILED
 from tests.fuzz.cases import read_case
 from tests.fuzz.differential import check_case
+from tests.tiers import tiered
 
 FOLDER = Path(__file__).parent
-FILES = sorted(FOLDER.glob("*.yaml"))
+LONG = "more-planes-than-parameters"
+CASES = [(path.stem, backend) for path in sorted(FOLDER.glob("*.yaml")) for backend in COMPARED]
+QUICK = [(name, backend) for name, backend in CASES if name != LONG and backend not in COMPILED]
 
 
-def cases() -> list:
-    found = []
-    for path in FILES:
-        for backend in COMPARED:
-            marks = [pytest.mark.slow] if backend in COMPILED else []
-            found.append(pytest.param(path, backend, id=f"{path.stem}-{backend}", marks=marks))
-    return found
-
-
-@pytest.mark.parametrize(("path", "backend"), cases())
-def test_backends_agree(path: Path, backend: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("case", tiered(CASES, QUICK), ids="-".join)
+def test_backends_agree(case: tuple[str, str], tmp_path: Path) -> None:
+    name, backend = case
     skip_without_compiler(backend)
+    path = FOLDER / f"{name}.yaml"
     found = check_case(replace(read_case(path), backend=backend), Building("-O0", tmp_path))
     assert found is None, f"{found}\npython -m tests.fuzz --replay {path.relative_to(FOLDER.parents[1])}"
-
-
-def test_there_are_some() -> None:
-    assert FILES

@@ -9,8 +9,8 @@ takes the first of them, `make test-all` all. `python -m tests.fuzz` tries other
 from __future__ import annotations
 
 import os
+import platform
 from collections.abc import Iterable, Sequence
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -18,19 +18,25 @@ import pytest
 
 from powderdsl.compiler import BACKENDS as powderdsl_backends
 from powderdsl.compiler import load, shipped_rules, shipped_tests, shipped_variants
-from powderdsl.diagnostics import CompileError
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.syntax.sources import shipped
-from powderdsl.targets.cpp.build import Building
+from powderdsl.targets.cpp.build import (
+    ARCHITECTURE,
+    Building,
+    building,
+    find_compiler,
+    flags_for,
+    processor,
+)
 from powderdsl.testing.generators.cases import Start, load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.compilers import skip_without_compiler
 from tests.fuzz import COMPARED, STARTS_AT_ONCE, differential
-from tests.fuzz.compare import assert_same, find_difference
+from tests.fuzz.compare import assert_same, assert_same_worlds, find_difference
 from tests.fuzz.differential import Outcome, Plan, run_seed
 from tests.fuzz.exercised import constructs, missing, operations
-from tests.fuzz.rulemaker import random_ruleset_text
+from tests.fuzz.rulemaker import random_ruleset
 from tests.tiers import tiered
 
 BACKENDS = ("reference", *STARTS_AT_ONCE)
@@ -44,18 +50,6 @@ MAX_REJECTED = 0.08
 
 COVERED_BY = 200
 """So many random rulesets exercise everything."""
-
-
-@cache
-def seeded_ruleset(seed: int) -> Ruleset | None:
-    """The random ruleset of a seed; None if the static checks refuse it."""
-    try:
-        return load_text(random_ruleset_text(seed), f"seed{seed}.yaml")
-    except CompileError:
-        return None
-
-
-# Shipped rulesets
 
 
 def compositions() -> list[str]:
@@ -77,13 +71,17 @@ def compositions() -> list[str]:
     return ["+".join(loaded(name)) for name in shipped_rules()]
 
 
+SIZES = [(2, 9, 33), (3, 4, 5), (2, 1, 64), (2, 65, 1), (1, 1, 1), (1, 2, 31), (1, 20, 97)]
+STRIPS = [(2, 16, 70), (1, 64, 64), (1, 256, 256), (9, 520, 20), (2, 8, 1)]
+"""Worlds that native code cuts into strips: of one row, of more rows than one list of active rows has; large and many."""
+
 BASES = [name for name in compositions() if not name.startswith("powderworld2_")]
 """The compositions without the variants of a large ruleset."""
 
 
 @pytest.mark.parametrize("name", tiered(compositions(), BASES))
 def test_shipped_rulesets(name: str) -> None:
-    compare_shipped(load(name), BACKENDS)
+    compare_shipped(load(name), BACKENDS, SIZES)
 
 
 @pytest.mark.parametrize(
@@ -91,16 +89,28 @@ def test_shipped_rulesets(name: str) -> None:
 )
 def test_shipped_rulesets_as_native_code(name: str) -> None:
     skip_without_compiler()
-    compare_shipped(load(name), ("reference", "native"))
+    compare_shipped(load(name), ("reference", "native"), SIZES + STRIPS)
 
 
-def compare_shipped(ruleset: Ruleset, backends: Sequence[str]) -> None:
-    simulators = [compile_ruleset(ruleset, backend=backend) for backend in backends]
-    for seed, shape in enumerate(
-        [(2, 9, 33), (3, 4, 5), (2, 1, 64), (2, 65, 1), (1, 1, 1), (1, 2, 31), (1, 20, 97)]
-    ):
-        start = random_start(ruleset, Choices.seeded(seed), shape)
-        assert_same(ruleset, start, steps=3, simulators=simulators)
+def compare_shipped(
+    ruleset: Ruleset, backends: Sequence[str], shapes: Sequence[tuple[int, int, int]]
+) -> None:
+    assert_same_worlds([compile_ruleset(ruleset, backend=backend) for backend in backends], shapes, 3)
+
+
+LEVELS = {"x86-64-v2": "sse4_2", "x86-64-v3": "avx2", "x86-64-v4": "avx512bw"}
+"""Levels of processors, and an instruction set that a machine needs for each."""
+
+
+@pytest.mark.parametrize("level", tiered(LEVELS, ["x86-64-v3"]))
+def test_worlds_do_not_depend_on_vectors(level: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    skip_without_compiler()
+    if platform.machine() not in ("x86_64", "AMD64") or LEVELS[level] not in processor():
+        pytest.skip(f"this processor is not {level}")
+    monkeypatch.setenv(ARCHITECTURE, level)
+    assert any(one.replace("_", "-") == f"-march={level}" for one in flags_for(find_compiler(), "-O0"))
+    with building(Building("-O0", tmp_path)):
+        compare_shipped(load("core+sand+water+wind"), ("torch", "native"), [(5, 8, 70), (9, 7, 33)])
 
 
 def test_parameters_may_differ_by_world(torch) -> None:  # type: ignore[no-untyped-def]
@@ -148,9 +158,6 @@ def test_elements_that_appear_are_found_by_later_passes(torch) -> None:  # type:
                 skip_without_compiler(backend)
                 sim = compile_ruleset(rules, backend=backend)
                 assert not sim.step(sim.world(ids)).ids.any(), (backend, shape, start)
-
-
-# Random rulesets
 
 
 def agreed(outcomes: Iterable[Outcome]) -> int:
@@ -212,17 +219,11 @@ def test_every_target_is_compared_once() -> None:
     assert len(set(programs.values())) == len(COMPARED), programs
 
 
-def test_few_random_texts_are_refused() -> None:
-    seeds = range(FIRST, min(FIRST + COVERED_BY, LAST))
-    refused = [seed for seed in seeds if seeded_ruleset(seed) is None]
-    assert len(refused) <= MAX_REJECTED * len(seeds), refused
-
-
 def test_draws_from_outside() -> None:
     """Draws that the caller gives count the same on every backend; extremes among them."""
     generator = np.random.default_rng(5)
     for seed in range(FIRST, FIRST + 12):
-        ruleset = seeded_ruleset(seed)
+        ruleset = random_ruleset(seed)
         if ruleset is None or not ruleset.streams:
             continue
         start = random_start(ruleset, Choices.seeded(seed), (2, 3, 33))
@@ -231,25 +232,23 @@ def test_draws_from_outside() -> None:
             stream.name: np.where(generator.random(start.ids.shape) < 0.5, generator.random(start.ids.shape), generator.choice(edges, start.ids.shape))
             for stream in ruleset.streams
         }  # fmt: skip
-        assert_same(ruleset, start, BACKENDS, random=draws)
+        simulators = [compile_ruleset(ruleset, backend=backend) for backend in BACKENDS]
+        assert_same(start, simulators, random=draws)
 
 
-# What the random rulesets are made of
-
-
-def test_random_rulesets_use_all_that_targets_see() -> None:
+def test_random_rulesets_use_all_that_targets_see_and_few_are_refused() -> None:
     """Every construct and every operation, on numbers and on bit planes; the lists come from the compiler's tables."""
     used: set[tuple[str, str]] = set()
-    for seed in range(COVERED_BY):
-        ruleset = seeded_ruleset(seed)
-        if ruleset is not None:
+    seed = refused = 0
+    while missing(used) and seed < COVERED_BY:
+        ruleset = random_ruleset(seed)
+        seed += 1
+        if ruleset is None:
+            refused += 1
+        else:
             used |= {*constructs(ruleset)} | operations(ruleset)
-        if not missing(used):
-            return
-    pytest.fail(f"never exercised: {missing(used)}")
-
-
-# The comparison itself
+    assert not missing(used)
+    assert refused <= MAX_REJECTED * seed
 
 
 def test_a_difference_is_found_and_located() -> None:
@@ -259,7 +258,7 @@ def test_a_difference_is_found_and_located() -> None:
     )
     start = Start.fresh(np.zeros((2, 3, 4), np.uint8))
     right, wrong = compile_ruleset(ruleset, backend="reference"), compile_ruleset(ruleset, backend="torch")
-    assert_same(ruleset, start, simulators=[right, wrong], steps=3)
+    assert_same(start, [right, wrong], 3)
     step = wrong.step
 
     def broken(world, **options):  # type: ignore[no-untyped-def]
@@ -274,7 +273,7 @@ def test_a_difference_is_found_and_located() -> None:
     with pytest.raises(
         AssertionError, match=r"differ after step 2: `f` at \(1, 2, 3\): 3 and 7 \(1 differ\)"
     ) as found:
-        assert_same(ruleset, start, simulators=[right, wrong], steps=3)
+        assert_same(start, [right, wrong], 3)
     assert "f += step mod 2" in str(found.value)
 
 

@@ -6,7 +6,6 @@ Random rulesets come from seeds, as in test_differential.py; `Manner` leaves out
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ import pytest
 import torch
 
 import powderdsl
-from powderdsl.compiler import load
 from powderdsl.diagnostics import CompileError, Reporter, Source, Span
 from powderdsl.model import reference
 from powderdsl.model.check import check
@@ -25,10 +23,10 @@ from powderdsl.model.state import SNAP, slots
 from powderdsl.model.types import Assign, Moment, Move, Swap, Transform
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.simulation.simulator import compile as compile_ruleset
-from powderdsl.testing.generators.cases import Start, load_text, random_start
+from powderdsl.testing.generators.cases import load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.fuzz.compare import find_difference
-from tests.fuzz.rulemaker import Manner, random_ruleset_text
+from tests.fuzz.rulemaker import Manner, random_ruleset, random_ruleset_text
 
 ANYTHING = Manner()
 STEADY = Manner(draws=False, borders=False, symmetry=False)
@@ -37,16 +35,10 @@ SWAPS = Manner(forms=("swap",), overwrites=False)
 
 
 @cache
-def simulators(manner: Manner, seeds: range, backend: str = "wasm") -> tuple[Simulator, ...]:
+def simulators(manner: Manner, seeds: range) -> tuple[Simulator, ...]:
     """Simulators of random rulesets; texts that the static checks refuse are left out."""
-    found = []
-    for seed in seeds:
-        try:
-            ruleset = load_text(random_ruleset_text(seed, manner), f"seed{seed}.yaml")
-        except CompileError:
-            continue
-        found.append(compile_ruleset(ruleset, backend=backend))
-    return tuple(found)
+    rulesets = (random_ruleset(seed, manner) for seed in seeds)
+    return tuple(compile_ruleset(ruleset, backend="torch") for ruleset in rulesets if ruleset is not None)
 
 
 def random_world(simulator: Simulator, seed: int, shape: tuple[int, int, int]) -> World:
@@ -58,47 +50,8 @@ def assert_equal(first: World, second: World) -> None:
     assert difference is None, f"{difference}\n{first.sim.ruleset.name}"
 
 
-CASES = [("wasm", range(6)), ("torch", range(30, 33)), ("reference", range(45, 47))]
-
-
-# Batches and steps
-
-
-@pytest.mark.parametrize(("backend", "seeds"), CASES)
-def test_a_world_is_the_same_alone_and_in_a_batch(backend: str, seeds: range) -> None:
-    for number, simulator in enumerate(simulators(ANYTHING, seeds, backend)):
-        start = random_start(simulator.ruleset, Choices.seeded(number), (3, 3, 34))
-        together = start.world(simulator)
-        after = simulator.step(together, 3)
-        for i in range(3):
-            assert_equal(simulator.step(together.select([i]), 3), after.select(i))
-            alone = replace(start.one(i).world(simulator), index=together.index[i : i + 1])
-            assert_equal(simulator.step(alone, 3), after.select(i))
-        assert_equal(simulator.step(together.select([2, 0]), 3), after.select([2, 0]))
-
-
-@pytest.mark.parametrize(("backend", "seeds"), CASES)
-def test_steps_add_up_and_leave_their_argument_alone(backend: str, seeds: range) -> None:
-    for number, simulator in enumerate(simulators(ANYTHING, seeds, backend)):
-        world = random_world(
-            simulator, number, (2, 4, 34)
-        )  # the width of the test above: modules are made once
-        before = {name: value.clone() for name, value in world.state.items()}
-        one_by_one = world
-        for _ in range(3):
-            one_by_one = simulator.step(one_by_one)
-        at_once = simulator.step(world, 3)
-        assert_equal(at_once, one_by_one)
-        assert torch.equal(at_once.step, world.step + 3)
-        assert find_difference(world.state, before) is None
-        assert_equal(simulator.step(world, 0), world)
-        again = simulator.step(world, 3)
-        assert_equal(again, at_once)  # nothing is left over from the first time
-
-
 def test_a_saved_world_goes_on_as_if_it_had_never_stopped(tmp_path: Path) -> None:
-    chosen = [compile_ruleset(load("powderworld"), backend="wasm"), *simulators(ANYTHING, range(60, 64))]
-    for number, simulator in enumerate(chosen):
+    for number, simulator in enumerate(simulators(ANYTHING, range(60, 64))):
         middle = simulator.step(random_world(simulator, number, (2, 5, 33)), 2)
         path = tmp_path / f"world{number}.npz"
         powderdsl.save(middle, path)
@@ -107,10 +60,7 @@ def test_a_saved_world_goes_on_as_if_it_had_never_stopped(tmp_path: Path) -> Non
         assert_equal(simulator.step(loaded, 3), simulator.step(middle, 3))
 
 
-# Space
-
-
-@pytest.mark.parametrize("shape", [(2, 5, 7), (1, 1, 40), (1, 33, 2)])
+@pytest.mark.parametrize("shape", [(2, 5, 7), (1, 33, 2)])
 def test_shifted_worlds_have_shifted_futures(shape: tuple[int, int, int]) -> None:
     for number, simulator in enumerate(simulators(STEADY, range(12))):
         world = random_world(simulator, number, shape)
@@ -173,27 +123,17 @@ def test_symmetric_rules_treat_all_orientations_alike(symmetry: str) -> None:
     assert changed
 
 
-# Conservation
-
-
-@pytest.mark.parametrize("backend", ["torch", "wasm"])
-def test_swaps_conserve_what_cells_hold(backend: str) -> None:
-    """Swaps move an element with all its fields: the multiset of whole cells stays the same, in any shape.
-
-    Each width is a module of its own on `wasm`: there each ruleset has one shape, and seeds 1 and 9, which have
-    thousands of movements, are left to `torch`.
-    """
+def test_swaps_conserve_what_cells_hold() -> None:
+    """Swaps move an element with all its fields: the multiset of whole cells stays the same, in any shape."""
     moved = 0
-    shapes = ((2, 5, 9), (1, 1, 33), (2, 31, 1), (1, 2, 2))
-    seeds = range(24) if backend == "torch" else range(20, 36)
-    for number, simulator in enumerate(simulators(SWAPS, seeds, backend)):
+    for number, simulator in enumerate(simulators(SWAPS, range(20, 36))):
         carried = [slot.name for slot in slots(simulator.ruleset) if slot.travels and not slot.resets]
-        for shape in shapes if backend == "torch" else (shapes[number % 3],):
+        for shape in ((2, 5, 9), (1, 1, 33), (2, 31, 1), (1, 2, 2)):
             world = random_world(simulator, number, shape)
             after = simulator.step(world, 2)
             assert cells(world, carried) == cells(after, carried)
             moved += not torch.equal(world.ids, after.ids)
-    assert moved >= (20 if backend == "torch" else 3)
+    assert moved >= 12
 
 
 def cells(world: World, names: list[str]) -> list[list[tuple[float, ...]]]:
@@ -204,12 +144,8 @@ def cells(world: World, names: list[str]) -> list[list[tuple[float, ...]]]:
     return [sorted(map(tuple, cells.tolist())) for cells in stacked]
 
 
-# Ranges
-
-
-@pytest.mark.parametrize(("backend", "seeds"), [("wasm", range(200, 210)), ("reference", range(260, 262))])
-def test_every_value_is_one_that_was_declared(backend: str, seeds: range) -> None:
-    for number, simulator in enumerate(simulators(ANYTHING, seeds, backend)):
+def test_every_value_is_one_that_was_declared() -> None:
+    for number, simulator in enumerate(simulators(ANYTHING, range(200, 210))):
         ruleset = simulator.ruleset
         world = simulator.step(random_world(simulator, number, (2, 4, 33)), 3)
         ids = {element.id for element in ruleset.elements}
@@ -242,9 +178,6 @@ def test_every_value_is_one_that_was_declared(backend: str, seeds: range) -> Non
                 assert torch.equal(world[prop.name][elsewhere].long(), table[world.ids.long()][elsewhere])
 
 
-# What the static checks promise
-
-
 def test_what_is_shown_to_be_impossible_never_happens(monkeypatch: pytest.MonkeyPatch) -> None:
     """Substeps without a policy have no conflicts, and rules that "can never fire" (PD503) never fire."""
     silent: set[Span] = set()
@@ -271,7 +204,7 @@ def test_what_is_shown_to_be_impossible_never_happens(monkeypatch: pytest.Monkey
         return run_moment(moment, at, table)
 
     monkeypatch.setattr(reference, "run_moment", watched)
-    for seed in range(300, 360):
+    for seed in range(300, 330):
         reporter = Reporter()
         pack = read_file(Source(f"seed{seed}.yaml", random_ruleset_text(seed)), reporter)
         assert isinstance(pack, PackDecl)
@@ -284,9 +217,9 @@ def test_what_is_shown_to_be_impossible_never_happens(monkeypatch: pytest.Monkey
         simulator = compile_ruleset(ruleset, backend="reference")
         for part, shape in enumerate(((3, 4, 6), (2, 1, 3))):
             simulator.step(random_world(simulator, seed * 2 + part, shape), 2)
-    assert counts["moments"] > 150
-    assert counts["claims"] > 1500
-    assert counts["silent"] > 10
+    assert counts["moments"] > 70
+    assert counts["claims"] > 700
+    assert counts["silent"] > 4
 
 
 def _sources(masks: list[tuple[Any, Any]]) -> Iterator[Any]:
@@ -326,17 +259,3 @@ def _transformed(masks: list[tuple[Any, Any]]) -> list[Any]:
 
 def _total(masks: list[Any]) -> Any:
     return np.sum(masks, axis=0) if masks else np.zeros(1, int)
-
-
-def test_the_empty_world_of_an_empty_pack_stays() -> None:
-    """A ruleset without passes changes nothing, and a rule with chance 0 % is not a rule."""
-    head = "pack: p\nelements:\n  a: {id: 0, color: '#000000'}\n  b: {id: 1, color: '#000001'}\n"
-    never = "passes: {one: {do: 'a -> b, with chance 0%'}}\n"
-    always = "passes: {one: {do: 'a -> b, with chance 100%'}}\n"
-    start = Start.fresh(np.arange(12).reshape(1, 3, 4) % 2)
-    for text, changes in ((head, False), (head + never, False), (head + always, True)):
-        for backend in ("reference", "torch", "wasm"):
-            simulator = compile_ruleset(load_text(text), backend=backend)
-            world = start.world(simulator)
-            ids = simulator.step(world, 4).ids
-            assert bool((ids == 1).all()) if changes else torch.equal(ids, world.ids)
