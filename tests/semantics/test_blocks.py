@@ -7,7 +7,7 @@ import pytest
 
 from powderdsl.simulation.draw import to_numpy
 from tests.cli.commands import powderdsl as command
-from tests.semantics.texts import BACKENDS, diagnosed, mistakes, simulator
+from tests.semantics.texts import diagnosed, mistakes, simulator
 
 HEAD = """\
 pack: blocks
@@ -78,9 +78,8 @@ def test_the_fix_is_named_and_works():
     assert errors(MARGOLUS, 2) == set()
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_nothing_is_lost_or_doubled(backend):
-    sim = simulator(pack(MARGOLUS, 2), backend)
+def test_nothing_is_lost_or_doubled():
+    sim = simulator(pack(MARGOLUS, 2))
     random = np.random.default_rng(0)
     for size in ((2, 2), (4, 6), (8, 34), (10, 66)):
         ids = random.integers(0, 3, (2, *size)).astype(np.uint8)

@@ -6,10 +6,9 @@ import math
 
 import numpy as np
 import pytest
-import torch
 
 from powderdsl.simulation.draw import to_numpy
-from tests.semantics.texts import BACKENDS, codes, diagnosed, simulator
+from tests.semantics.texts import codes, diagnosed, simulator
 
 HEAD = """\
 pack: compass
@@ -63,9 +62,8 @@ def stepped(body: str, backend: str = "reference", ids=None, random=None, **fiel
     ],
 )
 def test_directions_are_compared_with_places_and_each_other(condition: str, expected: np.ndarray) -> None:
-    for backend in ("reference", "wasm"):
-        world = stepped(f"    do: mark := {condition}\n", backend, heading=HEADINGS, aim=AIMS)
-        np.testing.assert_array_equal(to_numpy(world["mark"])[0], expected)
+    world = stepped(f"    do: mark := {condition}\n", heading=HEADINGS, aim=AIMS)
+    np.testing.assert_array_equal(to_numpy(world["mark"])[0], expected)
 
 
 def reported(condition: str) -> list[str]:
@@ -102,10 +100,9 @@ def test_other_things_are_refused(condition: str, message: str) -> None:
 # Turns
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize(("word", "eighths"), [("clockwise", 2), ("counterclockwise", 6), ("opposite", 4)])
-def test_directions_turn(backend: str, word: str, eighths: int) -> None:
-    world = stepped(f"    do: turned := {word}(right.heading)\n", backend, heading=HEADINGS.T)
+def test_directions_turn(word: str, eighths: int) -> None:
+    world = stepped(f"    do: turned := {word}(right.heading)\n", heading=HEADINGS.T)
     np.testing.assert_array_equal(to_numpy(world["turned"])[0], np.roll(HEADINGS.T + eighths, -1, 1) % 8)
 
 
@@ -134,14 +131,12 @@ def test_mirrored_copies_turn_the_other_way() -> None:
 # Draws
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("count", [2, 3, 16])
-def test_each_value_stands_for_a_part_of_the_draws(backend: str, count: int) -> None:
+def test_each_value_stands_for_a_part_of_the_draws(count: int) -> None:
     values = [(3 * number) % 10 for number in range(count)]
     draws = (np.arange(240, dtype=np.float64).reshape(1, 12, 20) + 0.5) / 240
     body = f"    do: number := pick(luck, {', '.join(map(str, values))})\n"
-    given = draws if backend == "reference" else torch.from_numpy(draws)
-    world = stepped(body, backend, np.zeros((1, 12, 20), np.uint8), {"luck": given})
+    world = stepped(body, ids=np.zeros((1, 12, 20), np.uint8), random={"luck": draws})
     expected = np.array(values)[np.floor(count * draws).astype(int)]
     np.testing.assert_array_equal(to_numpy(world["number"]), expected)
 
@@ -187,12 +182,11 @@ def test_what_cannot_be_picked_or_turned_is_reported(rule: str, code: str) -> No
 # Sines
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_sines_are_close_and_those_of_the_oracle(backend: str) -> None:
+def test_sines_are_close_and_those_of_the_oracle() -> None:
     body = "    do:\n      - sine := sin(angle)\n      - cosine := cos(angle)\n"
     angles = np.concatenate([np.linspace(-1000, 1000, 3000), np.linspace(0, 2 * math.pi, 1040), np.zeros(8)])
     angles = angles.astype(np.float32).reshape(1, 46, 88)
-    oracle, world = (stepped(body, name, angle=angles) for name in ("reference", backend))
+    oracle, world = (stepped(body, name, angle=angles) for name in ("reference", "wasm"))
     for field, exact in (("sine", np.sin(angles.astype(float))), ("cosine", np.cos(angles.astype(float)))):
         np.testing.assert_array_equal(to_numpy(world[field]), to_numpy(oracle[field]))
         assert np.abs(to_numpy(world[field]) - exact).max() < 2.0**-22

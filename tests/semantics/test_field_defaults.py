@@ -14,8 +14,7 @@ from powderdsl.tasks.episodes import TaskProgram, check_actions
 from powderdsl.tasks.shipped import load_task
 from powderdsl.testing.generators.cases import load_text
 from powderdsl.testing.pack_tests.runner import run_examples
-from tests.compilers import skip_without_compiler
-from tests.semantics.texts import BACKENDS, mistakes
+from tests.semantics.texts import mistakes
 
 HEAD = """\
 pack: hunt
@@ -83,11 +82,8 @@ def rules():
     return load_text(PACK)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_fresh_cells_have_their_elements_default(rules, backend):
-    skip_without_compiler(backend)
-    results = run_examples(rules, sim=compile(rules, backend, tensors=False))
-    assert [result.problem for result in results] == ["", ""]
+def test_fresh_cells_have_their_elements_default(rules):
+    assert [result.problem for result in run_examples(rules)] == ["", ""]
 
 
 def test_painted_cells_are_fresh(rules):

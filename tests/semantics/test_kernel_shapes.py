@@ -11,7 +11,7 @@ from powderdsl.model.builtins import KERNEL_SHAPES, KERNELS, shaped_kernel
 from powderdsl.simulation.draw import to_numpy
 from powderdsl.testing.generators.cases import load_text
 from powderdsl.testing.pack_tests.runner import run_examples
-from tests.semantics.texts import BACKENDS, simulator
+from tests.semantics.texts import simulator
 
 CELLS = {
     "box": lambda y, x, r: True,
@@ -50,9 +50,8 @@ def test_a_shape_has_its_cells(shape, radius):
         assert shaped_kernel(shape, 1).weights == KERNELS[shape].weights
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_larger_than_life(backend):
-    sim = simulator(BOSCO, backend)
+def test_larger_than_life():
+    sim = simulator(BOSCO)
     random = np.random.default_rng(3)
     lit = (random.random((2, 40, 70)) < 0.5).astype(np.uint8)
     level = random.integers(0, 10, lit.shape)

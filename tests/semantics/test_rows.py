@@ -8,7 +8,7 @@ import pytest
 from powderdsl.analysis.ledger import ledger
 from powderdsl.simulation.draw import to_numpy
 from powderdsl.testing.generators.cases import load_text
-from tests.semantics.texts import BACKENDS, codes, mistakes, simulator
+from tests.semantics.texts import codes, mistakes, simulator
 
 HEAD = """\
 pack: road
@@ -27,9 +27,9 @@ passes:
 """
 
 
-def driven(body: str, backend: str, ids: list[int], drives: list[int]) -> tuple[list[int], list[int]]:
+def driven(body: str, ids: list[int], drives: list[int]) -> tuple[list[int], list[int]]:
     """Elements and loads of a row of cells after a step; at first each cell's load is its number."""
-    sim = simulator(HEAD + body, backend)
+    sim = simulator(HEAD + body)
     numbers = np.arange(1, len(ids) + 1)[None, None]
     speed = np.stack([numbers[0], -numbers[0]])[None].astype(np.float32) / 4
     world = sim.replace(sim.world([[ids]]), drives=np.array([[drives]]), load=numbers, speed=speed)
@@ -70,11 +70,10 @@ MOVES = {
 }
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("name", MOVES)
-def test_rows_move(name: str, backend: str) -> None:
+def test_rows_move(name: str) -> None:
     body, start, end = MOVES[name]
-    assert driven(body, backend, *start) == end
+    assert driven(body, *start) == end
 
 
 def test_only_the_target_can_be_left_behind() -> None:

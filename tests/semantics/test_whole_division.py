@@ -1,4 +1,4 @@
-"""`a div b`: rounded down for all signs, 0 where b is 0, the same on every backend; its range; coordinates under it."""
+"""`a div b`: rounded down for all signs, 0 where b is 0, its range; coordinates under it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 from powderdsl.simulation.draw import to_numpy
 from powderdsl.testing.generators.cases import load_text
 from powderdsl.testing.pack_tests.runner import run_examples
-from tests.semantics.texts import BACKENDS, codes, mistakes, simulator
+from tests.semantics.texts import codes, mistakes, simulator
 
 HEAD = """\
 pack: quotients
@@ -38,11 +38,10 @@ def divide(a: np.ndarray | int, b: np.ndarray | int) -> np.ndarray:
     return np.where(np.equal(b, 0), 0, np.floor_divide(a, np.where(np.equal(b, 0), 1, b)))
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_it_rounds_down_for_all_signs(backend: str) -> None:
+def test_it_rounds_down_for_all_signs() -> None:
     fields = "".join(f"  f{number}: {{type: -9000..9000, at: place}}\n" for number in range(len(QUOTIENTS)))
     rules = "".join(f"      - f{number} := {quotient}\n" for number, quotient in enumerate(QUOTIENTS))
-    sim = simulator(f"{HEAD}{fields}passes:\n  divide:\n    do:\n{rules}", backend)
+    sim = simulator(f"{HEAD}{fields}passes:\n  divide:\n    do:\n{rules}")
     x, y = np.meshgrid(np.arange(-33, 41), np.arange(-7, 7))
     few, many = np.clip(x, -9, 9), (x + 33) * 811
     world = sim.world(np.zeros((1, *x.shape), np.uint8))
