@@ -108,8 +108,8 @@ class Original:
         )
 
     @cached_property
-    def meaning(self) -> str:
-        return meaning(self.ruleset)
+    def fingerprint(self) -> str:
+        return fingerprint(self.ruleset)
 
     @cached_property
     def lowered(self) -> str:
@@ -126,11 +126,6 @@ class Original:
 def warnings_of(diagnostics: tuple[Diagnostic, ...]) -> Counter[str]:
     """Count the warnings of each code."""
     return Counter(diagnostic.code for diagnostic in diagnostics if diagnostic.severity is Severity.WARNING)
-
-
-def meaning(ruleset: Ruleset) -> str:
-    """A fingerprint of the model: compositions with the same one turn every world into the same."""
-    return fingerprint(replace(ruleset, tests=(), invariants=(), about=""))
 
 
 def lowered(ruleset: Ruleset) -> str:
@@ -191,7 +186,7 @@ def judge(original: Original, mutant: Mutant) -> Verdict:
     new = warnings - original.warnings
     if new:
         return Verdict("killed", "check", min(new))
-    if meaning(ruleset) == original.meaning:
+    if fingerprint(ruleset) == original.fingerprint:
         return Verdict("equivalent", "the same model")
     sim = compile(ruleset, backend=AT_ONCE)
     failed = failed_test(original, sim, mutant.pack, quick=True)
