@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from time import monotonic
 from typing import ClassVar, Self
@@ -12,8 +12,7 @@ from powderdsl.analysis.ledger import ledger as make_ledger
 from powderdsl.analysis.proofs import prove
 from powderdsl.arrays import np
 from powderdsl.model.check import select_packs
-from powderdsl.model.expressions.operators import ELEMENT_HERE, member
-from powderdsl.model.types import Never, Ruleset, Symmetric, Total
+from powderdsl.model.types import Never, Ruleset, Symmetric
 from powderdsl.simulation.draw import shown_fields
 from powderdsl.testing.generators.cases import Start
 from powderdsl.testing.properties.blame import culprits, difference, translated
@@ -78,7 +77,7 @@ class InvariantSearch:
         """
         ledger = ledger or make_ledger(runner.ruleset)
         search = cls(runner, plan, ledger=ledger)
-        for prop in properties_of(runner.ruleset, ledger):
+        for prop in properties_of(runner.ruleset):
             if prop.owner == AUTOMATIC:
                 search.trials += [] if declared_only else [Result(prop)]
                 continue
@@ -195,31 +194,15 @@ def counterexample(claim: Tested, runner: Runs, sample: Start, steps: int) -> Co
     return Counterexample(sample, steps, before, after, (int(cell[0]), int(cell[1])), lines)
 
 
-def properties_of(ruleset: Ruleset, ledger: Ledger) -> list[Property]:
+def properties_of(ruleset: Ruleset) -> list[Property]:
     """The declared invariants, then what every ruleset must fulfill."""
     properties = [
         *map(Property.of, ruleset.invariants),
         Property(KnownIds(), "cells hold elements that the ruleset has", AUTOMATIC, None),
         Property(Agreement(), "the backend gives what the reference gives", AUTOMATIC, None),
     ]
-    properties += [Property(claim, text, AUTOMATIC, None) for claim, text in _ledger_claims(ruleset, ledger)]
     unique: dict[str, Property] = {}
     for prop in properties:  # of two that say the same, the one that says it of more packs
         if prop.text not in unique or len(prop.scope) > len(unique[prop.text].scope):
             unique[prop.text] = prop
     return [prop for prop in properties if unique[prop.text] is prop]
-
-
-def _ledger_claims(ruleset: Ruleset, ledger: Ledger) -> Iterator[tuple[Total, str]]:
-    """The sums that the ledger decides, as claims: a world that breaks one shows a bug in powderdsl."""
-    ids = {element.name: element.id for element in ruleset.elements}
-    for trend, sums in ledger.sums.items():
-        for names in sums:
-            if len(names) == len(ledger.elements):
-                continue
-            numbers = tuple(sorted(ids[name] for name in names))
-            verb = "is constant" if trend == "constant" else trend
-            yield (
-                Total(member(ELEMENT_HERE, numbers), trend, frozenset(numbers)),
-                f"count({', '.join(names)}) {verb}",
-            )
