@@ -133,14 +133,14 @@ def neighborhood(value: Array, kernel: Kernel) -> Array:
 class Change(NamedTuple):
     """A write of a slot: by a rule, or by every step.
 
-    `asked` is the offset from a written cell to the cell in which the rule's condition holds, `source` the offset to the
+    `origin` is the offset from a written cell to the cell in which the rule's condition holds, `source` the offset to the
     cell that the new content comes from.
     """
 
     how: str
     slot: Slot
     rule: Rule | None = None
-    asked: Offset = (0, 0)
+    origin: Offset = (0, 0)
     source: Offset | None = None
 
 
@@ -353,11 +353,11 @@ def run_moment(moment: Moment, at: Context, table: Mapping[str, Slot]) -> State:
         for slot in traveling:
             write(Change(how, slot, rule), _in_fresh_cells(slot, ids, at), masks[id(rule)])
 
-    def arrive(rule: Swap | Move, source: Offset, asked: Offset = (0, 0)) -> None:
-        """Content comes from the neighbor `source` where the rule's condition holds in the neighbor `asked`."""
-        mask = look(masks[id(rule)], asked)
+    def arrive(rule: Swap | Move, source: Offset, origin: Offset = (0, 0)) -> None:
+        """Content comes from the neighbor `source` where the rule's condition holds in the neighbor `origin`."""
+        mask = look(masks[id(rule)], origin)
         for slot in traveling:
-            write(Change("arrive", slot, rule, asked, source), look(before[slot.name], source), mask)
+            write(Change("arrive", slot, rule, origin, source), look(before[slot.name], source), mask)
 
     for assignment in assigns:
         assign("assign", assignment, assignment)

@@ -260,19 +260,19 @@ def _fuse(first: Compute, second: Compute, reads: Counter[str], graph: Graph) ->
 
     `loop choices: a = m ? x : y`, `loop cells: b = 0.9 * a` → `loop choices: b = 0.9 * (m ? x : y)`.
     """
-    made = {out.var.name: out.value for out in first.outs}
+    results = {out.var.name: out.value for out in first.outs}
     if first.over != "choices" or first.region is None or second.region is None:
         return None
     if any(out.var.type != REAL or not out.otherwise or not is_zero(out.otherwise) for out in second.outs):
         return None
     nodes = ordered(second.results)
     simple = all(node.type == REAL and node.op in CONTINUING for node in nodes)
-    known = {choices(value)[1].attr for value in made.values()} | made.keys()
+    known = {choices(value)[1].attr for value in results.values()} | results.keys()
     inside = Counter(loaded(second.values))
     few = sum(bool(node.args) for node in nodes) <= FEW
-    if not (simple and few and known >= second.reads) or any(reads[name] != inside[name] for name in made):
+    if not (simple and few and known >= second.reads) or any(reads[name] != inside[name] for name in results):
         return None
-    new = rewritten(nodes, graph, lambda node: made.get(node.attr))
+    new = rewritten(nodes, graph, lambda node: results.get(node.attr))
     return replace(first, outs=tuple([replace(out, value=new(out.value)) for out in second.outs]))
 
 
@@ -282,8 +282,8 @@ CONTINUING = ("load", "const", "param", "add", "sub", "mul", "neg", "abs")
 
 def _components(run: Sequence[Compute]) -> list[list[Compute]]:
     """The loops of a run in groups that do not read each other's results."""
-    made = made_in(run).keys()
-    return connected(run, lambda loop: made & (loop.reads | loop.vars.keys()))
+    names = made_in(run).keys()
+    return connected(run, lambda loop: names & (loop.reads | loop.vars.keys()))
 
 
 def _sweeps(run: Sequence[Compute], reads: Counter[str]) -> Sweeps:
@@ -293,15 +293,15 @@ def _sweeps(run: Sequence[Compute], reads: Counter[str]) -> Sweeps:
     does not begin where the store did.
     """
     loops: list[Compute] = []
-    made: dict[str, Compute] = {}
+    makers: dict[str, Compute] = {}
     inside = Counter[tuple[int, str]]()
     part = 0
     for loop in run:
-        before = [(read, made[read.name]) for read in field_reads(loop) if read.name in made]
+        before = [(read, makers[read.name]) for read in field_reads(loop) if read.name in makers]
         part = max([part, *[maker.part + 1 for read, maker in before if read.wraps and read.dy]])
         behind = [maker.lag + read.dy + (read.dx != 0) for read, maker in before if maker.part == part]
         loops.append(replace(loop, part=part, lag=max([0, *behind])))
-        made |= {name: loops[-1] for name, var in loop.vars.items() if var.type == REAL}
+        makers |= {name: loops[-1] for name, var in loop.vars.items() if var.type == REAL}
         inside.update((part, name) for name in loaded(loop.values))
-    passing = [name for name, loop in made.items() if reads[name] == inside[loop.part, name]]
+    passing = [name for name, loop in makers.items() if reads[name] == inside[loop.part, name]]
     return Sweeps(frees=tuple(passing), body=tuple(loops))

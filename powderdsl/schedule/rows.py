@@ -75,14 +75,13 @@ class Rows:
 def rows_of(sweeps: Sweeps, reaches: Mapping[str, int]) -> Rows:
     """The plan of loops that run together."""
     rings, saved, waiting = _buffer_rows(sweeps)
-    made = sweeps.vars
     loops = []
     turned = 0
     for loop in sweeps.body:
         chains = chains_of(loop) if loop.over == "choices" else []
         _, planes = region_of(loop)
         # Choices test their masks themselves.
-        marked = [] if chains else [name for name in planes if name not in made]
+        marked = [] if chains else [name for name in planes if name not in sweeps.vars]
         loops.append(RowLoop(loop, tuple(marked), tuple(map(tuple, chains)), turned))
         turned += -(-len(loops[-1].masks) // TURNED) * TURNED
     first = sweeps.body[0]

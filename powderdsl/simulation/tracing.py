@@ -213,7 +213,7 @@ class RecordedStep:
                 return
             substep = self.substeps[-1]
             attempt = Attempt(
-                substep.rules[id(change.rule)], substep, substep.neighbor_of(self.cell, change.asked)
+                substep.rules[id(change.rule)], substep, substep.neighbor_of(self.cell, change.origin)
             )
             source = None if change.source is None else substep.neighbor_of(self.cell, change.source)
         old, new = pick(before, self.cell), pick(after, self.cell)

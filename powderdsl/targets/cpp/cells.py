@@ -112,12 +112,12 @@ def _addresses(rows: Rows) -> str:
 
 def _nothing(rows: Rows) -> list[str]:
     """Tests of fields and planes; if all are true, the loops do nothing."""
-    made = {out.var.name for out in rows.outs}
+    results = {out.var.name for out in rows.outs}
     tests = []
     for region in (plan.loop.region for plan in rows.loops):
         for part in alternatives(region):
             name, test = (part.args[0].attr, "still") if part.op == "live" else (part.attr, "zero")
-            tests += [f"{name}->{test}"] if name not in made else []
+            tests += [f"{name}->{test}"] if name not in results else []
     return list(dict.fromkeys(tests))
 
 

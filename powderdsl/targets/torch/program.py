@@ -74,7 +74,8 @@ class Kernels:
     params: Mapping[str, Tensor]
     streams: Mapping[str, tuple[int, int]]
     """Position in `keys`, and bits."""
-    given: Mapping[str, Tensor]
+    replacements: Mapping[str, Tensor]
+    """Draws that replace random numbers, by stream."""
     base: Tensor
     idents: Tensor
     step: Tensor
@@ -131,8 +132,8 @@ class Kernels:
         key = (stream, bits)
         if key not in self._draws:
             position, resolution = self.streams[stream]
-            if stream in self.given:
-                self._draws[key] = self.given[stream] >> (resolution - bits)
+            if stream in self.replacements:
+                self._draws[key] = self.replacements[stream] >> (resolution - bits)
             else:
                 self._draws[key] = draws(self.keys[position], bits, *self.shape[1:])
         return self._draws[key]

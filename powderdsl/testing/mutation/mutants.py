@@ -244,6 +244,6 @@ def _typed(decls: Iterable[TypedDecl], kind: str) -> dict[str, str]:
         declared = decl.type or decl.default
         text = declared.span.text.strip() if declared else ""
         is_range = re.match(r"-?\d+\s*\.\.", text)
-        held = "int" if is_range else "chance" if "%" in text else text.partition("(")[0]
-        kinds[decl.name.text] = f"{kind}:{held}"
+        content = "int" if is_range else "chance" if "%" in text else text.partition("(")[0]
+        kinds[decl.name.text] = f"{kind}:{content}"
     return kinds

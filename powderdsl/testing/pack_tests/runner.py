@@ -162,9 +162,9 @@ def _problems(example: Example, world: World, step: int) -> Iterator[tuple[int, 
         differs = (world.sim.kind.to_numpy(world.ids) != wanted) & (wanted >= 0)
         if differs.any():
             index, row, column = (int(part[0]) for part in np.nonzero(differs))
-            there, asked = int(world.ids[index, row, column]), int(wanted[row, column])
+            actual, expected = int(world.ids[index, row, column]), int(wanted[row, column])
             names = {element.id: element.name for element in world.sim.ruleset.elements}
-            yield index, f"row {row}, column {column} is `{names[there]}`, not `{names[asked]}`", ""
+            yield index, f"row {row}, column {column} is `{names[actual]}`, not `{names[expected]}`", ""
     for grid in example.expect_fields:
         problem = field_problem(grid, world)
         if problem is not None:

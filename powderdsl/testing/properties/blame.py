@@ -162,10 +162,10 @@ def _changes(pack: str, ruleset: Ruleset) -> Iterator[tuple[str, Cause]]:
         yield name, Cause(pack, element.name.span, f"{does} `{name}`")
     for also in decl.also:
         if ruleset.element(also.name.word) is not None:
-            given = [f"the tag `{tag.word}`" for tag in also.tags]
-            given += [f"`{key.word}`" for key, _ in also.values]
+            additions = [f"the tag `{tag.word}`" for tag in also.tags]
+            additions += [f"`{key.word}`" for key, _ in also.values]
             name = also.name.word
-            yield name, Cause(pack, also.name.span, f"gives `{name}` {' and '.join(given)}")
+            yield name, Cause(pack, also.name.span, f"gives `{name}` {' and '.join(additions)}")
     for prop in decl.properties:
         for key, _ in prop.values:
             yield key.word, Cause(pack, key.span, f"gives `{key.word}` a value of `{prop.name.text}`")

@@ -105,8 +105,8 @@ def find_breaks(claim: Tested, ruleset: Ruleset, sample: Start, states: list[Sta
 
     match claim:
         case Unchanging():
-            held = sorted(claim.ids)
-            return _breaks_of([np.isin(old, held) & (old != new) for old, new in pairwise(ids)])
+            protected = sorted(claim.ids)
+            return _breaks_of([np.isin(old, protected) & (old != new) for old, new in pairwise(ids)])
         case Total():
             wrong, masks = TREND_BREAKS[claim.trend], []
             for old, new in pairwise(values.astype(np.int64) for values in evaluated(claim.value)):
@@ -137,9 +137,9 @@ def find_breaks(claim: Tested, ruleset: Ruleset, sample: Start, states: list[Sta
     raise TypeError(f"{type(claim).__name__} needs more than one run")
 
 
-def _never(held: list[Array]) -> Breaks:
+def _never(holds: list[Array]) -> Breaks:
     """By where something forbidden holds, from the start on: a world that starts with it does not count."""
-    return _breaks_of(held[1:], np.asarray(~held[0].any((1, 2))))
+    return _breaks_of(holds[1:], np.asarray(~holds[0].any((1, 2))))
 
 
 def _breaks_of(by_step: list[Array], counts: Array | None = None) -> Breaks:

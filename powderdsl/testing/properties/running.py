@@ -79,9 +79,9 @@ def run_sample(
     start = full_state(ruleset or sim.ruleset, sample)
     world = sim.world(sample.ids, sample.seed, index=sample.index)
     dtypes = {slot.name: slot.dtype for slot in sim.slots}
-    given = {name: sim.kind.from_numpy(values.astype(dtypes[name])) for name, values in start.items()}
+    arrays = {name: sim.kind.from_numpy(values.astype(dtypes[name])) for name, values in start.items()}
     clock = sim.kind.from_numpy(sample.step.copy())
-    world = replace(world, state={**world.state, **given}, start=clock)
+    world = replace(world, state={**world.state, **arrays}, start=clock)
     history = [start]
     for _ in range(steps):
         world = sim.step(world, random=random, params=dict(sample.params) or None)
@@ -195,7 +195,7 @@ def join_starts(samples: Sequence[Start], ruleset: Ruleset) -> Start:
     names = {name for sample in samples for name in sample.fields}
     table = {slot.name: slot for slot in slots(ruleset)}
     defaults = {param.name: float(param.default) for param in ruleset.params}
-    given = {name for sample in samples for name in sample.params}
+    params = {name for sample in samples for name in sample.params}
     return Start(
         np.concatenate([sample.ids for sample in samples]),
         np.concatenate([sample.seed for sample in samples]),
@@ -209,7 +209,7 @@ def join_starts(samples: Sequence[Start], ruleset: Ruleset) -> Start:
         },
         {
             name: np.concatenate([s.params.get(name, np.full(len(s), defaults[name])) for s in samples])
-            for name in sorted(given)
+            for name in sorted(params)
         },
     )
 

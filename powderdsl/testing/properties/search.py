@@ -83,8 +83,8 @@ class InvariantSearch:
                 continue
             verdict = prove(prop.claim, runner.ruleset, ledger, prop.without)  # type: ignore[arg-type]
             if isinstance(verdict, Proven):
-                given = f", given {verdict.given}" if verdict.given else ""
-                search.trials.append(Result(prop, verdict.reason + given, is_proven=True))
+                condition = f", given {verdict.given}" if verdict.given else ""
+                search.trials.append(Result(prop, verdict.reason + condition, is_proven=True))
             else:
                 search.trials.append(Result(prop, doubts=verdict.rules))
         return search

@@ -156,9 +156,9 @@ def _single(sample: Start) -> list[Start]:
 
 def _fresh(sample: Start) -> list[Start]:
     """With fields, parameters and the clock as in fresh worlds; with one of them, if not with all."""
-    given = {"fields": sample.fields, "params": sample.params, "step": sample.step.any()}
+    differs = {"fields": sample.fields, "params": sample.params, "step": sample.step.any()}
     usual: dict[str, Any] = {"fields": {}, "params": {}, "step": np.zeros_like(sample.step)}
-    parts = [{name: usual[name]} for name in given if given[name]]
+    parts = [{name: usual[name]} for name in differs if differs[name]]
     together = dict(chain.from_iterable(part.items() for part in parts))
     return [replace(sample, **part) for part in ([together, *parts] if parts else [])]
 
@@ -185,11 +185,11 @@ def _parts(axis: int, halves: bool, sample: Start) -> list[Start]:
         return []
     half = size // 2
     if halves:
-        kept = [[*range(at, at + half)] for at in range(size - half + 1)]
+        rests = [[*range(at, at + half)] for at in range(size - half + 1)]
     else:
-        kept = [[at for at in range(size) if at != gone] for gone in range(size - 1, -1, -1)]
+        rests = [[at for at in range(size) if at != gone] for gone in range(size - 1, -1, -1)]
     # Rows and columns are the last axes of every array.
-    places = [(..., keep, slice(None)) if axis == 0 else (..., keep) for keep in kept]
+    places = [(..., rest, slice(None)) if axis == 0 else (..., rest) for rest in rests]
     return [
         replace(
             sample,
