@@ -148,16 +148,16 @@ class Ledger:
 
     @cached_property
     def rising_sums(self) -> tuple[tuple[str, ...], ...]:
-        """For each element the smallest sum with it that never falls, unless that sum is constant.
+        """The smallest sum with each element that never falls, unless that sum is constant.
 
-        It holds all that the element may become. Every other sum of different elements that cannot fall is joined of
-        these and of constant ones.
+        Such a sum holds all that its element may become. Every other sum of different elements that cannot fall is
+        joined of these and of constant ones.
         """
         return self._closed_sums(self.changes)
 
     @cached_property
     def falling_sums(self) -> tuple[tuple[str, ...], ...]:
-        """The same for sums that never rise: all that may become the element."""
+        """The smallest sum with each element that never rises, unless constant: all that may become the element."""
         return self._closed_sums([(after, before) for before, after in self.changes])
 
     @property
@@ -345,7 +345,7 @@ def _names_of(ids: Iterable[int], names: Mapping[int, str]) -> Iterator[str]:
 
 
 def find_fields(ruleset: Ruleset, effects: Iterable[LineEffects]) -> tuple[FieldEntry, ...]:
-    """All of them: fields in load order, scratch fields by pass, then properties."""
+    """The analysis of all fields: in load order, then scratch fields by pass, then properties."""
     writes = [(line.line, assign) for line in effects for assign in line.writes]
     entries = []
     for item in (*ruleset.fields, *(item for pass_ in ruleset.passes for item in pass_.scratch)):

@@ -273,7 +273,7 @@ class PackDecl(Record, noun="a pack"):
 
     @property
     def entries(self) -> tuple[ElementDecl | AlsoDecl, ...]:
-        """Its entries for single elements."""
+        """The pack's entries for single elements."""
         return (*self.elements, *self.also)
 
     @property
@@ -314,7 +314,7 @@ class RulesetDecl(Record, noun="a ruleset"):
 
     @property
     def members(self) -> dict[str, RulesetDecl]:
-        """Its packs: those of its base that it keeps, then its own; each with the ruleset in whose file it is listed."""
+        """The ruleset's packs: those of its base that it keeps, then its own; each with the ruleset in whose file it is listed."""
         members = self.base.members if self.base else {}
         for scalar in self.without:
             members.pop(scalar.text, None)
@@ -345,7 +345,7 @@ class RulesetDecl(Record, noun="a ruleset"):
 
     @property
     def renames(self) -> dict[str, tuple[Scalar, Scalar]]:
-        """Its own renames and the inherited ones, by qualified name."""
+        """The ruleset's own renames and the inherited ones, by qualified name."""
         renames = {}
         for ruleset in self.lineage:
             for old, new in ruleset.rename:

@@ -75,7 +75,7 @@ def _abs_bounds(a: Bounds) -> Bounds:
 
 
 def _quotient_bounds(a: Bounds, b: Bounds) -> Bounds:
-    """For divisors of one sign, the extremes lie at the ends of both ranges."""
+    """The bounds of a quotient by divisors of one sign: the extremes lie at the ends of both ranges."""
     divisors = [d for d in (b[0], min(b[1], -1), max(b[0], 1), b[1]) if d and b[0] <= d <= b[1]]
     corners = [x // d for x in a for d in divisors] + [0] * (b[0] <= 0 <= b[1])
     return min(corners), max(corners)

@@ -68,7 +68,7 @@ def mix(x: Array, key: Any = 0) -> Array:
 
 
 def key(clock: Clock, stream: int, start: int) -> Array:
-    """One 32-bit key a world: seed, world index, step and stream mixed in one after the other."""
+    """The 32-bit key of each world: seed, world index, step and stream mixed in one after the other."""
     seed = clock.seed.astype(np.uint64)
     result = np.full(seed.shape, start, np.uint64)
     for part in (seed, seed >> 32, clock.index, clock.step, np.asarray(stream)):

@@ -122,7 +122,7 @@ def _postpone_stores(sweeps: Sweeps, after: set[str], namer: Namer, graph: Graph
 
 
 def _last_reads(sweeps: Sweeps, after: set[str]) -> dict[str, tuple[int, int]]:
-    """By field that may be overwritten: the least lag at which a loop may overwrite a row, and its last reader."""
+    """The fields that may be overwritten, each with the least lag at which a loop may overwrite a row and its last reader."""
     reads: dict[str, tuple[int, int]] = {}
     needed = after.union(sweeps.vars)
     for number, loop in enumerate(sweeps.body):

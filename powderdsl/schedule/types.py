@@ -317,7 +317,7 @@ Facts = dict[Node, None]
 def on_all_paths(
     roots: Iterable[Node], below: Callable[[Node, Facts], Iterable[tuple[Node, Facts]]]
 ) -> dict[Node, Facts]:
-    """For each node, the facts that all paths from the roots to it have in common.
+    """The facts that all paths from the roots to a node have in common, by node.
 
     `below` returns the nodes that a node reads, each with the facts of the path through that node.
     """

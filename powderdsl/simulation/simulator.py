@@ -210,7 +210,7 @@ class Simulator:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """For ``auto``: sentences that name the backends that ran, and the reasons."""
+        """Sentences that name the backends that ``auto`` ran, and the reasons."""
         if self.backend == "auto" and self.running == "wasm" and self.kind.xp.__name__ != "torch":
             return ("wasm: native code takes torch and more work, or --backend native",)
         return tuple(getattr(self._program.whole, "notes", ()))

@@ -78,7 +78,7 @@ class NumberedRule:
 
     @property
     def place(self) -> str:
-        """The same as text: `file:line`."""
+        """The rule's position as text: `file:line`."""
         return place_of(self.span)
 
 

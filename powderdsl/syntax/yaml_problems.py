@@ -51,7 +51,7 @@ class Place:
         return Span(self.source, start, start + max(length, 1))
 
     def rest(self, start: int) -> Span:
-        """From `start` to the end of its line."""
+        """The text from `start` to the end of its line."""
         return self.span(start, len(self.after(start).rstrip()))
 
     def quoted(self, at: int) -> str:

@@ -53,7 +53,7 @@ def pieces(program: Program) -> dict[str, tuple[Piece, ...]]:
 
 
 def limits(xp: Any, values: Any, threshold: Threshold) -> Any:
-    """For chances, float64 [B]: the number of possible draws below each, or not above it if strict: int64 [B]."""
+    """The number of possible draws below each chance (float64 [B]), or not above it if strict: int64 [B]."""
     count = 1 << threshold.bits
     scaled = values * count - 0.5
     limit = -xp.floor(-scaled) if threshold.strict else xp.floor(scaled) + 1

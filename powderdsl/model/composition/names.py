@@ -173,7 +173,7 @@ def report_unknown(
 
 
 def needs_of(packs: Mapping[str, PackDecl]) -> dict[str, tuple[str, ...]]:
-    """For each pack, itself, then all packs that it needs, directly or not, in load order."""
+    """Each pack with itself and all packs that it needs, directly or not, in load order."""
     closed = {}
     for pack in packs:
         reached = [pack]

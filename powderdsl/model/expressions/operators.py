@@ -62,7 +62,7 @@ class Place:
 
 @dataclass(frozen=True)
 class PlaceChoice:
-    """One place where the condition holds, the other one elsewhere. As a value it is an element, or a direction."""
+    """A choice by a condition between two places. As a value it is an element, or a direction."""
 
     condition: Expr
     yes: Place | PlaceChoice
@@ -649,7 +649,7 @@ def _turn(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
 
 
 def _pick(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
-    """One of several values by a draw, as choices between them."""
+    """Nested choices that pick one of several values by a draw."""
     first, *children = syntax.children
     draw = typer.evaluate(first, scope)
     if not isinstance(draw, Expr) or draw.kind != DRAW:

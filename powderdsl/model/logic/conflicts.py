@@ -95,7 +95,7 @@ class Conflict:
     def report_added(
         self, causes: Sequence[Cause], pass_name: str, example: str, settled: bool, reporter: Reporter
     ) -> None:
-        """Report it at what added packs do to cause it: a warning if `settled`, because one rule wins."""
+        """Reports the conflict at what added packs do to cause it: a warning if `settled`, because one rule wins."""
         first, *more = causes
         secondary = [Label(cause.span, "and this") for cause in more]
         secondary.append(Label(self.first, "claims the cell"))

@@ -215,7 +215,7 @@ def report_undrawn(
 
 
 def _may_draw(name: str, number: int, ruleset: Ruleset, facts: Facts) -> Iterator[bool | None]:
-    """For each rule that reads the property: may it happen where this element stands?"""
+    """Whether each rule that reads the property may happen where this element stands."""
     for pass_ in ruleset.passes:
         everywhere = {let.name: let.value for moment in pass_.moments for let in moment.lets}
         for moment in pass_.moments:
@@ -388,7 +388,7 @@ def _report_unwritten(composition: Composition, reporter: Reporter) -> None:
 
 
 def overridden_ids(passes: tuple[Pass, ...], names: Sequence[str], facts: Facts) -> dict[str, frozenset[int]]:
-    """For each of these properties the ids whose cells may hold their own value: the ids that some rule assigns it to.
+    """The ids, by property, whose cells may hold their own value: those that some rule assigns it to.
 
     A value of its own may fulfill the condition of another such rule, so this continues until nothing is added.
     """

@@ -387,6 +387,6 @@ def noticed_share(counts: dict[str, int]) -> float:
 
 
 def handwritten_share(counts: dict[str, int]) -> float:
-    """Of the mutants that invariants and tests notice, the part that those written by hand notice; 1 if there are none."""
+    """The part of the mutants noticed by invariants and tests that those written by hand notice; 1 if there are none."""
     tested = counts["invariant"] + counts["test"] + counts["generated"]
     return (tested - counts["generated"]) / tested if tested else 1.0

@@ -65,7 +65,7 @@ class Mutant:
 
     @property
     def key(self) -> str:
-        """Identifies the mutant from run to run: place, kind and the new text."""
+        """The mutant's identity from run to run: place, kind and the new text."""
         return f"{self.place} {self.operator} {self.diff}"
 
 

@@ -133,7 +133,7 @@ def near_bounds(text: str) -> list[str]:
 
 
 def near_weights(text: str) -> list[str]:
-    """None where there was one, or twice as much; one where there was none."""
+    """The weights tried for a weight: none where there was one, or twice as much; one where there was none."""
     return ["0", str(2 * int(text))] if int(text) else ["1"]
 
 
@@ -277,7 +277,7 @@ class Entry:
         return {key.text: (key, node) for key, node in container.entries}
 
     def entries(self) -> Iterator[Entry]:
-        """The entries below it."""
+        """The entries below a node."""
         return entries_of(self.node, self.path, self.names)
 
     def items(self) -> list[Entry]:

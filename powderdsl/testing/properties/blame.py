@@ -61,7 +61,7 @@ def _turning(count: int, broken: Callable[[int], bool]) -> int:
 
 
 def translated(sample: Start, ruleset: Ruleset, target: Ruleset) -> Start | None:
-    """The same worlds under rules with other packs; None if those lack an element. Fields that they lack are left out."""
+    """These worlds under rules with other packs, without fields that those lack; None if those lack an element."""
     numbers = {element.qualified: element.id for element in target.elements}
     table = np.full(256, -1, np.int64)
     for element in ruleset.elements:
@@ -125,7 +125,7 @@ def _lines_that_happened(ruleset: Ruleset, state: Mapping[str, Any]) -> list[Spa
 
 
 def _rules(ruleset: Ruleset, lines: Iterable[Span], packs: tuple[str, ...]) -> list[Cause]:
-    """Those of some lines of rules that are of some packs."""
+    """The lines among these that rules of some packs have."""
     owners = {
         rule.span: pass_.pack for pass_ in ruleset.passes for moment in pass_.moments for rule in moment.rules
     }
@@ -154,7 +154,7 @@ def pack_changes(pack: str, ruleset: Ruleset, near: frozenset[str]) -> list[Caus
 
 
 def _changes(pack: str, ruleset: Ruleset) -> Iterator[tuple[str, Cause]]:
-    """The element that a pack does something to, or nothing; and what it does."""
+    """What a pack does, after the element that it does it to, if any."""
     assert ruleset.declared is not None
     decl: PackDecl = next(pack_decl for pack_decl in ruleset.declared.packs if pack_decl.name.text == pack)
     for element in decl.elements:

@@ -138,12 +138,12 @@ def find_breaks(claim: Tested, ruleset: Ruleset, sample: Start, states: list[Sta
 
 
 def _never(holds: list[Array]) -> Breaks:
-    """By where something forbidden holds, from the start on: a world that starts with it does not count."""
+    """Breaks by something forbidden that holds nowhere at first: a world that starts with it does not count."""
     return _breaks_of(holds[1:], np.asarray(~holds[0].any((1, 2))))
 
 
 def _breaks_of(by_step: list[Array], counts: Array | None = None) -> Breaks:
-    """From bool [B, H, W] for each step: what is broken after it."""
+    """The breaks in bool [B, H, W] for each step, which says what is broken after it."""
     masks = np.stack(by_step)
     batch, _, width = masks.shape[1:]
     counts = np.ones(batch, bool) if counts is None else counts
@@ -157,7 +157,7 @@ def _breaks_of(by_step: list[Array], counts: Array | None = None) -> Breaks:
 
 
 def vary_one_cell(ruleset: Ruleset, sample: Start) -> tuple[Start, Array]:
-    """The same worlds with another fresh element in one cell each, by their seeds; and which cells: bool [B, H, W]."""
+    """Copies of worlds with another fresh element in one cell each, by their seeds; and these cells: bool [B, H, W]."""
     height, width = sample.shape
     known = np.array([element.id for element in ruleset.elements])
     worlds = np.arange(len(sample))

@@ -92,7 +92,7 @@ def run_sample(
 def first_difference(
     first: Sequence[State], second: Sequence[State], names: Iterable[str] | None = None
 ) -> Array:
-    """After which step each world of two runs differs in one of these slots or in any, 0 if it does not: int [B]."""
+    """The first step after which each world of two runs differs in one of these slots or in any, 0 if none: int [B]."""
     when = np.zeros(len(first[0]["element"]), np.int64)
     for step in range(len(first) - 1, 0, -1):
         when[differences(first[step], second[step], names).any((1, 2))] = step
@@ -160,7 +160,7 @@ def rule_spans(ruleset: Ruleset) -> tuple[Span, ...]:
 
 
 def with_line_marks(ruleset: Ruleset) -> Ruleset:
-    """The same rules, each of which also sets a flag of its line where it happens; nothing reads the flags."""
+    """A copy of rules that each also set a flag of their line where they happen; nothing reads the flags."""
     names = {span: f"{MARK}{number}" for number, span in enumerate(rule_spans(ruleset))}
     home = ruleset.elements[0]
     flags = [Field(name, FLAG, 0, "place", False, None, home.pack, home.span) for name in names.values()]

@@ -163,7 +163,7 @@ class InvariantSearch:
         return self.trials
 
     def report_differences(self) -> None:
-        """Say of each broken invariant that holds in its scope, without added packs, how these break it."""
+        """Reports how added packs break each broken invariant that holds in its scope without them."""
         ruleset = self.runner.ruleset
         broken = [(trial, trial.counterexample) for trial in self.trials if trial.counterexample is not None]
         for scope in dict.fromkeys(trial.prop.scope for trial, _ in broken):

@@ -155,7 +155,7 @@ def _single(sample: Start) -> list[Start]:
 
 
 def _fresh(sample: Start) -> list[Start]:
-    """With fields, parameters and the clock as in fresh worlds; with one of them, if not with all."""
+    """Worlds with fields, parameters and the clock as in fresh ones: all of them, then one of them."""
     differs = {"fields": sample.fields, "params": sample.params, "step": sample.step.any()}
     usual: dict[str, Any] = {"fields": {}, "params": {}, "step": np.zeros_like(sample.step)}
     parts = [{name: usual[name]} for name in differs if differs[name]]
@@ -164,15 +164,15 @@ def _fresh(sample: Start) -> list[Start]:
 
 
 def _absent_fields(sample: Start) -> list[Start]:
-    """With one field as in fresh cells."""
+    """Worlds with one field as in fresh cells."""
     return [
-        replace(sample, fields={name: values for name, values in sample.fields.items() if name != gone})
-        for gone in sample.fields
+        replace(sample, fields={name: values for name, values in sample.fields.items() if name != absent})
+        for absent in sample.fields
     ]
 
 
 def _plain_seed(sample: Start) -> list[Start]:
-    """With a seed that is easy to write."""
+    """Worlds with a seed that is easy to write."""
     if 0 <= int(sample.seed[0]) < SEEDS:
         return []
     return [replace(sample, seed=np.array([number])) for number in range(SEEDS)]
