@@ -1,7 +1,6 @@
-"""Datasets as Minari datasets, and Minari datasets as datasets. Both directions keep every value.
+"""Datasets as Minari datasets, and back. Both directions keep every value.
 
-Minari stores uint8 images as JPEG unless it is told otherwise, which changes ids. It is told otherwise here, and images
-that were stored so are refused.
+Minari stores uint8 images as JPEG by default, which changes ids. The export turns that off.
 """
 
 from __future__ import annotations
@@ -21,21 +20,16 @@ from powderdsl.datasets.manifest import (
     changed_params,
     damaged,
     read_recipe,
-    recipe_of,
     reporting_damage,
 )
 from powderdsl.datasets.recorder import add_shard, begin_manifest, lock_place
 from powderdsl.datasets.shards import DTYPES, check_episodes, knows_ids, row_shape
 from powderdsl.diagnostics import CompileError
 from powderdsl.envs import env_id
-from powderdsl.envs.actions import KINDS, ActionForm, action_form
-from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.system.fingerprint import fingerprint
 from powderdsl.system.packages import require
 from powderdsl.system.writing import failure, scratch_folder, writing
-from powderdsl.tasks.episodes import TaskProgram
 from powderdsl.tasks.shipped import load_task, shipped_tasks
-from powderdsl.tasks.task import Task
 
 if TYPE_CHECKING:
     import minari
@@ -181,131 +175,78 @@ def _spec(recipe: Recipe) -> Any:
 # Import
 
 
-def from_minari(
-    dataset_id: str,
-    folder: str | Path,
-    *,
-    task: str | Path | Task | TaskProgram | None = None,
-    shard: int | None = None,
-    compress: bool = False,
-    **how: Any,
-) -> Dataset:
-    """Read a Minari dataset into a folder. A dataset that `to_minari` wrote gives the same shards, byte for byte.
-
-    Other Minari datasets need `task`, in whose environment they must have been collected; its actions may be in any
-    form of `envs.actions`. An episode's world is `world` of its infos, or its seed; `success` of the infos is kept.
+def from_minari(dataset_id: str, folder: str | Path) -> Dataset:
+    """Read a Minari dataset that `to_minari` wrote into a folder: the same shards, byte for byte.
 
     Args:
         dataset_id: ``namespace/name-v0``.
         folder: the folder to write, which is made, but not its parent. An interrupted import is completed.
-        task: as in `TensorEnv`.
-        shard: as in `record`; only with `task`.
-        compress: as in `record`; only with `task`.
-        how: split, observation, knobs, params, last_action and others of `TensorEnv`; only with `task`.
 
     Raises:
-        CompileError: PD612 if Minari is not installed; PD630 if there is no such dataset, it is damaged, or its images
-            are JPEG; PD631 if the folder has another dataset; PD613 if the folder cannot be written.
-        ValueError: another argument is wrong.
+        CompileError: PD612 if Minari is not installed; PD630 if there is no such dataset, it is damaged, or `to_minari`
+            did not write it; PD631 if the folder has another dataset; PD613 if the folder cannot be written.
+        ValueError: Minari rejects the id.
     """
     require_minari()
-    if task is None and (shard is not None or compress or how):
-        raise TypeError("from_minari takes shard, compress and arguments of the environment only with a task")
     source = _opened(_place(dataset_id) / DATA)
-    form: ActionForm | None = None
-    if task is None:
-        recipe = _exported_recipe(source)
-    else:
-        env = TensorEnv(task, 1, **{"autoreset_mode": "disabled", "observation": "ids"} | how)
-        form = _form(source, env)
-        policy = str(source.storage.metadata.get("algorithm_name") or f"Minari {dataset_id}")[:500]
-        recipe = recipe_of(env, policy=policy, episodes=source.total_episodes, shard=shard, compress=compress)
-    place = Path(folder)
+    recipe, place = _exported_recipe(source), Path(folder)
     with lock_place(place):
         manifest = begin_manifest(place, recipe)
         recorded = {row.number for row in manifest.shards}
         for number in range(recipe.shards):
             if number not in recorded:
-                manifest = add_shard(place, manifest, number, _shard(source, recipe, number, form))
+                manifest = add_shard(place, manifest, number, _shard(source, recipe, number))
     return Dataset.open(place)
 
 
 def _opened(folder: Path) -> minari.MinariDataset:
     """The Minari dataset in a folder. Raises CompileError (PD630)."""
     from minari import MinariDataset
-    from minari.dataset.minari_storage import MinariStorage, is_image_space
+    from minari.dataset.minari_storage import MinariStorage
 
     with reporting_damage(f"{folder} cannot be imported"):
         # Minari makes an environment to get spaces that are missing, with whatever function the file names.
         missing = {"observation_space", "action_space"} - MinariStorage.read_raw_metadata(folder).keys()
         if missing:
             raise ValueError(f"its metadata lack {min(missing)}")
-        source = MinariDataset(folder)
-        if source.storage.jpeg_encoding and is_image_space(source.observation_space):
-            raise ValueError("its observations are stored as JPEG, which does not keep their values")
-    return source
+        return MinariDataset(folder)
 
 
 def _exported_recipe(source: minari.MinariDataset) -> Recipe:
     """The recipe that `to_minari` left. Raises CompileError (PD630)."""
     folder, exported = source.storage.data_path, source.storage.metadata.get(KEY)
     if not isinstance(exported, dict) or not isinstance(exported.get("recipe"), dict):
-        reason, helps = (
-            "powderdsl did not write it, so its meaning is unknown",
-            "name the task that it was collected in: `task=`",
+        reason = "powderdsl did not write it, so its meaning is unknown"
+        raise damaged(
+            f"{folder} cannot be imported", reason, "`record` plays any policy, also one of another library"
         )
-        raise damaged(f"{folder} cannot be imported", reason, helps)
     # Episodes may have been added since.
     return read_recipe(folder, exported["recipe"] | {"episodes": source.total_episodes})
 
 
-def _form(source: minari.MinariDataset, env: TensorEnv) -> ActionForm:
-    """The form of the actions. Raises CompileError (PD630) for actions or observations that are not an environment's."""
-    with reporting_damage(f"{source.storage.data_path} cannot be imported"):
-        space = env.observation.space
-        if source.observation_space != space:
-            raise ValueError(f"its observations are not {space.dtype} {list(space.shape)}")
-        for kind in KINDS:
-            form = action_form(kind, env.task.agent, env.device)
-            if source.action_space == form.space:
-                return form
-        raise ValueError(f"its actions are not those of {env.task.name}")
-
-
-def _shard(
-    source: minari.MinariDataset, recipe: Recipe, number: int, form: ActionForm | None
-) -> dict[str, list[Array]]:
+def _shard(source: minari.MinariDataset, recipe: Recipe, number: int) -> dict[str, list[Array]]:
     """The arrays of a shard, in parts, all checked. Raises CompileError (PD630)."""
     parts: dict[str, list[Array]] = {name: [] for name in DTYPES}
     for episode in recipe.episodes_of(number):
         with reporting_damage(f"episode_{episode}: {source.storage.data_path} cannot be imported"):
-            for name, value in _episode(source, episode, recipe, form).items():
+            for name, value in _episode(source, episode, recipe).items():
                 parts[name].append(value)
     return parts
 
 
-def _episode(
-    source: minari.MinariDataset, number: int, recipe: Recipe, form: ActionForm | None
-) -> dict[str, Array]:
+def _episode(source: minari.MinariDataset, number: int, recipe: Recipe) -> dict[str, Array]:
     """The arrays of one episode, as a shard holds them. Raises ValueError."""
     (episode,) = source.iterate_episodes([number])
-    length, action, infos = len(episode), episode.actions, episode.infos or {}
-    if form is not None:
-        action = form.decode(np.asarray(action)).cpu().numpy()
-    if "world" in infos:
-        world = infos["world"][0]
-    else:
-        (metadata,) = source.storage.get_episode_metadata([number])
-        world = metadata["seed"]
+    length, infos = len(episode), episode.infos
     arrays = {
         "observation": episode.observations,
-        "action": action,
+        "action": episode.actions,
         "reward": episode.rewards,
         "terminated": episode.terminations,
-        "truncated": episode.truncations & ~episode.terminations,
-        "success": infos["success"][1:] if "success" in infos else np.zeros(length, bool),
+        "truncated": episode.truncations,
+        "success": infos["success"][1:],
         "length": np.array([length]),
-        "world": np.array([world]),
+        "world": infos["world"][:1],
     }
     rows = {"observation": length + 1, "length": 1, "world": 1}
     for name, value in arrays.items():

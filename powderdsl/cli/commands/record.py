@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 @opt.option(
     "--from-minari",
     "ID",
-    "Record nothing: read a Minari dataset into the folder --out; of TASK, unless --to-minari wrote it.",
+    "Record nothing: read a Minari dataset that --to-minari wrote into the folder --out.",
 )
 def command(
     task: str | None,
@@ -70,10 +70,10 @@ def command(
     """
     modes = {"--verify": verify, "--to-minari": to_minari, "--from-minari": from_minari}
     mode, *others = [name for name, value in modes.items() if value is not None] or [""]
-    needs, takes = NEEDS[mode]
+    needs = NEEDS[mode]
     values = {"TASK": task, "--out": out, "--episodes": episodes}
     arguments = [*others, *(name for name, value in values.items() if value is not None)]
-    if extra := [name for name in arguments if name not in takes]:
+    if extra := [name for name in arguments if name not in needs]:
         raise BadInput(f"{mode} does not go with {', '.join(extra)}")
     if missing := [name for name in needs if name not in arguments]:
         raise BadInput(f"missing {', '.join(missing)}")
@@ -86,15 +86,17 @@ def command(
         if mode == "":
             dataset = _recorded(str(task), Path(out or ""), episodes or 0, policy, changes, how)
         elif from_minari is not None:
-            dataset = _imported(from_minari, Path(out or ""), task, changes, how)
+            from powderdsl.datasets import minari
+
+            dataset = minari.from_minari(from_minari, out or "")
         else:
             dataset = Dataset.open(verify or out or "")
         if verify is not None:
             dataset.check()
         if to_minari is not None:
-            from powderdsl.datasets.minari import to_minari as write_minari
+            from powderdsl.datasets import minari
 
-            write_minari(dataset, to_minari)
+            minari.to_minari(dataset, to_minari)
     recipe, size = dataset.recipe, sum(row.bytes for row in dataset.manifest.shards)
     click.echo(
         f"{to_minari or verify or out}: {counted(len(dataset), 'episode')} of {recipe.task} "
@@ -106,12 +108,12 @@ def command(
 
 
 NEEDS = {
-    "": (("TASK", "--out", "--episodes"), ("TASK", "--out", "--episodes")),
-    "--verify": ((), ()),
-    "--to-minari": (("--out",), ("--out",)),
-    "--from-minari": (("--out",), ("TASK", "--out")),
+    "": ("TASK", "--out", "--episodes"),
+    "--verify": (),
+    "--to-minari": ("--out",),
+    "--from-minari": ("--out",),
 }
-"""What each of the command's modes needs, and what it takes."""
+"""The arguments that each of the command's modes needs; it takes no others of them."""
 
 
 def _recorded(
@@ -158,14 +160,3 @@ def require_gymnasium() -> None:
     from powderdsl.system.packages import require
 
     require("gymnasium", "recording", "pip install 'powderdsl[rl]'")
-
-
-def _imported(
-    name: str, out: Path, task: str | None, changes: dict[str, Any], how: dict[str, Any]
-) -> Dataset:
-    from powderdsl.datasets.minari import from_minari
-
-    if task is None:
-        return from_minari(name, out)
-    names = ("split", "observation", "worlds", "shard", "compress", "backend", "device")
-    return from_minari(name, out, task=load_task(task, **changes), **{name: how[name] for name in names})
