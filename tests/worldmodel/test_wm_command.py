@@ -64,15 +64,18 @@ def test_train_eval_finetune_and_show(dunes: str, tmp_path: Path) -> None:
 def test_the_curve_of_a_training(dunes: str, tmp_path: Path) -> None:
     folder, out = tmp_path / "run", tmp_path / "curve.png"
     run(*begin(dunes, folder, "--iterations", 20, "--validate-every", 5), exits=0)
-    run("wm", "show", folder, "--curve", "--out", out, exits=0)
-    assert np.asarray(Image.open(out)).shape[:2] == (630, 975)
+    losses = ("curves", folder, "--metric", "loss/train", "--metric", "loss/validation")
     lines = folder / "metrics.jsonl"
     lines.write_text(
         lines.read_text() + '{"step": 30, "loss/train": "x", "loss/validation": null}\n', encoding="utf-8"
     )
-    run("wm", "show", folder, "--curve", "--out", out, exits=0)
+    run(*losses, "--out", out, exits=0)
+    assert np.asarray(Image.open(out)).shape[:2] == (630, 975)
+    table = run(*losses, exits=0).output
+    assert "| loss/train | 1 | 10 |" in table
+    assert "| loss/validation | 1 | 5 |" in table
     lines.unlink()
-    assert "has no losses yet" in run("wm", "show", folder, "--curve", "--out", out, exits=2).output
+    assert "nothing has been written yet" in run(*losses, exits=2).output
 
 
 def test_packs_take_all_words_up_to_the_next_option(dunes: str, tmp_path: Path) -> None:

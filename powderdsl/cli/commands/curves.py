@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -12,9 +13,16 @@ from powderdsl.cli.exits import BadInput
 
 @click.command("curves")
 @click.argument("runs", metavar="RUN…", nargs=-1, required=True)
-@click.option("--metric", default="held_out/return", metavar="NAME", help="A number of metrics.jsonl.")
+@opt.option(
+    "--metric",
+    "NAME",
+    "A number of metrics.jsonl. May be repeated.",
+    ("held_out/return",),
+    to="metrics",
+    multiple=True,
+)
 @opt.output("--out", "FILE", "The picture to write; without it, a table is printed.")
-def command(runs: tuple[str, ...], metric: str, out: Path | None) -> None:
+def command(runs: tuple[str, ...], metrics: tuple[str, ...], out: Path | None) -> None:
     """Show what agents or world models learned, step by step.
 
     Runs that differ only in their seed make one curve: the mean, with its 95 % interval. For agents, train with
@@ -24,18 +32,21 @@ def command(runs: tuple[str, ...], metric: str, out: Path | None) -> None:
     from powderdsl.experiments.studies.results import as_table, baselines_of, curves_of, write_curves
 
     folders = [find_run(name) for name in runs]
-    curves = curves_of(folders, metric)
+    curves = [
+        curve if len(metrics) == 1 else replace(curve, label=f"{metric} {curve.label}".rstrip())
+        for metric in metrics
+        for curve in curves_of(folders, metric)
+    ]
     if not curves:
         known = sorted(
             {name for run in folders for line in read_metrics(run.path) for name in line} - {"step"}
         )
         there = f"there are {', '.join(known)}" if known else "nothing has been written yet"
-        raise BadInput(f"no run has the metric {metric}; {there}")
+        raise BadInput(f"no run has the metric {' or '.join(metrics)}; {there}")
     if out is None:
         click.echo(as_table(curves), nl=False)
         return
     title = str(folders[0].config.get("task", ""))
-    write_curves(
-        out, curves, metric, baselines_of(folders) if metric == "held_out/return" else {}, Path(title).stem
-    )
+    baselines = baselines_of(folders) if metrics == ("held_out/return",) else {}
+    write_curves(out, curves, ", ".join(metrics), baselines, Path(title).stem)
     click.echo(str(out))

@@ -16,6 +16,7 @@ from powderdsl.tasks.task import Task
 
 if TYPE_CHECKING:
     from powderdsl.datasets.dataset import Dataset
+    from powderdsl.experiments.runs import RunFolder
 
 
 @click.command("record", cls=opt.ManyWords)
@@ -80,11 +81,9 @@ def command(
     require_gymnasium()
     from powderdsl.datasets.dataset import Dataset
 
-    knobs, settings, packs = (how.pop(name) for name in ("knobs", "settings", "packs"))
-    changes = {"knobs": knobs, "params": settings, "packs": packs}
     with user_values():
         if mode == "":
-            dataset = _recorded(str(task), Path(out or ""), episodes or 0, policy, changes, how)
+            dataset = _recorded(str(task), Path(out or ""), policy, episodes=episodes, **how)
         elif from_minari is not None:
             from powderdsl.datasets import minari
 
@@ -117,37 +116,36 @@ NEEDS = {
 
 
 def _recorded(
-    name: str, out: Path, episodes: int, policy: str, changes: dict[str, Any], how: dict[str, Any]
+    name: str,
+    out: Path,
+    policy: str,
+    *,
+    knobs: dict[str, int],
+    settings: dict[str, str],
+    packs: tuple[str, ...],
+    **how: Any,
 ) -> Dataset:
     from powderdsl.datasets.recorder import SCRIPTED, record
     from powderdsl.experiments.runs import find_run, recorded_palette
 
     check_place(out)
-    palette = None if policy in SCRIPTED else recorded_palette(find_run(policy, "ppo"))
-    task = load_task(name, **changes, palette=palette)
+    run = None if policy in SCRIPTED else find_run(policy, "ppo")
+    palette = None if run is None else recorded_palette(run)
+    task = load_task(name, knobs=knobs, params=settings, packs=packs, palette=palette)
     check_split(task, how["split"])
-    with progress(task.name, episodes, lines=True, resumes=out) as show:
-        acting = {"policy": policy} if policy in SCRIPTED else _trained(policy, task, how)
-        return record(
-            task,
-            folder=out,
-            episodes=episodes,
-            progress=lambda done, total: show(done, "episodes"),
-            **acting,
-            **how,
-        )
+    with progress(task.name, how["episodes"], lines=True, resumes=out) as show:
+        acting = {"policy": policy} if run is None else _trained(run, task, how)
+        return record(task, folder=out, progress=lambda done, total: show(done, "episodes"), **acting, **how)
 
 
-def _trained(path: str, task: Task, how: dict[str, Any]) -> dict[str, Any]:
+def _trained(run: RunFolder, task: Task, how: dict[str, Any]) -> dict[str, Any]:
     """The policy of a run, its name and what it observes, as arguments of `record`.
 
     Raises CompileError (PD620), and ValueError if the run does not fit.
     """
     from powderdsl.envs.tensor_env import TensorEnv
-    from powderdsl.experiments.runs import find_run
     from powderdsl.rl.policies import config_of, load_policy
 
-    run = find_run(path, "ppo")
     sees = config_of(run).observation
     where = {name: how[name] for name in ("split", "backend", "device")}
     env = TensorEnv(task, 1, observation=sees, **where)

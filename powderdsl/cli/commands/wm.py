@@ -31,8 +31,6 @@ OF_WORLDS = {field.name for field in (*fields(DataConfig), *fields(Variety))} - 
 OF_WORLDS |= {*KNOBS, "packs", "held_out", "settings", "worlds", "after"}
 """Options that select worlds: a dataset has its own."""
 MACHINE = ("device", "threads", "backend", "store")
-CURVES = ("loss/train", "loss/validation")
-"""Metrics that are plotted."""
 
 _network = opt.option(
     "--network",
@@ -213,27 +211,14 @@ def eval_command(run: str, as_json: bool, out: Path | None, **values: Any) -> No
 @command.command("show", cls=opt.ManyWords)
 @_test_options
 @opt.output("--out", "FILE", "The picture to write.", ".png", required=True)
-@opt.option("--curve", bool, "Plot the losses of the training instead.")
 @opt.option("--steps", (1, 4096), "Steps to predict.  [default: as trained]")
 @opt.option("--after", (0, 10**6), "Steps that worlds run before the start.  [default: 0]")
 @opt.option("--scale", (1, 16), "Pixels per cell.", 2)
-def show_command(run: str, out: Path, curve: bool, scale: int, **values: Any) -> None:
+def show_command(run: str, out: Path, scale: int, **values: Any) -> None:
     """Draw each test as a strip: start, truth, prediction, and in red where that is wrong.
 
-    For several times the steps that the network was trained for, it is applied to what it predicted. With --curve, the
-    losses on training and on held-out worlds are plotted against the iterations, from the run's metrics.
+    For several times the steps that the network was trained for, it is applied to what it predicted.
     """
-    if curve:
-        from powderdsl.experiments.runs import find_run
-        from powderdsl.experiments.studies.results import curves_of, write_curves
-        from powderdsl.worldmodel.training import KIND
-
-        record = find_run(run, KIND)
-        curves = [replace(curve, label=metric) for metric in CURVES for curve in curves_of([record], metric)]
-        if not curves:
-            raise BadInput(f"{record.path} has no losses yet")
-        write_curves(out, curves, "loss", {}, record.path.name)
-        return
     from powderdsl.worldmodel.evaluation import recorded_strips, strips, unseen_worlds
 
     trained, recording, machine = _load_network(run, values)
