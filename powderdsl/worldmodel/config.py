@@ -63,7 +63,7 @@ class DataConfig(Checked):
     pairs: int = setting(16, low=1)
     rulesets: int = setting(0, "Number of rulesets to draw around the rules.", 0, MAX_RULESETS)
     """World s runs under number `first_ruleset` + s mod `rulesets`. 0: all under `rules`."""
-    first_ruleset: int = setting(0, low=0, high=1 << 32)
+    first_ruleset: int = setting(0, "Number of the first drawn ruleset.", 0, 1 << 32)
     variety: Variety = field(default_factory=Variety)
     """The differences between the rulesets."""
     capacity: int = setting(1024 * 256, "Capacity of the buffer, in pairs.", 1, 1 << 32, option="buffer")

@@ -44,7 +44,7 @@ def test_train_evaluate_and_go_on(folder: Path) -> None:
         (("train",), "TASK"),
         (("train", "sand-pulling"), "sand-pushing"),
         (("train", "sand-pushing", "--split", "tset"), "no split"),
-        (("train", "keep-ice", "--complexity", "3"), "no knob `complexity`"),
+        (("train", "keep-ice", "--knob", "complexity=3"), "no knob `complexity`"),
         (("train", "sand-pushing", "--network", "paper", "--observation", "rgb"), "rgb"),
         (("train", "--resume", "nowhere"), "nowhere"),
         (("train", "sand-pushing", "--resume", "nowhere"), "--resume goes without TASK"),

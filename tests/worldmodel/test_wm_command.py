@@ -87,7 +87,7 @@ def test_packs_take_all_words_up_to_the_next_option(dunes: str, tmp_path: Path) 
 
 def test_preset_and_options_make_the_configuration(tmp_path: Path, dunes: str) -> None:
     folder = tmp_path / "run"
-    run(*begin(dunes, folder, "--preset", "paper", "--elements", 2, "--iterations", 1, "--seed", 5))
+    run(*begin(dunes, folder, "--preset", "paper", "--knob", "kinds=2", "--iterations", 1, "--seed", 5))
     config = json.loads((folder / "run.json").read_text())["config"]
     assert (config["learning_rate"], config["seed"], config["batch"]) == (0.005, 5, 4)
     assert config["data"]["knobs"] == {"kinds": 2}
@@ -99,7 +99,7 @@ def test_preset_and_options_make_the_configuration(tmp_path: Path, dunes: str) -
         (("train", "--packs", "core", "--held-out", "sand"), "give one of them"),
         (("train", "--held-out", "snad"), "did you mean `sand`?"),
         (("train", "--rules", "core+snad"), "PD304"),
-        (("train", "--elements", "99"), "the knob `kinds` must lie in 0..4"),
+        (("train", "--knob", "kinds=99"), "the knob `kinds` must lie in 0..4"),
         (("train", "--knob", "lines=2"), "no knob `lines`"),
         (("train", "--iterations", "0"), "`iterations` must be an integer from 1"),
         (("train", "--chances", "3"), "--rulesets says how many"),

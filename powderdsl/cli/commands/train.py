@@ -30,9 +30,6 @@ from powderdsl.system.reading import read_json
 @opt.path("--init-from", "DATASET", "Dataset whose actions the network learns first (behavior cloning).")
 @opt.settings_of(TrainConfig)
 @opt.knobs("Another value for a knob of the task. May be repeated.")
-@opt.option("--n-lines", (0, 10**6), "Short for --knob lines=N.", to="lines")
-@opt.option("--n-disks", (0, 10**6), "Short for --knob disks=N.", to="disks")
-@opt.option("--complexity", (0, 10**6), "Short for --knob complexity=N.")
 @opt.parameters
 @opt.packs
 @opt.backend(None, "Backend that runs the rules.  [default: auto]")
@@ -62,7 +59,7 @@ def command(task: str | None, folder: Path | None, resume: Path | None, **values
     click.echo(f"powderdsl evaluate {folder}; powderdsl watch {folder}", err=True)
 
 
-WHAT = ("lines", "disks", "complexity", "knobs", "settings", "packs")
+WHAT = ("knobs", "settings", "packs")
 """Options that decide on worlds and rules."""
 
 
@@ -75,10 +72,9 @@ def new_config(values: Mapping[str, Any]) -> TrainConfig:
     settings = opt.given_options(values, names)
     if "init_from" in settings:
         settings["init_from"] = str(settings["init_from"].absolute())
-    knobs = values["knobs"] | opt.given_options(values, ("lines", "disks", "complexity"))
     name = str(Path(task).absolute()) if Path(task).suffix else task
-    more = {"knobs": knobs, "params": values["settings"], "packs": values["packs"]}
-    return preset(values["preset_name"], name, **settings, **more)
+    what = {"knobs": values["knobs"], "params": values["settings"], "packs": values["packs"]}
+    return preset(values["preset_name"], name, **settings, **what)
 
 
 def _config_of(folder: Path, values: Mapping[str, Any]) -> TrainConfig:

@@ -25,10 +25,8 @@ if TYPE_CHECKING:
     from powderdsl.worldmodel.training import Trained, TrainingProgress
 
 
-KNOBS = ("kinds", "lines", "disks", "squares")
-"""Knobs of the shipped task that have options of their own."""
 OF_WORLDS = {field.name for field in (*fields(DataConfig), *fields(Variety))} - {"task"}
-OF_WORLDS |= {*KNOBS, "packs", "held_out", "settings", "worlds", "after"}
+OF_WORLDS |= {"packs", "held_out", "settings", "worlds", "after"}
 """Options that select worlds: a dataset has its own."""
 MACHINE = ("device", "threads", "backend", "store")
 
@@ -82,14 +80,9 @@ def command() -> None:
 @opt.settings_of(DataConfig)
 @opt.settings_of(TrainConfig)
 @opt.settings_of(Variety)
-@opt.option("--first-ruleset", (0, 1 << 31), "Number of the first drawn ruleset.  [default: 0]")
 @opt.option("--rules", "RULES", "Rules of the worlds.  [default: the task's own]")
 @opt.option("--packs", "PACK…", "Keep only these packs of the rules, or add them.", multiple=True)
 @opt.option("--held-out", "PACK…", "Leave these packs of the rules out.", multiple=True)
-@opt.option("--elements", (0, 255), "Number of elements drawn besides empty.", to="kinds")
-@opt.option("--lines", (0, 256), "Maximum number of lines per world.")
-@opt.option("--disks", (0, 256), "Maximum number of disks per world.")
-@opt.option("--squares", (0, 256), "Maximum number of squares per world.")
 @opt.knobs("Another value for a knob of the task.")
 @opt.parameters
 @_run_options
@@ -132,11 +125,10 @@ def new_config(values: Mapping[str, Any], rules_of: Callable[..., str]) -> Train
     with user_values():
         config = replace(PRESETS[values["preset"]], **given_settings(values, TrainConfig))
         rules, task = values["rules"] or "", values["task"] or config.data.task
-        short = opt.given_options(values, KNOBS)
         changes = {
             **given_settings(values, DataConfig),
             "rules": rules_of(rules, task, packs, held_out) if packs or held_out else rules,
-            "knobs": short | values["knobs"],
+            "knobs": values["knobs"],
             "params": values["settings"],
             "variety": Variety(**variety),
         }
