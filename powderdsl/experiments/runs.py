@@ -370,10 +370,9 @@ def not_a_run(folder: Path, why: str, helps: tuple[str, ...] = ()) -> CompileErr
     return failure("PD620", f"{folder} is not a run that can be used here", notes=(why,), helps=helps)
 
 
-def write_json(path: Path, value: Any, *, follow: bool = False) -> Path:
-    """Write a file whole or not at all. `follow`: write to where a link leads. Raises CompileError (PD613)."""
-    write_text(path, json.dumps(value, indent=1, ensure_ascii=False) + "\n", follow=follow)
-    return path
+def write_json(path: Path, value: Any) -> None:
+    """Write a value as JSON, a file whole or not at all. Raises CompileError (PD613)."""
+    write_text(path, json.dumps(value, indent=1, ensure_ascii=False) + "\n")
 
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> tuple[str, ...]:

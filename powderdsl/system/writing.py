@@ -73,9 +73,9 @@ def scratch_folder(parent: Path) -> Iterator[Path]:
         yield Path(name)
 
 
-def write_text(path: Path, text: str, *, follow: bool = False) -> None:
+def write_text(path: Path, text: str) -> None:
     """Write a text as UTF-8, whole or not at all, as `replacing` does. Raises CompileError (PD613)."""
-    with replacing(path, follow=follow) as temporary:
+    with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 

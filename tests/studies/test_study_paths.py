@@ -8,7 +8,7 @@ import click
 import pytest
 
 from powderdsl.cli.commands.study import CALLED, NOT_FOR_STUDIES, commands
-from powderdsl.experiments.studies.study import FILE, READ, RULES, RUN_OR_TASK, TASK, confined, load_study
+from powderdsl.experiments.studies.study import READ, RULES, RUN_OR_TASK, TASK, confined, load_study
 from tests.cli.commands import powderdsl
 from tests.refusals import refused_codes
 
@@ -18,21 +18,21 @@ seeds: 1
 vary: {steps: [10]}
 steps:
   trained: {command: train, on: sand-pushing, steps: $steps}
-  tested: {command: evaluate, on: trained, out: scores.json}
+  tested: {command: evaluate, on: trained}
 measures:
   reward: {of: trained, value: splits/test/trained/mean}
 """
 
 ELSEWHERE = (
-    "/tmp/x.json",
-    "../x.json",
-    "a/../../x.json",
-    "~/x.json",
-    "..\\\\x.json",
-    "C:\\\\x.json",
-    '"a\\0b"',
-    '"\\e[2J"',
-    "link/x.json",
+    "/tmp/x.yaml",
+    "../x.yaml",
+    "a/../../x.yaml",
+    "~/x.yaml",
+    "..\\\\x.yaml",
+    "C:\\\\x.yaml",
+    '"a\\0b.yaml"',
+    '"\\e[2J.yaml"',
+    "link/x.yaml",
 )
 
 
@@ -42,9 +42,9 @@ def errors(path: Path, text: str) -> list[str]:
 
 
 @pytest.mark.parametrize("name", ELSEWHERE)
-def test_a_file_to_write_stays_in_the_results(name, tmp_path):
+def test_a_task_lies_beside_the_study(name, tmp_path):
     (tmp_path / "link").symlink_to("/tmp")
-    assert errors(tmp_path / "s.yaml", STUDY.replace("scores.json", name)) == ["PD112"]
+    assert errors(tmp_path / "s.yaml", STUDY.replace("on: sand-pushing", f"on: {name}")) == ["PD112"]
 
 
 @pytest.mark.parametrize(
@@ -64,9 +64,7 @@ def test_what_a_step_works_on_lies_beside_the_study(old, new, tmp_path):
 @pytest.mark.parametrize("option", ["rules", "packs", "held-out", "task"])
 def test_rules_and_tasks_lie_beside_the_study(option, tmp_path):
     text = STUDY.replace("{command: train, on: sand-pushing,", f"{{command: wm train, {option}: OTHER,")
-    text = text.replace(
-        "{command: evaluate, on: trained, out: scores.json}", "{command: wm eval, on: trained}"
-    )
+    text = text.replace("command: evaluate", "command: wm eval")
     text = text.replace("steps: $steps", "iterations: $steps")
     assert errors(tmp_path / "s.yaml", text.replace("OTHER", "../x.yaml")) == ["PD112"]
     assert errors(
@@ -76,11 +74,11 @@ def test_rules_and_tasks_lie_beside_the_study(option, tmp_path):
 
 def test_a_path_made_of_values_is_checked_too(tmp_path):
     text = STUDY.replace("vary: {steps: [10]}", "vary: {steps: [10], up: [a, ..]}")
-    assert errors(tmp_path / "s.yaml", text.replace("scores.json", "$up/x.json")) == ["PD112"]
+    assert errors(tmp_path / "s.yaml", text.replace("sand-pushing", "$up/x.yaml")) == ["PD112"]
     text = STUDY.replace(
-        "vary: {steps: [10]}", "vary: {steps: {small: [10], paper: [10], sets: {10: {to: /etc/x.json}}}}"
+        "vary: {steps: [10]}", "vary: {steps: {small: [10], paper: [10], sets: {10: {to: /etc/x.yaml}}}}"
     )
-    assert errors(tmp_path / "s.yaml", text.replace("scores.json", "$to")) == ["PD112"]
+    assert errors(tmp_path / "s.yaml", text.replace("sand-pushing", "$to")) == ["PD112"]
 
 
 @pytest.mark.parametrize("option", ["run", "resume"])
@@ -89,26 +87,24 @@ def test_a_study_cannot_choose_folders(option, tmp_path):
     assert errors(tmp_path / "s.yaml", text) == ["PD806"]
 
 
-def test_good_paths_become_paths_of_the_study_and_of_its_results(tmp_path):
+def test_good_paths_become_paths_of_the_study(tmp_path):
     (tmp_path / "s.yaml").write_text(STUDY.replace("on: sand-pushing", "on: mine/task.yaml"))
     study = load_study(str(tmp_path / "s.yaml"), commands())
     point = next(iter(study.points("small")))
     place = tmp_path / "results" / "runs" / point.name
     assert str(tmp_path / "mine" / "task.yaml") in study.command(study.steps[0], point, place)
-    assert study.command(study.steps[1], point, place)[-1] == str(place / "scores.json")
 
 
 def test_each_kind_of_word(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    folder, results = tmp_path / "a+b", tmp_path / "r"
-    assert confined(FILE, "x.json", folder, results) == str(results / "x.json")
-    assert confined(TASK, "sand-pushing", folder, results) == "sand-pushing"
-    assert confined(RUN_OR_TASK, "sand-pushing", folder, results) == "sand-pushing"
-    assert confined(RUN_OR_TASK, "base", folder, results) == str(folder / "base")
-    assert confined(RULES, "core+x.yaml+water-gas", folder, results) == f"core+{folder / 'x.yaml'}+water-gas"
+    folder = tmp_path / "a+b"
+    assert confined(TASK, "sand-pushing", folder) == "sand-pushing"
+    assert confined(RUN_OR_TASK, "sand-pushing", folder) == "sand-pushing"
+    assert confined(RUN_OR_TASK, "base", folder) == str(folder / "base")
+    assert confined(RULES, "core+x.yaml+water-gas", folder) == f"core+{folder / 'x.yaml'}+water-gas"
     (tmp_path / "secret").write_text("x")
     with pytest.raises(ValueError, match="shipped rules"):
-        confined(RULES, "core+secret", folder, results)
+        confined(RULES, "core+secret", folder)
 
 
 def test_results_with_a_link_that_leads_out_are_refused(tmp_path):
@@ -149,8 +145,7 @@ def test_every_word_that_stands_for_a_value_is_known():
             offered = {name[2:] for name in one.opts} & found[words].keys()
             assert not offered or not {*one.opts} & {*NOT_FOR_STUDIES}
             if offered or isinstance(one, click.Argument):
-                assert (one.metavar or "") in {"", "FILE", "FILE.json", *READ, *plain}, one.name
+                assert (one.metavar or "") in {"", *READ, *plain}, one.name
         paths = [one for one in command.params if isinstance(one.type, click.Path)]
         for one in paths:
-            name = one.opts[0][2:]
-            assert name == "run" or found[words].get(name, FILE).startswith(FILE)
+            assert one.opts[0] == "--run" or one.opts[0][2:] not in found[words]

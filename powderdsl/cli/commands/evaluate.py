@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -36,14 +35,12 @@ if TYPE_CHECKING:
 @click.option("--backend", type=opt.BACKEND, help="Backend that runs the rules.  [default: the run's]")
 @click.option("--device", help="A torch device.  [default: the run's]")
 @opt.option("--json", bool, "One JSON object instead of a table.", to="as_json")
-@opt.output("--out", "FILE.json", "Also write the JSON object to this file.")
 def command(
     run: str,
     knobs: dict[str, int],
     settings: dict[str, str],
     packs: tuple[str, ...],
     as_json: bool,
-    out: Path | None,
     **how: Any,
 ) -> None:
     """Mean return and 95 % interval of the agent of a RUN, on each split, in the same worlds as the other policies.
@@ -52,13 +49,10 @@ def command(
     policies that need no training are compared.
     """
     played = find_played(run, knobs, settings, packs)
-    from powderdsl.experiments.runs import write_json
     from powderdsl.rl.evaluation import evaluate
 
     with user_values():
         evaluation = evaluate(played, packs=packs, **how)
-    if out is not None:
-        write_json(out, evaluation.as_json(), follow=True)
     if as_json:
         print_json(evaluation.as_json())
     else:

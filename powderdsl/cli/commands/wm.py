@@ -174,8 +174,7 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
     "--rulesets", (0, 1024), "Number of rulesets that training never saw, to test under.  [default: 0]"
 )
 @opt.option("--json", bool, "One JSON object instead of a table.", to="as_json")
-@opt.output("--out", "FILE", "Also write the results to this file.")
-def eval_command(run: str, as_json: bool, out: Path | None, **values: Any) -> None:
+def eval_command(run: str, as_json: bool, **values: Any) -> None:
     """Test a network beside two baselines: that nothing changes, and each element's most frequent outcome.
 
     RUN is a run's folder, or its name in runs/. Losses are cross-entropies a cell, in nats. The worlds have seeds
@@ -192,8 +191,6 @@ def eval_command(run: str, as_json: bool, out: Path | None, **values: Any) -> No
         tested = evaluate(trained, worlds=values["worlds"], machine=machine, **tested_on(values))
     plain = tested.plain()
     write_json(trained.run.path / "evaluation.json", plain)
-    if out is not None:
-        write_json(out, plain, follow=True)
     if as_json:
         print_json(plain)
     else:

@@ -23,11 +23,10 @@ SIZES = ("small", "paper")
 SEED, SIZE = "seed", "size"
 MAX_POINTS = 10_000
 
-TEXT, FLAG, FILE = "text", "flag", "FILE"
+TEXT, FLAG = "text", "flag"
 TASK, RUN, RUN_OR_TASK, RULES, PACKS = "TASK", "RUN", "RUN|TASK", "RULES", "PACK…"
 READ = (TASK, RUN, RUN_OR_TASK, RULES, PACKS)
-"""What words of commands mean: FLAG, or what the help calls them. Words that begin with FILE name a file to write, those of
-READ something to read. All others are text."""
+"""What words of commands mean: FLAG, or what the help calls them. Those of READ name something to read; all others are text."""
 
 Commands = Mapping[tuple[str, ...], Mapping[str, str]]
 """Commands that steps may call, with the meaning of each option (without dashes) and of the argument (``on``)."""
@@ -183,9 +182,9 @@ class Study:
         return other if other.makes_run else self.works_on(other)
 
     def command(self, step: StudyStep, point: Point, place: Path) -> list[str]:
-        """The words of a step's command, whose runs and files lie in `place`.
+        """The words of a step's command, whose runs lie in `place`.
 
-        Raises CompileError (PD112) if a word names a path that leads out of the study's folder, or out of `place`.
+        Raises CompileError (PD112) if a word names a path that leads out of the study's folder.
         """
         words, run = list(step.command), self.works_on(step)
         for name, word in step.words:
@@ -194,7 +193,7 @@ class Study:
                 words.append(str(place / run.name))
                 continue
             try:
-                text = confined(means, text, self.folder, place)
+                text = confined(means, text, self.folder)
             except ValueError as error:
                 message = f"the path `{text}` leaves the study's folder"
                 raise CompileError([Diagnostic("PD112", message, Label(word.span, str(error)))]) from None
@@ -213,13 +212,8 @@ class Study:
         return {"study": self.name, "size": size, "varied": [axis.name for axis in self.axes], "steps": steps}
 
 
-def confined(means: str, text: str, folder: Path, results: Path) -> str:
-    """A word for a command, from an untrusted study: paths are in `folder`, those of files to write in `results`.
-
-    Raises ValueError for a path that leads out of there.
-    """
-    if means.startswith(FILE):
-        return str(inside(results, text))
+def confined(means: str, text: str, folder: Path) -> str:
+    """A word for a command, from an untrusted study. Raises ValueError for a path that leads out of `folder`."""
     if means in (RULES, PACKS):
         return "+".join(_pack(part, folder) for part in text.split("+"))
     is_shipped_task = text in shipped_names("tasks")
