@@ -24,7 +24,7 @@ SMOKE = 20
 EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "2000"))
 """Examples of each kind in the smoke test and in the campaign."""
 
-FEWER = {"heavy": 10, "text": 3, "random rules": 3}
+FEWER = {"heavy": 10, "random rules": 3}
 """Kinds that take long, or many choices: so many times fewer examples."""
 
 SEEDS = 60

@@ -146,17 +146,6 @@ def _character(choices: Choices) -> str:
     return chr(code)
 
 
-def any_text(choices: Choices) -> str:
-    """Characters without any sense."""
-    return "".join(_character(choices) for _ in range(choices.below(201)))
-
-
-def any_words(choices: Choices) -> str:
-    """Words and signs of rule files, in any order."""
-    words = [*vocabulary(), *[" "] * (len(vocabulary()) // 2), *["\n", "\n  ", "\n    - ", ": "] * 20]
-    return "".join(choices.pick(words) for _ in range(choices.below(61)))
-
-
 def any_rule(choices: Choices) -> str:
     """A good file with a rule of words in any order."""
     rule = " ".join(choices.pick(vocabulary()) for _ in range(choices.below(15))).replace("'", "")
@@ -215,8 +204,6 @@ KINDS: dict[str, tuple[int, Callable[[Choices], str]]] = {
     "lines": (5, damaged_lines),
     "tokens": (5, damaged_tokens),
     "random rules": (4, damaged_random_rules),
-    "text": (2, any_text),
-    "words": (2, any_words),
     "rule": (3, any_rule),
     "expression": (3, any_expression),
     "heavy": (2, heavy),

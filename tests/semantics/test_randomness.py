@@ -81,25 +81,6 @@ def test_draws_of_other_clocks_have_nothing_in_common(one: dict[str, int], other
     assert len(np.intersect1d(first, second)) < 5  # 20,480 of 2^32 twice: 0.1 are expected in common
 
 
-@pytest.mark.parametrize("bits", [16, 32])
-def test_numbers_are_uniform(bits: int) -> None:
-    """Chi-square over 256 equal parts of the unit interval, of the highest and of the lowest bits, and of pairs."""
-    numbers = draws(bits=bits, shape=(256, 320))
-    right = np.roll(numbers, -1, 1)
-    for parts in (
-        numbers >> np.uint64(bits - 8),
-        numbers & np.uint64(255),
-        (numbers >> np.uint64(bits - 4)) * np.uint64(16) + (right >> np.uint64(bits - 4)),
-        (numbers >> np.uint64(bits - 4)) * np.uint64(16) + (np.roll(numbers, -1, 0) >> np.uint64(bits - 4)),
-    ):
-        found = np.bincount(parts.ravel().astype(int), minlength=256)
-        expected = numbers.size / 256
-        statistic = ((found - expected) ** 2 / expected).sum()
-        # Wilson and Hilferty: the cube root of χ²/k is nearly normal, here with k = 255.
-        deviations = ((statistic / 255) ** (1 / 3) - (1 - 2 / (9 * 255))) / np.sqrt(2 / (9 * 255))
-        assert abs(deviations) < DEVIATIONS, (statistic, deviations)
-
-
 def test_draws_lie_strictly_inside_and_half_way_between_multiples() -> None:
     clock = Clock(np.array([0, 7]), np.array([0, 3]), np.array([0, 0]))
     values = draw(clock, 5, 16, 40, 70)

@@ -174,6 +174,3 @@ def test_whoever_is_loaded_last_has_the_last_word() -> None:
 )
 def test_mistakes_of_a_ruleset_are_reported(also: str, code: str) -> None:
     assert code in codes(ruleset(also))
-
-
-# Floats of some elements

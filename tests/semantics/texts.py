@@ -12,8 +12,6 @@ from powderdsl.model.packs import read_file
 from powderdsl.testing.generators.cases import load_text
 from tests.compilers import skip_without_compiler
 
-BACKENDS = ("reference", "torch", "native", "wasm")
-
 
 def simulator(text: str, backend: str = "reference") -> powderdsl.Simulator:
     """A simulator of a pack. The test is skipped if the backend needs a compiler that is missing."""

@@ -17,26 +17,6 @@ PLACE = st.integers(-12, 90)
 SIZES = st.sampled_from([(1, 1), (7, 9), (64, 64), (65, 30), (130, 12)])
 
 
-def picture(cells: np.ndarray) -> list[str]:
-    return ["".join("x" if cell else "." for cell in row) for row in cells]
-
-
-def test_the_shapes_of_generators():
-    ramp = ["......", "...x..", "..xx..", ".xxx..", "......"]
-    assert picture(mask(Shape("ramp", (3, 1, 1, 3)), (5, 6))) == ramp
-    assert picture(mask(Shape("ramp", (1, 3, 3, 1)), (5, 6))) == ramp
-    assert picture(mask(Shape("ramp", (1, 1, 3, 1)), (5, 3))) == ["...", ".x.", ".x.", ".x.", "..."]
-    assert picture(mask(Shape("square", (2, 2, 1)), (4, 4))) == ["....", ".xx.", ".xx.", "...."]
-    assert picture(mask(Shape("arch", (1, 4, 0, 4, 1)), (4, 5))) == [".....", "xxxx.", "x..x.", "x..x."]
-    assert picture(mask(Shape("container", (0, None, 1, None, 1)), (3, 5))) == [".x..x", ".x..x", ".xxxx"]
-    assert picture(mask(Shape("wave", (1, 2, 4, 0)), (4, 8))) == [
-        "........",
-        "x...x...",
-        "xx.xxx.x",
-        "xxxxxxxx",
-    ]
-
-
 def ranges() -> st.SearchStrategy[list[int | None]]:
     """A start and an end above it; perhaps open."""
     start = st.integers(0, 70)

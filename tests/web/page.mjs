@@ -1,5 +1,5 @@
 // Uses the playground as people do, in headless Chromium: node page.mjs ADDRESS FOLDER
-// Pictures and downloads go to FOLDER; what was seen and measured is printed as JSON.
+// Pictures and downloads go to FOLDER; what was seen is printed as JSON.
 import { join } from "node:path";
 import { launch, openPage } from "./browser.mjs";
 
@@ -50,9 +50,7 @@ async function edit(page, from, to) {
   );
 }
 const until = (page, what) =>
-  page.waitForFunction((name) => powderdsl.edits[name] !== null, what, { timeout: 60000 }).then(() =>
-    page.evaluate((name) => powderdsl.edits[name], what),
-  );
+  page.waitForFunction((name) => powderdsl.edits[name] !== null, what, { timeout: 60000 });
 
 async function drag(page, from, to) {
   const box = await page.locator("#canvas").boundingBox();
@@ -75,14 +73,10 @@ const saved = (page, id, name) =>
     await page.locator(`#${id}`).click();
   });
 
-const seen = { seconds: {} };
-const begun = performance.now();
-const lap = (name) => (seen.seconds[name] = Math.round((performance.now() - begun) / 100) / 10);
+const seen = {};
 const { page, problems } = await openPage(browser, address);
 page.on("request", (one) => requests.add(new URL(one.url()).origin));
 page.on("dialog", (one) => one.accept());
-seen.firstWorld = await page.evaluate(() => powderdsl.firstWorld);
-lap("first world");
 
 // While the compiler loads: paint sand and see it fall; undo; drag wind.
 await page.locator("#run").click();
@@ -134,23 +128,19 @@ for (const one of ["Shift+ArrowUp", "Shift+ArrowUp", "Enter"]) await page.keyboa
 seen.keyboard.push((await count(page, "water")) > dry);
 await page.keyboard.press("Control+z");
 seen.keyboard.push((await count(page, "water")) === dry);
-lap("painted");
 
 // Break a rule, see where and why; fix it, and see the world continue.
 await ready(page);
-seen.compilerReady = await page.evaluate(() => powderdsl.compilerReady);
 await said(page, "problems", /No mistakes/);
-lap("compiler");
 const before = await hashes(page, "wind.velocity");
 await edit(page, "density: 4", "densit: 4");
-seen.keystrokeToDiagnostics = await until(page, "checkTook");
+await until(page, "checkTook");
 seen.problem = await text(page, "problems");
 await page.locator("#run").click();
 await passed(page, before.step, 6);
-await page.screenshot({ path: join(folder, "broken.png") });
 seen.ranWhileBroken = (await step(page)) - before.step;
 await edit(page, "densit: 4", "density: 2");
-seen.editToRunning = await until(page, "applyTook");
+await until(page, "applyTook");
 seen.applied = await text(page, "status");
 seen.stepsAfterFix = (await step(page)) - before.step;
 seen.sandAfterFix = await count(page, "sand");
@@ -160,7 +150,6 @@ await page.locator("#packs button", { hasText: "+ pack" }).click();
 await until(page, "applyTook");
 seen.own = await page.locator("#elements button", { hasText: "mine" }).count();
 await page.locator("#run").click();
-lap("edited");
 
 // A link opens the same world, with the same rules, while this page goes on.
 await page.locator("#share").click();
@@ -198,7 +187,6 @@ seen.continued = await hashes(page, "wind.velocity");
 await saved(page, "save-png", "world.png");
 await saved(page, "save-gif", "world.gif");
 await saved(page, "save-webm", "world.webm");
-lap("saved");
 
 // Why a cell changed, and what is known about the rules.
 await page.keyboard.press("t");
@@ -208,8 +196,6 @@ await said(page, "checks", /of powderworld/);
 await page.locator("#checks button", { hasText: "ledger" }).click();
 await said(page, "checks", /ledger of/);
 seen.checks = await text(page, "checks");
-await page.screenshot({ path: join(folder, "checks.png") });
-lap("explained");
 
 await ready(second.page);
 seen.sameFromLink = JSON.stringify(await hashes(second.page, "wind.velocity")) === JSON.stringify(here);
@@ -217,7 +203,6 @@ seen.ownFromLink = await second.page.locator("#elements button", { hasText: "min
 await second.page.locator("#save summary").click();
 seen.noVideo = [await second.page.locator("#save-webm").isDisabled(), await text(second.page, "no-video")];
 await second.page.close();
-lap("link");
 
 // A stranger's link: damaged, or with HTML in it.
 for (const bad of ["#w=AAAA", "#w=%3Cscript%3E", `#w=${"A".repeat(5000)}`]) {
@@ -236,9 +221,6 @@ await page.locator("#gallery .card").first().waitFor();
 seen.gallery = await page.locator("#gallery .card").count();
 await page.setViewportSize({ width: 360, height: 740 });
 seen.tooWide = await page.evaluate(() => document.documentElement.scrollWidth > innerWidth);
-await page.screenshot({ path: join(folder, "narrow.png") });
-
-lap("end");
 seen.problems = [...problems, ...second.problems];
 seen.origins = [...requests].filter((one) => one !== new URL(address).origin && one !== "null");
 console.log(JSON.stringify(seen, null, 1));
