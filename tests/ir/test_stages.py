@@ -99,16 +99,6 @@ def test_golden_ir(name: str, tmp_path: Path, golden) -> None:  # type: ignore[n
     golden(GOLDEN / f"{name}.ir", text)
 
 
-def test_densities_become_sets_of_elements(tmp_path: Path) -> None:
-    """After `resolve` no property is looked up any more, and substeps that cannot happen are gone."""
-    before = program_of("fall", tmp_path)
-    after = run_passes(before)
-    assert "table" in print_program(before)
-    assert "table" not in print_program(after)
-    assert len(before.passes[0].substeps) == 4
-    assert len(after.passes[0].substeps) == 2  # grains sink through air and smoke, air through smoke
-
-
 def test_planes_hold_no_whole_numbers(tmp_path: Path) -> None:
     for name in PACKS:
         planes = lower_bits(run_passes(program_of(name, tmp_path)))

@@ -62,15 +62,6 @@ def assert_equal(found: World, wanted: World) -> None:
 Pair = tuple[Simulator, Simulator]
 
 
-def test_single_steps_are_those_of_one_call(sims: Pair) -> None:
-    native, plain = sims
-    world = start(native)
-    for _ in range(9):
-        world = native.step(world)
-    assert_equal(world, plain.step(start(plain), 9))
-    assert_equal(native.step(world, 0), world)
-
-
 def test_old_worlds_stay(sims: Pair) -> None:
     native, plain = sims
     kept = [start(native, 3)]

@@ -156,24 +156,6 @@ def test_fields_hold_only_what_rules_allow() -> None:
         compare(alone, world)
 
 
-def test_the_clock_continues_a_world() -> None:
-    """Cells, fields, seed and step are all that the future depends on."""
-    ruleset = load("core+sand+water")
-    _, _, state = states(ruleset, (12, 64), 5)
-    one, two = (StandaloneWorld(ruleset, (12, 64)) for _ in range(2))
-    one.begin(state["element"], 3)
-    one.call("step", 9)
-    two.begin(one.ids(), 0)
-    clock = one.running.read(one.call("clock"), 24)
-    assert np.frombuffer(clock, np.int64).tolist() == [3, 0, 9]
-    two.running.write(two.call("clock"), bytes(clock))
-    for name in two.slots:
-        two.take(name, one.field(name))
-    for world in (one, two):
-        world.call("step", 20)
-    assert np.array_equal(one.ids(), two.ids())
-
-
 needs_node = pytest.mark.skipif(node() is None, reason="no Node.js")
 
 
