@@ -45,8 +45,9 @@ class Worlds(ctypes.Structure):
 @cache
 def driver() -> ctypes.CDLL:
     """The CUDA driver. Raises NoCuda."""
+    name = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
     try:
-        return ctypes.CDLL("libcuda.so.1")
+        return ctypes.CDLL(name)
     except OSError as error:
         raise NoCuda(f"no CUDA driver: {error}") from None
 
@@ -55,10 +56,13 @@ def driver() -> ctypes.CDLL:
 def nvrtc(version: str) -> ctypes.CDLL:
     """NVRTC of a CUDA version such as ``13.0``: loaded, on the library path, or in a package. Raises NoCuda."""
     major = version.split(".")[0]
-    names = [f"libnvrtc.so.{major}"]
+    if sys.platform == "win32":
+        names, pattern = [f"nvrtc64_{major}0_0.dll"], f"nvrtc64_{major}*.dll"
+    else:
+        names, pattern = [f"libnvrtc.so.{major}"], f"libnvrtc.so.{major}*"
     for folder in sys.path:
-        for place in ("nvidia/*/lib", "torch/lib"):
-            names += sorted(glob.glob(str(Path(folder or ".") / place / f"{names[0]}*")))
+        for place in ("nvidia/*/lib", "nvidia/*/bin", "nvidia/*/bin/*", "torch/lib"):
+            names += sorted(glob.glob(str(Path(folder or ".") / place / pattern)))
     for name in names:
         try:
             for beside in glob.glob(str(Path(name).parent / "libnvrtc-builtins.so.*")) if "/" in name else ():
