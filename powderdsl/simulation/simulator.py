@@ -330,7 +330,7 @@ class Simulator:
 
     # Changing worlds
 
-    def replace(self, world: World, **fields: Any) -> World:
+    def replace(self, world: World, /, **fields: Any) -> World:
         """The world with these fields set. New ids make fresh cells; other fields are set after that.
 
         Args:
@@ -345,7 +345,7 @@ class Simulator:
         """
         self.check(world)
         state, xp = dict(world.state), self.kind.xp
-        new_ids = fields.pop("ids", fields.pop("element", None))
+        new_ids = fields.pop("ids", None)
         if new_ids is not None:
             ids = self._broadcast(self._integers(new_ids, "ids"), "ids", world.shape)
             check_ids(self.kind, ids, "ids", self.ruleset)
@@ -378,7 +378,7 @@ class Simulator:
                 f"{name} must have the shape {list(target)}, found {list(array.shape)}"
             ) from None
 
-    def paint(self, world: World, *, where: Any, element: str | None = None, **fields: Any) -> World:
+    def paint(self, world: World, /, *, where: Any, element: str | None = None, **fields: Any) -> World:
         """Set cells of a mask: fresh cells of an element, and values of fields.
 
         Args:

@@ -16,7 +16,16 @@ from itertools import pairwise
 from typing import Any, TypeVar
 
 from powderdsl.diagnostics import Label, Reporter, Span, suggest
-from powderdsl.model.declarations import SHARED, Definition, PackDecl, PassDecl, RulesetDecl, TestDecl
+from powderdsl.model.declarations import (
+    SHARED,
+    Definition,
+    FieldDecl,
+    PackDecl,
+    PassDecl,
+    PropertyDecl,
+    RulesetDecl,
+    TestDecl,
+)
 from powderdsl.syntax.parse import Syntax
 from powderdsl.syntax.yaml_tree import Mapping as MappingNode
 from powderdsl.syntax.yaml_tree import Node, Scalar
@@ -24,6 +33,9 @@ from powderdsl.syntax.yaml_tree import Node, Scalar
 D = TypeVar("D", bound=Definition)
 
 MAX_PASSES = 200
+
+STATE = frozenset(("element", "ids"))
+"""Names that the elements of cells have in Python and in files, beside those of fields and properties."""
 
 
 class Names:
@@ -84,14 +96,15 @@ class Names:
         """True if a global name is a pack's own, or one of a pack that it needs."""
         return self.pack(name) in (None, *self.needs.get(pack, (pack,)))
 
-    def check_word(self, scalar: Scalar, noun: str) -> bool:
+    def check_word(self, scalar: Scalar | Syntax, noun: str, more: frozenset[str] = frozenset()) -> bool:
         """True if a word may name something. Reports a reserved word."""
-        if scalar.text in self.reserved:
+        is_reserved = scalar.text in self.reserved | more
+        if is_reserved:
             self.reporter.error(
                 "PD311", f"`{scalar.text}` is a reserved word", scalar.span, f"cannot name {noun}",
                 helps=[f"write `{scalar.text}_`, or choose another name"],
             )  # fmt: skip
-        return scalar.text not in self.reserved
+        return not is_reserved
 
     def _define(self, decl: Any) -> None:
         scalar, word, needs = decl.name, decl.name.text, self.needs[decl.pack]
@@ -108,7 +121,10 @@ class Names:
         _, new = self.rename.get(decl.qualified, (None, None))
         if new is not None:
             self.renamed.add(decl.qualified)
-        if not self.check_word(scalar, decl.NOUN) or not self.check_word(new or scalar, decl.NOUN):
+        taken = STATE if isinstance(decl, FieldDecl | PropertyDecl) else frozenset()
+        if not all(
+            self.check_word(name, decl.NOUN, taken) for name in dict.fromkeys((scalar, new or scalar))
+        ):
             return
         near = [pack for pack in self.needs if pack in needs or decl.pack in self.needs[pack]]
         other = self._first(near, word)

@@ -125,7 +125,7 @@ class Scope:
     locals: dict[str, Operand]
     orientation: Matrix = IDENTITY
 
-    def bind(self, **names: Operand) -> Scope:
+    def bind(self, /, **names: Operand) -> Scope:
         return replace(self, locals={**self.locals, **names})
 
 

@@ -388,8 +388,10 @@ class Typer:
         return Expr("draw", DRAW, value=name, span=span) if name in symbols.streams else None
 
     def is_new(self, name: Scalar | Syntax, scope: Scope) -> bool:
-        """True if a local name is new. Reports a name that hides another one which its pack knows."""
+        """True if a local name is new. Reports a reserved word, and a name that hides another one which its pack knows."""
         names, word = self.symbols.names, name.text
+        if not names.check_word(name, "anything"):
+            return False
         other = scope.locals.get(word) or self.find(word, name.span, Scope(scope.pack, {}))
         if other is None or (
             word not in scope.locals and not names.knows(scope.pack, names.of(scope.pack, word))
