@@ -36,12 +36,13 @@ from powderdsl.model.types import Ruleset
 from powderdsl.tasks.shipped import load_task_with_diagnostics
 from powderdsl.testing.pack_tests.runner import run_examples
 from powderdsl.worlds.scene import load_start
+from tests.tiers import tiered
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 ROOT_PAGES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "examples/README.md")
 PAGES = [*(ROOT / name for name in ROOT_PAGES), *sorted(DOCS.rglob("*.md"))]
-SLOW = {"docs/libraries.md"}
+SLOW = {"docs/creatures.md", "docs/libraries.md", "docs/migrating.md", "docs/worldmodels.md"}
 MANY_STEPS = 4
 """Commands that run longer are cut to this many steps: what they print does not depend on it."""
 
@@ -311,7 +312,7 @@ SHOWN_STEPS = 24
 """Steps of animations that are compared."""
 
 
-@pytest.mark.parametrize("path", PICTURES)
+@pytest.mark.parametrize("path", tiered(PICTURES, sorted(PICTURES)[-1:]))
 def test_pictures_are_what_their_commands_draw(path: str, generate: Any, tmp_path: Path) -> None:
     """Its first frames, pixel by pixel: `python docs/generate.py --pictures` draws pictures again."""
     from powderdsl.cli import main

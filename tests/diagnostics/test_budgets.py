@@ -49,6 +49,7 @@ RULES = [f"soil -> {'weed' if n % 2 else 'air'} if d + 10 * e == {n}" for n in r
 """Each keeps apart from each, as only a search shows."""
 
 
+@pytest.mark.slow
 def test_many_rules_are_too_much_work_and_each_help_helps() -> None:
     [(code, helps)] = reported("    do:\n" + listed(RULES, 6))
     assert code == "PD508"

@@ -146,6 +146,7 @@ with lock_folder(run.path):
 """
 
 
+@pytest.mark.slow
 def test_no_kill_leaves_an_unreadable_checkpoint(tmp_path: Path) -> None:
     chance, last = random.Random(5), 0
     for _ in range(4):

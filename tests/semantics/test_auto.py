@@ -238,6 +238,7 @@ def start_of(sim: Simulator) -> World:
 needs_compiler = pytest.mark.skipif(not compilers(), reason="no C++ compiler")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cxx", compilers())
 def test_every_compiler_gives_the_oracles_worlds(
     cxx: str, rules: Ruleset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -309,6 +310,7 @@ def test_a_damaged_cache_is_mended(rules: Ruleset, tmp_path: Path) -> None:
             assert powderdsl.compile(rules).running == "native"
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
 def test_forks_run_native_code_too(rules: Ruleset, tmp_path: Path) -> None:

@@ -113,6 +113,7 @@ def test_several_processes_change_no_outcome():
     assert {verdict.status for verdict in alone.values()} - {"survived"}
 
 
+@pytest.mark.slow
 def test_a_process_that_is_killed_is_an_error():
     campaign = run_campaign("wireworld", (), list(range(40)), jobs=2, seed=0)
     next(campaign)

@@ -53,6 +53,7 @@ def test_arrays_make_the_worlds_of_tensors(torch, name):
                 assert (found[key] == one).all(), key
 
 
+@pytest.mark.slow
 def test_worlds_are_made_without_torch_and_numpy():
     ended = subprocess.run([sys.executable, "-c", ALONE], capture_output=True, text=True)
     assert ended.stderr == ""

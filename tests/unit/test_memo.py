@@ -124,6 +124,7 @@ EDITS: tuple[tuple[str, Callable[[str], str]], ...] = (
 )
 
 
+@pytest.mark.slow
 def test_edited_rules_compile_to_the_same_code(rules: Path) -> None:
     memo, path = Memo(), rules / "small.yaml"
     assert code(path, memo) == code(path, None)

@@ -115,6 +115,7 @@ def test_odd_characters(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert without_libyaml(text, monkeypatch) == parsed(text)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "text",
     [

@@ -163,6 +163,7 @@ def test_names_say_what_is_loaded(rules: str, name: str) -> None:
     assert library.load(rules).name == name
 
 
+@pytest.mark.slow
 def test_commands_say_what_is_loaded() -> None:
     rules = "powderworld-gas+grit.yaml"
     for words in (("check", rules, "--ledger", "--quick"), ("run", rules, "--steps", "1"), ("show", rules)):

@@ -139,6 +139,7 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", BLOCKED, *arguments], capture_output=True, text=True)
 
 
+@pytest.mark.slow
 def test_worlds_run_and_are_saved_as_with_torch(tmp_path: Path) -> None:
     """A scene that sets fields, then the saved world; shapes at random, drawn in the terminal."""
     scene = tmp_path / "scene.yaml"
@@ -159,6 +160,7 @@ def test_worlds_run_and_are_saved_as_with_torch(tmp_path: Path) -> None:
     assert drawn.split() == write_ascii(ids, sim.ruleset.elements).split()
 
 
+@pytest.mark.slow
 def test_pictures_are_written_and_what_lacks_a_package_says_so(tmp_path: Path) -> None:
     first, second = tmp_path / "first.png", tmp_path / "second.png"
     assert run("render", "garden", "--rules", "powderworld", "--out", str(first)).returncode == 0
@@ -184,9 +186,9 @@ def test_backends_that_need_torch_say_so() -> None:
 @pytest.mark.parametrize(
     "arguments",
     [
-        ("check", "powderworld", "--ledger", "--notes"),
+        ("check", "core+sand+water", "--ledger", "--notes"),
         ("test", "wishes.yaml", "--examples", "32", "--no-keep"),
-        ("trace", "powderworld", "--at", "9,9", "--step", "4", "--size", "16x16", "--seed", "2"),
+        ("trace", "core+sand+water", "--at", "9,9", "--step", "4", "--size", "16x16", "--seed", "2"),
     ],
     ids=" ".join,
 )

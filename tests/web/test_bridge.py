@@ -208,6 +208,7 @@ def test_what_does_not_fit_is_an_error_message(
     assert found["error"]
 
 
+@pytest.mark.slow
 def test_every_ruleset_of_the_site_opens(session: bridge.Session) -> None:
     for entry in shipped_entries():
         assert call("check", entry.files(), entry.off)["result"]["ok"], entry.key

@@ -121,6 +121,7 @@ def test_bad_input_is_said_and_nothing_is_begun(
     assert not (folder / "runs").exists()
 
 
+@pytest.mark.slow
 def test_ctrl_c_saves_and_says_how_to_go_on(dunes: str, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     words = [str(word) for word in begin(dunes, folder, "--iterations", 100_000)]
