@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import Field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -109,24 +109,17 @@ def path(name: str, metavar: str, about: str, **more: Any) -> Option:
     return option(name, click.Path(path_type=Path), about, metavar=metavar, **more)
 
 
-class OutputFile(click.Path):
-    """A file to write, in a folder that can be written to. Its suffix is one of `suffixes`, if there are any."""
+def output(name: str, metavar: str, about: str, *suffixes: str, **more: Any) -> Option:
+    """An option for a file to write, with one of some suffixes. Raises CompileError (PD613) before the command begins."""
 
-    def __init__(self, suffixes: Collection[str]):
-        super().__init__(path_type=Path)
-        self.suffixes = suffixes
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
-        path = Path(value)
-        if self.suffixes and path.suffix.lower() not in self.suffixes:
-            self.fail(f"`{value}` must end in {' or '.join(self.suffixes)}", param, ctx)
+    def checked_path(text: str) -> Path:
+        path = Path(text)
+        if suffixes and path.suffix.lower() not in suffixes:
+            raise ValueError(f"must end in {' or '.join(suffixes)}")
         check_writable(path)
         return path
 
-
-def output(name: str, metavar: str, about: str, *suffixes: str, **more: Any) -> Option:
-    """An option for a file to write, which is checked before the command begins. Raises CompileError (PD613)."""
-    return option(name, OutputFile(suffixes), about, metavar=metavar, **more)
+    return option(name, Parsed(metavar, checked_path), about, metavar=metavar, **more)
 
 
 def pairs(name: str, metavar: str, about: str, to: str, value: str = ".+", read: type = str) -> Option:
