@@ -96,10 +96,6 @@ def _smaller_trees(tree: Tree) -> Iterator[Tree]:
         for key in keys:  # a loop's body once, a nested block's parts for the block
             if str(key).startswith(("for ", "repeat ")):
                 yield {("do" if k == key else k): v for k, v in tree.items()}
-                yield from (
-                    {(line if k == key else k): v for k, v in tree.items()}
-                    for line in _smaller_headers(str(key))
-                )
     for key in keys:
         value = tree[key]  # type: ignore[index]
         if key in ("type", "pack"):  # another kind would be another case
@@ -112,12 +108,6 @@ def _smaller_trees(tree: Tree) -> Iterator[Tree]:
                 yield {k: (smaller if k == key else v) for k, v in tree.items()}
             else:
                 yield [smaller if i == key else v for i, v in enumerate(tree)]
-
-
-def _smaller_headers(line: str) -> Iterator[str]:
-    if line.startswith("for ") and ", " in line:
-        parts = line[4:].split(", ")
-        yield from (f"for {', '.join([*parts[:i], *parts[i + 1 :]])}" for i in range(len(parts)))
 
 
 def _smaller_lines(text: str) -> Iterator[str]:

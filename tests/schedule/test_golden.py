@@ -15,7 +15,7 @@ import pytest
 
 from powderdsl.compiler import load, lower
 from powderdsl.ir.bits import segments
-from powderdsl.ir.ops import REAL, Node, Program, nodes_of, ordered
+from powderdsl.ir.ops import REAL, Node, Program, ordered
 from powderdsl.ir.text import print_program
 from powderdsl.schedule.stages import PLANNERS, plan
 from powderdsl.schedule.text import print_schedule
@@ -57,16 +57,6 @@ def work(nodes: Iterable[Node]) -> dict[str, int]:
         elif node.args or node.op in by_op:
             counts[by_op.get(node.op, "others")] += 1
     return counts
-
-
-def plane_rows(rules: str) -> list[dict[str, str | int]]:
-    rows: list[dict[str, str | int]] = []
-    for part in planes(rules):
-        for pass_ in part.passes:
-            text = print_program(part, pass_.name).partition("\npass ")[2]
-            row = {"pass": pass_.name, "substeps": len(pass_.substeps), "slots": len(pass_.outputs)}
-            rows.append({**row, **work(nodes_of(pass_)), "digest": digest(text)})
-    return rows
 
 
 def schedule_rows(rules: str, backend: str) -> list[dict[str, str | int]]:
@@ -120,7 +110,6 @@ def test_plans_of_small_rules(rules: str, golden: Callable[[Path, str], None]) -
 @pytest.mark.golden
 @pytest.mark.parametrize("rules", LARGE)
 def test_plans_of_large_rules(rules: str, golden: Callable[[Path, str], None]) -> None:
-    golden(file_of(rules, "planes"), table(plane_rows(rules)))
     for backend in ("native", "cuda"):
         golden(file_of(rules, backend), table(schedule_rows(rules, backend)))
 

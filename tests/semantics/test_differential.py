@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -57,8 +58,8 @@ def compositions() -> list[str]:
 
     def listed(name: str, key: str) -> list[str]:
         text = (shipped("rules") / f"{name}.yaml").read_text(encoding="utf-8")
-        line = next((line for line in text.splitlines() if line.startswith(f"{key}:")), "")
-        return line.removeprefix(f"{key}:").replace("[", " ").replace("]", " ").replace(",", " ").split()
+        line = re.search(rf"^{key}:(.*)", text, re.MULTILINE)
+        return re.findall(r"\w+", line[1]) if line else []
 
     def with_needs(name: str) -> list[str]:
         return [*(one for word in listed(name, "needs") for one in with_needs(word)), name]

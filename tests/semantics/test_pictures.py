@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from fractions import Fraction
 from functools import cache
@@ -14,7 +13,6 @@ import pytest
 from PIL import Image
 
 import powderdsl
-from powderdsl.cli.pictures import LiveView, first_world, pictures, render_frame
 from powderdsl.diagnostics import CompileError
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.draw import palette, ramps, rgb
@@ -150,27 +148,6 @@ def test_colors_have_no_meaning() -> None:
     )
     assert plain != kiln()
     assert fingerprint(plain) == fingerprint(kiln())
-
-
-def test_commands_and_the_terminal_draw_what_worlds_show(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("NO_COLOR", raising=False)
-    monkeypatch.setenv("TERM", "xterm")
-    sim = simulator(KILN)
-    world = random_start(sim.ruleset, Choices.seeded(5), (1, 6, 20)).world(sim)
-    image = world.rgb()[0]
-    assert np.array_equal(pictures(world, most=1, factor=1), image.numpy())
-
-    class Terminal(io.StringIO):
-        encoding = "utf-8"
-
-        def isatty(self) -> bool:
-            return True
-
-    stream = Terminal()
-    with LiveView(sim.ruleset.elements, stream, fields=sim.ruleset.fields) as view:
-        view.show(**first_world(world))
-    for line in render_frame(image).split("\n"):
-        assert line in stream.getvalue()
 
 
 STOVE = """\

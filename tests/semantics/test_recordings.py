@@ -21,16 +21,14 @@ which reads every .npz file in FOLDER that has a `before_ids` array.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
 import powderdsl
+from powderdsl.simulation.simulator import Simulator
 from tests.recordings import Recording, State, given, read_recording, recording_paths, where_first
 
 DATA = Path(__file__).parents[1] / "data"
@@ -51,45 +49,23 @@ MOVING_SPEED = 0.1  # the wind pass moves nothing below it
 Mask = npt.NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class Runner:
-    """The compiled ruleset on one backend, taking and giving NumPy arrays."""
-
-    backend: str
-    simulator: Any
-
-    def run(self, state: State, random: dict[str, np.ndarray], passes: tuple[str, ...]) -> State:
-        """The state after one step that runs only `passes`."""
-        fields = {name: given(state[name], self.backend) for name in FIELDS}
-        world = self.simulator.replace(self.simulator.world(given(state["ids"], self.backend)), **fields)
-        draws = {stream: given(draw, self.backend) for stream, draw in random.items()}
-        world = self.simulator.step(world, random=draws, passes=list(passes))
-        return {"ids": np.asarray(world.ids), **{name: np.asarray(world[name]) for name in FIELDS}}
-
-
-@cache
-def compiled(backend: str) -> Runner:
-    """The Powderworld ruleset on one backend, compiled once for all tests."""
-    return Runner(backend, powderdsl.compile(powderdsl.load("powderworld"), backend=backend))
-
-
-@pytest.fixture(params=["reference", "wasm"])
-def runner(request: pytest.FixtureRequest) -> Runner:
-    """The ruleset on each backend in turn."""
-    return compiled(request.param)
+@pytest.fixture(scope="module", params=["reference", "wasm"])
+def simulator(request: pytest.FixtureRequest) -> Simulator:
+    return powderdsl.compile("powderworld", backend=request.param)
 
 
 @pytest.fixture(params=RECORDINGS, ids=lambda path: path.stem)
-def path(request: pytest.FixtureRequest) -> Path:
-    """Each recording's path in turn."""
-    chosen: Path = request.param
-    return chosen
+def recording(request: pytest.FixtureRequest) -> Recording:
+    return read_recording(request.param)
 
 
-@pytest.fixture
-def recording(path: Path) -> Recording:
-    """Each recording in turn."""
-    return read_recording(path)
+def run(simulator: Simulator, state: State, random: dict[str, np.ndarray], passes: tuple[str, ...]) -> State:
+    """The state after one step that runs only `passes`, as NumPy arrays."""
+    fields = {name: given(state[name], simulator.backend) for name in FIELDS}
+    world = simulator.replace(simulator.world(given(state["ids"], simulator.backend)), **fields)
+    draws = {stream: given(draw, simulator.backend) for stream, draw in random.items()}
+    world = simulator.step(world, random=draws, passes=list(passes))
+    return {"ids": np.asarray(world.ids), **{name: np.asarray(world[name]) for name in FIELDS}}
 
 
 def near(mask: Mask, reach: int) -> Mask:
@@ -150,18 +126,18 @@ def assert_same(ours: State, recording: Recording, passes_done: int) -> None:
     assert close.all(), f"velocity: {where_first(~close)}"
 
 
-def test_names_and_order_are_the_engines(runner: Runner, recording: Recording) -> None:
-    assert tuple(runner.simulator.elements) == recording.elements
-    assert tuple(runner.simulator.passes) == recording.passes == PASSES
+def test_names_and_order_are_the_engines(simulator: Simulator, recording: Recording) -> None:
+    assert tuple(simulator.elements) == recording.elements
+    assert tuple(simulator.passes) == recording.passes == PASSES
 
 
 @pytest.mark.parametrize("last", PASSES)
-def test_cumulative(runner: Runner, recording: Recording, last: str) -> None:
+def test_passes_up_to_each_one_are_the_engines(simulator: Simulator, recording: Recording, last: str) -> None:
     done = PASSES.index(last) + 1
-    assert_same(runner.run(recording.states[0], recording.random, PASSES[:done]), recording, done)
+    assert_same(run(simulator, recording.states[0], recording.random, PASSES[:done]), recording, done)
 
 
-def test_wind_carries_what_a_cell_holds(runner: Runner, path: Path) -> None:
+def test_wind_carries_what_a_cell_holds(simulator: Simulator, recording: Recording) -> None:
     """In each world, the non-empty cells are the same before and after the wind, with all they hold.
 
     With the quirk they would not be: this is what the ruleset does where the engine cannot be followed.
@@ -174,8 +150,7 @@ def test_wind_carries_what_a_cell_holds(runner: Runner, path: Path) -> None:
         solid = held[:, held[0] != EMPTY]
         return solid[:, np.lexsort(solid)]
 
-    recording = read_recording(path)
     before = recording.states[-2]
-    after = runner.run(before, recording.random, ("wind",))
+    after = run(simulator, before, recording.random, ("wind",))
     for world in range(len(before["ids"])):
         np.testing.assert_array_equal(cells(after, world), cells(before, world))
