@@ -46,7 +46,9 @@ def start(
         steps: the number of steps that follow. `auto` imports torch, and may compile native code, only if they are many.
         how: passed on to `simulator.compile`.
 
-    Raises CompileError for files and names that cannot be used, BadInput for options that do not go together.
+    Raises:
+        CompileError: a file or name cannot be used.
+        BadInput: options that do not go together.
     """
     # A drawn world comes first: compiling may import torch, and whoever mistyped a name should not wait for that.
     drawn = start_drawn(ruleset, name, size, batch, seed)

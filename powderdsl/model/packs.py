@@ -66,6 +66,7 @@ class _PackReader(Reader):
         return record if record is not None and self.name(record.name, kind.NOUN) else None  # type: ignore[attr-defined]  # files have names
 
     def ruleset(self, tree: Mapping) -> RulesetDecl | None:
+        """Read a ruleset, and report what it lacks; None if its name cannot be read."""
         ruleset = self.file(RulesetDecl, tree)
         if tree.get("extends") is not None:
             return ruleset

@@ -178,7 +178,7 @@ def from_json(values: Mapping[str, Any], mistakes: Sequence[str] = ()) -> TrainC
     if config is not None:
         problems += _contradictions(config)
     if config is None or problems:
-        raise CompileError([_wrong(problem) for problem in problems])
+        raise CompileError([_mistake(problem) for problem in problems])
     return config
 
 
@@ -189,9 +189,9 @@ def check_task(config: TrainConfig, task: Task) -> None:
         check_split(task, config.eval_split)
     wrong = []
     if config.reward == "shaped" and task.goal.shaped is None:
-        wrong.append(_wrong(f"`reward`: the task {task.name} has no `shaped` reward"))
+        wrong.append(_mistake(f"`reward`: the task {task.name} has no `shaped` reward"))
     if config.init_expert and task.expert is None:
-        wrong.append(_wrong(f"`init_expert`: the task {task.name} has no expert"))
+        wrong.append(_mistake(f"`init_expert`: the task {task.name} has no expert"))
     if wrong:
         raise CompileError(wrong)
 
@@ -225,5 +225,6 @@ def _contradictions(config: TrainConfig) -> Iterator[str]:
         yield "`rollout` × `envs` is 1: an update needs two actions or more"
 
 
-def _wrong(message: str) -> Diagnostic:
+def _mistake(message: str) -> Diagnostic:
+    """A diagnostic of settings, which have no place in a file."""
     return Diagnostic("PD640", message, Label(None))

@@ -173,6 +173,7 @@ def swap_fields(schedule: Schedule) -> Schedule:
     namer, graph = Namer(schedule), schedule.graph
 
     def change(loop: Compute) -> list[Statement]:
+        """The loop as a movement, and a loop that clears what enters, if all its values are such a choice."""
         swaps = [_match_swap(out.value, offsets, shifted) for out in loop.outs]
         ways = dict.fromkeys(swap and swap[0] for swap in swaps)
         if loop.over == "words" or len(ways) != 1 or swaps[0] is None:
@@ -376,6 +377,7 @@ class _Assignment:
 
 
 def _inner_first(body: Sequence[Statement]) -> Iterator[Statement]:
+    """All statements, each after those in its body."""
     for statement in body:
         yield from _inner_first(statement.body)
         yield statement

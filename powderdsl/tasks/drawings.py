@@ -357,14 +357,14 @@ def read_stamp(decl: StampDecl, reader: Reader, ruleset: Ruleset) -> Stamp:
     """The picture of a stamp, which changes nothing after a report."""
     key, art, scene = decl.name, decl.art, decl.scene
     ids: NDArray[np.uint8] | None = None
-    if (art is None) == (scene is None):
-        label = "neither `art` nor `scene`" if art is None else "both `art` and `scene`"
-        reader.reporter.error("PD109", f"the stamp `{key.text}` needs one picture", key.span, label)
     try:
         if art is not None and scene is None:
             ids = _drawn(art, decl, reader, ruleset)
         elif scene is not None and art is None:
             ids = _named(scene, reader, ruleset)
+        else:
+            label = "neither `art` nor `scene`" if art is None else "both `art` and `scene`"
+            reader.reporter.error("PD109", f"the stamp `{key.text}` needs one picture", key.span, label)
     except CompileError as error:
         pass_on(error, reader.reporter, (art or scene or key).span)
     if ids is not None and max(ids.shape) > MAX_SIDE:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import monotonic
@@ -289,19 +289,8 @@ def _mutated(
         raise BadInput(f"--pack {unknown[0]}: {name} consists of {', '.join(loaded)}")
     every = original.mutants(frozenset(pack))
     numbers = sampled(every, mutants, seed)
-    verdicts: dict[int, Verdict] = {}
     events = run_campaign(name, pack, numbers, jobs or os.cpu_count() or 1, seed, settings=values)
-    interrupt: KeyboardInterrupt | None = None
-    with progress(name, len(numbers), lines=True) as show:
-        try:
-            for number, verdict in events:
-                verdicts[number] = verdict
-                alive = sum(verdict.status == "survived" for verdict in verdicts.values())
-                show(len(verdicts), f"{alive} survived")
-        except KeyboardInterrupt as caught:
-            interrupt = caught
-        finally:
-            events.close()  # its processes end
+    verdicts, interrupt = _collect(name, events, len(numbers))
     judged = [(every[number], verdicts[number]) for number in sorted(verdicts)]
     by_pack: dict[str, list[Verdict]] = {}
     for mutant, verdict in judged:
@@ -323,6 +312,24 @@ def _mutated(
         "packs": {pack: tally(own) for pack, own in by_pack.items()},
         "list": [_row(mutant, verdict) for mutant, verdict in judged if verdict.status != "invalid"],
     }
+
+
+def _collect(
+    title: str, events: Generator[tuple[int, Verdict]], total: int
+) -> tuple[dict[int, Verdict], KeyboardInterrupt | None]:
+    """The verdicts of mutants by number, and the interrupt that ended the campaign early."""
+    verdicts: dict[int, Verdict] = {}
+    with progress(title, total, lines=True) as show:
+        try:
+            for number, verdict in events:
+                verdicts[number] = verdict
+                alive = sum(verdict.status == "survived" for verdict in verdicts.values())
+                show(len(verdicts), f"{alive} survived")
+        except KeyboardInterrupt as interrupt:
+            return verdicts, interrupt
+        finally:
+            events.close()  # its processes end
+    return verdicts, None
 
 
 def _survivors(judged: Sequence[tuple[Mutant, Verdict]]) -> Iterator[str]:

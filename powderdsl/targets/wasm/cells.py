@@ -124,16 +124,16 @@ class CellLoop(Loop):
         addresses = [self.addresses[name] for name in planes]
         return op("i64.ne", self.library.row_flags(addresses, self.row, self.memory.half), 0)
 
-    def skip_unless(self, busy: Value, rests: Iterable[Node | None]) -> None:
-        """Skip a line that is not busy: outputs get the values `rests`, or nothing."""
-        with body.when(op("i32.eqz", busy)):
-            for i, rest in enumerate(rests):
-                if rest is not None and rest.op == "load":
-                    self.copy(i, self.addresses[str(rest.attr)])
+    def skip_unless(self, is_live: Value, values: Iterable[Node | None]) -> None:
+        """Skip a line unless a flag holds. Its outputs get `values`: copies of fields, constants, or zeros for None."""
+        with body.when(op("i32.eqz", is_live)):
+            for i, value in enumerate(values):
+                if value is not None and value.op == "load":
+                    self.copy(i, self.addresses[str(value.attr)])
                 elif self.loop.outs[i].var.type == REAL:
                     self.set_live(i, ZERO)
                 else:
-                    full = rest is not None and rest.attr
+                    full = value is not None and value.attr
                     if full:
                         self.somewhere[i].set(1)
                     for w in range(self.memory.words):

@@ -35,12 +35,12 @@ class Choices:
         """From `least` to `most` different options, in their order."""
         most = min(most, len(options))
         wanted = self.integer(min(least, most), most)
-        kept: list[T] = []
+        picked: list[T] = []
         for i, option in enumerate(options):
             left = len(options) - i
-            if self.below(left) < wanted - len(kept):
-                kept.append(option)
-        return kept
+            if self.below(left) < wanted - len(picked):
+                picked.append(option)
+        return picked
 
     def weighted(self, rows: Sequence[tuple[int, T]]) -> T:
         """One of the options, each as likely as its weight says."""
