@@ -65,10 +65,6 @@ def test_json_is_one_list(pack):
     assert found[0]["primary"]["span"]["start"] == {"line": 4, "column": 18}
 
 
-def test_json_of_clean_rules_is_empty():
-    assert json.loads(powderdsl("check", "powderworld", "--json").stdout) == []
-
-
 def test_several_rulesets_are_checked_one_by_one(pack):
     result = powderdsl("check", "powderworld", pack(), "nope", exits=2)
     assert "powderworld: 14 elements" in result.stdout

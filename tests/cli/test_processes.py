@@ -77,12 +77,8 @@ def on_terminal(*arguments: str, interrupt: str = "", **environment: str) -> tup
 SMALL = ("--backend", "reference", "--size", "8x8")
 
 
-def without_no_color() -> dict[str, str]:
-    return {"NO_COLOR": ""}
-
-
 def test_a_live_view_is_drawn_in_place():
-    status, shown = on_terminal("run", "life", *SMALL, "--steps", "3", "--watch", **without_no_color())
+    status, shown = on_terminal("run", "life", *SMALL, "--steps", "3", "--watch", NO_COLOR="")
     assert status == 0
     assert shown.count("\x1b[?25l") == shown.count("\x1b[?25h") == 1
     assert re.search(r"life  step 3 of 3", shown)
@@ -91,7 +87,7 @@ def test_a_live_view_is_drawn_in_place():
 
 def test_a_live_view_can_be_interrupted():
     status, shown = on_terminal(
-        "run", "life", *SMALL, "--steps", "1000000", "--watch", interrupt="step 2 ", **without_no_color()
+        "run", "life", *SMALL, "--steps", "1000000", "--watch", interrupt="step 2 ", NO_COLOR=""
     )
     assert status == 130
     assert shown.rstrip().endswith("\x1b[?25h") or "\x1b[?25h" in shown[-40:]
@@ -120,14 +116,14 @@ def test_no_progress_elsewhere(tmp_path):
 
 
 def test_diagnostics_are_colored_on_terminals_only():
-    _, shown = on_terminal("check", "nonsense", **without_no_color())
+    _, shown = on_terminal("check", "nonsense", NO_COLOR="")
     assert "\x1b[31;1m" in shown
     _, plain = on_terminal("check", "nonsense", NO_COLOR="1")
     assert "\x1b" not in plain
 
 
 def test_pages_are_laid_out_on_terminals():
-    status, shown = on_terminal("explain", "PD301", **without_no_color())
+    status, shown = on_terminal("explain", "PD301", NO_COLOR="")
     assert status == 0
     assert "\x1b[" in shown
     assert "PD301" in shown

@@ -70,12 +70,6 @@ def test_an_animation_has_every_nth_step_and_the_ends(every, frames):
     assert result.stderr.rstrip().endswith("-> x.gif")
 
 
-def test_a_film():
-    pytest.importorskip("imageio_ffmpeg")
-    assert powderdsl("run", "core+grit.yaml", *FAST, "--out", "x.mp4").exit_code == 0
-    assert Path("x.mp4").read_bytes()[4:8] == b"ftyp"
-
-
 def test_a_saved_world_goes_on_where_it_stopped():
     start = ("powderworld", "--backend", "reference", "--size", "16x16", "--batch", "2", "--seed", "5")
     powderdsl("run", *start, "--steps", "3", "--out", "three.npz")
@@ -245,20 +239,24 @@ def test_worlds_that_cannot_be_used(tmp_path, world, code):
 @pytest.mark.parametrize(
     "arguments",
     [
-        ("core", "--size", "100000x100000"),
-        ("core", "--batch", "1000000"),
-        ("core+grit.yaml", "--set", "grit.vanish=200%"),
-        ("core+grit.yaml", "--set", "grit.vanish=often"),
-        ("core", "--out", "none/x.png"),
-        ("core", "--device", "cuda:99"),
-        ("nonsense",),
-        ("grit.yaml",),
+        ("run", "core", "--size", "100000x100000"),
+        ("run", "core", "--batch", "1000000"),
+        ("run", "core+grit.yaml", "--set", "grit.vanish=200%"),
+        ("run", "core+grit.yaml", "--set", "grit.vanish=often"),
+        ("run", "core", "--out", "none/x.png"),
+        ("run", "core", "--device", "cuda:99"),
+        (
+            "run",
+            "grit.yaml",
+        ),
+        ("render", "drawing.txt", "--rules", "core", "--out", "x.png"),
+        ("render", "none.npz", "--rules", "core", "--out", "x.png"),
+        ("render", "drawing.txt", "--rules", "core+grit.yaml", "--out", "none/x.png"),
     ],
 )
 def test_bad_values_are_diagnostics(tmp_path, arguments):
     before = sorted(tmp_path.iterdir())
-    result = powderdsl("run", *arguments)
-    assert result.exit_code == 2
+    result = powderdsl(*arguments, exits=2)
     assert "error[PD" in result.stderr
     assert "PD901" not in result.stderr
     assert sorted(tmp_path.iterdir()) == before
@@ -315,22 +313,3 @@ def test_render_draws_a_world_as_it_stands():
     assert picture_size("x.png") == (12, 9)
     powderdsl("run", "core+grit.yaml", *FAST, "--batch", "2", "--out", "x.npz")
     assert powderdsl("render", "x.npz", "--rules", "core+grit.yaml", "--out", "y.png").exit_code == 0
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ("drawing.txt", "--rules", "core", "--out", "x.png"),
-        ("none.npz", "--rules", "core", "--out", "x.png"),
-        ("drawing.txt", "--rules", "core+grit.yaml", "--out", "x.gif"),
-        ("drawing.txt", "--rules", "core+grit.yaml", "--out", "none/x.png"),
-        ("drawing.txt", "--rules", "nonsense", "--out", "x.png"),
-    ],
-)
-def test_bad_arguments_of_render_are_refused(tmp_path, arguments):
-    before = sorted(tmp_path.iterdir())
-    result = powderdsl("render", *arguments)
-    assert result.exit_code == 2
-    assert "error" in result.stderr.lower()
-    assert "PD901" not in result.stderr
-    assert sorted(tmp_path.iterdir()) == before

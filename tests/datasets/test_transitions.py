@@ -166,19 +166,6 @@ def test_workers_share_the_minibatches(
         assert all(torch.equal(a, b) for a, b in zip(found, one, strict=True))
 
 
-# A loader that is left early ends its workers while their queues still hold tensors. Python 3.11 then ends the queue's
-# thread inside torch's C++ code, which aborts the worker, and the loader reports that when it is collected.
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:.*_MultiProcessingDataLoaderIter:pytest.PytestUnraisableExceptionWarning")
-def test_workers_that_are_spawned_get_the_same(recorded: Dataset) -> None:
-    rows = Transitions(recorded)
-    found = torch.cat([batch.reward for batch in loader(rows, (2, "spawn"), batch_size=16)])
-    assert torch.equal(found, rows[:].reward)
-    data, wanted = (recorded.transitions(8, seed=4) for _ in range(2))
-    for found, one in zip(islice(loader(data, (2, "spawn"), batch_size=None), 3), wanted, strict=False):
-        assert torch.equal(found.observation, one.observation)
-
-
 # Splits
 
 

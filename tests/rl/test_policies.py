@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 
 from powderdsl.diagnostics import CompileError
-from powderdsl.envs.acting import action_keys, random_policy, uniforms
+from powderdsl.envs.acting import action_keys, random_policy
 from powderdsl.envs.observations import observation_of
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.experiments.runs import RunFolder
@@ -123,17 +123,6 @@ def test_doing_nothing_is_what_the_rules_do_alone(program: TaskProgram) -> None:
     play(program, None, worlds, recorder=Seen(program.task, len(worlds), 1))
     assert torch.equal(last[-1].ids, alone.ids)
     assert torch.equal(last[-1]["velocity"], alone["velocity"])
-
-
-def test_draws_of_a_policy_are_uniform_and_depend_on_seed_episode_and_step() -> None:
-    numbers = torch.arange(2000)
-    keys = torch.stack([action_keys(seed, numbers, step) for seed in (0, 1) for step in (0, 1)])
-    assert len(keys.unique()) == keys.numel()
-    drawn = uniforms(keys.flatten(), 5)
-    assert float(drawn.min()) >= 0
-    assert float(drawn.max()) < 1
-    assert torch.allclose(drawn.mean(0), torch.full((5,), 0.5, dtype=torch.float64), atol=0.02)
-    assert float(torch.corrcoef(drawn.T).fill_diagonal_(0).abs().max()) < 0.05
 
 
 def test_sampled_actions_follow_the_policy(run: RunFolder, program: TaskProgram) -> None:

@@ -125,16 +125,6 @@ def test_an_interrupted_run_saves_what_it_has(task: Path, tmp_path: Path) -> Non
     assert same(lasting(train(config, tmp_path / "run")), lasting(train(config, tmp_path / "whole")))
 
 
-def test_a_damaged_checkpoint_is_passed_over(task: Path, tmp_path: Path) -> None:
-    config = quick(task)
-    run = train(config, tmp_path / "run")
-    expected = lasting(run)
-    newest = run.checkpoint().path
-    newest.write_bytes(newest.read_bytes()[:-1000])
-    assert run.checkpoint().step == 64
-    assert same(lasting(train(config, tmp_path / "run")), expected)
-
-
 def test_another_configuration_is_refused(task: Path, tmp_path: Path) -> None:
     config = quick(task, steps=32)
     train(config, tmp_path / "run")

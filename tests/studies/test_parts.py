@@ -6,7 +6,6 @@ import json
 import os
 import re
 import subprocess
-import sys
 import threading
 from pathlib import Path
 
@@ -18,8 +17,7 @@ from powderdsl.cli.commands.study import command as study_command
 from powderdsl.cli.exits import BadInput
 from powderdsl.experiments.studies.run import StudyRun
 from powderdsl.experiments.studies.study import Point, StudyStep, load_study
-from tests.cli.commands import ROOT, environment_with, powderdsl
-from tests.processes import started
+from tests.cli.commands import ROOT, powderdsl
 
 STUDY = """
 study: patience
@@ -269,28 +267,6 @@ def test_a_task_of_a_cluster_waits_for_who_holds_its_point(steps_run: list[str])
         assert outcome.problem is None
         assert steps_run == [point.name]
     thread.join()
-
-
-HOLD = """
-import sys, time
-from filelock import FileLock
-with FileLock(sys.argv[1]):
-    print("held", flush=True)
-    time.sleep(600)
-"""
-
-
-def test_a_point_is_free_once_the_process_that_holds_it_is_killed(steps_run: list[str]) -> None:
-    study, point, place = prepared("out")
-    command = [sys.executable, "-c", HOLD, str(place / ".lock")]
-    with started(command, stdout=subprocess.PIPE, env=environment_with()) as running:
-        assert running.stdout.readline() == "held\n"
-        (outcome,) = study.run([point], 1)
-        assert outcome.held
-        running.kill()
-        running.wait()
-    (outcome,) = study.run([point], 1)
-    assert outcome.problem is None
 
 
 def test_the_recipe_for_slurm_runs_each_combination_once(tmp_path: Path) -> None:

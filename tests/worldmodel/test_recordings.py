@@ -20,8 +20,6 @@ from powderdsl.worldmodel.recordings import Recording, open_recording
 from powderdsl.worldmodel.training import finetuned
 from tests.cli.commands import powderdsl as run
 from tests.refusals import refusal
-from tests.states import same
-from tests.worldmodel.test_training import weights
 
 HERE = Machine(backend="torch")
 
@@ -157,20 +155,6 @@ def test_a_network_learns_what_the_action_does(folder: Path, tmp_path: Path) -> 
     assert scores["model"].loss < 0.8 * without["model"].loss
     assert scores["model"].loss < scores["action hidden"].loss
     assert (scores["model"].change_f1 or 0) > (without["model"].change_f1 or 0)
-
-
-def test_an_interrupted_run_ends_with_the_same_weights(folder: Path, tmp_path: Path) -> None:
-    config, recording = tiny(), opened(folder)
-    whole = train(config, tmp_path / "whole", machine=HERE, recording=recording)
-
-    def stop(now: object) -> None:
-        if getattr(now, "done", 0) == 11:
-            raise RuntimeError("stopped")
-
-    with pytest.raises(RuntimeError, match="stopped"):
-        train(config, tmp_path / "parts", machine=HERE, recording=recording, save_seconds=0, tell=stop)
-    parts = train(config, tmp_path / "parts", machine=HERE, recording=opened(folder), validate_every=7)
-    assert same(weights(parts), weights(whole))
 
 
 # The command line
