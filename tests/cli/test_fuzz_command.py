@@ -30,6 +30,7 @@ def test_every_target_is_compared_unless_some_are_named(tmp_path: Path) -> None:
     assert ": cuda-emulated against the reference" in some.stdout
 
 
+@pytest.mark.slow
 def test_damaged_files(tmp_path: Path) -> None:
     # A process of its own: the memory that loading takes is the peak of the process, which tests raise as well.
     line = command_line("fuzz", "--front-end", "--seeds", "0..30", "--jobs", 1, "--save", tmp_path)

@@ -28,6 +28,7 @@ from powderdsl.simulation.simulator import Simulator
 from powderdsl.simulation.simulator import compile as compile_rules
 from powderdsl.tasks.episodes import TaskProgram, load_task
 from powderdsl.tasks.shipped import shipped_tasks
+from tests.tiers import tiered
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +37,7 @@ def simulators() -> dict[str, Simulator]:
     return {}
 
 
-@pytest.mark.parametrize("name", shipped_tasks())
+@pytest.mark.parametrize("name", tiered(shipped_tasks(), ["destroying", "path-building", "sand-pushing"]))
 def test_both_checkers_pass_without_a_warning(name: str, simulators: dict[str, Simulator]) -> None:
     """With all kinds of observations and actions.
 

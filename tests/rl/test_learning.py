@@ -60,6 +60,7 @@ def test_a_score_for_each_bin_and_deed(tmp_path: Path) -> None:
         assert float(entropy[0]) == pytest.approx(-float((likely * likely.log()).sum()), abs=1e-4)
 
 
+@pytest.mark.slow
 def test_a_policy_takes_the_expert_from_a_dataset(tmp_path: Path) -> None:
     task = write_task(tmp_path, AIM)
     record(load_task(task), "expert", tmp_path / "data", episodes=200, backend="wasm")

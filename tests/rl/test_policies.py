@@ -39,6 +39,7 @@ def program(run: RunFolder) -> TaskProgram:
     return compile_task(str(run.config["task"]), backend="wasm")
 
 
+@pytest.mark.slow
 def test_a_policy_that_only_acts_imports_no_compiler(run: RunFolder) -> None:
     """The first optimizer of a process imports `torch._dynamo`, which takes a second."""
     program = f"""

@@ -153,6 +153,7 @@ def test_check_of_an_added_pack_ends_well_and_says_what_changes() -> None:
     assert [one["code"] for one in data] == ["PD515", "PD515"]
 
 
+@pytest.mark.slow
 def test_what_the_scope_breaks_alone_stays_an_error() -> None:
     shutil.copytree(ROOT / "rules", "rules")
     acid = Path("rules/acid.yaml")

@@ -111,6 +111,7 @@ def test_kangaroos_leap_ten_cells_high_or_25(first: bool) -> None:
         assert (height[16:] == 0).any(0).mean() > 0.5  # back on the ground
 
 
+@pytest.mark.slow
 def test_kangaroos_leap_over_walls_and_climb_no_steps() -> None:
     sim = simulator()
     room = ["#" * 16, *["#" + "." * 14 + "#"] * 10, *["#........#.....#"] * 3, "#..k.....#.....#", "#" * 16]

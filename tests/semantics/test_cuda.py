@@ -72,6 +72,7 @@ def test_worlds_with_more_words_than_threads_can_hold(folder: Path, monkeypatch:
     assert "[ROUNDS]" not in text
 
 
+@pytest.mark.slow
 def test_what_does_not_fit_leaves_the_chip() -> None:
     """Fields first, then planes; a block never takes more shared memory than it may."""
     ruleset = load("powderworld")

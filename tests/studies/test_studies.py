@@ -22,7 +22,6 @@ from powderdsl.experiments.studies.results import (
 )
 from powderdsl.experiments.studies.run import Outcome, StudyRun
 from powderdsl.experiments.studies.study import (
-    FILE,
     RUN_OR_TASK,
     TASK,
     TEXT,
@@ -35,7 +34,7 @@ from tests.refusals import refusal
 
 KNOWN: Mapping[tuple[str, ...], Mapping[str, str]] = {
     ("train",): {"on": TASK, **dict.fromkeys(("run", "seed", "steps", "knob"), TEXT)},
-    ("evaluate",): {"on": RUN_OR_TASK, "episodes": TEXT, "out": FILE},
+    ("evaluate",): {"on": RUN_OR_TASK, "episodes": TEXT},
 }
 
 TEXT = """

@@ -170,6 +170,7 @@ def same_in_v8(cases: list[tuple[Ruleset, Start]], steps: int, folder: Path, bac
     assert [one["hashes"] for one in in_node(jobs, folder)] == expected
 
 
+@pytest.mark.slow
 @needs_node
 def test_shipped_rulesets_in_v8(tmp_path: Path) -> None:
     cases = []

@@ -37,6 +37,7 @@ def files(*names: str) -> dict[str, str]:
     return Entry("rules", names).files()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("names", [("powderworld",), ("life",), ("powderworld", "docs/examples/salt.yaml")])
 def test_the_files_of_rules_are_the_rules(session: bridge.Session, names: tuple[str, ...]) -> None:
     found = call("check", files(*names), [])["result"]
