@@ -131,6 +131,7 @@ def test_numbers_have_three_figures(value, shown):
 # What passes cost
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["reference", "torch", "native", "wasm"])
 def test_every_backend_profiles_every_pass(backend, tmp_path, torch):
     rules = powderdsl.load("core+sand")  # little to compile

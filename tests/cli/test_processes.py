@@ -22,13 +22,12 @@ from tests.processes import started
     [
         (["--help"], {"torch", "numpy", "rich", "lark", "yaml", "PIL"}),
         (["explain", "PD301"], {"torch", "numpy", "rich", "lark", "yaml", "PIL"}),
-        (["check", "--quick", "powderworld"], {"torch", "numpy", "rich", "PIL"}),
-        (["check", "powderworld"], {"torch", "rich", "PIL"}),
+        (["check", "--quick", "core+sand"], {"torch", "numpy", "rich", "PIL"}),
+        (["check", "core+sand"], {"torch", "rich", "PIL"}),
         (["run", "core", "--steps", "2", "--size", "8x8"], {"torch", "rich", "PIL"}),
         (["trace", "core", "--at", "1,1", "--step", "1", "--size", "8x8"], {"torch", "rich", "PIL"}),
-        (["show", "powderworld"], {"torch", "numpy", "rich", "PIL"}),
-        (["compile", "powderworld", "--emit", "model"], {"torch", "numpy", "rich", "PIL"}),
-        (["compile", "powderworld", "--emit", "ir"], {"torch", "rich", "PIL"}),
+        (["show", "core"], {"torch", "numpy", "rich", "PIL"}),
+        (["compile", "core", "--emit", "ir"], {"torch", "rich", "PIL"}),
     ],
 )
 def test_commands_import_only_what_they_need(arguments, unwanted):

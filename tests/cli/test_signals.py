@@ -21,7 +21,7 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-@pytest.mark.parametrize("name", tiered(COMMANDS, ["video", "train"]))
+@pytest.mark.parametrize("name", tiered(COMMANDS, ["video"]))
 def test_sigterm_ends_a_command_cleanly(name: str, tmp_path: Path) -> None:
     if name == "video":
         pytest.importorskip("imageio_ffmpeg")

@@ -128,6 +128,7 @@ def changes_of(rules: str) -> dict[str, str]:
     return {one.message.split("`")[-2]: one.message.rpartition(": ")[2] for one in found}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "added",
     tiered(ADDED, [added for added in ADDED if added.name == "moss"]),

@@ -294,6 +294,7 @@ def compiled_natively(rules: Ruleset) -> None:
     sim.step(start_of(sim))
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_a_damaged_cache_is_mended(rules: Ruleset, tmp_path: Path) -> None:
     with building(Building("-O0", tmp_path)):

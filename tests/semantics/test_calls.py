@@ -62,6 +62,7 @@ def assert_equal(found: World, wanted: World) -> None:
 Pair = tuple[Simulator, Simulator]
 
 
+@pytest.mark.slow
 def test_old_worlds_stay(sims: Pair) -> None:
     native, plain = sims
     kept = [start(native, 3)]

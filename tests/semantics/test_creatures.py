@@ -88,6 +88,7 @@ def test_fish_swim_in_what_moves_and_is_no_heavier() -> None:
     assert entered(beside(simulator(), "F", 8), "fish", 25) == LIGHT | {"fish"}
 
 
+@pytest.mark.slow
 @both_worlds
 def test_birds_fly_one_cell_a_step_or_two_and_keep_away_from_walls(first: bool) -> None:
     sim = simulator(first)
@@ -128,6 +129,7 @@ def test_snakes_destroy_everything_but_walls() -> None:
     assert entered(beside(sim, "S", 2), "snake", 1) == {one.name for one in sim.ruleset.elements} - {"wall"}
 
 
+@pytest.mark.slow
 def test_cloners_pour_out_creatures_and_moles_and_snakes_eat_theirs() -> None:
     sim = simulator()
     start = load_start("hatchery", sim.ruleset)

@@ -115,6 +115,7 @@ def test_an_invalid_shard_is_refused(text: str, steps_run: list[str]) -> None:
 # Shards and `collect`
 
 
+@pytest.mark.slow
 def test_shards_in_folders_of_their_own_are_collected(steps_run: list[str]) -> None:
     whole = powderdsl("study", "study.yaml", "--out", "whole", exits=0)
     assert len(steps_run) == POINTS

@@ -88,7 +88,7 @@ SECOND = [
 
 
 @pytest.mark.parametrize("split", ["train", "test"])
-@pytest.mark.parametrize("name", [*WITNESSES, *tiered(SECOND, SECOND[::3])])
+@pytest.mark.parametrize("name", tiered([*WITNESSES, *SECOND], [*[*WITNESSES][:2], SECOND[0]]))
 def test_a_witness_solves_it_and_chance_does_not(torch, name, split):
     played = play(name, split)
     witness, chance, nothing = (played[player] for player in PLAYERS)

@@ -22,7 +22,7 @@ from tests.wheels import once, succeed
 
 HERE = Path(__file__).parent
 
-pytestmark = pytest.mark.wheel
+pytestmark = [pytest.mark.slow, pytest.mark.wheel]
 
 
 def needed() -> str:

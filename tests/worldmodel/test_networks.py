@@ -16,6 +16,7 @@ from powderdsl.worldmodel.networks import ActionChannels, CustomNetwork, is_netw
 from tests.cli.commands import powderdsl as run
 from tests.refusals import refusal
 from tests.states import same
+from tests.tiers import tiered
 from tests.worldmodel.test_training import weights
 
 HERE = Machine(backend="torch")
@@ -101,7 +102,7 @@ def tiny(task: str) -> TrainConfig:
     return TrainConfig(data, iterations=12, batch=4, learning_rate=0.01, seed=3)
 
 
-@pytest.mark.parametrize("name", ["nets:Wide", "nets:made"])
+@pytest.mark.parametrize("name", tiered(["nets:Wide", "nets:made"], ["nets:made"]))
 def test_a_network_of_ones_own_is_trained_and_tested(name: str, dunes: str) -> None:
     words = ("wm", "train", "--task", dunes, "--run", "run", *QUICK, "--iterations", 3)
     run(*words, "--network", name, exits=0)

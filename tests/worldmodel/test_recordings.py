@@ -140,6 +140,7 @@ def test_parts_share_no_world(recording: Recording) -> None:
 # Training
 
 
+@pytest.mark.slow
 def test_a_network_learns_what_the_action_does(folder: Path, tmp_path: Path) -> None:
     config, recording = tiny(iterations=150), opened(folder, "compact")
     found = train(config, tmp_path / "run", machine=HERE, recording=recording, validate_every=50)

@@ -89,6 +89,7 @@ def test_packs_that_others_need_stay() -> None:
         assert all(ids[one.qualified] == one.id for one in model.elements)
 
 
+@pytest.mark.slow
 def test_every_world_runs_under_its_own_ruleset(task) -> None:  # type: ignore[no-untyped-def]
     source = RulesetSource(RULES, MANY)
     worlds = task_worlds(DataConfig(task, rulesets=3, variety=MANY), backend="torch")

@@ -61,6 +61,7 @@ def lines(run: RunFolder) -> list[tuple[int, float]]:
     return [(line["step"], line["loss/train"]) for line in read_metrics(run.path)]
 
 
+@pytest.mark.slow
 def test_a_network_learns_what_baselines_cannot_know(garden: str, tmp_path: Path) -> None:
     config = few(tiny(garden, width=6, iterations=250, batch=8))
     trained = load_trained(train(config, tmp_path / "run", machine=HERE))
@@ -201,6 +202,7 @@ def test_other_networks_are_trained_and_tested_too(dunes: str, tmp_path: Path) -
     assert "weights are those of another network" in errors[0].notes[0]
 
 
+@pytest.mark.slow
 def test_held_out_packs_are_plugged_in(dunes: str, tmp_path: Path) -> None:
     config = few(tiny(dunes, iterations=40))
     config = replace(config, data=replace(config.data, rules="core+sand+water", knobs={"kinds": 1}))

@@ -61,6 +61,7 @@ def test_train_eval_finetune_and_show(dunes: str, tmp_path: Path) -> None:
     assert np.asarray(Image.open(out)).shape == (2 * 32 + 4, 4 * 40 + 4, 3)
 
 
+@pytest.mark.slow
 def test_the_curve_of_a_training(dunes: str, tmp_path: Path) -> None:
     folder, out = tmp_path / "run", tmp_path / "curve.png"
     run(*begin(dunes, folder, "--iterations", 20, "--validate-every", 5), exits=0)
