@@ -42,7 +42,13 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 ROOT_PAGES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "examples/README.md")
 PAGES = [*(ROOT / name for name in ROOT_PAGES), *sorted(DOCS.rglob("*.md"))]
-SLOW = {"docs/creatures.md", "docs/libraries.md", "docs/migrating.md", "docs/worldmodels.md"}
+SLOW = {
+    "docs/creatures.md",
+    "docs/libraries.md",
+    "docs/migrating.md",
+    "docs/ogbench.md",
+    "docs/worldmodels.md",
+}
 MANY_STEPS = 4
 """Commands that run longer are cut to this many steps: what they print does not depend on it."""
 

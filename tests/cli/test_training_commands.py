@@ -63,6 +63,7 @@ def test_bad_arguments_of_training_commands_are_refused(
     assert not list(folder.rglob("*.safetensors"))
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_says_how_to_go_on(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "powderdsl", "train", str(write_task(tmp_path)), *QUICK]
     command += ["--run", str(tmp_path / "run"), "--steps", "1e9", "--backend", "wasm"]

@@ -76,6 +76,7 @@ def test_old_worlds_stay(sims: Pair) -> None:
     assert_equal(again, plain.step(start(plain, 3), 6))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["seed", "index"])
 def test_numbers_written_to_count_for_the_worlds_that_have_them(sims: Pair, name: str) -> None:
     """Those of a world that a simulator made, written to by torch and by NumPy."""

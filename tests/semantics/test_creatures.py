@@ -101,6 +101,7 @@ def test_birds_fly_one_cell_a_step_or_two_and_keep_away_from_walls(first: bool) 
     assert first or distance.min() == 3
 
 
+@pytest.mark.slow
 @both_worlds
 def test_kangaroos_leap_ten_cells_high_or_25(first: bool) -> None:
     world = drawn(

@@ -76,7 +76,7 @@ SIZES = [(2, 9, 33), (3, 4, 5), (2, 1, 64), (2, 65, 1), (1, 1, 1), (1, 2, 31), (
 STRIPS = [(2, 16, 70), (1, 64, 64), (1, 256, 256), (9, 520, 20), (2, 8, 1)]
 """Worlds that native code cuts into strips: of one row, of more rows than one list of active rows has; large and many."""
 
-QUICK = ["core+bird", "core+fish", "core+wind", "langtons_ant", "life", "margolus", "powderworld"]
+QUICK = ["core+bird", "core+fish", "core+wind", "langtons_ant", "life", "margolus"]
 
 
 @pytest.mark.parametrize("name", tiered(compositions(), QUICK))
@@ -237,6 +237,7 @@ def test_draws_from_outside() -> None:
         assert_same(start, simulators, random=draws)
 
 
+@pytest.mark.slow
 def test_random_rulesets_use_all_that_targets_see_and_few_are_refused() -> None:
     """Every construct and every operation, on numbers and on bit planes; the lists come from the compiler's tables."""
     used: set[tuple[str, str]] = set()

@@ -271,6 +271,7 @@ measures:
     assert refusal(changed("episodes: 4", "episodes: 5").prepare)[0].code == "PD621"
 
 
+@pytest.mark.slow
 def test_a_step_that_fails_is_told_with_its_last_words(tmp_path: Path) -> None:
     text = TEXT.replace("on: sand-pushing", "on: no-such-task")
     study = read(text)

@@ -106,7 +106,6 @@ def test_moves_come_in_order_of_their_conditions() -> None:
     ]
 
 
-@pytest.mark.slow
 def test_a_search_plays_the_best_of_its_plans() -> None:
     """What it promises is what playing gives, and more plans are never worse: the first ones are among them."""
     program = program_of("  search: 12\n")

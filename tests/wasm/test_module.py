@@ -35,6 +35,7 @@ def test_the_module_of_powderworld_is_small() -> None:
     assert len(gzip.compress(code)) <= 50_000
 
 
+@pytest.mark.slow
 def test_branches_use_the_variables_of_others_again(tmp_path: Path) -> None:
     """A loop here has some 90,000 values, nearly all of them in branches; engines allow 50,000 variables."""
     rules = tmp_path / "long.yaml"

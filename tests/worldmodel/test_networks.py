@@ -217,6 +217,7 @@ def test_a_run_of_the_u_net_refuses_another_network(dunes: str) -> None:
     assert "--width is that of the U-net" in run(*words, "--network", "nets:Wide").output
 
 
+@pytest.mark.slow
 def test_hostile_names_in_a_run_are_text(dunes: str) -> None:
     words = ("wm", "train", "--task", dunes, "--run", "run", *QUICK, "--width", 2, "--iterations", 1)
     run(*words, exits=0)
