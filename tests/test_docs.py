@@ -318,6 +318,7 @@ SHOWN_STEPS = 24
 """Steps of animations that are compared."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", tiered(PICTURES, sorted(PICTURES)[-1:]))
 def test_pictures_are_what_their_commands_draw(path: str, generate: Any, tmp_path: Path) -> None:
     """Its first frames, pixel by pixel: `python docs/generate.py --pictures` draws pictures again."""

@@ -151,6 +151,7 @@ def run_grown(folder: Path, edits: dict[str, tuple[str, str]], program: str, *ar
     assert result.returncode == 0, result.stderr
 
 
+@pytest.mark.slow
 def test_an_operation_that_others_express_is_one_row_and_the_oracles(tmp_path: Path) -> None:
     rules = tmp_path / "growth.yaml"
     rules.write_text(RULES, "utf-8")

@@ -180,6 +180,7 @@ def test_random_rulesets(first: int) -> None:
     assert agreed(run_seed(seed, Plan(worlds=4, steps=2)) for seed in seeds) >= 3 * len(seeds)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seeds", "level"),
     [
