@@ -36,7 +36,6 @@ from powderdsl.model.types import Ruleset
 from powderdsl.tasks.shipped import load_task_with_diagnostics
 from powderdsl.testing.pack_tests.runner import run_examples
 from powderdsl.worlds.scene import load_start
-from tests.tiers import tiered
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -319,7 +318,7 @@ SHOWN_STEPS = 24
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", tiered(PICTURES, sorted(PICTURES)[-1:]))
+@pytest.mark.parametrize("path", PICTURES)
 def test_pictures_are_what_their_commands_draw(path: str, generate: Any, tmp_path: Path) -> None:
     """Its first frames, pixel by pixel: `python docs/generate.py --pictures` draws pictures again."""
     from powderdsl.cli import main

@@ -21,7 +21,6 @@ from powderdsl.testing.properties.refute import refuted
 from powderdsl.testing.properties.running import Runner
 from powderdsl.testing.properties.search import InvariantSearch, SearchPlan
 from tests.cli.commands import ROOT, powderdsl
-from tests.tiers import tiered
 
 
 @dataclass(frozen=True)
@@ -131,7 +130,7 @@ def changes_of(rules: str) -> dict[str, str]:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "added",
-    tiered(ADDED, [added for added in ADDED if added.name == "moss"]),
+    ADDED,
     ids=lambda added: added.name,
 )
 def test_a_pack_that_changes_others_is_told_by_its_own_line(added: Added) -> None:

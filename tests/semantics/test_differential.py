@@ -184,10 +184,9 @@ def test_random_rulesets(first: int) -> None:
 @pytest.mark.parametrize(
     ("seeds", "level"),
     [
-        (range(40, 41), "-O0"),
-        pytest.param(range(41, 46), "-O0", marks=pytest.mark.slow),
-        pytest.param(range(46, 48), "-O1", marks=pytest.mark.slow),
-        pytest.param(range(48, 60), "-O2", marks=pytest.mark.slow),
+        (range(40, 46), "-O0"),
+        (range(46, 48), "-O1"),
+        (range(48, 60), "-O2"),
     ],
 )
 def test_random_rulesets_as_native_code(seeds: range, level: str, tmp_path: Path) -> None:

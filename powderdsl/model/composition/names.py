@@ -35,7 +35,7 @@ D = TypeVar("D", bound=Definition)
 MAX_PASSES = 200
 
 STATE = frozenset(("element", "ids"))
-"""Names that the elements of cells have in Python and in files, beside those of fields and properties."""
+"""Names that Python and files reserve for the elements of cells; fields and properties need others."""
 
 
 class Names:

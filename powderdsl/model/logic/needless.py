@@ -215,7 +215,7 @@ def report_undrawn(
 
 
 def _may_draw(name: str, number: int, ruleset: Ruleset, facts: Facts) -> Iterator[bool | None]:
-    """Whether each rule that reads the property may happen where this element stands."""
+    """For each rule that reads the property: may it happen where this element is?"""
     for pass_ in ruleset.passes:
         everywhere = {let.name: let.value for moment in pass_.moments for let in moment.lets}
         for moment in pass_.moments:
