@@ -208,6 +208,9 @@ def test_a_split_depends_on_the_world_and_the_seed_alone(replayed: Dataset, reco
     assert [episodes_of(one) for one in again] == [episodes_of(one) for one in alone]
     other_seed = split(Transitions(replayed), (0.6, 0.4), seed=1)
     assert [episodes_of(one) for one in other_seed] != [episodes_of(one) for one in alone]
+    for seed in (-1, 1 << 62):
+        with pytest.raises(ValueError, match="seed"):
+            split(Transitions(replayed), (0.6, 0.4), seed=seed)
 
 
 def test_a_split_by_episode_keeps_episodes_whole(replayed: Dataset) -> None:

@@ -57,6 +57,12 @@ def under(one: Diagnostic) -> str:
     return one.primary.span.text
 
 
+def test_the_seed_of_a_study_with_one_seed_need_not_be_used() -> None:
+    text = AGENTS.replace(", seed: $seed", "")
+    assert refused(text) == [("PD806", "3")]
+    assert read(text.replace("seeds: 3", "seeds: 1")).seeds == 1
+
+
 @pytest.mark.parametrize("name", shipped_studies())
 def test_shipped_studies_pass(name: str) -> None:
     load_study(name, commands(), check_study)

@@ -12,7 +12,7 @@ from pathlib import Path
 import click
 import pytest
 
-from powderdsl.diagnostics import CompileError, Diagnostic, Label, Source, Span
+from powderdsl.diagnostics import CompileError, Diagnostic, Label, Reporter, Source, Span
 from powderdsl.diagnostics.diagnostic import render_text
 from powderdsl.diagnostics.printable import (
     PrintableStream,
@@ -103,6 +103,16 @@ def test_diagnostics_escape_every_part():
     assert not RAW.search(re.sub(r"\x1b\[[0-9;]*m", "", render_text(one, color=True)))
     # A line break in a message cannot pretend to be a line of its own.
     assert len(render_text(one).splitlines()) == 10
+
+
+def test_an_empty_place_is_underlined_by_one_caret():
+    reporter = Reporter()
+    reporter.report("PD101", "a value is missing", Span(Source("pack.yaml", "pack: "), 6, 6))
+    with pytest.raises(CompileError) as caught:
+        reporter.raise_if_errors()
+    (diagnostic,) = caught.value.diagnostics
+    assert (diagnostic.primary.span.start, diagnostic.primary.span.end) == (6, 7)
+    assert render_text(diagnostic).count("^") == 1
 
 
 @pytest.mark.parametrize("command", ["check", "show", "test", "show --json", "check --json"])
