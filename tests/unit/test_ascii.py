@@ -17,8 +17,8 @@ from tests.unit.elements import ELEMENTS
 WORLDS = arrays(np.uint8, array_shapes(min_dims=2, max_dims=2, max_side=9), elements=st.integers(0, 13))
 
 
-def problems(text: str, **options) -> list[tuple[str, str]]:
-    return [(one.code, one.primary.span.text) for one in refusal(read_ascii, text, ELEMENTS, **options)]
+def problems(text: str) -> list[tuple[str, str]]:
+    return [(one.code, one.primary.span.text) for one in refusal(read_ascii, text, ELEMENTS)]
 
 
 def test_glyphs_are_cells_and_whitespace_is_nothing():
@@ -29,10 +29,6 @@ def test_glyphs_are_cells_and_whitespace_is_nothing():
         assert ids.tolist() == expected
 
 
-def with_legend(text, legend):
-    return parse_ascii(Span(Source("drawing", text), 0, len(text)), ELEMENTS, Reporter(), legend)
-
-
 @given(WORLDS)
 def test_what_is_written_is_read_back(ids):
     assert np.array_equal(read_ascii(write_ascii(ids, ELEMENTS), ELEMENTS), ids)
@@ -40,20 +36,24 @@ def test_what_is_written_is_read_back(ids):
 
 def test_a_legend_wins_over_glyphs():
     # `s` is sand's glyph: with this legend it means water, and sand is written as `□`.
-    assert with_legend("s□.", {"s": "water", "□": "core.sand"}).tolist() == [[3, 2, 0]]
+    drawing = Span(Source("drawing", "s□."), 0, 3)
+    ids = parse_ascii(drawing, ELEMENTS, Reporter(), {"s": "water", "□": "core.sand"})
+    assert ids.tolist() == [[3, 2, 0]]
+    with pytest.raises(CompileError, match=r"PD604.*`watr`[\s\S]*did you mean `water`"):
+        parse_ascii(drawing, ELEMENTS, Reporter(), {"w": "watr"})
 
 
-def test_unknown_characters_are_named_once_each_where_they_first_stand():
-    assert problems("..X\n.YX\nY..\n") == [("PD610", "X"), ("PD610", "Y")]
-
-
-def test_uneven_rows_are_shown_without_the_space_around_them():
-    assert problems("....\n  . . .  \n\n....\n.....\n") == [("PD611", ". . ."), ("PD611", ".....")]
-
-
-@pytest.mark.parametrize("text", ["", " \n\t\n"])
-def test_an_empty_drawing_is_refused(text):
-    assert problems(text) == [("PD607", text[:1])]
+@pytest.mark.parametrize(
+    ("text", "code", "under"),
+    [
+        ("..X\n.YX\nY..\n", "PD610", ["X", "Y"]),
+        ("....\n  . . .  \n\n....\n.....\n", "PD611", [". . .", "....."]),
+        ("", "PD607", [""]),
+        (" \n\t\n", "PD607", [" "]),
+    ],
+)
+def test_each_mistake_is_named_once_where_it_first_stands(text, code, under):
+    assert problems(text) == [(code, one) for one in under]
 
 
 def test_a_drawing_larger_than_any_world(monkeypatch):
@@ -68,11 +68,6 @@ def test_spans_point_into_the_text_around_the_drawing():
     reporter = Reporter()
     assert parse_ascii(Span(Source("pack.yaml", text), start, end), ELEMENTS, reporter) is None
     assert [one.primary.span.place for one in reporter.diagnostics] == ["pack.yaml:3:4"]
-
-
-def test_a_bad_legend():
-    with pytest.raises(CompileError, match=r"PD604.*`watr`[\s\S]*did you mean `water`"):
-        with_legend(".", {"w": "watr"})
 
 
 def test_files(tmp_path):

@@ -32,14 +32,11 @@ def test_the_palette_is_by_id():
     assert not palette([]).any()
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.int64])
+@pytest.mark.parametrize("dtype", [np.uint8, np.int64])
 def test_every_cell_has_its_elements_color(dtype):
-    ids = np.arange(14, dtype=dtype).reshape(2, 7)
-    image = rgb(ids, COLORS)
-    assert image.shape == (2, 7, 3)
+    image = rgb(np.arange(14, dtype=dtype).reshape(2, 7), COLORS)
     assert image.dtype == np.uint8
-    assert tuple(image[0, 2]) == SAND
-    assert np.array_equal(image.reshape(14, 3), COLORS[:14, :3])
+    assert np.array_equal(image, COLORS[:14, :3].reshape(2, 7, 3))
 
 
 @pytest.mark.parametrize(
@@ -57,7 +54,6 @@ def test_motion_tints_by_half_the_speed_up_to_a_half(motion, tint):
     field = np.array(motion, dtype=np.float32).reshape(2, 1, 1)
     expected = [int(a + (b - a) * tint) for a, b in zip(SAND, (200, 100, 100), strict=True)]
     assert tinted(np.array([[ID["sand"]]]), field)[0, 0].tolist() == expected
-    assert tinted(torch.tensor([[ID["sand"]]]), torch.tensor(field))[0, 0].tolist() == expected
 
 
 def test_the_components_of_motion_are_not_mixed_up_with_the_batch():
@@ -86,11 +82,7 @@ def test_an_empty_batch_is_drawn():
 
 def test_scaling_makes_squares():
     image = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
-    large = scale(image, 3)
-    assert large.shape == (6, 6, 3)
-    for row in range(6):
-        for column in range(6):
-            assert np.array_equal(large[row, column], image[row // 3, column // 3])
+    assert np.array_equal(scale(image, 3), image.repeat(3, 0).repeat(3, 1))
     assert np.array_equal(scale(image, 1), image)
     assert scale(image[None], 2).shape == (1, 4, 4, 3)
 

@@ -19,56 +19,51 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.simulation.draw import palette, rgb
 from powderdsl.worlds.image import MAX_REPORTED, read_image
 from powderdsl.worlds.media import write_png
+from tests.refusals import refusal
 from tests.unit.elements import ELEMENTS
 
 IDS = np.arange(14, dtype=np.uint8).reshape(2, 7)
 
 
-def write_image(path, ids, elements) -> None:
-    write_png(path, rgb(ids, palette(elements)))
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "world.png"
+
+
+def write_image(path, ids) -> None:
+    write_png(path, rgb(ids, palette(ELEMENTS)))
 
 
 def refused(path, elements=ELEMENTS) -> tuple:
-    with pytest.raises(CompileError) as caught:
-        read_image(path, elements)
-    str(caught.value)
-    return caught.value.diagnostics
+    found = refusal(read_image, path, elements)
+    str(CompileError(found))
+    return found
 
 
-def test_what_is_written_is_read_back(tmp_path):
-    path = tmp_path / "world.png"
+def test_what_is_written_is_read_back(path):
     for ids in (IDS, torch.tensor(IDS), IDS.astype(np.int64)):
-        write_image(path, ids, ELEMENTS)
+        write_image(path, ids)
         found = read_image(path, ELEMENTS)
         assert found.dtype == np.uint8
         assert np.array_equal(found, IDS)
     with Image.open(path) as image:
         assert image.size == (7, 2)
         assert image.getpixel((2, 0)) == (0xF3, 0xC2, 0x3A)  # sand, in the published color
+        for converted in (image.convert("RGB"), image.convert("RGBA"), image.quantize(256)):
+            converted.save(path)
+            assert np.array_equal(read_image(path, ELEMENTS), IDS)
 
 
-@pytest.mark.parametrize("mode", ["RGB", "RGBA", "P"])
-def test_other_pixel_formats_of_the_same_colors(tmp_path, mode):
-    path = tmp_path / "world.png"
-    write_image(path, IDS, ELEMENTS)
-    with Image.open(path) as image:
-        converted = image.quantize(256) if mode == "P" else image.convert(mode)
-    converted.save(path)
-    assert np.array_equal(read_image(path, ELEMENTS), IDS)
-
-
-def test_black_and_white_and_gray(tmp_path):
+def test_black_and_white_and_gray(path):
     gray = (replace(ELEMENTS[0], color="#000000"), replace(ELEMENTS[1], color="#FFFFFF"))
     pixels = np.array([[0, 255, 255], [255, 0, 0]], dtype=np.uint8)
     for mode in ("L", "1", "LA"):
-        path = tmp_path / f"{mode}.png"
         Image.fromarray(pixels).convert(mode).save(path)
         assert np.array_equal(read_image(path, gray), pixels // 255)
 
 
-def test_a_wrong_color_names_the_pixel_the_color_and_the_nearest_element(tmp_path):
-    path = tmp_path / "world.png"
-    write_image(path, IDS, ELEMENTS)
+def test_a_wrong_color_names_the_pixel_the_color_and_the_nearest_element(path):
+    write_image(path, IDS)
     pixels = np.array(Image.open(path))
     pixels[1, 3] = (0xF4, 0xC2, 0x3B)
     pixels[1, 5] = (0xF4, 0xC2, 0x3B)
@@ -83,9 +78,8 @@ def test_a_wrong_color_names_the_pixel_the_color_and_the_nearest_element(tmp_pat
     assert "`stone`" in black.helps[0]
 
 
-def test_a_smoothed_picture_is_summed_up(tmp_path):
-    path = tmp_path / "world.png"
-    write_image(path, np.random.default_rng(0).integers(0, 14, (16, 16)), ELEMENTS)
+def test_a_smoothed_picture_is_summed_up(path):
+    write_image(path, np.random.default_rng(0).integers(0, 14, (16, 16)))
     with Image.open(path) as image:
         image.resize((64, 64), Image.Resampling.BICUBIC).save(path)
     found = refused(path)
@@ -93,8 +87,7 @@ def test_a_smoothed_picture_is_summed_up(tmp_path):
     assert "without smoothing" in found[-1].helps[0]
 
 
-def test_transparent_pixels_are_not_guessed(tmp_path):
-    path = tmp_path / "world.png"
+def test_transparent_pixels_are_not_guessed(path):
     pixels = np.full((2, 2, 4), (0xEC, 0xF0, 0xF1, 255), dtype=np.uint8)
     pixels[1, 0, 3] = 128
     Image.fromarray(pixels).save(path)
@@ -102,12 +95,11 @@ def test_transparent_pixels_are_not_guessed(tmp_path):
     assert found.message == "the pixel at row 1, column 0 is #ECF0F1 at 50% opacity"
 
 
-def test_a_color_of_two_elements_is_refused_where_it_is_used(tmp_path):
+def test_a_color_of_two_elements_is_refused_where_it_is_used(path):
     twins = (*ELEMENTS[:13], replace(ELEMENTS[13], color=ELEMENTS[2].color))
-    path = tmp_path / "world.png"
-    write_image(path, np.array([[0, 1]]), ELEMENTS)
+    write_image(path, np.array([[0, 1]]))
     assert read_image(path, twins).tolist() == [[0, 1]]
-    write_image(path, np.array([[0, 2]]), ELEMENTS)
+    write_image(path, np.array([[0, 2]]))
     (found,) = refused(path, twins)
     assert "`sand` and `cloner`" in found.message
 
@@ -116,14 +108,13 @@ def chunk(kind: bytes, data: bytes) -> bytes:
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
-def png(width: int, height: int, *chunks: bytes, depth: int = 8, color: int = 2) -> bytes:
-    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, color, 0, 0, 0))
+def png(width: int, height: int, *chunks: bytes) -> bytes:
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
     return b"\x89PNG\r\n\x1a\n" + header + b"".join(chunks) + chunk(b"IEND", b"")
 
 
-@pytest.mark.parametrize("side", [4097, 12_000, 60_000, 2**31 - 1])
-def test_a_picture_of_too_many_pixels_is_not_decoded(tmp_path, side):
-    path = tmp_path / "bomb.png"
+@pytest.mark.parametrize("side", [4097, 60_000, 2**31 - 1])
+def test_a_picture_of_too_many_pixels_is_not_decoded(path, side):
     path.write_bytes(png(side, side, chunk(b"IDAT", zlib.compress(bytes(1 << 20)))))
     tracemalloc.start()
     try:
@@ -135,26 +126,19 @@ def test_a_picture_of_too_many_pixels_is_not_decoded(tmp_path, side):
     assert peak < 4 << 20
 
 
-def test_a_text_that_unpacks_to_gigabytes(tmp_path):
-    path = tmp_path / "bomb.png"
-    packed = zlib.compress(bytes(100 << 20))
-    path.write_bytes(png(1, 1, chunk(b"zTXt", b"note\0\0" + packed), chunk(b"IDAT", zlib.compress(bytes(4)))))
-    assert [one.code for one in refused(path)] == ["PD602"]
-
-
-def test_sixteen_bit_pictures_are_refused(tmp_path):
-    path = tmp_path / "deep.png"
+def test_sixteen_bit_pictures_are_refused(path):
     Image.fromarray(np.full((2, 2), 60000, dtype=np.uint16)).save(path)
     (found,) = refused(path)
     assert found.code == "PD602"
     assert "8 bits" in found.notes[0]
 
 
-@pytest.mark.parametrize("data", [b"", b"GIF89a", b"\x89PNG\r\n\x1a\n", b"scene: a\n", png(0, 0), png(3, 3)])
-def test_files_that_are_not_png_pictures_are_refused(tmp_path, data):
-    path = tmp_path / "world.png"
-    path.write_bytes(data)
-    assert [one.code for one in refused(path)] == ["PD602"]
+def test_files_that_are_not_png_pictures_are_refused(path):
+    bomb = chunk(b"zTXt", b"note\0\0" + zlib.compress(bytes(100 << 20)))
+    full = png(1, 1, bomb, chunk(b"IDAT", zlib.compress(bytes(4))))
+    for data in (b"", b"GIF89a", b"\x89PNG\r\n\x1a\n", b"scene: a\n", png(0, 0), png(3, 3), full):
+        path.write_bytes(data)
+        assert [one.code for one in refused(path)] == ["PD602"]
 
 
 def test_files_that_cannot_be_read(tmp_path):
@@ -164,9 +148,8 @@ def test_files_that_cannot_be_read(tmp_path):
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_a_damaged_file_gives_a_world_or_a_diagnostic(tmp_path, data):
-    path = tmp_path / "world.png"
-    write_image(path, IDS, ELEMENTS)
+def test_a_damaged_file_gives_a_world_or_a_diagnostic(path, data):
+    write_image(path, IDS)
     content = bytearray(path.read_bytes())
     for _ in range(data.draw(st.integers(1, 4))):
         content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
@@ -180,10 +163,9 @@ def test_a_damaged_file_gives_a_world_or_a_diagnostic(tmp_path, data):
 
 
 @pytest.mark.parametrize("shape", [(1100, 1000), (1 << 21, 1)])
-def test_large_pictures_are_read_in_parts(tmp_path, shape) -> None:
+def test_large_pictures_are_read_in_parts(path, shape) -> None:
     ids = np.random.default_rng(3).integers(0, len(ELEMENTS), shape).astype(np.uint8)
-    path = tmp_path / "large.png"
-    write_png(path, rgb(ids, palette(ELEMENTS)))
+    write_image(path, ids)
     begun = process_time()
     assert np.array_equal(read_image(path, ELEMENTS), ids)
     assert process_time() - begun < 3  # not a round of Python for each row
