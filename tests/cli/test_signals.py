@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import random
 import signal
-import subprocess
-import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
-from tests.cli.commands import environment_with
+from powderdsl.system.interrupts import Terminated, delay_signal, interruptible
 from tests.cli.endless import COMMANDS, Place, last_step
 from tests.processes import waited
 from tests.tiers import tiered
@@ -19,37 +19,37 @@ from tests.tiers import tiered
 pytestmark = pytest.mark.skipif(
     not Path("/proc/self/environ").exists(), reason="looks for processes in /proc"
 )
+ENDED = [("video", 1), *((name, 10) for name in COMMANDS)]
+"""Commands, and how often each is ended."""
 
 
-@pytest.mark.parametrize("name", tiered(COMMANDS, ["video"]))
-def test_sigterm_ends_a_command_cleanly(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL], ids=["SIGTERM", "SIGKILL"])
+@pytest.mark.parametrize("ended", tiered(ENDED, ENDED[:1]), ids=str)
+def test_an_ended_command_leaves_nothing_behind_and_the_next_one_works(
+    ended: tuple[str, int], how: signal.Signals, tmp_path: Path
+) -> None:
+    """In the middle of its work, some times in one folder; then a command that ends well."""
+    name, times = ended
     if name == "video":
         pytest.importorskip("imageio_ffmpeg")
     place, command = Place(tmp_path), COMMANDS[name]
-    with place.begun(command) as running:
-        assert place.busy(command, running), place.said()
-        running.send_signal(signal.SIGTERM)
-        running.wait(timeout=120)
-        assert running.returncode == 143, place.said()
-        # Processes that Python itself starts end when a pipe closes.
-        assert waited(lambda: not place.survivors(), 5)
-    assert place.said().endswith("terminated by SIGTERM\n")
-    assert "Traceback" not in place.said()
-    assert place.scratch() == []
-    if name in ("train", "wm train", "study"):
-        assert place.checkpoint_steps()
-
-
-@pytest.mark.parametrize("name", tiered(["video", "fuzz", "mutate", "wm train"], ["video"]))
-def test_after_sigkill_nothing_runs_on_and_the_next_command_works(name: str, tmp_path: Path) -> None:
-    if name == "video":
-        pytest.importorskip("imageio_ffmpeg")
-    place, command = Place(tmp_path), COMMANDS[name]
-    with place.begun(command) as running:
-        assert place.busy(command, running), place.said()
-        running.kill()
-        running.wait()
-    assert waited(lambda: not place.survivors(), 60)
+    chance = random.Random(f"{name} {how}")
+    for _ in range(times):
+        (tmp_path / "compiling").unlink(missing_ok=True)
+        with place.begun(command) as running:
+            assert place.busy(command, running), place.said()
+            time.sleep(chance.random())
+            running.send_signal(how)
+            running.wait(timeout=120)
+            if how == signal.SIGTERM:
+                assert running.returncode == 143, place.said()
+                # Processes that Python itself starts end when a pipe closes.
+                assert waited(lambda: not place.survivors(), 5), place.said()
+                assert place.said().endswith("terminated by SIGTERM\n")
+                assert "Traceback" not in place.said()
+                assert place.scratch() == [], place.said()
+                assert name not in ("train", "wm train", "study") or place.checkpoint_steps()
+        assert waited(lambda: not place.survivors(), 60)
     place.run_again(command)
 
 
@@ -79,82 +79,30 @@ def test_a_killed_study_resumes_at_once(tmp_path: Path) -> None:
         assert "PD622" not in log
 
 
-CAUGHT = """
-import os, signal, sys, time
-from powderdsl.system.interrupts import Terminated, delay_signal, interruptible
-
-def twice():
-    with delay_signal() as asked:
-        os.kill(os.getpid(), signal.SIGTERM)
-        os.kill(os.getpid(), signal.SIGTERM)
-        time.sleep(0.01)
-        print("asked" if asked() else "not asked")
-
-def held_in_a_failure():
-    try:
-        with delay_signal():
-            os.kill(os.getpid(), signal.SIGTERM)
-            raise OSError
-    except OSError:
-        print("lost")
-
-def again():
-    try:
-        with delay_signal():
-            os.kill(os.getpid(), signal.SIGINT)
-            os.kill(os.getpid(), signal.SIGINT)
-            time.sleep(10)
-    except KeyboardInterrupt:
-        print("at once")
-
-with interruptible():
-    try:
-        {"twice": twice, "held": held_in_a_failure, "again": again}[sys.argv[1]]()
-    except Terminated as error:
-        print(error)
-"""
+def hold(numbers: Sequence[int], problem: Exception | None, reached: list[str]) -> None:
+    """Get signals in a block that holds them back, and fail there; note how far that goes."""
+    with interruptible():
+        with delay_signal() as asked:
+            for number in numbers:
+                os.kill(os.getpid(), number)
+            reached.append("asked" if asked() else "not asked")
+            if problem is not None:
+                raise problem
+        reached.append("lost")
 
 
 @pytest.mark.parametrize(
-    ("case", "said"),
+    ("numbers", "problem", "raised", "reached"),
     [
-        ("twice", ["asked", "terminated by SIGTERM"]),
-        ("held", ["terminated by SIGTERM"]),
-        ("again", ["at once"]),
+        ([signal.SIGTERM] * 2, None, Terminated, ["asked"]),  # `timeout` sends two
+        ([signal.SIGTERM], OSError(), Terminated, ["asked"]),
+        ([signal.SIGINT] * 2, None, KeyboardInterrupt, []),
     ],
 )
-def test_a_signal_is_never_lost(case: str, said: list[str]) -> None:
-    run = subprocess.run(
-        [sys.executable, "-c", CAUGHT, case],
-        env=environment_with(),
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert run.stdout.splitlines() == said
-    assert run.stderr == ""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL], ids=["SIGTERM", "SIGKILL"])
-@pytest.mark.parametrize("name", COMMANDS)
-def test_signals_at_any_moment(name: str, how: signal.Signals, tmp_path: Path) -> None:
-    """In the middle of the work, ten times each in one folder, then a command that ends well."""
-    place, command = Place(tmp_path), COMMANDS[name]
-    chance = random.Random(f"{name} {how}")
-    for _ in range(10):
-        (tmp_path / "compiling").unlink(missing_ok=True)
-        with place.begun(command) as running:
-            place.busy(command, running)
-            time.sleep(chance.random())
-            assert running.poll() is None, place.said()
-            running.send_signal(how)
-            running.wait(timeout=120)
-            if how == signal.SIGTERM:
-                assert running.returncode == 143, place.said()
-                assert waited(lambda: not place.survivors(), 5), place.said()
-                assert place.scratch() == [], place.said()
-                assert "Traceback" not in place.said()
-        assert waited(lambda: not place.survivors(), 60)
-    place.run_again(command)
+def test_a_signal_is_never_lost(
+    numbers: list[int], problem: Exception | None, raised: type[BaseException], reached: list[str]
+) -> None:
+    found: list[str] = []
+    with pytest.raises(raised):
+        hold(numbers, problem, found)
+    assert found == reached
