@@ -33,30 +33,6 @@ def test_all_combinations_are_measured():
     assert [line.split("  ")[0] for line in table[-3:-1]] == ["all passes", "whole step"]
 
 
-def test_parameters_can_be_set():
-    powderdsl(*TORCH, "--set", "life.nonsense=3", exits=exits.BAD_INPUT)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["no-such-rules"], "PD304"),
-        (["life", "--backend", "fast"], "fast"),
-        (["life", "--batch", "0"], "0"),
-        (["life", "--size", "0x4"], "at least one row"),
-        (["life", "--size", "4096x4096", "--batch", "1000"], "PD607"),
-        (["life", "--only", "snow"], "no element `snow`"),
-        (["life", "--only", "a,,b"], "NAME,NAME"),
-        (["life", "--workload", "storm"], "storm"),
-        (["life", "--seconds", "nan"], "seconds"),
-        (["life", "--seconds", "-1"], "seconds"),
-        (["life", "--device", "abacus"], "PD701"),
-    ],
-)
-def test_what_cannot_be_measured_is_refused(arguments, words):
-    assert words in powderdsl("bench", *arguments, exits=exits.BAD_INPUT).stderr
-
-
 def test_without_a_compiler_webassembly_is_measured(monkeypatch):
     def none():
         raise bench_command.NoCompiler("no C++ compiler found")
@@ -121,4 +97,3 @@ def test_a_program_cannot_be_named_as_a_backend(tmp_path):
     (tmp_path / "torch.py").write_text(PROGRAM)
     result = powderdsl(*TORCH, "--beside", "torch.py", exits=exits.BAD_INPUT)
     assert "`torch` is the name of another program or of a backend" in result.stderr
-    powderdsl(*TORCH, "--beside", "missing.py", exits=exits.BAD_INPUT)

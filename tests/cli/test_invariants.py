@@ -92,21 +92,6 @@ def test_the_same_seed_finds_the_same(folder):
     assert first.stdout == second.stdout
 
 
-@pytest.mark.parametrize(
-    ("text", "word"),
-    [("", "PD602"), ("property: rock never changes\n", "PD602"), ("world: [9 9]\nproperty: x\n", "PD602")],
-)
-def test_files_that_are_not_counterexamples_are_refused(folder, text, word):
-    (folder / "case.yaml").write_text(text)
-    assert word in powderdsl("test", "yard.yaml", "--replay", "case.yaml", exits=2).stderr
-
-
-def test_a_replay_needs_one_name(folder):
-    (folder / "case.yaml").write_text("x: y\n")
-    powderdsl("test", "--replay", "case.yaml", exits=2)
-    powderdsl("test", "yard.yaml", "--picture", "rock.gif", exits=2)
-
-
 def test_packs_under_pytest(folder):
     (folder / "other.yaml").write_text("services: {web: 1}\n")
     root = Path(__file__).resolve().parents[2]

@@ -69,15 +69,6 @@ def test_a_sample_is_in_proportion_and_the_same_again():
     assert len({mutants[number].operator for number in some}) >= 6
 
 
-def test_an_unknown_pack_is_refused(folder):
-    assert "spread" in mutate("spread.yaml", "--pack", "nowhere", exits=2).stderr
-
-
-@pytest.mark.parametrize("arguments", [("--write",), ("--pack", "life"), ("--mutants", "3"), ("--jobs", "1")])
-def test_options_of_mutations_need_them(folder, arguments):
-    assert "--mutate" in powderdsl("test", "life", *arguments, exits=2).stderr
-
-
 def test_mutants_run_with_other_parameters(folder):
     text = PACK.replace("passes:", "params: {speed: 50%}\npasses:").replace(
         "is wet  #", "is wet with chance speed  #"

@@ -54,29 +54,6 @@ def test_a_dataset_is_recorded_and_verified(task: Path, tmp_path: Path) -> None:
     assert "shard-000001.npz is damaged" in powderdsl("record", "--verify", out, exits=2).stderr
 
 
-def test_what_is_missing_is_named(task: Path) -> None:
-    found = powderdsl("record")
-    assert (found.exit_code, found.stderr) == (2, "error: missing TASK, --out, --episodes\n")
-    assert "missing --out\n" in powderdsl("record", task, "--episodes", "1").stderr
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("--verify", "gone"), "PD630"),
-        (("small", "--verify", "gone"), "--verify does not go with TASK"),
-        (("--knob", "disks"), "write NAME=N"),
-        (("sand-pushing", "--out", "d", "--episodes", "1", "--policy", "runs/clever"), "PD620"),
-        (("--observation", "matrix"), "matrix"),
-        (("sand-pushing", "--out", "d", "--episodes", "1", "--split", "tst"), "did you mean `test`"),
-        (("destroying", "--out", "d", "--episodes", "1", "--policy", "nothing"), "may neither `blow`"),
-    ],
-)
-def test_bad_values(arguments: tuple[str, ...], words: str, folder: Path) -> None:
-    assert words in powderdsl("record", *arguments, exits=2).stderr
-    assert list(folder.iterdir()) == []
-
-
 EPISODES = 240
 
 

@@ -168,12 +168,6 @@ def test_every_backend_shows_its_kernels(backend):
     assert len(result.stdout.splitlines()) > 10
 
 
-@pytest.mark.parametrize("arguments", [("reference",), ("native", "--pass", "life")])
-def test_kernels_that_do_not_exist_are_refused(arguments):
-    result = powderdsl("compile", "life", "--emit", "kernels", "--backend", *arguments, exits=2)
-    assert result.stderr.startswith("error: ")
-
-
 def test_trees_show_rules_as_parsed():
     result = powderdsl("compile", "core+water", "--emit", "tree", "--pass", "melt")
     heading = "do: ice -> water if count(thaws) > 1 and interact < melt  # rules/water.yaml:"
@@ -186,9 +180,3 @@ def test_trees_can_be_had_of_rules_that_are_wrong(tmp_path):
     path.write_text(PACK.replace("-> empty", "-> nothing_known"))
     powderdsl("compile", f"core+{path}", "--emit", "tree", exits=0)
     assert "PD301" in powderdsl("compile", f"core+{path}", "--emit", "model", exits=2).stderr
-
-
-@pytest.mark.parametrize("stage", ["tree", "model", "ir", "kernels"])
-def test_an_unknown_pass_gets_a_suggestion(stage):
-    result = powderdsl("compile", "powderworld", "--emit", stage, "--pass", "mlt", exits=2)
-    assert "no pass `mlt`; did you mean `melt`?" in result.stderr

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 
 import numpy as np
-import pytest
 from PIL import Image
 
 from tests.cli.commands import powderdsl as run
@@ -41,18 +40,3 @@ def test_a_sheet_shows_worlds_and_outlines_regions(tmp_path):
     outlined = (picture == (255, 0, 160)).all(-1).sum()
     side = (picture.shape[0] - 6) // 2 // 64  # two worlds in a row, with gaps of two pixels
     assert outlined == 4 * (2 * (20 + 9) * side - 4)
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ("show", "sand-pushing", "--split", "tset"),
-        ("show", "sand-pushing", "--knob", "lines"),
-        ("show", "sand-pushing", "--knob", "lines=99"),
-        ("show", "sand-pushing", "--out", "sheet.gif"),
-        ("show", "sand-pushing", "--out", "no/such/folder/sheet.png"),
-        ("show", "powderworld", "--out", "sheet.png"),
-    ],
-)
-def test_bad_arguments_of_show_are_refused(arguments):
-    run(*arguments, exits=2)

@@ -71,19 +71,3 @@ def test_a_saved_world_has_several_to_choose_from():
     data = [json.loads(powderdsl("trace", RULES, *options, "--number", one).stdout) for one in (0, 1)]
     assert [one["world"] for one in data] == [0, 1]
     assert [one["step"] for one in data] == [4, 4]  # the saved world knows how many steps it has made
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (("--at", "9,1", "--step", 1), "no cell 9,1: the world has 4 rows and 3 columns"),
-        (("--at", "here", "--step", 1), "write ROW,COLUMN"),
-        (("--at", "1,1", "--step", 0), "0 is not in the range"),
-        (("--at", "1,1", "--step", 1, "--of", "momentun"), "did you mean `momentum`?"),
-        (("--at", "1,1", "--step", 1, "--of", "density"), "follows from the element"),
-        (("--at", "1,1", "--step", 1, "--number", 7), "no world 7"),
-        (("--step", 1), "--at"),
-    ],
-)
-def test_bad_questions_end_with_exit_code_two(options, words):
-    assert words in powderdsl("trace", RULES, *FAST, *options, exits=2).stderr

@@ -37,32 +37,6 @@ def test_train_evaluate_and_go_on(folder: Path) -> None:
     }
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (("train",), "TASK"),
-        (("train", "sand-pulling"), "sand-pushing"),
-        (("train", "sand-pushing", "--split", "tset"), "no split"),
-        (("train", "keep-ice", "--knob", "complexity=3"), "no knob `complexity`"),
-        (("train", "sand-pushing", "--network", "paper", "--observation", "rgb"), "rgb"),
-        (("train", "--resume", "nowhere"), "nowhere"),
-        (("train", "sand-pushing", "--resume", "nowhere"), "--resume goes without TASK"),
-        (("train", "--resume", "nowhere", "--seed", "2"), "only steps"),
-        (("evaluate", "nowhere"), "PD620"),
-        (("evaluate", "sand-pushing", "--policies", "trained"), "random, nothing"),
-        (("evaluate", "nowhere", "--knob", "lines=2"), "a run has its own"),
-        (("watch", "sand-pushing", "--policy", "trained"), "no trained policy"),
-        (("watch", "sand-pushing", "--out", "x.png"), ".gif or .mp4"),
-        (("watch", "sand-pushing", "--scale", "32", "--worlds", "64", "--out", "no/x.gif"), "PD613"),
-    ],
-)
-def test_bad_arguments_of_training_commands_are_refused(
-    arguments: tuple[str, ...], said: str, folder: Path
-) -> None:
-    assert said in run(*arguments, exits=2).output
-    assert not list(folder.rglob("*.safetensors"))
-
-
 @pytest.mark.slow
 def test_an_interrupted_run_says_how_to_go_on(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "powderdsl", "train", str(write_task(tmp_path)), *QUICK]
