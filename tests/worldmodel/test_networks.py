@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,16 +11,16 @@ from pathlib import Path
 import pytest
 import torch
 
-from powderdsl.diagnostics import CompileError
-from powderdsl.worldmodel import DataConfig, Machine, TrainConfig, custom_network, load_trained, train
+from powderdsl.experiments.runs import read_metrics
+from powderdsl.worldmodel import TrainConfig, custom_network, load_trained, train
 from powderdsl.worldmodel.networks import ActionChannels, CustomNetwork, is_network_name
+from powderdsl.worldmodel.training import TrainingProgress
 from tests.cli.commands import powderdsl as run
-from tests.refusals import refusal
+from tests.refusals import refusal, refused_codes
 from tests.states import same
 from tests.tiers import tiered
-from tests.worldmodel.test_training import weights
+from tests.worldmodel.test_training import HERE, tiny, weights
 
-HERE = Machine(backend="torch")
 QUICK = ("--batch", 4, "--buffer", 32, "--refresh", 2, "--states", 8, "--backend", "torch")
 
 NETS = """
@@ -97,11 +98,6 @@ def was_imported(*words: object) -> tuple[int, str, bool]:
     return result.exit_code, result.output, "nets" in sys.modules or Path("imported").exists()
 
 
-def tiny(task: str) -> TrainConfig:
-    data = DataConfig(task=task, states=60, steps=2, pairs=4, capacity=240, refresh=3)
-    return TrainConfig(data, iterations=12, batch=4, learning_rate=0.01, seed=3)
-
-
 @pytest.mark.parametrize("name", tiered(["nets:Wide", "nets:made"], ["nets:made"]))
 def test_a_network_of_ones_own_is_trained_and_tested(name: str, dunes: str) -> None:
     words = ("wm", "train", "--task", dunes, "--run", "run", *QUICK, "--iterations", 3)
@@ -116,24 +112,39 @@ def test_a_network_of_ones_own_is_trained_and_tested(name: str, dunes: str) -> N
     run(*words, "--network", name, exits=0)
 
 
-def test_an_interrupted_run_ends_with_the_same_weights(dunes: str) -> None:
-    """Also with layers that draw random numbers, and with those that keep statistics."""
-    network = custom_network("nets:Wide")
-    config = tiny(dunes)
-    whole = train(config, "whole", machine=HERE, network=network)
+@pytest.mark.parametrize("name", [None, "nets:Wide"])
+def test_a_run_in_parts_is_a_run_at_once(name: str | None, dunes: str) -> None:
+    """Also with layers that draw random numbers, and with those that keep statistics. Validation changes no weight."""
+    config, network = tiny(dunes), custom_network(name) if name else None
+    how = {"machine": HERE, "network": network, "validate_every": 8}
+    plain = train(config, "plain", machine=HERE, network=network)
+    whole = train(config, "whole", **how)
+    found = {line["step"]: line for line in read_metrics(whole.path)}
+    assert [step for step, line in found.items() if "loss/validation" in line] == [8, 16, 24, 30]
+    assert [step for step, line in found.items() if "loss/train" in line] == [10, 20, 30]
+    assert found[30]["loss/validation"] < found[8]["loss/validation"]
+    for score in ("accuracy", "changed_accuracy", "change_f1", "ece", "change_ece"):
+        assert 0 <= found[30][f"validation/{score}"] <= 1
 
-    def stop(now: object) -> None:
-        if getattr(now, "done", 0) == 5:
+    def stop(now: TrainingProgress) -> None:
+        if now.done in (7, 14):
+            signal.raise_signal(signal.SIGINT)
+        if now.done == 19:
             raise RuntimeError("stopped")
 
-    with pytest.raises(RuntimeError, match="stopped"):
-        train(config, "parts", machine=HERE, network=network, save_seconds=0, tell=stop)
+    for error, seconds in ((KeyboardInterrupt, 600), (KeyboardInterrupt, 600), (RuntimeError, 0)):
+        with pytest.raises(error):
+            train(config, "parts", save_seconds=seconds, tell=stop, **how)
     torch.rand(100)  # what else the process draws makes no difference
-    parts = train(config, "parts", machine=HERE, network=network, validate_every=3)
-    assert same(weights(parts), weights(whole))
-    before = torch.random.get_rng_state()
-    load_trained(parts, network=network)
-    assert torch.equal(torch.random.get_rng_state(), before)
+    for _ in range(2):  # then it is done
+        parts = train(config, "parts", **how)
+        assert same(weights(parts), weights(whole))
+    assert same(weights(plain), weights(whole))
+    timeless = [
+        [{name: one for name, one in line.items() if "time/" not in name} for line in read_metrics(run.path)]
+        for run in (parts, whole)
+    ]
+    assert timeless[0] == timeless[1]
 
 
 @pytest.mark.parametrize(
@@ -169,58 +180,39 @@ def test_they_are_refused_before_a_run_begins(dunes: str) -> None:
 # What files name is never imported
 
 
-@pytest.fixture
-def trained(dunes: str) -> Path:
+def test_a_run_that_names_a_network_needs_it_on_the_command_line(dunes: str) -> None:
     words = ("wm", "train", "--task", dunes, "--run", "run", *QUICK, "--iterations", 1)
     run(*words, "--network", "nets:Wide", exits=0)
-    return Path("run")
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("eval", "run", "--backend", "torch"),
-        ("show", "run", "--out", "strips.png", "--backend", "torch"),
-        ("finetune", "run", "--packs", "stone", "--run", "tuned", "--backend", "torch"),
-    ],
-)
-def test_a_run_that_names_a_network_is_refused_without_the_option(
-    words: tuple[str, ...], trained: Path
-) -> None:
-    code, output, imported = was_imported("wm", *words)
-    assert (code, imported) == (2, False), output
-    assert "PD623" in output
-    assert "which it calls `nets:Wide`" in output
-    code, output, imported = was_imported("wm", *words, "--network", "nets:made")
-    assert code == 2, output
-    assert "it was trained with `nets:Wide`, not with `nets:made`" in output
-
-
-def test_training_that_continues_needs_the_same_network(trained: Path, dunes: str) -> None:
-    words = ("wm", "train", "--task", dunes, "--run", "run", *QUICK, "--iterations", 1)
+    for others in (
+        ("eval", "run"),
+        ("show", "run", "--out", "strips.png"),
+        ("finetune", "run", "--packs", "stone", "--run", "tuned"),
+    ):
+        code, output, imported = was_imported("wm", *others, "--backend", "torch")
+        assert (code, imported) == (2, False), output
+        assert "PD623" in output
+        assert "which it calls `nets:Wide`" in output
+        code, output, imported = was_imported("wm", *others, "--backend", "torch", "--network", "nets:made")
+        assert code == 2, output
+        assert "it was trained with `nets:Wide`, not with `nets:made`" in output
     code, output, imported = was_imported(*words)
     assert (code, imported) == (2, False), output
     assert '`network` is "nets:Wide" there, not set here' in output
-    config = TrainConfig.of(load_trained(trained, network=custom_network("nets:Wide")).run.config)
-    with pytest.raises(CompileError) as error:
-        train(config, "other", machine=HERE)  # what a run's file says decides nothing either
-    assert error.value.diagnostics[0].code == "PD623"
+    before = torch.random.get_rng_state()
+    config = TrainConfig.of(load_trained("run", network=custom_network("nets:Wide")).run.config)
+    assert torch.equal(torch.random.get_rng_state(), before)
+    # What a run's file says decides nothing either.
+    assert refused_codes(train, config, "other", machine=HERE) == ["PD623"]
     assert not Path("other").exists()
 
 
-def test_a_run_of_the_u_net_refuses_another_network(dunes: str) -> None:
+def test_a_run_of_the_u_net_has_no_name_and_hostile_names_are_text(dunes: str) -> None:
     words = ("wm", "train", "--task", dunes, "--run", "run", *QUICK, "--width", 2, "--iterations", 1)
     run(*words, exits=0)
     assert "network" not in json.loads(Path("run/run.json").read_text())["config"]
     result = run("wm", "eval", "run", "--network", "nets:Wide", "--backend", "torch", exits=2)
     assert "it was trained with the paper's U-net, not with `nets:Wide`" in result.output
     assert "--width is that of the U-net" in run(*words, "--network", "nets:Wide").output
-
-
-@pytest.mark.slow
-def test_hostile_names_in_a_run_are_text(dunes: str) -> None:
-    words = ("wm", "train", "--task", dunes, "--run", "run", *QUICK, "--width", 2, "--iterations", 1)
-    run(*words, exits=0)
     about = json.loads(Path("run/run.json").read_text())
     for name in ("nets:Wide", 3, ["nets:Wide"], "nets", "os:system('x')", "a" * 5000 + ":b"):
         about["config"]["network"] = name
@@ -231,23 +223,22 @@ def test_hostile_names_in_a_run_are_text(dunes: str) -> None:
             assert "Traceback" not in output
 
 
-@pytest.mark.parametrize("command", ["wm train", "wm finetune, on: trained", "wm eval, on: trained"])
-def test_a_study_cannot_name_a_network(command: str) -> None:
-    text = f"""
+def test_a_study_cannot_name_a_network() -> None:
+    text = """
 study: mine
 seeds: 1
-vary: {{elements: [1, 4]}}
+vary: {elements: [1, 4]}
 steps:
-  trained: {{command: wm train, elements: $elements}}
-  other: {{command: {command}, network: "nets:Wide"}}
-  tested: {{command: wm eval, on: trained}}
+  trained: {command: wm train, elements: $elements, network: "nets:Wide"}
+  tuned: {command: wm finetune, on: trained, network: "nets:Wide"}
+  tested: {command: wm eval, on: trained, network: "nets:Wide"}
 measures:
-  loss: {{of: trained, value: mean/model/loss}}
+  loss: {of: trained, value: mean/model/loss}
 """
     Path("study.yaml").write_text(text, encoding="utf-8")
     code, output, imported = was_imported("study", "study.yaml", "--dry-run")
     assert (code, imported) == (2, False), output
-    assert "has no option `network`" in output
+    assert output.count("has no option `network`") == 3
 
 
 def test_names_of_networks() -> None:
