@@ -38,7 +38,7 @@ reward: {final: count(sand)}
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A task, and forty episodes of it as ids and as compact observations."""
+    """A task, forty episodes of it as ids and as compact observations, and a run that learned from the ids."""
     torch.set_num_threads(1)
     place = tmp_path_factory.mktemp("builders")
     (place / "builders.yaml").write_text(BUILDERS, encoding="utf-8")
@@ -52,6 +52,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
             observation=kind,
             backend="torch",
         )
+    train(tiny(iterations=1), place / "run", machine=HERE, recording=opened(place))
     return place
 
 
@@ -188,7 +189,6 @@ def test_train_eval_and_show(copy: Path) -> None:
 
 
 def test_a_network_is_tested_on_another_recording_of_the_task(copy: Path) -> None:
-    train(tiny(iterations=2), "run", machine=HERE, recording=opened(copy))
     record("builders.yaml", "nothing", "still", episodes=30, seed=500, backend="torch")
     tested = run("wm", "eval", "run", "--data", "still", "--json", exits=0)
     assert json.loads(tested.stdout)["worlds_each"] == 30 * 5  # all transitions but the last ones
@@ -204,10 +204,7 @@ def test_a_network_is_tested_on_another_recording_of_the_task(copy: Path) -> Non
         (("train", "--data", "ids"), "give its file: `--task FILE`"),
         (("train", "--data", "ids", "--task", "sand-pushing"), "does not fit the task sand-pushing"),
         (("train", "--data", "ids", "--task", "builders.yaml", "--states", 10), "--states selects worlds"),
-        (
-            ("train", "--data", "ids", "--task", "builders.yaml", "--held-out", "sand"),
-            "--held-out selects worlds",
-        ),
+        (("train", "--data", "ids", "--held-out", "sand"), "--held-out selects worlds"),
         (("train", "--ignore-actions"), "--ignore-actions goes with --data"),
         (("eval", "run", "--split", "train"), "--split selects worlds"),
         (("eval", "run", "--worlds", "3"), "--worlds selects worlds"),
@@ -216,24 +213,21 @@ def test_a_network_is_tested_on_another_recording_of_the_task(copy: Path) -> Non
     ],
 )
 def test_options_that_make_no_sense_are_refused(words: tuple[object, ...], said: str, copy: Path) -> None:
-    if words[1] == "run":
-        train(tiny(iterations=1), "run", machine=HERE, recording=opened(copy))
     assert said in run("wm", *words, exits=2).output
     assert not Path("runs").exists()
 
 
 def test_a_run_of_worlds_takes_no_dataset(copy: Path, dunes: str) -> None:
-    run("wm", "train", "--task", dunes, "--run", "run", *QUICK, "--states", 4, "--backend", "torch", exits=0)
-    result = run("wm", "eval", "run", "--data", "ids", exits=2)
+    run("wm", "train", "--task", dunes, "--run", "own", *QUICK, "--states", 4, "--backend", "torch", exits=0)
+    result = run("wm", "eval", "own", "--data", "ids", exits=2)
     assert "--data is for networks that learned from a dataset" in result.output
-    assert refusal(evaluate_recording, load_trained("run"), opened(copy))[0].code == "PD623"
-    recorded = load_trained(train(tiny(iterations=1), "other", machine=HERE, recording=opened(copy)))
+    assert refusal(evaluate_recording, load_trained("own"), opened(copy))[0].code == "PD623"
+    recorded = load_trained("run")
     for action in (lambda: evaluate(recorded), lambda: finetuned(recorded, ["lava"])):
         assert refusal(action)[0].code == "PD623"
 
 
 def test_another_dataset_is_another_run(copy: Path) -> None:
-    train(tiny(iterations=1), "run", machine=HERE, recording=opened(copy))
     record("builders.yaml", "nothing", "still", episodes=40, backend="torch")
     other = open_recording("still", "builders.yaml")
     errors = refusal(train, tiny(iterations=1), "run", machine=HERE, recording=other)
@@ -253,24 +247,21 @@ def test_a_manifest_does_not_choose_which_file_is_read(copy: Path) -> None:
         assert refusal(open_recording, copy / "ids")[0].code == "PD631"
 
 
-def test_a_changed_task_is_refused(copy: Path) -> None:
-    task = Path("builders.yaml")
-    task.write_text(BUILDERS.replace("brush: [4, 7]", "brush: [4, 6]"), encoding="utf-8")
-    errors = refusal(open_recording, "ids", "builders.yaml")
-    assert errors[0].code == "PD631"
-    assert "have changed since" in errors[0].notes[0]
-
-
-def test_too_few_worlds_are_refused(copy: Path) -> None:
+def test_a_changed_task_and_too_few_worlds_are_refused(copy: Path) -> None:
     record("builders.yaml", "nothing", "few", episodes=3, worlds=1, backend="torch")
-    errors = refusal(open_recording, "few", "builders.yaml")
-    assert errors[0].code == "PD631"
-    assert "too few worlds" in errors[0].message
+    (found,) = refusal(open_recording, "few", "builders.yaml")
+    assert found.code == "PD631"
+    assert "too few worlds" in found.message
+    Path("builders.yaml").write_text(BUILDERS.replace("brush: [4, 7]", "brush: [4, 6]"), encoding="utf-8")
+    (found,) = refusal(open_recording, "ids", "builders.yaml")
+    assert found.code == "PD631"
+    assert "have changed since" in found.notes[0]
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
+def test_damaged_runs_are_refused(copy: Path) -> None:
+    path = Path("run/run.json")
+    about = json.loads(path.read_text())
+    for wrong in (
         {"channels": []},
         {"channels": ["element"] * 5000},
         {"channels": ["wind", "element"]},
@@ -278,11 +269,7 @@ def test_too_few_worlds_are_refused(copy: Path) -> None:
         {"channels": ["element", "more"]},
         {"actions": False},
         {"evil": 1},
-    ],
-)
-def test_damaged_runs_are_refused(wrong: dict[str, object], copy: Path) -> None:
-    found = train(tiny(iterations=1), "run", machine=HERE, recording=opened(copy))
-    about = json.loads((found.path / "run.json").read_text())
-    about["config"]["recorded"] |= wrong
-    (found.path / "run.json").write_text(json.dumps(about))
-    assert refusal(load_trained, "run")[0].code in ("PD620", "PD623")
+    ):
+        recorded = {**about["config"]["recorded"], **wrong}
+        path.write_text(json.dumps({**about, "config": {**about["config"], "recorded": recorded}}))
+        assert refusal(load_trained, "run")[0].code in ("PD620", "PD623"), wrong

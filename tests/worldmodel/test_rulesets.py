@@ -37,11 +37,14 @@ def _task(tmp_path: Path):  # type: ignore[no-untyped-def]
 
 def test_a_number_decides_a_ruleset() -> None:
     one, other = RulesetSource(RULES, MANY), RulesetSource(RULES, MANY)
-    assert [one.draw(number) for number in range(8)] == [
-        other.draw(number) for number in (0, 1, 2, 3, 4, 5, 6, 7)
-    ]
-    assert one.draw(3) == other.draw(3)
-    assert len({one.draw(number) for number in range(8)}) == 8
+    drawn = [one.draw(number) for number in range(8)]
+    assert drawn == [other.draw(number) for number in range(8)]
+    assert one.draw(3) == drawn[3]
+    assert len(set(drawn)) == 8
+    base = RulesetSource(RULES, Variety())
+    plain = base.draw(7)
+    assert (plain.left_out, plain.swapped, plain.params) == ((), (), ())
+    assert base.model(plain) is base.base
 
 
 def test_chances_stay_within_the_factor() -> None:
@@ -54,9 +57,8 @@ def test_chances_stay_within_the_factor() -> None:
         values = [one[name] for one in drawn]
         assert default / 2 <= min(values) < 0.6 * default
         assert 1.7 * default < max(values) <= min(1.0, 2 * default) + 1e-12
-        assert sum(value < default for value in values) == pytest.approx(
-            100, abs=25
-        )  # uniform in the logarithm
+        # Uniform in the logarithm.
+        assert sum(value < default for value in values) == pytest.approx(100, abs=25)
 
 
 def test_swapped_elements_have_each_others_property() -> None:
@@ -140,19 +142,8 @@ def test_unknown_properties_and_bad_numbers_are_refused() -> None:
 
 
 def test_seeds_may_have_rulesets_of_their_own(task) -> None:  # type: ignore[no-untyped-def]
-    first, other = (
-        task_worlds(
-            DataConfig(task, rulesets=2, first_ruleset=number, variety=MANY), backend="torch"
-        ).rulesets
-        for number in (0, 1)
-    )
+    data = [DataConfig(task, rulesets=2, first_ruleset=number, variety=MANY) for number in (0, 1)]
+    first, other = (task_worlds(one, backend="torch").rulesets for one in data)
     assert [one.number for one in other] == [1, 2]
     assert other[0] == first[1]
     assert other[1] not in first
-
-
-def test_without_variety_a_ruleset_is_the_base() -> None:
-    source = RulesetSource(RULES, Variety())
-    drawn = source.draw(7)
-    assert (drawn.left_out, drawn.swapped, drawn.params) == ((), (), ())
-    assert source.model(drawn) is source.base

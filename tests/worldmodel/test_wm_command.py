@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +11,8 @@ import pytest
 from PIL import Image
 
 from powderdsl.compiler import load
-from tests.cli.commands import ROOT
 from tests.cli.commands import powderdsl as run
-from tests.processes import started, waited
+from tests.cli.endless import COMMANDS, Place, last_step
 
 QUICK = ("--width", 4, "--batch", 4, "--buffer", 32, "--refresh", 2, "--states", 100, "--backend", "torch")
 
@@ -79,19 +75,14 @@ def test_the_curve_of_a_training(dunes: str, tmp_path: Path) -> None:
     assert "nothing has been written yet" in run(*losses, exits=2).output
 
 
-def test_packs_take_all_words_up_to_the_next_option(dunes: str, tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    run(*begin(dunes, folder, "--packs", "core", "sand", "--iterations", 1), exits=0)
-    data = json.loads((folder / "run.json").read_text())["config"]["data"]
-    assert load(data["rules"]).packs == ("core", "sand")
-
-
 def test_preset_and_options_make_the_configuration(tmp_path: Path, dunes: str) -> None:
     folder = tmp_path / "run"
-    run(*begin(dunes, folder, "--preset", "paper", "--knob", "kinds=2", "--iterations", 1, "--seed", 5))
+    given = ("--preset", "paper", "--knob", "kinds=2", "--iterations", 1, "--seed", 5)
+    run(*begin(dunes, folder, "--packs", "core", "sand", *given), exits=0)
     config = json.loads((folder / "run.json").read_text())["config"]
     assert (config["learning_rate"], config["seed"], config["batch"]) == (0.005, 5, 4)
     assert config["data"]["knobs"] == {"kinds": 2}
+    assert load(config["data"]["rules"]).packs == ("core", "sand")
 
 
 @pytest.mark.parametrize(
@@ -123,17 +114,13 @@ def test_bad_input_is_said_and_nothing_is_begun(
 
 
 @pytest.mark.slow
-def test_ctrl_c_saves_and_says_how_to_go_on(dunes: str, tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    words = [str(word) for word in begin(dunes, folder, "--iterations", 100_000)]
-    lines = folder / "metrics.jsonl"
-    command = [sys.executable, "-m", "powderdsl", *words]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    with started(command, stderr=subprocess.PIPE, env=environment) as process:
-        assert waited(lambda: lines.exists() and "loss/train" in lines.read_text())
+def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: Path) -> None:
+    place, command = Place(tmp_path), COMMANDS["wm train"]
+    with place.begun(command) as process:
+        assert place.busy(command, process), place.said()
         process.send_signal(signal.SIGINT)
-        _, told = process.communicate(timeout=240)
-    assert process.returncode == 130, told
-    assert f"interrupted; the same command continues in {folder}" in told
-    assert "Traceback" not in told
-    assert len(list((folder / "checkpoints").glob("*.safetensors"))) == 1
+        assert process.wait(timeout=240) == 130, place.said()
+    assert "interrupted; the same command continues in model" in place.said()
+    assert "Traceback" not in place.said()
+    (saved,) = place.checkpoint_steps().values()
+    assert saved >= last_step(tmp_path / "model" / "metrics.jsonl") > 0
