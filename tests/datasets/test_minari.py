@@ -192,9 +192,14 @@ def value(name: str, new: Any) -> Any:
     return broken_file(change)
 
 
+STRANGER = {"id": "any-v0", "entry_point": "pathlib:Path.touch", "kwargs": {"self": "bad"}}
+"""Minari makes the environment of a dataset that lacks a space, with whatever function it names."""
+
+
 @pytest.mark.parametrize(
     ("damage", "says"),
     [
+        (broken_metadata(lambda data: data.pop("action_space") and data.update(env_spec=json.dumps(STRANGER))), "its metadata lack action_space"),
         (lambda folder: (folder / "metadata.json").write_text("{"), "cannot be imported"),
         (lambda folder: (folder / "metadata.json").write_text("[]"), "cannot be imported"),
         (lambda folder: (folder / "main_data.hdf5").write_bytes(b"no"), "episode_0: "),
@@ -222,22 +227,6 @@ def test_damaged_minari_datasets_are_refused(
         from_minari(ID, tmp_path / "a")
     assert {one.code for one in caught.value.diagnostics} == {"PD630"}
     assert says in str(caught.value)
-
-
-def test_an_environment_named_by_a_stranger_is_not_made(
-    recorded: Dataset, root: Path, tmp_path: Path
-) -> None:
-    """Minari makes the environment of a dataset that lacks a space, with whatever function it names."""
-    to_minari(recorded, ID)
-    spec = {"id": "any-v0", "entry_point": "pathlib:Path.touch", "kwargs": {"self": str(tmp_path / "bad")}}
-
-    def change(data: dict[str, Any]) -> None:
-        del data["action_space"]
-        data["env_spec"] = json.dumps(spec)
-
-    broken_metadata(change)(root / ID / "data")
-    with pytest.raises(CompileError, match="its metadata lack action_space"):
-        from_minari(ID, tmp_path / "a")
 
 
 def test_flipped_bytes_are_seen_or_change_numbers(recorded: Dataset, root: Path, tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from powderdsl.datasets.dataset import Batch
 from powderdsl.datasets.manifest import FILE, read_manifest, write_manifest
 from powderdsl.diagnostics import CompileError
 from powderdsl.tasks.episodes import TaskProgram
-from tests.datasets.test_reading import numbered
+from tests.datasets.test_reading import numbered, windows_of
 from tests.refusals import refusal
 
 LENGTHS = [3, 1, 7, 2, 5, 5, 1, 4, 6, 2, 3]
@@ -46,12 +46,7 @@ def loader(data: Any, processes: tuple[int, str | None], **options: Any) -> Data
 
 def names(batch: Batch) -> list[tuple[int, int]]:
     """The (episode, action) of each transition of a batch, whose parts must belong together."""
-    episode, t = batch.observation[:, 0, 0, 0].long(), batch.observation[:, 0, 0, 1].long()
-    assert torch.equal(batch.next_observation[:, 0, 0, 0].long(), episode)
-    assert torch.equal(batch.next_observation[:, 0, 0, 1].long(), t + 1)
-    assert torch.equal(batch.reward, t + 100.0 * episode)
-    assert torch.equal(batch.success, t + 1 == torch.tensor(LENGTHS)[episode])
-    return list(zip(episode.tolist(), t.tolist(), strict=True))
+    return windows_of(Batch(*(value[:, None] for value in batch)), LENGTHS)
 
 
 # By number
@@ -94,29 +89,22 @@ def test_sequences_by_number_are_all_windows(counted: Dataset) -> None:
     wanted = [(e, t) for e, length in enumerate(LENGTHS) for t in range(length - 2)]
     (batch,) = DataLoader(rows, batch_size=len(rows))
     assert batch.observation.shape == (len(wanted), 3, 1, 1, 2)
-    assert names(Batch(*(value[:, 0] for value in batch))) == wanted
-    assert names(Batch(*(value[:, 2] for value in batch))) == [(e, t + 2) for e, t in wanted]
+    assert windows_of(batch, LENGTHS) == wanted
     assert rows[0].reward.shape == (3,)
     with pytest.raises(ValueError, match="length must be an integer from 1 to 7"):
         Transitions(counted, length=8)
 
 
 def test_several_folders_follow_one_another(recorded: Dataset, tmp_path: Path) -> None:
-    parts = []
+    parts, wanted = [], []
     for name, lengths in (("a", [2, 3]), ("b", [4]), ("c", [1, 2, 2])):
         (tmp_path / name).mkdir()
         parts.append(numbered(tmp_path / name, recorded.recipe, lengths, 2, compress=False))
+        wanted += [[e, t] for e, length in enumerate(lengths) for t in range(length)]
     rows = Transitions(parts)
-    assert len(rows) == 5 + 4 + 5
-    wanted = [
-        (e, t)
-        for lengths in ([2, 3], [4], [1, 2, 2])
-        for e, length in enumerate(lengths)
-        for t in range(length)
-    ]
+    assert len(rows) == len(wanted)
     order = torch.randperm(len(rows), generator=torch.Generator().manual_seed(0)).tolist()
-    shown = rows[order].observation[:, 0, 0].tolist()
-    assert shown == [list(wanted[i]) for i in order]
+    assert rows[order].observation[:, 0, 0].tolist() == [wanted[i] for i in order]
 
 
 def test_folders_of_other_meaning_are_refused(recorded: Dataset, tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from importlib.util import find_spec
@@ -17,10 +16,12 @@ from pathlib import Path
 
 import pytest
 
+from powderdsl.cli.commands.study import commands
 from powderdsl.diagnostics import Reporter, Source
+from powderdsl.experiments.runs import read_metrics
 from powderdsl.experiments.studies import run as on_cluster
 from powderdsl.experiments.studies.run import StudyRun
-from powderdsl.experiments.studies.study import TASK, TEXT, Study, read_study
+from powderdsl.experiments.studies.study import Study, read_study
 from powderdsl.system.writing import MARK
 from tests.cli.commands import command_line, environment_with, powderdsl
 from tests.cli.endless import TASK as DIG
@@ -56,12 +57,7 @@ def run_study(folder: Path, *words: str, seconds: float = 900) -> subprocess.Com
 
 
 def read(text: str) -> Study:
-    names = ("on", "run", "seed", "steps", "device", "policies", "episodes", "checkpoint-every")
-    names += ("preset", "envs", "rollout", "batch", "backend")
-    known = {("train",): dict.fromkeys(names, TEXT), ("evaluate",): dict.fromkeys(names[:-6], TEXT)}
-    known["train",] |= {"on": TASK}
-    del known["evaluate",]["run"]
-    return read_study(Source("study.yaml", text), Reporter(), known)
+    return read_study(Source("study.yaml", text), Reporter(), commands())
 
 
 def test_a_run_declares_what_it_needs() -> None:
@@ -180,9 +176,10 @@ def test_ten_deaths_change_no_number(tmp_path: Path) -> None:
     for name in RESULTS:
         assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "undisturbed" / name).read_bytes()
     for run in (tmp_path / "out/runs").glob("*"):
-        steps = list(_steps(run / "trained/metrics.jsonl"))
+        steps = [line["step"] for line in read_metrics(run / "trained")]
         assert steps == list(range(12, steps[-1] + 1, 12)), run  # no line is lost or written twice
-        assert steps == list(_steps(tmp_path / "undisturbed/runs" / run.name / "trained/metrics.jsonl"))
+        whole = read_metrics(tmp_path / "undisturbed/runs" / run.name / "trained")
+        assert steps == [line["step"] for line in whole]
     left = [path for path in (tmp_path / "out").rglob("*") if MARK in path.name]
     assert left == []
 
@@ -206,19 +203,11 @@ class _Driver:
 
 
 def _finished(folder: Path) -> dict[str, tuple[int, int]]:
-    found = {}
-    for path in folder.glob("done/*.json"):
-        about = path.stat()
-        found[path.name] = about.st_ino, about.st_mtime_ns
-    return found
+    stats = {path.name: path.stat() for path in folder.glob("done/*.json")}
+    return {name: (one.st_ino, one.st_mtime_ns) for name, one in stats.items()}
 
 
 def _compare(before: dict[str, tuple[int, int]], now: dict[str, tuple[int, int]]) -> None:
     """What is done stays done, and is not done again."""
     assert {name: now.get(name) for name in before} == before
     before.update(now)
-
-
-def _steps(metrics: Path) -> Iterator[int]:
-    for line in metrics.read_text(encoding="utf-8").splitlines():
-        yield json.loads(line)["step"]

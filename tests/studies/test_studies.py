@@ -31,6 +31,7 @@ from powderdsl.experiments.studies.study import (
     read_study,
 )
 from tests.refusals import refusal
+from tests.studies.test_ray import written
 
 KNOWN: Mapping[tuple[str, ...], Mapping[str, str]] = {
     ("train",): {"on": TASK, **dict.fromkeys(("run", "seed", "steps", "knob"), TEXT)},
@@ -144,30 +145,39 @@ def test_an_interval_is_that_of_student() -> None:
 
 
 @pytest.mark.parametrize(
-    ("mean", "half", "text"),
+    ("found", "scale", "text"),
     [
-        (0.12345, 0.0067, "0.1235 ± 0.0067"),
-        (12.3, 3.4, "12.3 ± 3.4"),
-        (1.0, math.inf, "1"),
-        (250.0, 31.0, "250 ± 31"),
+        ((0.12345, 0.11675, 0.13015), "linear", "0.1235 ± 0.0067"),
+        ((12.3, 8.9, 15.7), "linear", "12.3 ± 3.4"),
+        ((1.0, -math.inf, math.inf), "linear", "1"),
+        ((250.0, 219.0, 281.0), "linear", "250 ± 31"),
+        ((0.5, 0.25, 1.0), "log", "0.500 (0.250 to 1.00)"),
     ],
 )
-def test_numbers_are_rounded_by_their_interval(mean: float, half: float, text: str) -> None:
-    assert show_interval(Interval(mean, mean - half, mean + half)) == text
+def test_numbers_are_rounded_by_their_interval(
+    found: tuple[float, float, float], scale: str, text: str
+) -> None:
+    assert show_interval(Interval(*found), scale) == text
 
 
-def test_factors_are_shown_with_both_ends() -> None:
-    assert show_interval(Interval(0.5, 0.25, 1.0), "log") == "0.500 (0.250 to 1.00)"
-
-
-def test_verdicts_follow_the_intervals() -> None:
-    study = read(TEXT.replace("  squares: [0, 5]\n", "").replace(", squares=$squares", ""))
-    (rose,) = findings(study, outcomes(study, {("100",): (1.0, 1.1, 0.9), ("200",): (2.0, 2.1, 2.0)}))
-    assert rose.verdict.startswith("rises (last − first: +1.03")
-    (noise,) = findings(study, outcomes(study, {("100",): (1.0, 3.0, 0.9), ("200",): (2.0, 2.1, 2.0)}))
-    assert "rises, but the interval holds 0" in noise.verdict
-    (fell,) = findings(study, outcomes(study, {("100",): (2.0, 2.0, 2.0), ("200",): (1.0, 1.0, 1.0)}))
-    assert fell.verdict.startswith("does not rise")
+@pytest.mark.parametrize(
+    ("first", "last", "scale", "verdict"),
+    [
+        ((1.0, 1.1, 0.9), (2.0, 2.1, 2.0), "linear", "rises (last − first: +1.03"),
+        ((1.0, 3.0, 0.9), (2.0, 2.1, 2.0), "linear", "rises, but the interval holds 0"),
+        ((2.0, 2.0, 2.0), (1.0, 1.0, 1.0), "linear", "does not rise"),
+        ((1.0, 2.0, 4.0), (2.0, 4.0, 8.0), "log", "rises (last / first: 2.00 (2.00 to 2.00))"),
+        ((1.0, 2.0, 4.0), (2.0, 1.0, 9.0), "log", "rises, but the interval holds 1"),
+    ],
+)
+def test_verdicts_follow_the_intervals(
+    first: tuple[float, ...], last: tuple[float, ...], scale: str, verdict: str
+) -> None:
+    text = TEXT.replace("  squares: [0, 5]\n", "").replace(", squares=$squares", "")
+    study = read(text.replace("expect: rises", f"expect: rises, scale: {scale}"))
+    (found,) = findings(study, outcomes(study, {("100",): first, ("200",): last}))
+    assert found.verdict.startswith(verdict)
+    assert found.cells[0].over_seeds == interval(first, scale)
 
 
 def test_each_value_of_another_setting_has_a_verdict_of_its_own() -> None:
@@ -184,16 +194,6 @@ def test_each_value_of_another_setting_has_a_verdict_of_its_own() -> None:
     assert one.startswith("squares 0: rises (last − first: +1.00")
     assert other.startswith("squares 5: does not rise (last − first: -8.1")
     assert as_markdown(study, "small", outcomes(study, points)).count("- ") == 2
-
-
-def test_ratios_are_compared_on_the_scale_log() -> None:
-    text = TEXT.replace("  squares: [0, 5]\n", "").replace(", squares=$squares", "")
-    study = read(text.replace("expect: rises", "expect: rises, scale: log"))
-    (rose,) = findings(study, outcomes(study, {("100",): (1.0, 2.0, 4.0), ("200",): (2.0, 4.0, 8.0)}))
-    assert rose.verdict == "rises (last / first: 2.00 (2.00 to 2.00))"
-    assert rose.cells[0].over_seeds.mean == pytest.approx(2.0)
-    (noise,) = findings(study, outcomes(study, {("100",): (1.0, 2.0, 4.0), ("200",): (2.0, 1.0, 9.0)}))
-    assert "but the interval holds 1" in noise.verdict
 
 
 def test_a_table_names_what_did_not_finish(tmp_path: Path) -> None:
@@ -219,30 +219,9 @@ def test_words_have_a_figure_too(tmp_path: Path) -> None:
     assert "| lines+disks | 0.191 (" in as_markdown(study, "small", found)
 
 
-TINY = """
-task: dig
-rules: core+sand
-size: [8, 8]
-fill: sand
-agent: {may: [empty], brush: 2, bins: 4, actions: 3}
-reward: {final: count(empty)}
-splits: {test: {generate: [frame wall]}}
-"""
-
-
 def test_a_study_runs_goes_on_and_refuses_another(folder: Path) -> None:
-    Path("dig.yaml").write_text(TINY, encoding="utf-8")
-    text = """
-study: tiny
-about: Nothing much.
-seeds: 1
-vary: {steps: [12, 24]}
-steps:
-  trained: {command: train, on: dig.yaml, preset: small, envs: 4, rollout: 3, batch: 12, backend: torch, steps: $steps, seed: $seed}
-  tested: {command: evaluate, on: trained, episodes: 4}
-measures:
-  reward: {of: trained, value: splits/test/trained/mean, expect: rises}
-"""
+    written(folder, 1, [12, 24])
+    text = Path("study.yaml").read_text(encoding="utf-8")
     study = read_study(Source("study.yaml", text), Reporter(), commands())
     points = list(study.points("small"))
     run = StudyRun(study, folder / "out", "small")
