@@ -37,7 +37,7 @@ def test_what_is_written_is_read_back(ids):
 def test_a_legend_wins_over_glyphs():
     # `s` is sand's glyph: with this legend it means water, and sand is written as `□`.
     drawing = Span(Source("drawing", "s□."), 0, 3)
-    ids = parse_ascii(drawing, ELEMENTS, Reporter(), {"s": "water", "□": "core.sand"})
+    ids = parse_ascii(drawing, ELEMENTS, Reporter(), {"s": "water", "□": "sand.sand"})
     assert ids.tolist() == [[3, 2, 0]]
     with pytest.raises(CompileError, match=r"PD604.*`watr`[\s\S]*did you mean `water`"):
         parse_ascii(drawing, ELEMENTS, Reporter(), {"w": "watr"})

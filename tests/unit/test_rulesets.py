@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from fractions import Fraction
 from pathlib import Path
 
@@ -19,10 +18,10 @@ MEADOW = "ruleset: meadow\nextends: powderworld\nwithout: gas\npacks: grit\npara
 
 @pytest.fixture(autouse=True)
 def _folder(folder: Path) -> None:
-    write({"grit": PACK, "meadow": MEADOW})
+    write(grit=PACK, meadow=MEADOW)
 
 
-def write(files: Mapping[str, str]) -> None:
+def write(**files: str) -> None:
     for name, text in files.items():
         Path(f"{name}.yaml").write_text(text, encoding="utf-8")
 
@@ -49,9 +48,8 @@ def test_a_ruleset_has_the_packs_parameters_and_channels_of_its_base() -> None:
 
 
 def test_what_a_ruleset_says_itself_counts_more() -> None:
-    write(
-        {"small": "ruleset: small\nextends: meadow\nmatrix: [elements, density]\nparams: {water.melt: 20%}\n"}
-    )
+    own = "matrix: [elements, density]\nparams: {water.melt: 20%}\n"
+    write(small=f"ruleset: small\nextends: meadow\n{own}")
     found = library.load("small.yaml")
     assert [channel.name for channel in found.matrix if channel.id is None] == ["density"]
     assert {one.name: one.default for one in found.params}["water.melt"] == Fraction(1, 5)
@@ -59,30 +57,22 @@ def test_what_a_ruleset_says_itself_counts_more() -> None:
 
 
 def test_names_are_inherited() -> None:
-    write(
-        {
-            "named": "ruleset: named\npacks: [core, grit]\nrename: {grit.grit: gravel}\n",
-            "again": "ruleset: again\nextends: named\n",
-        }
-    )
+    write(named="ruleset: named\npacks: [core, grit]\nrename: {grit.grit: gravel}\n")
+    write(again="ruleset: again\nextends: named\n")
     assert library.load("again.yaml").element("gravel") is not None
 
 
 def test_a_pack_of_ones_own_takes_the_place_of_one_of_the_base() -> None:
     own = PACK.replace("pack: grit", "pack: gas").replace("grit: {id: 200,", "grit: {")
-    write({"gas": own, "dusty": "ruleset: dusty\nextends: powderworld\nwithout: gas\npacks: gas\n"})
+    write(gas=own, dusty="ruleset: dusty\nextends: powderworld\nwithout: gas\npacks: gas\n")
     found = library.load("dusty.yaml")
     assert found.element("gas.grit") is not None
     assert found.name == "dusty"
 
 
 def test_the_invariants_of_the_base_speak_of_the_base() -> None:
-    write(
-        {
-            "grit": PACK + "also: {wood: {tags: fluid, gravity: yes}}\n",
-            "meadow": MEADOW + "invariants: [count(wall) is constant]\n",
-        }
-    )
+    write(grit=PACK + "also: {wood: {tags: fluid, gravity: yes}}\n")
+    write(meadow=MEADOW + "invariants: [count(wall) is constant]\n")
     found = library.load("meadow.yaml")
     scopes = {one.pack: one.scope for one in found.invariants}
     assert scopes["meadow"] == found.packs
@@ -90,19 +80,15 @@ def test_the_invariants_of_the_base_speak_of_the_base() -> None:
 
 
 def test_leaving_a_pack_out_leaves_its_parameters_out() -> None:
-    write({"wet": "ruleset: wet\npacks: [core, sand, water]\nparams: {water.melt: 50%}\n"})
+    write(wet="ruleset: wet\npacks: [core, sand, water]\nparams: {water.melt: 50%}\n")
     assert library.load("wet.yaml-water").packs == ("core", "sand")
 
 
 def test_lines_of_a_ruleset_about_what_is_left_out_sleep() -> None:
     lines = "matrix: [elements, density, whiff]\ninvariants: [count(grit) never rises, wall never changes]\n"
-    write(
-        {
-            "grit": PACK + "fields: {whiff: {type: 0..9, at: place}}\n",
-            "airy": f"ruleset: airy\npacks: [core, grit]\n{lines}",
-            "still": "ruleset: still\nextends: airy\nwithout: grit\n",
-        }
-    )
+    write(grit=PACK + "fields: {whiff: {type: 0..9, at: place}}\n")
+    write(airy=f"ruleset: airy\npacks: [core, grit]\n{lines}")
+    write(still="ruleset: still\nextends: airy\nwithout: grit\n")
     for rules in ("airy.yaml-grit", "still.yaml"):
         found = library.load(rules)
         assert [one.span.text for one in found.invariants if one.pack == "airy"] == ["wall never changes"]
@@ -114,13 +100,13 @@ def test_lines_of_a_ruleset_about_what_is_left_out_sleep() -> None:
 
 
 def test_a_circle_of_rulesets_is_an_error_with_its_place() -> None:
-    write({"one": "ruleset: one\nextends: two\n", "two": "ruleset: two\nextends: one\n"})
+    write(one="ruleset: one\nextends: two\n", two="ruleset: two\nextends: one\n")
     assert errors_of("one.yaml") == [("PD314", "two.yaml", 2)]
 
 
 def test_rulesets_in_a_row_are_bounded() -> None:
-    write({f"r{n}": f"ruleset: r{n}\nextends: r{n + 1}\n" for n in range(MAX_BASES + 2)})
-    write({f"r{MAX_BASES + 2}": "ruleset: last\npacks: core\n"})
+    write(**{f"r{n}": f"ruleset: r{n}\nextends: r{n + 1}\n" for n in range(MAX_BASES + 2)})
+    write(**{f"r{MAX_BASES + 2}": "ruleset: last\npacks: core\n"})
     assert errors_of("r0.yaml") == [("PD508", f"r{MAX_BASES}.yaml", 2)]
     assert library.load("r2.yaml").packs == ("core",)
 
@@ -139,7 +125,7 @@ def test_rulesets_in_a_row_are_bounded() -> None:
     ],
 )
 def test_mistakes_have_a_place(text: str, code: str, line: int) -> None:
-    write({"wrong": f"ruleset: wrong\n{text}\n"})
+    write(wrong=f"ruleset: wrong\n{text}\n")
     assert errors_of("wrong.yaml") == [(code, "wrong.yaml", line)]
 
 
@@ -192,7 +178,7 @@ invariants:
 
 
 def test_warnings_about_a_pack_that_others_bring_about_are_notes() -> None:
-    write({"pool": POOL, "soak": "pack: soak\nneeds: pool\nalso: {reed: wet, mud: wet}\n"})
+    write(pool=POOL, soak="pack: soak\nneeds: pool\nalso: {reed: wet, mud: wet}\n")
     assert all(one.severity is Severity.NOTE for one in load_with_diagnostics("pool.yaml")[1])
     _, remarks = load_with_diagnostics("pool.yaml+soak.yaml")
     told = {one.message for one in remarks if one.code == "PD515"}
@@ -204,11 +190,6 @@ def test_warnings_about_a_pack_that_others_bring_about_are_notes() -> None:
 
 
 def test_warnings_that_a_pack_deserves_stay_warnings() -> None:
-    write(
-        {
-            "pool": POOL.replace('reed: {color: "#30A030"}', 'reed: {color: "#30A030", tags: wet}'),
-            "grit": PACK,
-        }
-    )
+    write(pool=POOL.replace('reed: {color: "#30A030"}', 'reed: {color: "#30A030", tags: wet}'))
     _, remarks = load_with_diagnostics("core+pool.yaml+grit.yaml")
     assert [one.code for one in remarks if one.severity is Severity.WARNING] == ["PD514"]

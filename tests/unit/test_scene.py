@@ -9,26 +9,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import powderdsl
 from powderdsl.diagnostics import CODES, CompileError, Reporter, Source, Span
 from powderdsl.worlds.raster import MAX_COORDINATE, Shape, mask
 from powderdsl.worlds.scene import draw_start, find_scene
 from powderdsl.worlds.scene.read import parse_statement, read_file, read_scenes
 from powderdsl.worlds.scene.statements import STATEMENTS
 from tests.refusals import refusal, refused_codes
-from tests.unit.elements import ELEMENTS, ID, RULES, Rules
+from tests.unit.elements import RULES
 
 ROOT = Path(__file__).resolve().parents[2]
 DESIGNED = ROOT / "tasks" / "scenes" / "designed.yaml"
-NAMES = (
-    "sand-on-water",
-    "stone-arches",
-    "ice-and-plants",
-    "burning-vines",
-    "acid-on-wood",
-    "water-flowing",
-    "dust-on-lava",
-    "gas-flowing",
-)
 
 
 def line(start: tuple[int, int], end: tuple[int, int], width: int) -> Shape:
@@ -122,13 +113,13 @@ def load_scene(place: str | Path, rules, **options) -> np.ndarray:
 
 def test_the_designed_worlds_are_the_recorded_ones_cell_for_cell():
     recorded = np.load(ROOT / "tests" / "data" / "population.npz")["start_ids"]
-    scenes = {scene.name: draw_start(scene, RULES).ids for scene in read_file(DESIGNED)}
-    assert tuple(scenes) == NAMES
-    for name, expected in zip(NAMES, recorded, strict=True):
-        assert scenes[name].dtype == np.uint8
-        assert np.array_equal(scenes[name], expected), name
-        assert np.array_equal(load_scene(name, RULES), expected), name
-        assert np.array_equal(load_scene(f"{DESIGNED}#{name}", RULES), expected), name
+    names = [scene.name for scene in read_file(DESIGNED)]
+    assert (names[0], names[-1]) == ("sand-on-water", "gas-flowing")
+    for name, expected in zip(names, recorded, strict=True):
+        for place in (name, f"{DESIGNED}#{name}"):
+            found = load_scene(place, RULES)
+            assert found.dtype == np.uint8
+            assert np.array_equal(found, expected), name
 
 
 SMALL = """scene: small
@@ -146,37 +137,29 @@ def load(tmp_path: Path, text: str, **options) -> np.ndarray:
     return load_scene(path, RULES, **options)
 
 
-def test_draw_may_be_a_block_with_comments(tmp_path):
+def test_draw_may_be_a_block_with_comments_or_missing(tmp_path):
     text = """scene: small
 size: [4, 5]
-fill: empty
+fill: water.ice
 draw: |
   # the ground
   box sand rows 2: columns 3:
 
   disk water at (0, 0) radius 1   # a drop
 """
-    assert load(tmp_path, text).tolist() == [[3, 0, 0, 0, 0], [0] * 5, [0, 0, 0, 2, 2], [0, 0, 0, 2, 2]]
+    assert load(tmp_path, text).tolist() == [[3, 6, 6, 6, 6], [6] * 5, [6, 6, 6, 2, 2], [6, 6, 6, 2, 2]]
+    assert load(tmp_path, text.partition("draw")[0]).tolist() == [[6] * 5] * 4
 
 
 def test_another_size_moves_the_frame_and_open_ends_and_nothing_else(tmp_path):
     text = SMALL.replace("rows 2:", "rows 2:end")
-    assert load(tmp_path, text, size=(5, 3)).tolist() == [
-        [1, 1, 1],
-        [1, 0, 1],
-        [1, 2, 1],
-        [1, 2, 1],
-        [1, 1, 1],
-    ]
-
-
-def test_a_scene_without_statements_is_its_fill(tmp_path):
-    assert (load(tmp_path, "scene: lake\nsize: [2, 3]\nfill: core.water\n") == ID["water"]).all()
+    wall = [1, 1, 1]
+    assert load(tmp_path, text, size=(5, 3)).tolist() == [wall, [1, 0, 1], [1, 2, 1], [1, 2, 1], wall]
 
 
 def test_elements_need_only_be_known_where_they_are_drawn():
     """A ruleset without some element still has the scenes that do not use it."""
-    few = Rules(tuple(element for element in ELEMENTS if element.name in ("empty", "wall", "sand", "water")))
+    few = powderdsl.load("core+sand+water")
     assert load_scene(f"{DESIGNED}#sand-on-water", few).shape == (64, 64)
     errors = refusal(load_scene, f"{DESIGNED}#stone-arches", few)
     assert {found.code for found in errors} == {"PD604"}
@@ -209,7 +192,6 @@ HEAD = "scene: bad\nsize: [8, 8]\nfill: empty\ndraw:\n"
         ("disk sand at (1, 99999999999999999999) radius 2", "PD606", "99999999999999999999"),
         ("disk sand at (20, 20) radius 3", "PD608", "disk sand at (20, 20) radius 3"),
         ("line wall from (0, 0) to (3, 3)", "PD605", "\n"),
-        ("line wall from (-9, 0) to (-9, 5) width 1", "PD608", "line wall from (-9, 0) to (-9, 5) width 1"),
         ("box water rows 5:3", "PD606", "5:3"),
         ("box water rows -2:4", "PD606", "-2"),
         ("box water rows 1:2:3", "PD605", ":"),
@@ -220,7 +202,6 @@ HEAD = "scene: bad\nsize: [8, 8]\nfill: empty\ndraw:\n"
         ("disk sand at (1..3, 1) radius 2", "PD605", "1..3"),
         ("fill sand in slot", "PD605", "slot"),
         ("fill sand over water", "PD605", "water"),
-        ("frame wåll", "PD605", "å"),
         ('"frame \\"wall\\""', "PD605", '"frame \\"wall\\""'),
         ('""', "PD605", '"'),
         ("frame " + "x" * 2000, "PD605", "f"),

@@ -11,8 +11,8 @@ import powderdsl
 from powderdsl.worlds.scene import load_start
 from tests.cli.commands import powderdsl as command
 from tests.refusals import refusal
+from tests.unit.elements import RULES
 
-RULES = powderdsl.load("powderworld")
 HEAD = "scene: small\nsize: [4, 6]\nfill: empty\ndraw:\n"
 
 
