@@ -14,13 +14,14 @@ from powderdsl.datasets import Dataset, record
 from powderdsl.envs.acting import FrameStack
 from powderdsl.envs.sb3 import PowderVecEnv
 from powderdsl.envs.tensor_env import TensorEnv
+from powderdsl.experiments.runs import read_metrics
 from powderdsl.rl import evaluate, load_policy, train
 from powderdsl.rl.fcn import BinPolicy, fcn_policy
 from powderdsl.syntax.sources import shipped
 from powderdsl.system.fingerprint import fingerprint
 from powderdsl.tasks.episodes import compile_task
 from powderdsl.tasks.shipped import load_task, shipped_tasks
-from tests.refusals import refusal
+from tests.refusals import refusal, refused_codes
 from tests.rl.tiny_tasks import DIG, PLACE, quick, write_task
 from tests.states import same
 
@@ -72,10 +73,7 @@ def test_a_policy_takes_the_expert_from_a_dataset(tmp_path: Path) -> None:
     assert [one.policy for one in (trained, expert, nothing)] == ["trained", "expert", "nothing"]
     assert trained.normalized.mean > 0.8
     assert at_random.normalized.mean < 0.4
-    (cloned,) = [
-        line for line in (run.path / "metrics.jsonl").read_text().splitlines() if "clone/loss" in line
-    ]
-    assert '"step": 0' in cloned
+    assert [line["step"] for line in read_metrics(run.path) if "clone/loss" in line] == [0]
     # The dataset is not needed again.
     (tmp_path / "data").rename(tmp_path / "elsewhere")
     assert train(quick(task, steps=40, learning_rate=1e-9, **how), tmp_path / "run").checkpoint().step == 64
@@ -113,11 +111,9 @@ def test_a_dataset_of_another_task_is_refused(tmp_path: Path) -> None:
     other.mkdir()
     record(load_task(write_task(other, PLACE)), "random", tmp_path / "data", episodes=4, backend="wasm")
     config = quick(write_task(tmp_path), init_from=str(tmp_path / "data"))
-    assert refusal(train, config, tmp_path / "run")[0].code == "PD631"
-    assert (
-        refusal(train, replace(config, init_from=str(tmp_path / "nothing")), tmp_path / "run2")[0].code
-        == "PD630"
-    )
+    assert refused_codes(train, config, tmp_path / "run") == ["PD631"]
+    config = replace(config, init_from=str(tmp_path / "nothing"))
+    assert refused_codes(train, config, tmp_path / "run2") == ["PD630"]
 
 
 def test_shaped_rewards_change_training_alone(tmp_path: Path) -> None:
@@ -129,10 +125,8 @@ def test_shaped_rewards_change_training_alone(tmp_path: Path) -> None:
     assert returns[0] != returns[1]
     scores = [evaluate(run, policies=["nothing"], episodes=8).scores for run in (plain, shaped)]
     assert scores[0] == scores[1]  # of the task's own reward
-    assert (
-        refusal(train, quick(write_task(tmp_path, PLACE), reward="shaped"), tmp_path / "none")[0].code
-        == "PD640"
-    )
+    unshaped = quick(write_task(tmp_path, PLACE), reward="shaped")
+    assert refused_codes(train, unshaped, tmp_path / "none") == ["PD640"]
 
 
 SHAPED = [
@@ -185,14 +179,8 @@ def test_a_policy_sees_the_frames_that_it_learned_from(tmp_path: Path) -> None:
     observed, _ = env.reset(seed=1)
     assert policy(FrameStack(2).push(observed), torch.zeros(2, dtype=torch.int64)).shape == (2, 5)
     assert len(evaluate(run, policies=["trained"], episodes=4).scores) == 2
-    record(
-        load_task(tmp_path / "task.yaml"),
-        policy,
-        tmp_path / "data",
-        episodes=4,
-        policy_name="two frames",
-        backend="wasm",
-    )
+    task = load_task(tmp_path / "task.yaml")
+    record(task, policy, tmp_path / "data", episodes=4, policy_name="two frames", backend="wasm")
 
 
 @pytest.mark.parametrize("network", ["small", "fcn"])
@@ -206,22 +194,14 @@ def test_held_out_evaluation_changes_no_weights(tmp_path: Path, network: str) ->
     assert same(states[0]["random"], states[1]["random"])
 
 
-@pytest.mark.parametrize(("steps", "left"), [(1, 1), (33, 1 / 2), (64, 1 / 2), (65, 1 / 3)])
-def test_a_falling_rate_is_positive_in_the_last_rollout(steps: int, left: float, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("steps", "rollouts"), [(1, 1), (33, 2), (64, 2), (65, 3)])
+def test_a_falling_rate_is_positive_in_the_last_rollout(steps: int, rollouts: int, tmp_path: Path) -> None:
     config = quick(write_task(tmp_path), schedule="linear", steps=steps)
     assert config.envs * config.rollout == 32
-    state = train(config, tmp_path / "run").checkpoint().state
-    (group,) = state["optimizer"]["param_groups"]
-    assert group["lr"] == pytest.approx(config.learning_rate * left)
-
-
-def test_a_falling_rate_belongs_to_the_run(tmp_path: Path) -> None:
-    task = write_task(tmp_path)
-    run = train(quick(task, schedule="linear", steps=64), tmp_path / "run")
-    rates = [
-        line for line in (run.path / "metrics.jsonl").read_text().splitlines() if "learning_rate" in line
-    ]
-    assert len(rates) == 1  # of the first update; the last one's is written by the next rollout
-    assert (
-        "`steps`" in refusal(train, quick(task, schedule="linear", steps=128), tmp_path / "run")[0].notes[0]
-    )
+    run = train(config, tmp_path / "run")
+    (group,) = run.checkpoint().state["optimizer"]["param_groups"]
+    assert group["lr"] == pytest.approx(config.learning_rate / rollouts)
+    # That of an update is written by the next rollout.
+    assert (run.path / "metrics.jsonl").read_text().count("learning_rate") == rollouts - 1
+    # It belongs to the run.
+    assert "`steps`" in refusal(train, replace(config, steps=128), tmp_path / "run")[0].notes[0]

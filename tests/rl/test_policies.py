@@ -176,30 +176,21 @@ def test_a_film_is_written(run: RunFolder, tmp_path: Path) -> None:
         assert image.n_frames == 1 + 4 * (1 + 2) + 3  # type: ignore[attr-defined]
 
 
-def warm_task(folder: Path, *, start: int) -> str:
-    """A task file whose cells are stoves that heat up and change color."""
-    (folder / "stove.yaml").write_text(
-        f"pack: stove\nneeds: core\nfields: {{heat: {{type: 0..9, at: element, stove: {start}}}}}\n"
+def test_films_and_start_worlds_show_fields(tmp_path: Path) -> None:
+    """Where the color of an element follows a field, films show it after each step: these cells heat up."""
+    (tmp_path / "stove.yaml").write_text(
+        "pack: stove\nneeds: core\nfields: {heat: {type: 0..9, at: element, stove: 3}}\n"
         'elements: {stove: {density: 5, color: "#303030", color_by: {field: heat, to: "#FF3000"}}}\n'
         "passes: {burn: {do: heat += 1 where stove}}\n"
     )
-    (folder / "task.yaml").write_text(
+    task = tmp_path / "task.yaml"
+    task.write_text(
         "task: warm\nrules: core+stove.yaml\nsize: [8, 8]\nfill: stove\n"
         "agent: {may: [wall, nothing], bins: 2, brush: 4, actions: 1, steps_per_action: 2}\nreward: {each: placed}\n"
     )
-    return str(folder / "task.yaml")
-
-
-def test_films_show_fields(tmp_path: Path) -> None:
-    """Where the color of an element follows a field, films show it after each step."""
-    program = compile_task(warm_task(tmp_path, start=0), backend="wasm")
-    _, pictures = film(program, None, torch.arange(1), factor=1)
+    _, pictures = film(compile_task(str(task), backend="wasm"), None, torch.arange(1), factor=1)
     reds = [int(frame[4, 4, 0]) for frame in pictures]
-    assert reds == [48, 48, 71, 94]  # the start, the action, two steps
-
-
-def test_start_worlds_of_a_task_show_fields(tmp_path: Path) -> None:
-    out = tmp_path / "sheet.png"
-    powderdsl("show", warm_task(tmp_path, start=9), "--seeds", "1", "--out", str(out), exits=0)
-    with Image.open(out) as image:
-        assert image.convert("RGB").getpixel((9, 9)) == (255, 48, 0)
+    assert reds == [117, 117, 140, 163]  # the start, the action, two steps
+    powderdsl("show", task, "--seeds", "1", "--out", tmp_path / "sheet.png", exits=0)
+    with Image.open(tmp_path / "sheet.png") as image:
+        assert image.convert("RGB").getpixel((9, 9)) == (117, 48, 32)

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -55,34 +56,39 @@ OTHER = {
 
 @pytest.mark.parametrize("name", OTHER)
 def test_a_run_in_parts_is_a_run_at_once(task: Path, tmp_path: Path, name: str) -> None:
-    whole = train(quick(task, **OTHER[name]), tmp_path / "whole")
-    for steps in (10, 33, 96):
-        parts = train(quick(task, **OTHER[name], steps=steps), tmp_path / "parts")
+    def stop(step: int, mean: float | None) -> None:
+        if step >= 76:
+            raise KeyboardInterrupt
+
+    config, folder = quick(task, **OTHER[name]), tmp_path / "parts"
+    whole = train(config, tmp_path / "whole")
+    train(replace(config, steps=10), folder)
+    with pytest.raises(KeyboardInterrupt):
+        train(replace(config, checkpoint_minutes=60.0), folder, progress=stop)
+    assert read_run(folder).checkpoint().step == 64  # it saves what it has
+    parts = train(config, folder)
+    path = parts.checkpoint().path
     assert parts.checkpoint().step == whole.checkpoint().step == 96
     assert same(lasting(parts), lasting(whole))
     assert logged(parts) == logged(whole)
     assert [line["step"] for line in logged(whole) if "held_out/return" not in line] == [32, 64, 96]
     held_out = [line["step"] for line in logged(whole) if "held_out/return" in line]
     assert held_out == {"fcn": [0, 64], "frames": [0, 32, 64, 96]}.get(name, [])
-
-
-def test_other_seeds_give_other_weights(task: Path, tmp_path: Path) -> None:
-    runs = [train(quick(task, seed=seed, steps=32), tmp_path / str(seed)) for seed in (0, 1)]
-    assert not same(*(lasting(run)["policy"] for run in runs))
-
-
-def test_batches_need_not_divide_a_rollout(task: Path, tmp_path: Path) -> None:
-    """The last of an epoch is smaller, here one action, and nobody is warned."""
-    run = train(quick(task, steps=32, batch=31), tmp_path / "run")
-    assert all(one.isfinite().all() for one in run.checkpoint().state["policy"].values())
-
-
-def test_a_run_that_is_done_stays_as_it_is(task: Path, tmp_path: Path) -> None:
-    run = train(quick(task, steps=32), tmp_path / "run")
-    path, when = run.checkpoint().path, run.checkpoint().path.stat().st_mtime_ns
-    train(quick(task, steps=32), tmp_path / "run")
-    assert run.checkpoint().path == path
+    when = path.stat().st_mtime_ns
+    assert train(config, folder).checkpoint().path == path  # it is done, and stays as it is
     assert path.stat().st_mtime_ns == when
+
+
+def test_random_numbers_of_the_caller_stay_and_a_runs_own_follow_its_seed(task: Path, tmp_path: Path) -> None:
+    """The last batch of an epoch may be smaller, here one action, and nobody is warned."""
+    random.seed(1), np.random.seed(1), torch.manual_seed(1)
+    expected = random.random(), np.random.rand(), torch.rand(1).item()
+    random.seed(1), np.random.seed(1), torch.manual_seed(1)
+    runs = [train(quick(task, steps=32, batch=31, seed=seed), tmp_path / str(seed)) for seed in (0, 1)]
+    assert (random.random(), np.random.rand(), torch.rand(1).item()) == expected
+    policies = [run.checkpoint().state["policy"] for run in runs]
+    assert not same(*policies)
+    assert all(one.isfinite().all() for one in policies[0].values())
 
 
 TRAINING = """
@@ -113,18 +119,6 @@ def test_a_run_that_is_killed_ends_as_if_it_had_not_been(task: Path, tmp_path: P
     assert logged(run) == logged(whole)
 
 
-def test_an_interrupted_run_saves_what_it_has(task: Path, tmp_path: Path) -> None:
-    def stop(step: int, mean: float | None) -> None:
-        if step >= 76:
-            raise KeyboardInterrupt
-
-    config = quick(task, checkpoint_minutes=60.0)
-    with pytest.raises(KeyboardInterrupt):
-        train(config, tmp_path / "run", progress=stop)
-    assert read_run(tmp_path / "run").checkpoint().step == 64
-    assert same(lasting(train(config, tmp_path / "run")), lasting(train(config, tmp_path / "whole")))
-
-
 def test_another_configuration_is_refused(task: Path, tmp_path: Path) -> None:
     config = quick(task, steps=32)
     train(config, tmp_path / "run")
@@ -133,14 +127,6 @@ def test_another_configuration_is_refused(task: Path, tmp_path: Path) -> None:
     assert [note.split(" ")[0] for note in errors[0].notes] == ["`epochs`", "`seed`"]
     task.write_text(task.read_text().replace("/ 10", "/ 20"))
     assert "task_fingerprint" in refusal(train, config, tmp_path / "run")[0].notes[0]
-
-
-def test_random_numbers_of_the_caller_stay(task: Path, tmp_path: Path) -> None:
-    random.seed(1), np.random.seed(1), torch.manual_seed(1)
-    expected = random.random(), np.random.rand(), torch.rand(1).item()
-    random.seed(1), np.random.seed(1), torch.manual_seed(1)
-    train(quick(task, steps=32), tmp_path / "run")
-    assert (random.random(), np.random.rand(), torch.rand(1).item()) == expected
 
 
 def test_all_mistakes_are_named() -> None:
