@@ -262,12 +262,6 @@ def checkpoint_damaged(data: bytes, random: Random) -> bytes:
     return save(tensors | {STATE: torch.frombuffer(bytearray(text), dtype=torch.uint8)})
 
 
-def renamed(path: Path) -> None:
-    """Give a checkpoint the name that its digest asks for."""
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
-    path.rename(path.with_name(f"{path.name[:12]}-{digest}.safetensors"))
-
-
 # Kinds
 
 
@@ -278,14 +272,17 @@ class Kind:
     name: str
     many: int
     words: tuple[str, ...]
-    files: tuple[tuple[str, Callable[[bytes, Random], bytes]], ...]
+    pattern: str
+    change: Callable[[bytes, Random], bytes]
     after: Callable[[Path], None] = lambda folder: None
 
 
 def _renamed(folder: Path) -> None:
+    """Give checkpoints the names that their digests ask for."""
     for path in sorted(folder.glob("*/checkpoints/*.safetensors")):
         if path.is_file():
-            renamed(path)
+            digest = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+            path.rename(path.with_name(f"{path.name[:12]}-{digest}.safetensors"))
 
 
 def _signed(folder: Path) -> None:
@@ -306,37 +303,34 @@ def _signed(folder: Path) -> None:
 
 SMALL = ("--backend", "reference", "--steps", "1", "--out", "out.png")
 KINDS = (
-    Kind("rules", 450, ("check", "grit.yaml+core"), (("grit.yaml", yaml_damaged),)),
-    Kind("tests of rules", 60, ("test", "core+grit.yaml", "--examples", "2", "--no-keep"), (("grit.yaml", yaml_damaged),)),
-    Kind("ruleset", 60, ("show", "pair.yaml"), (("pair.yaml", yaml_damaged),)),
-    Kind("world", 250, ("run", "core+sand", "--world", "world.npz", *SMALL), (("world.npz", npz_damaged),)),
-    Kind("picture", 160, ("run", "core+sand", "--world", "world.png", *SMALL), (("world.png", png_damaged),)),
-    Kind("drawing", 80, ("run", "core+sand", "--world", "world.txt", *SMALL), (("world.txt", bytes_damaged),)),
-    Kind("scene", 220, ("render", "scene.yaml", "--rules", "core+sand", "--out", "out.png"), (("scene.yaml", yaml_damaged),)),
-    Kind("task", 220, ("check", "dig.yaml"), (("dig.yaml", yaml_damaged),)),
-    Kind("study", 160, ("study", "study.yaml", "--dry-run"), (("study.yaml", yaml_damaged),)),
-    Kind("a study's results", 120, ("study", "collect", "results", "--seeds", "1"), (("results/study.json", json_damaged),)),
-    Kind("values in them", 80, ("study", "collect", "results", "--seeds", "1"), (("results/done/*=100,*.json", json_damaged),)),
-    Kind("dataset", 120, ("record", "--verify", "data"), (("data/dataset.json", json_damaged),)),
-    Kind("shards", 80, ("record", "--verify", "data"), (("data/shard-000000.npz", npz_damaged),), _signed),
-    Kind("agent", 60, ("evaluate", "ppo", "--episodes", "1", "--policies", "trained"), (("ppo/run.json", json_damaged),)),
-    Kind("agent's checkpoint", 80, ("evaluate", "ppo", "--episodes", "1", "--policies", "trained"), (("ppo/checkpoints/*.safetensors", checkpoint_damaged),), _renamed),
-    Kind("world model", 50, ("wm", "eval", "wm", "--worlds", "1", "--split", "test"), (("wm/run.json", json_damaged),)),
-    Kind("its checkpoint", 50, ("wm", "eval", "wm", "--worlds", "1", "--split", "test"), (("wm/checkpoints/*.safetensors", checkpoint_damaged),), _renamed),
+    Kind("rules", 450, ("check", "grit.yaml+core"), "grit.yaml", yaml_damaged),
+    Kind("tests of rules", 60, ("test", "core+grit.yaml", "--examples", "2", "--no-keep"), "grit.yaml", yaml_damaged),
+    Kind("ruleset", 60, ("show", "pair.yaml"), "pair.yaml", yaml_damaged),
+    Kind("world", 250, ("run", "core+sand", "--world", "world.npz", *SMALL), "world.npz", npz_damaged),
+    Kind("picture", 160, ("run", "core+sand", "--world", "world.png", *SMALL), "world.png", png_damaged),
+    Kind("drawing", 80, ("run", "core+sand", "--world", "world.txt", *SMALL), "world.txt", bytes_damaged),
+    Kind("scene", 220, ("render", "scene.yaml", "--rules", "core+sand", "--out", "out.png"), "scene.yaml", yaml_damaged),
+    Kind("task", 220, ("check", "dig.yaml"), "dig.yaml", yaml_damaged),
+    Kind("study", 160, ("study", "study.yaml", "--dry-run"), "study.yaml", yaml_damaged),
+    Kind("a study's results", 120, ("study", "collect", "results", "--seeds", "1"), "results/study.json", json_damaged),
+    Kind("values in them", 80, ("study", "collect", "results", "--seeds", "1"), "results/done/*=100,*.json", json_damaged),
+    Kind("dataset", 120, ("record", "--verify", "data"), "data/dataset.json", json_damaged),
+    Kind("shards", 80, ("record", "--verify", "data"), "data/shard-000000.npz", npz_damaged, _signed),
+    Kind("agent", 60, ("evaluate", "ppo", "--episodes", "1", "--policies", "trained"), "ppo/run.json", json_damaged),
+    Kind("agent's checkpoint", 80, ("evaluate", "ppo", "--episodes", "1", "--policies", "trained"), "ppo/checkpoints/*.safetensors", checkpoint_damaged, _renamed),
+    Kind("world model", 50, ("wm", "eval", "wm", "--worlds", "1", "--split", "test"), "wm/run.json", json_damaged),
+    Kind("its checkpoint", 50, ("wm", "eval", "wm", "--worlds", "1", "--split", "test"), "wm/checkpoints/*.safetensors", checkpoint_damaged, _renamed),
 )  # fmt: skip
 
 
 def damage(kind: Kind, folder: Path, seed: int) -> str:
-    """Damage the files of a kind in a folder; how, in a word."""
+    """Damage the file of a kind in a folder; how, in a word."""
     random = Random(f"{kind.name} {seed}")
-    how = "damaged"
-    for pattern, change in kind.files:
-        path = sorted(folder.glob(pattern))[0]
-        odd = random.random()
-        if odd < 0.04:
-            how = _no_file(path, random, folder)
-        else:
-            path.write_bytes(change(path.read_bytes(), random))
+    how, path = "damaged", sorted(folder.glob(kind.pattern))[0]
+    if random.random() < 0.04:
+        how = _no_file(path, random, folder)
+    else:
+        path.write_bytes(kind.change(path.read_bytes(), random))
     kind.after(folder)
     return how
 
@@ -451,7 +445,7 @@ vary:
   steps: {about: interactions, small: [100, 200], paper: [1000, 2000]}
 steps:
   trained: {command: train, on: dig.yaml, steps: $steps, seed: $seed}
-  tested: {command: evaluate, on: trained, episodes: 4, out: scores.json}
+  tested: {command: evaluate, on: trained, episodes: 4}
 measures:
   reward: {of: trained, value: splits/test/trained/mean, about: mean reward, expect: rises}
 """

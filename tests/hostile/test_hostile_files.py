@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import shutil
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import chdir
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.cli.commands import powderdsl
+from tests.cli.commands import ROOT, environment_with, powderdsl
 from tests.hostile.damage_kinds import KINDS, Kind, make_valid
+from tests.processes import started
 
 SECONDS, MEGABYTES = 5.0, 300.0
 """Processor time of a command, and memory beyond that for a valid file of the kind."""
@@ -38,18 +37,14 @@ def valid(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def run_all(seeds: Mapping[str, range], valid: Path, place: Path) -> Iterator[dict[str, Any]]:
-    """What came of the files of each kind's seeds, in a process that has imported everything and trains nothing itself."""
+def run_all(kind: Kind, valid: Path, place: Path) -> Iterator[dict[str, Any]]:
+    """What came of the files of a kind, in a process that has imported everything and trains nothing itself."""
     script = "import sys; from tests.hostile.worker import work; work(*sys.argv[1:])"
-    jobs = [f"{name}|{one.start}|{one.stop}" for name, one in seeds.items()]
-    root = Path(__file__).resolve().parents[2]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(root)}
-    words = [sys.executable, "-c", script, str(valid), str(place), *jobs]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, env=environment, cwd=root, text=True) as running:
-        assert running.stdout is not None
-        for line in running.stdout:
-            yield json.loads(line)
-    assert running.returncode == 0
+    words = [sys.executable, "-c", script, str(valid), str(place), kind.name]
+    options = {"stdout": subprocess.PIPE, "cwd": ROOT, "env": environment_with(OMP_NUM_THREADS="1")}
+    with started(words, **options) as running:
+        yield from map(json.loads, running.stdout)
+        assert running.wait() == 0
 
 
 def problems(found: dict[str, Any]) -> list[str]:
@@ -74,32 +69,20 @@ def problems(found: dict[str, Any]) -> list[str]:
 
 
 @pytest.mark.slow
-def test_a_few_hostile_files(valid: Path, tmp_path: Path) -> None:
-    check({kind.name: range(1) for kind in KINDS}, valid, tmp_path)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
-def test_many_hostile_files(kind: Kind, valid: Path, tmp_path: Path) -> None:
-    check({kind.name: range(100, 100 + kind.many)}, valid, tmp_path)
-
-
-def check(seeds: Mapping[str, range], valid: Path, place: Path) -> None:
+def test_hostile_files(kind: Kind, valid: Path, tmp_path: Path) -> None:
     wrong: list[str] = []
     statuses: Counter[int] = Counter()
     slowest = largest = 0.0
-    for found in run_all(seeds, valid, place):
+    for found in run_all(kind, valid, tmp_path):
         statuses[found["status"]] += 1
         slowest = max(slowest, found["seconds"] - found["usual_seconds"])
         largest = max(largest, found["megabytes"] - found["usual_megabytes"])
         told = problems(found)
         if told:
             output = bytes.fromhex(found["output"]).decode("utf-8", "replace")
-            wrong.append(
-                f"{found['kind']} {found['seed']} ({found['how']}): {'; '.join(told)}\n{output[-600:]}"
-            )
-    assert sum(statuses.values()) == sum(map(len, seeds.values()))
+            wrong.append(f"{found['seed']} ({found['how']}): {'; '.join(told)}\n{output[-600:]}")
+    assert sum(statuses.values()) == kind.many
     codes = ", ".join(f"{code}: {count}" for code, count in sorted(statuses.items()))
-    print(f"{', '.join(seeds)}: exit codes {codes}, at most {slowest:.1f} s and {largest:.0f} MB more")
-    shutil.rmtree(place, ignore_errors=True)
+    print(f"{kind.name}: exit codes {codes}, at most {slowest:.1f} s and {largest:.0f} MB more")
     assert not wrong, "\n\n".join(wrong[:20])

@@ -13,7 +13,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 from powderdsl.cli import main
 from powderdsl.cli.dispatch import COMMANDS
@@ -112,24 +112,16 @@ def _run(words: Sequence[str], folder: Path, log: Path, environment: dict[str, s
         os._exit(status)
 
 
-def work(valid: str, place: str, *jobs: str) -> None:
-    """Run the command of a kind on files of its seeds, for each job: ``KIND|START|STOP``."""
+def work(valid: str, place: str, name: str) -> None:
+    """Run the command of a kind on files of all its seeds."""
     out = os.fdopen(os.dup(1), "w", encoding="utf-8")
     import_everything()
-    for job in jobs:
-        name, start, stop = job.split("|")
-        kind = next(kind for kind in KINDS if kind.name == name)
-        _work(kind, range(int(start), int(stop)), valid, place, out)
-    sys.stdout.flush()
-
-
-def _work(kind: Kind, seeds: range, valid: str, place: str, out: TextIO) -> None:
+    kind = next(kind for kind in KINDS if kind.name == name)
     usual = [_try(kind, Path(valid), Path(place) / f"usual-{number}", None)[1] for number in range(2)]
     assert usual[-1].status == 0, usual[-1].output.decode(errors="replace")
-    for seed in seeds:
+    for seed in range(100, 100 + kind.many):
         how, found, escaped = _try(kind, Path(valid), Path(place) / str(seed), seed)
         row: dict[str, Any] = {
-            "kind": kind.name,
             "seed": seed,
             "how": how,
             "status": found.status,
@@ -141,8 +133,7 @@ def _work(kind: Kind, seeds: range, valid: str, place: str, out: TextIO) -> None
             "hung": found.hung,
             "escaped": escaped,
         }
-        out.write(json.dumps(row) + "\n")
-        out.flush()
+        print(json.dumps(row), file=out, flush=True)
 
 
 def _try(kind: Kind, valid: Path, place: Path, seed: int | None) -> tuple[str, Measured, list[str]]:

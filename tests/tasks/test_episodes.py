@@ -23,8 +23,9 @@ NOISE = "generate:\n" + "".join(
 
 
 def task_of(text: str):
+    """A task without a mistake."""
     reporter = Reporter()
-    task = read_task(Source("test.yaml", HEAD + text), reporter)
+    task = read_task(Source("test.yaml", text), reporter)
     assert [one.code for one in reporter.diagnostics] == []
     return task
 
@@ -33,7 +34,7 @@ def task_of(text: str):
 def program_of():
     """Programs of tasks on one simulator: they all have the same rules."""
     simulator = compile_rules(load("powderworld"), "wasm")
-    return lambda text: TaskProgram(task_of(text), "train", simulator)
+    return lambda text: TaskProgram(task_of(HEAD + text), "train", simulator)
 
 
 # What actions do
@@ -226,12 +227,8 @@ def test_rewards_against_a_slow_count(torch, program_of, expression):
 
 
 def test_the_last_action_is_over_and_free_steps_run_in_it(torch, program_of):
-    text = (
-        NOISE
-        + "agent: {may: [sand], actions: 3, steps_per_action: 2, free_steps: 5}\nreward: {each: taken, final: 100}\n"
-    )
-    task = text.replace("final: 100", "final: 100 + 0 * taken")
-    program = program_of(task)
+    agent = "agent: {may: [sand], actions: 3, steps_per_action: 2, free_steps: 5}\n"
+    program = program_of(f"{NOISE}{agent}reward: {{each: taken, final: 100 + 0 * taken}}\n")
     episodes = program.start(torch.arange(4))
     mask = torch.tensor([True, False, True, False])
     actions = torch.tensor([[3, 4, 0, 1, 1]]).expand(4, 5)

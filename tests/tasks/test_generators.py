@@ -4,29 +4,20 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from powderdsl.diagnostics import Reporter, Source
 from powderdsl.targets.tensor_kind import Tensors
-from powderdsl.tasks.file import read_task
 from powderdsl.tasks.shipped import load_task, shipped_tasks
 from powderdsl.tasks.tensors import generator
 from powderdsl.tasks.tensors.generator import WorldMaker
 from powderdsl.worlds.raster import Shape, mask
 from powderdsl.worlds.scene.read import read_file
+from tests.cli.commands import ROOT
+from tests.tasks.test_episodes import task_of
 
-ROOT = Path(__file__).resolve().parents[2]
 HEAD = "task: test\nrules: powderworld\nsize: [64, 64]\nfill: empty\nagent: {may: any, actions: 3}\n"
-
-
-def task_of(text: str):
-    reporter = Reporter()
-    task = read_task(Source("test.yaml", HEAD + text), reporter)
-    assert [one.code for one in reporter.diagnostics] == []
-    return task
 
 
 def maker(torch, task, split: str = "train", variant: int = 0):
@@ -34,7 +25,7 @@ def maker(torch, task, split: str = "train", variant: int = 0):
 
 
 def worlds(torch, text: str, count: int) -> np.ndarray:
-    return maker(torch, task_of(text)).make(torch.arange(count)).ids.numpy()
+    return maker(torch, task_of(HEAD + text)).make(torch.arange(count)).ids.numpy()
 
 
 EVERYTHING = """
@@ -75,13 +66,8 @@ generate:
 """
 
 
-def test_a_region_without_shapes_covers_nothing(torch):
-    found = worlds(torch, "regions: {nowhere: []}\ngenerate: [fill sand in nowhere]\n", 2)
-    assert not found.any()
-
-
 def test_a_world_is_the_same_alone_and_in_any_batch(torch, monkeypatch):
-    one = maker(torch, task_of(EVERYTHING))
+    one = maker(torch, task_of(HEAD + EVERYTHING))
     seeds = torch.tensor([0, 7, 2**40, 3, 12_345, 2**62])
     together = one.make(seeds)
     assert len({world.numpy().tobytes() for world in together.ids}) == 6
@@ -98,7 +84,7 @@ def test_a_world_is_the_same_alone_and_in_any_batch(torch, monkeypatch):
 
 
 def test_what_regions_targets_and_stamps_hold(torch):
-    made = maker(torch, task_of(EVERYTHING)).make(torch.arange(4))
+    made = maker(torch, task_of(HEAD + EVERYTHING)).make(torch.arange(4))
     assert made.regions["left_half"].shape == (1, 64, 64)
     assert made.regions["left_half"][0, :, :32].all()
     assert not made.regions["left_half"][0, :, 32:].any()
@@ -110,6 +96,7 @@ def test_what_regions_targets_and_stamps_hold(torch):
     corner = worlds(torch, text, 1)[0]
     assert corner[0, 60:].tolist() == [3, 3, 5, 0]
     assert (corner[1:] == 3).all()
+    assert not worlds(torch, "regions: {nowhere: []}\ngenerate: [fill sand in nowhere]\n", 2).any()
 
 
 def test_draws_are_uniform(torch):
@@ -160,14 +147,10 @@ def test_the_designed_worlds_are_the_recorded_ones(torch):
     assert [one.name for one in task.split("designed").variants] == [scene.name for scene in scenes]
 
 
-def element(task, name: str) -> int:
-    return next(one.id for one in task.ruleset.elements if one.name == name)
-
-
 @pytest.mark.parametrize("split", ["train", "test"])
 def test_sand_pushing_is_laid_out_as_the_paper_says(torch, split):
     task = load_task("sand-pushing")
-    wall, sand = element(task, "wall"), element(task, "sand")
+    wall, sand = (task.ruleset.element(name).id for name in ("wall", "sand"))
     blocks = []
     for number in range(len(task.split(split).variants)):
         ids = maker(torch, task, split, number).make(torch.arange(60)).ids.numpy()
@@ -194,7 +177,7 @@ def test_the_hand_made_worlds_are_the_recorded_ones(torch):
 
 def test_path_building_is_laid_out_as_the_paper_says(torch):
     task = load_task("path-building")
-    wall, water, cloner = (element(task, name) for name in ("wall", "water", "cloner"))
+    wall, water, cloner = (task.ruleset.element(name).id for name in ("wall", "water", "cloner"))
     for split in ("train", "test"):
         ids = maker(torch, task, split).make(torch.arange(40)).ids.numpy()
         spring = ids[:, 5:15, 5:35]

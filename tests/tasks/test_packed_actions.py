@@ -30,7 +30,7 @@ reward: {each: painted + count(sand) + 100 * placed}
         ("[24, 70]", "count(sand) + 100 * placed + 10 * blown + left"),
     ],
 )
-def test_packed_worlds_are_acted_on_alike(torch, size, each):
+def test_packed_worlds_are_acted_on_and_restarted_alike(torch, size, each):
     """Few worlds are cut into strips in native code, many are not; 70 columns are more than one word."""
     text = TASK.replace("SIZE", size).replace("painted + count(sand) + 100 * placed", each)
     task = read_task(Source("packed.yaml", text), Reporter())
@@ -38,45 +38,28 @@ def test_packed_worlds_are_acted_on_alike(torch, size, each):
     for batch, reuse in ((1, True), (3, False), (20, True), (20, False)):
         one, other = native.start(torch.arange(batch)), plain.start(torch.arange(batch))
         random = torch.Generator().manual_seed(batch)
-        for _ in range(13):
+        for turn in range(13):
             actions = torch.stack(
                 [torch.randint(0, n, (batch,), generator=random) for n in native.action_nvec], 1
             )
-            given, before = (
-                one,
-                None if reuse else {name: value.clone() for name, value in one.world.state.items()},
-            )
+            given = one
+            before = {} if reuse else {name: value.clone() for name, value in one.world.state.items()}
             one, reward, _, over = native.act(one, actions, reuse=reuse)
             other, expected, _, also = plain.act(other, actions)
             assert torch.equal(reward, expected)
             assert torch.equal(over, also)
+            if turn < 2:  # what is never restarted ends
+                seeds, mask = torch.arange(batch) + 100 * turn, torch.arange(batch) % 3 == turn
+                acted, kept = one, one.world.state["element"].clone()
+                one = native.restart(one, mask, seeds, reuse=reuse)
+                other = plain.restart(other, mask, seeds)
+                assert reuse or torch.equal(native.simulator.step(acted.world, 0).ids, kept)
+            assert one.world.step.tolist() == other.world.step.tolist()
             for name, value in other.world.state.items():
                 assert torch.equal(one.world.state[name], value), name
-            for name, value in (before or {}).items():
+            for name, value in before.items():
                 fresh = native.simulator.step(given.world, 0).state[name]  # unpacked again
                 assert torch.equal(fresh, value), name
-
-
-@pytest.mark.parametrize("size", ["[64, 64]", "[20, 70]"])
-def test_packed_worlds_restart_alike(torch, size):
-    task = read_task(Source("packed.yaml", TASK.replace("SIZE", size)), Reporter())
-    native, plain = (compile_task(task, backend=backend) for backend in ("native", "wasm"))
-    for batch, reuse in ((3, True), (3, False), (20, True)):
-        one, other = native.start(torch.arange(batch)), plain.start(torch.arange(batch))
-        actions = torch.tensor([[7, 2, 14, 2, 0]]).expand(batch, 5)
-        for turn in range(3):
-            one, *_ = native.act(one, actions, reuse=reuse)
-            other, *_ = plain.act(other, actions)
-            kept = one.world.state["element"].clone()
-            seeds, mask = torch.arange(batch) + 100 * turn, torch.arange(batch) % 3 == turn
-            again = native.restart(one, mask, seeds, reuse=reuse)
-            other = plain.restart(other, mask, seeds)
-            if not reuse:
-                assert torch.equal(native.simulator.step(one.world, 0).ids, kept)
-            one = again
-            for name, value in other.world.state.items():
-                assert torch.equal(one.world.state[name], value), name
-            assert one.world.step.tolist() == other.world.step.tolist()
 
 
 MEASURES = """task: measured
