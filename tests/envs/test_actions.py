@@ -9,11 +9,13 @@ import pytest
 import torch
 from gymnasium.spaces import Discrete, MultiDiscrete
 
+from powderdsl.diagnostics import Reporter, Source
 from powderdsl.envs.actions import KINDS, UNREAD, action_form
 from powderdsl.envs.gym import PowderEnv, PowderVectorEnv
 from powderdsl.envs.sb3 import PowderVecEnv
 from powderdsl.envs.tensor_env import TensorEnv
-from powderdsl.tasks.episodes import TaskProgram, load_task
+from powderdsl.tasks.episodes import TaskProgram
+from powderdsl.tasks.file import read_task
 from powderdsl.tasks.task import BLOW, NO_CHANGE, Agent
 
 CPU = torch.device("cpu")
@@ -21,6 +23,14 @@ CPU = torch.device("cpu")
 
 def agent(*choices: int, bins: tuple[int, int] = (3, 4)) -> Agent:
     return Agent(choices, (2, 2), bins, 5, 1, 0, "velocity" if BLOW in choices else None, 1.0)
+
+
+def varied(small: TaskProgram, task_file: Path, may: str) -> TaskProgram:
+    """The small task with other actions."""
+    text = task_file.read_text().replace("[sand, blow]", may).replace("bins: 4", "bins: [4, 3]")
+    task = read_task(Source("other.yaml", text), Reporter())
+    assert task is not None
+    return TaskProgram(task, "train", small.simulator)
 
 
 @pytest.mark.parametrize(
@@ -52,6 +62,9 @@ def test_forms_have_what_the_task_reads(made: Agent, names: str, nvec: tuple[int
     found = single.decode(every)
     assert len({tuple(row) for row in found.tolist()}) == count
     assert torch.equal(single.encode(found), every)
+    for kind in KINDS:
+        action_form(kind, made, CPU).encode(found)
+    assert torch.equal(found, single.decode(every)), "encoding writes to what it is given"
 
 
 def test_the_order_of_discrete_actions() -> None:
@@ -71,15 +84,11 @@ def test_the_order_of_discrete_actions() -> None:
 @pytest.mark.parametrize("kind", ["multidiscrete", "discrete"])
 @pytest.mark.parametrize("may", ["[sand, blow, nothing]", "[sand, water, nothing]", "[blow]", "[wall]"])
 def test_an_action_does_the_same_in_every_form(
-    small: TaskProgram, task_file: Path, tmp_path: Path, kind: str, may: str
+    small: TaskProgram, task_file: Path, kind: str, may: str
 ) -> None:
-    path = tmp_path / "other.yaml"
-    path.write_text(task_file.read_text().replace("[sand, blow]", may).replace("bins: 4", "bins: [4, 3]"))
-    program = TaskProgram(load_task(path), "train", small.simulator)
-    full, other = (
-        TensorEnv(program, 8, observation="compact"),
-        TensorEnv(program, 8, observation="compact", actions=kind),
-    )
+    program = varied(small, task_file, may)
+    full = TensorEnv(program, 8, observation="compact")
+    other = TensorEnv(program, 8, observation="compact", actions=kind)
     full.reset(seed=0)
     other.reset(seed=0)
     for actions in np.random.default_rng(5).integers(0, full.action_nvec, (12, 8, 5)):
@@ -88,12 +97,10 @@ def test_an_action_does_the_same_in_every_form(
             assert torch.equal(one, same)
 
 
-def test_full_masks_numbers_that_nothing_reads(small: TaskProgram, task_file: Path, tmp_path: Path) -> None:
-    path = tmp_path / "calm.yaml"
-    path.write_text(task_file.read_text().replace("[sand, blow]", "[sand, nothing]"))
-    calm = TaskProgram(load_task(path), "train", small.simulator)
-    parts = np.split(PowderEnv(calm, actions="full").action_masks(), np.cumsum([4, 4, 2, 3])[:4])
-    assert [part.tolist() for part in parts] == [[True] * 4] * 2 + [[True] * 2] + [[False, True, False]] * 2
+def test_full_masks_numbers_that_nothing_reads(small: TaskProgram, task_file: Path) -> None:
+    calm = PowderEnv(varied(small, task_file, "[sand, nothing]"), actions="full")
+    parts = [part.tolist() for part in np.split(calm.action_masks(), np.cumsum([3, 4, 2, 3]))]
+    assert parts == [[True] * 3, [True] * 4, [True] * 2, [False, True, False], [False, True, False]]
     assert PowderEnv(small, actions="full").action_masks().all()  # which may blow
     idle = action_form("full", agent(NO_CHANGE), CPU)
     allowed = [part.nonzero()[:, 0].tolist() for part in idle.mask.split(idle.nvec)]
@@ -134,10 +141,8 @@ def test_infos_have_masks_where_asked_for(small: TaskProgram, kind: str) -> None
     assert "action_mask" not in PowderEnv(small, actions=kind).reset(seed=0)[1]
 
 
-def test_bad_actions_name_what_is_wrong(small: TaskProgram, task_file: Path, tmp_path: Path) -> None:
-    path = tmp_path / "calm.yaml"
-    path.write_text(task_file.read_text().replace("[sand, blow]", "[sand, nothing]"))
-    env = TensorEnv(TaskProgram(load_task(path), "train", small.simulator), 2, actions="multidiscrete")
+def test_bad_actions_name_what_is_wrong(small: TaskProgram, task_file: Path) -> None:
+    env = TensorEnv(varied(small, task_file, "[sand, nothing]"), 2, actions="multidiscrete")
     env.reset(seed=0)
     with pytest.raises(ValueError, match=r"actions\[1, 2\] \(choice\) is 2: it must lie in 0\.\.1"):
         env.step([[0, 0, 0], [0, 0, 2]])
@@ -158,10 +163,3 @@ def test_bad_actions_name_what_is_wrong(small: TaskProgram, task_file: Path, tmp
         TensorEnv(small, actions="discreet")
     with pytest.raises(ValueError, match="1,048,576 at most"):
         action_form("discrete", agent(*range(20), bins=(256, 256)), CPU)
-
-
-def test_encoding_changes_nothing_that_it_is_given() -> None:
-    numbers = torch.tensor([[1, 2, 0, 2, 2]])
-    for kind in KINDS:
-        action_form(kind, agent(4, BLOW), CPU).encode(numbers)
-        assert numbers.tolist() == [[1, 2, 0, 2, 2]]

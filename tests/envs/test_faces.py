@@ -24,30 +24,18 @@ from powderdsl.envs.gym import GoalEnv, PowderEnv, PowderVectorEnv
 from powderdsl.envs.observations import KINDS
 from powderdsl.envs.sb3 import PowderVecEnv
 from powderdsl.envs.tensor_env import TensorEnv
-from powderdsl.simulation.simulator import Simulator
-from powderdsl.simulation.simulator import compile as compile_rules
-from powderdsl.tasks.episodes import TaskProgram, load_task
+from powderdsl.tasks.episodes import TaskProgram, compile_task
 from powderdsl.tasks.shipped import shipped_tasks
 from tests.tiers import tiered
 
 
-@pytest.fixture(scope="module")
-def simulators() -> dict[str, Simulator]:
-    """One simulator a ruleset, by its name: tasks share them."""
-    return {}
-
-
 @pytest.mark.parametrize("name", tiered(shipped_tasks(), ["destroying", "path-building", "sand-pushing"]))
-def test_both_checkers_pass_without_a_warning(name: str, simulators: dict[str, Simulator]) -> None:
+def test_both_checkers_pass_without_a_warning(name: str) -> None:
     """With all kinds of observations and actions.
 
     Stable-Baselines3 takes 3-D floats for ill-made pictures, so its checker is shown `matrix` flattened.
     """
-    task = load_task(name)
-    simulator = simulators.get(task.ruleset.name)
-    if simulator is None or simulator.ruleset != task.ruleset:
-        simulator = simulators[task.ruleset.name] = compile_rules(task.ruleset, "wasm")
-    program = TaskProgram(task, "train", simulator)
+    program = compile_task(name, backend="wasm")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for kind, actions in zip(KINDS, [*ACTIONS, "discrete"], strict=True):

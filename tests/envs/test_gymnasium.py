@@ -14,10 +14,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.wrappers import TimeLimit
 from gymnasium.wrappers import vector as wrappers
 
-import powderdsl.envs  # noqa: F401
+from powderdsl.envs import env_id
 from powderdsl.envs.gym import PowderEnv, PowderVectorEnv
 from powderdsl.envs.sb3 import PowderVecEnv
 from powderdsl.tasks.episodes import TaskProgram
+from powderdsl.tasks.shipped import shipped_tasks
 
 Wrap = Callable[[VectorEnv[Any, Any, Any]], VectorEnv[Any, Any, Any]]
 
@@ -121,14 +122,18 @@ def test_specs_say_how_many_actions_an_episode_has(small: TaskProgram) -> None:
     while env is not env.unwrapped:  # a limit from outside would truncate what the last action terminates
         assert not isinstance(env, TimeLimit)
         env = env.env
-    vector = gymnasium.make_vec(name, num_envs=2, **how)
+    vector = gymnasium.make_vec(name, num_envs=2, observation="compact", **how)
     assert vector.spec.max_episode_steps == task.agent.actions
+    assert isinstance(vector.unwrapped, PowderVectorEnv)
+    assert vector.metadata["autoreset_mode"] is vector.unwrapped.autoreset_mode is AutoresetMode.NEXT_STEP
+    assert vector.reset(seed=0)[0].shape == (2, 6, 64, 64)
     assert gymnasium.make(name, max_episode_steps=2, **how).spec.max_episode_steps == 2
     assert gymnasium.make_vec(name, num_envs=2, max_episode_steps=2, **how).spec.max_episode_steps == 2
     direct: Any
     for direct in (PowderEnv(small), PowderVectorEnv(small, 2), PowderVecEnv(small, 2)):
         assert direct.spec.max_episode_steps == 6
     assert PowderEnv(small, max_episode_steps=4).spec.max_episode_steps == 4
+    assert all(env_id(task) in gymnasium.registry for task in shipped_tasks())
 
 
 def test_specs_make_the_same_environment_again(small: TaskProgram) -> None:

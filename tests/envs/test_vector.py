@@ -6,7 +6,6 @@ import copy
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -14,13 +13,10 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode
 
-import powderdsl.envs  # noqa: F401
 from powderdsl.diagnostics import CompileError
-from powderdsl.envs import env_id
 from powderdsl.envs.gym import PowderEnv, PowderVectorEnv
 from powderdsl.envs.tensor_env import TensorEnv, world_seeds
 from powderdsl.tasks.episodes import TaskProgram, compile_task, load_task
-from powderdsl.tasks.shipped import shipped_tasks
 from tests.states import same
 
 ENVS, STEPS = 5, 16
@@ -37,7 +33,6 @@ class ByHand:
 
     def __init__(self, program: TaskProgram, seed: int):
         self.program, self.base, self.number = program, seed, -1
-        self.over = False
         self.begin()
 
     def begin(self) -> None:
@@ -282,16 +277,6 @@ def test_it_renders(small: TaskProgram) -> None:
     text.reset(seed=0)
     assert text.render().splitlines()[0] == "#" * 16
     assert PowderEnv(small).render() is None
-
-
-def test_every_shipped_task_is_registered_and_batched() -> None:
-    assert all(env_id(task) in gymnasium.registry for task in shipped_tasks())
-    env = gymnasium.make_vec("powderdsl/SandPushing-v0", num_envs=3, backend="torch", observation="compact")
-    assert isinstance(env.unwrapped, PowderVectorEnv)
-    assert env.metadata["autoreset_mode"] is env.unwrapped.autoreset_mode is AutoresetMode.NEXT_STEP
-    observed, _ = env.reset(seed=0)
-    assert observed.shape == (3, 6, 64, 64)
-    assert load_task("sand-pushing").size == (64, 64)
 
 
 def test_programs_are_shared(task_file: Path) -> None:

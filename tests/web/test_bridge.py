@@ -71,11 +71,17 @@ def test_packs_are_left_out(session: bridge.Session) -> None:
     assert {"acid.yaml", "wind.yaml"}.isdisjoint(found["packs"])
     assert session.ruleset.packs == powderdsl.load("powderworld-acid-wind").packs
     assert not call("check", files("powderworld"), ["core"])["result"]["ok"]
+    given = files("life") | {"mine.yaml": "pack: [", "other.yaml": "x" * 10_000}  # may be anything
+    assert call("check", given, ["mine", "other"])["result"]["ok"]
+    assert call("check", given, ["mine", "other", "life"]) == {"error": "every pack is off"}
 
 
 MINE = 'pack: mine\nneeds: core\nelements:\n  mine: {density: 4, gravity: yes, color: "#E0559A"}\n'
 
-EDITS: list[tuple[tuple[str, ...], dict[str, str], list[str], str, list[str]]] = [
+Edit = tuple[tuple[str, ...], dict[str, str], list[str], str, list[str]]
+"""Packs, files that are edited, packs that are off; then what a command is to load, and which files it needs."""
+
+EDITS: list[Edit] = [
     (("powderworld",), {}, [], "powderworld", []),
     (("life",), {}, [], "life", []),
     (("powderworld",), {}, ["acid"], "powderworld-acid", []),
@@ -92,17 +98,11 @@ EDITS: list[tuple[tuple[str, ...], dict[str, str], list[str], str, list[str]]] =
 ]
 
 
-@pytest.mark.parametrize(("names", "edits", "off", "rules", "saved"), EDITS)
+@pytest.mark.parametrize("case", EDITS)
 def test_the_command_line_reads_the_same_rules(
-    session: bridge.Session,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    names: tuple[str, ...],
-    edits: dict[str, str],
-    off: list[str],
-    rules: str,
-    saved: list[str],
+    session: bridge.Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: Edit
 ) -> None:
+    names, edits, off, rules, saved = case
     given = files(*names)
     given |= {name: text + given.get(name, "") for name, text in edits.items()}
     assert call("check", given, off)["result"]["ok"]
@@ -121,12 +121,6 @@ def test_the_command_line_reads_the_same_rules(
             archive.extractall()
     wanted = powderdsl.load(found["rules"])
     assert (wanted.name, wanted.palette, wanted.passes) == (good.name, good.palette, good.passes)
-
-
-def test_a_pack_that_is_off_may_be_anything(session: bridge.Session) -> None:
-    given = files("life") | {"mine.yaml": "pack: [", "other.yaml": "x" * 10_000}
-    assert call("check", given, ["mine", "other"])["result"]["ok"]
-    assert call("check", given, ["mine", "other", "life"]) == {"error": "every pack is off"}
 
 
 def test_rulesets_that_extend_each_other_are_a_mistake(session: bridge.Session) -> None:
@@ -200,13 +194,11 @@ HOSTILE = [
 ]
 
 
-@pytest.mark.parametrize(("name", "arguments"), HOSTILE)
-def test_what_does_not_fit_is_an_error_message(
-    session: bridge.Session, name: str, arguments: list[Any]
-) -> None:
+@pytest.mark.usefixtures("session")
+def test_what_does_not_fit_is_an_error_message() -> None:
     call("check", files("core", "sand"), [])
-    found = call(name, *arguments)
-    assert found["error"]
+    for name, arguments in HOSTILE:
+        assert call(name, *arguments)["error"]
 
 
 @pytest.mark.slow
