@@ -158,6 +158,8 @@ class Place:
             waited(lambda: running.poll() is not None or len(self.survivors()) >= command.processes)
         else:  # it writes nothing: it has imported everything once it has used some processor time
             waited(lambda: running.poll() is not None or seconds_of(running.pid) > 4)
+        # What an earlier command wrote looks busy too; this one handles signals once it has worked a little.
+        waited(lambda: running.poll() is not None or seconds_of(running.pid) > 0.3)
         return running.poll() is None
 
     def said(self) -> str:

@@ -27,9 +27,9 @@ tests:
 """
 
 
-def run_tests(text: str, folder):
+def run_tests(text: str, folder, exits: int):
     (folder / "grit.yaml").write_text(PACK + text)
-    return powderdsl("test", "core+grit.yaml")
+    return powderdsl("test", "core+grit.yaml", exits=exits)
 
 
 # new
@@ -52,14 +52,10 @@ def test_new_elements_have_free_ids_and_colors_of_their_own(folder):
     assert len({element.color for element in everything.elements}) == len(everything.elements)
 
 
-def test_new_works_beside_files_that_are_broken(folder):
-    (folder / "broken.yaml").write_text("pack: [")
-    (folder / "other.yaml").write_bytes(b"\xff")
-    powderdsl("new", "salt", exits=0)
-
-
-def test_new_writes_to_a_folder_that_exists(folder):
+def test_new_writes_to_a_folder_also_beside_files_that_are_broken(folder):
     (folder / "packs").mkdir()
+    (folder / "packs" / "broken.yaml").write_text("pack: [")
+    (folder / "packs" / "other.yaml").write_bytes(b"\xff")
     powderdsl("new", "salt", "--dir", "packs", exits=0)
     assert (folder / "packs" / "salt.yaml").exists()
 
@@ -88,15 +84,14 @@ def test_names_that_a_pack_cannot_have(folder, name):
 
 
 def test_tests_that_pass(folder):
-    result = run_tests(TESTS, folder)
-    assert result.exit_code == 0, result.stdout
+    run_tests("", folder, exits=0)
+    result = run_tests(TESTS, folder, exits=0)
     assert "ok    grit: two grains fall side by side\n" in result.stdout
     assert result.stdout.endswith("all passed\n")
 
 
 def test_what_is_not_as_expected_is_shown(folder):
-    result = run_tests(TESTS.replace(". x x .", ". x . ."), folder)
-    assert result.exit_code == 1
+    result = run_tests(TESTS.replace(". x x .", ". x . ."), folder, exits=1)
     place = "grit.yaml:12: row 2, column 2 is `grit`, not `empty` (seed 0, after 3 steps)"
     assert f"FAIL  grit: two grains fall side by side\n      {place}\n" in result.stdout
     assert "      given      expected   found\n" in result.stdout
@@ -105,8 +100,7 @@ def test_what_is_not_as_expected_is_shown(folder):
 
 
 def test_a_condition_that_does_not_always_hold(folder):
-    result = run_tests(TESTS.replace("grit or empty or wall", "empty or wall"), folder)
-    assert result.exit_code == 1
+    result = run_tests(TESTS.replace("grit or empty or wall", "empty or wall"), folder, exits=1)
     assert "`empty or wall` does not hold at row 2, column 1 (seed 0, after 1 step)" in result.stdout
 
 
@@ -140,8 +134,7 @@ tests:
         . . .
         # # #
 """
-    result = run_tests(lonely, folder)
-    assert result.exit_code == 1
+    run_tests(lonely, folder, exits=1)
     (outcome,) = [r for r in run_examples(package.load("core", "grit.yaml")) if r.example.pack == "grit"]
     assert not outcome.passed
     assert outcome.after == ("...", ".G.", "###")
@@ -153,16 +146,10 @@ def test_conditions_may_read_fields_draws_and_parameters(folder):
     conditions = (
         "always: [momentum in -10..10, interact > 0, count(wall) >= 0, vanish <= 50%, grit or not grit]"
     )
-    result = run_tests(TESTS.replace("always: [grit or empty or wall]", conditions), folder)
-    assert result.exit_code == 0, result.output
-
-
-def test_no_tests_are_no_failure(folder):
-    powderdsl("test", "life", exits=0)
+    run_tests(TESTS.replace("always: [grit or empty or wall]", conditions), folder, exits=0)
 
 
 def test_rules_that_are_wrong_are_not_tested(folder):
-    result = run_tests(TESTS.replace("G G", "G Z"), folder)
-    assert result.exit_code == 2
+    result = run_tests(TESTS.replace("G G", "G Z"), folder, exits=2)
     assert "PD301" in result.stderr
     assert "^" in result.stderr

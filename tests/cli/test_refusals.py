@@ -122,6 +122,7 @@ REFUSED = (
     *((f"test life --replay {name}.yaml", "PD602") for name in ("empty", "case", "world")),
     ("test --replay case.yaml", "--replay"),
     ("test life --picture rock.gif", "--picture"),
+    ("ogbench eazy --out d", "did you mean `easy`"),
     ("new salt --dir nowhere", "PD613"),
 )
 

@@ -52,21 +52,7 @@ def test_json_has_a_stable_form():
 
 
 def test_a_saved_world_has_several_to_choose_from():
-    powderdsl(
-        "run",
-        RULES,
-        "--backend",
-        "reference",
-        "--batch",
-        2,
-        "--size",
-        "4x5",
-        "--steps",
-        3,
-        "--out",
-        "w.npz",
-        exits=0,
-    )
+    powderdsl(*f"run {RULES} --backend reference --batch 2 --size 4x5 --steps 3 --out w.npz".split(), exits=0)
     options = ("--backend", "reference", "--world", "w.npz", "--at", "0,0", "--step", 1, "--json")
     data = [json.loads(powderdsl("trace", RULES, *options, "--number", one).stdout) for one in (0, 1)]
     assert [one["world"] for one in data] == [0, 1]

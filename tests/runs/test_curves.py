@@ -7,11 +7,10 @@ import math
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
-from powderdsl.cli.commands.curves import command
 from powderdsl.experiments.runs import Metrics, RunFolder, open_run, write_json
 from powderdsl.experiments.studies.results import as_table, baselines_of, curves_of
+from tests.cli.commands import powderdsl
 
 
 def written(folder: Path, seed: int, rate: float, lines: dict[int, float]) -> RunFolder:
@@ -55,16 +54,11 @@ def test_policies_that_need_no_training_are_lines(runs: list[RunFolder]) -> None
 
 
 def test_the_command(runs: list[RunFolder], tmp_path: Path) -> None:
-    names = [str(run.path) for run in runs]
-    table = CliRunner().invoke(command, names)
-    assert table.exit_code == 0
-    assert len(table.output.splitlines()) == 2 + 2 + 2
+    command = ("curves", *(run.path for run in runs))
+    assert len(powderdsl(*command, exits=0).output.splitlines()) == 2 + 2 + 2
     picture = tmp_path / "curves.png"
-    assert CliRunner().invoke(command, [*names, "--out", str(picture)]).exit_code == 0
+    powderdsl(*command, "--out", picture, exits=0)
     assert picture.read_bytes()[:4] == b"\x89PNG"
-    missing = CliRunner().invoke(command, [*names, "--metric", "loss"])
-    assert missing.exit_code != 0
-    assert "no run has the metric loss; there are held_out/return, rollout/other" in str(
-        missing.output + str(missing.exception)
-    )
+    missing = powderdsl(*command, "--metric", "loss", exits=2)
+    assert "no run has the metric loss; there are held_out/return, rollout/other" in missing.stderr
     assert json.loads((tmp_path / "a0" / "run.json").read_text())["config"]["task"] == "dig"

@@ -38,6 +38,11 @@ def test_the_newest_checkpoint_comes_back_and_one_more_is_kept(tmp_path: Path) -
     assert found.state["numbers"] == [300, 0.5, None, "text"]
     assert found.state["pair"] == (1, 2)
     assert torch.equal(found.state["weights"]["layer"], torch.full((3,), 300.0))
+    with pytest.raises(TypeError):
+        run.save_checkpoint(400, {"code": print})
+    assert run.checkpoint().step == 300
+    run.save_checkpoint(3, state_of(3))  # a run that went back
+    assert run.checkpoint().step == 3
 
 
 @pytest.mark.parametrize("damage", ["cut", "changed", "emptied"])
@@ -54,20 +59,6 @@ def test_a_damaged_checkpoint_is_passed_over(tmp_path: Path, damage: str) -> Non
     # A run that goes back and comes to the same step again is not stopped by what lies there.
     run.save_checkpoint(2, state_of(2))
     assert run.checkpoint().step == 2
-
-
-def test_later_checkpoints_of_a_run_that_went_back_are_dropped(tmp_path: Path) -> None:
-    run = open_run(tmp_path / "run", "toy", {})
-    for step in (1, 5, 3):
-        run.save_checkpoint(step, state_of(step))
-    assert run.checkpoint().step == 3
-
-
-def test_only_plain_values_and_tensors_are_saved(tmp_path: Path) -> None:
-    run = open_run(tmp_path / "run", "toy", {})
-    with pytest.raises(TypeError):
-        run.save_checkpoint(1, {"code": print})
-    assert run.latest_checkpoint() is None
 
 
 def test_the_same_settings_come_back_and_others_are_refused(tmp_path: Path) -> None:
