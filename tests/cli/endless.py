@@ -136,6 +136,7 @@ class Place:
     def begun(self, command: Endless) -> Iterator[subprocess.Popen[str]]:
         """The command, begun; it does not outlive the block."""
         log = self.folder / "stderr"
+        self.earlier = set(self.folder.glob(command.busy)) if command.busy else set()
         with (
             log.open("w") as errors,
             started(
@@ -152,14 +153,11 @@ class Place:
     def busy(self, command: Endless, running: subprocess.Popen[str]) -> bool:
         """Wait until a command is in the middle of its work; False if it ended before."""
         if command.busy:
-            pattern = command.busy
-            waited(lambda: running.poll() is not None or any(self.folder.glob(pattern)))
+            waited(lambda: running.poll() is not None or set(self.folder.glob(command.busy)) - self.earlier)
         elif command.processes > 1:
             waited(lambda: running.poll() is not None or len(self.survivors()) >= command.processes)
         else:  # it writes nothing: it has imported everything once it has used some processor time
             waited(lambda: running.poll() is not None or seconds_of(running.pid) > 4)
-        # What an earlier command wrote looks busy too; this one handles signals once it has worked a little.
-        waited(lambda: running.poll() is not None or seconds_of(running.pid) > 0.3)
         return running.poll() is None
 
     def said(self) -> str:

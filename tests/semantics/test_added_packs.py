@@ -108,9 +108,7 @@ passes:
 )
 
 
-@pytest.fixture(autouse=True)
-def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("folder")]
 
 
 def write(name: str, text: str) -> str:
@@ -127,12 +125,7 @@ def changes_of(rules: str) -> dict[str, str]:
     return {one.message.split("`")[-2]: one.message.rpartition(": ")[2] for one in found}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "added",
-    ADDED,
-    ids=lambda added: added.name,
-)
+@pytest.mark.parametrize("added", ADDED, ids=lambda added: added.name)
 def test_a_pack_that_changes_others_is_told_by_its_own_line(added: Added) -> None:
     found = changes_of(f"powderworld+{write(added.name, added.text)}")
     for invariant, line in added.changes:
@@ -142,10 +135,8 @@ def test_a_pack_that_changes_others_is_told_by_its_own_line(added: Added) -> Non
 STEAM = ROOT / "docs/examples/steam.yaml"
 
 
-@pytest.mark.slow
 def test_check_of_an_added_pack_ends_well_and_says_what_changes() -> None:
-    result = powderdsl("check", f"powderworld+{STEAM}", "--warnings-as-errors")
-    assert result.exit_code == 0
+    result = powderdsl("check", f"powderworld+{STEAM}", "--warnings-as-errors", exits=0)
     claim = "count(water?, ice?) is constant without (acid?, cloner?, plant?)"
     assert f"  with `steam`, `{claim}` no longer holds: {STEAM}:17\n" in result.stdout
     assert "powderworld+steam: 15 elements, 13 passes, no errors, 2 notes" in result.stdout
@@ -153,7 +144,6 @@ def test_check_of_an_added_pack_ends_well_and_says_what_changes() -> None:
     assert [one["code"] for one in data] == ["PD515", "PD515"]
 
 
-@pytest.mark.slow
 def test_what_the_scope_breaks_alone_stays_an_error() -> None:
     shutil.copytree(ROOT / "rules", "rules")
     acid = Path("rules/acid.yaml")
@@ -166,7 +156,6 @@ def test_what_the_scope_breaks_alone_stays_an_error() -> None:
     assert found["PD512"].primary.span.text == "wall never changes"
 
 
-@pytest.mark.slow
 def test_a_packs_own_claims_are_errors_only_where_it_breaks_them_itself() -> None:
     text = ADDED[1].text + "invariants:\n  - count(bane) is constant\n"
     ruleset = library.load(f"powderworld+{write('bane', text)}")
@@ -178,7 +167,6 @@ def test_a_packs_own_claims_are_errors_only_where_it_breaks_them_itself() -> Non
     assert changes["pole never changes"].startswith(str(ROOT / "rules/acid.yaml"))
 
 
-@pytest.mark.slow
 def test_of_two_added_packs_the_one_that_matters_is_named() -> None:
     moss, quake = write("moss", ADDED[0].text), write("quake", ADDED[2].text)
     ruleset = library.load(f"powderworld+{moss}+{quake}")
@@ -198,7 +186,6 @@ def tried(ruleset: library.Ruleset, cells: list[list[int]]) -> list[Result]:
     return search.finish()
 
 
-@pytest.mark.slow
 def test_a_world_never_starts_with_what_the_claim_excludes() -> None:
     """Steam turns to water in the first step, and the plant grows in the second: both have to be shown."""
     ruleset = library.load(f"powderworld+{STEAM}")
@@ -217,19 +204,15 @@ def test_a_world_never_starts_with_what_the_claim_excludes() -> None:
     assert lines
 
 
-@pytest.mark.slow
 def test_tests_that_an_added_pack_changes_are_told_and_do_not_fail() -> None:
     rules = f"core+sand+water+fire+wind+{write('quake', ADDED[2].text.replace('10%', '90%'))}"
     results = {one.example.name: one for one in run_examples(library.load(rules))}
     changed = results["an explosion throws sand away"]
     assert (changed.passed, changed.failed, changed.added) == (False, False, ("quake",))
     rules = "core+sand+fire+wind+quake.yaml"
-    result = powderdsl("test", rules, "--examples", "64", "--no-keep")
-    assert result.exit_code == 0, result.output
-    assert (
-        "differs  wind: an explosion throws sand away\n      with `quake`\n      quake.yaml:7: sand? swaps"
-        in result.output
-    )
+    result = powderdsl("test", rules, "--examples", "64", "--no-keep", exits=0)
+    told = "differs  wind: an explosion throws sand away\n      with `quake`\n      quake.yaml:7: sand? swaps"
+    assert told in result.output
     assert "differs   core: wall never changes (with `quake`: quake.yaml:7)" in result.output
     assert "different with added packs" in result.output.splitlines()[-1]
     data = json.loads(powderdsl("test", rules, "--examples", "64", "--no-keep", "--json").stdout)[rules]
@@ -238,10 +221,9 @@ def test_tests_that_an_added_pack_changes_are_told_and_do_not_fail() -> None:
     assert (wall["status"], wall["difference"]["packs"]) == ("differs", ["quake"])
 
 
-@pytest.mark.slow
 def test_a_test_that_fails_in_its_scope_fails_with_more_packs_too() -> None:
     text = ADDED[0].text + "tests:\n  - nothing grows:\n      given: |\n        # # #\n        # o ~\n"
     text += "      after: 30 steps\n      expect: |\n        # # #\n        # o ?\n"
-    result = powderdsl("test", f"core+water+stone+sand+{write('moss', text)}", "--examples", "0", "--no-keep")
-    assert result.exit_code == 1
+    rules = f"core+water+stone+sand+{write('moss', text)}"
+    result = powderdsl("test", rules, "--examples", "0", "--no-keep", exits=1)
     assert "FAIL  moss: nothing grows" in result.output

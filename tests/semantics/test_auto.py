@@ -247,10 +247,8 @@ def test_every_compiler_gives_the_oracles_worlds(
     oracle = powderdsl.compile(rules, backend="reference")
     with building(Building("-O2", tmp_path)):
         native = powderdsl.compile(rules, backend="native", threads=2)
-    assert (
-        find_difference(oracle.step(start_of(oracle), 25).state, native.step(start_of(native), 25).state)
-        is None
-    )
+    wanted, found = (sim.step(start_of(sim), 25) for sim in (oracle, native))
+    assert find_difference(wanted.state, found.state) is None
 
 
 @needs_compiler
@@ -352,18 +350,12 @@ with building(Building('-O0', Path(sys.argv[1]))):
 
 
 def test_run_says_what_ran_and_why(tmp_path: Path) -> None:
-    quick = command(
-        "run", "life", "--size", "8x8", "--steps", "4", "-v", "--out", tmp_path / "x.npz", CXX="no-such"
-    )
-    assert quick.exit_code == 0
+    run = ("run", "life", "--size", "8x8", "--steps", "4", "-v", "--out", tmp_path / "x.npz")
+    quick = command(*run, CXX="no-such", exits=0)
     assert "wasm on cpu" in quick.stderr
     assert "  wasm: native code takes torch and more work, or --backend native" in quick.stderr
-    native = command("run", "life", "--size", "8x8", "--backend", "native", CXX="no-such")
-    assert native.exit_code == 2
+    native = command(*run, "--backend", "native", CXX="no-such", exits=2)
     assert "PD701" in native.stderr
     assert "pip install powderdsl[native]" in native.stderr
-
-
-def test_commands_tell_of_compilers_in_a_sentence() -> None:
     note = plain_warning(NoCompilerWarning("no C++ compiler"), NoCompilerWarning, "auto.py", 1)
     assert note == "note: no C++ compiler\n"

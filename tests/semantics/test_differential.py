@@ -22,14 +22,7 @@ from powderdsl.compiler import load, shipped_rules, shipped_tests, shipped_varia
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.syntax.sources import shipped
-from powderdsl.targets.cpp.build import (
-    ARCHITECTURE,
-    Building,
-    building,
-    find_compiler,
-    flags_for,
-    processor,
-)
+from powderdsl.targets.cpp.build import ARCHITECTURE, Building, building, find_compiler, flags_for, processor
 from powderdsl.testing.generators.cases import Start, load_text, random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.compilers import skip_without_compiler
@@ -182,28 +175,12 @@ def test_random_rulesets(first: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("seeds", "level"),
-    [
-        (range(40, 46), "-O0"),
-        (range(46, 48), "-O1"),
-        (range(48, 60), "-O2"),
-    ],
+    ("seeds", "level"), [(range(40, 46), "-O0"), (range(46, 48), "-O1"), (range(48, 60), "-O2")]
 )
 def test_random_rulesets_as_native_code(seeds: range, level: str, tmp_path: Path) -> None:
     """Few, since each takes seconds to compile; the level of optimization changes nothing."""
     skip_without_compiler()
     plan = Plan(("native",), worlds=4, steps=3, building=Building(level, tmp_path))
-    assert agreed(run_seed(seed, plan) for seed in seeds) >= 4
-
-
-@pytest.mark.parametrize(
-    "seeds",
-    tiered([range(60, 61), *(range(first, first + 8) for first in (61, 69, 77, 85))], [range(60, 61)]),
-)
-def test_random_rulesets_as_emulated_kernels(seeds: range, tmp_path: Path) -> None:
-    """The kernels of `cuda`, compiled for the CPU."""
-    skip_without_compiler()
-    plan = Plan(("cuda-emulated",), worlds=4, steps=3, building=Building("-O0", tmp_path))
     assert agreed(run_seed(seed, plan) for seed in seeds) >= 4
 
 

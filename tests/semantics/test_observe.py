@@ -57,12 +57,8 @@ def rules_of(name: str) -> Ruleset:
 
 @cache
 def simulator(name: str, backend: str) -> Simulator:
-    return powderdsl.compile(rules_of(name), backend=backend)
-
-
-def simulator_or_skip(name: str, backend: str) -> Simulator:
     skip_without_compiler(backend)
-    return simulator(name, backend)
+    return powderdsl.compile(rules_of(name), backend=backend)
 
 
 def ways_out(world: World) -> dict[str, object]:
@@ -78,7 +74,7 @@ def ways_out(world: World) -> dict[str, object]:
 @pytest.mark.parametrize("name", ["kinds", "powderworld"])
 def test_the_same_on_every_backend(name: str, backend: str, torch) -> None:  # type: ignore[no-untyped-def]
     """After a step (so that native worlds are packed), new or into the middle of a larger buffer, nothing else touched."""
-    sim, oracle = simulator_or_skip(name, backend), simulator(name, "reference")
+    sim, oracle = simulator(name, backend), simulator(name, "reference")
     for number, (height, width) in enumerate(SIZES):
         start = random_start(sim.ruleset, Choices.seeded(number), (9 if width == 33 else 2, height, width))
         expected = ways_out(oracle.step(start.world(oracle), 2))
@@ -152,7 +148,7 @@ def test_bytes_stand_for_all_that_lasts(name: str, torch) -> None:  # type: igno
 
 @pytest.mark.parametrize("backend", ["torch", "native"])
 def test_buffers_that_do_not_fit(backend: str, torch) -> None:  # type: ignore[no-untyped-def]
-    sim = simulator_or_skip("kinds", backend)
+    sim = simulator("kinds", backend)
     world = sim.step(random_start(sim.ruleset, Choices.seeded(5), (2, 3, 70)).world(sim))
     for way, look in ways_out(world).items():
         good = look()  # type: ignore[operator]
@@ -177,7 +173,7 @@ def test_buffers_that_do_not_fit(backend: str, torch) -> None:  # type: ignore[n
 
 def test_packed_worlds_are_not_unpacked(torch) -> None:  # type: ignore[no-untyped-def]
     """Pictures, channels and planes come straight from native memory."""
-    sim = simulator_or_skip("kinds", "native")
+    sim = simulator("kinds", "native")
     world = sim.step(sim.world(torch.ones(9, 5, 70, dtype=torch.uint8)))
     ids = torch.empty(9, 5, 70, dtype=torch.uint8)
     for look in (world.rgb, world.matrix, world.planes, lambda: world.read("element", ids)):

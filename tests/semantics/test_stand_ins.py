@@ -94,11 +94,8 @@ def test_a_pass_replaces_another_in_its_place() -> None:
         "    do: soil -> sky with chance wet\n  late: {after: sprout?, do: sky -> soil if left is sky}\n"
     )
     rules = powderdsl.load("ground.yaml+seed.yaml+flood.yaml")
-    assert [(one.name, one.pack) for one in rules.passes] == [
-        ("settle", "flood"),
-        ("sprout", "seed"),
-        ("late", "flood"),
-    ]
+    passes = {one.name: one.pack for one in rules.passes}
+    assert [*passes.items()] == [("settle", "flood"), ("sprout", "seed"), ("late", "flood")]
     assert stepped("ground.yaml+flood.yaml", [[1, 1], [0, 1]]) == [[1, 1], [1, 1]]
 
 

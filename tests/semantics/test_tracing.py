@@ -74,19 +74,13 @@ def values(miss_or_parts: object) -> dict[str, object]:
 
 def test_a_swap_names_its_rule_and_both_sources():
     body = "do:\n  - swap below if rock and weight > below.weight and below is void"
+    read = {"element": "rock", "weight": 5, "below.weight": 1, "below": "void"}
     for row, source in ((1, (0, 0)), (0, (1, 0))):
         found = traced(body, "o/.", row, 0)
         (write,) = found.writes
-        assert write.how == "arrive"
-        assert write.source == source
-        assert write.attempt.cell == (0, 0)
+        assert (write.how, write.source, write.attempt.cell) == ("arrive", source, (0, 0))
         assert write.attempt.rule.span.line == line_of(lab(body), "swap below")
-        assert values(write.attempt.parts) == {
-            "element": "rock",
-            "weight": 5,
-            "below.weight": 1,
-            "below": "void",
-        }
+        assert values(write.attempt.parts) == read
         assert found.writer() is write.attempt.rule
 
 
@@ -105,9 +99,8 @@ def test_a_push_and_an_effect_name_the_cell_whose_condition_held():
     assert write.attempt.cell == (0, 1)
     assert write.after.tolist() == [0, -3]
     found = traced("do: rock -> void, then right.mark += 2", "o.", 0, 1, "mark")
-    assert [(one.how, one.attempt.cell, int(one.after)) for one in found.writes if one.attempt] == [
-        ("effect", (0, 0), 2)
-    ]
+    (effect,) = [one for one in found.writes if one.attempt]
+    assert (effect.how, effect.attempt.cell, int(effect.after)) == ("effect", (0, 0), 2)
 
 
 def test_what_no_rule_does_is_told_too():
@@ -115,10 +108,7 @@ def test_what_no_rule_does_is_told_too():
     start = replace(world_of(ruleset, "o"))
     start = start.sim.replace(start, mark=4)
     found = trace(start, 0, 0)
-    assert [(one.slot.name, one.how) for one in found.writes] == [
-        ("mark", "reset"),
-        ("heat", "assign"),
-    ]
+    assert [(one.slot.name, one.how) for one in found.writes] == [("mark", "reset"), ("heat", "assign")]
     assert found.writer("mark") is None
 
 
@@ -150,11 +140,8 @@ def test_a_count_names_the_neighbors_it_found():
 def test_a_let_is_taken_apart_as_it_was_fixed():
     body = "let: {ready: rock and count(bomb) > 0 and below is void}\ndo: bomb -> void\nthen: rock -> moth if ready"
     found = traced(body, "ob/..", 0, 0)
-    asked = found.writes[0].attempt
-    assert {part.let for part in asked.parts} == {
-        None,
-        "ready",
-    }  # the bomb was still there when it was fixed
+    asked = found.writes[0].attempt  # the bomb was still there when it was fixed
+    assert {part.let for part in asked.parts} == {None, "ready"}
     miss = only_miss(traced(body, "ob/oo", 0, 0))
     (part,) = miss.failed
     assert (part.let, values([part])) == ("ready", {"below": "rock"})
