@@ -1,4 +1,10 @@
-"""Recorded steps of the published engines: which files there are, and what they hold."""
+"""Recorded steps of the published engines: which files there are, and what they hold.
+
+A recording holds steps of an engine as it ran: the state before a step, the random numbers it drew, and the state after
+each of its passes. Those in tests/data are a few steps of each file, chosen so that every event of the full files is
+among them (tests/data/make_recordings.py). Tests read full recordings, or others of the same kind, from a folder that
+is named by the variable `POWDERDSL_RECORDINGS`, or `POWDERDSL_SECOND_RECORDINGS` for the second Powderworld.
+"""
 
 from __future__ import annotations
 

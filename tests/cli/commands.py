@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -37,18 +36,6 @@ def powderdsl(*arguments: object, exits: int | None = None, **environment: str) 
     assert "Traceback" not in result.output
     assert exits in (None, result.exit_code), result.output
     return result
-
-
-def process(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run as a user does, in a process of its own."""
-    return subprocess.run(
-        command_line(*arguments),
-        env=environment_with(**environment),
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
 
 
 def command_line(*arguments: object) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 from collections.abc import Iterator, Sequence
@@ -194,26 +193,8 @@ class Place:
         )
         assert run.returncode == command.status, run.stderr
 
-    def checkpoint_steps(self) -> dict[str, int]:
-        """The newest checkpoint of each run, by its folder."""
-        found: dict[str, int] = {}
-        for path in sorted(self.folder.rglob("*.safetensors")):
-            found[str(path.parent)] = int(path.name.partition("-")[0])
-        return found
-
 
 def seconds_of(pid: int) -> float:
     """Processor time that a process has used so far."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
-def last_step(metrics: Path) -> int:
-    """The step of the last whole line of a run's metrics; 0 if there is none."""
-    lines = metrics.read_text(encoding="utf-8").splitlines() if metrics.exists() else []
-    for line in reversed(lines):
-        try:
-            return int(json.loads(line)["step"])
-        except ValueError:
-            continue
-    return 0

@@ -17,15 +17,12 @@ from tests.fuzz.cases import read_case, write_case
 from tests.fuzz.reducer import reduce_case
 
 
-def listed(names: tuple[str, ...]) -> str:
-    return f"{', '.join(names[:-1])} and {names[-1]}"
-
-
 @pytest.mark.slow
 def test_every_target_is_compared_unless_some_are_named(tmp_path: Path) -> None:
     skip_without_compiler()
     given = ("fuzz", "--jobs", 1, "--worlds", 1, "--steps", 1, "--seeds", "0..1", "--save", tmp_path)
-    assert f": {listed(COMPARED)} against the reference" in powderdsl(*given, exits=0).stdout
+    named = f"{', '.join(COMPARED[:-1])} and {COMPARED[-1]}"
+    assert f": {named} against the reference" in powderdsl(*given, exits=0).stdout
     some = powderdsl(*given, "--backends", "reference,cuda-emulated", exits=0)
     assert ": cuda-emulated against the reference" in some.stdout
 

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from powderdsl.cli import exits, main, output
 from powderdsl.cli.dispatch import COMMANDS
 from powderdsl.diagnostics import CODES, CompileError, Diagnostic, Label
-from tests.cli.commands import command_line, environment_with, powderdsl, process
+from tests.cli.commands import command_line, environment_with, powderdsl
 
 
 def test_help_lists_every_command():
@@ -102,8 +102,9 @@ def test_color_is_for_terminals_that_want_it(monkeypatch, is_terminal, term, no_
 
 
 def test_a_terminal_without_the_characters_gets_others():
-    result = process("show", "powderworld", PYTHONIOENCODING="ascii", PYTHONUTF8="0", LC_ALL="C")
-    assert result.returncode == 0, result.stderr
+    environment = environment_with(PYTHONIOENCODING="ascii", PYTHONUTF8="0", LC_ALL="C")
+    show = command_line("show", "powderworld")
+    result = subprocess.run(show, env=environment, capture_output=True, text=True, check=True)
     assert result.stdout.isascii()
 
 

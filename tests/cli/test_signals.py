@@ -11,8 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from powderdsl.experiments.runs import read_metrics
 from powderdsl.system.interrupts import Terminated, delay_signal, interruptible
-from tests.cli.endless import COMMANDS, Place, last_step
+from tests.cli.endless import COMMANDS, Place
 from tests.processes import waited
 from tests.tiers import tiered
 
@@ -48,16 +49,23 @@ def test_an_ended_command_leaves_nothing_behind_and_the_next_one_works(
                 assert place.said().endswith("terminated by SIGTERM\n")
                 assert "Traceback" not in place.said()
                 assert place.scratch() == [], place.said()
-                assert name not in ("train", "wm train", "study") or place.checkpoint_steps()
+                if name in ("train", "wm train", "study", "record"):
+                    assert "the same command continues in" in place.said()
+                if name in ("train", "wm train", "study"):
+                    assert any(tmp_path.rglob("*.safetensors"))
         assert waited(lambda: not place.survivors(), 60)
     place.run_again(command)
+
+
+def last_step(run: Path) -> int:
+    return max((line["step"] for line in read_metrics(run)), default=0)
 
 
 @pytest.mark.slow
 def test_a_killed_study_resumes_at_once(tmp_path: Path) -> None:
     """What it had started saves where it is and ends; the next call waits for that, and continues there."""
     place, command = Place(tmp_path), COMMANDS["study"]
-    trained = [tmp_path / f"out/runs/batch=12,seed={seed}/trained/metrics.jsonl" for seed in (0, 1)]
+    trained = [tmp_path / f"out/runs/batch=12,seed={seed}/trained" for seed in (0, 1)]
     with place.begun(command) as running:
         # Either run may be the first to get so far.
         assert waited(lambda: running.poll() is not None or all(last_step(path) > 0 for path in trained))

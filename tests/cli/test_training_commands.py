@@ -4,15 +4,9 @@ from __future__ import annotations
 
 import json
 import shlex
-import signal
-import subprocess
-import sys
 from pathlib import Path
 
-import pytest
-
 from tests.cli.commands import powderdsl as run
-from tests.processes import started, waited
 from tests.rl.tiny_tasks import write_task
 
 QUICK = shlex.split("--preset small --envs 4 --rollout 8 --batch 16 --epochs 1 --features 8")
@@ -35,17 +29,3 @@ def test_train_evaluate_and_go_on(folder: Path) -> None:
     assert {name: list(scores) for name, scores in splits.items()} == {
         name: ["random", "nothing"] for name in ("train", "test")
     }
-
-
-@pytest.mark.slow
-def test_an_interrupted_run_says_how_to_go_on(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "powderdsl", "train", str(write_task(tmp_path)), *QUICK]
-    command += ["--run", str(tmp_path / "run"), "--steps", "1e9", "--backend", "wasm"]
-    lines = tmp_path / "run" / "metrics.jsonl"
-    with started(command, stderr=subprocess.PIPE) as child:
-        assert waited(lambda: lines.exists() and lines.read_text().count("\n") > 2)
-        child.send_signal(signal.SIGINT)
-        _, said = child.communicate(timeout=240)
-    assert child.returncode == 130, said
-    assert f"the same command continues in {tmp_path / 'run'}" in said
-    assert list((tmp_path / "run" / "checkpoints").glob("*.safetensors"))

@@ -84,8 +84,10 @@ def entered(before: World, name: str, steps: int) -> set[str]:
 # --- how they move
 
 
-def test_fish_swim_in_what_moves_and_is_no_heavier() -> None:
-    assert entered(beside(simulator(), "F", 8), "fish", 25) == LIGHT | {"fish"}
+def test_fish_swim_in_what_moves_and_is_no_heavier_and_snakes_destroy_all_but_walls() -> None:
+    sim = simulator()
+    assert entered(beside(sim, "F", 8), "fish", 25) == LIGHT | {"fish"}
+    assert entered(beside(sim, "S", 2), "snake", 1) == {one.name for one in sim.ruleset.elements} - {"wall"}
 
 
 @pytest.mark.slow
@@ -123,11 +125,6 @@ def test_kangaroos_leap_over_walls_and_climb_no_steps() -> None:
     for _ in range(12):
         walking = sim.step(walking, params={"kangaroo.leaps": 0})
         assert cells(walking, "kangaroo")[:, 2, 1:5].any(1).all()
-
-
-def test_snakes_destroy_everything_but_walls() -> None:
-    sim = simulator()
-    assert entered(beside(sim, "S", 2), "snake", 1) == {one.name for one in sim.ruleset.elements} - {"wall"}
 
 
 @pytest.mark.slow

@@ -1,22 +1,13 @@
 """The Powderworld ruleset against recorded steps of the published engine, pass by pass.
 
-Each recording holds steps of the engine as it ran: the state before the step, the random numbers it drew,
-and the state after each of its twelve passes. Here the same state and the same numbers go into the ruleset,
-all steps of one file as one batch of worlds, on both backends: passes 1..k in one step from the state before it,
-for each k.
+The recorded state and random numbers go into the ruleset, all steps of one file as one batch of worlds, on both
+backends: passes 1..k in one step from the state before it, for each k.
 
 What must agree: element ids, gravity and clone in every cell; velocity within 1e-3 (4e-6 is what another
 order of summing floats makes of it); momentum in every cell before the wind. After the wind, ids may differ
 in one cell of 10,000 (a velocity on the border of two octants may round either way), and momentum where the
 engine's one known quirk can explain it: see `quirk_can_explain`. What the ruleset does in those cells
 instead is checked for itself, in `test_wind_carries_what_a_cell_holds`.
-
-The recordings in tests/data are a few steps of each file, chosen so that every event of the full files is
-among them (tests/data/make_recordings.py). To check against full recordings, or others of the same kind:
-
-    POWDERDSL_RECORDINGS=FOLDER pytest tests/semantics/test_recordings.py
-
-which reads every .npz file in FOLDER that has a `before_ids` array.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """The second Powderworld against recorded steps of its engine: every pass alone, and whole steps.
 
-A recording holds steps of the engine of 2023 as it ran: the state before, the random numbers, the state after each of
-its 18 passes, and where a defect of the engine shows in the result of a pass. Each pass runs alone from the recorded
-state before it, all steps of one file as one batch of worlds:
+Each pass runs alone from the recorded state before it, all steps of one file as one batch of worlds. Recordings say
+where a defect of the engine shows in the result of a pass:
 
 * `powderworld2` conserves what the engine loses: the same in all cells but those where a defect shows, and after
   a whole step in all worlds where none does;
@@ -11,11 +10,6 @@ state before it, all steps of one file as one batch of worlds:
 Ids, gravity, density and `fell` must be equal, what creatures keep within 1e-4, velocity within 1e-3. The engine's
 three custom numbers are fields of their own here: see `fields_of`. A gravity of 2, which only sums of a defect have,
 counts as none: such cells never fall.
-
-The recordings in tests/data/second are a few steps of each file, chosen so that every event of the full files is among
-them (tests/data/make_recordings.py). To check against full recordings, or others of the same kind:
-
-    POWDERDSL_SECOND_RECORDINGS=FOLDER pytest tests/semantics/test_second_recordings.py
 """
 
 from __future__ import annotations
