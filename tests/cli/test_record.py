@@ -121,12 +121,6 @@ def test_a_dataset_goes_to_minari_and_back(
     for words, says in (
         (("--out", out, "--to-minari", "me/small-v0"), "there is a Minari dataset me/small-v0"),
         (("--out", out, "--to-minari", "small"), "a Minari dataset is named namespace/name-v0"),
-        (("--to-minari", "me/small-v1"), "missing --out"),
-        (
-            ("--out", out, "--to-minari", "me/a-v0", "--from-minari", "me/a-v0"),
-            "--to-minari does not go with --from-minari",
-        ),
-        ((task, "--out", out, "--to-minari", "me/a-v0"), "--to-minari does not go with TASK"),
         (("--out", tmp_path / "no", "--from-minari", "me/none-v0"), "cannot be imported"),
     ):
         assert says in powderdsl("record", *words, exits=2).stderr

@@ -28,6 +28,11 @@ USAGE = (
     *("check", "run", "compile core", "compile core --emit poetry", "render garden --rules core"),
     *("render garden --rules core --out x.gif", "explain PD301 PD302"),
 )
+UNUSABLE = (
+    *("''", "9", "'a b'", "a-b", "../a", "salt.yaml", "x" * 41, "é"),
+    *("if", "count", "above", "powder", "core", "sand", "wood", "interact", "vanish", "powderworld"),
+)
+"""Names that a pack cannot have."""
 WORLD = "run core+grit.yaml --backend reference --out x.png --world"
 TRACE = "trace core+grit.yaml --backend reference --world drawing.txt"
 RECORD = "record sand-pushing --out d --episodes 1"
@@ -123,6 +128,13 @@ REFUSED = (
     ("test --replay case.yaml", "--replay"),
     ("test life --picture rock.gif", "--picture"),
     ("ogbench eazy --out d", "did you mean `easy`"),
+    ("record --to-minari me/small-v1", "missing --out"),
+    (
+        "record --out d --to-minari me/a-v0 --from-minari me/a-v0",
+        "--to-minari does not go with --from-minari",
+    ),
+    ("record small --out d --to-minari me/a-v0", "--to-minari does not go with TASK"),
+    *((f"new {name}", "error: ") for name in UNUSABLE),
     ("new salt --dir nowhere", "PD613"),
 )
 

@@ -8,6 +8,7 @@ import random
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -170,10 +171,8 @@ def test_one_process_at_a_time(tmp_path: Path) -> None:
         child.communicate()
 
     def free() -> bool:
-        try:
-            with lock_folder(run.path):
-                return True
-        except CompileError:
-            return False
+        with suppress(CompileError), lock_folder(run.path):
+            return True
+        return False
 
     assert waited(free)

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from powderdsl.testing.generators.cases import load_text
-from powderdsl.testing.pack_tests.chances import ERROR_RATE, OFF, divergence, is_unlikely, trials_for
+from powderdsl.testing.pack_tests.chances import ERROR_RATE, OFF, is_unlikely, trials_for
 from powderdsl.testing.pack_tests.runner import run_examples
 from tests.semantics.texts import mistakes
 from tests.tiers import tiered
@@ -82,12 +82,6 @@ def tail_of_rejection(trials: int, claimed: float, true: float) -> float:
         for k in range(low, high + 1)
     ]  # fmt: skip
     return 1 - math.fsum(math.exp(one) for one in logs)
-
-
-def test_divergence_is_zero_only_for_the_same_chance():
-    assert divergence(0.3, 0.3) == 0
-    assert divergence(0.31, 0.3) > 0
-    assert divergence(0.1, 0.0) == math.inf
 
 
 @pytest.mark.parametrize(
