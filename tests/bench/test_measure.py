@@ -18,9 +18,6 @@ def rules():
     return powderdsl.load("core+sand+water+wind")
 
 
-# The plan
-
-
 def test_a_plan_is_a_cross_product_without_repeats(rules):
     plan = Plan(rules, backends=["wasm", "torch"], batches=[1, 4, 1], sizes=[(8, 8), (4, 6)], threads=[1, 2])
     assert len(plan.cells) == len(set(plan.cells)) == 16
@@ -30,9 +27,6 @@ def test_a_plan_is_a_cross_product_without_repeats(rules):
 def test_few_takes_what_moves(rules):
     assert [element.name for element in Plan(rules, workload="few").elements] == ["sand", "water"]
     assert Plan(powderdsl.load("life"), workload="few").elements  # nothing moves there
-
-
-# The worlds
 
 
 def worlds(rules, workload, **options):
@@ -63,9 +57,6 @@ def test_worlds_have_the_elements_that_were_chosen(rules):
     water = rules.element("water").id
     assert set(worlds(rules, "shapes", only=["water"]).ids.unique().tolist()) == {0, water}
     assert set(worlds(rules, "shapes", only=["empty"]).ids.unique().tolist()) == {0}
-
-
-# The order
 
 
 def test_rounds_are_interleaved_and_loading_is_not_timed(rules, torch):
@@ -111,15 +102,9 @@ def test_torch_has_its_threads_back(rules, torch):
     assert torch.get_num_threads() == before
 
 
-# What comes out
-
-
 def test_numbers_have_three_figures():
     shown = {0.01234: "0.0123", 12.34: "12.3", 1234.5: "1,234", 12.34e6: "12.3M"}
     assert {value: number(value) for value in shown} == shown
-
-
-# What passes cost
 
 
 @pytest.mark.slow

@@ -98,9 +98,6 @@ def test_archives_are_those_of_numpy(tmp_path):
                 archive.read("about")
 
 
-# Checkpoints
-
-
 def test_what_training_saves_is_read(tmp_path):
     shared = torch.arange(6).reshape(2, 3)
     weights = OrderedDict(

@@ -112,9 +112,6 @@ def test_a_ruleset_reads_packs_of_its_own_folder_alone(folder):
         assert refused_codes(powderdsl.load, "home/r.yaml") == [code]
 
 
-# Names with a `+`
-
-
 def test_files_with_a_plus_in_their_path_can_be_named(folder):
     (folder / "a+b-c").mkdir()
     path = "a+b-c/g+r.yaml"
@@ -128,9 +125,6 @@ def test_files_with_a_plus_in_their_path_can_be_named(folder):
     )
     assert powderdsl.load(f"core+{path}").packs == ("core", "grit")
     command("check", f"core+{folder / path}", exits=0)
-
-
-# Writing
 
 
 def test_a_link_stays_a_link_and_its_target_is_written(tmp_path):

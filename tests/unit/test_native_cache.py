@@ -13,7 +13,7 @@ import sys
 import time
 from datetime import datetime, timedelta
 from pathlib import Path
-from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 from filelock import FileLock
@@ -356,21 +356,15 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_kernels_for_gpus_lie_there_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """No GPU is needed: the compiler's version and what it compiles are made up."""
-    compiled = []
-
-    def compile_text(compiler: object, text: str, options: object) -> bytes:
-        compiled.append(text)
-        return text.encode()
-
+    compile_text = Mock(side_effect=lambda compiler, text, options: text.encode())
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    nvrtc = SimpleNamespace(nvrtcVersion=lambda major, minor: None)
-    monkeypatch.setattr(cuda_build, "nvrtc", lambda version: nvrtc)
+    monkeypatch.setattr(cuda_build, "nvrtc", Mock())
     monkeypatch.setattr(cuda_build, "compile_text", compile_text)
     a, b = (
         KernelSource("rules", text, Layout(), group=1, threads=32, shared=0, scratch=0) for text in ("a", "b")
     )
     wanted = [(a, "sm_90"), (a, "sm_80"), (a, "sm_90"), (b, "sm_90")]
     assert [cuda_build.machine_code(*one, "13.0") for one in wanted] == [b"a", b"a", b"a", b"b"]
-    assert compiled == ["a", "a", "b"]
+    assert [call.args[1] for call in compile_text.call_args_list] == ["a", "a", "b"]
     found = cache.entries(tmp_path / "powderdsl" / "native")
     assert [entry.name for entry in found] == ["rules.cuda"] * 3

@@ -19,20 +19,15 @@ from tests.unit.elements import ELEMENTS
 COLORS = palette(ELEMENTS)
 
 
-class Screen(io.TextIOWrapper):
+class Screen(io.StringIO):
     """A stream that says whether it is a terminal and remembers what was written."""
 
-    def __init__(self, is_terminal: bool, encoding: str = "utf-8"):
-        super().__init__(io.BytesIO(), encoding=encoding, newline="")
+    def __init__(self, is_terminal: bool):
+        super().__init__(newline="")
         self.is_terminal = is_terminal
 
     def isatty(self) -> bool:
         return self.is_terminal
-
-    @property
-    def written(self) -> str:
-        self.flush()
-        return self.buffer.getvalue().decode(self.encoding)
 
 
 def replay(written: str) -> tuple[list[str], list[list[tuple]], bool]:
@@ -112,14 +107,14 @@ def test_frames_are_redrawn_in_place_and_the_cursor_comes_back():
     first, second = np.zeros((4, 6), dtype=np.uint8), np.full((4, 6), 3, dtype=np.uint8)
     with LiveView(ELEMENTS, screen) as view:
         view.show(first, caption="a long caption")
-        assert not replay(screen.written)[2]
+        assert not replay(screen.getvalue())[2]
         view.show(second, caption="step 2")
-        lines, colors, _ = replay(screen.written)
+        lines, colors, _ = replay(screen.getvalue())
         assert lines == ["▀" * 6, "▀" * 6, "step 2", ""]
         water = tuple(COLORS[3, :3].tolist())
         assert colors[0] == [(water, water)] * 6
         view.show(np.zeros((2, 3), dtype=np.uint8), caption="small")
-    lines, _, visible = replay(screen.written)
+    lines, _, visible = replay(screen.getvalue())
     assert lines == ["▀▀▀", "small", ""], "something of the larger frame is left"
     assert visible
 
@@ -130,7 +125,7 @@ def test_motion_tints():
     motion[0, 1, 1] = 9
     with LiveView(ELEMENTS, screen, fields=powderdsl.load("core+wind").fields) as view:
         view.show(torch.zeros((2, 2), dtype=torch.uint8), fields={"velocity": motion})
-    _, colors, _ = replay(screen.written)
+    _, colors, _ = replay(screen.getvalue())
     empty = tuple(COLORS[0, :3].tolist())
     assert colors[0][0] == (empty, empty)
     assert colors[0][1][0] == empty
@@ -149,7 +144,7 @@ def test_an_interrupt_gives_the_terminal_back_and_goes_on(error):
 
     with pytest.raises(error):
         watch()
-    lines, _, visible = replay(screen.written)
+    lines, _, visible = replay(screen.getvalue())
     assert visible
     assert lines[:2] == ["▀▀▀▀"] * 2
 
@@ -161,7 +156,7 @@ def test_without_a_terminal_frames_are_plain_text(monkeypatch, is_terminal, kind
     with LiveView(ELEMENTS, screen) as view:
         view.show(np.array([[0, 1], [2, 3]]), caption="step 0")
         view.show(np.array([[1, 1], [1, 1]]), caption="step 1")
-    assert screen.written == ".#\ns~\nstep 0\n##\n##\nstep 1\n"
+    assert screen.getvalue() == ".#\ns~\nstep 0\n##\n##\nstep 1\n"
 
 
 def test_no_color_means_glyphs_in_place(monkeypatch):
@@ -170,10 +165,10 @@ def test_no_color_means_glyphs_in_place(monkeypatch):
     with LiveView(ELEMENTS, screen) as view:
         view.show(np.array([[0, 1], [2, 3]]), caption="step 0")
         view.show(np.array([[1, 1], [1, 2]]), caption="step 1")
-    lines, _, visible = replay(screen.written)
+    lines, _, visible = replay(screen.getvalue())
     assert lines == ["##", "#s", "step 1", ""]
     assert visible
-    assert "38;2" not in screen.written
+    assert "38;2" not in screen.getvalue()
     monkeypatch.setenv("NO_COLOR", "")
     assert LiveView(ELEMENTS, screen).color
 
@@ -186,7 +181,7 @@ def test_what_is_shown_fits_the_terminal(monkeypatch, columns, lines, no_color):
     screen = Screen(True)
     with LiveView(ELEMENTS, screen) as view:
         view.show(np.zeros((64, 64), dtype=np.uint8), caption="c" * 200)
-    shown, _, _ = replay(screen.written)
+    shown, _, _ = replay(screen.getvalue())
     assert max(map(len, shown)) <= columns
     if lines > 2:
         assert len(shown) <= lines

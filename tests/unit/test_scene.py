@@ -22,18 +22,6 @@ ROOT = Path(__file__).resolve().parents[2]
 DESIGNED = ROOT / "tasks" / "scenes" / "designed.yaml"
 
 
-def line(start: tuple[int, int], end: tuple[int, int], width: int) -> Shape:
-    return Shape("line", (*start, *end, width))
-
-
-def disk(center: tuple[int, int], radius: int) -> Shape:
-    return Shape("disk", (*center, radius))
-
-
-def box(rows: tuple[int, int | None] = (0, None), columns: tuple[int, int | None] = (0, None)) -> Shape:
-    return Shape("box", (*rows, *columns))
-
-
 def picture(cells: np.ndarray) -> list[str]:
     return ["".join("x" if cell else "." for cell in row) for row in cells]
 
@@ -50,17 +38,17 @@ def errors(text: str) -> tuple:
 
 def test_the_largest_numbers_do_not_overflow():
     far = MAX_COORDINATE
-    diagonal = mask(line((-far, -far), (far, far), 1), (8, 8))
+    diagonal = mask(Shape("line", (-far, -far, far, far, 1)), (8, 8))
     assert picture(diagonal)[0] == "xx......"
-    assert mask(line((-far, far), (far, -far), far), (8, 8)).all()
-    assert mask(disk((far, far), far), (8, 8)).sum() == 0
-    assert mask(disk((0, 0), far), (8, 8)).all()
+    assert mask(Shape("line", (-far, far, far, -far, far)), (8, 8)).all()
+    assert mask(Shape("disk", (far, far, far)), (8, 8)).sum() == 0
+    assert mask(Shape("disk", (0, 0, far)), (8, 8)).all()
 
 
 def test_boxes_leave_the_end_out_and_frames_follow_the_size():
-    assert picture(mask(box((1, 3), (0, 2)), (4, 4))) == ["....", "xx..", "xx..", "...."]
-    assert picture(mask(box((2, None), (3, None)), (3, 4))) == ["....", "....", "...x"]
-    assert mask(box(), (2, 3)).all()
+    assert picture(mask(Shape("box", (1, 3, 0, 2)), (4, 4))) == ["....", "xx..", "xx..", "...."]
+    assert picture(mask(Shape("box", (2, None, 3, None)), (3, 4))) == ["....", "....", "...x"]
+    assert mask(Shape("box", (0, None, 0, None)), (2, 3)).all()
     assert picture(mask(Shape("frame"), (4, 3))) == ["xxx", "x.x", "x.x", "xxx"]
     assert mask(Shape("frame"), (1, 5)).all()
 
@@ -78,14 +66,14 @@ def statement(text: str):
 @pytest.mark.parametrize(
     ("text", "element", "shape"),
     [
-        ("line stone from (63, 5) to (32,-5) width 3", "stone", line((63, 5), (32, -5), 3)),
-        ("disk sand at ( 32 , 32 )radius 10", "sand", disk((32, 32), 10)),
-        ("box water rows 32:64", "water", box((32, 64))),
-        ("box water rows 32:end columns :4", "water", box((32, None), (0, 4))),
-        ("box fire rows 48: columns 48:", "fire", box((48, None), (48, None))),
-        ("box fire columns 7", "fire", box(columns=(7, 8))),
-        ("box fire rows :", "fire", box()),
-        ("box fire", "fire", box()),
+        ("line stone from (63, 5) to (32,-5) width 3", "stone", Shape("line", (63, 5, 32, -5, 3))),
+        ("disk sand at ( 32 , 32 )radius 10", "sand", Shape("disk", (32, 32, 10))),
+        ("box water rows 32:64", "water", Shape("box", (32, 64, 0, None))),
+        ("box water rows 32:end columns :4", "water", Shape("box", (32, None, 0, 4))),
+        ("box fire rows 48: columns 48:", "fire", Shape("box", (48, None, 48, None))),
+        ("box fire columns 7", "fire", Shape("box", (0, None, 7, 8))),
+        ("box fire rows :", "fire", Shape("box", (0, None, 0, None))),
+        ("box fire", "fire", Shape("box", (0, None, 0, None))),
         ("frame core.wall", "core.wall", Shape("frame")),
     ],
 )
