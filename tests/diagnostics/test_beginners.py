@@ -157,15 +157,8 @@ def test_a_pack_that_others_need_is_missed_once() -> None:
     assert "leave out what needs it: `sand`, " in result.output
 
 
-@pytest.mark.parametrize(
-    ("setting", "shown"),
-    [
-        ("500%", "cannot be `500%`"),
-        ("2", "cannot be `2`"),
-        ("-5%", "cannot be `-5%`"),
-    ],
-)
-def test_a_chance_of_the_command_line_is_shown_as_it_was_written(setting: str, shown: str) -> None:
+@pytest.mark.parametrize("setting", ["500%", "2", "-5%"])
+def test_a_chance_of_the_command_line_is_shown_as_it_was_written(setting: str) -> None:
     result = command("run", "core+water", "--set", f"water.melt={setting}", "--steps", "1", exits=2)
-    assert shown in result.stderr
+    assert f"cannot be `{setting}`" in result.stderr
     assert "0% to 100%" in result.stderr

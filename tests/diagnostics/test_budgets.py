@@ -29,13 +29,19 @@ passes:
 """
 
 
+def remarks(text: str) -> list[Diagnostic]:
+    """Warnings and notes on a pack without errors."""
+    reporter = Reporter()
+    pack = read_file(Source("yard.yaml", text), reporter)
+    assert isinstance(pack, PackDecl)
+    check([pack], None, reporter)
+    return list(reporter.diagnostics)
+
+
 def reported(body: str) -> list[tuple[str, tuple[str, ...]]]:
     """Codes and helps of the errors that a pass has."""
-    reporter = Reporter()
     try:
-        pack = read_file(Source("yard.yaml", HEAD + body), reporter)
-        assert isinstance(pack, PackDecl)
-        check([pack], None, reporter)
+        remarks(HEAD + body)
     except CompileError as error:
         return [(one.code, one.helps) for one in error.diagnostics]
     return []
@@ -107,13 +113,9 @@ NEVER = f"{ONE} and (a + b * c) mod 61 == 6"
 """No cell fulfills it, and every cell that fulfills ONE fulfills MORE, as only a long search would show."""
 
 
-def remarks(text: str) -> list[Diagnostic]:
+def on_rules(text: str) -> list[Diagnostic]:
     """Warnings and notes on the rules of a pack."""
-    reporter = Reporter()
-    pack = read_file(Source("yard.yaml", text), reporter)
-    assert isinstance(pack, PackDecl)
-    check([pack], None, reporter)
-    return [one for one in reporter.diagnostics if one.code not in ("PD504", "PD507")]
+    return [one for one in remarks(text) if one.code not in ("PD504", "PD507")]
 
 
 @pytest.mark.parametrize(
@@ -132,7 +134,7 @@ def remarks(text: str) -> list[Diagnostic]:
 def test_what_is_not_decided_is_told_once(body: str) -> None:
     head = HEAD.replace("fields:", "fields:\n  load: {type: 0..9, at: element, of: weed}")
     line = len((head + body).splitlines())
-    (found,) = remarks(head + body)
+    (found,) = on_rules(head + body)
     assert (found.code, found.severity) == ("PD518", Severity.NOTE)
     assert found.message.endswith(f"any effect: yard.yaml:{line}")
 
@@ -140,21 +142,20 @@ def test_what_is_not_decided_is_told_once(body: str) -> None:
 def test_chances_that_are_not_decided_are_told() -> None:
     head = HEAD.replace("elements:", "properties: {bite: {type: chance, weed: 5%}}\nelements:")
     hard = f"soil -> air if {NEVER} and below is weed with chance below.bite"
-    (found,) = remarks(f"{head}    do: {hard}\n")
+    (found,) = on_rules(f"{head}    do: {hard}\n")
     assert [label.span.text for label in (found.primary, *found.secondary)] == ["5%", hard]
 
 
 def test_a_copy_that_is_decided_speaks_for_the_others() -> None:
     """A loop's rule that fires in one round is alive, however hard the other rounds are."""
-    assert remarks(f"{HEAD}    for k in (1, 2): {{do: 'soil -> weed if k == 1 or {NEVER}'}}\n") == []
-    assert [
-        one.code for one in remarks(f"{HEAD}    do: soil -> weed if a == 3 and a == 4 and {NEVER}\n")
-    ] == ["PD503"]
+    assert on_rules(f"{HEAD}    for k in (1, 2): {{do: 'soil -> weed if k == 1 or {NEVER}'}}\n") == []
+    (found,) = on_rules(f"{HEAD}    do: soil -> weed if a == 3 and a == 4 and {NEVER}\n")
+    assert found.code == "PD503"
 
 
 def test_many_undecided_lines_are_counted() -> None:
     rules = [f"d += 1 where {NEVER} and e == {n}" for n in range(9)] * 3
-    (found,) = remarks(HEAD + "    do:\n" + listed(rules, 6))
+    (found,) = on_rules(HEAD + "    do:\n" + listed(rules, 6))
     assert found.message.endswith("yard.yaml:34 and 7 more")
     assert len(found.secondary) == 19
 
@@ -162,12 +163,12 @@ def test_many_undecided_lines_are_counted() -> None:
 def test_a_hard_rule_leaves_work_for_the_warnings_of_others() -> None:
     hard = f"    do:\n      - d := 3 where {ONE}\n      - d := 3 where {MORE}\n"
     easy = "  later:\n    do:\n      - d := 1 where soil\n      - d := 1 where any\n"
-    assert [one.code for one in remarks(HEAD + hard + easy)] == ["PD518", "PD514"]
+    assert [one.code for one in on_rules(HEAD + hard + easy)] == ["PD518", "PD514"]
 
 
 def test_no_rule_of_a_long_list_is_left_out_in_silence() -> None:
     rules = [f"d := 1 where soil and a == {n % 60}" for n in range(120)] + ["d := 1 where any"]
-    *overruled, undecided = remarks(HEAD + "    do:\n" + listed(rules, 6))
+    *overruled, undecided = on_rules(HEAD + "    do:\n" + listed(rules, 6))
     assert {one.code for one in overruled} == {"PD514"}
     assert undecided.code == "PD518"
     named, more = undecided.message.removesuffix(" more").split(" and ")

@@ -5,10 +5,8 @@ from __future__ import annotations
 import pytest
 
 from powderdsl.compiler import load_with_diagnostics
-from powderdsl.diagnostics import CompileError, Reporter, Severity, Source
-from powderdsl.model.check import check
-from powderdsl.model.declarations import PackDecl
-from powderdsl.model.packs import read_file
+from powderdsl.diagnostics import Severity
+from tests.diagnostics.test_budgets import remarks
 from tests.semantics.test_differential import compositions
 
 YARD = """pack: yard
@@ -28,14 +26,7 @@ streams: [coin]
 
 def found_in(text: str, *codes: str) -> list[tuple[str, str]]:
     """Diagnostics with these codes, each with what is underlined."""
-    reporter = Reporter()
-    try:
-        pack = read_file(Source("yard.yaml", text), reporter)
-        assert isinstance(pack, PackDecl)
-        check([pack], None, reporter)
-    except CompileError as error:
-        raise AssertionError(str(error)) from None
-    spans = [(one.code, one.primary.span) for one in reporter.diagnostics if one.code in codes]
+    spans = [(one.code, one.primary.span) for one in remarks(text) if one.code in codes]
     return [(code, span.text) for code, span in spans if span is not None]
 
 
@@ -88,12 +79,8 @@ SEEN, DEEP = "above is weed", "above is weed and below is air"
         ("first_wins", f"soil -> weed if {SEEN}", f"soil -> air if {DEEP}", 1),
         ("first_wins", f"soil -> weed if {DEEP}", f"soil -> air if {SEEN}", None),
         ("drop_both", f"soil -> weed if {DEEP}", f"soil -> air if {SEEN}", 0),
-        (
-            "drop_both",
-            "age := 3 where soil",
-            "age := 4 where soil or weed",
-            0,
-        ),  # a policy is for movement alone
+        # A policy is for movement alone.
+        ("drop_both", "age := 3 where soil", "age := 4 where soil or weed", 0),
         ("drop_both", "age := 3 where soil or weed", "age := 4 where soil", None),
         ("prove", "age += 3 where soil", "age -= 4 where soil", None),
     ],

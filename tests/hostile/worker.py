@@ -11,7 +11,7 @@ import signal
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -50,12 +50,6 @@ class Measured:
     seconds: float
     megabytes: float
     hung: bool = False
-
-
-def import_everything() -> None:
-    """Import what commands need, once."""
-    for name in MODULES:
-        importlib.import_module(name)
 
 
 def measured(words: Sequence[str], folder: Path, **environment: str) -> Measured:
@@ -115,22 +109,20 @@ def _run(words: Sequence[str], folder: Path, log: Path, environment: dict[str, s
 def work(valid: str, place: str, name: str) -> None:
     """Run the command of a kind on files of all its seeds."""
     out = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    import_everything()
+    for module in MODULES:
+        importlib.import_module(module)
     kind = next(kind for kind in KINDS if kind.name == name)
     usual = [_try(kind, Path(valid), Path(place) / f"usual-{number}", None)[1] for number in range(2)]
     assert usual[-1].status == 0, usual[-1].output.decode(errors="replace")
     for seed in range(100, 100 + kind.many):
         how, found, escaped = _try(kind, Path(valid), Path(place) / str(seed), seed)
         row: dict[str, Any] = {
+            **asdict(found),
             "seed": seed,
             "how": how,
-            "status": found.status,
             "output": found.output[-20_000:].hex(),
-            "seconds": found.seconds,
-            "megabytes": found.megabytes,
             "usual_seconds": min(one.seconds for one in usual),
             "usual_megabytes": max(one.megabytes for one in usual),
-            "hung": found.hung,
             "escaped": escaped,
         }
         print(json.dumps(row), file=out, flush=True)

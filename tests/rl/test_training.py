@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 import torch
 
-from powderdsl.experiments.runs import RunFolder, read_metrics, read_run
+from powderdsl.experiments.runs import RunFolder, read_run
 from powderdsl.rl import evaluate, preset, train
 from powderdsl.rl.config import HOW, from_json
 from tests.processes import started
 from tests.refusals import refusal
 from tests.rl.tiny_tasks import PLACE, quick, write_task
-from tests.states import same
+from tests.states import logged, same
 
 
 @pytest.fixture
@@ -36,14 +36,6 @@ def lasting(run: RunFolder) -> dict[str, Any]:
     state["episodes"] = [one[:2] for one in state["episodes"]]
     state["logged"] = {name: one for name, one in state["logged"].items() if not name.startswith("time/")}
     return state
-
-
-def logged(run: RunFolder) -> list[dict[str, Any]]:
-    """The metrics without times of day, and without the count of rollouts since the last start."""
-    return [
-        {name: value for name, value in line.items() if not name.startswith("time/")}
-        for line in read_metrics(run.path)
-    ]
 
 
 OTHER = {

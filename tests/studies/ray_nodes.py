@@ -90,8 +90,8 @@ class Nodes:
             return True
         return False
 
-    def kill_node(self, node: int) -> int:
-        """Kill all processes of a node at once, as when a machine dies; returns how many there were."""
+    def kill_node(self, node: int | None = None) -> int:
+        """Kill all processes of a node at once, as when a machine dies, or of all; returns how many there were."""
         doomed = self.processes(node)
         # What is stopped starts nothing new.
         for number in (signal.SIGSTOP, signal.SIGKILL):
@@ -103,14 +103,7 @@ class Nodes:
 
     def end(self) -> None:
         """Kill everything, also processes that are just being started."""
-        assert waited(lambda: not self._kill_all(), 60)
-
-    def _kill_all(self) -> bool:
-        found = list(self.processes())
-        for pid in found:
-            with suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
-        return bool(found)
+        assert waited(lambda: self.kill_node() == 0, 60)
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 
@@ -13,7 +14,7 @@ from powderdsl.diagnostics import CompileError, Reporter, Severity, Source
 from powderdsl.experiments.runs import Estimate
 from powderdsl.rl.evaluation import evaluate
 from powderdsl.system.fingerprint import fingerprint
-from powderdsl.tasks.episodes import TaskProgram, compile_task
+from powderdsl.tasks.episodes import Episodes, TaskProgram, compile_task
 from powderdsl.tasks.file import read_task
 from powderdsl.tasks.players import ExpertPlayer, best_plans
 from powderdsl.tasks.shipped import load_task
@@ -110,24 +111,21 @@ def test_a_search_plays_the_best_of_its_plans() -> None:
     """What it promises is what playing gives, and more plans are never worse: the first ones are among them."""
     program = program_of("  search: 12\n")
     worlds = torch.arange(5)
-    player, episodes = ExpertPlayer(program), program.start(worlds)
-    total = torch.zeros(5, dtype=torch.float64)
-    for _ in range(program.task.agent.actions):
-        episodes, reward, *_ = program.act(episodes, player(episodes))
-        total += reward.double()
+    plans = {count: best_plans(program, worlds, count) for count in (1, 4, 12)}
 
-    def returns(count: int) -> torch.Tensor:
-        plans, found = best_plans(program, worlds, count), program.start(worlds)
-        summed = torch.zeros(5, dtype=torch.float64)
+    def played(choose: Callable[[Episodes, int], torch.Tensor]) -> torch.Tensor:
+        episodes, total = program.start(worlds), torch.zeros(5, dtype=torch.float64)
         for step in range(program.task.agent.actions):
-            found, reward, *_ = program.act(found, plans[:, step])
-            summed += reward.double()
-        return summed
+            episodes, reward, *_ = program.act(episodes, choose(episodes, step))
+            total += reward.double()
+        return total
 
-    assert torch.equal(total, returns(12))
-    assert bool((returns(12) >= returns(4)).all())
-    assert bool((returns(12) > returns(1)).any())
-    assert torch.equal(best_plans(program, worlds[3:], 12), best_plans(program, worlds, 12)[3:])
+    one, four, twelve = (played(lambda _, step, plan=plan: plan[:, step]) for plan in plans.values())
+    player = ExpertPlayer(program)
+    assert torch.equal(played(lambda episodes, _: player(episodes)), twelve)
+    assert bool((twelve >= four).all())
+    assert bool((twelve > one).any())
+    assert torch.equal(best_plans(program, worlds[3:], 12), plans[12][3:])
 
 
 def test_an_expert_changes_no_fingerprint() -> None:

@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from powderdsl.experiments.runs import RunFolder, read_metrics
+from powderdsl.experiments.runs import RunFolder
 from powderdsl.worldmodel import (
     DataConfig,
     Machine,
@@ -29,7 +29,7 @@ from powderdsl.worldmodel.evaluation import unseen_worlds
 from powderdsl.worldmodel.worlds import VALIDATION_SEEDS, VALIDATION_WORLDS, validation_pairs
 from tests.processes import started, waited
 from tests.refusals import refusal, refused_codes
-from tests.states import same
+from tests.states import logged, same
 
 HERE = Machine(backend="torch")
 
@@ -53,10 +53,6 @@ def few(config: TrainConfig) -> TrainConfig:
 def weights(run: RunFolder) -> dict[str, Tensor]:
     found: dict[str, Tensor] = run.checkpoint().state["model"]
     return found
-
-
-def lines(run: RunFolder) -> list[tuple[int, float]]:
-    return [(line["step"], line["loss/train"]) for line in read_metrics(run.path)]
 
 
 @pytest.mark.slow
@@ -115,7 +111,7 @@ def test_a_killed_run_ends_with_the_same_weights(dunes: str, tmp_path: Path) -> 
     run = train(config, folder, machine=HERE)
     whole = train(config, tmp_path / "whole", machine=HERE)
     assert same(weights(run), weights(whole))
-    assert lines(run) == lines(whole)
+    assert logged(run) == logged(whole)
 
 
 def test_another_configuration_or_task_file_is_another_run(dunes: str, tmp_path: Path) -> None:
