@@ -41,7 +41,7 @@ from powderdsl.system.writing import replacing
 from powderdsl.tasks.shipped import load_task, load_task_with_diagnostics
 from powderdsl.testing.properties.refute import refuted
 from powderdsl.worldmodel import training
-from powderdsl.worldmodel.config import HERE, DataConfig, TrainConfig
+from powderdsl.worldmodel.config import DataConfig, Machine, TrainConfig
 from powderdsl.worldmodel.networks import custom_network
 from powderdsl.worlds.ascii import read_ascii
 from powderdsl.worlds.image import read_image
@@ -256,7 +256,7 @@ def learn_too_fast() -> None:
     config = TrainConfig(data, width=1, iterations=50, batch=1, learning_rate=0.5)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training._Trainer, "step", lambda self, *pairs: math.inf if self.done == 35 else 1.0)
-        training.train(config, "runs/dunes", machine=HERE)
+        training.train(config, "runs/dunes", machine=Machine(backend="reference"))
 
 
 def collect_different_results() -> None:

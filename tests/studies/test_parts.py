@@ -269,15 +269,14 @@ def test_the_recipe_for_slurm_runs_each_combination_once(tmp_path: Path) -> None
             "SLURM_CPUS_PER_TASK": "2",
         }
         environment = {**os.environ, **slurm, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
-        said = subprocess.run(
-            ["bash", "-c", script], env=environment, capture_output=True, text=True, check=True
-        )
+        options = {"env": environment, "capture_output": True, "text": True, "check": True}
+        said = subprocess.run(["bash", "-c", script], **options)
         words = said.stdout.split()
         assert words[0] == "study"
-        options = dict(zip(words[2::2], words[3::2], strict=True))
-        assert set(options) <= {name for one in study_command.params for name in one.opts}
-        points = selected(load_study(words[1], known), options["--size"], None, {})
-        found.append(part(points, SHARD.convert(options["--shard"], None, None)))
+        given = dict(zip(words[2::2], words[3::2], strict=True))
+        assert set(given) <= {name for one in study_command.params for name in one.opts}
+        points = selected(load_study(words[1], known), given["--size"], None, {})
+        found.append(part(points, SHARD.convert(given["--shard"], None, None)))
     assert all(len(points) == 1 for points in found)
     assert [points[0] for points in found] == list(load_study("start-states", known).points("paper"))
 

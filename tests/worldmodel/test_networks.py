@@ -100,16 +100,14 @@ def was_imported(*words: object) -> tuple[int, str, bool]:
 
 @pytest.mark.parametrize("name", tiered(["nets:Wide", "nets:made"], ["nets:made"]))
 def test_a_network_of_ones_own_is_trained_and_tested(name: str, dunes: str) -> None:
-    words = ("wm", "train", "--task", dunes, "--run", "run", *QUICK, "--iterations", 3)
-    run(*words, "--network", name, exits=0)
+    words = ("wm", "train", "--task", dunes, "--run", "run", *QUICK, "--iterations", 3, "--network", name)
+    run(*words, exits=0)
     config = json.loads(Path("run/run.json").read_text())["config"]
     assert config["network"] == name
-    run(
-        "wm", "eval", "run", "--network", name, "--split", "two", "--worlds", 1, "--backend", "torch", exits=0
-    )
-    out = ("--out", "strips.png", "--backend", "torch", "--split", "two")
-    run("wm", "show", "run", "--network", name, *out, exits=0)
-    run(*words, "--network", name, exits=0)
+    how = ("--network", name, "--split", "two", "--backend", "torch")
+    run("wm", "eval", "run", "--worlds", 1, *how, exits=0)
+    run("wm", "show", "run", "--out", "strips.png", *how, exits=0)
+    run(*words, exits=0)
 
 
 @pytest.mark.parametrize("name", [None, "nets:Wide"])
