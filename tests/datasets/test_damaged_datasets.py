@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
+import pickle
 import shutil
 import tracemalloc
 import zipfile
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from powderdsl.datasets import Dataset, Transitions
 from powderdsl.datasets.shards import write_shard
 from powderdsl.diagnostics import CompileError
+from tests.hostile.damage_kinds import npy
 from tests.refusals import refusal
 
 Arrays = dict[str, NDArray[Any]]
@@ -210,31 +211,16 @@ def test_arrays_of_wrong_shapes_or_values_are_refused(
     assert any(words in reason and "shard-000001" in reason for reason in reasons(folder))
 
 
-def npy(value: Any, header: bytes | None = None) -> bytes:
-    """A .npy file, pickled where need be, or with a header of one's own."""
-    out = io.BytesIO()
-    np.lib.format.write_array(out, value, allow_pickle=True)
-    data = out.getvalue()
-    if header is None:
-        return data
-    length = int.from_bytes(data[8:10], "little")
-    return data[:8] + len(header).to_bytes(2, "little") + header + data[10 + length :]
-
-
-HEADER = b"{'descr': '<i8', 'fortran_order': False, 'shape': (%d,), }\n"
+EIGHT = npy("'<i8'", (8,), bytes(64))
 MEMBERS: list[tuple[str, bytes, str]] = [
-    ("world.npy", npy(np.array([{"a": 1}] * 8, dtype=object)), "`world` is not an array of numbers"),
-    ("world.npy", npy(np.zeros(8, np.float64)), "`world` is float64"),
-    (
-        "world.npy",
-        npy(np.zeros(8, np.int64), HEADER % 10**15),
-        "`world` has 64 bytes, not 8,000,000,000,000,000",
-    ),
-    ("world.npy", npy(np.zeros(8, np.int64), b"__import__('os').abort()\n"), "malformed node"),
-    ("world.npy", npy(np.zeros(8, np.int64), HEADER % 8)[:-8], "56 bytes, not 64"),
+    ("world.npy", npy("'|O'", (8,), pickle.dumps([{"a": 1}] * 8)), "`world` is not an array of numbers"),
+    ("world.npy", npy("'<f8'", (8,), bytes(64)), "`world` is float64"),
+    ("world.npy", npy("'<i8'", (10**15,), bytes(64)), "`world` has 64 bytes, not 8,000,000,000,000,000"),
+    ("world.npy", npy("'<i8'", "__import__('os').abort()", bytes(64)), "malformed node"),
+    ("world.npy", EIGHT[:-8], "56 bytes, not 64"),
     ("world.npy", b"not numpy", "`world` is not an array"),
-    ("../world.npy", npy(np.zeros(8, np.int64)), "and nothing else"),
-    ("extra.npy", npy(np.zeros(8, np.int64)), "and nothing else"),
+    ("../world.npy", EIGHT, "and nothing else"),
+    ("extra.npy", EIGHT, "and nothing else"),
 ]
 
 

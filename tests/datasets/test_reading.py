@@ -20,7 +20,7 @@ from powderdsl.datasets.manifest import Manifest, Recipe, write_manifest
 from powderdsl.datasets.shards import write_shard
 from powderdsl.diagnostics import CompileError
 from powderdsl.envs import TensorEnv
-from powderdsl.tasks.episodes import TaskProgram, compile_task
+from powderdsl.tasks.episodes import TaskProgram
 from tests.refusals import refusal
 
 
@@ -154,25 +154,16 @@ def test_indices_out_of_range_are_refused(recorded: Dataset) -> None:
             call()
 
 
-def test_data_of_another_meaning_is_refused(recorded: Dataset, small: TaskProgram) -> None:
+def test_data_of_another_meaning_is_refused(recorded: Dataset, small: TaskProgram, task_file: Path) -> None:
     recorded.require(TensorEnv(small, 1), same_rules=True)
     (found,) = refusal(recorded.require, TensorEnv("ice-bridge", 1, observation="compact", backend="torch"))
     assert found.code == "PD631"
     names = {note.split("`")[1].split(".")[0] for note in found.notes}
     assert {"observation", "channels", "shape", "palette", "action_nvec", "choices"} <= names
-    melting = compile_task(
-        replace(
-            small.task,
-            ruleset=replace(
-                small.task.ruleset,
-                params=tuple(replace(one, default=1) for one in small.task.ruleset.params),
-            ),
-        ),
-        backend="torch",
-    )
-    recorded.require(TensorEnv(melting, 1))
+    melting = TensorEnv(str(task_file), 1, params={"water.melt": 1.0}, backend="torch")
+    recorded.require(melting)
     with pytest.raises(CompileError, match="PD631"):
-        recorded.require(TensorEnv(melting, 1), same_rules=True)
+        recorded.require(melting, same_rules=True)
 
 
 def test_the_flat_layouts(recorded: Dataset) -> None:

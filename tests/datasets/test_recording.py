@@ -43,10 +43,8 @@ def test_episodes_are_what_stepping_gives(observation: str, small: TaskProgram, 
             observed, reward, terminated, truncated, info = env.step(action[None])
             assert torch.equal(one.observation[step + 1], observed[0])
             assert float(one.reward[step]) == float(reward)
-            assert (bool(one.terminated[step]), bool(one.truncated[step])) == (
-                bool(terminated),
-                bool(truncated),
-            )
+            assert bool(one.terminated[step]) == bool(terminated)
+            assert bool(one.truncated[step]) == bool(truncated)
             assert bool(one.success[step]) == bool(info["success"])
         assert terminated or truncated
         ends.add((bool(terminated), bool(truncated), len(one.action) < 6))

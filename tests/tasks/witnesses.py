@@ -127,17 +127,10 @@ def prime_the_cloners(seen: Seen) -> Act:
 
 
 WITNESSES: dict[str, Callable[[Seen], Act]] = {
-    "burn-the-weeds": burn_the_weeds,
-    "dig-a-channel": dig_a_channel,
-    "ice-bridge": ice_bridge,
-    "build-an-arch": build_an_arch,
-    "blow-up-the-heap": blow_up_the_heap,
-    "greenhouses": greenhouses,
-    "keep-ice": keep_ice,
-    "sort-sand-and-stone": sort_sand_and_stone,
-    "herd-gas": herd_gas,
-    "firewall": firewall,
-    "quench-lava": quench_lava,
-    "prime-the-cloners": prime_the_cloners,
+    player.__name__.replace("_", "-"): player
+    for player in (
+        *(burn_the_weeds, dig_a_channel, ice_bridge, build_an_arch, blow_up_the_heap, greenhouses),
+        *(keep_ice, sort_sand_and_stone, herd_gas, firewall, quench_lava, prime_the_cloners),
+    )
 }
 """Who solves which task."""
