@@ -15,7 +15,7 @@ from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from powderdsl.diagnostics import CompileError, Label, Reporter, Severity, Source, Span, suggest
+from powderdsl.diagnostics import CompileError, Diagnostic, Label, Reporter, Source, Span, suggest
 from powderdsl.model.check import check, demote_outgrown
 from powderdsl.model.composition.compose import Palette, compose
 from powderdsl.model.composition.names import words_of_tree
@@ -25,11 +25,12 @@ from powderdsl.model.packs import read_file
 from powderdsl.model.types import Ruleset
 from powderdsl.syntax.sources import path_beside, read_source, shipped, shipped_names
 from powderdsl.syntax.yaml_tree import parse_yaml
+from powderdsl.system.cache import persistent
+from powderdsl.system.fingerprint import fingerprint
 from powderdsl.system.memo import Memo, collection_paused
 from powderdsl.system.reading import inside, is_path
 
 if TYPE_CHECKING:
-    from powderdsl.diagnostics import Diagnostic
     from powderdsl.ir.bits import Segment
     from powderdsl.ir.ops import PassGraph, Program
 
@@ -124,13 +125,21 @@ def load_with_diagnostics(
 ) -> tuple[Ruleset, tuple[Diagnostic, ...]]:
     """Read rule files as `load` does; return the checked model, and its warnings and notes in source order."""
     reporter = Reporter()
-    packs, ruleset = read(names, reporter)
+    reader = _Reader(reporter)
+    packs, ruleset = reader.read_all(names)
     reporter.raise_if_errors()
-    model = check(packs, ruleset, reporter, palette, shipped_words)
+
+    def checked() -> tuple[Ruleset, tuple[Diagnostic, ...]]:
+        model = check(packs, ruleset, reporter, palette, shipped_words)
+        reporter.raise_if_errors()
+        return model, reporter.diagnostics
+
+    words = list(map(str, names))
+    inputs = [words, [(source.name, source.text) for source in reader.sources], palette]
+    model, remarks = persistent("+".join(words), repr(inputs), checked)
     if params:
         model = set_params(model, params, reporter)
-    reporter.raise_if_errors()
-    remarks = tuple(d for d in reporter.diagnostics if d.severity is not Severity.ERROR)
+        reporter.raise_if_errors()
     return model, demote_outgrown(model, remarks)
 
 
@@ -154,33 +163,7 @@ def whole_palette(*names: str | Path) -> tuple[str | None, ...]:
 
 def read(names: Sequence[str | Path], reporter: Reporter) -> tuple[list[PackDecl], RulesetDecl | None]:
     """Read the declarations of everything named, each pack once, in the order of first mention; report mistakes."""
-    reader = _Reader(reporter)
-    packs, rulesets = reader.packs, reader.rulesets
-    left_out: dict[str, None] = {}
-    for name in names:
-        plus, minus = split_names(name)
-        left_out |= dict.fromkeys(minus)
-        for word in plus:
-            reader.read(word)
-    for word in left_out:
-        if word not in packs:
-            helps = suggest(word, packs, "packs")
-            reporter.error("PD304", f"`{word}` is left out, but it was not there", None, helps=helps)
-    if not names:
-        example = "name a shipped ruleset or a file: `powderworld`"
-        reporter.error("PD304", "no rules were named", None, helps=[example])
-    loaded = {name: pack for name, pack in packs.items() if name not in left_out}
-    if not rulesets:
-        return list(loaded.values()), None
-    *beside, last = rulesets
-    for ruleset in last.lineage:
-        for scalar in ruleset.without:  # the ids of their elements stay reserved
-            lister = ruleset.base.members.get(scalar.text) if ruleset.base else None
-            if lister is not None and scalar.text not in last.members:
-                reader.read(scalar.text, lister)
-    members = dict.fromkeys(name for ruleset in last.lineage for name in ruleset.members)
-    reserved = {name: packs[name] for name in members if name not in loaded and name in packs}
-    return list(loaded.values()), replace(last, beside=tuple(beside), left_out=reserved)
+    return _Reader(reporter).read_all(names)
 
 
 def split_names(name: str | Path) -> tuple[list[str], list[str]]:
@@ -244,10 +227,14 @@ def _is_there(text: str) -> bool:
 
 def _read_apart(source: Source) -> tuple[PackDecl | RulesetDecl | None, tuple[Diagnostic, ...]]:
     """The declaration of a file, and its diagnostics."""
-    reporter = Reporter()
-    with suppress(CompileError):  # more errors than the limit
-        return read_file(source, reporter), reporter.diagnostics
-    return None, reporter.diagnostics
+
+    def read() -> tuple[PackDecl | RulesetDecl | None, tuple[Diagnostic, ...]]:
+        reporter = Reporter()
+        with suppress(CompileError):  # more errors than the limit
+            return read_file(source, reporter), reporter.diagnostics
+        return None, reporter.diagnostics
+
+    return persistent(Path(source.name).name, repr((source.name, source.text)), read)
 
 
 SMALL = 1 << 16
@@ -264,12 +251,43 @@ class _Reader:
         self.reporter = reporter
         self.packs: dict[str, PackDecl] = {}
         self.rulesets: list[RulesetDecl] = []
+        self.sources: list[Source] = []
+
+    def read_all(self, names: Sequence[str | Path]) -> tuple[list[PackDecl], RulesetDecl | None]:
+        """Read the declarations of everything named; report mistakes."""
+        packs, rulesets = self.packs, self.rulesets
+        left_out: dict[str, None] = {}
+        for name in names:
+            plus, minus = split_names(name)
+            left_out |= dict.fromkeys(minus)
+            for word in plus:
+                self.read(word)
+        for word in left_out:
+            if word not in packs:
+                helps = suggest(word, packs, "packs")
+                self.reporter.error("PD304", f"`{word}` is left out, but it was not there", None, helps=helps)
+        if not names:
+            example = "name a shipped ruleset or a file: `powderworld`"
+            self.reporter.error("PD304", "no rules were named", None, helps=[example])
+        loaded = {name: pack for name, pack in packs.items() if name not in left_out}
+        if not rulesets:
+            return list(loaded.values()), None
+        *beside, last = rulesets
+        for ruleset in last.lineage:
+            for scalar in ruleset.without:  # the ids of their elements stay reserved
+                lister = ruleset.base.members.get(scalar.text) if ruleset.base else None
+                if lister is not None and scalar.text not in last.members:
+                    self.read(scalar.text, lister)
+        members = dict.fromkeys(name for ruleset in last.lineage for name in ruleset.members)
+        reserved = {name: packs[name] for name in members if name not in loaded and name in packs}
+        return list(loaded.values()), replace(last, beside=tuple(beside), left_out=reserved)
 
     def declaration(self, path: Path | None) -> PackDecl | RulesetDecl | None:
         """The declaration in a file."""
         source = read_source(path, self.reporter) if path else None
         if source is None:
             return None
+        self.sources.append(source)
         read_apart = _read_once if len(source.text) <= SMALL else _read_apart
         decl, diagnostics = read_apart(source)
         for diagnostic in diagnostics:
@@ -404,6 +422,12 @@ def lower(ruleset: Ruleset, memo: Memo | None = None) -> Program:
         return memo.of(("optimized", pass_.name), key, run).passes[0]
 
     return replace(program, passes=tuple(map(optimized, program.passes)))
+
+
+def segments_of(ruleset: Ruleset, memo: Memo | None = None) -> tuple[Segment, ...]:
+    """A ruleset as segments of optimized IR, on bit planes if the planes can represent the passes. `memo` as in `lower`."""
+    inputs = f"{ruleset.name} {fingerprint(replace(ruleset, declared=None), places=True)}"
+    return persistent(f"{ruleset.name} on planes", inputs, lambda: parts(lower(ruleset, memo), memo))
 
 
 def parts(program: Program, memo: Memo | None = None) -> tuple[Segment, ...]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from powderdsl.arrays import np
 from powderdsl.cli.exits import BadInput, user_values
-from powderdsl.compiler import lower, parts
+from powderdsl.compiler import segments_of
 from powderdsl.model.state import fitting
 from powderdsl.model.types import Ruleset
 from powderdsl.system.memo import Memo
@@ -72,7 +72,7 @@ def start(
 
 def _fits_planes(ruleset: Ruleset, memo: Memo) -> bool:
     """True if bit planes carry all passes. WebAssembly runs only these; without torch, the slow oracle runs the rest."""
-    return all(part.planes is not None for part in parts(lower(ruleset, memo), memo))
+    return all(part.planes is not None for part in segments_of(ruleset, memo))
 
 
 def start_drawn(

@@ -181,7 +181,7 @@ def tint_cells(kind: ArrayKind, image: Array, vectors: Array, tint: CellTint) ->
 
 def scale(image: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
     """Every pixel of pictures uint8 [..., H, W, 3] as a square of `factor` by `factor`."""
-    return np.repeat(np.repeat(image, factor, axis=-3), factor, axis=-2)
+    return np.repeat(np.repeat(image, factor, axis=-2), factor, axis=-3)
 
 
 def contact_sheet(

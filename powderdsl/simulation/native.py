@@ -2,8 +2,8 @@
 
 Each width has its own library, or shares one with others (`known_width`). A library is made when the first grid of its
 width is stepped, so that no time is spent on code that is not needed. If the same model was compiled before, its code comes
-from the cache and nothing is lowered. The cache's key depends on the model, on every source file that turns models into
-C++, on the compiler, the processor and the width. Values of parameters are inputs of a step, so the key excludes them.
+from the cache and nothing is lowered. The cache's key depends on the model, on the code of this package, on the compiler,
+the processor and the width. Values of parameters are inputs of a step, so the key excludes them.
 
 The backend `auto` starts on WebAssembly, or on torch where wasmtime has no wheel. Once the work done and requested is
 worth it, a thread compiles. The backend changes between two steps, with the same worlds: long calls are split into slices.
@@ -12,7 +12,6 @@ Short scripts never start a compiler.
 
 from __future__ import annotations
 
-import hashlib
 import threading
 import time
 import warnings
@@ -21,7 +20,6 @@ from contextvars import copy_context
 from dataclasses import replace
 from functools import cache, partial
 from math import prod
-from pathlib import Path
 
 import torch
 
@@ -29,9 +27,9 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.ir.bits import segments
 from powderdsl.ir.ops import Program
 from powderdsl.model.types import Ruleset
+from powderdsl.system.cache import code_version, turn
 from powderdsl.system.fingerprint import fingerprint
 from powderdsl.targets.array_kind import Array
-from powderdsl.targets.cache import turn
 from powderdsl.targets.cpp.build import (
     INSTALL,
     MISSING,
@@ -47,8 +45,6 @@ from powderdsl.targets.cpp.program import NativeProgram, compile_program, recall
 from powderdsl.targets.cpp.source import known_width
 from powderdsl.targets.job import Job, Runnable, mixed_program, shape_of, unavailable
 from powderdsl.targets.torch.program import TorchProgram
-
-SOURCES = ("compiler.py", "simulation/native.py", "model", "analysis", "ir", "schedule", "targets")
 
 WORTH = 2.0
 """Native code is compiled once work on the first backend, done or expected in the current call, exceeds this many seconds.
@@ -66,19 +62,7 @@ def start_key(ruleset: Ruleset, width: int | None = None) -> str:
     compiler = find_compiler()
     params = tuple(replace(param, default=0, about="") for param in ruleset.params)
     model = fingerprint(replace(ruleset, params=params))
-    return cache_key(f"{model}{generator()} {width}", compiler, flags_for(compiler, current().level))
-
-
-@cache
-def generator() -> str:
-    """A hash of the source files that generate C++."""
-    here = Path(__file__).resolve().parents[1]
-    digest = hashlib.sha256()
-    for name in SOURCES:
-        files = sorted(p for p in (here / name).rglob("*") if p.suffix in (".py", ".hpp")) or [here / name]
-        for path in files:
-            digest.update(path.read_bytes())
-    return digest.hexdigest()
+    return cache_key(f"{model}{code_version()} {width}", compiler, flags_for(compiler, current().level))
 
 
 class ByWidth:

@@ -9,7 +9,7 @@ from functools import cache
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from powderdsl.compiler import BACKENDS, lower, parts
+from powderdsl.compiler import BACKENDS, lower, segments_of
 from powderdsl.diagnostics import CompileError
 from powderdsl.ir.ops import Program
 from powderdsl.model import reference
@@ -150,7 +150,7 @@ def make_program(
 def _plain_program(ruleset: Ruleset, kind: ArrayKind, memo: Memo | None) -> Runnable:
     """WebAssembly without torch: the oracle runs the passes that it cannot."""
     return mixed_program(
-        parts(lower(ruleset, memo), memo),
+        segments_of(ruleset, memo),
         lambda program, planes: WasmProgram(program, planes, kind, memo),
         lambda program: ReferenceProgram(ruleset, kind, program),
     )

@@ -130,7 +130,7 @@ def _indexed(images: Any, frame: NDArray[np.uint8]) -> Any:
     # pixels would take longer than the simulation.
     rows = np.append(True, (frame[1:] != frame[:-1]).any(axis=(1, 2)))
     cells = frame[rows]
-    columns = np.append(True, (cells[:, 1:] != cells[:, :-1]).any(axis=(0, 2)))
+    columns = np.append(True, (cells[:, 1:] != cells[:, :-1]).any(axis=0).any(axis=1))
     packed = cells[:, columns].astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], dtype=np.uint32)
     colors, index = np.unique(packed, return_inverse=True)
     if len(colors) > 256:

@@ -25,7 +25,7 @@ from powderdsl.simulation import native
 from powderdsl.simulation.native import AutoProgram
 from powderdsl.simulation.programs import BackendProgram
 from powderdsl.simulation.simulator import Simulator, World
-from powderdsl.targets import cache
+from powderdsl.system import cache
 from powderdsl.targets.cpp.build import Building, NoCompiler, NoCompilerWarning, building
 from powderdsl.targets.job import Clock, Job
 from powderdsl.testing.generators.cases import load_text, random_start

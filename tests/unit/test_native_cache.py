@@ -18,8 +18,8 @@ from unittest.mock import Mock
 import pytest
 from filelock import FileLock
 
+from powderdsl.system import cache
 from powderdsl.system.writing import MARK, cache_folder, scratch_folder
-from powderdsl.targets import cache
 from powderdsl.targets.cpp.build import (
     Building,
     Compiler,

@@ -13,22 +13,22 @@ from powderdsl.cli.output import counted
 from powderdsl.system.reports import table
 
 if TYPE_CHECKING:
-    from powderdsl.targets.cache import Entry
+    from powderdsl.system.cache import Entry
 
 
 @click.group("cache")
 def command() -> None:
     """List or remove the compiled code that this machine keeps, or print its folder.
 
-    Native code is compiled once for a ruleset, a compiler and a processor, and is private to the user. Beyond
-    512 MB, the code that was used least recently is removed.
+    Rules are checked, lowered and compiled once for each version of their text. The results are private to the user.
+    Beyond 512 MB, those that were used least recently are removed.
     """
 
 
 @command.command("list")
 def list_entries() -> None:
     """List the files of compiled code, the most recently used first."""
-    from powderdsl.targets.cache import entries
+    from powderdsl.system.cache import entries
 
     stored = entries(_folder())
     rows = [["code of", "size", "last used"]]
@@ -43,7 +43,7 @@ def list_entries() -> None:
 @command.command("clear")
 def clear_entries() -> None:
     """Remove compiled code. Running programs continue; code is compiled again when it is next needed."""
-    from powderdsl.targets.cache import clear
+    from powderdsl.system.cache import clear
 
     removed = clear(_folder())
     click.echo(f"removed {counted(len(removed), 'file')}, {_megabytes(removed)}", err=True)
@@ -57,9 +57,9 @@ def print_path() -> None:
 
 def _folder() -> Path:
     """The folder of compiled code. An OSError, if others may write to it, ends the command with its message."""
-    from powderdsl.system.writing import cache_folder
+    from powderdsl.system.cache import compiled_folder
 
-    return cache_folder("native")
+    return compiled_folder()
 
 
 def _megabytes(entries: Sequence[Entry]) -> str:

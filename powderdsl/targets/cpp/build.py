@@ -21,8 +21,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryFile
 
-from powderdsl.system.writing import cache_folder, scratch_folder
-from powderdsl.targets import cache
+from powderdsl.system import cache
+from powderdsl.system.writing import scratch_folder
 
 INSTALL = "install g++ or clang++, or `pip install powderdsl[native]`"
 """Advice where there is no compiler."""
@@ -152,7 +152,7 @@ class Building:
     def place(self) -> Path:
         """The folder. Raises NoCompiler if no folder is private to the user."""
         try:
-            return self.folder or cache_folder("native")
+            return self.folder or cache.compiled_folder()
         except OSError as error:
             raise NoCompiler(f"no folder for compiled code: {error}") from None
 

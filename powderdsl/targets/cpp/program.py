@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from powderdsl.ir.ops import Program
+from powderdsl.system import cache
 from powderdsl.system.reading import read_bytes
-from powderdsl.targets import cache
 from powderdsl.targets.codec import Piece, parameters, pieces
 from powderdsl.targets.cpp.build import build, current, load_library
 from powderdsl.targets.cpp.source import native_source

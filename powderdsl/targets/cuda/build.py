@@ -16,8 +16,7 @@ from pathlib import Path
 
 import torch
 
-from powderdsl.system.writing import cache_folder
-from powderdsl.targets import cache as native_cache
+from powderdsl.system import cache as native_cache
 from powderdsl.targets.cuda.source import KernelSource
 
 OPTIONS = ("--std=c++17", "--fmad=false", "--prec-div=true", "--prec-sqrt=true", "--ftz=false", "-w")
@@ -95,7 +94,7 @@ def machine_code(source: KernelSource, architecture: str, version: str) -> bytes
     options = (f"--gpu-architecture={architecture}", *OPTIONS)
     key = "\0".join([source.text, f"{major.value}.{minor.value}", *options])
     try:
-        folder = cache_folder("native")
+        folder = native_cache.compiled_folder()
     except OSError as error:
         raise NoCuda(f"no cache folder: {error}") from None
     name = hashlib.sha256(key.encode()).hexdigest()[:32]

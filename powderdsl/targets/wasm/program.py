@@ -13,6 +13,7 @@ from threading import RLock
 
 from powderdsl.ir.ops import Program
 from powderdsl.ir.text import structure
+from powderdsl.system.cache import persistent
 from powderdsl.system.memo import Memo
 from powderdsl.targets.array_kind import Array, ArrayKind
 from powderdsl.targets.codec import parameters, pieces
@@ -51,8 +52,13 @@ class WasmProgram:
     def module(self, width: int) -> Compiled:
         """The module for a width."""
 
+        def code() -> bytes:
+            return wasm_module(self.planes, width, memo=self._memo).code
+
         def make() -> Compiled:
-            return self._compile(wasm_module(self.planes, width, memo=self._memo).code)
+            return self._compile(
+                persistent(f"WebAssembly of width {width}", repr((self._digest, width)), code)
+            )
 
         return _MODULES.of((self._digest, width), "", make)
 

@@ -6,14 +6,18 @@ import atexit
 import ctypes
 from contextlib import suppress
 from functools import cache
+from hashlib import sha256
+from importlib.metadata import version
 from typing import Any, TypeVar
 from weakref import WeakSet
 
 import wasmtime
 from wasmtime import _ffi
 
+from powderdsl.system.cache import persistent
 from powderdsl.targets.wasm.host import TOO_LARGE
 
+WASMTIME = version("wasmtime")
 MOST_ARGUMENTS = 16
 GROWTH = 16 << 20
 """Address space reserved for growth on machines with little address space."""
@@ -63,7 +67,15 @@ class WasmtimeModule:
 
     def _compile(self) -> None:
         self._engine = self.engine
-        self._module = _keep_alive(wasmtime.Module(self.engine, self._code))
+        inputs = f"{WASMTIME} {_engine(reserve=True) is self.engine} {sha256(self._code).hexdigest()}"
+        machine_code = persistent(
+            "machine code", inputs, lambda: bytes(wasmtime.Module(self.engine, self._code).serialize())
+        )
+        try:
+            module = wasmtime.Module.deserialize(self.engine, machine_code)
+        except wasmtime.WasmtimeError:  # made by another processor
+            module = wasmtime.Module(self.engine, self._code)
+        self._module = _keep_alive(module)
 
     def __call__(self) -> WasmtimeInstance:
         """A new instance. Raises MemoryError where there is no room for its memory."""

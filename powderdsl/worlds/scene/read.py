@@ -19,6 +19,7 @@ from powderdsl.model.types import Ruleset
 from powderdsl.syntax import yaml_tree
 from powderdsl.syntax.parse import Syntax, line_of
 from powderdsl.syntax.sources import read_source, shipped
+from powderdsl.system.cache import persistent
 from powderdsl.system.writing import failure
 from powderdsl.worlds.ascii import ids_by_name
 from powderdsl.worlds.raster import MAX_CELLS, Paint, Setting, Shape, Size, mask
@@ -303,10 +304,14 @@ def read_file(path: Path) -> tuple[Scene, ...]:
 @lru_cache(maxsize=32)
 def _checked_scenes(source: Source) -> tuple[Scene, ...]:
     """The scenes of a text: tasks look up those of shipped files again and again. Raises CompileError."""
-    reporter = Reporter()
-    scenes = read_scenes(source, reporter)
-    reporter.raise_if_errors()
-    return scenes
+
+    def read() -> tuple[Scene, ...]:
+        reporter = Reporter()
+        scenes = read_scenes(source, reporter)
+        reporter.raise_if_errors()
+        return scenes
+
+    return persistent(Path(source.name).name, repr((source.name, source.text)), read)
 
 
 def draw_start(scene: Scene, ruleset: Ruleset, *, size: Size | None = None) -> Start:

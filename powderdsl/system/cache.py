@@ -1,6 +1,6 @@
-"""The cache of compiled code: files that are added atomically and checked before they are loaded.
+"""The cache of compiled code and results: files that are added atomically and checked before they are loaded.
 
-<key>-<digest>-<name>    a library, a GPU kernel, or other data needed to run it; modified when it was last used
+<key>-<digest>-<name>    a library, a GPU kernel, or the result of a stage; modified when it was last used
 <key>.lock               held by the process that compiles
 .powderdsl-…             being added, or a compiler's
 """
@@ -9,24 +9,35 @@ from __future__ import annotations
 
 import hashlib
 import os
+import pickle
 import re
 import shutil
+import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 # Imported here, not later: a fork while another thread imports it would leave the child waiting forever.
 from filelock import FileLock, Timeout
 
 from powderdsl.system.reading import read_bytes
-from powderdsl.system.writing import scratch_folder
+from powderdsl.system.writing import cache_folder, scratch_folder
+
+T = TypeVar("T")
 
 NAME = re.compile(r"([0-9a-f]+)-([0-9a-f]{64})-(.+)")
 
 LIMIT = 512 << 20
 """Bytes of files to keep; beyond that, those used longest ago are removed."""
+
+MOST = 2000
+"""Files to keep, as few as that a folder is searched quickly."""
+
+QUICK = 0.01
+"""Seconds of work whose results are not worth a file."""
 
 UNUSED = 24 * 3600.0
 """Seconds after which other files are removed; until then another process may be at work on them."""
@@ -42,6 +53,49 @@ class Entry(NamedTuple):
     name: str
     size: int
     used: float
+
+
+def compiled_folder() -> Path:
+    """The user's folder of compiled code. Raises OSError if it is not private to the user."""
+    return cache_folder("compiled")
+
+
+@cache
+def code_version() -> str:
+    """A hash of this version of Python and of everything in this package that turns text into code."""
+    here = Path(__file__).resolve().parents[1]
+    digest = hashlib.sha256(sys.version.encode())
+    for path in sorted(path for path in here.rglob("*") if path.suffix in (".py", ".lark", ".hpp")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def persistent(name: str, inputs: str, make: Callable[[], T]) -> T:
+    """The result of `make`, from the cache if an earlier process made it with the same code.
+
+    Exceptions are not stored, nor what was made quickly. A cache that cannot be read or written only costs time.
+
+    Args:
+        name: the stage, for `powderdsl cache list`.
+        inputs: a text that differs wherever results differ.
+        make: returns the result, which can be pickled.
+    """
+    if sys.platform == "emscripten":  # files do not outlive the page
+        return make()
+    text = f"{code_version()}\0{name}\0{inputs}"
+    key = hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()[:32]
+    with suppress(OSError):
+        path = find(compiled_folder(), key)
+        if path is not None:
+            # Whoever can write into the folder can also replace libraries, so a pickle is as safe as they are.
+            stored: T = pickle.loads(read_bytes(path, LIMIT))
+            return stored
+    start = time.process_time()
+    result = make()
+    if time.process_time() - start > QUICK:
+        with suppress(OSError, RecursionError):
+            add(compiled_folder(), key, pickle.dumps(result), name)
+    return result
 
 
 def find(folder: Path, key: str) -> Path | None:
@@ -95,12 +149,12 @@ def clear(folder: Path) -> list[Entry]:
 
 
 def tidy(folder: Path, limit: int = LIMIT, keep: Path | None = None) -> None:
-    """Remove old leftovers and, beyond `limit` bytes, the files used longest ago, except `keep`."""
+    """Remove old leftovers and, beyond `limit` bytes or `MOST` files, the files used longest ago, except `keep`."""
     stored = entries(folder)
     total = 0
-    for entry in sorted(stored, key=lambda entry: entry.path != keep):
+    for count, entry in enumerate(sorted(stored, key=lambda entry: entry.path != keep)):
         total += entry.size
-        if total > limit and entry.path != keep:
+        if (total > limit or count >= MOST) and entry.path != keep:
             _discard(entry.path)
     for path in sorted({*folder.iterdir()} - {entry.path for entry in stored}):
         with suppress(OSError):
