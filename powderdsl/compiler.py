@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from difflib import get_close_matches
@@ -16,15 +16,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from powderdsl.diagnostics import CompileError, Diagnostic, Label, Reporter, Source, Span, suggest
-from powderdsl.model.check import check, demote_outgrown
-from powderdsl.model.composition.compose import Palette, compose
-from powderdsl.model.composition.names import words_of_tree
 from powderdsl.model.declarations import PackDecl, RulesetDecl
-from powderdsl.model.definitions import set_params
-from powderdsl.model.packs import read_file
 from powderdsl.model.types import Ruleset
 from powderdsl.syntax.sources import path_beside, read_source, shipped, shipped_names
-from powderdsl.syntax.yaml_tree import parse_yaml
 from powderdsl.system.cache import persistent
 from powderdsl.system.fingerprint import fingerprint
 from powderdsl.system.memo import Memo, collection_paused
@@ -33,6 +27,7 @@ from powderdsl.system.reading import inside, is_path
 if TYPE_CHECKING:
     from powderdsl.ir.bits import Segment
     from powderdsl.ir.ops import PassGraph, Program
+    from powderdsl.model.composition.compose import Palette
 
 BACKENDS = {
     "auto": "`wasm` at once, and `native` once that is compiled; `cuda`, or else `torch`, on other devices",
@@ -60,6 +55,9 @@ def shipped_rules() -> list[str]:
 @cache
 def shipped_words() -> dict[str, str]:
     """The words that the shipped packs define, each with its pack."""
+    from powderdsl.model.composition.names import words_of_tree
+    from powderdsl.syntax.yaml_tree import parse_yaml
+
     packs: dict[str, str] = {}
     for source in _shipped_sources():
         for word in words_of_tree(parse_yaml(source, Reporter())):
@@ -67,11 +65,10 @@ def shipped_words() -> dict[str, str]:
     return packs
 
 
-def _shipped_sources() -> Iterator[Source]:
-    for path in sorted(shipped("rules").glob("*.yaml")):
-        source = read_source(path, Reporter())
-        if source is not None:
-            yield source
+@cache
+def _shipped_sources() -> tuple[Source, ...]:
+    paths = sorted(shipped("rules").glob("*.yaml"))
+    return tuple(source for path in paths if (source := read_source(path, Reporter())))
 
 
 def shipped_variants() -> set[str]:
@@ -130,17 +127,22 @@ def load_with_diagnostics(
     reporter.raise_if_errors()
 
     def checked() -> tuple[Ruleset, tuple[Diagnostic, ...]]:
+        from powderdsl.model.check import check, demote_outgrown
+
         model = check(packs, ruleset, reporter, palette, shipped_words)
         reporter.raise_if_errors()
-        return model, reporter.diagnostics
+        return model, demote_outgrown(model, reporter.diagnostics)
 
     words = list(map(str, names))
-    inputs = [words, [(source.name, source.text) for source in reader.sources], palette]
+    sources = (*reader.sources, *_shipped_sources())  # advice names shipped packs
+    inputs = [words, [(source.name, source.text) for source in sources], palette]
     model, remarks = persistent("+".join(words), repr(inputs), checked)
     if params:
+        from powderdsl.model.definitions import set_params
+
         model = set_params(model, params, reporter)
         reporter.raise_if_errors()
-    return model, demote_outgrown(model, remarks)
+    return model, remarks
 
 
 def whole_palette(*names: str | Path) -> tuple[str | None, ...]:
@@ -152,6 +154,8 @@ def whole_palette(*names: str | Path) -> tuple[str | None, ...]:
     reporter = Reporter()
     packs, ruleset = read([word for name in names for word in split_names(name)[0]], reporter)
     reporter.raise_if_errors()
+    from powderdsl.model.composition.compose import compose
+
     composition = compose(packs, ruleset, reporter)
     reporter.raise_if_errors()
     own = composition.own_slots if ruleset else composition.slots
@@ -229,6 +233,8 @@ def _read_apart(source: Source) -> tuple[PackDecl | RulesetDecl | None, tuple[Di
     """The declaration of a file, and its diagnostics."""
 
     def read() -> tuple[PackDecl | RulesetDecl | None, tuple[Diagnostic, ...]]:
+        from powderdsl.model.packs import read_file
+
         reporter = Reporter()
         with suppress(CompileError):  # more errors than the limit
             return read_file(source, reporter), reporter.diagnostics

@@ -56,7 +56,8 @@ def start(
 
     memo = Memo()  # what is lowered here is not lowered again
     many = drawn is None or drawn.ids.size * max(steps, 100) > FEW
-    tensors = backend == "auto" and (many or not _fits_planes(ruleset, memo))
+    # WebAssembly runs only what bit planes carry; without torch, the slow oracle runs the rest.
+    tensors = backend == "auto" and (many or any(part.planes is None for part in segments_of(ruleset, memo)))
     sim = compile(ruleset, backend, tensors=tensors, memo=memo, **how)
     with user_values():
         if drawn is None:
@@ -68,11 +69,6 @@ def start(
             values: dict[str, Any] = {key: field.values}
             world = sim.paint(world, where=field.where, **values)
         return world
-
-
-def _fits_planes(ruleset: Ruleset, memo: Memo) -> bool:
-    """True if bit planes carry all passes. WebAssembly runs only these; without torch, the slow oracle runs the rest."""
-    return all(part.planes is not None for part in segments_of(ruleset, memo))
 
 
 def start_drawn(

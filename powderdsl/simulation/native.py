@@ -27,7 +27,7 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.ir.bits import segments
 from powderdsl.ir.ops import Program
 from powderdsl.model.types import Ruleset
-from powderdsl.system.cache import code_version, turn
+from powderdsl.system.cache import code_hash
 from powderdsl.system.fingerprint import fingerprint
 from powderdsl.targets.array_kind import Array
 from powderdsl.targets.cpp.build import (
@@ -40,6 +40,7 @@ from powderdsl.targets.cpp.build import (
     current,
     find_compiler,
     flags_for,
+    turn,
 )
 from powderdsl.targets.cpp.program import NativeProgram, compile_program, recall, remember
 from powderdsl.targets.cpp.source import known_width
@@ -62,7 +63,7 @@ def start_key(ruleset: Ruleset, width: int | None = None) -> str:
     compiler = find_compiler()
     params = tuple(replace(param, default=0, about="") for param in ruleset.params)
     model = fingerprint(replace(ruleset, params=params))
-    return cache_key(f"{model}{code_version()} {width}", compiler, flags_for(compiler, current().level))
+    return cache_key(f"{model}{code_hash()} {width}", compiler, flags_for(compiler, current().level))
 
 
 class ByWidth:

@@ -6,18 +6,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any
-
-from lark import Lark, Token, Tree
-from lark import __version__ as lark_version
-from lark.exceptions import UnexpectedCharacters, UnexpectedInput, UnexpectedToken
-from lark.utils import TextSlice
+from typing import TYPE_CHECKING, Any
 
 from powderdsl.diagnostics import Reporter, Source, Span
 from powderdsl.diagnostics.printable import shown_character
 from powderdsl.syntax.hints import CUT, character_help, expected_words, token_help, was_cut
 from powderdsl.syntax.yaml_tree import Node, Scalar
 from powderdsl.system.writing import cache_folder
+
+if TYPE_CHECKING:
+    from lark import Lark, Token, Tree
+    from lark.exceptions import UnexpectedInput
 
 MAX_LENGTH = 2000
 MAX_DEPTH = 48
@@ -69,9 +68,11 @@ LANGUAGES = {start: language for language in (RULES, STATEMENTS) for start in la
 @cache
 def parser(language: Language = RULES) -> Lark:
     """The parser of a language. Its tables are kept in the user's cache: making them takes 0.2 s."""
+    from lark import Lark, __version__
+
     grammar = Path(__file__).with_name("grammar.lark").read_text(encoding="utf-8")
     try:
-        cache_file: str | bool = str(cache_folder("syntax") / f"{language.starts[0]}-{lark_version}.lark")
+        cache_file: str | bool = str(cache_folder("syntax") / f"{language.starts[0]}-{__version__}.lark")
     except (OSError, RuntimeError):  # no home folder, or one that cannot be written
         cache_file = False
     return Lark(
@@ -116,6 +117,9 @@ def parse_scalar(scalar: Scalar, start: str, reporter: Reporter) -> Syntax | Non
 
 def parse_text(line: Span, start: str, reporter: Reporter, usage: Sequence[str] = ()) -> Syntax | None:
     """Parse a line from a start symbol. Reports at most one syntax error, whose help is `usage` if given."""
+    from lark.exceptions import UnexpectedInput
+    from lark.utils import TextSlice
+
     language = LANGUAGES[start]
     length, first = line.end - line.start, Span(line.source, line.start, line.start + 1)
     helps = usage or ["give parts of it names with `let:`"]
@@ -146,7 +150,7 @@ def depth(tree: Tree) -> int:
 
 
 def _to_syntax(tree: Tree | Token, source: Source, fallback: Span) -> Syntax:
-    if isinstance(tree, Token):
+    if isinstance(tree, str):  # a token
         start = tree.start_pos if tree.start_pos is not None else fallback.start
         stop = tree.end_pos if tree.end_pos is not None else fallback.end
         return Syntax("token", (), str(tree), Span(source, start, stop))
@@ -161,6 +165,8 @@ def _to_syntax(tree: Tree | Token, source: Source, fallback: Span) -> Syntax:
 def _report_syntax_error(
     error: UnexpectedInput, line: Span, language: Language, reporter: Reporter, usage: Sequence[str]
 ) -> None:
+    from lark.exceptions import UnexpectedCharacters, UnexpectedToken
+
     source, text = line.source, line.source.text
     if isinstance(error, UnexpectedCharacters):
         start: int = error.pos_in_stream  # type: ignore[assignment]  # declared as None, set by this subclass

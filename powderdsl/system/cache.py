@@ -14,14 +14,11 @@ import re
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple, TypeVar
-
-# Imported here, not later: a fork while another thread imports it would leave the child waiting forever.
-from filelock import FileLock, Timeout
 
 from powderdsl.system.reading import read_bytes
 from powderdsl.system.writing import cache_folder, scratch_folder
@@ -42,9 +39,6 @@ QUICK = 0.01
 UNUSED = 24 * 3600.0
 """Seconds after which other files are removed; until then another process may be at work on them."""
 
-PATIENCE = 120.0
-"""Seconds to wait for another process that compiles the same source; after that both compile."""
-
 
 class Entry(NamedTuple):
     """A file in the cache. `used` is the time of its last use, in seconds since the epoch."""
@@ -61,10 +55,10 @@ def compiled_folder() -> Path:
 
 
 @cache
-def code_version() -> str:
-    """A hash of this version of Python and of everything in this package that turns text into code."""
+def code_hash() -> str:
+    """A hash of the code of this package."""
     here = Path(__file__).resolve().parents[1]
-    digest = hashlib.sha256(sys.version.encode())
+    digest = hashlib.sha256()
     for path in sorted(path for path in here.rglob("*") if path.suffix in (".py", ".lark", ".hpp")):
         digest.update(path.read_bytes())
     return digest.hexdigest()
@@ -82,7 +76,7 @@ def persistent(name: str, inputs: str, make: Callable[[], T]) -> T:
     """
     if sys.platform == "emscripten":  # files do not outlive the page
         return make()
-    text = f"{code_version()}\0{name}\0{inputs}"
+    text = f"{code_hash()}\0{sys.version}\0{name}\0{inputs}"
     key = hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()[:32]
     with suppress(OSError):
         path = find(compiled_folder(), key)
@@ -160,21 +154,6 @@ def tidy(folder: Path, limit: int = LIMIT, keep: Path | None = None) -> None:
         with suppress(OSError):
             if time.time() - path.lstat().st_mtime > UNUSED:
                 _discard(path)
-
-
-@contextmanager
-def turn(folder: Path, key: str) -> Iterator[None]:
-    """Let one process at a time into the block, up to a time limit: all of them would compile the same source.
-
-    The operating system releases the lock of a process that dies. Without file locks, nobody waits.
-    """
-    lock = FileLock(folder / f"{key}.lock")
-    with suppress(OSError, NotImplementedError, Timeout):
-        lock.acquire(timeout=PATIENCE)
-    try:
-        yield
-    finally:
-        lock.release()
 
 
 def _discard(path: Path) -> None:

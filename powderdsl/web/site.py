@@ -32,8 +32,9 @@ from powderdsl.model.state import fits
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.standalone import standalone_module
 from powderdsl.syntax.sources import shipped
+from powderdsl.system.cache import code_hash, persistent
 from powderdsl.system.memo import Memo
-from powderdsl.system.writing import cache_folder, replacing
+from powderdsl.system.writing import replacing
 from powderdsl.targets.array_kind import ArrayKind
 from powderdsl.tasks.shipped import load_task, shipped_tasks
 from powderdsl.tasks.tensors.generator import StartWorlds
@@ -320,29 +321,11 @@ def _dump(value: Any) -> bytes:
 
 
 def cached(name: str, make: Make) -> bytes:
-    """A file about shipped rules, made once for a version of the code."""
-    try:
-        folder = _cache_folder()
-    except OSError:
-        return make()
-    if not (folder / name).is_file():
-        _write(folder / name, make())
-    return (folder / name).read_bytes()
-
-
-def _cache_folder() -> Path:
-    """The folder of files made by this code: in the installation, or else in the user's cache.
-
-    Files of other versions are removed from the cache. Raises OSError if the user has no private cache.
-    """
-    version = MADE / "version.txt"
-    if version.is_file() and version.read_text(encoding="utf-8") == code_version():
-        return MADE
-    folder = cache_folder("play") / code_version()
-    for other in sorted(folder.parent.iterdir()):
-        if other != folder:
-            shutil.rmtree(other, ignore_errors=True)
-    return folder
+    """A file about shipped rules: from the installation, or made once for a version of the code."""
+    version, path = MADE / "version.txt", MADE / name
+    if version.is_file() and version.read_text(encoding="utf-8") == code_version() and path.is_file():
+        return path.read_bytes()
+    return persistent(name, code_version(), make)
 
 
 def write_made() -> None:
@@ -355,12 +338,11 @@ def write_made() -> None:
 
 @cache
 def code_version() -> str:
-    """A hash of all modules of powderdsl, and of its rules, tasks and examples."""
-    digest = hashlib.sha256()
-    code = {*HERE.parent.rglob("*.py"), *HERE.parent.rglob("*.lark")}
+    """A hash of the code of powderdsl, and of its rules, tasks and examples."""
+    digest = hashlib.sha256(code_hash().encode())
     folders = shipped("rules"), shipped("tasks"), examples_folder()
     texts = [path for folder in folders for path in sorted(folder.rglob("*.yaml"))]
-    for path in sorted(code) + sorted(texts):
+    for path in sorted(texts):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 

@@ -19,7 +19,7 @@ import pytest
 from filelock import FileLock
 
 from powderdsl.system import cache
-from powderdsl.system.writing import MARK, cache_folder, scratch_folder
+from powderdsl.system.writing import MARK, scratch_folder
 from powderdsl.targets.cpp.build import (
     Building,
     Compiler,
@@ -336,7 +336,7 @@ def test_what_cannot_be_run_says_so(tmp_path: Path) -> None:
 
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    folder = cache_folder("native")
+    folder = cache.compiled_folder()
     assert powderdsl("cache", "path").stdout == f"{folder}\n"
     assert powderdsl("cache", "list").stdout == ""
     put(folder, "0123456789abcdef", bytes(1 << 21), used=3 * 86400)
@@ -366,5 +366,5 @@ def test_kernels_for_gpus_lie_there_too(tmp_path: Path, monkeypatch: pytest.Monk
     wanted = [(a, "sm_90"), (a, "sm_80"), (a, "sm_90"), (b, "sm_90")]
     assert [cuda_build.machine_code(*one, "13.0") for one in wanted] == [b"a", b"a", b"a", b"b"]
     assert [call.args[1] for call in compile_text.call_args_list] == ["a", "a", "b"]
-    found = cache.entries(tmp_path / "powderdsl" / "native")
+    found = cache.entries(cache.compiled_folder())
     assert [entry.name for entry in found] == ["rules.cuda"] * 3

@@ -16,7 +16,7 @@ from powderdsl.compiler import lower
 from powderdsl.ir.bits import segments
 from powderdsl.system.memo import Memo
 from powderdsl.targets.tensor_kind import Tensors
-from powderdsl.targets.wasm import program
+from powderdsl.targets.wasm import program, source
 from powderdsl.targets.wasm.binary import Module
 from powderdsl.targets.wasm.program import Instance, WasmProgram, WasmState
 from powderdsl.targets.wasm.source import wasm_module
@@ -51,10 +51,11 @@ def packed(world: Any) -> tuple[Instance, int]:
 
 def test_the_same_rules_are_compiled_once_for_a_width(monkeypatch: pytest.MonkeyPatch, torch) -> None:  # type: ignore[no-untyped-def]
     made: list[int] = []
-    original = program.wasm_module
+    original = source.wasm_module
     monkeypatch.setattr(
-        program, "wasm_module", lambda *given, **more: made.append(given[1]) or original(*given, **more)
+        source, "wasm_module", lambda *given, **more: made.append(given[1]) or original(*given, **more)
     )
+    monkeypatch.setattr(program, "persistent", lambda name, inputs, make: make())
     monkeypatch.setattr(program, "_MODULES", Memo(versions=1, things=64))
     for chance in ("20%", "20%", "30%"):
         ruleset = powderdsl.load("core+sand+water", params={"water.melt": chance})

@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from powderdsl.cli.output import counted
+from powderdsl.system.cache import Entry, clear, compiled_folder, entries
 from powderdsl.system.reports import table
-
-if TYPE_CHECKING:
-    from powderdsl.system.cache import Entry
 
 
 @click.group("cache")
@@ -28,9 +24,7 @@ def command() -> None:
 @command.command("list")
 def list_entries() -> None:
     """List the files of compiled code, the most recently used first."""
-    from powderdsl.system.cache import entries
-
-    stored = entries(_folder())
+    stored = entries(compiled_folder())
     rows = [["code of", "size", "last used"]]
     for entry in stored:
         used = time.strftime("%Y-%m-%d %H:%M", time.localtime(entry.used))
@@ -43,23 +37,14 @@ def list_entries() -> None:
 @command.command("clear")
 def clear_entries() -> None:
     """Remove compiled code. Running programs continue; code is compiled again when it is next needed."""
-    from powderdsl.system.cache import clear
-
-    removed = clear(_folder())
+    removed = clear(compiled_folder())
     click.echo(f"removed {counted(len(removed), 'file')}, {_megabytes(removed)}", err=True)
 
 
 @command.command("path")
 def print_path() -> None:
     """Print the folder on stdout."""
-    click.echo(_folder())
-
-
-def _folder() -> Path:
-    """The folder of compiled code. An OSError, if others may write to it, ends the command with its message."""
-    from powderdsl.system.cache import compiled_folder
-
-    return compiled_folder()
+    click.echo(compiled_folder())
 
 
 def _megabytes(entries: Sequence[Entry]) -> str:

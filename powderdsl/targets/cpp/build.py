@@ -13,13 +13,16 @@ import shutil
 import signal
 import subprocess
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryFile
+
+# Imported here, not later: a fork while another thread imports it would leave the child waiting forever.
+from filelock import FileLock, Timeout
 
 from powderdsl.system import cache
 from powderdsl.system.writing import scratch_folder
@@ -141,6 +144,9 @@ def processor() -> str:
 
 TIMEOUT = 600
 
+PATIENCE = 120.0
+"""Seconds to wait for another process that compiles the same source; after that both compile."""
+
 
 @dataclass(frozen=True)
 class Building:
@@ -176,6 +182,21 @@ def current() -> Building:
     return _building.get()
 
 
+@contextmanager
+def turn(folder: Path, key: str) -> Iterator[None]:
+    """Let one process at a time into the block, up to a time limit: all of them would compile the same source.
+
+    The operating system releases the lock of a process that dies. Without file locks, nobody waits.
+    """
+    lock = FileLock(folder / f"{key}.lock")
+    with suppress(OSError, NotImplementedError, Timeout):
+        lock.acquire(timeout=PATIENCE)
+    try:
+        yield
+    finally:
+        lock.release()
+
+
 def cache_key(source: str, compiler: Compiler, flags: tuple[str, ...]) -> str:
     """A hash of everything that a library depends on."""
     program = shutil.which(compiler.command[0]) or ""
@@ -201,7 +222,7 @@ def build(source: str, ruleset: str = "", units: int = 1) -> Path:
     key = cache_key(source, compiler, flags)
     if library := cache.find(folder, key):
         return library
-    with cache.turn(folder, key):
+    with turn(folder, key):
         if library := cache.find(folder, key):
             return library
         try:

@@ -13,8 +13,7 @@ from functools import partial
 
 from powderdsl.ir.ops import REAL, Program
 from powderdsl.system.random import MASK, START_0, START_1
-from powderdsl.targets.codec import Piece
-from powderdsl.targets.layout import Layout
+from powderdsl.targets.wasm.batches import HEADER
 from powderdsl.targets.wasm.binary import (
     F32,
     I32,
@@ -33,7 +32,6 @@ from powderdsl.targets.wasm.library import (
     GOLDEN,
     GROUPS,
     HALOED,
-    HEADER,
     LANES,
     LIVE,
     SOME,
@@ -51,12 +49,6 @@ LARGE_PLANE = 32 << 10
 """Bytes of a plane of two worlds that exceed a near cache; then the lanes are strips of one world."""
 
 WEIGHTS = bytes(1 << i for i in range(8)) * 2
-
-
-def numbers_of(piece: Piece, layout: Layout, size: int) -> tuple[int, int, int, int]:
-    """The arguments of `load` and `store` for a piece of the state whose cells have `size` bytes."""
-    slot, planes, signed = layout.home(piece)
-    return slot if planes else len(layout.planes) + slot, planes, int(signed), size
 
 
 class Batches:

@@ -23,6 +23,8 @@ from powderdsl.schedule.rows import chains_of
 from powderdsl.schedule.types import Move, Schedule, Sweeps, flat, reads_of
 from powderdsl.system.random import MASK
 from powderdsl.targets.layout import Layout
+from powderdsl.targets.wasm import batches
+from powderdsl.targets.wasm.batches import HEADER, aligned
 from powderdsl.targets.wasm.binary import (
     I32,
     I64,
@@ -42,9 +44,6 @@ from powderdsl.targets.wasm.binary import (
 )
 
 WORD, LANES = 64, 2
-HEADER = 16
-"""Bytes of numbers before the contents of planes, fields and batches."""
-
 REFS, SOME, HALOED, NEXT = (Member("i32.load", at) for at in (0, 4, 8, 12))
 FIELD = 2
 """The value of `haloed` that marks fields."""
@@ -55,7 +54,7 @@ REFS_SOME = Member("i64.load", 0)
 LIVE = Member("i32.load8_u", HEADER)
 """The live byte of a line, at the field's address plus the line's number."""
 
-WORLDS, GROUPS = Member("i32.load", 0), Member("i32.load", 4)
+WORLDS, GROUPS = Member("i32.load", batches.WORLDS), Member("i32.load", batches.GROUPS)
 
 PAGE = 1 << 16
 GOLDEN, FIRST, SECOND = 0x9E3779B1, 0x7FEB352D, 0x846CA68B
@@ -75,10 +74,6 @@ STILL, SWAPPED = bytes(range(16)), bytes([*range(8, 16), *range(8)])
 """Patterns for `i8x16.swizzle`: the lanes unmodified, and exchanged."""
 
 ZERO = const("i32", 0)
-
-
-def aligned(count: int, by: int = 16) -> int:
-    return -(-count // by) * by
 
 
 class Extent(NamedTuple):

@@ -19,10 +19,8 @@ from powderdsl.targets.array_kind import Array, ArrayKind
 from powderdsl.targets.codec import parameters, pieces
 from powderdsl.targets.job import Job, Like, OwnedBatch, like_of, shape_of
 from powderdsl.targets.layout import layout_of
-from powderdsl.targets.wasm.driver import numbers_of
+from powderdsl.targets.wasm.batches import GROUPS, HEADER, aligned, numbers_of
 from powderdsl.targets.wasm.host import Compiled, this_host
-from powderdsl.targets.wasm.library import GROUPS, HEADER, aligned
-from powderdsl.targets.wasm.source import wasm_module
 
 ROOM = 1 << 30
 """Bytes of memory from which an instance takes no new batches. The other half remains for its batches to step and read."""
@@ -53,6 +51,8 @@ class WasmProgram:
         """The module for a width."""
 
         def code() -> bytes:
+            from powderdsl.targets.wasm.source import wasm_module
+
             return wasm_module(self.planes, width, memo=self._memo).code
 
         def make() -> Compiled:
@@ -183,7 +183,7 @@ class Instance:
         if job.timing is None:
             self.call("run", batch, job.steps)
             return
-        groups = int.from_bytes(self.running.read(batch + GROUPS.offset, 4), "little")
+        groups = int.from_bytes(self.running.read(batch + GROUPS, 4), "little")
         for group in range(groups):
             self.call("enter", batch, group)
             for step in range(job.steps):
