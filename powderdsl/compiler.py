@@ -432,8 +432,14 @@ def lower(ruleset: Ruleset, memo: Memo | None = None) -> Program:
 
 def segments_of(ruleset: Ruleset, memo: Memo | None = None) -> tuple[Segment, ...]:
     """A ruleset as segments of optimized IR, on bit planes if the planes can represent the passes. `memo` as in `lower`."""
-    inputs = f"{ruleset.name} {fingerprint(replace(ruleset, declared=None), places=True)}"
-    return persistent(f"{ruleset.name} on planes", inputs, lambda: parts(lower(ruleset, memo), memo))
+    return persistent(
+        f"{ruleset.name} on planes", text_key(ruleset), lambda: parts(lower(ruleset, memo), memo)
+    )
+
+
+def text_key(ruleset: Ruleset) -> str:
+    """A text that differs wherever anything of two models differs, places in files included."""
+    return fingerprint(replace(ruleset, declared=None), whole=True)
 
 
 def parts(program: Program, memo: Memo | None = None) -> tuple[Segment, ...]:

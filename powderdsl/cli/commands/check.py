@@ -9,21 +9,20 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from powderdsl.analysis.account import ledger_data, ledger_text
-from powderdsl.analysis.ledger import Ledger
-from powderdsl.analysis.ledger import ledger as make_ledger
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BAD_INPUT, FAILED, OK
 from powderdsl.cli.output import counted, print_json, write_diagnostics
-from powderdsl.compiler import load_with_diagnostics, lower
+from powderdsl.compiler import load_with_diagnostics, lower, text_key
 from powderdsl.diagnostics import CompileError, Diagnostic, Severity
 from powderdsl.diagnostics.diagnostic import diagnostic_data
 from powderdsl.model.types import Ruleset
+from powderdsl.system.cache import persistent
 from powderdsl.system.reports import table
 from powderdsl.tasks.shipped import is_task
 
 if TYPE_CHECKING:
     from powderdsl.analysis.costs import PassCost
+    from powderdsl.analysis.ledger import Ledger
     from powderdsl.tasks.task import Task
 
 
@@ -85,6 +84,8 @@ def command(
         if cost:
             data["cost"] = {result.name: result.cost for result in results if result.cost is not None}
         if ledger:
+            from powderdsl.analysis.account import ledger_data
+
             data["ledger"] = {result.name: ledger_data(result.ledger) for result in results if result.ledger}
         print_json(data)
     elif shown:
@@ -107,6 +108,8 @@ def _lines(result: Checked, notes: bool) -> Iterator[str]:
     if result.cost is not None:
         yield from ("", *_cost_lines(result.cost))
     if result.ledger is not None:
+        from powderdsl.analysis.account import ledger_text
+
         yield from ("", ledger_text(result.ledger))
 
 
@@ -120,18 +123,28 @@ def _check(name: str, quick: bool, cost: bool, ledger: bool) -> Checked:
         ruleset, diagnostics = load_with_diagnostics(name)
     except CompileError as error:
         return Checked(name, error.diagnostics)
-    book = None
     if ruleset.invariants and not quick:
-        from powderdsl.testing.properties.refute import refuted  # brings numpy
-
-        book = make_ledger(ruleset)
-        diagnostics = (*diagnostics, *refuted(ruleset, book))
+        inputs = text_key(ruleset)
+        broken = persistent(f"invariants of {ruleset.name}", inputs, lambda: _refuted(ruleset))
+        diagnostics = (*diagnostics, *broken)
     expenses = None
     if cost:
         from powderdsl.analysis.costs import costs
 
         expenses = costs(lower(ruleset))
-    return Checked(name, diagnostics, ruleset, expenses, (book or make_ledger(ruleset)) if ledger else None)
+    return Checked(name, diagnostics, ruleset, expenses, _ledger(ruleset) if ledger else None)
+
+
+def _refuted(ruleset: Ruleset) -> tuple[Diagnostic, ...]:
+    from powderdsl.testing.properties.refute import refuted  # brings numpy
+
+    return refuted(ruleset, _ledger(ruleset))
+
+
+def _ledger(ruleset: Ruleset) -> Ledger:
+    from powderdsl.analysis.ledger import ledger
+
+    return ledger(ruleset)
 
 
 def _cost_lines(passes: tuple[PassCost, ...]) -> Iterator[str]:
