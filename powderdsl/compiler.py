@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from difflib import get_close_matches
@@ -276,6 +276,7 @@ class _Reader:
             example = "name a shipped ruleset or a file: `powderworld`"
             self.reporter.error("PD304", "no rules were named", None, helps=[example])
         loaded = {name: pack for name, pack in packs.items() if name not in left_out}
+        loaded = {**self.needed_by(loaded, left_out), **loaded}
         if not rulesets:
             return list(loaded.values()), None
         *beside, last = rulesets
@@ -287,6 +288,29 @@ class _Reader:
         members = dict.fromkeys(name for ruleset in last.lineage for name in ruleset.members)
         reserved = {name: packs[name] for name in members if name not in loaded and name in packs}
         return list(loaded.values()), replace(last, beside=tuple(beside), left_out=reserved)
+
+    def needed_by(self, loaded: Mapping[str, PackDecl], left_out: Collection[str]) -> dict[str, PackDecl]:
+        """The packs that others need and that nobody named or left out, from files beside those or shipped."""
+        needed: dict[str, PackDecl] = {}
+        waiting = list(loaded.values())
+        known = {
+            name for pack in waiting for name in (pack.name.text, *(word.text for word in pack.provides))
+        }
+        for pack in waiting:  # grows on the way
+            for need in pack.needs:
+                word = need.text
+                if word in known or word in left_out or is_path(word):
+                    continue
+                known.add(word)
+                decl = self.declaration(_file_beside(word, self.reporter, pack, need.span))
+                if isinstance(decl, PackDecl) and decl.name.text == word:
+                    needed[word] = decl
+                    waiting.append(decl)
+        if len(needed) < 2:
+            return needed
+        from powderdsl.model.composition.names import needed_first
+
+        return {name: needed[name] for name in needed_first(needed)}
 
     def declaration(self, path: Path | None) -> PackDecl | RulesetDecl | None:
         """The declaration in a file."""
@@ -390,23 +414,33 @@ def _find_beside(word: str, reporter: Reporter, ruleset: RulesetDecl, span: Span
         message = f"a ruleset names other files without a path: `{word}`"
         reporter.error("PD304", message, span, helps=helps)
         return None
-    folder, name = Path(ruleset.source.name).parent, f"{word}.yaml"
+    reported = len(reporter.diagnostics)
+    path = _file_beside(word, reporter, ruleset, span)
+    if path is None and len(reporter.diagnostics) == reported:
+        _report_unknown(word, span, reporter)
+    return path
+
+
+def _file_beside(
+    word: str, reporter: Reporter, decl: PackDecl | RulesetDecl, span: Span | None
+) -> Path | None:
+    """The file of a pack in the folder of a declaration, or else the shipped one. Reports a link that leads out (PD112)."""
+    folder, name = Path(decl.source.name).parent, f"{word}.yaml"
     if _is_there(str(folder / name)):
         try:
             return inside(folder, name)
         except ValueError as error:
-            reporter.error("PD112", f"`{name}` leaves the ruleset's folder", span, str(error))
+            reporter.error("PD112", f"`{name}` leaves the folder of `{decl.name.text}`", span, str(error))
             return None
     path = shipped("rules") / name
-    if _is_there(str(path)):
-        return path
-    _report_unknown(word, span, reporter)
-    return None
+    return path if _is_there(str(path)) else None
 
 
 def _report_unknown(word: str, span: Span | None, reporter: Reporter) -> None:
     close = get_close_matches(word, shipped_rules(), n=1)
     helps = [f"did you mean `{close[0]}`?"] if close else ["shipped: " + ", ".join(shipped_rules())]
+    if span is None and _is_there(f"{word}.yaml"):
+        helps = [f"did you mean the file `{word}.yaml`?"]
     label = "not shipped, and no file" if span else ""
     reporter.error("PD304", f"no pack or ruleset `{word}`", span, label, helps=helps)
 

@@ -6,6 +6,7 @@ import os
 import sys
 import warnings
 from collections.abc import Sequence
+from contextlib import nullcontext
 from importlib import import_module
 from typing import Any, NoReturn
 
@@ -68,7 +69,9 @@ class GuardedCommand(click.Command):
         warnings.formatwarning = plain_warning
         if os.environ.pop(LIFELINE, None):
             end_with_stdin()
-        with printable_streams(), interruptible():
+        # For completion, click writes bytes that a shell reads: names of ours, and nothing from files.
+        completes = "_POWDERDSL_COMPLETE" in os.environ
+        with nullcontext() if completes else printable_streams(), interruptible():
             try:
                 status = super().main(args, prog_name or self.name, *rest, **options)
             except (Exception, KeyboardInterrupt) as error:

@@ -57,16 +57,14 @@ def home_of(path: Path) -> str:
         return str(path)
     for other in sorted(path.parent.glob("*.yaml")):
         head = _text(other)
-        if re.search(r"^ruleset:", head, re.MULTILINE) and path.stem in _listed("packs", head):
+        if re.search(r"^ruleset:", head, re.MULTILINE) and path.stem in _members(head):
             return str(other)
-    beside = {name: path.parent / f"{name}.yaml" for name in _listed("needs", text)}
-    packs = [str(file) if file.is_file() else name for name, file in beside.items()]
-    return "+".join([*packs, str(path)])
+    return str(path)
 
 
-def _listed(key: str, text: str) -> list[str]:
-    """The names after a key that stand on its line."""
-    match = re.search(rf"^{key}:[ \t]*\[?([^\]\n]*)", text, re.MULTILINE)
+def _members(text: str) -> list[str]:
+    """The packs of a ruleset that are listed on one line."""
+    match = re.search(r"^packs:[ \t]*\[?([^\]\n]*)", text, re.MULTILINE)
     return re.findall(r"\w+", match[1]) if match else []
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 from types import SimpleNamespace
 
@@ -120,3 +121,17 @@ def test_a_closed_pipe_is_no_mistake():
         running.stdout.close()
         assert "Traceback" not in running.stderr.read()
         running.wait(timeout=60)
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_shells_complete_commands_and_options(shell):
+    source = process(_POWDERDSL_COMPLETE=f"{shell}_source").stdout
+    assert f"_POWDERDSL_COMPLETE={shell}_complete" in source
+    if shutil.which(shell):
+        subprocess.run(
+            [shell, "-c", source if shell != "zsh" else f"autoload compinit; compinit -u\n{source}"],
+            check=True,
+        )
+    words = {"COMP_WORDS": "powderdsl tra", "COMP_CWORD": "tra" if shell == "fish" else "1"}
+    answer = process(_POWDERDSL_COMPLETE=f"{shell}_complete", **words).stdout
+    assert all(word in answer for word in ("trace", "train"))

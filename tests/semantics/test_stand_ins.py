@@ -78,7 +78,6 @@ def test_elements_keep_the_name_of_the_pack_that_defines_them() -> None:
     [
         (("ground.yaml+moor.yaml+seed.yaml",), "PD306"),  # the pack itself comes first
         (("moor.yaml+dune.yaml+seed.yaml",), "PD306"),
-        (("seed.yaml",), "PD305"),
     ],
 )
 def test_exactly_one_pack_provides_another(names: tuple[str, ...], code: str) -> None:

@@ -215,7 +215,7 @@ def compose(
     """
     ruleset = ruleset or NO_RULESET
     loaded = with_stand_ins(packs)
-    _check_needs(loaded, reporter)
+    _check_needs(loaded, ruleset.left_out, reporter)
     reporter.raise_if_errors()  # every name of a missing pack would be reported too
     names = Names(loaded, SHARED, ruleset.renames, reporter, RESERVED | reserved_words() | {"elements"})
     params = {}
@@ -277,7 +277,7 @@ def title(loaded: Collection[str], ruleset: RulesetDecl) -> str:
     return "".join([ruleset.name.text, *gone, *added]).removeprefix("+")
 
 
-def _check_needs(loaded: Mapping[str, PackDecl], reporter: Reporter) -> None:
+def _check_needs(loaded: Mapping[str, PackDecl], left_out: Collection[str], reporter: Reporter) -> None:
     """Report packs that cannot be loaded together, and packs that are needed and not loaded."""
     stands_in: dict[str, PackDecl] = {}
     missing: dict[str, dict[str, Span]] = {}
@@ -299,13 +299,11 @@ def _check_needs(loaded: Mapping[str, PackDecl], reporter: Reporter) -> None:
     for name, needing in missing.items():
         first, *others = needing
         count = f" and {len(others)} others need" if others else " needs"
-        fix = f"load it too, as in `{name}+{first}`"
+        fix = f"put `{name}.yaml` into the folder of `{loaded[first].source.name}`: none is shipped"
         if close := get_close_matches(name, sorted(loaded.keys() - needing.keys()), n=1, cutoff=0.75):
             fix = f"did you mean `{close[0]}`?"
-        elif others:
-            fix = (
-                f"load `{name}` too, or leave out what needs it: {', '.join(f'`{pack}`' for pack in needing)}"
-            )
+        elif name in left_out:
+            fix = f"leave out what needs it too: {', '.join(f'`-{pack}`' for pack in needing)}"
         reporter.error(
             "PD305", f"pack `{first}`{count} `{name}`, which is not loaded", needing[first], "not loaded",
             secondary=[Label(needing[pack], "needed here too") for pack in others[:3]], helps=[fix],
