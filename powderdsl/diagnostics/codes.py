@@ -78,6 +78,7 @@ _ROWS = (
     ("PD407", "not-assignable"),
     ("PD408", "range-overflow", _WARNING),
     ("PD409", "offset-too-far"),
+    ("PD410", "alternatives-not-joined"),
     # PD5xx: the logic of rules
     ("PD501", "movement-conflict"),
     ("PD502", "write-conflict"),

@@ -240,6 +240,8 @@ RULES: list[tuple[str, str, str, str | None]] = [
     ("a fraction", "age := 1.5", "PD401", "1.5"),
     ("a remainder of zero", "soil -> weed if age mod 0 == 1", "PD405", "0"),
     ("a look too far", "soil -> weed if at(99, 0) is weed", "PD409", "at(99, 0)"),
+    ("a set after a test of a neighbor", "soil -> weed if below is soil or weed", "PD410", "below is soil or weed"),
+    ("sets after a test", "soil -> weed if age > 1 or left is not soil or (weed, soil)", "PD410", "left is not soil or (weed, soil)"),
     ("a look that varies", "soil -> weed if at(age, 0) is weed", "PD405", "age"),
     # Calls and assignments
     ("too few values", "soil -> weed if at(1) is weed", "PD406", "at(1)"),

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from fractions import Fraction
-from itertools import pairwise, product
+from itertools import pairwise, product, takewhile
 from math import prod
 
 from powderdsl.diagnostics import Label, Reporter, Span
@@ -552,6 +552,8 @@ class Typer:
     # Logic
 
     def logic(self, syntax: Syntax, scope: Scope) -> Operand:
+        if syntax.kind == "or_":
+            self.check_alternatives(syntax, scope)
         operands = self.operands(syntax, scope)
         report_repeated(syntax.children, self.reporter)
         if all(isinstance(operand, (SetOf, Absent)) for operand in operands):
@@ -561,6 +563,37 @@ class Typer:
         pairs = zip(operands, syntax.children, strict=True)
         flags = [self.flag(operand, child.span) for operand, child in pairs]
         return (disjunction if syntax.kind == "or_" else conjunction)(flags, syntax.span)
+
+    def check_alternatives(self, syntax: Syntax, scope: Scope) -> None:
+        """Report `PLACE is A or B`, which reads as one test of a place: `B` alone is a test of the cell itself."""
+        choices = [syntax]
+        while choices[0].kind == "or_":
+            choices[:1] = choices[0].children
+        for number, test in enumerate(choices):
+            if test.kind not in ("is_", "is_not") or test.children[0].text == "here":
+                continue
+            others = list(takewhile(lambda choice: self.is_set(choice, scope), choices[number + 1 :]))
+            if not others or not self.is_set(test.children[1], scope):
+                continue
+            if ")" in test.span.source.text[test.span.end : others[0].span.start]:
+                continue
+            place, first = (child.span.text for child in test.children)
+            names = [first.strip("()"), *(other.span.text for other in others)]
+            words = "is not" if test.kind == "is_not" else "is"
+            raise self.fail(
+                "PD410",
+                f"`{names[-1]}` is no part of the test of `{place}`",
+                Span(test.span.source, test.span.start, others[-1].span.end),
+                f"as written, `{names[-1]}` tests the cell itself",
+                f"write `{place} {words} ({', '.join(names)})`, or `({test.span.text}) or {' or '.join(names[1:])}`",
+            )
+
+    def is_set(self, syntax: Syntax, scope: Scope) -> bool:
+        """True for the name of an element, tag or set, and for a list of such names."""
+        if syntax.kind == "tuple":
+            return all(self.is_set(child, scope) for child in syntax.children)
+        named = syntax.kind in ("name", "optional_name")
+        return named and isinstance(self.find(syntax.text, syntax.span, scope), SetOf)
 
     def compare(self, syntax: Syntax, scope: Scope) -> Operand:
         operands = self.operands(syntax, scope)
