@@ -124,14 +124,15 @@ def test_a_closed_pipe_is_no_mistake():
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_shells_complete_commands_and_options(shell):
-    source = process(_POWDERDSL_COMPLETE=f"{shell}_source").stdout
+def test_shells_complete_commands(shell):
+    def answer(step, **words):
+        environment = environment_with(_POWDERDSL_COMPLETE=f"{shell}_{step}", **words)
+        return subprocess.check_output(command_line(), env=environment, text=True)
+
+    source = answer("source")
     assert f"_POWDERDSL_COMPLETE={shell}_complete" in source
     if shutil.which(shell):
-        subprocess.run(
-            [shell, "-c", source if shell != "zsh" else f"autoload compinit; compinit -u\n{source}"],
-            check=True,
-        )
+        script = f"autoload compinit; compinit -u\n{source}" if shell == "zsh" else source
+        subprocess.run([shell, "-c", script], check=True)
     words = {"COMP_WORDS": "powderdsl tra", "COMP_CWORD": "tra" if shell == "fish" else "1"}
-    answer = process(_POWDERDSL_COMPLETE=f"{shell}_complete", **words).stdout
-    assert all(word in answer for word in ("trace", "train"))
+    assert all(word in answer("complete", **words) for word in ("trace", "train"))

@@ -9,7 +9,7 @@ from pathlib import Path
 from tests.cli.commands import powderdsl as run
 from tests.rl.tiny_tasks import write_task
 
-QUICK = shlex.split("--preset small --envs 4 --rollout 8 --batch 16 --epochs 1 --features 8")
+QUICK = shlex.split("--envs 4 --rollout 8 --batch 16 --epochs 1 --features 8")
 
 
 def test_train_evaluate_and_go_on(folder: Path) -> None:
@@ -20,6 +20,7 @@ def test_train_evaluate_and_go_on(folder: Path) -> None:
     assert "runs/task-seed0: 64 interactions" in trained.output
     about = json.loads(Path("runs/task-seed0/run.json").read_text())
     assert about["config"]["knobs"] == {"size": 3}
+    assert about["config"]["network"] == "small"
     assert "128 interactions" in run("train", "--resume", "task-seed0", "--steps", "1e2").output
     table = run("evaluate", "task-seed0", "--episodes", "4", "--splits", "test").output
     assert "after 128 interactions" in table

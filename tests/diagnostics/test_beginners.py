@@ -154,7 +154,7 @@ def test_a_pack_that_others_need_is_missed_once() -> None:
     assert result.output.count("error[") == 1
     assert "which is not loaded" in result.output
     assert "did you mean" not in result.output
-    assert "leave out what needs it: `sand`, " in result.output
+    assert "leave out what needs it too: `-sand`, " in result.output
 
 
 @pytest.mark.parametrize("setting", ["500%", "2", "-5%"])

@@ -23,8 +23,8 @@ from powderdsl.system.reading import read_json
 @opt.option(
     "--preset",
     list(PRESETS),
-    "Settings that other options change: the paper's, or those for a few minutes on one core.",
-    "paper",
+    "Settings that other options change: the paper's, or those for a few minutes on one core."
+    "  [default: small; paper with --device cuda]",
     to="preset_name",
 )
 @opt.path("--init-from", "DATASET", "Dataset whose actions the network learns first (behavior cloning).")
@@ -48,7 +48,8 @@ def command(task: str | None, folder: Path | None, resume: Path | None, **values
         folder = folder or Path("runs") / f"{Path(config.task).stem}-seed{config.seed}"
     from powderdsl.rl.training import train
 
-    with progress(Path(config.task).stem, config.steps, lines=True, resumes=folder) as show:
+    rollout = config.envs * config.rollout
+    with progress(Path(config.task).stem, config.steps, lines=True, resumes=folder, rounds=rollout) as show:
 
         def tell(step: int, mean: float | None) -> None:
             show(min(step, config.steps), "" if mean is None else f"return {mean:.3f}")
@@ -74,7 +75,8 @@ def new_config(values: Mapping[str, Any]) -> TrainConfig:
         settings["init_from"] = str(settings["init_from"].absolute())
     name = str(Path(task).absolute()) if Path(task).suffix else task
     what = {"knobs": values["knobs"], "params": values["settings"], "packs": values["packs"]}
-    return preset(values["preset_name"], name, **settings, **what)
+    usual = "paper" if settings.get("device", "cpu").startswith("cuda") else "small"
+    return preset(values["preset_name"] or usual, name, **settings, **what)
 
 
 def _config_of(folder: Path, values: Mapping[str, Any]) -> TrainConfig:

@@ -569,10 +569,10 @@ class Typer:
         choices = [syntax]
         while choices[0].kind == "or_":
             choices[:1] = choices[0].children
-        for number, test in enumerate(choices):
+        for index, test in enumerate(choices):
             if test.kind not in ("is_", "is_not") or test.children[0].text == "here":
                 continue
-            others = list(takewhile(lambda choice: self.is_set(choice, scope), choices[number + 1 :]))
+            others = list(takewhile(lambda choice: self.is_set(choice, scope), choices[index + 1 :]))
             if not others or not self.is_set(test.children[1], scope):
                 continue
             if ")" in test.span.source.text[test.span.end : others[0].span.start]:
