@@ -7,6 +7,7 @@ import sys
 import time
 from dataclasses import asdict, replace
 from pathlib import Path
+from unittest import mock
 
 import pytest
 import torch
@@ -69,15 +70,9 @@ def test_a_network_learns_what_baselines_cannot_know(garden: str, tmp_path: Path
 def test_validation_worlds_are_held_out(dunes: str) -> None:
     data = tiny(dunes).data
     worlds = task_worlds(data, backend="torch")
-    seeds: list[int] = []
-    start = worlds.start
-
-    def noted(asked: Tensor) -> object:
-        seeds.extend(asked.tolist())
-        return start(asked)
-
-    worlds.start = noted  # type: ignore[method-assign, assignment]
-    pairs = validation_pairs(worlds, data)
+    with mock.patch.object(worlds, "start", wraps=worlds.start) as start:
+        pairs = validation_pairs(worlds, data)
+    seeds = [seed for call in start.call_args_list for seed in call.args[0].tolist()]
     assert len(set(seeds)) == VALIDATION_WORLDS == sum(len(starts) for starts, _ in pairs)
     assert min(seeds) > TEST_SEEDS + (1 << 20)  # tests have at most that many worlds
     # World n gives pair n mod 4 of its future.
