@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,6 @@ from PIL import Image
 
 from powderdsl.compiler import load
 from tests.cli.commands import powderdsl as run
-from tests.cli.endless import COMMANDS, Place, last_step
 
 QUICK = ("--width", 4, "--batch", 4, "--buffer", 32, "--refresh", 2, "--states", 100, "--backend", "torch")
 
@@ -111,16 +109,3 @@ def test_bad_input_is_said_and_nothing_is_begun(
     task = ("--task", dunes) if words[0] == "train" else ()
     assert said in run("wm", *words, *task, exits=2).output
     assert not (folder / "runs").exists()
-
-
-@pytest.mark.slow
-def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path: Path) -> None:
-    place, command = Place(tmp_path), COMMANDS["wm train"]
-    with place.begun(command) as process:
-        assert place.busy(command, process), place.said()
-        process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=240) == 130, place.said()
-    assert "interrupted; the same command continues in model" in place.said()
-    assert "Traceback" not in place.said()
-    (saved,) = place.checkpoint_steps().values()
-    assert saved >= last_step(tmp_path / "model" / "metrics.jsonl") > 0
