@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from powderdsl.experiments.runs import differences, misfit
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.draw import contact_sheet, palette, rgb, scale
+from powderdsl.tasks.shipped import load_task
 from powderdsl.worldmodel.config import HERE, DataConfig, Machine
 from powderdsl.worldmodel.networks import without_actions
 from powderdsl.worldmodel.recordings import Recording
@@ -174,7 +175,7 @@ def unseen_data(
     data: DataConfig,
     *,
     task: str | None = None,
-    split: str = "designed",
+    split: str = "",
     rules: str | None = None,
     only: tuple[str, ...] | None = None,
     knobs: Mapping[str, int] | None = None,
@@ -184,17 +185,21 @@ def unseen_data(
 
     Args:
         task, rules, only, knobs: those of the training data unless others are given; with another task, its own knobs.
+        split: by default `designed` if the task has it, or else the split of the training data, whose worlds have other
+            seeds here.
         rulesets: how many rulesets the worlds run under in turn, drawn as those of the training data were, and none of
             which training takes. 0: the rules as they are.
     """
+    knobs = (data.knobs if task is None else {}) if knobs is None else knobs
+    splits = [split.name for split in load_task(task or data.task, knobs=knobs).splits]
     return replace(
         data,
         task=task or data.task,
-        split=split,
+        split=split or next(name for name in ("designed", data.split, *splits) if name in splits),
         rules=data.rules if rules is None else rules,
         params=data.params if rules is None else {},
         only=data.only if only is None else only,
-        knobs=(data.knobs if task is None else {}) if knobs is None else knobs,
+        knobs=knobs,
         rulesets=rulesets,
         first_ruleset=UNSEEN_RULESETS,
     )

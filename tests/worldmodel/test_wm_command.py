@@ -21,7 +21,8 @@ def begin(task: str, folder: Path, *more: object) -> tuple[object, ...]:
 
 def test_train_eval_finetune_and_show(dunes: str, tmp_path: Path) -> None:
     folder, tuned = tmp_path / "run", tmp_path / "tuned"
-    run(*begin(dunes, folder, "--held-out", "stone", "--iterations", 5, "--knob", "squares=2"), exits=0)
+    words = begin(dunes, folder, "--held-out", "stone", "--iterations", 5, "--knob", "squares=2")
+    advice = run(*words, exits=0).output.splitlines()[-1]
     about = json.loads((folder / "run.json").read_text())
     assert load(about["config"]["data"]["rules"]).packs == ("core", "sand", "water")
     assert about["config"]["data"]["knobs"] == {"squares": 2}
@@ -41,9 +42,11 @@ def test_train_eval_finetune_and_show(dunes: str, tmp_path: Path) -> None:
     assert about["config"]["data"]["only"] == ["stone"]
     assert about["config"]["parent"] in {path.name for path in (folder / "checkpoints").iterdir()}
     assert about["parent"] == {"path": str(folder), "iterations": 5}
-    found = run(*("wm", "eval", tuned, "--split", "train", "--worlds", 2, "--json", "--backend", "torch"))
+    # The advice of `wm train` works as printed: a task without the split `designed` is tested on that of the training.
+    assert advice.split("; ")[1] == f"powderdsl wm eval {folder}"
+    found = run("wm", "eval", tuned, "--worlds", 2, "--json", "--backend", "torch", exits=0)
     data = json.loads(found.stdout)
-    assert (data["only"], data["iterations"]) == (["stone"], 3)
+    assert (data["only"], data["iterations"], data["split"]) == (["stone"], 3, "train")
     assert set(data["mean"]) == {"model", "nothing changes", "most frequent outcome"}
 
     out = tmp_path / "strips.png"

@@ -43,7 +43,9 @@ _machine_options = opt.several(
 _test_options = opt.several(
     click.argument("run", metavar="RUN"),
     opt.option("--task", "TASK", "A shipped task or a file.  [default: the run's]"),
-    opt.option("--split", "SPLIT", "Split of the task to test on.  [default: designed]"),
+    opt.option(
+        "--split", "SPLIT", "Split of the task to test on.  [default: designed, or that of the training]"
+    ),
     opt.option("--rules", "RULES", "Rules to test under.  [default: the run's]"),
     _recording,
     _machine_options,
