@@ -20,7 +20,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # runs from a checkout that is not installed
 
-from powderdsl.cli.dispatch import COMMANDS
+from powderdsl.cli.dispatch import GROUPS
 from powderdsl.compiler import MAX_BASES, shipped_rules
 from powderdsl.experiments.studies import study as _study_file  # noqa: F401  # declares the records of studies
 from powderdsl.ir.stages import PIPELINE
@@ -165,7 +165,7 @@ def shipped() -> str:
     rows = []
     for name in shipped_rules():
         packs, ruleset = read([name], Reporter())
-        about = ruleset.about if ruleset else packs[0].about
+        about = ruleset.about if ruleset else packs[-1].about  # those that it needs come first
         rows.append((f"`{name}`", "ruleset" if ruleset else "pack", about))
     return table(("name", "", "what it is"), rows)
 
@@ -216,8 +216,12 @@ def planner() -> str:
 
 
 def commands() -> str:
-    rows = [(f"`powderdsl {name}`", about) for name, about in COMMANDS.items()]
-    return table(("command", "what it does"), rows)
+    rows = [
+        ("" if number else f"**{title}**", f"`powderdsl {name}`", about)
+        for title, group in GROUPS.items()
+        for number, (name, about) in enumerate(group.items())
+    ]
+    return table(("", "command", "what it does"), rows)
 
 
 def mutations() -> str:

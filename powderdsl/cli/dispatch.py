@@ -16,30 +16,49 @@ from powderdsl.cli.exits import report_failure, version
 from powderdsl.diagnostics.printable import printable_streams
 from powderdsl.system.interrupts import LIFELINE, end_with_stdin, interruptible
 
-COMMANDS = {
-    # name, as of the module in powderdsl.cli.commands: summary
-    "run": "Run a world: watch it, or write a picture or an animation.",
-    "play": "Open a page to paint worlds and to change their rules while they run.",
-    "check": "Find all mistakes in rule files and tasks at once.",
-    "compile": "Print the output of a compiler stage.",
-    "show": "List elements, reactions, passes and parameters, or describe a task.",
-    "test": "Run the tests of packs and check their invariants.",
-    "trace": "Explain a cell: which rule wrote it, and what the rule read.",
-    "record": "Record episodes of a task: data for offline learning and world models.",
-    "ogbench": "Collect the data sets of OGBench's Powderworld.",
-    "bench": "Measure how fast rules run, on each backend, batch and size.",
-    "train": "Train an agent on a task, or resume an interrupted run.",
-    "evaluate": "Compare an agent with a random policy and with doing nothing.",
-    "curves": "Draw learning curves of runs, with intervals over seeds.",
-    "watch": "Record a film of an agent at its task.",
-    "wm": "World models: train, test and fine-tune networks that predict worlds.",
-    "study": "Run training over many settings and seeds, and compare the results.",
-    "cache": "List or remove cached compiled code.",
-    "new": "Create a starter pack: an element, a rule and a test.",
-    "render": "Draw a world as a picture, without running it.",
-    "export": "Write rules as a WebAssembly module, for a page or a game.",
-    "explain": "Explain a diagnostic code and how to fix it.",
+GROUPS = {
+    # title: names, as of the modules in powderdsl.cli.commands, and summaries
+    "Start": {
+        "new": "Create a starter pack: an element, a rule and a test.",
+        "run": "Run a world: watch it, or write a picture or an animation.",
+        "play": "Open a page to paint worlds and to change their rules while they run.",
+        "render": "Draw a world as a picture, without running it.",
+    },
+    "Rules": {
+        "check": "Find all mistakes in rule files and tasks at once.",
+        "test": "Run the tests of packs and check their invariants.",
+        "trace": "Explain a cell: which rule wrote it, and what the rule read.",
+        "show": "List elements, reactions, passes and parameters, or describe a task.",
+        "explain": "Explain a diagnostic code and how to fix it.",
+        "compile": "Print the output of a compiler stage.",
+        "bench": "Measure how fast rules run, on each backend, batch and size.",
+        "export": "Write rules as a WebAssembly module, for a page or a game.",
+        "cache": "List or remove cached compiled code.",
+    },
+    "Learn": {
+        "train": "Train an agent on a task, or resume an interrupted run.",
+        "evaluate": "Compare an agent with a random policy and with doing nothing.",
+        "watch": "Record a film of an agent at its task.",
+        "curves": "Draw learning curves of runs, with intervals over seeds.",
+        "record": "Record episodes of a task: data for offline learning and world models.",
+        "wm": "World models: train, test and fine-tune networks that predict worlds.",
+        "study": "Run training over many settings and seeds, and compare the results.",
+        "ogbench": "Collect the data sets of OGBench's Powderworld.",
+    },
 }
+COMMANDS = {name: summary for group in GROUPS.values() for name, summary in group.items()}
+
+ENVIRONMENT = {
+    "NO_COLOR": "No colors, also on a terminal.",
+    "FORCE_COLOR": "Colors, also without a terminal.",
+    "CXX": "C++ compiler of the backend native.",
+    "POWDERDSL_ARCH": "Processor that it compiles for, such as x86-64-v3.  [default: this one]",
+    "XDG_CACHE_HOME": "Folder of the cache of checked and compiled rules.  [default: ~/.cache]",
+    "CI": "`powderdsl test` keeps no counterexamples.",
+    "POWDERDSL_DEBUG": "1: tracebacks of mistakes in powderdsl itself.",
+    "_POWDERDSL_COMPLETE": "bash_source: print what completes commands in bash; README.md has other shells.",
+}
+"""Variables that commands read."""
 
 
 _usual = warnings.formatwarning
@@ -94,8 +113,9 @@ class CommandGroup(GuardedCommand, click.Group):
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        with formatter.section("Commands"):
-            formatter.write_dl(list(COMMANDS.items()))
+        for title, rows in {**GROUPS, "Environment variables": ENVIRONMENT}.items():
+            with formatter.section(title):
+                formatter.write_dl(list(rows.items()))
 
 
 @click.group(

@@ -22,8 +22,10 @@ if TYPE_CHECKING:
 
 
 def color_wanted(stream: IO[Any]) -> bool:
-    """True if output should be colored: on a terminal that supports it, and without NO_COLOR (https://no-color.org)."""
-    return stream.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
+    """True if output should be colored: on a terminal that supports it, or with FORCE_COLOR, and never with NO_COLOR."""
+    if os.environ.get("NO_COLOR") or os.environ.get("FORCE_COLOR"):
+        return not os.environ.get("NO_COLOR")
+    return stream.isatty() and os.environ.get("TERM") != "dumb"
 
 
 def write_diagnostics(diagnostics: Iterable[Diagnostic], stream: IO[str]) -> None:

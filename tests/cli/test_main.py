@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 from types import SimpleNamespace
@@ -12,15 +13,28 @@ import pytest
 from click.testing import CliRunner
 
 from powderdsl.cli import exits, main, output
-from powderdsl.cli.dispatch import COMMANDS
+from powderdsl.cli.dispatch import COMMANDS, ENVIRONMENT
 from powderdsl.diagnostics import CODES, CompileError, Diagnostic, Label
-from tests.cli.commands import command_line, environment_with, powderdsl
+from tests.cli.commands import ROOT, command_line, environment_with, powderdsl
 
 
 def test_help_lists_every_command():
     assert powderdsl("--version").stdout.startswith("powderdsl 0.")
-    result = powderdsl("--help", exits=0)
-    assert all(f"\n  {name} " in result.stdout for name in COMMANDS)
+    lines = powderdsl("--help", exits=0).stdout.splitlines()
+    shown = [line.split()[0] for line in lines if line.startswith("  ") or line.endswith(":")]
+    start = shown.index("Start:")
+    assert [word for word in shown[start:] if word in COMMANDS] == [*COMMANDS]
+    assert [word for word in shown[start:] if word.endswith(":")][:3] == ["Start:", "Rules:", "Learn:"]
+
+
+def test_help_lists_the_variables_that_commands_read():
+    read = re.compile(r"environ(?:\.\w+\(|\[)?\"([A-Z_]+)\"")
+    found = {
+        name for path in (ROOT / "powderdsl").rglob("*.py") for name in read.findall(path.read_text("utf-8"))
+    }
+    assert {"NO_COLOR", "POWDERDSL_DEBUG"} < found
+    assert found - {*ENVIRONMENT} == {"OMP_NUM_THREADS", "TERM"}
+    assert all(f"\n  {name}  " in powderdsl("--help").stdout for name in ENVIRONMENT)
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -88,16 +102,19 @@ def test_values_that_the_api_refuses_are_bad_input():
 
 
 @pytest.mark.parametrize(
-    ("is_terminal", "term", "no_color", "wanted"),
+    ("is_terminal", "term", "no_color", "force_color", "wanted"),
     [
-        (True, "xterm", "", True),
-        (False, "xterm", "", False),
-        (True, "dumb", "", False),
-        (True, "xterm", "1", False),
+        (True, "xterm", "", "", True),
+        (False, "xterm", "", "", False),
+        (True, "dumb", "", "", False),
+        (True, "xterm", "1", "", False),
+        (False, "dumb", "", "1", True),
+        (True, "xterm", "1", "1", False),
     ],
 )
-def test_color_is_for_terminals_that_want_it(monkeypatch, is_terminal, term, no_color, wanted):
+def test_color_is_for_terminals_that_want_it(monkeypatch, is_terminal, term, no_color, force_color, wanted):
     monkeypatch.setenv("NO_COLOR", no_color)
+    monkeypatch.setenv("FORCE_COLOR", force_color)
     monkeypatch.setenv("TERM", term)
     assert output.color_wanted(SimpleNamespace(isatty=lambda: is_terminal)) == wanted
 
