@@ -104,6 +104,14 @@ def test_only_selects_settings_and_seeds(only: list[str], count: int | str) -> N
         selected(study, "small", None, wanted)
 
 
+def test_seeds_that_make_too_many_combinations_are_refused() -> None:
+    text = STUDY.replace("[100, 200, 300]", str([*range(100, 200)]))
+    study = read_study(Source("study.yaml", text), Reporter(), commands())
+    assert len(selected(study, "small", 50, {})) == 10_000
+    with pytest.raises(BadInput, match="a study has at most 10,000"):
+        selected(study, "small", 51, {})
+
+
 @pytest.mark.parametrize("text", ["0/2", "3/2", "1", "1/0", "a/b", "1/2/3", "-1/2", "1/99999999", ""])
 def test_an_invalid_shard_is_refused(text: str, steps_run: list[str]) -> None:
     assert "is not a part: write 1/4" in powderdsl("study", "study.yaml", "--shard", text, exits=2).stderr

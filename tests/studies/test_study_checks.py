@@ -63,6 +63,22 @@ def test_the_seed_of_a_study_with_one_seed_need_not_be_used() -> None:
     assert read(text.replace("seeds: 3", "seeds: 1")).seeds == 1
 
 
+@pytest.mark.parametrize(
+    ("settings", "steps", "number"),
+    [(9, 1, "10,000 combinations"), (7300, 1, "10,000 combinations"), (2, 60, "50,000 calls")],
+)
+def test_a_study_of_too_many_points_is_refused_before_it_is_checked(
+    settings: int, steps: int, number: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Products with 14 and with more than 4,300 digits, which Python does not print."""
+    monkeypatch.setattr(Study, "points", None)
+    vary = "".join(f"\n  a{i}: {[*range(30 if settings < 10 else 4)]}" for i in range(settings))
+    calls = "".join(f"\n  s{i}: {{command: train, on: sand-pushing, seed: $a0}}" for i in range(steps))
+    text = f"study: s\nseeds: 1\nvary:{vary}\nsteps:{calls}\nmeasures: {{m: {{of: s0, value: mean}}}}\n"
+    (error,) = refusal(read, text)
+    assert (error.code, error.message) == ("PD806", f"more than {number} at the size `small`")
+
+
 @pytest.mark.parametrize("name", shipped_studies())
 def test_shipped_studies_pass(name: str) -> None:
     load_study(name, commands(), check_study)

@@ -29,6 +29,7 @@ from powderdsl.experiments.studies.run import (
 )
 from powderdsl.experiments.studies.study import (
     FLAG,
+    MAX_POINTS,
     SIZE,
     SIZES,
     TEXT,
@@ -89,6 +90,9 @@ SHARD = opt.Parsed("I/N", _shard)
 
 def selected(study: Study, size: str, seeds: int | None, only: Mapping[str, str]) -> list[Point]:
     """The combinations that were asked for. Raises BadInput if there are none."""
+    number = study.number(size, seeds)
+    if number > MAX_POINTS:
+        raise BadInput(f"--seeds: {number:,} combinations; a study has at most {MAX_POINTS:,}")
     points = every = list(study.points(size, seeds))
     for name, text in only.items():
         known = {point.names[name] for point in every if name in point.names and name != SIZE}

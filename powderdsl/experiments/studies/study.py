@@ -21,7 +21,8 @@ from powderdsl.system.reading import inside, is_path
 
 SIZES = ("small", "paper")
 SEED, SIZE = "seed", "size"
-MAX_POINTS = 10_000
+MAX_POINTS, MAX_CALLS = 10_000, 50_000
+"""Combinations of a study, each with every seed; and calls of commands, a step for each of them."""
 
 TEXT, FLAG = "text", "flag"
 TASK, RUN, RUN_OR_TASK, RULES, PACKS = "TASK", "RUN", "RUN|TASK", "RULES", "PACK…"
@@ -159,6 +160,10 @@ class Study:
     source: Source
     folder: Path
 
+    def number(self, size: str, seeds: int | None = None) -> int:
+        """The number of combinations, each with every seed."""
+        return (seeds or self.seeds) * math.prod(len(axis.values[size]) for axis in self.axes)
+
     def points(self, size: str, seeds: int | None = None) -> Iterator[Point]:
         """Yield all combinations, each with every seed. Seeds vary slowest, so that early ends leave whole sets."""
         for seed in range(self.seeds if seeds is None else seeds):
@@ -289,10 +294,12 @@ class _StudyReader:
         measures = [measure for key, node in named if (measure := self.measure(key, node)) is not None]
         places = {key.text: node.span for key, node in self.reader.pairs(tree, "a mapping")}
         for size in SIZES:
-            points = math.prod((decl.seeds, *(len(axis.values[size]) for axis in axes)))
-            if points > MAX_POINTS:
-                message = f"{points:,} combinations at the size `{size}`"
-                self.error("PD806", message, places.get("study", first_line(tree)), f"at most {MAX_POINTS:,}")
+            points = decl.seeds * math.prod(len(axis.values[size]) for axis in axes)
+            if points > MAX_POINTS or points * len(self.steps) > MAX_CALLS:
+                number = f"{MAX_POINTS:,} combinations" if points > MAX_POINTS else f"{MAX_CALLS:,} calls"
+                place = places.get("study", first_line(tree))
+                self.error("PD806", f"more than {number} at the size `{size}`", place, "vary less")
+                self.reader.reporter.raise_if_errors()  # checks go through all of them
         names = {SEED: places["seeds"]} if decl.seeds > 1 else {}
         for axis in axes:
             settings = next(iter(axis.sets.values()), {}) or {axis.name: axis.key}
