@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -148,6 +148,8 @@ def _not_a_statement(item: yaml_tree.Mapping, reporter: Reporter, nested: bool) 
 
 MAX_DRAWINGS = 4_096
 """Drawings of one world, repetitions counted."""
+MAX_VISITS = 100_000
+"""Statements and names of one task's worlds, those of a part each time that a list has it."""
 
 
 @dataclass(frozen=True)
@@ -175,6 +177,8 @@ class Drawer:
     ruleset: Ruleset
     size: Size
     reporter: Reporter
+    visits: Iterator[int]
+    """The numbers of what is checked: worlds of one task share them."""
     used_parts: set[str] = field(default_factory=set)
     count: int = 0
     cells: int = 0
@@ -196,10 +200,19 @@ class Drawer:
             stamps=tuple(plan.stamps.values()),
         )
 
+    def visit(self, span: Span) -> None:
+        """Count something that is checked. Raises CompileError for more than MAX_VISITS."""
+        if next(self.visits) >= MAX_VISITS:
+            helps = ["a part counts each time that a list has it"]
+            message = f"a task of more than {MAX_VISITS:,} statements"
+            self.reporter.error("PD508", message, span, "over the limit", helps=helps)
+            self.reporter.raise_if_errors()
+
     def lets(self, written: Lets, names: dict[str, Expr | None]) -> tuple[tuple[str, Expr], ...]:
         """The amounts of named numbers, in order. They are added to `names`."""
         lets = []
         for word, syntax in written:
+            self.visit(word.span)
             amount = None if syntax is None else read_amount(syntax, names, self.reporter)
             names[word.text] = amount and Expr("let", amount.kind, value=word.text)
             if amount is not None:
@@ -230,6 +243,7 @@ class Drawer:
         return tuple(groups)
 
     def part(self, name: Syntax, inside: tuple[str, ...]) -> tuple[Group, ...]:
+        self.visit(name.span)
         if name.text not in self.plan.parts:
             report_unknown("part", name, self.plan.parts, self.reporter)
             return ()
@@ -240,6 +254,7 @@ class Drawer:
         return self.groups(self.plan.parts[name.text], (*inside, name.text))
 
     def repeated(self, repeat: Repeat) -> tuple[Group, ...]:
+        self.visit(repeat.span)
         self.count += 1
         place, names = self.count, dict(self.names)
         for word, _ in repeat.lets:
@@ -267,6 +282,7 @@ class Drawer:
         return (Group(place, count, most, lets, tuple(drawings)),) if most and drawings else ()
 
     def drawing(self, statement: Statement, names: Mapping[str, Expr | None]) -> Drawing | None:
+        self.visit(statement.span)
         ids, over = (
             choice_ids(choice, self.ruleset, self.reporter, self.plan.knobs) if choice else ()
             for choice in (statement.choice, statement.over)

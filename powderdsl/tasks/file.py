@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import count
 from typing import Any
 
 from powderdsl.compiler import load_with_diagnostics, names_in_file, read
@@ -334,9 +335,9 @@ class _TaskReader:
                 self.reporter.error("PD302", message, decl.name.span, label, helps=helps)
             variants = [base] if decl.stands is None else self.stands(base, decl.stands)
             plans.append((decl.name.text, decl.about, variants))
-        splits, used = [], set()
+        splits, used, visits = [], set(), count()
         for name, about, variants in plans:
-            drawers = [Drawer(variant, self.ruleset, size, self.reporter) for variant in variants]
+            drawers = [Drawer(variant, self.ruleset, size, self.reporter, visits) for variant in variants]
             splits.append(Split(name, about, tuple(drawer.generator() for drawer in drawers)))
             used |= {part for drawer in drawers for part in drawer.used_parts}
         return tuple(splits), used

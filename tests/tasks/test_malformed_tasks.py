@@ -230,6 +230,8 @@ def test_deep_and_long_files_end_well():
         "- part ground", "- part p0\n  - part ground"
     )
     assert {one[0] for one in found(parts)} == {"PD508"}
+    nothing = parts.replace("  p30:\n    - fill sand\n", "  p30:\n    - repeat 0: [fill sand]\n")
+    assert [one[0] for one in found(nothing)] == ["PD508"]  # without a single drawing
     assert re.match("PD", found("task: a\n" * 3)[0][0])
 
 
