@@ -9,6 +9,7 @@ from pathlib import Path
 from powderdsl.arrays import NDArray, np
 from powderdsl.diagnostics import CompileError, Reporter, Span, suggest
 from powderdsl.model.schema import Entry, Reader, first_line, keyed
+from powderdsl.model.state import slot_name, slots
 from powderdsl.model.types import Element, Expr, Ruleset
 from powderdsl.syntax import yaml_tree
 from powderdsl.syntax.parse import Syntax, line_of
@@ -19,17 +20,18 @@ from powderdsl.tasks.task import (
     MAX_SIDE,
     NOTHING,
     Drawing,
+    FieldValue,
     Generator,
     Group,
     Region,
     Stamp,
     Target,
 )
-from powderdsl.worlds.ascii import load_ascii, parse_ascii
+from powderdsl.worlds.ascii import ids_by_name, load_ascii, parse_ascii
 from powderdsl.worlds.image import read_image
 from powderdsl.worlds.raster import Setting, Shape, Size, mask
 from powderdsl.worlds.scene import draw_start, find_scene
-from powderdsl.worlds.scene.read import covers_nothing, not_a_statement, shipped_scene
+from powderdsl.worlds.scene.read import covers_nothing, not_a_statement, owners_of, shipped_scene, value_of
 from powderdsl.worlds.scene.statements import (
     RANGES,
     Statement,
@@ -196,7 +198,7 @@ class Drawer:
             lets=self.lets(plan.lets, self.names),
             regions=tuple(self.region(name, shapes) for name, shapes in plan.regions.items()),
             groups=self.groups(plan.items),
-            targets=tuple(Target(name, self.groups(items)) for name, items in plan.targets.items()),
+            targets=tuple(self.target(name, items) for name, items in plan.targets.items()),
             stamps=tuple(plan.stamps.values()),
         )
 
@@ -207,6 +209,14 @@ class Drawer:
             message = f"a task of more than {MAX_VISITS:,} statements"
             self.reporter.error("PD508", message, span, "over the limit", helps=helps)
             self.reporter.raise_if_errors()
+
+    def target(self, name: str, items: Sequence[Item]) -> Target:
+        groups = self.groups(items)
+        for drawing in (drawing for group in groups for drawing in group.drawings):
+            if drawing.value is not None and drawing.span is not None:
+                message = f"the target `{name}` sets `{drawing.value.slot.name}`"
+                self.reporter.error("PD605", message, drawing.span, "a target is made of elements only")
+        return Target(name, groups)
 
     def lets(self, written: Lets, names: dict[str, Expr | None]) -> tuple[tuple[str, Expr], ...]:
         """The amounts of named numbers, in order. They are added to `names`."""
@@ -292,6 +302,7 @@ class Drawer:
             if word is not None and word.text not in known:
                 report_unknown(what, word, known, self.reporter)
         amounts = amounts_of(statement, names, self.reporter, MAX_NUMBER)
+        value = self.value(statement.setting) if statement.setting else None
         if amounts is None or not self.covers_something(statement, amounts):
             return None
         return Drawing(
@@ -302,8 +313,18 @@ class Drawer:
             where.text if where else None,
             frozenset(over) if statement.over else None,
             stamp.text if stamp else None,
+            value,
             statement.span,
         )
+
+    def value(self, setting: Setting) -> FieldValue | None:
+        """The value of a field; None after a report."""
+        setting = replace(setting, name=slot_name(self.ruleset, setting.name))
+        known = {slot.name: slot for slot in slots(self.ruleset)[1:]}
+        ids = ids_by_name(self.ruleset.elements)
+        parts = value_of(setting, known, ids, self.ruleset, self.reporter)
+        slot = known.get(setting.name)
+        return FieldValue(slot, parts, owners_of(slot, self.ruleset)) if slot and parts else None
 
     def covers_something(self, statement: Statement, amounts: tuple[Expr | None, ...]) -> bool:
         """Return True if the shape can cover a cell; report a shape that never does."""

@@ -92,7 +92,10 @@ class TaskProgram:
         starts = self._starts.make(seeds)
         nothing = torch.zeros_like(seeds)
         clock = (seeds, nothing.clone(), nothing.clone())
-        world = World(self.simulator, self._hands.fresh_state(starts.ids), *clock)
+        state = self._hands.fresh_state(starts.ids)
+        for name, (values, where) in starts.fields.items():
+            state[name] = torch.where(where if values.ndim == 3 else where[:, None], values, state[name])
+        world = World(self.simulator, state, *clock)
         measured = self._meter.take(world, starts.regions, starts.targets, None)
         return Episodes(
             world, seeds, nothing.clone(), nothing.bool(), starts.regions, starts.targets, measured, measured

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from powderdsl.diagnostics import Span
+from powderdsl.model.state import Slot
 from powderdsl.model.types import Expr, Ruleset
 from powderdsl.system.fingerprint import UNMEANING
 from powderdsl.worlds.raster import Shape, Size
@@ -46,6 +47,15 @@ class Knob:
 
 
 @dataclass(frozen=True)
+class FieldValue:
+    """What a drawing sets instead of elements: a field's value, in cells of `owners`, all elements if None."""
+
+    slot: Slot
+    parts: tuple[float, ...]
+    owners: frozenset[int] | None
+
+
+@dataclass(frozen=True)
 class Drawing:
     """One statement of a generator.
 
@@ -61,6 +71,7 @@ class Drawing:
     where: str | None = None
     over: frozenset[int] | None = None
     stamp: str | None = None
+    value: FieldValue | None = None
     span: Span | None = field(default=None, compare=False, repr=False)
 
 

@@ -454,7 +454,8 @@ def task_worlds() -> dict[str, list[dict[str, Any]]]:
     for name in shipped_tasks():
         task = load_task(name)
         starts = StartWorlds(task, task.splits[0].name, kind).make(np.array([0], np.int64))
-        world = _named(f"task {name}", task.about, task.ruleset, np.asarray(starts.ids)[0])
+        fields = {name: np.asarray(values)[0] for name, (values, _) in starts.fields.items()}
+        world = _named(f"task {name}", task.about, task.ruleset, np.asarray(starts.ids)[0], fields)
         worlds.setdefault("+".join(task.rules), []).append(world)
     return worlds
 

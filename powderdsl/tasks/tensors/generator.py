@@ -14,6 +14,7 @@ from math import prod
 from operator import or_
 from typing import Any
 
+from powderdsl.model.state import Slot
 from powderdsl.model.types import Expr
 from powderdsl.system.random import MASK, base_keys, mix, name_number
 from powderdsl.targets.array_kind import Array, ArrayKind
@@ -76,11 +77,15 @@ _WITHOUT_ROWS = ("scatter", "stamp")
 
 @dataclass(frozen=True)
 class Made:
-    """Generated worlds: ids uint8 [B, H, W]; regions bool [B, H, W] or [1, H, W]; targets uint8 [B, H, W]."""
+    """Generated worlds: ids uint8 [B, H, W]; regions bool [B, H, W] or [1, H, W]; targets uint8 [B, H, W].
+
+    `fields` has the values that are set, [B, H, W] or [B, 2, H, W], and the cells that have them, bool [B, H, W].
+    """
 
     ids: Array
     regions: Mapping[str, Array]
     targets: Mapping[str, Array]
+    fields: Mapping[str, tuple[Array, Array]]
 
 
 def join_worlds(kind: ArrayKind, parts: Sequence[Made], fixed: Mapping[str, Array]) -> Made:
@@ -90,7 +95,14 @@ def join_worlds(kind: ArrayKind, parts: Sequence[Made], fixed: Mapping[str, Arra
         cells = [xp.broadcast_to(part.regions[name], part.ids.shape) for part in parts]
         regions[name] = xp.concatenate(cells)
     targets = {name: xp.concatenate([part.targets[name] for part in parts]) for name in parts[0].targets}
-    return Made(xp.concatenate([part.ids for part in parts]), regions, targets)
+    fields = {
+        name: (
+            xp.concatenate([part.fields[name][0] for part in parts]),
+            xp.concatenate([part.fields[name][1] for part in parts]),
+        )
+        for name in parts[0].fields
+    }
+    return Made(xp.concatenate([part.ids for part in parts]), regions, targets, fields)
 
 
 class Hashes:
@@ -163,10 +175,10 @@ class _Draws:
 
 
 class WorldMaker:
-    """A generator made executable for one size and kind of arrays."""
+    """A generator made executable for one size and kind of arrays. `slots` are the fields that worlds set."""
 
-    def __init__(self, generator: Generator, size: Size, kind: ArrayKind):
-        self.generator, self.size, self.kind = generator, size, kind
+    def __init__(self, generator: Generator, size: Size, kind: ArrayKind, slots: Sequence[Slot] = ()):
+        self.generator, self.size, self.kind, self.slots = generator, size, kind, slots
         self.stamps = {stamp.name: _bordered(stamp.rows, kind) for stamp in generator.stamps}
         self._fixed: dict[Drawing, Array] = {}
         """Cells of shapes that are the same in every world."""
@@ -192,12 +204,19 @@ class WorldMaker:
         for region in self.generator.regions:
             if region.drawn:
                 regions[region.name] = self._region(region, hashes, names)
-        ids = self._painted(self.generator.fill, self.generator.groups, hashes, names, regions)
+        batch, fields = len(seeds), dict[str, tuple[Array, Array]]()
+        for slot in self.slots:
+            shape = (batch, *self.size) if slot.planes == 1 else (batch, slot.planes, *self.size)
+            fields[slot.name] = (
+                self.kind.zeros(slot.dtype, shape),
+                self.kind.zeros("bool", (batch, *self.size)),
+            )
+        ids = self._painted(self.generator.fill, self.generator.groups, hashes, names, regions, fields)
         targets = {
-            target.name: self._painted(NOTHING, target.groups, hashes, names, regions)
+            target.name: self._painted(NOTHING, target.groups, hashes, names, regions, {})
             for target in self.generator.targets
         }
-        return Made(ids, regions, targets)
+        return Made(ids, regions, targets, fields)
 
     def _lets(
         self, lets: tuple[tuple[str, Expr], ...], hashes: Hashes, repeats: int, names: Mapping[str, Array]
@@ -236,8 +255,9 @@ class WorldMaker:
         hashes: Hashes,
         names: Mapping[str, Array],
         regions: Mapping[str, Array],
+        fields: dict[str, tuple[Array, Array]],
     ) -> Array:
-        """All groups painted on one element: uint8 [B, H, W]."""
+        """All groups painted on one element: uint8 [B, H, W]. `fields`, as in `Made`, are changed."""
         xp, batch = self.kind.xp, len(hashes.keys[0])
         ids = self.kind.zeros("uint8", (batch, *self.size)) + self.kind.put(fill, "uint8")
         for group in groups:
@@ -254,7 +274,7 @@ class WorldMaker:
             painters = [_Painter(self, drawing, hashes, local, active) for drawing in group.drawings]
             for repeat in range(repeats):
                 for painter in painters:
-                    ids = painter.painted(ids, repeat, regions)
+                    ids = painter.painted(ids, repeat, regions, fields)
         return ids
 
 
@@ -280,7 +300,13 @@ class _Painter:
             first, last = (kind.xp.broadcast_to(edge, (*shape, maker.size[1])) for edge in rows)
             self.rows = first, last * self.active[..., None]  # no rows without the repetition
 
-    def painted(self, ids: Array, repeat: int, regions: Mapping[str, Array]) -> Array:
+    def painted(
+        self,
+        ids: Array,
+        repeat: int,
+        regions: Mapping[str, Array],
+        fields: dict[str, tuple[Array, Array]],
+    ) -> Array:
         """Worlds with one repetition on top: uint8 [B, H, W]."""
         drawing, maker = self.drawing, self.maker
         painted = self.ids[:, repeat, None, None]
@@ -298,11 +324,34 @@ class _Painter:
             cells = cells & regions[drawing.where]
         if drawing.over is not None:
             cells = cells & reduce(or_, [ids == number for number in sorted(drawing.over)])
+        if fields:
+            self._set_fields(ids, cells & (self.active[:, repeat, None, None] != 0), fields)
+        if drawing.value is not None:
+            return ids
         # Bits of bytes, which are changed many at a time; `where` takes 15 times as long.
         changed = (ids ^ painted) * cells
         if drawing.kind in _WITHOUT_ROWS or self.is_fixed:
             changed = changed * self.active[:, repeat, None, None]
         return ids ^ changed
+
+    def _set_fields(self, ids: Array, cells: Array, fields: dict[str, tuple[Array, Array]]) -> None:
+        """Set the value of a field in cells, bool [B, H, W]; new elements get their own values of what travels."""
+        xp, value = self.maker.kind.xp, self.drawing.value
+        if value is None:
+            for slot in self.maker.slots:
+                values, where = fields[slot.name]
+                fields[slot.name] = values, where & ~cells if slot.travels else where
+            return
+        if value.owners is not None:
+            owned = [ids == number for number in sorted(value.owners)]
+            cells = cells & reduce(or_, owned, xp.zeros_like(cells))
+        values, where = fields[value.slot.name]
+        parts = self.maker.kind.put(list(value.parts), value.slot.dtype)
+        if value.slot.planes == 1:
+            new = xp.where(cells, parts[0], values)
+        else:
+            new = xp.where(cells[:, None], parts[:, None, None], values)
+        fields[value.slot.name] = new, where | cells
 
     def _stamp(self, repeat: int) -> Array:
         """The stamp where it stands in each world: uint8 [B, H, W], NOTHING around it."""
@@ -349,7 +398,10 @@ class StartWorlds:
 
     def __init__(self, task: Task, split: str, kind: ArrayKind):
         self.kind = kind
-        self._makers = [WorldMaker(variant, task.size, kind) for variant in task.split(split).variants]
+        variants = task.split(split).variants
+        drawings = [drawing for variant in variants for group in variant.groups for drawing in group.drawings]
+        slots = {drawing.value.slot.name: drawing.value.slot for drawing in drawings if drawing.value}
+        self._makers = [WorldMaker(variant, task.size, kind, tuple(slots.values())) for variant in variants]
         cells = [maker.fixed_cells for maker in self._makers]
         self.fixed: Mapping[str, Array] = {
             name: value
@@ -377,4 +429,5 @@ class StartWorlds:
             batch.ids[order],
             regions,
             {name: target[order] for name, target in batch.targets.items()},
+            {name: (values[order], where[order]) for name, (values, where) in batch.fields.items()},
         )

@@ -29,9 +29,7 @@ from powderdsl.worlds.scene.statements import (
     Statement,
     amounts_of,
     constants,
-    read_line,
     read_statement,
-    shape_of,
 )
 
 
@@ -183,20 +181,13 @@ def _lines(block: Span) -> list[Span]:
 
 def parse_statement(span: Span, reporter: Reporter) -> Paint | Setting | None:
     """The statement of a scene at `span`, or None after reporting bad syntax (PD605) or numbers (PD606)."""
-    if ":=" in span.text:
-        tree = read_line(span, "setting", reporter)
-        if tree is None:
-            return None
-        name, value, *shapes = tree.children
-        drawn = shape_of(shapes[0], reporter) if shapes else None
-        shape = _fixed(drawn, SETTING, reporter) if drawn else None if shapes else Shape("fill")
-        word = "".join(value.span.text.split())
-        return Setting(name.text, word, shape, tree.span, name.span, value.span) if shape else None
     statement = read_statement(span, reporter)
     if statement is None:
         return None
     usage = STATEMENTS.get(statement.kind, "statements of scenes: " + ", ".join(STATEMENTS))
-    shape = _fixed(statement, usage, reporter)
+    shape = _fixed(statement, SETTING if statement.setting else usage, reporter)
+    if statement.setting is not None:
+        return replace(statement.setting, shape=shape) if shape else None
     element = statement.choice.children[0] if statement.choice and statement.choice.children else None
     return Paint(element.text, shape, statement.span, element.span) if shape and element else None
 
@@ -341,7 +332,7 @@ def draw_start(scene: Scene, ruleset: Ruleset, *, size: Size | None = None) -> S
             reporter.error("PD604", f"unknown element `{name}`", span, label, helps=helps)
     slot_of = {slot.name: slot for slot in slots(ruleset) if slot.name != "element"}
     settings = [paint for paint in paints if isinstance(paint, Setting)]
-    values = {setting: _value(setting, slot_of, ids, ruleset, reporter) for setting in settings}
+    values = {setting: value_of(setting, slot_of, ids, ruleset, reporter) for setting in settings}
     reporter.raise_if_errors()
     fields: dict[str, FieldValues] = {}
     for name in dict.fromkeys(setting.name for setting in settings):
@@ -357,8 +348,7 @@ def draw_start(scene: Scene, ruleset: Ruleset, *, size: Size | None = None) -> S
                 if slot_of[name].travels:
                     field.where[cells] = False
             continue
-        prop = ruleset.property(paint.name)
-        owners = slot_of[paint.name].of if prop is None else prop.stored  # None: all elements have it
+        owners = owners_of(slot_of[paint.name], ruleset)
         if owners is not None:
             cells = cells & np.isin(drawn, sorted(owners))
         if not cells.any():
@@ -372,7 +362,13 @@ def draw_start(scene: Scene, ruleset: Ruleset, *, size: Size | None = None) -> S
     return Start(drawn, fields)
 
 
-def _value(
+def owners_of(slot: Slot, ruleset: Ruleset) -> frozenset[int] | None:
+    """The elements whose cells can have another value than the default; None for all."""
+    prop = ruleset.property(slot.name)
+    return slot.of if prop is None else prop.stored
+
+
+def value_of(
     setting: Setting,
     slot_of: Mapping[str, Slot],
     ids: Mapping[str, int],

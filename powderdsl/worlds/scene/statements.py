@@ -13,7 +13,7 @@ from powderdsl.model.operations import OPERATIONS
 from powderdsl.model.types import Expr, integer
 from powderdsl.syntax.parse import Syntax, parse_text
 from powderdsl.syntax.yaml_tree import Scalar
-from powderdsl.worlds.raster import MAX_COORDINATE
+from powderdsl.worlds.raster import MAX_COORDINATE, Setting, Shape
 
 STATEMENTS = {
     "line": "line ELEMENT from (ROW, COLUMN) to (ROW, COLUMN) width NUMBER",
@@ -38,7 +38,7 @@ GENERATOR_STATEMENTS = {
 """The statements of a generator, which also has random cells, pictures, and named lists of statements."""
 
 SETTING = "FIELD := VALUE in SHAPE"
-"""The statement that sets a field in cells of a scene; without `in`, in all cells."""
+"""The statement that sets a field in cells; without `in`, in all cells."""
 
 _POINT = (("a row", -MAX_COORDINATE), ("a column", -MAX_COORDINATE))
 _ROWS = (("the start of a range", 0), ("the end of a range", 0))
@@ -78,6 +78,8 @@ class Statement:
     name: Syntax | None = None
     where: Syntax | None = None
     over: Syntax | None = None
+    setting: Setting | None = None
+    """The field that is set in the cells, instead of elements; its shape is this statement's."""
 
 
 def amounts_of(
@@ -113,9 +115,16 @@ CHOICES = ("element", "some", "any_element", "first")
 
 def read_statement(line: Span, reporter: Reporter) -> Statement | None:
     """The statement of a line, or None after reporting PD605 or PD606."""
-    tree = read_line(line, "statement", reporter)
+    sets = ":=" in line.text
+    tree = read_line(line, "setting" if sets else "statement", reporter)
     if tree is None:
         return None
+    if sets:
+        field_name, value, *shapes = tree.children
+        drawn = shape_of(shapes[0], reporter) if shapes else Statement("fill", (), tree.span)
+        word = "".join(value.span.text.split())
+        setting = Setting(field_name.text, word, Shape("fill"), tree.span, field_name.span, value.span)
+        return drawn and replace(drawn, setting=setting)
     painted, *clauses = tree.children
     first, *parts = painted.children
     numbers = _numbers(painted, parts, reporter)
