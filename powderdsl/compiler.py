@@ -136,7 +136,7 @@ def load_with_diagnostics(
     words = list(map(str, names))
     sources = (*reader.sources, *_shipped_sources())  # advice names shipped packs
     inputs = [words, [(source.name, source.text) for source in sources], palette]
-    model, remarks = persistent("+".join(words), repr(inputs), checked)
+    model, remarks = persistent(f"model of {'+'.join(words)}", repr(inputs), checked)
     if params:
         from powderdsl.model.definitions import set_params
 
@@ -240,7 +240,7 @@ def _read_apart(source: Source) -> tuple[PackDecl | RulesetDecl | None, tuple[Di
             return read_file(source, reporter), reporter.diagnostics
         return None, reporter.diagnostics
 
-    return persistent(Path(source.name).name, repr((source.name, source.text)), read)
+    return persistent(f"rules in {Path(source.name).name}", repr((source.name, source.text)), read)
 
 
 SMALL = 1 << 16

@@ -66,6 +66,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "simulation.observe": (*_BACK, "simulation.draw"),
     "simulation.simulator": (
         *_BACK,
+        "simulation.draw",
         "simulation.state_checks",
         "simulation.programs",
         "simulation.observe",
@@ -77,7 +78,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "targets",
         "simulation.simulator",
     ),  # explains by what the oracle does
-    "worlds.media": ("arrays", "system", "simulation.draw"),
+    "worlds.media": ("arrays", "system", "simulation.draw", "simulation.simulator"),
     "worlds": (*_FRONT, "analysis", "simulation.draw"),
     "worlds.store": (*_FRONT, "worlds", "simulation.simulator"),  # saved worlds are values of the simulator
     "testing.generators": _SCREEN,

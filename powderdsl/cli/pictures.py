@@ -16,44 +16,30 @@ from powderdsl.cli.exits import BadInput
 from powderdsl.cli.output import color_wanted
 from powderdsl.diagnostics.printable import printable, raw_stream
 from powderdsl.model.types import Element, Field
-from powderdsl.simulation.draw import contact_sheet, looks, rgb, scale, shown_fields, to_numpy
+from powderdsl.simulation.draw import looks, rgb, shown_fields, to_numpy
 from powderdsl.worlds.ascii import write_ascii
 
 if TYPE_CHECKING:
     from powderdsl.simulation.simulator import World
 
-USUAL_SIDE = 400
 MAX_SIDE = 16_384
 """Pixels a side. More would take gigabytes before the first one is written."""
 
 
 def pictures(world: World, *, most: int, factor: int | None) -> NDArray[np.uint8]:
-    """A batch as one picture, uint8 [H', W', 3]: up to `most` worlds side by side, cells of `factor` pixels.
-
-    Colors follow fields, and vectors tint cells, as the rules declare. Without a factor a side has about USUAL_SIDE pixels. Raises
-    BadInput for pictures of more than MAX_SIDE.
-    """
-    shown = min(len(world), most)
-    columns = math.ceil(math.sqrt(shown))
-    longest = max(world.shape[1:]) * columns
-    factor = factor or max(1, min(8, USUAL_SIDE // longest))
-    if longest * factor > MAX_SIDE:
-        raise BadInput(f"a picture of {longest * factor:,} pixels a side: choose a smaller --scale or --size")
-    few = world.select(slice(0, shown))
-    rules = few.sim.ruleset
-    image = rgb(few.ids, fields=fields_of(few), **looks(rules.elements, rules.fields))
-    images = scale(image, factor)
-    return images[0] if shown == 1 else contact_sheet(images, columns=columns)
+    """A batch as one picture: see `World.picture`. Raises BadInput for pictures of more than MAX_SIDE."""
+    longest = max(world.shape[1:]) * math.ceil(math.sqrt(min(len(world), most)))
+    if longest * (factor or 1) > MAX_SIDE:
+        raise BadInput(
+            f"a picture of {longest * (factor or 1):,} pixels a side: choose a smaller --scale or --size"
+        )
+    return world.picture(factor, most)
 
 
 def first_world(world: World) -> dict[str, Any]:
     """The first world of a batch, as `LiveView.show` takes it: `ids` [H, W] and `fields`."""
-    return {"ids": world.ids[0], "fields": {name: values[0] for name, values in fields_of(world).items()}}
-
-
-def fields_of(world: World) -> dict[str, Any]:
-    """The fields that pictures show, [B, H, W] or of vectors [B, 2, H, W], by name."""
-    return {name: world[name] for name in shown_fields(world.sim.ruleset)}
+    fields = {name: world[name][0] for name in shown_fields(world.sim.ruleset)}
+    return {"ids": world.ids[0], "fields": fields}
 
 
 # In a terminal

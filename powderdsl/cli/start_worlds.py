@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from powderdsl.arrays import np
@@ -12,9 +10,8 @@ from powderdsl.compiler import segments_of
 from powderdsl.model.state import fitting
 from powderdsl.model.types import Ruleset
 from powderdsl.system.memo import Memo
-from powderdsl.system.writing import failure
 from powderdsl.worlds.raster import Size
-from powderdsl.worlds.scene import Start, load_start
+from powderdsl.worlds.scene import Start
 from powderdsl.worlds.strewn import check_cells, strew
 
 if TYPE_CHECKING:
@@ -25,8 +22,6 @@ DEFAULT_SIDE = 64
 FEW = 1 << 27
 """Cells times steps that WebAssembly runs in about a second, the time that it takes to import torch. Also, 100 times the
 number of cells: larger worlds may not fit into the memory of WebAssembly."""
-
-KINDS = "worlds are .npz, .png, .txt and .yaml files, FILE.yaml#NAME, or a shipped scene's name"
 
 
 def start(
@@ -59,16 +54,12 @@ def start(
     # WebAssembly runs only what bit planes carry; without torch, the slow oracle runs the rest.
     tensors = backend == "auto" and (many or any(part.planes is None for part in segments_of(ruleset, memo)))
     sim = compile(ruleset, backend, tensors=tensors, memo=memo, **how)
+    from powderdsl.worlds.store import fresh_world, load_world
+
     with user_values():
         if drawn is None:
-            from powderdsl.worlds.store import load_world
-
             return load_world(str(name), sim)
-        world = sim.world(drawn.ids, seed=seed or 0)
-        for key, field in drawn.fields.items():
-            values: dict[str, Any] = {key: field.values}
-            world = sim.paint(world, where=field.where, **values)
-        return world
+        return fresh_world(sim, drawn, seed or 0)
 
 
 def start_drawn(
@@ -85,30 +76,12 @@ def start_drawn(
     if name.lower().endswith(".npz"):
         _refuse_options("a saved world has its own", size=size, batch=batch, seed=seed)
         return None
-    world = drawn_world(name, ruleset, size)
+    from powderdsl.worlds.store import drawn_world
+
+    with user_values():
+        world = drawn_world(name, ruleset, size)
     check_cells(batch or 1, world.ids.shape)
     return Start(np.repeat(world.ids[None], batch or 1, axis=0), world.fields)
-
-
-def drawn_world(name: str, ruleset: Ruleset, size: Size | None) -> Start:
-    """A picture, an ASCII drawing or a scene; only scenes set fields and can have another `size`."""
-    suffix = Path(name).suffix.lower()
-    if suffix == ".png":
-        _refuse_options("a picture has its own", size=size)
-        from powderdsl.worlds.image import read_image
-
-        return Start(read_image(name, ruleset.elements), {})
-    if suffix == ".txt":
-        _refuse_options("a drawing has its own", size=size)
-        from powderdsl.worlds.ascii import load_ascii
-
-        return Start(load_ascii(name, ruleset.elements), {})
-    if suffix not in (".yaml", ".yml"):
-        if Path(name).is_file():
-            raise failure("PD602", f"cannot tell what {name} is", helps=(KINDS,))
-        if re.search(r"\.[A-Za-z0-9]{1,5}\Z", name):
-            raise failure("PD601", f"no world {name}", helps=(KINDS,))
-    return load_start(name, ruleset, size=size)
 
 
 def _refuse_options(reason: str, **options: object) -> None:

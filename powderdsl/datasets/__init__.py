@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Dataset", "Transitions", "from_minari", "record", "split", "to_minari"]
 
-__getattr__ = importing(
+__getattr__, __dir__ = importing(
     "powderdsl.datasets",
     {"dataset": "Dataset Transitions split", "minari": "from_minari to_minari", "recorder": "record"},
 )

@@ -37,6 +37,6 @@ for _task in shipped_tasks():
         )
 
 
-__getattr__ = importing(
+__getattr__, __dir__ = importing(
     "powderdsl.envs", {"gym": "GoalEnv PowderEnv PowderVectorEnv", "tensor_env": "TensorEnv"}
 )

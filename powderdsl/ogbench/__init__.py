@@ -36,7 +36,7 @@ def _register() -> None:
 
 _register()
 
-__getattr__ = importing(
+__getattr__, __dir__ = importing(
     "powderdsl.ogbench",
     {
         "datasets": "load_dataset make_env_and_datasets",

@@ -17,6 +17,6 @@ if TYPE_CHECKING:
 
 __all__ = ["TrainConfig", "evaluate", "load_policy", "preset", "train"]
 
-__getattr__ = importing(
+__getattr__, __dir__ = importing(
     "powderdsl.rl", {"evaluation": "evaluate", "policies": "load_policy", "training": "train"}
 )

@@ -5,12 +5,15 @@ Worlds are immutable; every method returns a new one. Arrays are in the storage 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from io import BytesIO
 from operator import index
 from typing import TYPE_CHECKING, Any
 
+from powderdsl.arrays import NDArray, np
 from powderdsl.compiler import load
 from powderdsl.model.state import (
     Slot,
@@ -22,6 +25,7 @@ from powderdsl.model.state import (
     slots,
 )
 from powderdsl.model.types import Ruleset
+from powderdsl.simulation import draw
 from powderdsl.simulation.programs import array_kind, make_program
 from powderdsl.simulation.state_checks import (
     check_ids,
@@ -32,6 +36,7 @@ from powderdsl.simulation.state_checks import (
     unknown_slot,
 )
 from powderdsl.system.memo import Memo
+from powderdsl.system.packages import require
 from powderdsl.targets.array_kind import Array
 from powderdsl.targets.job import Clock, Job, PassClock, shape_of
 
@@ -39,11 +44,12 @@ if TYPE_CHECKING:
     from powderdsl.simulation.observe import Observer
 
 MAX_CELLS = 1 << 31
+USUAL_SIDE = 400
 BATCH_SIZES = 16
 """The number of batch sizes whose default parameters are cached."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class World:
     """A batch of worlds of one ruleset, as arrays of the simulator's kind: torch tensors, or arrays without torch.
 
@@ -71,6 +77,18 @@ class World:
                 raise ValueError(
                     f"a world's {name} must be int64 [{batch}], found {array.dtype} {list(array.shape)}"
                 )
+
+    def __repr__(self) -> str:
+        worlds, rows, columns = self.shape
+        steps = " to ".join(str(end) for end in sorted({int(self.step.min()), int(self.step.max())}))
+        return f"<World of {self.sim.ruleset.name}: {worlds} of {rows}×{columns} cells at step {steps}>"
+
+    def _repr_png_(self) -> bytes:
+        """The picture that a notebook shows."""
+        image, file = self.picture(), BytesIO()
+        images = require("PIL.Image", "showing a world", "pip install pillow")
+        images.frombytes("RGB", (image.shape[1], image.shape[0]), image.tobytes()).save(file, "PNG")
+        return file.getvalue()
 
     @property
     def step(self) -> Array:
@@ -130,6 +148,34 @@ class World:
     def rgb(self, out: Array | None = None) -> Array:
         """Pictures in the elements' colors, a pixel a cell: uint8 [B, H, W, 3]. `out` and errors: as in `read`."""
         return self.sim.observer.rgb(self.state, out)
+
+    def picture(self, scale: int | None = None, most: int = 16) -> NDArray[np.uint8]:
+        """Worlds side by side as one picture, uint8 [H', W', 3]; vectors tint cells as the rules declare.
+
+        Args:
+            scale: pixels a cell; by default as many as make a side of about 400.
+            most: how many worlds are shown.
+        """
+        few, rules = self.select(slice(0, most)), self.sim.ruleset
+        columns = math.ceil(math.sqrt(len(few)))
+        scale = scale or max(1, min(8, USUAL_SIDE // (max(self.shape[1:]) * columns)))
+        fields = {name: few[name] for name in draw.shown_fields(rules)}
+        image = draw.rgb(few.ids, fields=fields, **draw.looks(rules.elements, rules.fields))
+        images = draw.scale(image, scale)
+        return images[0] if len(few) == 1 else draw.contact_sheet(images, columns=columns)
+
+    def count(self, element: str) -> Array:
+        """The number of cells of an element, or of elements with a tag, in each world: int64 [B].
+
+        Raises KeyError for an unknown name.
+        """
+        elements = self.sim.ruleset.elements
+        ids = {one.id for one in elements if element in (one.name, one.qualified, *one.tags)}
+        if not ids:
+            raise unknown_name("element", element, self.sim.elements)
+        xp = self.sim.kind.xp
+        cells = sum(xp.asarray(self.ids == number, dtype=xp.int64) for number in sorted(ids))
+        return cells.reshape(len(self), -1).sum(-1)
 
     def compact(self, out: Array | None = None) -> Array:
         """All fields that last from step to step, as bytes: uint8 [B, C, H, W], named by `sim.observer.compact_names`.
@@ -198,6 +244,9 @@ class Simulator:
         self._defaults = lru_cache(BATCH_SIZES)(self._default_parameters)
         """Parameters by batch size: always the same mapping, whose inputs programs cache. It must not change."""
         self._program = make_program(ruleset, backend, self.kind, threads, memo)
+
+    def __repr__(self) -> str:
+        return f"<Simulator of {self.ruleset.name}: {len(self.elements)} elements, {self.running} on {self.device}>"
 
     def of(self, ruleset: Ruleset) -> Simulator:
         """A simulator of another ruleset on the same backend and device."""
@@ -443,6 +492,13 @@ class Simulator:
         clock = Clock(world.seed, world.index, world.start, world.since)
         state = self._program.run(Job(world.state, clock, steps, values, draws, names, reuse))
         return world.with_state(state, sim=self, since=world.since + steps)
+
+    def frames(self, world: World, steps: int, every: int = 1) -> Iterator[World]:
+        """The world at the start, after each `every` steps, and at the end after `steps`."""
+        yield world
+        for done in range(0, steps, every):
+            world = self.step(world, min(every, steps - done))
+            yield world
 
     def _pass_names(self, passes: Sequence[str]) -> frozenset[str]:
         if isinstance(passes, str):

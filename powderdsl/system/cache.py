@@ -70,8 +70,8 @@ def persistent(name: str, inputs: str, make: Callable[[], T]) -> T:
     Exceptions are not stored, nor what was made quickly. A cache that cannot be read or written only costs time.
 
     Args:
-        name: the stage, for `powderdsl cache list`.
-        inputs: a text that differs wherever results differ.
+        name: what the result is; each stage has names of its own.
+        inputs: a text that differs wherever results of the stage differ.
         make: returns the result, which can be pickled.
     """
     if sys.platform == "emscripten":  # files do not outlive the page

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Any
@@ -25,8 +26,11 @@ def require(module: str, work: str, *helps: str) -> Any:
         raise failure("PD612", f"{work} needs {missing}, which is not installed", helps=helps) from None
 
 
-def importing(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
-    """The ``__getattr__`` of a package that imports a public name on first use. `homes` has the names in each module."""
+def importing(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """The ``__getattr__`` and ``__dir__`` of a package that imports a public name on first use.
+
+    `homes` has the names in each module.
+    """
 
     def import_name(name: str) -> Any:
         for module, names in homes.items():
@@ -34,4 +38,4 @@ def importing(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
                 return getattr(import_module(f"{package}.{module}"), name)
         raise AttributeError(f"module {package!r} has no attribute {name!r}")
 
-    return import_name
+    return import_name, lambda: list(sys.modules[package].__all__)

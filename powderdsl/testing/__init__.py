@@ -15,4 +15,4 @@ if TYPE_CHECKING:
 __all__ = ["worlds"]
 
 
-__getattr__ = importing("powderdsl.testing.generators", {"strategies": "worlds"})
+__getattr__, __dir__ = importing("powderdsl.testing", {"generators.strategies": "worlds"})

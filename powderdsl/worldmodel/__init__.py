@@ -40,7 +40,7 @@ __all__ = [
     "unseen_seeds",
 ]
 
-__getattr__ = importing(
+__getattr__, __dir__ = importing(
     "powderdsl.worldmodel",
     {
         "config": "DataConfig Machine TrainConfig",

@@ -8,13 +8,16 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from powderdsl.arrays import NDArray, np
 from powderdsl.simulation.draw import to_numpy
 from powderdsl.system.interrupts import delay_signal
 from powderdsl.system.packages import require
 from powderdsl.system.writing import replacing
+
+if TYPE_CHECKING:
+    from powderdsl.simulation.simulator import World
 
 MIN_GIF_DELAY = 20
 """Milliseconds. Browsers slow down GIFs whose frames are shorter."""
@@ -54,6 +57,20 @@ def write_gif(path: str | Path, frames: Iterable[Any], *, fps: float = 30) -> No
         first.save(
             temporary, "GIF", save_all=True, append_images=images, duration=delay, optimize=False, loop=0
         )
+
+
+def gif(worlds: Iterable[World], path: str | Path, *, fps: float = 30, scale: int | None = None) -> None:
+    """Write worlds one after the other, such as `Simulator.frames`, as an endless animation. Batches stand side by side.
+
+    Args:
+        fps: frames a second, at most 50. scale: pixels a cell, see `World.picture`.
+
+    Raises:
+        CompileError, ValueError: as `write_gif`.
+    """
+    if Path(path).suffix.lower() != ".gif":
+        raise ValueError(f"an animation's name ends in .gif, found {str(path)!r}")
+    write_gif(path, (world.picture(scale) for world in worlds), fps=fps)
 
 
 def write_mp4(path: str | Path, frames: Iterable[Any], *, fps: float = 30) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import os
+import re
 from collections.abc import Mapping
 from math import prod
 from pathlib import Path
@@ -18,7 +19,10 @@ from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.system.archives import Archive, BadArchive, open_archive, write_archive
 from powderdsl.system.reading import parse_json
 from powderdsl.system.writing import failure, replacing
-from powderdsl.worlds.raster import MAX_CELLS
+from powderdsl.worlds.ascii import load_ascii
+from powderdsl.worlds.image import read_image
+from powderdsl.worlds.raster import MAX_CELLS, Size
+from powderdsl.worlds.scene import Start, load_start
 
 FORMAT = 1
 SLOT, IDS = "slot_", "slot_element"
@@ -40,6 +44,10 @@ def save(world: World, path: str | Path) -> None:
     if not isinstance(world, World):
         raise TypeError(f"save takes a World, found {type(world).__name__}")
     target = Path(path)
+    if target.suffix.lower() != ".npz":
+        raise ValueError(
+            f"a saved world's name ends in .npz, found {target.name!r}; see powderdsl.gif for animations"
+        )
     check_saved(target, world.shape)
     ruleset = world.sim.ruleset
     about = {
@@ -61,17 +69,39 @@ def save(world: World, path: str | Path) -> None:
             raise _unreadable(target, f"cannot be written: {error.strerror}") from None
 
 
-def load_world(path: str | Path, sim: Simulator) -> World:
-    """Worlds from a file, for a simulator whose ruleset may number its elements differently.
+def load_world(
+    path: str | Path,
+    sim: Simulator,
+    *,
+    size: Size | None = None,
+    batch: int | None = None,
+    seed: int | None = None,
+) -> World:
+    """Worlds from a saved .npz, or fresh ones from a scene, a drawing (.txt) or a picture (.png).
+
+    The simulator's ruleset may number the elements of a saved world differently.
+
+    Args:
+        path: a file, ``FILE.yaml#NAME`` for one of several scenes, or a shipped scene's name such as ``"garden"``.
+        size: (rows, columns) instead of the scene's.
+        batch: how many worlds start from a drawn one, 1 if not given.
+        seed: of the random numbers of fresh worlds, 0 if not given.
 
     Raises:
-        CompileError: PD602 if the file is not a saved world; PD603 if the ruleset lacks one of its elements or fields;
-            PD607 if it has more than MAX_CELLS cells.
+        CompileError: PD602 if the file is not a world; PD603 or PD604 if the ruleset lacks one of its elements or fields;
+            PD607 if it has more than MAX_CELLS cells; what `load_start` raises.
         TypeError: `sim` is not a simulator.
+        ValueError: a saved world has its own size, batch and seed, a picture its own size.
     """
     if not isinstance(sim, Simulator):
         raise TypeError(f"load_world takes a Simulator, from powderdsl.compile; found {type(sim).__name__}")
     source = Path(path)
+    if source.suffix.lower() != ".npz":
+        drawn = drawn_world(str(path), sim.ruleset, size)
+        ids = np.repeat(drawn.ids[None], batch or 1, axis=0)
+        return fresh_world(sim, Start(ids, drawn.fields), seed or 0)
+    if (size, batch, seed) != (None, None, None):
+        raise ValueError("a saved world has its own size, batch and seed")
     try:
         with open_archive(source) as archive:
             return _load(archive, sim, source)
@@ -81,6 +111,40 @@ def load_world(path: str | Path, sim: Simulator) -> World:
         raise _unreadable(source, f"cannot be read: {error.strerror or error}") from None
     except (BadArchive, AttributeError, LookupError, TypeError, ValueError) as error:
         raise _unreadable(source, f"is not a saved world: {' '.join(str(error).split())[:200]}") from None
+
+
+KINDS = "worlds are .npz, .png, .txt and .yaml files, FILE.yaml#NAME, or a shipped scene's name"
+
+
+def drawn_world(name: str, ruleset: Ruleset, size: Size | None) -> Start:
+    """A picture, an ASCII drawing or a scene; only scenes set fields and can have another `size`."""
+    suffix = Path(name).suffix.lower()
+    if suffix == ".png":
+        _refuse_size(size, "a picture")
+        return Start(read_image(name, ruleset.elements), {})
+    if suffix == ".txt":
+        _refuse_size(size, "a drawing")
+        return Start(load_ascii(name, ruleset.elements), {})
+    if suffix not in (".yaml", ".yml"):
+        if Path(name).is_file():
+            raise failure("PD602", f"cannot tell what {name} is", helps=(KINDS,))
+        if re.search(r"\.[A-Za-z0-9]{1,5}\Z", name):
+            raise failure("PD601", f"no world {name}", helps=(KINDS,))
+    return load_start(name, ruleset, size=size)
+
+
+def _refuse_size(size: Size | None, kind: str) -> None:
+    if size is not None:
+        raise ValueError(f"size does not go with this world: {kind} has its own")
+
+
+def fresh_world(sim: Simulator, start: Start, seed: int) -> World:
+    """New worlds of ids [B, H, W] with the fields that a scene sets."""
+    world = sim.world(start.ids, seed=seed)
+    for name, field in start.fields.items():
+        values: dict[str, Any] = {name: field.values}
+        world = sim.paint(world, where=field.where, **values)
+    return world
 
 
 def _load(archive: Archive, sim: Simulator, source: Path) -> World:

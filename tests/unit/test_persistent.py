@@ -12,13 +12,16 @@ from powderdsl import compiler
 from powderdsl.compiler import load_with_diagnostics
 from powderdsl.diagnostics import CompileError
 from powderdsl.system import cache
+from powderdsl.worlds.scene import read
+from powderdsl.worlds.scene.read import read_file
 
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(cache, "QUICK", -1.0)
-    monkeypatch.setattr(compiler, "persistent", cache.persistent)
+    for module in (compiler, read):
+        monkeypatch.setattr(module, "persistent", cache.persistent)
     return tmp_path / "powderdsl" / "compiled"
 
 
@@ -87,6 +90,8 @@ def test_a_model_and_its_remarks_are_those_of_the_text(folder: Path, tmp_path: P
     pack.write_text(text.replace("5%", "6%"))
     changed = load_with_diagnostics("core", pack)
     assert changed[0] != first[0]
+    with pytest.raises(CompileError, match="scene"):
+        read_file(pack)
     pack.write_text(text.replace("-> wall", "-> moos"))
     for _ in range(2):
         with pytest.raises(CompileError) as caught:

@@ -269,8 +269,9 @@ def _write_sheet(task: Task, split: str, seeds: int, out: Path) -> None:
     """Start worlds side by side, each region outlined in a color of its own."""
     import torch
 
-    from powderdsl.cli.pictures import MAX_SIDE, USUAL_SIDE
+    from powderdsl.cli.pictures import MAX_SIDE
     from powderdsl.simulation.draw import OUTLINES, contact_sheet, outline, scale
+    from powderdsl.simulation.simulator import USUAL_SIDE
     from powderdsl.tasks.episodes import compile_task
     from powderdsl.worlds.media import write_png
 

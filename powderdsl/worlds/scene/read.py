@@ -302,7 +302,7 @@ def _checked_scenes(source: Source) -> tuple[Scene, ...]:
         reporter.raise_if_errors()
         return scenes
 
-    return persistent(Path(source.name).name, repr((source.name, source.text)), read)
+    return persistent(f"scenes in {Path(source.name).name}", repr((source.name, source.text)), read)
 
 
 def draw_start(scene: Scene, ruleset: Ruleset, *, size: Size | None = None) -> Start:
