@@ -80,6 +80,9 @@ class GuardedCommand(click.Command):
         self, args: Sequence[str] | None = None, prog_name: str | None = None, *rest: Any, **options: Any
     ) -> NoReturn:
         """Run a command and exit with one of the codes of `exits`."""
+        for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+            if getattr(sys, name) is None:  # closed (`>&-`); no file of ours may take its number
+                setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115 until the end
         # A terminal that lacks a character shows a `?` in its place.
         for stream in (sys.stdout, sys.stderr):
             if hasattr(stream, "reconfigure"):

@@ -43,6 +43,17 @@ def test_every_command_has_help_and_its_name(name):
     assert main.get_command(click.Context(main), name).name == name
 
 
+@pytest.mark.parametrize("streams", [">&-", "<&- >&- 2>&-"])
+def test_streams_may_be_closed(streams, tmp_path):
+    """What goes there is lost; a file that is written does not take its place."""
+    out = tmp_path / "world.png"
+    words = command_line("render", "garden", "--rules", "powderworld", "--out", out)
+    command = ["sh", "-c", f'"$@" {streams}', "sh", *words]
+    ended = subprocess.run(command, env=environment_with(), capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert out.read_bytes().endswith(b"IEND\xaeB`\x82")
+
+
 def test_no_command_is_a_usage_error():
     powderdsl(exits=exits.BAD_INPUT)
 
