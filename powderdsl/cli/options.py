@@ -41,6 +41,23 @@ class Parsed(click.ParamType):
             self.fail(f"`{value}` {error}", param, ctx)
 
 
+class _Digits(click.ParamType):
+    """Refuses digits of other scripts, which Python reads and rule files do not have."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if isinstance(value, str) and not value.isascii():
+            self.fail(f"`{value}` is not a number in digits from 0 to 9", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+class Integer(_Digits, click.IntRange):
+    """An integer in a range."""
+
+
+class Decimal(_Digits, click.types.FloatParamType):
+    """A number."""
+
+
 def _count(text: str) -> int:
     text = text.replace("_", "")
     if not re.fullmatch(r"[0-9]{1,18}|[0-9]{1,6}(\.[0-9]{1,6})?[eE]\+?[0-9]{1,2}", text):
@@ -92,7 +109,7 @@ def option(name: str, kind: Any, about: str, default: Any = None, *, to: str = "
         case str():
             more["metavar"] = kind
         case (int() as low, int() as high):
-            more |= {"type": click.IntRange(low, high), "metavar": "N"}
+            more |= {"type": Integer(low, high), "metavar": "N"}
         case [*words]:
             more["type"] = click.Choice(words)
         case _ if kind is bool:
@@ -173,7 +190,7 @@ def _setting(field: Field[Any]) -> Option:
     elif isinstance(field.default, int):
         kind = COUNT
     elif isinstance(field.default, float):
-        kind = float
+        kind = Decimal()
     return option(f"--{name}", kind, about, to=field.name, multiple=isinstance(field.default, tuple))
 
 

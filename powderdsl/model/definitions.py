@@ -359,6 +359,8 @@ def describe_kind(kind: Kind) -> str:
 def param_value(kind: Kind, value: Any) -> Value | None:
     """The value of a kind for a text (``"5%"``, ``"yes"``) or a number; None if it has none."""
     text = value.strip() if isinstance(value, str) else ""
+    if not text.isascii():  # Python reads digits of other scripts, rules do not
+        return None
     try:
         number = float(text[:-1]) / 100 if text.endswith("%") else float(FLAG_WORDS.get(text, value))
     except (TypeError, ValueError, OverflowError):

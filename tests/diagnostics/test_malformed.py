@@ -147,6 +147,8 @@ SECTIONS: list[tuple[str, str, str, str | None]] = [
     ("a field nowhere", "fields: {f: {type: flag, at: home}}\n", "PD110", "home"),
     ("a field without a kind", "fields: {f: {at: place}}\n", "PD109", "{"),
     ("of without element", "fields: {f: {type: flag, at: place, of: weed}}\n", "PD401", "weed"),
+    ("a digit of another script", "properties: {p: {type: 0..3, weed: ٣}}\n", "PD201", "٣"),
+    ("a wide digit", "properties: {p: {type: 0..3, weed: ３}}\n", "PD201", "３"),
     ("a property outside", "properties: {p: {type: 0..3, weed: 7}}\n", "PD402", "7"),
     ("a parameter that is a vector", "params: {p: {type: vec2(0..1), default: 0}}\n", "PD401", "vec2(0..1)"),
     ("a parameter without a kind", "params: {p: 0.2}\n", "PD401", "0.2"),

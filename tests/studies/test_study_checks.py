@@ -100,6 +100,8 @@ def test_shipped_studies_pass(name: str) -> None:
         # values of options
         (AGENTS, "[100, 200]", "[100, lots]", "PD806", "lots"),
         (AGENTS, "episodes: 4", "episodes: 4.5", "PD806", "4.5"),
+        (AGENTS, "episodes: 4", "episodes: ４", "PD806", "４"),
+        (AGENTS, "preset: $size", "gamma: 0.٩", "PD806", "0.٩"),
         (AGENTS, "episodes: 4", "deterministic: maybe", "PD806", "maybe"),
         (AGENTS, "preset: $size", "preset: smal", "PD806", "smal"),
         (AGENTS, "preset: $size", "gamma: 7", "PD640", "7"),

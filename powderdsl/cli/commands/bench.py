@@ -29,7 +29,7 @@ MAX_SECONDS = 3600
 
 
 def _seconds(text: str) -> float:
-    seconds = float(text)
+    seconds = float(text) if text.isascii() else 0
     if not 0 < seconds <= MAX_SECONDS:  # false for NaN
         raise ValueError(f"is not a number above 0, up to {MAX_SECONDS}")
     return seconds
