@@ -157,6 +157,10 @@ SECTIONS: list[tuple[str, str, str, str | None]] = [
     ("bits of 24", "streams: {coin: {bits: 24}}\n", "PD110", "24"),
     # Kernels and sets
     *DETAILS,
+    ("a pack that needs itself", "needs: yard\n", "PD307", "yard"),
+    ("a pack that conflicts with itself", "conflicts: yard\n", "PD307", "yard"),
+    ("a pack that provides itself", "provides: yard\n", "PD307", "yard"),
+    ("a pack that needs what it provides", "provides: soil\nneeds: soil\n", "PD307", "soil"),
     ("a set of itself", "sets: {s: s}\n", "PD307", "s"),
     ("sets of each other", "sets:\n  s: t\n  t: (s, weed)\n", "PD307", "s"),
     ("a chain of 1,000 sets", "sets:\n" + "".join(f"  s{i}: s{i + 1}\n" for i in range(1000)) + "  s1000: weed\n", "PD508", None),

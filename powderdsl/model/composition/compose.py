@@ -282,6 +282,15 @@ def _check_needs(loaded: Mapping[str, PackDecl], left_out: Collection[str], repo
     stands_in: dict[str, PackDecl] = {}
     missing: dict[str, dict[str, Span]] = {}
     for name, pack in loaded.items():
+        for verb, words in (
+            ("needs", pack.needs),
+            ("conflicts with", pack.conflicts),
+            ("provides", pack.provides),
+        ):
+            for word in words:
+                if word.text == name:
+                    message = f"pack `{name}` {verb} itself"
+                    reporter.error("PD307", message, word.span, "the pack itself", helps=["remove it"])
         for need in pack.needs:
             if need.text not in loaded:
                 missing.setdefault(need.text, {})[name] = need.span
@@ -290,7 +299,7 @@ def _check_needs(loaded: Mapping[str, PackDecl], left_out: Collection[str], repo
             if other in pack.provides:
                 rival = rival or stands_in.get(other.text)
                 stands_in.setdefault(other.text, pack)
-            if rival is not None:
+            if rival is not None and rival is not pack:
                 reporter.error(
                     "PD306", f"packs `{name}` and `{rival.name.text}` cannot be loaded together",
                     other.span, "declared here", secondary=[Label(rival.name.span, "loaded too")],
