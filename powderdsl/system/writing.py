@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory, mkstemp
+from secrets import token_hex
+from tempfile import TemporaryDirectory
 
 from powderdsl.diagnostics import CompileError, Diagnostic, Label
 from powderdsl.system.reading import check_regular
@@ -35,13 +36,12 @@ def replacing(path: Path, *, follow: bool = False) -> Iterator[Path]:
             the link itself is replaced, which may come from a stranger's folder.
     """
     target = destination(path, follow=follow)
+    temporary = target.parent / f".{target.stem[:40]}{MARK}{token_hex(8)}{target.suffix}"
     try:
-        handle, name = mkstemp(target.suffix, f".{target.stem[:40]}{MARK}", target.parent)
-    except (OSError, ValueError) as error:
-        raise not_writable(path, error) from None
-    os.close(handle)
-    temporary = Path(name)
-    try:
+        try:
+            os.close(os.open(temporary, os.O_CREAT | os.O_EXCL, 0o600))
+        except (OSError, ValueError) as error:
+            raise not_writable(path, error) from None
         with writing(path):
             yield temporary
             # Temporary files are private to their owner; a new file follows the umask, which can only be set.
@@ -50,7 +50,8 @@ def replacing(path: Path, *, follow: bool = False) -> Iterator[Path]:
             temporary.chmod(0o666 & ~mask)
             os.replace(temporary, target)
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError, ValueError):
+            temporary.unlink()
 
 
 @contextmanager

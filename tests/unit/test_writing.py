@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from powderdsl.system.writing import MARK, replacing, scratch_folder
+from powderdsl.system.writing import MARK, replacing, scratch_folder, write_text
 from tests.cli.commands import environment_with
 from tests.processes import waited
+from tests.refusals import refusal
 
 
 def names(folder: Path) -> list[str]:
@@ -29,6 +31,28 @@ def test_nothing_is_left_however_a_block_ends(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         interrupted()
     assert names(tmp_path) == []
+
+
+def test_nothing_is_left_by_a_signal_between_two_lines(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    close = os.close
+
+    def interrupted(handle: int) -> None:
+        close(handle)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "close", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_text(tmp_path / "x.txt", "whole")
+    assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize("name", ["x\0.txt", "\ud800.txt", "none/x.txt", "file/x.txt", "."])
+def test_a_path_that_cannot_be_a_file_is_named(name: str, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    (error,) = refusal(write_text, tmp_path / name, "whole")
+    assert (error.code, error.message) == ("PD613", f"cannot write {tmp_path / name}")
 
 
 def test_a_file_is_replaced_at_the_end(tmp_path: Path) -> None:
