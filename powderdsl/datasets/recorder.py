@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from shutil import rmtree
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from powderdsl.datasets.manifest import (
     write_manifest,
 )
 from powderdsl.datasets.shards import DTYPES, is_whole, row_shape, write_shard
+from powderdsl.diagnostics import CompileError
 from powderdsl.envs.acting import FrameStack, Policy, action_keys, random_policy
 from powderdsl.envs.observations import Observation, observation_of
 from powderdsl.envs.tensor_env import TensorEnv
@@ -122,14 +124,20 @@ def record(
 
 @contextmanager
 def lock_place(folder: Path) -> Iterator[None]:
-    """Make the folder and lock it."""
+    """Make the folder and lock it. A new one without a shard is removed where a CompileError ends the block."""
     check_place(folder)
+    is_new = not folder.is_dir()
     try:
-        folder.mkdir(exist_ok=True)
+        folder.mkdir(exist_ok=not is_new)
     except (OSError, ValueError) as error:
         raise not_writable(folder, error) from None
     with lock_folder(folder):
-        yield
+        try:
+            yield
+        except CompileError:
+            if is_new and not any(folder.glob("*.npz")):
+                rmtree(folder, ignore_errors=True)
+            raise
 
 
 def begin_manifest(folder: Path, recipe: Recipe) -> Manifest:

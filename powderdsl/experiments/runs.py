@@ -135,19 +135,21 @@ class Metrics:
         """Numbers by name, such as ``loss/train``, after `step` steps. What is not finite is left out of the lines."""
         numbers = {name: float(value) for name, value in values.items()}
         finite = {name: value for name, value in numbers.items() if math.isfinite(value)}
-        self._file.write(json.dumps({"step": step, **finite}) + "\n")
-        self._file.flush()
-        if self._events is not None:
-            for name, value in numbers.items():
-                self._events.add_scalar(name, value, step)
+        with writing(self._lines):
+            self._file.write(json.dumps({"step": step, **finite}) + "\n")
+            self._file.flush()
+            if self._events is not None:
+                for name, value in numbers.items():
+                    self._events.add_scalar(name, value, step)
 
     def __enter__(self) -> Metrics:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._file.close()
-        if self._events is not None:
-            self._events.close()
+        with writing(self._lines):
+            self._file.close()
+            if self._events is not None:
+                self._events.close()
 
 
 def read_metrics(folder: Path) -> Iterator[dict[str, Any]]:

@@ -17,6 +17,7 @@ from powderdsl.datasets.manifest import MAX_SHARDS, read_manifest, recipe_of
 from powderdsl.diagnostics import CompileError
 from powderdsl.envs import TensorEnv
 from powderdsl.envs.acting import action_keys, random_policy
+from powderdsl.system.archives import write_archive
 from powderdsl.tasks.episodes import TaskProgram
 from tests.refusals import refusal
 
@@ -90,6 +91,32 @@ def test_recording_goes_on_where_it_stopped(
     assert played[-1] == 20
     assert all((folder / name).stat().st_mtime_ns == when for name, when in before.items())
     assert {path.name for path in folder.iterdir()} <= {*files(folder), "dataset.json", ".lock"}
+
+
+@pytest.mark.parametrize(("shards", "left"), [(0, []), (1, ["dataset.json", "shard-000000.npz"])])
+def test_a_full_disk_is_told_with_its_path(
+    shards: int, left: list[str], small: TaskProgram, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a single shard, nothing is left; otherwise what a further call completes."""
+    written = 0
+
+    def write(*arguments: Any) -> None:
+        nonlocal written
+        if written == shards:
+            raise OSError(28, "No space left on device")
+        written += 1
+        write_archive(*arguments)
+
+    monkeypatch.setattr("powderdsl.datasets.shards.write_archive", write)
+    folder = tmp_path / "data"
+    with pytest.raises(CompileError, match=rf"PD613.* cannot write {folder}/shard-00000{shards}.npz"):
+        record(small, "random", folder, episodes=20, shard=8)
+    assert sorted(path.name for path in tmp_path.rglob("[!.]*.*")) == left
+    assert folder.exists() == bool(shards)
+    folder.mkdir(exist_ok=True)  # somebody else's
+    with pytest.raises(CompileError):
+        record(small, "random", folder, episodes=20, shard=8)
+    assert folder.exists()
 
 
 def test_damaged_shards_are_recorded_anew(small: TaskProgram, recorded: Dataset, tmp_path: Path) -> None:

@@ -124,6 +124,14 @@ def test_metrics_after_the_last_checkpoint_are_written_once(tmp_path: Path) -> N
     assert list((run.path / "tensorboard").iterdir())
 
 
+def test_metrics_on_a_full_disk_are_told_with_their_path(tmp_path: Path) -> None:
+    metrics = Metrics(tmp_path)
+    with Path("/dev/full").open("a") as full:
+        os.dup2(full.fileno(), metrics._file.fileno())
+    with pytest.raises(CompileError, match=r"PD613.* cannot write .*metrics\.jsonl"), metrics:
+        metrics.write(1, {"loss": 0.5})
+
+
 SAVING = """
 import sys, torch
 from powderdsl.experiments.runs import lock_folder, open_run
