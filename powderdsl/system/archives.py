@@ -11,7 +11,7 @@ import struct
 import zipfile
 from ast import literal_eval
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
@@ -173,15 +173,20 @@ def _header(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> tuple[str, Head
     with archive.open(entry) as member:
         if member.read(len(_MAGIC)) != _MAGIC:
             raise BadArchive(f"`{name}` is not an array")
-        (count,) = struct.unpack("<H", member.read(2))
+        count = int.from_bytes(member.read(2), "little")
         if count > MAX_HEADER:
             raise BadArchive(f"`{name}` has a header of {count:,} bytes")
-        values = literal_eval(member.read(count).decode("latin-1").strip())
-        start = member.tell()
-    descr, fortran, shape = values["descr"], values["fortran_order"], values["shape"]
-    dtype = "str" if re.fullmatch("<U[0-9]{1,9}", descr) else _TYPES.get(descr)
+        text, start = member.read(count).decode("latin-1"), member.tell()
+    values, refusal = None, BadArchive(f"`{name}` is not an array of numbers")
+    with suppress(ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
+        values = literal_eval(text.strip())
+    match values:
+        case {"descr": str(descr), "fortran_order": bool(fortran), "shape": tuple(shape)}:
+            dtype = "str" if re.fullmatch("<U[0-9]{1,9}", descr) else _TYPES.get(descr)
+        case _:
+            raise refusal
     if dtype is None or any(type(side) is not int or side < 0 for side in shape):
-        raise BadArchive(f"`{name}` is not an array of numbers")
+        raise refusal
     if fortran:
         raise BadArchive(f"`{name}` is not in C order: save `numpy.ascontiguousarray` of it")
     itemsize = int(descr[2:]) * (4 if dtype == "str" else 1)

@@ -58,7 +58,7 @@ def test_worlds_that_could_not_be_loaded_are_not_saved(tmp_path):
     ("words", "members"),
     [
         ("is not an array of numbers", {"x": np.array([None])}),
-        ("string", {"x": np.zeros(2, [("a", "i4")])}),
+        ("is not an array of numbers", {"x": np.zeros(2, [("a", "i4")])}),
         ("is not an array of numbers", {"x": np.zeros(2, "S3")}),
         ("is not an array of numbers", {"x": np.array([1j])}),
         ("is not an array of numbers", {"x": np.array([1], ">i4")}),
@@ -69,6 +69,18 @@ def test_worlds_that_could_not_be_loaded_are_not_saved(tmp_path):
 def test_archives_of_anything_else_are_refused(words, members, tmp_path):
     np.savez(tmp_path / "a.npz", **members)
     with pytest.raises(BadArchive, match=words), open_archive(tmp_path / "a.npz"):
+        pass
+
+
+@pytest.mark.parametrize(
+    "header",
+    ["", "{}", "[1", "f(2)", "9" * 5000, "(" * 900, "{'descr': '<i4', 'fortran_order': 0, 'shape': 3}"],
+    ids=range(7),
+)
+def test_damaged_headers_are_told_in_our_words(header, tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("x.npy", b"\x93NUMPY\1\0" + len(header).to_bytes(2, "little") + header.encode())
+    with pytest.raises(BadArchive, match="`x` is not an array of numbers"), open_archive(tmp_path / "a.npz"):
         pass
 
 
