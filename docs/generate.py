@@ -240,17 +240,49 @@ def mutations() -> str:
     return table(("pack", "mistake", "noticed by"), rows)
 
 
-def mutation_operators() -> str:
-    from powderdsl.testing.mutation.mutants import OPERATORS
+MISTAKES: dict[str, str] = {
+    "neighbor": "another neighbor: `below` for `above`, `left` for `below.left`",
+    "comparison": "`<=` for `<`, `!=` for `==`, `is not` for `is`",
+    "constant": "a number that is one off, or twice as large",
+    "chance": "a chance ten times as large or small, or half as large again",
+    "connective": "`or` for `and`, or a part of a condition that is missing",
+    "negation": "a `not` too much or too few",
+    "guard": "a missing `if`, `where` or `with chance`",
+    "effect": "a missing effect after `then`",
+    "write": "`+=` for `:=`, `-=` for `+=`",
+    "arithmetic": "`-` for `+`, `max` for `min`, the other branch of a choice",
+    "coordinate": "`column` for `row`",
+    "element": "another element, or source and target exchanged",
+    "set": "another set, a missing member, `any but` forgotten",
+    "tag": "a missing tag, another tag, a tag too much",
+    "kernel": "another kernel, another weight, other edges",
+    "stream": "another stream",
+    "let": "another `let` value, or one that is not fixed in time",
+    "parameter": "another parameter",
+    "property": "another property, or another value of an element",
+    "field": "another field; `at`, `resets`, `of`, default or range changed",
+    "side": "a missing direction or symmetry",
+    "order": "passes, rounds or rules in another order",
+    "conflicts": "another policy for conflicts, or none",
+    "rule": "a missing rule or block",
+    "override": "an element that does not override, or does",
+}
+"""Kinds of mistakes, and a line about each."""
 
-    return table(
-        ("mistake", "what is written instead"), ((f"`{n}`", about) for n, about in OPERATORS.items())
-    )
+
+def mutation_operators() -> str:
+    return table(("mistake", "what is written instead"), ((f"`{n}`", about) for n, about in MISTAKES.items()))
+
+
+def handwritten_share(counts: dict[str, int]) -> float:
+    """The part of the mutants noticed by invariants and tests that those written by hand notice; 1 if there are none."""
+    tested = counts["invariant"] + counts["test"] + counts["generated"]
+    return (tested - counts["generated"]) / tested if tested else 1.0
 
 
 def mutation_testing() -> str:
     """What `docs/mutation_table.py` has counted, a line a pack, and the sum."""
-    from powderdsl.testing.mutation.judging import COUNTED, handwritten_share, noticed_share
+    from powderdsl.testing.mutation.judging import COUNTED, noticed_share
 
     path = DOCS / "mutation.json"
     measured = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}

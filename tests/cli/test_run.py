@@ -12,13 +12,13 @@ import powderdsl as package
 from powderdsl.analysis.changes import unchanging_ids
 from powderdsl.cli.start_worlds import start, start_drawn
 from powderdsl.compiler import shipped_tests
-from powderdsl.testing.generators.cases import load_text
 from powderdsl.worlds.raster import Paint
 from powderdsl.worlds.scene import shipped_scenes
 from powderdsl.worlds.strewn import strew
 from tests.cli.commands import PACK, powderdsl
 from tests.refusals import refused_codes
 from tests.semantics.test_mixed import HEAVY
+from tests.semantics.texts import load_text
 
 FAST = ("--backend", "reference", "--size", "12x20", "--steps", "3")
 """Small and without a compiler: how rules run is tested elsewhere."""

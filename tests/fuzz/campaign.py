@@ -15,12 +15,12 @@ from tempfile import gettempdir
 import torch
 
 from powderdsl.system.writing import scratch_folder
-from powderdsl.testing.generators.cases import load_text
 from tests.fuzz.cases import Case, write_case
 from tests.fuzz.crew import Done, Lost, work_through
 from tests.fuzz.differential import Finding, Outcome, Plan, run_seed, seeded_starts, still_fails
 from tests.fuzz.reducer import reduce_case
 from tests.fuzz.rulemaker import random_ruleset_text
+from tests.semantics.texts import load_text
 
 SEED_LIMIT = 600
 """Seconds that a seed may take before it counts as one that hangs."""

@@ -10,8 +10,9 @@ import numpy as np
 from powderdsl.model.state import slots
 from powderdsl.model.types import Ruleset
 from powderdsl.system.writing import replacing
-from powderdsl.testing.generators.cases import Start, load_text
+from powderdsl.testing.generators.cases import Start
 from powderdsl.testing.generators.trees import line_of, read_start, read_yaml, reading, start_tree, write_yaml
+from tests.semantics.texts import load_text
 
 
 @dataclass(frozen=True)

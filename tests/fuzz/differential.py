@@ -18,7 +18,7 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.targets.cpp.build import Building, building
-from powderdsl.testing.generators.cases import Start, load_text, random_start
+from powderdsl.testing.generators.cases import Start, random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.fuzz import EMULATED, STARTS_AT_ONCE
 from tests.fuzz.cases import Case, fitted
@@ -26,6 +26,7 @@ from tests.fuzz.compare import find_difference
 from tests.fuzz.cuda_emulation import EmulatedSimulator
 from tests.fuzz.exercised import Used, constructs, operations
 from tests.fuzz.rulemaker import random_ruleset_text
+from tests.semantics.texts import load_text
 
 if TYPE_CHECKING:
     from powderdsl.simulation.simulator import Simulator

@@ -9,7 +9,6 @@ from functools import cache, partial
 from powderdsl.diagnostics import CompileError
 from powderdsl.model.builtins import KERNEL_SHAPES, KERNELS, shaped_kernel
 from powderdsl.model.types import CHANCE, DIRECTION, ELEMENT, FLAG, REAL, VEC2, Kind, Ruleset, integer
-from powderdsl.testing.generators.cases import load_text
 from powderdsl.testing.generators.choices import Choices
 from powderdsl.testing.generators.trees import Tree, write_yaml
 from tests.fuzz.grammar import (
@@ -22,6 +21,7 @@ from tests.fuzz.grammar import (
     flag_of_a_loop,
     productions,
 )
+from tests.semantics.texts import load_text
 
 RANGES = (
     (0, 1), (0, 3), (-2, 2), (0, 7), (-1, 1), (0, 0), (-5, -2), (3, 9), (-128, 127), (0, 127), (-129, 5), (0, 128),

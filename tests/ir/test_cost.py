@@ -10,8 +10,8 @@ import pytest
 from powderdsl.analysis.costs import PassCost, costs
 from powderdsl.compiler import lower
 from powderdsl.ir import bits
-from powderdsl.testing.generators.cases import load_text
 from tests.cli.commands import powderdsl
+from tests.semantics.texts import load_text
 
 PACK = """\
 pack: small

@@ -10,9 +10,9 @@ from powderdsl.compiler import load
 from powderdsl.ir.ops import REAL, InvalidIR
 from powderdsl.schedule.stages import CPU, plan
 from powderdsl.schedule.types import Compute, Move, Sweeps, flat
-from powderdsl.testing.generators.cases import load_text
 from tests.schedule.test_stages import packed_passes, run_stages
 from tests.schedule.verify import verify
+from tests.semantics.texts import load_text
 
 
 def test_a_row_is_not_read_before_it_is_there() -> None:

@@ -15,10 +15,10 @@ from powderdsl.model.types import Ruleset
 from powderdsl.schedule.lifetimes import Pending, Pool, assign_buffers, insert_barriers
 from powderdsl.schedule.stages import CPU, CUDA, Stage, steps
 from powderdsl.schedule.types import Schedule
-from powderdsl.testing.generators.cases import load_text
 from tests.fuzz.rulemaker import random_ruleset
 from tests.schedule.interpreter import SNAP, World, run_graph, run_schedule
 from tests.schedule.verify import verify
+from tests.semantics.texts import load_text
 from tests.tiers import tiered
 
 WORLDS = 4

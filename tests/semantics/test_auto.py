@@ -28,11 +28,12 @@ from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.system import cache
 from powderdsl.targets.cpp.build import Building, NoCompiler, NoCompilerWarning, building
 from powderdsl.targets.job import Clock, Job
-from powderdsl.testing.generators.cases import load_text, random_start
+from powderdsl.testing.generators.cases import random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.cli.commands import environment_with
 from tests.cli.commands import powderdsl as command
 from tests.fuzz.compare import find_difference
+from tests.semantics.texts import load_text
 
 RULES = """\
 pack: kettle
@@ -321,7 +322,7 @@ from pathlib import Path
 from powderdsl.simulation import native
 from powderdsl.simulation.simulator import compile
 from powderdsl.targets.cpp.build import Building, building
-from powderdsl.testing.generators.cases import load_text
+from tests.semantics.texts import load_text
 
 native.WORTH = 0.0
 with building(Building('-O0', Path(sys.argv[1]))):

@@ -13,8 +13,8 @@ from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.simulation.simulator import compile as compile_rules
 from powderdsl.targets.cpp.build import Building, building
 from powderdsl.targets.cpp.program import KEPT_INPUTS
-from powderdsl.testing.generators.cases import load_text
 from tests.compilers import skip_without_compiler
+from tests.semantics.texts import load_text
 
 RULES = """\
 pack: rain

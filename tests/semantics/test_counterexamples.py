@@ -10,11 +10,11 @@ import pytest
 import powderdsl
 from powderdsl.analysis.ledger import ledger
 from powderdsl.model.types import Ruleset
-from powderdsl.testing.generators.cases import load_text
 from powderdsl.testing.properties import refute
 from powderdsl.testing.properties.refute import refuted
 from powderdsl.testing.properties.running import Runner
 from powderdsl.testing.properties.search import InvariantSearch, SearchPlan
+from tests.semantics.texts import load_text
 
 
 @pytest.fixture(autouse=True)

@@ -23,7 +23,7 @@ from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.syntax.sources import shipped
 from powderdsl.targets.cpp.build import ARCHITECTURE, Building, building, find_compiler, flags_for, processor
-from powderdsl.testing.generators.cases import Start, load_text, random_start
+from powderdsl.testing.generators.cases import Start, random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.compilers import skip_without_compiler
 from tests.fuzz import COMPARED, STARTS_AT_ONCE, differential
@@ -31,6 +31,7 @@ from tests.fuzz.compare import assert_same, assert_same_worlds, find_difference
 from tests.fuzz.differential import Outcome, Plan, run_seed
 from tests.fuzz.exercised import constructs, missing, operations
 from tests.fuzz.rulemaker import random_ruleset
+from tests.semantics.texts import load_text
 from tests.tiers import tiered
 
 BACKENDS = ("reference", *STARTS_AT_ONCE)

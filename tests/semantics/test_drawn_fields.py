@@ -7,8 +7,8 @@ import pytest
 
 from powderdsl.simulation.draw import to_numpy
 from powderdsl.simulation.simulator import compile
-from powderdsl.testing.generators.cases import load_text
 from powderdsl.testing.pack_tests.runner import run_examples
+from tests.semantics.texts import load_text
 
 FIELDS = """\
 pack: load

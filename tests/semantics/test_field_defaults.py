@@ -12,9 +12,8 @@ from powderdsl.simulation.simulator import compile
 from powderdsl.simulation.tracing import trace
 from powderdsl.tasks.episodes import TaskProgram, check_actions
 from powderdsl.tasks.shipped import load_task
-from powderdsl.testing.generators.cases import load_text
 from powderdsl.testing.pack_tests.runner import run_examples
-from tests.semantics.texts import mistakes
+from tests.semantics.texts import load_text, mistakes
 
 HEAD = """\
 pack: hunt

@@ -9,9 +9,8 @@ from powderdsl.analysis.costs import costs
 from powderdsl.compiler import lower
 from powderdsl.model.builtins import KERNEL_SHAPES, KERNELS, shaped_kernel
 from powderdsl.simulation.draw import to_numpy
-from powderdsl.testing.generators.cases import load_text
 from powderdsl.testing.pack_tests.runner import run_examples
-from tests.semantics.texts import simulator
+from tests.semantics.texts import load_text, simulator
 
 CELLS = {
     "box": lambda y, x, r: True,

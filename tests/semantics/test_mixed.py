@@ -16,10 +16,11 @@ from powderdsl.targets.job import MixedProgram, mixed_program
 from powderdsl.targets.tensor_kind import Tensors
 from powderdsl.targets.torch.program import TorchProgram
 from powderdsl.targets.wasm.program import WasmProgram
-from powderdsl.testing.generators.cases import load_text, random_start
+from powderdsl.testing.generators.cases import random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.compilers import skip_without_compiler
 from tests.fuzz.compare import assert_same_worlds, find_difference
+from tests.semantics.texts import load_text
 from tests.tiers import tiered
 
 ROWS = "\n".join("      - " + " ".join(str(1 + (5 * i + 3 * j) % 7) for j in range(21)) for i in range(21))

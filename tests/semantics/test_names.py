@@ -8,7 +8,7 @@ import pytest
 
 import powderdsl
 from powderdsl.diagnostics import CompileError
-from powderdsl.testing.generators.cases import load_text
+from tests.semantics.texts import load_text
 
 PACK = """
 pack: names

@@ -11,10 +11,11 @@ import powderdsl
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.draw import palette, rgb
 from powderdsl.simulation.simulator import Simulator, World
-from powderdsl.testing.generators.cases import load_text, random_start
+from powderdsl.testing.generators.cases import random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.compilers import skip_without_compiler
 from tests.fuzz import TARGETS
+from tests.semantics.texts import load_text
 
 BACKENDS = ("reference", *TARGETS)
 SIZES = [(1, 1), (3, 33), (2, 64), (5, 65), (1, 130), (16, 70)]

@@ -6,10 +6,9 @@ import math
 
 import pytest
 
-from powderdsl.testing.generators.cases import load_text
 from powderdsl.testing.pack_tests.chances import ERROR_RATE, OFF, is_unlikely, trials_for
 from powderdsl.testing.pack_tests.runner import run_examples
-from tests.semantics.texts import mistakes
+from tests.semantics.texts import load_text, mistakes
 from tests.tiers import tiered
 
 PACK = """\

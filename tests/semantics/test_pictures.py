@@ -16,12 +16,12 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.draw import palette, ramps, rgb
 from powderdsl.system.fingerprint import fingerprint
-from powderdsl.testing.generators.cases import load_text, random_start
+from powderdsl.testing.generators.cases import random_start
 from powderdsl.testing.generators.choices import Choices
 from powderdsl.worlds.store import load_world
 from tests.cli.commands import powderdsl as run_command
 from tests.fuzz import TARGETS
-from tests.semantics.texts import codes, diagnosed, simulator
+from tests.semantics.texts import codes, diagnosed, load_text, simulator
 
 BACKENDS = ("reference", *TARGETS)
 SIZES = [(1, 1), (3, 33), (5, 65), (16, 70)]

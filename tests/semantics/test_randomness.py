@@ -10,7 +10,7 @@ import pytest
 from powderdsl.model.reference import Clock, draw
 from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.system.random import name_number
-from powderdsl.testing.generators.cases import load_text
+from tests.semantics.texts import load_text
 
 Shape = tuple[int, int]
 Planes = Any

@@ -7,8 +7,7 @@ import pytest
 
 from powderdsl.analysis.ledger import ledger
 from powderdsl.simulation.draw import to_numpy
-from powderdsl.testing.generators.cases import load_text
-from tests.semantics.texts import codes, mistakes, simulator
+from tests.semantics.texts import codes, load_text, mistakes, simulator
 
 HEAD = """\
 pack: road

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from powderdsl.simulation.draw import to_numpy
-from powderdsl.testing.generators.cases import load_text
 from powderdsl.testing.pack_tests.runner import run_examples
-from tests.semantics.texts import codes, mistakes, simulator
+from tests.semantics.texts import codes, load_text, mistakes, simulator
 
 HEAD = """\
 pack: quotients

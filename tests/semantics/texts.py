@@ -9,8 +9,18 @@ from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Source
 from powderdsl.model.check import check
 from powderdsl.model.declarations import PackDecl
 from powderdsl.model.packs import read_file
-from powderdsl.testing.generators.cases import load_text
+from powderdsl.model.types import Ruleset
 from tests.compilers import skip_without_compiler
+
+
+def load_text(text: str, name: str = "random.yaml") -> Ruleset:
+    """The checked model of one pack given as text. Raises CompileError."""
+    reporter = Reporter()
+    pack = read_file(Source(name, text), reporter)
+    reporter.raise_if_errors()
+    if not isinstance(pack, PackDecl):
+        raise ValueError("the text is not a pack")
+    return check([pack], None, reporter)
 
 
 def simulator(text: str, backend: str = "reference") -> powderdsl.Simulator:

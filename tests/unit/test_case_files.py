@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from powderdsl.testing.generators.cases import load_text
 from tests.fuzz.cases import Case, read_case, write_case
 from tests.fuzz.compare import find_difference
 from tests.fuzz.differential import seeded_starts
 from tests.fuzz.rulemaker import random_ruleset_text
+from tests.semantics.texts import load_text
 
 
 @pytest.mark.parametrize("seed", [10, 43, 65])

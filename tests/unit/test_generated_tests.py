@@ -6,10 +6,10 @@ import pytest
 
 from powderdsl.diagnostics import Source
 from powderdsl.simulation.simulator import compile
-from powderdsl.testing.generators.cases import load_text
 from powderdsl.testing.mutation.judging import Original
 from powderdsl.testing.mutation.written import GeneratedTest, distinguish, with_tests, written_test
 from powderdsl.testing.pack_tests.runner import run_examples
+from tests.semantics.texts import load_text
 
 NEW = GeneratedTest("p", "generated x", "- generated x:\n    given: a\n    expect: a\n")
 HEAD = 'pack: p\nelements: {a: {id: 0, color: "#101010", glyph: a}}\n'

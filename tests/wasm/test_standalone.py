@@ -19,11 +19,12 @@ from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.simulation.standalone import standalone_module
-from powderdsl.testing.generators.cases import Start, load_text, random_start
+from powderdsl.testing.generators.cases import Start, random_start
 from powderdsl.testing.generators.choices import Choices
 from tests.cli.commands import powderdsl as command
 from tests.fuzz.rulemaker import random_ruleset
 from tests.semantics.test_mixed import spread
+from tests.semantics.texts import load_text
 from tests.tiers import tiered
 from tests.wasm.standalone_world import (
     StandaloneWorld,

@@ -1,4 +1,4 @@
-"""A ruleset from text, and start worlds that are random in everything a world holds."""
+"""Start worlds that are random in everything a world holds."""
 
 from __future__ import annotations
 
@@ -10,10 +10,6 @@ from random import Random
 from typing import TYPE_CHECKING, Any
 
 from powderdsl.arrays import np
-from powderdsl.diagnostics import Reporter, Source
-from powderdsl.model.check import check
-from powderdsl.model.declarations import PackDecl
-from powderdsl.model.packs import read_file
 from powderdsl.model.state import SNAP, Slot, fitting, slots
 from powderdsl.model.types import Kind, Property, Ruleset
 from powderdsl.testing.generators.choices import Choices
@@ -31,16 +27,6 @@ CLOCKS = (0, 0, 0, 1, 6, 1 << 20, (1 << 32) - 1, 1 << 40)
 
 FEW_CELLS = 12
 """Worlds of at most this many cells are chosen cell by cell, so that Hypothesis can shrink them; others are filled by a seed."""
-
-
-def load_text(text: str, name: str = "random.yaml") -> Ruleset:
-    """The checked model of one pack given as text. Raises CompileError."""
-    reporter = Reporter()
-    pack = read_file(Source(name, text), reporter)
-    reporter.raise_if_errors()
-    if not isinstance(pack, PackDecl):
-        raise ValueError("the text is not a pack")
-    return check([pack], None, reporter)
 
 
 @dataclass(frozen=True)

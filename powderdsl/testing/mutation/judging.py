@@ -384,9 +384,3 @@ def noticed_share(counts: dict[str, int]) -> float:
     """The share of noticed mutants among those that are not equivalent; 1 if there are none."""
     different = counts["mutants"] - counts["equivalent"]
     return counts["killed"] / different if different else 1.0
-
-
-def handwritten_share(counts: dict[str, int]) -> float:
-    """The part of the mutants noticed by invariants and tests that those written by hand notice; 1 if there are none."""
-    tested = counts["invariant"] + counts["test"] + counts["generated"]
-    return (tested - counts["generated"]) / tested if tested else 1.0

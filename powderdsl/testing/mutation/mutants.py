@@ -21,7 +21,7 @@ Path = tuple[tuple[Container, int], ...]
 
 @dataclass(frozen=True)
 class Change:
-    """A mistake: the kind of it (see `OPERATORS`), and characters `start` to `end` (exclusive) that become `text`."""
+    """A mistake: the kind of it (docs/testing.md has a table), and characters `start` to `end` (exclusive) that become `text`."""
 
     operator: str
     start: int
@@ -67,36 +67,6 @@ class Mutant:
     def key(self) -> str:
         """The mutant's identity from run to run: place, kind and the new text."""
         return f"{self.place} {self.operator} {self.diff}"
-
-
-OPERATORS: dict[str, str] = {
-    "neighbor": "another neighbor: `below` for `above`, `left` for `below.left`",
-    "comparison": "`<=` for `<`, `!=` for `==`, `is not` for `is`",
-    "constant": "a number that is one off, or twice as large",
-    "chance": "a chance ten times as large or small, or half as large again",
-    "connective": "`or` for `and`, or a part of a condition that is missing",
-    "negation": "a `not` too much or too few",
-    "guard": "a missing `if`, `where` or `with chance`",
-    "effect": "a missing effect after `then`",
-    "write": "`+=` for `:=`, `-=` for `+=`",
-    "arithmetic": "`-` for `+`, `max` for `min`, the other branch of a choice",
-    "coordinate": "`column` for `row`",
-    "element": "another element, or source and target exchanged",
-    "set": "another set, a missing member, `any but` forgotten",
-    "tag": "a missing tag, another tag, a tag too much",
-    "kernel": "another kernel, another weight, other edges",
-    "stream": "another stream",
-    "let": "another `let` value, or one that is not fixed in time",
-    "parameter": "another parameter",
-    "property": "another property, or another value of an element",
-    "field": "another field; `at`, `resets`, `of`, default or range changed",
-    "side": "a missing direction or symmetry",
-    "order": "passes, rounds or rules in another order",
-    "conflicts": "another policy for conflicts, or none",
-    "rule": "a missing rule or block",
-    "override": "an element that does not override, or does",
-}
-"""Kinds of mistakes, and a line about each."""
 
 
 def split_common_ends(old: list[str], new: list[str]) -> tuple[list[str], list[str], list[str]]:
