@@ -170,21 +170,35 @@ def several(*options: Option) -> Option:
     return decorate
 
 
-def settings_of(config: type, *, only: Sequence[str] = ()) -> Option:
+def settings_of(
+    config: type,
+    presets: Mapping[str, Mapping[str, Any]] | None = None,
+    *,
+    only: Sequence[str] = (),
+    **names: str,
+) -> Option:
     """An option for each field of a dataclass that has a help text (`system.settings`). Its default is None.
 
-    The settings themselves report values out of range, all mistakes together. `only`: names of fields; unless given, all.
+    The settings themselves report values out of range, all mistakes together. `presets`: the settings that each changes,
+    for the help; None: a run has them. `only`: names of fields; unless given, all. `names`: other names of options.
     """
-    return several(*(_setting(field) for field in fields(config) if not only or field.name in only))
+    chosen = [field for field in fields(config) if not only or field.name in only]
+    return several(*(_setting(field, names.get(field.name, ""), presets) for field in chosen))
 
 
-def _setting(field: Field[Any]) -> Option:
+def _setting(field: Field[Any], name: str, presets: Mapping[str, Mapping[str, Any]] | None) -> Option:
     about = field.metadata.get("about")
     if not about:
         return several()
-    name = field.metadata["option"] or field.name.replace("_", "-")
+    defaults: dict[str, Any] = {"default": "the run's"}
+    if presets is not None:
+        own = {name: values.get(field.name, field.default) for name, values in presets.items()}
+        defaults = own if len({*own.values()}) > 1 else {"default": field.default}
+    words = ", ".join(f"{name}: {value}" for name, value in defaults.items() if value not in ("", ()))
+    about = about.partition("  [default")[0] + (words and f"  [{words}]")
+    name = name or field.metadata["option"] or field.name.replace("_", "-")
     limits = field.metadata["limits"]
-    kind: Any = name.upper()
+    kind: Any = name.rpartition("-")[2].upper()
     if limits.choices:
         kind = limits.choices
     elif isinstance(field.default, int):
@@ -216,37 +230,59 @@ size = option("--size", SIZE, "Rows and columns, such as 48x64.")
 device = click.option("--device", default="cpu", help="A torch device: cpu, cuda, cuda:1.")
 
 
-class ManyWords(click.Command):
-    """A command whose options for packs take all words up to the next option: ``--packs ONE ANOTHER``."""
-
-    MANY = ("--packs", "--held-out", "--only")
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        words: list[str] = []
-        option, first = "", False
-        for word in args:
-            if word.startswith("-"):
-                option, first = word if word in self.MANY else "", True
-                words.append(word)
-            else:
-                words += [word] if first or not option else [option, word]
-                first = False
-        return super().parse_args(ctx, words)
-
-
-def _places(ctx: click.Context, param: click.Parameter, words: tuple[str, ...]) -> tuple[str, ...]:
-    """Packs as runs record them: files by their absolute paths."""
-    return tuple(str(Path(word).absolute()) if word.endswith((".yaml", ".yml")) else word for word in words)
+SECTIONS = {
+    "Run": "run resume preset seed steps iterations episodes envs examples seconds rounds save-every validate-every",
+    "World": "world task split worlds size number rules packs held-out only knob set slots workload reward after data "
+    "ignore-actions",
+    "Drawn rulesets": "rulesets first-ruleset chances swap leave-out",
+    "Cell": "at step of",
+    "Policy": "policy policies deterministic",
+    "Network": "network observation features frames width",
+    "Cloning": "init-from init-expert init-epochs",
+    "Training": "rollout batch epochs learning-rate schedule gamma gae-lambda clip entropy vf-coef max-grad-norm target-kl "
+    "normalize buffer refresh",
+    "Evaluation": "eval-every eval-split eval-episodes",
+    "Counterexamples": "replay picture keep",
+    "Mutants": "mutate mutants write jobs",
+    "Data": "out shard compress verify to-minari from-minari",
+    "Output": "out watch scale every fps beside profile all json verbose",
+    "Machine": "backend device threads store",
+}
+"""Names of options, by the section of the help that they stand in."""
 
 
-packs = click.option(
-    "--packs",
-    multiple=True,
-    metavar="PACK…",
-    callback=_places,
-    help="Packs, by name or file, that are added to the task's rules.",
-)
-"""For commands whose class is `ManyWords`."""
+class Command(click.Command):
+    """A command whose help has its options in sections, if there are many; those that would stand alone are last."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        options = [option for option in self.get_params(ctx) if isinstance(option, click.Option)]
+        rows = {option.opts[-1][2:]: option.get_help_record(ctx) or ("", "") for option in options}
+        for title, words in SECTIONS.items() if len(rows) > 10 else ():
+            names = [name for name in words.split() if name in rows]
+            if len(names) > 1:
+                with formatter.section(title):
+                    formatter.write_dl([rows.pop(name) for name in names])
+        with formatter.section("Options"):
+            formatter.write_dl([*rows.values()])
+
+
+def pack_list(name: str, about: str, read: Callable[[str], str] = str, **more: Any) -> Option:
+    """An option for packs, joined by commas; it may be repeated."""
+
+    def joined(
+        ctx: click.Context, param: click.Parameter, lists: tuple[tuple[str, ...], ...]
+    ) -> tuple[str, ...]:
+        return tuple(read(pack) for packs in lists for pack in packs)
+
+    return option(name, NAMES, about, metavar="PACK,PACK", multiple=True, callback=joined, **more)
+
+
+def _place(pack: str) -> str:
+    """A pack as runs record it: a file by its absolute path."""
+    return str(Path(pack).absolute()) if pack.endswith((".yaml", ".yml")) else pack
+
+
+packs = pack_list("--packs", "Packs, by name or file, that are added to the task's rules.", _place)
 
 
 BACKEND = click.Choice(list(BACKENDS))

@@ -49,16 +49,16 @@ class DataConfig(Checked):
     pairs, of which each iteration replaces `refresh`; if all pairs of all worlds fit in, it holds these and stays so.
     """
 
-    task: str = setting(
-        "world-model", "A shipped task or a file.  [default: world-model]", form="a name or a file"
-    )
+    task: str = setting("world-model", form="a name or a file")
     split: str = setting("train", "Split of the task to train on.  [default: train]", form="a name")
     rules: str = setting("")
     """As everywhere: a shipped ruleset, packs joined by ``+``, left out behind ``-``. Empty: the task's own."""
     only: tuple[str, ...] = setting(())
     knobs: Mapping[str, int] = setting(dict)
     params: Mapping[str, Any] = setting(dict)
-    states: int = setting(1_000_000, "Number of start worlds. Tests begin at 2³².", 1, TEST_SEEDS)
+    states: int = setting(
+        1_000_000, "How many worlds there are to draw from.", 1, TEST_SEEDS, option="worlds"
+    )
     steps: int = setting(8, low=1)
     pairs: int = setting(16, low=1)
     rulesets: int = setting(0, "Number of rulesets to draw around the rules.", 0, MAX_RULESETS)

@@ -141,7 +141,7 @@ def open_recording(folder: str | Path, task: str | None = None) -> Recording:
     if task is None and recipe.task not in shipped_tasks():
         # A name out of the manifest must not lead to a file.
         message = f"{folder} was recorded from the task `{recipe.task}`, which is not a shipped one"
-        raise failure("PD631", message, helps=("give its file: `--task FILE`",))
+        raise failure("PD631", message, helps=("give its file, too",))
     name = task or recipe.task
     ids = {int(number): element for number, element in recipe.palette.items()}
     palette = tuple(ids.get(number) for number in range(max(ids) + 1))

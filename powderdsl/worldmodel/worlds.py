@@ -330,6 +330,6 @@ def _missing_elements(
             span,
             "none of these can be drawn" if span else "",
             notes=[f"they need {', '.join(elements)}"],
-            helps=["add the packs that have them, or choose other worlds with `--split` or `--task`"],
+            helps=["add the packs that have them, or choose another split or task"],
         )
     return CompileError(reporter.diagnostics)

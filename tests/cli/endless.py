@@ -29,7 +29,7 @@ about: Two runs that are ended.
 seeds: 2
 vary: {batch: [12]}
 steps:
-  trained: {command: train, on: dig.yaml, preset: small, envs: 4, rollout: 3, batch: $batch, backend: torch, steps: 900000000, seed: $seed, checkpoint-every: 0}
+  trained: {command: train, on: dig.yaml, preset: small, envs: 4, rollout: 3, batch: $batch, backend: torch, steps: 900000000, seed: $seed, save-every: 0}
   tested: {command: evaluate, on: trained}
 measures:
   reward: {of: trained, value: splits/test/trained/mean}
@@ -75,9 +75,9 @@ COMMANDS = {
         ("run", "life", *SMALL, "--steps", "3", "--out", "data/x.npz"),
     ),
     "train": Endless(
-        ("train", "dig.yaml", *TINY, "--run", "agent", "--steps", "900000000", "--checkpoint-every", "0"),
+        ("train", "dig.yaml", *TINY, "--run", "agent", "--steps", "900000000", "--save-every", "0"),
         "agent/checkpoints/[0-9]*.safetensors",
-        ("train", "dig.yaml", *TINY, "--run", "agent", "--steps", "12", "--checkpoint-every", "0"),
+        ("train", "dig.yaml", *TINY, "--run", "agent", "--steps", "12", "--save-every", "0"),
     ),
     "evaluate": Endless(
         ("evaluate", "dig.yaml", "--episodes", "1000000", "--backend", "reference", "--out", "x.json"),
@@ -85,9 +85,9 @@ COMMANDS = {
     ),
     "wm train": Endless(
         (
-            *("wm", "train", "--task", "dig.yaml", "--width", "4", "--batch", "4", "--buffer", "32"),
-            *("--refresh", "2", "--states", "100", "--backend", "torch", "--run", "model"),
-            *("--iterations", "900000000", "--store", "disk", "--save-every", "1"),
+            *("wm", "train", "dig.yaml", "--width", "4", "--batch", "4", "--buffer", "32"),
+            *("--refresh", "2", "--worlds", "100", "--backend", "torch", "--run", "model"),
+            *("--iterations", "900000000", "--store", "disk", "--save-every", "0.02"),
         ),
         "model/checkpoints/[0-9]*.safetensors",
     ),

@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 import subprocess
+from collections.abc import Iterator
 from types import SimpleNamespace
 
 import click
@@ -47,11 +48,40 @@ def test_every_command_has_help_and_its_name(name):
 def test_streams_may_be_closed(streams, tmp_path):
     """What goes there is lost; a file that is written does not take its place."""
     out = tmp_path / "world.png"
-    words = command_line("render", "garden", "--rules", "powderworld", "--out", out)
+    words = command_line("render", "powderworld", "--world", "garden", "--out", out)
     command = ["sh", "-c", f'"$@" {streams}', "sh", *words]
     ended = subprocess.run(command, env=environment_with(), capture_output=True, text=True)
     assert (ended.returncode, ended.stderr) == (0, "")
     assert out.read_bytes().endswith(b"IEND\xaeB`\x82")
+
+
+def leaves(command: click.Command, *words: str) -> Iterator[tuple[tuple[str, ...], click.Command]]:
+    """Commands without commands of their own, and what calls them."""
+    names = command.list_commands(click.Context(command)) if isinstance(command, click.Group) else ()
+    for name in names:
+        yield from leaves(command.get_command(click.Context(command), name), *words, name)
+    if not names:
+        yield words, command
+
+
+def test_many_options_are_in_sections():
+    for words, command in leaves(main):
+        text = powderdsl(*words, "--help", exits=0).stdout
+        names = [option.opts[-1] for option in command.params if isinstance(option, click.Option)]
+        first = re.search(r"^\w[\w ]*:$", text, re.M).start()
+        shown = re.findall(r"^  (?:-\w, )?(--[\w-]+)", text[first:], re.M)
+        assert sorted(shown) == sorted([*names, "--help"]), words
+        rest = text.partition("\nOptions:")[2]
+        assert len(names) <= 10 or rest.count("\n  -") <= 4, words
+
+
+def test_help_has_the_defaults_of_presets():
+    help_text = " ".join(powderdsl("train", "--help").stdout.split())
+    assert "[paper: 256, small: 128, fcn: 32]" in help_text
+    assert "Worlds that are played at once. [default: 32]" in help_text
+    help_text = " ".join(powderdsl("wm", "train", "--help").stdout.split())
+    assert "Features of the first block. [paper: 32, small: 16]" in help_text
+    assert "..." not in powderdsl("wm", "--help").stdout.partition("Commands:")[2]
 
 
 def test_no_command_is_a_usage_error():

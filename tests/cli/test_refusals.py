@@ -25,8 +25,8 @@ BAD_OPTIONS = (
 )
 USAGE = (
     *(f"run core {option}" for option in BAD_OPTIONS),
-    *("check", "run", "compile core", "compile core --emit poetry", "render garden --rules core"),
-    *("render garden --rules core --out x.gif", "explain PD301 PD302"),
+    *("check", "run", "compile core", "compile core --emit poetry", "render core --world garden"),
+    *("render core --world garden --out x.gif", "explain PD301 PD302"),
 )
 UNUSABLE = (
     *("''", "9", "'a b'", "a-b", "../a", "salt.yaml", "x" * 41, "é"),
@@ -63,9 +63,9 @@ REFUSED = (
     ("run core+grit.yaml --world saved.npz --batch 2", "--batch does not go with this world"),
     ("run core+grit.yaml --world saved.npz --seed 0", "--seed does not go with this world"),
     ("run core+grit.yaml --world drawing.txt --size 4x4 --watch", "size does not go with this world"),
-    ("render drawing.txt --rules core --out x.png", "error[PD"),
-    ("render none.npz --rules core --out x.png", "error[PD"),
-    ("render drawing.txt --rules core+grit.yaml --out none/x.png", "error[PD"),
+    ("render core --world drawing.txt --out x.png", "error[PD"),
+    ("render core --world none.npz --out x.png", "error[PD"),
+    ("render core+grit.yaml --world drawing.txt --out none/x.png", "error[PD"),
     ("bench no-such-rules", "PD304"),
     ("bench life --backend fast", "fast"),
     ("bench life --batch 0", "0"),
@@ -123,9 +123,9 @@ REFUSED = (
     ),
     *(
         (f"test life {option}", "--mutate")
-        for option in ("--write", "--pack life", "--mutants 3", "--jobs 1")
+        for option in ("--write", "--packs life", "--mutants 3", "--jobs 1")
     ),
-    ("test life --mutate --jobs 1 --pack nowhere", "life"),
+    ("test life --mutate --jobs 1 --packs nowhere", "life"),
     *((f"test life --replay {name}.yaml", "PD602") for name in ("empty", "case", "world")),
     ("test --replay case.yaml", "--replay"),
     ("test life --picture rock.gif", "--picture"),

@@ -54,12 +54,12 @@ def test_pictures_have_the_last_step_and_worlds_stand_side_by_side():
     assert result.stderr.count("\n") == 1, "progress is for terminals"
     assert "\x1b" not in result.stderr
     powderdsl("run", "core+grit.yaml", *FAST, "--batch", "3", "--out", "x.npz", exits=0)
-    powderdsl("render", "x.npz", "--rules", "core+grit.yaml", "--out", "y.png", exits=0)
+    powderdsl("render", "core+grit.yaml", "--world", "x.npz", "--out", "y.png", exits=0)
     powderdsl("run", "core+grit.yaml", *FAST, "--batch", "3", "--out", "x.png", exits=0)
     assert picture_size("x.png") == picture_size("y.png")
     wide, high = picture_size("x.png")
     assert wide > high
-    powderdsl("render", "drawing.txt", "--rules", "core+grit.yaml", "--out", "x.png", "--scale", "3", exits=0)
+    powderdsl("render", "core+grit.yaml", "--world", "drawing.txt", "--out", "x.png", "--scale", "3", exits=0)
     assert picture_size("x.png") == (12, 9)
 
 

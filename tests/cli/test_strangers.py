@@ -78,7 +78,7 @@ generate:
 agent: {may: [empty, sand], bins: 2, brush: 4, actions: 2, steps_per_action: 1}
 reward: {each: count(sand)}
 """
-MODEL = shlex.split("--width 1 --iterations 2 --batch 2 --states 4 --buffer 64 --refresh 2 --backend wasm")
+MODEL = shlex.split("--width 1 --iterations 2 --batch 2 --worlds 4 --buffer 64 --refresh 2 --backend wasm")
 AGENT = shlex.split(
     "--preset small --features 2 --envs 2 --rollout 4 --batch 4 --epochs 1 --steps 8 --backend wasm"
 )
@@ -102,11 +102,11 @@ def test_a_pack_of_each_kind_goes_through_every_command(name: str) -> None:
     file = f"{name}.yaml"
     run("check", f"powderworld+{file}", "--quick")
     run(*f"run powderworld+{file} --size 12x12 --steps 3 --backend wasm --out w.npz".split())
-    run("wm", "train", "--task", "pool.yaml", *MODEL, "--run", "less")
+    run("wm", "train", "pool.yaml", *MODEL, "--run", "less")
     run("wm", "finetune", "less", "--packs", file, "--iterations", "2", "--backend", "wasm", "--run", "more")
     run("wm", "eval", "more", "--split", "train", "--worlds", "2", "--backend", "wasm")
     held = ["--rules", f"powderworld+{file}", "--held-out", name]
-    run("wm", "train", "--task", "pool.yaml", *held, *MODEL, "--run", "held")
+    run("wm", "train", "pool.yaml", *held, *MODEL, "--run", "held")
     run("wm", "finetune", "held", "--packs", name, "--iterations", "2", "--backend", "wasm", "--run", "back")
     run("train", "pool.yaml", *AGENT, "--packs", file, "--run", "agent")
     run("evaluate", "agent", "--episodes", "2")
@@ -128,7 +128,7 @@ def test_two_packs_with_one_id_and_one_that_has_no_room(tmp_path: Path) -> None:
     ids = {one["name"]: one["id"] for one in shown["elements"]}
     assert (ids["slime"], ids["ooze"]) == (14, 15)
     run("train", "pool.yaml", *AGENT, "--slots", "15", "--run", "agent")
-    result = powderdsl("evaluate", "agent", "--packs", "slime.yaml", "ooze.yaml", "--episodes", "2", exits=2)
+    result = powderdsl("evaluate", "agent", "--packs", "slime.yaml,ooze.yaml", "--episodes", "2", exits=2)
     assert "PD623" in result.stderr
     assert "--slots 16" in result.stderr
 

@@ -34,7 +34,7 @@ def test_a_task_is_shown_as_text_and_as_json():
 
 def test_a_sheet_shows_worlds_and_outlines_regions(tmp_path):
     out = tmp_path / "sheet.png"
-    run("show", "sand-pushing", "--split", "handmade", "--seeds", "4", "--out", str(out))
+    run("show", "sand-pushing", "--split", "handmade", "--worlds", "4", "--out", str(out))
     picture = np.asarray(Image.open(out))
     assert picture.shape[0] == picture.shape[1]
     outlined = (picture == (255, 0, 160)).all(-1).sum()

@@ -22,7 +22,7 @@ def test_train_evaluate_and_go_on(folder: Path) -> None:
     assert about["config"]["knobs"] == {"size": 3}
     assert about["config"]["network"] == "small"
     assert "128 interactions" in run("train", "--resume", "task-seed0", "--steps", "1e2").output
-    table = run("evaluate", "task-seed0", "--episodes", "4", "--splits", "test").output
+    table = run("evaluate", "task-seed0", "--episodes", "4", "--split", "test").output
     assert "after 128 interactions" in table
     assert [line.split()[1] for line in table.splitlines()[-3:]] == ["trained", "random", "nothing"]
     other = run("evaluate", "task.yaml", "--episodes", "4", "--json")

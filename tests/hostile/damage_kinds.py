@@ -309,7 +309,7 @@ KINDS = (
     Kind("world", 250, ("run", "core+sand", "--world", "world.npz", *SMALL), "world.npz", npz_damaged),
     Kind("picture", 160, ("run", "core+sand", "--world", "world.png", *SMALL), "world.png", png_damaged),
     Kind("drawing", 80, ("run", "core+sand", "--world", "world.txt", *SMALL), "world.txt", bytes_damaged),
-    Kind("scene", 220, ("render", "scene.yaml", "--rules", "core+sand", "--out", "out.png"), "scene.yaml", yaml_damaged),
+    Kind("scene", 220, ("render", "core+sand", "--world", "scene.yaml", "--out", "out.png"), "scene.yaml", yaml_damaged),
     Kind("task", 220, ("check", "dig.yaml"), "dig.yaml", yaml_damaged),
     Kind("study", 160, ("study", "study.yaml", "--dry-run"), "study.yaml", yaml_damaged),
     Kind("a study's results", 120, ("study", "collect", "results", "--seeds", "1"), "results/study.json", json_damaged),
@@ -374,11 +374,11 @@ def make_valid(folder: Path, run: Callable[..., None]) -> None:
     (folder / "study.yaml").write_text(STUDY)
     _results(folder)
     run("run", "core+sand", "--size", "8", "--steps", "1", "--backend", "reference", "--out", "world.npz")
-    run("render", "scene.yaml", "--rules", "core+sand", "--scale", "1", "--out", "world.png")
+    run("render", "core+sand", "--world", "scene.yaml", "--scale", "1", "--out", "world.png")
     run("record", "dig.yaml", "--out", "data", "--episodes", "4", "--shard", "2", "--backend", "torch")
     tiny = ("--backend", "torch", "--preset", "small")
     run("train", "dig.yaml", *tiny, "--envs", "4", "--rollout", "3", "--batch", "12", "--steps", "12", "--features", "8", "--run", "ppo")  # fmt: skip
-    run("wm", "train", "--task", "dig.yaml", *tiny, "--iterations", "2", "--batch", "2", "--width", "2", "--states", "4", "--buffer", "8", "--refresh", "2", "--run", "wm")  # fmt: skip
+    run("wm", "train", "dig.yaml", *tiny, "--iterations", "2", "--batch", "2", "--width", "2", "--worlds", "4", "--buffer", "8", "--refresh", "2", "--run", "wm")  # fmt: skip
     for run_folder in ("ppo", "wm"):
         shutil.rmtree(folder / run_folder / "tensorboard", ignore_errors=True)
         about = folder / run_folder / "run.json"

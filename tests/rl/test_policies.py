@@ -191,6 +191,6 @@ def test_films_and_start_worlds_show_fields(tmp_path: Path) -> None:
     _, pictures = film(compile_task(str(task), backend="wasm"), None, torch.arange(1), factor=1)
     reds = [int(frame[4, 4, 0]) for frame in pictures]
     assert reds == [117, 117, 140, 163]  # the start, the action, two steps
-    powderdsl("show", task, "--seeds", "1", "--out", tmp_path / "sheet.png", exits=0)
+    powderdsl("show", task, "--worlds", "1", "--out", tmp_path / "sheet.png", exits=0)
     with Image.open(tmp_path / "sheet.png") as image:
         assert image.convert("RGB").getpixel((9, 9)) == (117, 48, 32)

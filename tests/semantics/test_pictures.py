@@ -174,7 +174,7 @@ def test_pictures_of_commands(stove: Path) -> None:
     done(f"{run} a.png --scale 1")
     assert (48 + (255 - 48) // 3, 48, 48 - 48 // 3) in pixels(Path("a.png"))  # a third of the way
     done(f"{run} a.npz")
-    done("render a.npz --rules core+stove.yaml --out b.png --scale 1")
+    done("render core+stove.yaml --world a.npz --out b.png --scale 1")
     assert pixels(Path("b.png")) == pixels(Path("a.png"))
     done(f"{run} a.gif --scale 1")
     done("run core+stove.yaml --world b.png --steps 0 --out c.npz")  # a color of a ramp means its element

@@ -38,7 +38,7 @@ about: Many small runs.
 seeds: {seeds}
 vary: {{steps: {steps}}}
 steps:
-  trained: {{command: train, on: dig.yaml, preset: small, envs: 4, rollout: 3, batch: 12, backend: torch, steps: $steps, seed: $seed, checkpoint-every: 0}}
+  trained: {{command: train, on: dig.yaml, preset: small, envs: 4, rollout: 3, batch: 12, backend: torch, steps: $steps, seed: $seed, save-every: 0}}
   tested: {{command: evaluate, on: trained, episodes: 4, policies: "trained,random"}}
 measures:
   reward: {{of: trained, value: splits/test/trained/mean, expect: rises}}

@@ -24,7 +24,7 @@ vary:
   few: {small: [some], paper: [some], sets: {some: {lines: 2}}}
 steps:
   trained: {command: train, on: $task, preset: $size, steps: $steps, knob: lines=$lines, seed: $seed}
-  tested: {command: evaluate, on: trained, episodes: 4, splits: "test,train", policies: "trained,random"}
+  tested: {command: evaluate, on: trained, episodes: 4, split: "test,train", policies: "trained,random"}
 measures:
   reward: {of: trained, value: splits/test/trained/above/random/mean, expect: rises}
 """
@@ -91,10 +91,10 @@ def test_shipped_studies_pass(name: str) -> None:
         (AGENTS, "on: trained", "on: trianed", "PD806", "trianed"),
         (AGENTS, "on: trained, ", "", "PD806", "tested"),
         (AGENTS, "destroying]", "destorying]", "PD801", "destorying"),
-        (AGENTS, "command: evaluate, on: trained, episodes: 4, splits: \"test,train\", policies: \"trained,random\"",
+        (AGENTS, "command: evaluate, on: trained, episodes: 4, split: \"test,train\", policies: \"trained,random\"",
          "command: wm eval, on: trained", "PD806", "trained"),
         (AGENTS, "command: evaluate, on: trained", "command: evaluate, on: tested", "PD806", "tested"),
-        (MODELS, "command: wm train", "command: wm train, on: powderworld", "PD806", "powderworld"),
+        (MODELS, "command: wm train", "command: wm train, on: powderworld", "PD801", "powderworld"),
         (MODELS, "on: tuned", "on: later", "PD806", "later"),
         (MODELS, "command: wm eval, on: tuned, split: held_out", "command: evaluate, on: tuned", "PD806", "tuned"),
         # values of options
@@ -125,7 +125,7 @@ def test_shipped_studies_pass(name: str) -> None:
         (MODELS, "split: held_out", "split: held_out, only: [gas, wood]", "PD304", "wood"),
         (MODELS, "knob: kinds=$elements", "knob: kinds=$elements, rulesets: 2, swap: densty", "PD301", "densty"),
         (MODELS, "split: held_out", "rules: powderwolrd", "PD304", "powderwolrd"),
-        (MODELS, "held-out: [gas, acid]", "task: world-modle", "PD801", "world-modle"),
+        (MODELS, "held-out: [gas, acid]", "on: world-modle", "PD801", "world-modle"),
         # measures
         (MODELS, "of: tuned", "of: trained", "PD806", "trained"),
         # what makes no difference
@@ -193,7 +193,7 @@ def test_files_elsewhere_are_not_even_read(tmp_path: Path) -> None:
 
 def test_a_dry_run_prints_what_a_shell_takes(folder: Path) -> None:
     text = AGENTS.replace("episodes: 4", "episodes: 4, deterministic: yes").replace(
-        'splits: "test,train"', 'splits: "test, train"'
+        'split: "test,train"', 'split: "test, train"'
     )
     Path("my study.yaml").write_text(text, encoding="utf-8")
     result = powderdsl("study", "my study.yaml", "--dry-run", "--seeds", 1, "--out", "it's here", exits=0)
@@ -202,7 +202,7 @@ def test_a_dry_run_prints_what_a_shell_takes(folder: Path) -> None:
     words = shlex.split(lines[1])
     assert words[:2] == ["powderdsl", "evaluate"]
     assert words[2].startswith("it's here/runs/")
-    options = "--episodes 4 --deterministic --splits 'test, train' --policies trained,random"
+    options = "--episodes 4 --deterministic --split 'test, train' --policies trained,random"
     assert words[3:] == shlex.split(options)
 
 

@@ -56,12 +56,13 @@ def test_what_a_step_works_on_lies_beside_the_study(old, new, tmp_path):
     assert errors(tmp_path / "s.yaml", STUDY.replace(old, new)) == ["PD112"]
 
 
-@pytest.mark.parametrize("option", ["rules", "packs", "held-out", "task"])
+@pytest.mark.parametrize("option", ["rules", "packs", "held-out", "on"])
 def test_rules_and_tasks_lie_beside_the_study(option, tmp_path):
-    text = STUDY.replace("{command: train, on: sand-pushing,", f"{{command: wm train, {option}: OTHER,")
+    text = STUDY.replace("{command: train, on: sand-pushing,", f'{{command: wm train, {option}: "OTHER",')
     text = text.replace("command: evaluate", "command: wm eval")
     text = text.replace("steps: $steps", "iterations: $steps")
-    for name in ("../x.yaml", "/etc/x.yaml" if option == "task" else "core+/etc/x.yaml"):
+    mark = "," if option in ("packs", "held-out") else "+"
+    for name in ("../x.yaml", "/etc/x.yaml" if option == "on" else f"core{mark}/etc/x.yaml"):
         assert errors(tmp_path / "s.yaml", text.replace("OTHER", name)) == ["PD112"]
 
 
@@ -113,7 +114,7 @@ def test_results_with_a_link_that_leads_out_are_refused(tmp_path):
 def test_every_word_that_stands_for_a_value_is_known():
     """An option with a new kind of value must say what it is before studies may give it."""
     plain = ["N", "A,B", "NAME=N", "PACK.PARAM=VALUE", "PROPERTY", "CHANCE", "MINUTES"]
-    plain += ["SPLIT", "DIR", "DEVICE", "EVAL-SPLIT", "SWAP"]
+    plain += ["SPLIT", "DIR", "DEVICE", "SWAP"]
     found = commands()
     assert set(found) == set(CALLED)
     for words in CALLED:

@@ -113,7 +113,7 @@ def test_worlds_run_and_are_saved_as_with_torch(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_pictures_are_written_and_what_lacks_a_package_says_so(tmp_path: Path) -> None:
     first, second = tmp_path / "first.png", tmp_path / "second.png"
-    assert run("render", "garden", "--rules", "powderworld", "--out", str(first)).returncode == 0
+    assert run("render", "powderworld", "--world", "garden", "--out", str(first)).returncode == 0
     ruleset = powderdsl.load("powderworld")
     write_png(
         second, pictures(start(ruleset, "garden", None, None, None, backend="wasm"), most=1, factor=None)

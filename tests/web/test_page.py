@@ -126,7 +126,7 @@ def test_a_world_of_edited_rules_continues_as_the_status_line_says(
 def test_pictures(seen: dict[str, Any], scripts: Path) -> None:
     """The page draws as `powderdsl render` does; its animation ends with the same picture, in fewer colors."""
     folder: Path = seen["folder"]
-    words = ("render", "later.npz", "--rules", "powderworld", "--scale", "8", "--out", "later.png")
+    words = ("render", "powderworld", "--world", "later.npz", "--scale", "8", "--out", "later.png")
     succeed(scripts / "powderdsl", *words, cwd=folder)
     with np.load(folder / "later.npz") as later:
         assert (np.abs(later["slot_velocity"]) > 0.1).sum() > 100

@@ -21,7 +21,7 @@ from tests.states import logged, same
 from tests.tiers import tiered
 from tests.worldmodel.test_training import HERE, tiny, weights
 
-QUICK = ("--batch", 4, "--buffer", 32, "--refresh", 2, "--states", 8, "--backend", "torch")
+QUICK = ("--batch", 4, "--buffer", 32, "--refresh", 2, "--worlds", 8, "--backend", "torch")
 
 NETS = """
 import torch
@@ -100,7 +100,7 @@ def was_imported(*words: object) -> tuple[int, str, bool]:
 
 @pytest.mark.parametrize("name", tiered(["nets:Wide", "nets:made"], ["nets:made"]))
 def test_a_network_of_ones_own_is_trained_and_tested(name: str, dunes: str) -> None:
-    words = ("wm", "train", "--task", dunes, "--run", "run", *QUICK, "--iterations", 3, "--network", name)
+    words = ("wm", "train", dunes, "--run", "run", *QUICK, "--iterations", 3, "--network", name)
     run(*words, exits=0)
     config = json.loads(Path("run/run.json").read_text())["config"]
     assert config["network"] == name
@@ -165,7 +165,7 @@ def test_networks_that_cannot_be_trained_are_refused(name: str, said: str) -> No
 
 
 def test_they_are_refused_before_a_run_begins(dunes: str) -> None:
-    result = run("wm", "train", "--task", dunes, "--run", "run", *QUICK, "--network", "nets:Broken", exits=2)
+    result = run("wm", "train", dunes, "--run", "run", *QUICK, "--network", "nets:Broken", exits=2)
     line = NETS[: NETS.index("no such layer")].count("\n") + 1
     assert f"nets.py:{line}" in result.output
     assert not Path("run").exists()
@@ -175,7 +175,7 @@ def test_they_are_refused_before_a_run_begins(dunes: str) -> None:
 
 
 def test_a_run_that_names_a_network_needs_it_on_the_command_line(dunes: str) -> None:
-    words = ("wm", "train", "--task", dunes, "--run", "run", *QUICK, "--iterations", 1)
+    words = ("wm", "train", dunes, "--run", "run", *QUICK, "--iterations", 1)
     run(*words, "--network", "nets:Wide", exits=0)
     for others in (
         ("eval", "run"),
@@ -201,7 +201,7 @@ def test_a_run_that_names_a_network_needs_it_on_the_command_line(dunes: str) -> 
 
 
 def test_a_run_of_the_u_net_has_no_name_and_hostile_names_are_text(dunes: str) -> None:
-    words = ("wm", "train", "--task", dunes, "--run", "run", *QUICK, "--width", 2, "--iterations", 1)
+    words = ("wm", "train", dunes, "--run", "run", *QUICK, "--width", 2, "--iterations", 1)
     run(*words, exits=0)
     assert "network" not in json.loads(Path("run/run.json").read_text())["config"]
     result = run("wm", "eval", "run", "--network", "nets:Wide", "--backend", "torch", exits=2)

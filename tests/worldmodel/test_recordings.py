@@ -174,7 +174,7 @@ QUICK = ("--width", 4, "--batch", 4, "--iterations", 3)
 
 
 def test_train_eval_and_show(copy: Path) -> None:
-    words = ("wm", "train", "--data", "compact", "--task", "builders.yaml", *QUICK)
+    words = ("wm", "train", "builders.yaml", "--data", "compact", *QUICK)
     run(*words, "--slots", 20, exits=0)
     about = json.loads(Path("runs/builders/run.json").read_text())
     assert about["dataset"] == "compact"
@@ -201,9 +201,9 @@ def test_a_network_is_tested_on_another_recording_of_the_task(copy: Path) -> Non
     ("words", "said"),
     [
         (("train", "--data", "nowhere"), "PD630"),
-        (("train", "--data", "ids"), "give its file: `--task FILE`"),
-        (("train", "--data", "ids", "--task", "sand-pushing"), "does not fit the task sand-pushing"),
-        (("train", "--data", "ids", "--task", "builders.yaml", "--states", 10), "--states selects worlds"),
+        (("train", "--data", "ids"), "give its file, too"),
+        (("train", "--data", "ids", "sand-pushing"), "does not fit the task sand-pushing"),
+        (("train", "--data", "ids", "builders.yaml", "--worlds", 10), "--worlds selects worlds"),
         (("train", "--data", "ids", "--held-out", "sand"), "--held-out selects worlds"),
         (("train", "--ignore-actions"), "--ignore-actions goes with --data"),
         (("eval", "run", "--split", "train"), "--split selects worlds"),
@@ -218,7 +218,7 @@ def test_options_that_make_no_sense_are_refused(words: tuple[object, ...], said:
 
 
 def test_a_run_of_worlds_takes_no_dataset(copy: Path, dunes: str) -> None:
-    run("wm", "train", "--task", dunes, "--run", "own", *QUICK, "--states", 4, "--backend", "torch", exits=0)
+    run("wm", "train", dunes, "--run", "own", *QUICK, "--worlds", 4, "--backend", "torch", exits=0)
     result = run("wm", "eval", "own", "--data", "ids", exits=2)
     assert "--data is for networks that learned from a dataset" in result.output
     assert refusal(evaluate_recording, load_trained("own"), opened(copy))[0].code == "PD623"

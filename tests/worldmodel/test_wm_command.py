@@ -12,11 +12,11 @@ from PIL import Image
 from powderdsl.compiler import load
 from tests.cli.commands import powderdsl as run
 
-QUICK = ("--width", 4, "--batch", 4, "--buffer", 32, "--refresh", 2, "--states", 100, "--backend", "torch")
+QUICK = ("--width", 4, "--batch", 4, "--buffer", 32, "--refresh", 2, "--worlds", 100, "--backend", "torch")
 
 
 def begin(task: str, folder: Path, *more: object) -> tuple[object, ...]:
-    return "wm", "train", "--task", task, "--run", folder, *QUICK, *more
+    return "wm", "train", task, "--run", folder, *QUICK, *more
 
 
 def test_train_eval_finetune_and_show(dunes: str, tmp_path: Path) -> None:
@@ -62,7 +62,7 @@ def test_train_eval_finetune_and_show(dunes: str, tmp_path: Path) -> None:
 def test_the_curve_of_a_training(dunes: str, tmp_path: Path) -> None:
     folder, out = tmp_path / "run", tmp_path / "curve.png"
     run(*begin(dunes, folder, "--iterations", 20, "--validate-every", 5), exits=0)
-    losses = ("curves", folder, "--metric", "loss/train", "--metric", "loss/validation")
+    losses = ("curves", folder, "--metric", "loss/train,loss/validation")
     lines = folder / "metrics.jsonl"
     lines.write_text(
         lines.read_text() + '{"step": 30, "loss/train": "x", "loss/validation": null}\n', encoding="utf-8"
@@ -79,7 +79,7 @@ def test_the_curve_of_a_training(dunes: str, tmp_path: Path) -> None:
 def test_preset_and_options_make_the_configuration(tmp_path: Path, dunes: str) -> None:
     folder = tmp_path / "run"
     given = ("--preset", "paper", "--knob", "kinds=2", "--iterations", 1, "--seed", 5)
-    run(*begin(dunes, folder, "--packs", "core", "sand", *given), exits=0)
+    run(*begin(dunes, folder, "--packs", "core,sand", *given), exits=0)
     config = json.loads((folder / "run.json").read_text())["config"]
     assert (config["learning_rate"], config["seed"], config["batch"]) == (0.005, 5, 4)
     assert config["data"]["knobs"] == {"kinds": 2}
@@ -109,6 +109,6 @@ def test_preset_and_options_make_the_configuration(tmp_path: Path, dunes: str) -
 def test_bad_input_is_said_and_nothing_is_begun(
     words: tuple[str, ...], said: str, dunes: str, folder: Path
 ) -> None:
-    task = ("--task", dunes) if words[0] == "train" else ()
-    assert said in run("wm", *words, *task, exits=2).output
+    task = (dunes,) if words[0] == "train" else ()
+    assert said in run("wm", words[0], *task, *words[1:], exits=2).output
     assert not (folder / "runs").exists()

@@ -39,7 +39,7 @@ SECONDS = opt.Parsed("FLOAT", _seconds)
 EPILOG = "\b\nWorkloads:\n" + "\n".join(f"  {name:<7} {about}" for name, about in WORKLOADS.items())
 
 
-@click.command("bench", epilog=EPILOG)
+@click.command("bench", cls=opt.Command, epilog=EPILOG)
 @click.argument("rules", metavar="[RULES]", default="powderworld")
 @opt.option(
     "--backend",

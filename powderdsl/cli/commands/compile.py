@@ -36,12 +36,7 @@ STAGES = ("tree", "model", "ir", "planes", "schedule", "kernels")
 @opt.option("--pass", "NAME", "Print only this pass of the rules.", to="pass_name")
 @opt.parameters
 def command(
-    rules: str,
-    stage: str,
-    backend: str,
-    after: str | None,
-    pass_name: str | None,
-    settings: dict[str, str],
+    rules: str, stage: str, backend: str, after: str | None, pass_name: str | None, settings: dict[str, str]
 ) -> None:
     """Print the output of a compiler stage."""
     if after is not None and stage != "schedule":

@@ -13,14 +13,7 @@ from powderdsl.cli.exits import BadInput
 
 @click.command("curves")
 @click.argument("runs", metavar="RUN…", nargs=-1, required=True)
-@opt.option(
-    "--metric",
-    "NAME",
-    "A number of metrics.jsonl. May be repeated.",
-    ("held_out/return",),
-    to="metrics",
-    multiple=True,
-)
+@opt.option("--metric", opt.NAMES, "Numbers of metrics.jsonl.", "held_out/return", to="metrics")
 @opt.output("--out", "FILE", "The picture to write; without it, a table is printed.")
 def command(runs: tuple[str, ...], metrics: tuple[str, ...], out: Path | None) -> None:
     """Show what agents or world models learned, step by step.

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from powderdsl.rl.evaluation import Evaluation
 
 
-@click.command("evaluate", cls=opt.ManyWords)
+@click.command("evaluate", cls=opt.Command)
 @click.argument("run", metavar="RUN|TASK")
-@opt.option("--splits", opt.NAMES, "Splits: sets of worlds.  [default: all splits of the task]")
+@opt.option("--split", opt.NAMES, "Splits: sets of worlds.  [default: all of the task]", to="splits")
 @opt.option(
     "--policies",
     opt.NAMES,

@@ -22,14 +22,7 @@ from powderdsl.cli.output import counted, progress
 @opt.option("--threads", (1, 1024), "CPU threads.", 1)
 @opt.backend("auto")
 @opt.device
-def command(
-    level: str,
-    out: Path,
-    threads: int,
-    backend: str,
-    device: str,
-    **how: Any,
-) -> int:
+def command(level: str, out: Path, threads: int, backend: str, device: str, **how: Any) -> int:
     """Collect the data set of LEVEL, easy, medium or hard: scripted play, in OGBench's files.
 
     The files depend only on the options. After an interruption, the same command continues.

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from powderdsl.experiments.runs import RunFolder
 
 
-@click.command("record", cls=opt.ManyWords)
+@click.command("record", cls=opt.Command)
 @click.argument("task", required=False)
 @opt.path("--out", "FOLDER", "Folder of the dataset.")
 @opt.option("--episodes", (1, 1 << 32), "Number of episodes to record.")
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 )
 @opt.option("--observation", ("ids", "compact"), "Record elements only, or the whole state.", "ids")
 @opt.option("--seed", (0, (1 << 61) - 1), "World of the first episode, and seed of the policy.", 0)
-@opt.option("--worlds", (1, (1 << 61) - 1), "Number of worlds: they are numbered from 0.", 1_000_000)
+@opt.option("--worlds", (1, (1 << 61) - 1), "How many worlds there are to draw from.", 1_000_000)
 @opt.knobs("Another value for a knob of the task.")
 @opt.parameters
 @opt.packs

@@ -41,7 +41,7 @@ class Playback:
         return self.out.suffix.lower() if self.out else ""
 
 
-@click.command("run")
+@click.command("run", cls=opt.Command)
 @opt.rules
 @opt.world
 @opt.size

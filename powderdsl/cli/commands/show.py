@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 @opt.parameters
 @opt.knobs("For a task: another value for a knob.")
 @opt.option("--split", "SPLIT", "For a task: the set of worlds.", "train")
-@opt.option("--seeds", (1, 256), "For a task: the number of worlds.", 16)
+@opt.option("--worlds", (1, 256), "For a task: how many worlds of the split.", 16)
 @opt.output("--out", "FILE.png", "For a task: draw these worlds, with regions outlined.", ".png")
 def command(
     rules: str,
@@ -41,7 +41,7 @@ def command(
     settings: dict[str, str],
     knobs: dict[str, int],
     split: str,
-    seeds: int,
+    worlds: int,
     out: Path | None,
 ) -> None:
     """List elements, reactions, passes and parameters; or what a task is, with pictures.
@@ -55,8 +55,8 @@ def command(
         check_split(task, split)
         _show(*_of_task(task), as_json)
         if out is not None:
-            _write_sheet(task, split, seeds, out)
-            click.echo(f"wrote {out}: seeds 0 to {seeds - 1} of {split}", err=as_json)
+            _write_sheet(task, split, worlds, out)
+            click.echo(f"wrote {out}: worlds 0 to {worlds - 1} of {split}", err=as_json)
         return
     if out is not None or knobs:
         raise BadInput("--out and --knob go with a task")
@@ -265,7 +265,7 @@ def _agent_text(task: Task) -> Iterator[str]:
     yield f"a brush of {brush[0]}×{brush[1]} cells at {bins[0]}×{bins[1]} places"
 
 
-def _write_sheet(task: Task, split: str, seeds: int, out: Path) -> None:
+def _write_sheet(task: Task, split: str, worlds: int, out: Path) -> None:
     """Start worlds side by side, each region outlined in a color of its own."""
     import torch
 
@@ -276,13 +276,13 @@ def _write_sheet(task: Task, split: str, seeds: int, out: Path) -> None:
     from powderdsl.worlds.media import write_png
 
     program = compile_task(task, split=split, backend="torch")
-    episodes = program.start(torch.arange(seeds))
+    episodes = program.start(torch.arange(worlds))
     drawn = episodes.world.rgb().numpy()
-    columns = math.ceil(math.sqrt(seeds))
+    columns = math.ceil(math.sqrt(worlds))
     longest = max(task.size) * columns
     factor = max(2, min(8, 2 * USUAL_SIDE // longest))
     if longest * factor > MAX_SIDE:
-        raise BadInput(f"a picture of {longest * factor:,} pixels a side: show fewer --seeds")
+        raise BadInput(f"a picture of {longest * factor:,} pixels a side: show fewer --worlds")
     images = scale(drawn, factor)
     for color, masks in zip(cycle(OUTLINES), episodes.regions.values(), strict=False):
         for world, image in enumerate(images):

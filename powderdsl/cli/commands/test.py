@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 MAX_SECONDS = 24 * 3600
 
 
-@click.command("test")
+@click.command("test", cls=opt.Command)
 @click.argument("rules", nargs=-1, metavar="[RULES]...")
 @opt.backend(None, "Backend that runs the rules.  [default: wasm]")
 @opt.parameters
@@ -60,7 +60,7 @@ MAX_SECONDS = 24 * 3600
 )
 @opt.option("--json", bool, "One JSON object instead of text.", to="as_json")
 @opt.option("--mutate", bool, "Put mistakes into the packs, and list those that nothing notices.")
-@opt.option("--pack", "PACK", "With --mutate: only mistakes in this pack. May be repeated.", multiple=True)
+@opt.pack_list("--packs", "With --mutate: only mistakes in these packs.")
 @opt.option(
     "--mutants", (1, 1_000_000), "With --mutate: maximum number of mutants, of each kind in proportion."
 )
@@ -270,7 +270,7 @@ def _mutate(names: Iterable[str], as_json: bool, **how: Any) -> int:
 def _mutated(
     name: str,
     as_json: bool,
-    pack: tuple[str, ...],
+    packs: tuple[str, ...],
     settings: dict[str, str],
     mutants: int | None,
     seed: int,
@@ -284,12 +284,12 @@ def _mutated(
     values = tuple(settings.items())
     original = Original.of(name, values)
     loaded = [pack.name.text for pack in original.packs]
-    unknown = [word for word in pack if word not in loaded]
+    unknown = [word for word in packs if word not in loaded]
     if unknown:
-        raise BadInput(f"--pack {unknown[0]}: {name} consists of {', '.join(loaded)}")
-    every = original.mutants(frozenset(pack))
+        raise BadInput(f"--packs {unknown[0]}: {name} consists of {', '.join(loaded)}")
+    every = original.mutants(frozenset(packs))
     numbers = sampled(every, mutants, seed)
-    events = run_campaign(name, pack, numbers, jobs or os.cpu_count() or 1, seed, settings=values)
+    events = run_campaign(name, packs, numbers, jobs or os.cpu_count() or 1, seed, settings=values)
     verdicts, interrupt = _collect(name, events, len(numbers))
     judged = [(every[number], verdicts[number]) for number in sorted(verdicts)]
     by_pack: dict[str, list[Verdict]] = {}

@@ -25,14 +25,14 @@ def _cell(text: str) -> tuple[int, int]:
 CELL = opt.Parsed("ROW,COLUMN", _cell)
 
 
-@click.command("trace")
+@click.command("trace", cls=opt.Command)
 @opt.rules
 @opt.world
 @opt.size
 @opt.option("--seed", (0, 2**63 - 1), "Seed of all random numbers.  [default: 0]")
 @opt.option("--at", CELL, "Row and column of the cell, from 0.", to="cell", required=True)
 @opt.option("--step", (1, 10**9), "Step of the run, from 1.", required=True)
-@opt.option("--of", "NAME", "Explain only `element`, or this field. May be repeated.", multiple=True)
+@opt.option("--of", opt.NAMES, "Explain only `element`, or these fields.")
 @opt.option("--number", (0, 1 << 20), "Number of the world in a saved batch.", 0)
 @opt.option("--all", bool, "List every rule that did not happen, and why.", to="every_rule")
 @opt.option("--json", bool, "Print one JSON object.", to="as_json")
@@ -45,7 +45,7 @@ def command(
     seed: int | None,
     cell: tuple[int, int],
     step: int,
-    of: tuple[str, ...],
+    of: tuple[str, ...] | None,
     every_rule: bool,
     as_json: bool,
     backend: str,
@@ -63,7 +63,7 @@ def command(
 
     worlds = start(ruleset, world, size, None, seed, backend=backend, steps=step)
     with user_values():
-        history = trace(worlds, *cell, step, every_rule=every_rule, of=of or None, **how)
+        history = trace(worlds, *cell, step, every_rule=every_rule, of=of, **how)
     if as_json:
         print_json(trace_data(history))
     else:

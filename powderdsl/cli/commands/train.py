@@ -16,7 +16,7 @@ from powderdsl.rl.config import PRESETS, TrainConfig, from_json, preset
 from powderdsl.system.reading import read_json
 
 
-@click.command("train", cls=opt.ManyWords)
+@click.command("train", cls=opt.Command)
 @click.argument("task", metavar="TASK", required=False)
 @opt.path("--run", "DIR", "Folder of the run.  [default: runs/TASK-seedN]", to="folder")
 @opt.path("--resume", "DIR", "Continue a run with its own settings.")
@@ -28,7 +28,7 @@ from powderdsl.system.reading import read_json
     to="preset_name",
 )
 @opt.path("--init-from", "DATASET", "Dataset whose actions the network learns first (behavior cloning).")
-@opt.settings_of(TrainConfig)
+@opt.settings_of(TrainConfig, PRESETS, checkpoint_minutes="save-every")
 @opt.knobs("Another value for a knob of the task. May be repeated.")
 @opt.parameters
 @opt.packs

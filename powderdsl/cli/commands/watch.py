@@ -14,10 +14,10 @@ from powderdsl.cli.pictures import MAX_SIDE
 from powderdsl.tasks.task import Task
 
 
-@click.command("watch", cls=opt.ManyWords)
+@click.command("watch", cls=opt.Command)
 @click.argument("run", metavar="RUN|TASK")
 @click.option("--split", help="Split: the set of worlds.  [default: test where the task has it, else train]")
-@opt.option("--worlds", (1, 64), "Number of worlds, side by side.", 4)
+@opt.option("--worlds", (1, 64), "How many worlds of the split, side by side.", 4)
 @opt.option(
     "--policy",
     ("trained", "expert", "random", "nothing"),

@@ -30,15 +30,17 @@ OF_WORLDS |= {"packs", "held_out", "settings", "worlds", "after"}
 """Options that select worlds: a dataset has its own."""
 MACHINE = ("device", "threads", "backend", "store")
 
-_network = opt.option(
-    "--network",
-    "MODULE:CLASS",
-    "Your own network, which this imports.  [default: the U-net]",
-    to="network_name",
-)
 _recording = opt.path("--data", "DATASET", "Transitions with actions, recorded by `powderdsl record`.")
 _machine_options = opt.several(
-    _network, opt.option("--threads", (1, 1024), "CPU threads.", 1), opt.device, opt.backend("auto")
+    opt.option(
+        "--network",
+        "MODULE:CLASS",
+        "Your network, which is imported.  [default: the U-net]",
+        to="network_name",
+    ),
+    opt.option("--threads", (1, 1024), "CPU threads.", 1),
+    opt.device,
+    opt.backend("auto"),
 )
 _test_options = opt.several(
     click.argument("run", metavar="RUN"),
@@ -52,9 +54,13 @@ _test_options = opt.several(
 )
 _run_options = opt.several(
     _machine_options,
-    opt.path("--run", "DIR", "Folder of the run.", to="folder"),
+    opt.path(
+        "--run", "DIR", "Folder of the run.  [default: named after TASK, or RUN and packs]", to="folder"
+    ),
     opt.option("--store", ["auto", "memory", "disk"], "Where to keep the buffer.", "auto"),
-    opt.option("--save-every", (1, 10**6), "Seconds between checkpoints.", 60),
+    opt.option(
+        "--save-every", click.FloatRange(0, 1e6), "Minutes between checkpoints.", 1.0, metavar="MINUTES"
+    ),
     opt.option("--validate-every", (0, 10**9), "Iterations between tests on held-out worlds; 0: none.", 100),
 )
 
@@ -70,27 +76,29 @@ def command() -> None:
     """
 
 
-@command.command("train", cls=opt.ManyWords)
+@command.command("train", cls=opt.Command)
 @opt.option(
     "--preset",
     ["small", "paper"],
     "Settings that other options change: `small` for a CPU, `paper` for a GPU.",
     "small",
 )
+@click.argument("task", metavar="TASK", required=False)
 @_recording
 @opt.option("--ignore-actions", bool, "With --data: the network does not see the actions.")
-@opt.settings_of(DataConfig)
-@opt.settings_of(TrainConfig)
-@opt.settings_of(Variety)
+@opt.settings_of(DataConfig, {name: vars(preset.data) for name, preset in PRESETS.items()})
+@opt.settings_of(TrainConfig, {name: vars(preset) for name, preset in PRESETS.items()})
+@opt.settings_of(Variety, {name: vars(preset.data.variety) for name, preset in PRESETS.items()})
 @opt.option("--rules", "RULES", "Rules of the worlds.  [default: the task's own]")
-@opt.option("--packs", "PACK…", "Keep only these packs of the rules, or add them.", multiple=True)
-@opt.option("--held-out", "PACK…", "Leave these packs of the rules out.", multiple=True)
+@opt.pack_list("--packs", "Keep only these packs of the rules, or add them.")
+@opt.pack_list("--held-out", "Leave these packs of the rules out.")
 @opt.knobs("Another value for a knob of the task.")
 @opt.parameters
 @_run_options
 def train_command(folder: Path | None, ignore_actions: bool, **values: Any) -> None:
-    """Train a network on worlds that nobody touches.
+    """Train a network on worlds of TASK that nobody touches.
 
+    TASK is a shipped one, by default world-model, or a file.
     A run that was stopped continues when the same command is given again, as if it had not been stopped.
     """
     if values["network_name"] and values["width"]:
@@ -137,19 +145,17 @@ def new_config(values: Mapping[str, Any], rules_of: Callable[..., str]) -> Train
         return replace(config, data=replace(config.data, **changes))
 
 
-@command.command("finetune", cls=opt.ManyWords)
+@command.command("finetune", cls=opt.Command)
 @click.argument("run", metavar="RUN")
-@opt.option(
+@opt.pack_list(
     "--packs",
-    "PACK…",
     "The packs to learn, by name or file: added to the run's rules, and all that worlds draw.",
-    multiple=True,
     required=True,
 )
 @opt.settings_of(TrainConfig, only=("iterations", "batch", "learning_rate", "seed"))
 @_run_options
 def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **values: Any) -> None:
-    """Continue from the weights of a run, on worlds that draw only elements of other packs.
+    """Continue a run on worlds that draw only elements of other packs.
 
     RUN is a run's folder, or its name in runs/. The result is a new run.
     """
@@ -165,9 +171,9 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
     _run(config, target, values, parent=trained.checkpoint, note=note)
 
 
-@command.command("eval", cls=opt.ManyWords)
+@command.command("eval", cls=opt.Command)
 @_test_options
-@opt.option("--only", "PACK…", "Draw elements of these packs only.  [default: the run's]", multiple=True)
+@opt.pack_list("--only", "Draw elements of these packs only.  [default: the run's]")
 @opt.knobs("Another value for a knob of the task.  [default: the run's]")
 @opt.option(
     "--worlds", (1, 1 << 20), "Worlds of the split, or futures of each designed world.  [default: 32, 4]"
@@ -177,8 +183,9 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
 )
 @opt.option("--json", bool, "One JSON object instead of a table.", to="as_json")
 def eval_command(run: str, as_json: bool, **values: Any) -> None:
-    """Test a network beside two baselines: that nothing changes, and each element's most frequent outcome.
+    """Test a network beside two baselines.
 
+    They say that nothing changes, or each element's most frequent outcome.
     RUN is a run's folder, or its name in runs/. Losses are cross-entropies a cell, in nats. The worlds have seeds
     that no training takes. A network that learned from a dataset is tested on its test worlds, or on another dataset,
     and also with its actions hidden. What is found is also written to the run's evaluation.json.
@@ -199,14 +206,14 @@ def eval_command(run: str, as_json: bool, **values: Any) -> None:
         click.echo("\n".join(_result_tables(tested, plain)))
 
 
-@command.command("show", cls=opt.ManyWords)
+@command.command("show", cls=opt.Command)
 @_test_options
 @opt.output("--out", "FILE", "The picture to write.", ".png", required=True)
 @opt.option("--steps", (1, 4096), "Steps to predict.  [default: as trained]")
 @opt.option("--after", (0, 10**6), "Steps that worlds run before the start.  [default: 0]")
 @opt.option("--scale", (1, 16), "Pixels per cell.", 2)
 def show_command(run: str, out: Path, scale: int, **values: Any) -> None:
-    """Draw each test as a strip: start, truth, prediction, and in red where that is wrong.
+    """Draw each test as a strip: start, truth, prediction, mistakes.
 
     For several times the steps that the network was trained for, it is applied to what it predicted.
     """
@@ -332,7 +339,7 @@ def _run(config: TrainConfig, folder: Path, values: dict[str, Any], **more: Any)
             machine=machine,
             network=network,
             tell=tell,
-            save_seconds=values["save_every"],
+            save_seconds=60 * values["save_every"],
             validate_every=values["validate_every"],
             **more,
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import os
+import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, dataclass, field, replace
 from pathlib import Path
@@ -25,7 +26,7 @@ MAX_POINTS, MAX_CALLS = 10_000, 50_000
 """Combinations of a study, each with every seed; and calls of commands, a step for each of them."""
 
 TEXT, FLAG = "text", "flag"
-TASK, RUN, RUN_OR_TASK, RULES, PACKS = "TASK", "RUN", "RUN|TASK", "RULES", "PACK…"
+TASK, RUN, RUN_OR_TASK, RULES, PACKS = "TASK", "RUN", "RUN|TASK", "RULES", "PACK,PACK"
 READ = (TASK, RUN, RUN_OR_TASK, RULES, PACKS)
 """What words of commands mean: FLAG, or what the help calls them. Those of READ name something to read; all others are text."""
 
@@ -220,7 +221,11 @@ class Study:
 def confined(means: str, text: str, folder: Path) -> str:
     """A word for a command, from an untrusted study. Raises ValueError for a path that leads out of `folder`."""
     if means in (RULES, PACKS):
-        return "+".join(_pack(part, folder) for part in text.split("+"))
+        mark = "[+,]" if means == PACKS else "[+]"
+        return "".join(
+            part if re.fullmatch(mark, part) else _pack(part.strip(), folder)
+            for part in re.split(f"({mark})", text)
+        )
     is_shipped_task = text in shipped_names("tasks")
     may_be_path = means == RUN or (means == RUN_OR_TASK and not is_shipped_task) or is_path(text)
     return str(inside(folder, text)) if means in READ and may_be_path else text
