@@ -124,7 +124,10 @@ def load_with_diagnostics(
     reporter = Reporter()
     reader = _Reader(reporter)
     packs, ruleset = reader.read_all(names)
-    reporter.raise_if_errors()
+    if reporter.has_errors:
+        if reader.is_whole and not any(d.code == "PD111" for d in reporter.diagnostics):
+            _report_more(packs, ruleset, reader, palette)
+        reporter.raise_if_errors()
 
     def checked() -> tuple[Ruleset, tuple[Diagnostic, ...]]:
         from powderdsl.model.check import check, demote_outgrown
@@ -143,6 +146,44 @@ def load_with_diagnostics(
         model = set_params(model, params, reporter)
         reporter.raise_if_errors()
     return model, remarks
+
+
+def _report_more(
+    packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reader: _Reader, palette: Palette | None
+) -> None:
+    """Report what is also wrong in files with mistakes, except what may follow from these."""
+    from powderdsl.model.check import check
+    from powderdsl.model.composition.names import SHARED, words_of_tree
+    from powderdsl.syntax.yaml_tree import parse_yaml
+
+    lost = {word for source in reader.sources for word in words_of_tree(parse_yaml(source, Reporter()))}
+    for pack in packs:
+        lost -= {decl.name.text for section in (*SHARED, "passes") for decl in getattr(pack, section)}
+    later = Reporter()
+    with suppress(CompileError):
+        check([replace(pack, tests=(), invariants=()) for pack in packs], ruleset, later, palette, alone=True)
+    for diagnostic in later.diagnostics:
+        span = diagnostic.primary.span
+        word = span.text.removesuffix("?") if span else ""
+        if diagnostic.code in INDEPENDENT and word not in lost:
+            with suppress(CompileError):  # more errors than the limit
+                reader.reporter.add(diagnostic)
+
+
+INDEPENDENT = (
+    "PD108",
+    "PD110",
+    "PD301",
+    "PD401",
+    "PD402",
+    "PD403",
+    "PD405",
+    "PD406",
+    "PD407",
+    "PD409",
+    "PD410",
+)
+"""Errors in rules and values, which follow from an earlier one only if they name what could not be read."""
 
 
 def whole_palette(*names: str | Path) -> tuple[str | None, ...]:
@@ -258,6 +299,8 @@ class _Reader:
         self.packs: dict[str, PackDecl] = {}
         self.rulesets: list[RulesetDecl] = []
         self.sources: list[Source] = []
+        self.is_whole = True
+        """Whether all files could be read, if only in part."""
 
     def read_all(self, names: Sequence[str | Path]) -> tuple[list[PackDecl], RulesetDecl | None]:
         """Read the declarations of everything named; report mistakes."""
@@ -320,6 +363,7 @@ class _Reader:
         self.sources.append(source)
         read_apart = _read_once if len(source.text) <= SMALL else _read_apart
         decl, diagnostics = read_apart(source)
+        self.is_whole &= decl is not None
         for diagnostic in diagnostics:
             self.reporter.add(diagnostic)
         return decl

@@ -38,6 +38,10 @@ OF_COMPOSITIONS = ("PD315", "PD316")
 """Warnings about a combination of packs: misspelled optional names, and values that another pack replaces."""
 
 
+MISREAD = ("PD109", "PD302", "PD303", "PD305", "PD306", "PD307", "PD310", "PD311", "PD508")
+"""Errors after which rules would only be misread: names that clash, packs and elements that are missing."""
+
+
 def resolve_names(
     packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reporter: Reporter, palette: Palette | None = None
 ) -> tuple[Typer, list[tuple[str, int, Span]]]:
@@ -46,7 +50,8 @@ def resolve_names(
     Raises CompileError where names clash.
     """
     composition = compose(packs, ruleset, reporter, palette)
-    reporter.raise_if_errors()  # with clashing names or missing packs, rules would only be misread
+    if any(diagnostic.code in MISREAD for diagnostic in reporter.diagnostics):
+        reporter.raise_if_errors()
     add_constants(composition)
     typer = Typer(composition, reporter)
     return typer, define_symbols(typer)

@@ -162,3 +162,44 @@ def test_a_chance_of_the_command_line_is_shown_as_it_was_written(setting: str) -
     result = command("run", "core+water", "--set", f"water.melt={setting}", "--steps", "1", exits=2)
     assert f"cannot be `{setting}`" in result.stderr
     assert "0% to 100%" in result.stderr
+
+
+BAD_READING = """
+pack: hill
+needs: core
+fields:
+  age: {type: int, at: element}
+  heat: {type: float}
+elements:
+  ant: {density: 9, color: "black", burn: 30%}
+  bee: {density: 2, color: "#101010"}
+passes:
+  walk:
+    after: fire
+    do:
+      - bee -> empty if count(bee) = 3
+      - bee -> empty if below.wall
+      - bee -> ant if age > 3 and heat > 2
+  sleep: {do: bee -> empty with chance 5}
+"""
+BAD_NAMES = """
+pack: hill
+needs: core
+elements:
+  bee: {density: 2, gravity: maybe, color: "#101010", tags: [fluid, flamable]}
+passes:
+  burn:
+    after: flwo
+    do: bee -> empty if count(bee in rnig) > 2
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "places"),
+    [
+        (BAD_READING, ["int", "{", "float", "9", '"black"', "burn", "fire", "=", "wall", "5"]),
+        (BAD_NAMES, ["maybe", "flamable", "flwo", "rnig"]),
+    ],
+)
+def test_mistakes_of_all_stages_are_found_at_once(text: str, places: list[str], tmp_path: Path) -> None:
+    assert [found.primary.span.text for found in load(text, tmp_path)] == places
