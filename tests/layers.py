@@ -133,7 +133,6 @@ _TORCH = (
     "targets.torch.program",
     "targets.arrays.program",
     "targets.cpp.program",
-    "targets.cuda.build",
     "targets.cuda.program",
     "targets.cpp.counts",
     "simulation.native",
@@ -152,7 +151,7 @@ _TORCH = (
     "ogbench.collect",
 )
 THIRD_PARTIES: dict[str, Home] = {
-    "yaml": Home((*_TEXT, "testing.generators.trees"), (*_TEXT, "testing.generators.trees")),
+    "yaml": Home((*_TEXT, "testing.properties.outcomes"), (*_TEXT, "testing.properties.outcomes")),
     "lark": Home(_TEXT, _TEXT),
     "torch": Home(
         (

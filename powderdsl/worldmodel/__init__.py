@@ -1,8 +1,7 @@
 """World models: networks that learn to predict a world some steps later (Frans & Isola 2023, section 4).
 
-`worlds` makes the data, `replay` stores it, `recordings` are transitions with actions. `networks` has the paper's network;
-`training`, `evaluation` and `scores` take that network or any other: a callable from ids uint8 [B, H, W] to logits
-[B, slots, H, W].
+`worlds` makes the data, `recordings` are transitions with actions. `networks` has the paper's network; `training`,
+`evaluation` and `scores` take that network or any other: a callable from ids uint8 [B, H, W] to logits [B, slots, H, W].
 """
 
 from __future__ import annotations
@@ -16,9 +15,8 @@ if TYPE_CHECKING:
     from powderdsl.worldmodel.evaluation import evaluate, evaluate_recording
     from powderdsl.worldmodel.networks import UNet, custom_network
     from powderdsl.worldmodel.recordings import open_recording
-    from powderdsl.worldmodel.replay import Replay
     from powderdsl.worldmodel.scores import score
-    from powderdsl.worldmodel.training import finetuned, load_trained, train
+    from powderdsl.worldmodel.training import Replay, finetuned, load_trained, train
     from powderdsl.worldmodel.worlds import pairs_of, task_worlds, unseen_seeds
 
 __all__ = [
@@ -47,9 +45,8 @@ __getattr__, __dir__ = importing(
         "evaluation": "evaluate evaluate_recording",
         "networks": "UNet custom_network",
         "recordings": "open_recording",
-        "replay": "Replay",
         "scores": "score",
-        "training": "finetuned load_trained train",
+        "training": "Replay finetuned load_trained train",
         "worlds": "pairs_of task_worlds unseen_seeds",
     },
 )

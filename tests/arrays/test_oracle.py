@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from powderdsl.testing.generators.cases import random_start
-from powderdsl.testing.generators.choices import Choices
+from powderdsl.testing.generators.cases import Choices, random_start
 from powderdsl.testing.properties.running import Oracle
 from tests.fuzz.rulemaker import random_ruleset
 from tests.tiers import tiered

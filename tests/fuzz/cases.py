@@ -11,7 +11,14 @@ from powderdsl.model.state import slots
 from powderdsl.model.types import Ruleset
 from powderdsl.system.writing import replacing
 from powderdsl.testing.generators.cases import Start
-from powderdsl.testing.generators.trees import line_of, read_start, read_yaml, reading, start_tree, write_yaml
+from powderdsl.testing.properties.outcomes import (
+    line_of,
+    read_start,
+    read_yaml,
+    reading,
+    start_tree,
+    write_yaml,
+)
 from tests.semantics.texts import load_text
 
 

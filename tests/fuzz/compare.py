@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from powderdsl.model.types import Ruleset
-from powderdsl.testing.generators.cases import Start, random_start
-from powderdsl.testing.generators.choices import Choices
+from powderdsl.testing.generators.cases import Choices, Start, random_start
 
 if TYPE_CHECKING:
     from powderdsl.simulation.simulator import Simulator

@@ -14,8 +14,7 @@ from powderdsl.model.types import Ruleset
 from powderdsl.simulation.programs import BackendProgram
 from powderdsl.simulation.simulator import Simulator
 from powderdsl.targets.cpp.build import find_compiler
-from powderdsl.targets.cuda.build import Launch, Worlds
-from powderdsl.targets.cuda.program import Compile, CudaProgram
+from powderdsl.targets.cuda.program import Compile, CudaProgram, Launch, Worlds
 from powderdsl.targets.cuda.source import KernelSource
 from powderdsl.targets.torch.program import packed_program
 from tests.fuzz import EMULATED

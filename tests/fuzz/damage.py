@@ -23,7 +23,7 @@ from powderdsl.model.types import Ruleset
 from powderdsl.syntax.sources import shipped
 from powderdsl.system.reports import as_json
 from powderdsl.system.writing import replacing
-from powderdsl.testing.generators.choices import Choices
+from powderdsl.testing.generators.cases import Choices
 from tests.fuzz.crew import Lost, work_through
 from tests.fuzz.rulemaker import Manner, ruleset_text
 

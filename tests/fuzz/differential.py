@@ -18,8 +18,7 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.targets.cpp.build import Building, building
-from powderdsl.testing.generators.cases import Start, random_start
-from powderdsl.testing.generators.choices import Choices
+from powderdsl.testing.generators.cases import Choices, Start, random_start
 from tests.fuzz import EMULATED, STARTS_AT_ONCE
 from tests.fuzz.cases import Case, fitted
 from tests.fuzz.compare import find_difference

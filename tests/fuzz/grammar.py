@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 from powderdsl.model.builtins import MAX_MAGNITUDE
-from powderdsl.testing.generators.choices import Choices
+from powderdsl.testing.generators.cases import Choices
 
 Reach = Callable[[list[float]], float]
 

@@ -10,7 +10,7 @@ from powderdsl.diagnostics import Reporter, Source, Span
 from powderdsl.syntax.parse import Syntax, parse_text
 from powderdsl.syntax.yaml_tree import parse_yaml
 from powderdsl.testing.generators.cases import Start
-from powderdsl.testing.generators.trees import Tree, to_tree, write_yaml
+from powderdsl.testing.properties.outcomes import Tree, to_tree, write_yaml
 from powderdsl.testing.properties.shrink import smallest
 from tests.fuzz.cases import Case
 

@@ -9,8 +9,8 @@ from functools import cache, partial
 from powderdsl.diagnostics import CompileError
 from powderdsl.model.builtins import KERNEL_SHAPES, KERNELS, shaped_kernel
 from powderdsl.model.types import CHANCE, DIRECTION, ELEMENT, FLAG, REAL, VEC2, Kind, Ruleset, integer
-from powderdsl.testing.generators.choices import Choices
-from powderdsl.testing.generators.trees import Tree, write_yaml
+from powderdsl.testing.generators.cases import Choices
+from powderdsl.testing.properties.outcomes import Tree, write_yaml
 from tests.fuzz.grammar import (
     EXPRESSIONS,
     RULES,

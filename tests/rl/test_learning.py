@@ -16,7 +16,7 @@ from powderdsl.envs.sb3 import PowderVecEnv
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.experiments.runs import read_metrics
 from powderdsl.rl import evaluate, load_policy, train
-from powderdsl.rl.fcn import BinPolicy, fcn_policy
+from powderdsl.rl.policies import BinPolicy, fcn_policy
 from powderdsl.syntax.sources import shipped
 from powderdsl.system.fingerprint import fingerprint
 from powderdsl.tasks.episodes import compile_task

@@ -11,8 +11,7 @@ import powderdsl
 from powderdsl.compiler import load_with_diagnostics
 from powderdsl.diagnostics import Diagnostic
 from powderdsl.model.types import Ruleset
-from powderdsl.testing.generators.cases import random_start
-from powderdsl.testing.generators.choices import Choices
+from powderdsl.testing.generators.cases import Choices, random_start
 from tests.refusals import refusal
 
 TREES = """\

@@ -12,8 +12,7 @@ from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.simulation.simulator import compile as compile_rules
 from powderdsl.targets.job import MixedProgram
 from powderdsl.targets.wasm.program import WasmState
-from powderdsl.testing.generators.cases import random_start
-from powderdsl.testing.generators.choices import Choices
+from powderdsl.testing.generators.cases import Choices, random_start
 from tests.semantics.test_mixed import HEAVY
 from tests.semantics.texts import load_text
 from tests.tiers import tiered

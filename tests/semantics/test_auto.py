@@ -28,8 +28,7 @@ from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.system import cache
 from powderdsl.targets.cpp.build import Building, NoCompiler, NoCompilerWarning, building
 from powderdsl.targets.job import Clock, Job
-from powderdsl.testing.generators.cases import random_start
-from powderdsl.testing.generators.choices import Choices
+from powderdsl.testing.generators.cases import Choices, random_start
 from tests.cli.commands import environment_with
 from tests.cli.commands import powderdsl as command
 from tests.fuzz.compare import find_difference

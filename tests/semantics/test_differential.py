@@ -23,8 +23,7 @@ from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.syntax.sources import shipped
 from powderdsl.targets.cpp.build import ARCHITECTURE, Building, building, find_compiler, flags_for, processor
-from powderdsl.testing.generators.cases import Start, random_start
-from powderdsl.testing.generators.choices import Choices
+from powderdsl.testing.generators.cases import Choices, Start, random_start
 from tests.compilers import skip_without_compiler
 from tests.fuzz import COMPARED, STARTS_AT_ONCE, differential
 from tests.fuzz.compare import assert_same, assert_same_worlds, find_difference

@@ -17,8 +17,7 @@ from powderdsl.model.state import slots
 from powderdsl.model.types import ELEMENT, Ruleset
 from powderdsl.simulation.simulator import World
 from powderdsl.simulation.simulator import compile as compile_ruleset
-from powderdsl.testing.generators.cases import random_start
-from powderdsl.testing.generators.choices import Choices
+from powderdsl.testing.generators.cases import Choices, random_start
 from tests.fuzz.rulemaker import random_ruleset
 from tests.semantics.test_differential import compositions
 from tests.semantics.texts import load_text

@@ -16,8 +16,7 @@ from powderdsl.targets.job import MixedProgram, mixed_program
 from powderdsl.targets.tensor_kind import Tensors
 from powderdsl.targets.torch.program import TorchProgram
 from powderdsl.targets.wasm.program import WasmProgram
-from powderdsl.testing.generators.cases import random_start
-from powderdsl.testing.generators.choices import Choices
+from powderdsl.testing.generators.cases import Choices, random_start
 from tests.compilers import skip_without_compiler
 from tests.fuzz.compare import assert_same_worlds, find_difference
 from tests.semantics.texts import load_text

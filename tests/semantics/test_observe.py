@@ -11,8 +11,7 @@ import powderdsl
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.draw import palette, rgb
 from powderdsl.simulation.simulator import Simulator, World
-from powderdsl.testing.generators.cases import random_start
-from powderdsl.testing.generators.choices import Choices
+from powderdsl.testing.generators.cases import Choices, random_start
 from tests.compilers import skip_without_compiler
 from tests.fuzz import TARGETS
 from tests.semantics.texts import load_text

@@ -6,8 +6,7 @@ import math
 
 import pytest
 
-from powderdsl.testing.pack_tests.chances import ERROR_RATE, OFF, is_unlikely, trials_for
-from powderdsl.testing.pack_tests.runner import run_examples
+from powderdsl.testing.pack_tests.runner import ERROR_RATE, OFF, is_unlikely, run_examples, trials_for
 from tests.semantics.texts import load_text, mistakes
 from tests.tiers import tiered
 

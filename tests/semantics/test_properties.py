@@ -23,8 +23,7 @@ from powderdsl.model.state import SNAP, slots
 from powderdsl.model.types import Assign, Moment, Move, Swap, Transform
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.simulation.simulator import compile as compile_ruleset
-from powderdsl.testing.generators.cases import random_start
-from powderdsl.testing.generators.choices import Choices
+from powderdsl.testing.generators.cases import Choices, random_start
 from tests.fuzz.compare import find_difference
 from tests.fuzz.rulemaker import Manner, random_ruleset, random_ruleset_text
 from tests.semantics.texts import load_text

@@ -11,8 +11,7 @@ from powderdsl.compiler import load
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import compile
 from powderdsl.simulation.tracing import SLOT, Provenance, RecordedStep, Recorder
-from powderdsl.testing.generators.cases import Start, random_start
-from powderdsl.testing.generators.choices import Choices
+from powderdsl.testing.generators.cases import Choices, Start, random_start
 from tests.fuzz import STARTS_AT_ONCE
 from tests.semantics.test_differential import compositions
 from tests.tiers import tiered

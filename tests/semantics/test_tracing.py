@@ -13,8 +13,7 @@ from powderdsl.compiler import load
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import World, compile
 from powderdsl.simulation.tracing import Attempt, RecordedStep, Trace, pick, trace, trace_data, trace_text
-from powderdsl.testing.generators.cases import random_start
-from powderdsl.testing.generators.choices import Choices
+from powderdsl.testing.generators.cases import Choices, random_start
 from tests.fuzz.rulemaker import random_ruleset
 from tests.semantics.texts import load_text
 from tests.tiers import tiered

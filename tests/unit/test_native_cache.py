@@ -30,7 +30,7 @@ from powderdsl.targets.cpp.build import (
     flags_for,
     run_compilers,
 )
-from powderdsl.targets.cuda import build as cuda_build
+from powderdsl.targets.cuda import program as cuda_program
 from powderdsl.targets.cuda.source import KernelSource
 from powderdsl.targets.layout import Layout
 from tests.cli.commands import environment_with, powderdsl
@@ -358,13 +358,13 @@ def test_kernels_for_gpus_lie_there_too(tmp_path: Path, monkeypatch: pytest.Monk
     """No GPU is needed: the compiler's version and what it compiles are made up."""
     compile_text = Mock(side_effect=lambda compiler, text, options: text.encode())
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(cuda_build, "nvrtc", Mock())
-    monkeypatch.setattr(cuda_build, "compile_text", compile_text)
+    monkeypatch.setattr(cuda_program, "nvrtc", Mock())
+    monkeypatch.setattr(cuda_program, "compile_text", compile_text)
     a, b = (
         KernelSource("rules", text, Layout(), group=1, threads=32, shared=0, scratch=0) for text in ("a", "b")
     )
     wanted = [(a, "sm_90"), (a, "sm_80"), (a, "sm_90"), (b, "sm_90")]
-    assert [cuda_build.machine_code(*one, "13.0") for one in wanted] == [b"a", b"a", b"a", b"b"]
+    assert [cuda_program.machine_code(*one, "13.0") for one in wanted] == [b"a", b"a", b"a", b"b"]
     assert [call.args[1] for call in compile_text.call_args_list] == ["a", "a", "b"]
     found = cache.entries(cache.compiled_folder())
     assert [entry.name for entry in found] == ["rules.cuda"] * 3

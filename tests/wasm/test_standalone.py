@@ -19,8 +19,7 @@ from powderdsl.model.types import Ruleset
 from powderdsl.simulation.simulator import Simulator, World
 from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.simulation.standalone import standalone_module
-from powderdsl.testing.generators.cases import Start, random_start
-from powderdsl.testing.generators.choices import Choices
+from powderdsl.testing.generators.cases import Choices, Start, random_start
 from tests.cli.commands import powderdsl as command
 from tests.fuzz.rulemaker import random_ruleset
 from tests.semantics.test_mixed import spread

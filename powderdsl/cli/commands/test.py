@@ -38,7 +38,7 @@ from powderdsl.testing.properties.search import InvariantSearch, SearchPlan, cou
 
 if TYPE_CHECKING:
     from powderdsl.testing.mutation.judging import Verdict
-    from powderdsl.testing.mutation.mutants import Mutant
+    from powderdsl.testing.mutation.operators import Mutant
     from powderdsl.testing.mutation.written import GeneratedTest
 
 MAX_SECONDS = 24 * 3600

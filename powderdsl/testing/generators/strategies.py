@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from powderdsl.compiler import load
 from powderdsl.model.types import Ruleset
-from powderdsl.testing.generators.cases import Start, random_start
-from powderdsl.testing.generators.choices import Choices
+from powderdsl.testing.generators.cases import Choices, Start, random_start
 
 T = TypeVar("T")
 

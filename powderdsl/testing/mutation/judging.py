@@ -35,8 +35,7 @@ from powderdsl.simulation.programs import starting_backend
 from powderdsl.simulation.simulator import Simulator, compile
 from powderdsl.system.fingerprint import fingerprint
 from powderdsl.system.interrupts import delay_signal
-from powderdsl.testing.mutation.mutants import Mutant
-from powderdsl.testing.mutation.operators import mutants_of
+from powderdsl.testing.mutation.operators import Mutant, mutants_of
 from powderdsl.testing.mutation.written import GENERATED, GeneratedTest, distinguish, written_test
 from powderdsl.testing.pack_tests.runner import run_examples
 from powderdsl.testing.properties.outcomes import Property, Result

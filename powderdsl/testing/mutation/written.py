@@ -23,7 +23,7 @@ from powderdsl.syntax.yaml_tree import Mapping, parse_yaml
 from powderdsl.syntax.yaml_tree import Sequence as YamlSequence
 from powderdsl.system.writing import write_text
 from powderdsl.testing.generators.cases import Array, Start
-from powderdsl.testing.mutation.mutants import Mutant
+from powderdsl.testing.mutation.operators import Mutant
 from powderdsl.testing.pack_tests.runner import ANYTHING, SEEDS, field_rows
 from powderdsl.testing.properties.running import State, first_difference, random_samples, run_sample
 from powderdsl.testing.properties.shrink import Work, shrink_while

@@ -17,8 +17,7 @@ from powderdsl.model.state import Slot, slots
 from powderdsl.model.types import FLAG, Assign, Field, Moment, Pass, Rule, Ruleset
 from powderdsl.simulation.programs import starting_backend
 from powderdsl.simulation.simulator import compile
-from powderdsl.testing.generators.cases import Array, Start, clamped_to_holders, fresh, random_start
-from powderdsl.testing.generators.choices import Choices
+from powderdsl.testing.generators.cases import Array, Choices, Start, clamped_to_holders, fresh, random_start
 
 if TYPE_CHECKING:
     from powderdsl.simulation.simulator import Simulator, World
