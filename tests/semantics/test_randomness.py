@@ -148,3 +148,24 @@ def test_rounds_draw_for_themselves_and_copies_of_a_symmetry_share(block: str, i
     grown = float((sim.step(world, steps=1).ids[:, 1, 1] == 1).double().mean())
     expected = 1 - 0.7**independent
     assert abs(grown - expected) < DEVIATIONS * (expected * (1 - expected) / count) ** 0.5
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "stays"),
+    [
+        ("vine with", "vine and not soil with", True),
+        ("grow:", "other: {do: vine -> soil if above is soil}, grow:", True),
+        ("side", "near", False),
+        ("grow:", "sprout:", False),
+        ("pack: vines", "pack: grapes", False),
+        ("[soil", "[vine -> soil if above is soil, soil", False),
+    ],
+)
+def test_draws_of_a_chance_follow_from_its_place_and_names(old: str, new: str, stays: bool) -> None:
+    text = VINES.format(block=f'"for side in (above, left)": [{SIDE}]')
+    before, after = (
+        {stream.name for stream in load_text(one).streams if "#" in stream.name}
+        for one in (text, text.replace(old, new))
+    )
+    assert before == {"vines.grow#0[side = above]", "vines.grow#0[side = left]"}
+    assert (before == after) is stays
