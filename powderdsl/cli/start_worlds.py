@@ -10,6 +10,7 @@ from powderdsl.compiler import segments_of
 from powderdsl.model.state import fitting
 from powderdsl.model.types import Ruleset
 from powderdsl.system.memo import Memo
+from powderdsl.system.writing import failure
 from powderdsl.worlds.raster import Size
 from powderdsl.worlds.scene import Start
 from powderdsl.worlds.strewn import check_cells, strew
@@ -47,7 +48,7 @@ def start(
     """
     # A drawn world comes first: compiling may import torch, and whoever mistyped a name should not wait for that.
     drawn = start_drawn(ruleset, name, size, batch, seed)
-    from powderdsl.simulation.simulator import compile
+    from powderdsl.simulation.simulator import LAST_STEP, compile
 
     memo = Memo()  # what is lowered here is not lowered again
     many = drawn is None or drawn.ids.size * max(steps, 100) > FEW
@@ -58,7 +59,11 @@ def start(
 
     with user_values():
         if drawn is None:
-            return load_world(str(name), sim)
+            world = load_world(str(name), sim)
+            if world.since + steps > LAST_STEP:
+                fix = f"it can make {LAST_STEP - world.since:,} more: the last step is {LAST_STEP:,}"
+                raise failure("PD602", f"`{name}` cannot make {steps:,} steps", helps=(fix,))
+            return world
         return fresh_world(sim, drawn, seed or 0)
 
 

@@ -44,6 +44,8 @@ if TYPE_CHECKING:
     from powderdsl.simulation.observe import Observer
 
 MAX_CELLS = 1 << 31
+LAST_STEP = (1 << 63) - 1
+"""The largest number of steps that a world can have made."""
 USUAL_SIDE = 400
 BATCH_SIZES = 16
 """The number of batch sizes whose default parameters are cached."""
@@ -55,7 +57,7 @@ class World:
 
     `Simulator.world` makes them. `sim` is their simulator. `state` has one array per slot, [B, H, W] or [B, 2, H, W] in
     the slot's dtype. `seed`, `index` and `step` (int64 [B]) determine the random numbers: equal values give the same
-    future, alone or in any batch. `step` is `since` steps after `start`.
+    future, alone or in any batch. `step` is `since` steps after `start`, and no step of the batch is later than `since`.
 
     Raises:
         ValueError: a seed, index or start of another shape, dtype or device.
@@ -482,10 +484,10 @@ class Simulator:
         Raises:
             KeyError: unknown streams, passes or parameters.
             TypeError: an argument of a wrong type; worlds whose arrays are of another kind.
-            ValueError: a wrong shape or value; worlds of other rules.
+            ValueError: a wrong shape or value; worlds of other rules; steps beyond LAST_STEP.
         """
         self.check(world)
-        steps, batch = _step_count(steps), world.seed.shape[0]
+        steps, batch = _step_count(steps, world), world.seed.shape[0]
         values = self._defaults(batch) if params is None else self._parameters(params, batch)
         draws = self._draws(random, world) if random is not None else {}
         names = self._pass_names(passes) if passes is not None else None
@@ -560,7 +562,7 @@ class Simulator:
         self.check(world)
         timing, params = PassClock(self.device), self._defaults(len(world))
         clock = Clock(world.seed, world.index, world.start, world.since)
-        self._program.run(Job(world.state, clock, _step_count(steps), params, {}, None, timing=timing))
+        self._program.run(Job(world.state, clock, _step_count(steps, world), params, {}, None, timing=timing))
         return {name: timing.seconds[name] for name in self.passes} if timing.seconds else {}
 
 
@@ -594,12 +596,14 @@ def compile(
     return Simulator(model, backend, device, threads, tensors=tensors, memo=memo)
 
 
-def _step_count(value: Any) -> int:
-    """An integer of 0 or more, Python's or NumPy's."""
+def _step_count(value: Any, world: World) -> int:
+    """An integer of 0 or more, Python's or NumPy's, that takes no world beyond LAST_STEP. Raises ValueError."""
     try:
         number = index(value)
     except TypeError:
         number = -1
     if number < 0 or isinstance(value, bool):
         raise ValueError(f"steps must be an integer of 0 or more, found {value!r}")
+    if world.since + number > LAST_STEP:
+        raise ValueError(f"step {world.since + number:,} lies beyond {LAST_STEP:,}, the last one")
     return number

@@ -263,7 +263,7 @@ class Session:
                 fields[slot_name(rules, name)] = values.reshape((1, *components, *shape))
         seed, index, step = (int(number) for number in data["clock"])
         world = sim.replace(sim.world(ids, seed=seed), **fields)
-        return replace(world, index=np.full_like(world.index, index), start=np.full_like(world.start, step))
+        return replace(world, index=np.full_like(world.index, index), since=step)
 
 
 def _is_ruleset(text: str) -> bool:

@@ -15,7 +15,7 @@ from powderdsl.arrays import np
 from powderdsl.diagnostics import CompileError
 from powderdsl.model.state import qualified_slots, slot_name
 from powderdsl.model.types import ELEMENT, Ruleset
-from powderdsl.simulation.simulator import Simulator, World
+from powderdsl.simulation.simulator import LAST_STEP, Simulator, World
 from powderdsl.system.archives import Archive, BadArchive, open_archive, write_archive
 from powderdsl.system.reading import parse_json
 from powderdsl.system.writing import failure, replacing
@@ -151,7 +151,10 @@ def _load(archive: Archive, sim: Simulator, source: Path) -> World:
     """Worlds from an archive. Raises BadArchive, or LookupError, TypeError or ValueError for malformed values."""
     palette, qualified, saved_in = _about(archive)
     shape = _shape(archive, sim, source)
-    clock = {name: sim.kind.from_numpy(_clock(archive, name)) for name in CLOCK}
+    clock = {name: _clock(archive, name) for name in CLOCK}
+    since = int(clock["step"].max())
+    clock["step"] = clock["step"] - since
+    seed, index, start = map(sim.kind.from_numpy, clock.values())
     ids = archive.read(IDS)
     fields: dict[str, Any] = {}
     for key in archive.headers:
@@ -171,7 +174,7 @@ def _load(archive: Archive, sim: Simulator, source: Path) -> World:
         value = archive.read(key)
         fields[slot.name] = _translate(palette, value, sim, source) if slot.kind == ELEMENT else value
     world = sim.replace(sim.world(_translate(palette, ids, sim, source)), **fields)
-    return World(sim, world.state, *clock.values())
+    return World(sim, world.state, seed, index, start, since)
 
 
 def _about(archive: Archive) -> tuple[dict[int, str], dict[str, str], str]:
@@ -214,10 +217,10 @@ def _clock(archive: Archive, name: str) -> Any:
     batch = archive.headers[IDS].shape[:1]
     if header is None or header.dtype[:1] not in "iu" or header.shape != batch:
         raise BadArchive(f"its arrays do not fit together (`{name}`)")
-    values = archive.read(name).astype(np.int64)
-    if (values < 0).any():
-        raise BadArchive(f"`{name}` is below 0")
-    return values
+    values = archive.read(name)
+    if (values < 0).any() or (values > LAST_STEP).any():
+        raise BadArchive(f"`{name}` does not lie in 0..{LAST_STEP:,}")
+    return values.astype(np.int64)
 
 
 def _translate(palette: dict[int, str], ids: Any, sim: Simulator, path: Path) -> Any:
