@@ -153,7 +153,8 @@ def _report_more(
 ) -> None:
     """Report what is also wrong in files with mistakes, except what may follow from these."""
     from powderdsl.model.check import check
-    from powderdsl.model.composition.names import SHARED, words_of_tree
+    from powderdsl.model.composition.names import words_of_tree
+    from powderdsl.model.declarations import SHARED
     from powderdsl.syntax.yaml_tree import parse_yaml
 
     lost = {word for source in reader.sources for word in words_of_tree(parse_yaml(source, Reporter()))}

@@ -48,6 +48,7 @@ GROUPS = {
 }
 COMMANDS = {name: summary for group in GROUPS.values() for name, summary in group.items()}
 
+COMPLETE = "_POWDERDSL_COMPLETE"
 ENVIRONMENT = {
     "NO_COLOR": "No colors, also on a terminal.",
     "FORCE_COLOR": "Colors, also without a terminal.",
@@ -56,7 +57,7 @@ ENVIRONMENT = {
     "XDG_CACHE_HOME": "Folder of the cache of checked and compiled rules.  [default: ~/.cache]",
     "CI": "`powderdsl test` keeps no counterexamples.",
     "POWDERDSL_DEBUG": "1: tracebacks of mistakes in powderdsl itself.",
-    "_POWDERDSL_COMPLETE": "bash_source: print what completes commands in bash; README.md has other shells.",
+    COMPLETE: "bash_source: print what completes commands in bash; README.md has other shells.",
 }
 """Variables that commands read."""
 
@@ -92,7 +93,7 @@ class GuardedCommand(click.Command):
         if os.environ.pop(LIFELINE, None):
             end_with_stdin()
         # For completion, click writes bytes that a shell reads: names of ours, and nothing from files.
-        completes = "_POWDERDSL_COMPLETE" in os.environ
+        completes = COMPLETE in os.environ
         with nullcontext() if completes else printable_streams(), interruptible():
             try:
                 status = super().main(args, prog_name or self.name, *rest, **options)
@@ -113,6 +114,10 @@ class CommandGroup(GuardedCommand, click.Group):
 
             ctx.fail(with_suggestion(f"no command `{cmd_name}`", cmd_name, COMMANDS, "commands"))
         command: click.Command = import_module(f"powderdsl.cli.commands.{cmd_name}").command
+        if COMPLETE in os.environ:
+            from powderdsl.cli.completion import add_completion
+
+            add_completion(command)
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:

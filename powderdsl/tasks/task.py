@@ -35,7 +35,7 @@ NOTHING = 255
 
 @dataclass(frozen=True)
 class Knob:
-    """An integer that is set from outside: ``--lines 8``. `value` is what it is in this task."""
+    """An integer that is set from outside: ``--knob lines=8``. `value` is what it is in this task."""
 
     name: str
     default: int

@@ -194,3 +194,34 @@ def test_shells_complete_commands(shell):
         subprocess.run([shell, "-c", script], check=True)
     words = {"COMP_WORDS": "powderdsl tra", "COMP_CWORD": "tra" if shell == "fish" else "1"}
     assert all(word in answer("complete", **words) for word in ("trace", "train"))
+
+
+def completed(line: str) -> set[str]:
+    environment = {"COMP_WORDS": f"powderdsl {line}", "COMP_CWORD": str(len(line.split()))}
+    answer = powderdsl(_POWDERDSL_COMPLETE="bash_complete", **environment, exits=0).stdout
+    return {entry.partition(",")[2] for entry in answer.splitlines() if entry.startswith("plain,")}
+
+
+@pytest.mark.parametrize(
+    ("line", "found", "lost"),
+    [
+        ("run core+w", {"core+water", "core+wireworld"}, {"water"}),
+        ("check powderworld-ga", {"powderworld-gas"}, set()),
+        ("show san", {"sand", "sand-pushing"}, {"water"}),
+        ("train sand-pushing --split h", {"handmade"}, {"train"}),
+        ("train --split te", {"test"}, {"train"}),
+        ("evaluate sand-pushing --split train,t", {"train,test"}, {"test"}),
+        ("run core --world fi", {"fish-tank"}, {"fish"}),
+        ("run core --backend na", {"native"}, {"wasm"}),
+        ("wm train --held-out gas,st", {"gas,stone"}, {"stone"}),
+        ("study st", {"start-states"}, set()),
+    ],
+)
+def test_names_complete_parameters(line, found, lost):
+    assert found <= completed(line)
+    assert not lost & completed(line)
+
+
+def test_runs_complete_parameters(folder):
+    (folder / "runs" / "pond").mkdir(parents=True)
+    assert completed("evaluate po") == completed("curves po") == {"pond"}

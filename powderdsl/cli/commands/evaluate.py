@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @click.command("evaluate", cls=opt.Command)
 @click.argument("run", metavar="RUN|TASK")
-@opt.option("--split", opt.NAMES, "Splits: sets of worlds.  [default: all of the task]", to="splits")
+@opt.option("--split", opt.NAMES, "Sets of worlds.  [default: all]", to="splits", metavar="SPLIT,SPLIT")
 @opt.option(
     "--policies",
     opt.NAMES,
