@@ -68,6 +68,7 @@ _ROWS = (
     ("PD316", "value-contested", _WARNING),
     ("PD317", "value-replaced", _NOTE),
     ("PD318", "override-changes-id", _WARNING),
+    ("PD319", "need-not-declared", _WARNING),
     # PD4xx: kinds and ranges
     ("PD401", "wrong-kind"),
     ("PD402", "value-out-of-range"),

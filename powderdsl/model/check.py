@@ -17,7 +17,7 @@ from powderdsl.model.declarations import PackDecl, RulesetDecl
 from powderdsl.model.definitions import define_symbols, element_ramps
 from powderdsl.model.elaborate import Elaborator
 from powderdsl.model.examples import check_assigned, check_examples
-from powderdsl.model.expressions.symbols import add_constants, report_unknown_names
+from powderdsl.model.expressions.symbols import add_constants, report_undeclared_needs, report_unknown_names
 from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.invariants import check_invariants
 from powderdsl.model.logic.conflicts import check_logic
@@ -77,6 +77,7 @@ def check(
     composition = typer.symbols
     elaborated = Elaborator(typer)
     elaborated.run(composition.passes)
+    report_undeclared_needs(typer)  # tests and invariants only speak of what is loaded
     examples = check_examples(typer)
     check_alone = partial(_check_some, Declared(tuple(packs), None), alone=True)
     invariants = check_invariants(composition, typer, check_alone)

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import powderdsl
+from powderdsl.compiler import load_with_diagnostics
 from powderdsl.diagnostics import CompileError
 from powderdsl.system.fingerprint import fingerprint
 from tests.cli.commands import powderdsl as run
@@ -61,3 +62,21 @@ def test_links_do_not_lead_out_of_the_folder(packs: Path, tmp_path: Path) -> Non
 def test_a_file_here_is_suggested_for_an_unknown_name(packs: Path, tmp_path: Path) -> None:
     (packs / "seed.yaml").rename(tmp_path / "seed.yaml")
     assert "did you mean the file `seed.yaml`?" in run("check", "core+seed", exits=2).stdout
+
+
+@pytest.mark.parametrize(
+    ("rule", "warned"),
+    [
+        ("loam -> empty if count(water) > 0", ["water"]),
+        ("loam -> empty if count(water?) > 0", []),
+        ("loam -> seed if fire", ["seed", "fire"]),
+        ("loam -> wall if sand and above.momentum > 0", []),  # of packs that a pack needs needs
+        ("loam -> empty if above.velocity?.row > 1", []),
+    ],
+)
+def test_a_name_of_a_pack_that_is_not_needed_is_a_warning(packs: Path, rule: str, warned: list[str]) -> None:
+    (packs / "loam.yaml").write_text(f"{LOAM}passes:\n  crumble:\n    do: {rule}\n")
+    _, remarks = load_with_diagnostics("powderworld+packs/seed.yaml+packs/loam.yaml")
+    warnings = [remark for remark in remarks if remark.code == "PD319"]
+    assert [warning.primary.span.text for warning in warnings] == warned
+    assert all("add `" in warning.helps[0] and "?`" in warning.helps[0] for warning in warnings)

@@ -159,6 +159,17 @@ def report_unknown_names(typer: Typer) -> None:
     typer.unknown.clear()
 
 
+def report_undeclared_needs(typer: Typer) -> None:
+    """Report the names in rules and values so far that come from packs which their pack does not need."""
+    for (pack, word), span in typer.undeclared.items():
+        owner = typer.symbols.names.pack(typer.symbols.names.of(pack, word))
+        typer.reporter.report(
+            "PD319", f"`{word}` comes from the pack `{owner}`, which `{pack}` does not need", span,
+            "an error where that pack is not loaded",
+            helps=[f"add `{owner}` to the `needs` of `{pack}`, or write `{word}?`"],
+        )  # fmt: skip
+
+
 def _fix(name: str, known_here: Iterable[str], after_dot: bool, symbols: Composition) -> str:
     """The fix for an unknown name. `known_here` are the local names of its scope."""
     elsewhere = [qualified for qualified in symbols.params if qualified.endswith(f".{name}")]

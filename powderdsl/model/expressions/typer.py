@@ -131,6 +131,8 @@ class Typer:
         self.resolving: list[str] = []
         self.unknown: dict[tuple[str, bool], dict[Span, Iterable[str]]] = {}
         """By unknown name, and True if it follows a dot: its places, each with the local names there."""
+        self.undeclared: dict[tuple[str, str], Span] = {}
+        """The first places of names that a pack uses and no pack that it needs defines."""
         self._sets_too_deep = False
         self._work = self._rule_start = 0
         self._rule_span: Span | None = None
@@ -358,6 +360,10 @@ class Typer:
         """The operand of a name. An unknown one is reported once, with all its places, by `report_unknown_names`."""
         operand = self.find(name, span, scope)
         if operand is not None:
+            names, may_be_absent = self.symbols.names, span.source.text[span.end : span.end + 1] == "?"
+            is_known = name in scope.locals or names.knows(scope.pack, names.of(scope.pack, name))
+            if not is_known and not may_be_absent:
+                self.undeclared.setdefault((scope.pack, name), span)
             return operand
         if self.symbols.is_declared(name, scope.pack):
             raise Poisoned  # what is wrong with its declaration has been reported
