@@ -10,8 +10,8 @@ from random import Random
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from powderdsl.arrays import np
-from powderdsl.model.state import SNAP, Slot, fitting, slots
-from powderdsl.model.types import Kind, Property, Ruleset
+from powderdsl.model.state import SNAP, Slot, fitting, fresh_values, slots
+from powderdsl.model.types import Kind, Ruleset
 
 if TYPE_CHECKING:
     from powderdsl.simulation.simulator import Simulator, World
@@ -163,9 +163,8 @@ class Start:
 
 def fresh(ruleset: Ruleset, slot: Slot, ids: Array) -> Array:
     """A slot's values in fresh cells of these elements."""
-    prop = ruleset.property(slot.name)
-    if prop is not None:
-        return property_table(ruleset, prop, slot.dtype)[ids]
+    if ruleset.property(slot.name) is not None:
+        return np.array(fresh_values(ruleset, slot), slot.dtype)[ids]
     values = _fresh_values(slot)[ids]
     return np.moveaxis(values, -1, 1) if slot.planes == 2 else values
 
@@ -174,14 +173,6 @@ def fresh(ruleset: Ruleset, slot: Slot, ids: Array) -> Array:
 def _fresh_values(slot: Slot) -> Array:
     """A field's values [256] or [256, 2] in fresh cells, by element id."""
     return np.array([slot.fresh(identity) for identity in range(256)], slot.dtype)
-
-
-def property_table(ruleset: Ruleset, prop: Property, dtype: str = "float64") -> Array:
-    """The values [256] of a property by element id, with the parameters' defaults."""
-    defaults = {param.name: param.default for param in ruleset.params}
-    table = np.zeros(256, dtype)
-    table[: len(prop.values)] = [defaults[v] if isinstance(v, str) else v for v in prop.values]
-    return table
 
 
 def holding(ruleset: Ruleset, slot: Slot, ids: Array) -> Array:

@@ -11,9 +11,9 @@ from random import Random
 from powderdsl.analysis.ledger import TREND_BREAKS
 from powderdsl.arrays import np
 from powderdsl.model import reference
-from powderdsl.model.state import slots
+from powderdsl.model.state import property_values, slots
 from powderdsl.model.types import Bounded, Claim, Expr, Local, Never, Ruleset, Symmetric, Total, Unchanging
-from powderdsl.testing.generators.cases import Array, Start, fresh, property_table
+from powderdsl.testing.generators.cases import Array, Start, fresh
 from powderdsl.testing.properties.running import (
     Oracle,
     Runs,
@@ -121,11 +121,11 @@ def find_breaks(claim: Tested, ruleset: Ruleset, sample: Start, states: list[Sta
         case Never():
             return _never(evaluated(claim.condition))
         case Bounded():
-            prop = ruleset.property(claim.field)
-            if claim.field in states[0] or prop is None:
+            if claim.field in states[0]:
                 fields = [state[claim.field] for state in states]
             else:
-                fields = [property_table(ruleset, prop)[cells] for cells in ids]
+                table = np.array(property_values(ruleset, claim.field), np.float64)
+                fields = [table[cells] for cells in ids]
             outside = [np.asarray((values < claim.lo) | (values > claim.hi)) for values in fields]
             return _never([np.asarray(mask.any(1)) if mask.ndim == 4 else mask for mask in outside])
         case KnownIds():
