@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from powderdsl.diagnostics import CompileError, Diagnostic, Label, Reporter, Source, Span, suggest
-from powderdsl.model.declarations import PackDecl, RulesetDecl
+from powderdsl.model.declarations import SHARED, PackDecl, RulesetDecl, read_file
 from powderdsl.model.types import Ruleset
 from powderdsl.syntax.sources import path_beside, read_source, shipped, shipped_names
 from powderdsl.system.cache import persistent
@@ -154,7 +154,6 @@ def _report_more(
     """Report what is also wrong in files with mistakes, except what may follow from these."""
     from powderdsl.model.check import check
     from powderdsl.model.composition.names import words_of_tree
-    from powderdsl.model.declarations import SHARED
     from powderdsl.syntax.yaml_tree import parse_yaml
 
     lost = {word for source in reader.sources for word in words_of_tree(parse_yaml(source, Reporter()))}
@@ -275,8 +274,6 @@ def _read_apart(source: Source) -> tuple[PackDecl | RulesetDecl | None, tuple[Di
     """The declaration of a file, and its diagnostics."""
 
     def read() -> tuple[PackDecl | RulesetDecl | None, tuple[Diagnostic, ...]]:
-        from powderdsl.model.packs import read_file
-
         reporter = Reporter()
         with suppress(CompileError):  # more errors than the limit
             return read_file(source, reporter), reporter.diagnostics

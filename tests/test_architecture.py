@@ -542,7 +542,7 @@ def slow_imports_after(statement: str, path: Path = ROOT) -> set[str]:
     "statement",
     [
         "import powderdsl; powderdsl.load('powderworld')",
-        "import powderdsl.cli, powderdsl.testing.properties.refute",
+        "import powderdsl.cli, powderdsl.testing.properties.search",
         "from powderdsl.compiler import load, lower; from powderdsl.ir.bits import lower_bits; "
         "from powderdsl.targets.wasm.source import wasm_module; wasm_module(lower_bits(lower(load('life'))), 64)",
         "from powderdsl.cli.commands.study import commands; "

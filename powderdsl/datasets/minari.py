@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from powderdsl.datasets.dataset import Dataset
+from powderdsl.datasets.dataset import DTYPES, Dataset, check_episodes, knows_ids, row_shape
 from powderdsl.datasets.manifest import (
     Recipe,
     changed_params,
@@ -23,7 +23,6 @@ from powderdsl.datasets.manifest import (
     reporting_damage,
 )
 from powderdsl.datasets.recorder import add_shard, begin_manifest, lock_place
-from powderdsl.datasets.shards import DTYPES, check_episodes, knows_ids, row_shape
 from powderdsl.diagnostics import CompileError
 from powderdsl.envs import env_id
 from powderdsl.system.fingerprint import fingerprint

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from powderdsl.datasets.dataset import Dataset
+from powderdsl.datasets.dataset import DTYPES, Dataset, is_whole, row_shape, write_shard
 from powderdsl.datasets.manifest import (
     FILE,
     Manifest,
@@ -25,7 +25,6 @@ from powderdsl.datasets.manifest import (
     recipe_of,
     write_manifest,
 )
-from powderdsl.datasets.shards import DTYPES, is_whole, row_shape, write_shard
 from powderdsl.diagnostics import CompileError
 from powderdsl.envs.acting import FrameStack, Policy, action_keys, random_policy
 from powderdsl.envs.observations import Observation, observation_of

@@ -21,7 +21,7 @@ from powderdsl.model.state import (
 from powderdsl.model.types import Param, Ruleset
 from powderdsl.system.memo import Memo
 from powderdsl.system.writing import failure
-from powderdsl.targets.codec import Piece, pieces
+from powderdsl.targets.layout import Piece, pieces
 from powderdsl.targets.wasm.source import wasm_module
 from powderdsl.targets.wasm.standalone import Face, Knob, Stored
 

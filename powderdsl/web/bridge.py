@@ -165,7 +165,7 @@ class Session:
         """The invariants: `proven` with the reason, `tried` on worlds, or `broken` with a small counterexample."""
         from powderdsl.analysis.ledger import ledger
         from powderdsl.testing.properties.outcomes import counterexample_lines
-        from powderdsl.testing.properties.refute import quick_results
+        from powderdsl.testing.properties.search import quick_results
 
         rules = self._rules()
         rows = []

@@ -1,6 +1,6 @@
 """World models: networks that learn to predict a world some steps later (Frans & Isola 2023, section 4).
 
-`worlds` makes the data, `recordings` are transitions with actions. `networks` has the paper's network; `training`,
+`worlds` makes the data, or reads transitions with actions. `networks` has the paper's network; `training`,
 `evaluation` and `scores` take that network or any other: a callable from ids uint8 [B, H, W] to logits [B, slots, H, W].
 """
 
@@ -14,10 +14,9 @@ if TYPE_CHECKING:
     from powderdsl.worldmodel.config import DataConfig, Machine, TrainConfig
     from powderdsl.worldmodel.evaluation import evaluate, evaluate_recording
     from powderdsl.worldmodel.networks import UNet, custom_network
-    from powderdsl.worldmodel.recordings import open_recording
     from powderdsl.worldmodel.scores import score
     from powderdsl.worldmodel.training import Replay, finetuned, load_trained, train
-    from powderdsl.worldmodel.worlds import pairs_of, task_worlds, unseen_seeds
+    from powderdsl.worldmodel.worlds import open_recording, pairs_of, task_worlds, unseen_seeds
 
 __all__ = [
     "DataConfig",
@@ -44,9 +43,8 @@ __getattr__, __dir__ = importing(
         "config": "DataConfig Machine TrainConfig",
         "evaluation": "evaluate evaluate_recording",
         "networks": "UNet custom_network",
-        "recordings": "open_recording",
         "scores": "score",
         "training": "Replay finetuned load_trained train",
-        "worlds": "pairs_of task_worlds unseen_seeds",
+        "worlds": "open_recording pairs_of task_worlds unseen_seeds",
     },
 )

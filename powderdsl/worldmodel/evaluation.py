@@ -18,11 +18,17 @@ from powderdsl.simulation.draw import contact_sheet, palette, rgb, scale
 from powderdsl.tasks.shipped import load_task
 from powderdsl.worldmodel.config import HERE, DataConfig, Machine
 from powderdsl.worldmodel.networks import without_actions
-from powderdsl.worldmodel.recordings import Recording
-from powderdsl.worldmodel.rulesets import UNSEEN_RULESETS
 from powderdsl.worldmodel.scores import Network, Score, elements_of, frequent, outcomes, score, still
 from powderdsl.worldmodel.training import Trained, check_slots, load_rules_of
-from powderdsl.worldmodel.worlds import Pairs, TaskWorlds, pairs_of, task_worlds, unseen_seeds
+from powderdsl.worldmodel.worlds import (
+    UNSEEN_RULESETS,
+    Pairs,
+    Recording,
+    TaskWorlds,
+    pairs_of,
+    task_worlds,
+    unseen_seeds,
+)
 
 FIT_WORLDS = 64
 """The most training worlds that baselines are fitted on."""

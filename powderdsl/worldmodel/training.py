@@ -48,7 +48,7 @@ from powderdsl.worldmodel.scores import score
 from powderdsl.worldmodel.worlds import Pairs, Worlds, pairs_of, task_worlds, validation_pairs
 
 if TYPE_CHECKING:
-    from powderdsl.worldmodel.recordings import Recording
+    from powderdsl.worldmodel.worlds import Recording
 
 TOGETHER = 1 << 20
 """The most cells that are simulated together when the buffer is filled."""

@@ -1,27 +1,53 @@
-"""Worlds to learn from: those of a task without its agent, under other rules, and with fewer elements to draw."""
+"""Worlds to learn from: those of a task without its agent, under other rules, and with fewer elements to draw; and
+transitions recorded from a task, each a state, an action, and the state after it.
+
+Rulesets are drawn from a distribution: other chances, swapped properties, packs left out. A number determines each.
+
+A recorded input is uint8 [B, C + 3, H, W]: the C channels of the observation, and three of what the action does to each
+cell, as `tasks.tensors.actions.Hands` does it: the element that it places (`NO_ELEMENT` for none), and the rows and columns
+of its speed plus 2 (0 where it does not blow). `ActionChannels` makes of it what networks see.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol
+import hashlib
+import json
+import math
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from itertools import combinations
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
-from powderdsl.compiler import load
+from powderdsl.compiler import load, read
+from powderdsl.datasets.manifest import changed_params, choice_names
 from powderdsl.diagnostics import CompileError, Reporter, Span, suggest
+from powderdsl.experiments.runs import differences
+from powderdsl.model.check import check
 from powderdsl.model.composition.compose import Palette
+from powderdsl.model.composition.names import with_stand_ins
+from powderdsl.model.declarations import ElementDecl, PackDecl
+from powderdsl.model.definitions import set_params
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.programs import starting_backend
 from powderdsl.simulation.simulator import World
 from powderdsl.system.fingerprint import fingerprint
+from powderdsl.system.random import MASK, base_keys, mix
 from powderdsl.system.writing import failure
 from powderdsl.tasks.episodes import TaskProgram, compile_task
-from powderdsl.tasks.shipped import check_split, load_task
-from powderdsl.tasks.task import NO_CHANGE, NOTHING, Drawing, Generator, Goal, Split, Stamp, Task
-from powderdsl.worldmodel.config import TEST_SEEDS, DataConfig
-from powderdsl.worldmodel.rulesets import Drawn, RulesetSource, check_properties
+from powderdsl.tasks.shipped import check_split, load_task, shipped_tasks
+from powderdsl.tasks.task import BLOW, NO_CHANGE, NOTHING, Drawing, Generator, Goal, Split, Stamp, Task
+from powderdsl.tasks.tensors.actions import cells_of
+from powderdsl.worldmodel.config import TEST_SEEDS, DataConfig, Recorded, TrainConfig, Variety
+from powderdsl.worldmodel.networks import NO_ELEMENT
+
+if TYPE_CHECKING:
+    from powderdsl.datasets import Dataset, Transitions
+    from powderdsl.datasets.manifest import Recipe
 
 VALIDATION_SEEDS = 1 << 33
 """The first seed of worlds that models are validated on during training: far beyond those of tests."""
@@ -333,3 +359,293 @@ def _missing_elements(
             helps=["add the packs that have them, or choose another split or task"],
         )
     return CompileError(reporter.diagnostics)
+
+
+PARTS = (0.8, 0.1, 0.1)
+"""Shares of the worlds for training, validation and tests."""
+
+
+class Recording:
+    """A dataset of a task's transitions, ready to learn from. Made by `open_recording`.
+
+    `palette` names the dataset's ids; `rules` are the task's, with these ids. `parts` are the transitions of the
+    training, validation and test worlds: the same for every recording of these worlds.
+    """
+
+    def __init__(self, dataset: Dataset, name: str, task: Task, palette: tuple[str | None, ...]):
+        from powderdsl.datasets import Transitions, split
+
+        self.dataset, self.name, self.task, self.palette = dataset, name, task, palette
+        self.rules, self.size = task.ruleset, task.size
+        self.all = Transitions(dataset)
+        try:
+            self.parts: tuple[Transitions, ...] = split(self.all, PARTS)
+        except ValueError as error:
+            fix, why = "record episodes of more worlds: a hundred are enough", str(error)
+            raise failure(
+                "PD631", f"{dataset.folder} has too few worlds", notes=(why,), helps=(fix,)
+            ) from None
+
+    @cached_property
+    def recorded(self) -> Recorded:
+        """The facts about this recording that a run's file keeps."""
+        agent, recipe = self.task.agent, self.dataset.recipe
+        rows = [row.sha256 for row in self.dataset.manifest.shards]
+        text = json.dumps([asdict(recipe), rows], sort_keys=True)
+        digest = hashlib.sha256(text.encode()).hexdigest()
+        return Recorded(digest, recipe.channels, agent.steps_per_action, agent.speed)
+
+    def configured(self, config: TrainConfig) -> TrainConfig:
+        """A configuration changed to train on this dataset. Whether it uses recorded actions stays."""
+        recipe = self.dataset.recipe
+        data = DataConfig(
+            task=self.name,
+            split=recipe.split,
+            knobs=dict(recipe.knobs),
+            params=changed_params(recipe, load_task(self.name)),
+            steps=self.task.agent.steps_per_action,
+        )
+        slots = (*self.palette, *[None] * (config.slots - len(self.palette)))
+        actions = config.recorded is None or config.recorded.actions
+        return replace(config, data=data, palette=slots, recorded=replace(self.recorded, actions=actions))
+
+    def eligible(self, rows: Transitions) -> Tensor:
+        """The numbers of transitions of `steps_per_action` steps, int64 [n]: a last action may have free steps."""
+        length = torch.from_numpy(rows.episodes.length)
+        last = torch.zeros(len(rows), dtype=torch.bool)
+        if self.task.agent.free_steps:
+            last[length.cumsum(0) - 1] = length == self.task.agent.actions
+        return (~last).nonzero()[:, 0]
+
+    def pairs(self, rows: Transitions, numbers: Tensor, device: str | torch.device = "cpu") -> Pairs:
+        """Inputs and next ids, uint8 [B, C + 3, H, W] and [B, H, W], of transitions by number, int64 [B]."""
+        transitions = rows[numbers]
+        inputs = torch.cat([transitions.observation, self.painted(transitions.action)], 1)
+        return inputs.to(device), transitions.next_observation[:, 0].to(device)
+
+    def painted(self, actions: Tensor) -> Tensor:
+        """Return the channels that show actions, integers [B, 5], cell by cell: uint8 [B, 3, H, W]."""
+        agent, actions = self.task.agent, actions.long()
+        block = cells_of(agent, self.size, actions[:, 1], actions[:, 0])
+        choice = torch.tensor(agent.choices)[actions[:, 2]][:, None, None]
+        placed = torch.where(block & (choice >= 0), choice, NO_ELEMENT)
+        blown = block & (choice == BLOW)
+        speed = [torch.where(blown, actions[:, at, None, None] + 1, 0) for at in (4, 3)]
+        return torch.stack([placed, *speed], 1).to(torch.uint8)
+
+    def spread(self, rows: Transitions, most: int, device: str | torch.device = "cpu") -> list[Pairs]:
+        """Up to `most` transitions, evenly spread, in batches."""
+        numbers = self.eligible(rows)
+        numbers = numbers[torch.arange(min(most, len(numbers))) * len(numbers) // min(most, len(numbers))]
+        return [self.pairs(rows, some, device) for some in numbers.split(64)]
+
+    def batch(self, iteration: int, count: int, *, seed: int, device: str | torch.device) -> Pairs:
+        """A batch of the training worlds' transitions, all equally likely, which seed and iteration decide."""
+        from powderdsl.datasets.dataset import drawn
+
+        numbers = self.training
+        chosen = torch.from_numpy(drawn(seed % (1 << 62), iteration, count, len(numbers)))
+        return self.pairs(self.parts[0], numbers[chosen], device)
+
+    @cached_property
+    def training(self) -> Tensor:
+        """The numbers of the eligible transitions of training worlds."""
+        return self.eligible(self.parts[0])
+
+
+def open_recording(folder: str | Path, task: str | None = None) -> Recording:
+    """The recording in a dataset's folder.
+
+    Args:
+        task: the file of the task that was played, unless it is a shipped one.
+
+    Raises:
+        CompileError: PD630 for a folder that is not a dataset, or is damaged; PD631 if it was recorded from another task,
+            or has too few worlds; what `load_task` raises.
+    """
+    from powderdsl.datasets import Dataset
+
+    dataset = Dataset.open(folder)
+    recipe = dataset.recipe
+    if task is None and recipe.task not in shipped_tasks():
+        # A name out of the manifest must not lead to a file.
+        message = f"{folder} was recorded from the task `{recipe.task}`, which is not a shipped one"
+        raise failure("PD631", message, helps=("give its file, too",))
+    name = task or recipe.task
+    ids = {int(number): element for number, element in recipe.palette.items()}
+    palette = tuple(ids.get(number) for number in range(max(ids) + 1))
+    params = changed_params(recipe, load_task(name))
+    played = load_task(name, knobs=recipe.knobs, params=params, palette=palette)
+    notes = _differences(recipe, played)
+    if notes:
+        raise failure("PD631", f"{folder} does not fit the task {played.name}", notes=notes)
+    return Recording(dataset, name, played, palette)
+
+
+def _differences(recipe: Recipe, task: Task) -> tuple[str, ...]:
+    """The differences between a recipe and a task, none if the task was recorded with it."""
+    there = {"size": recipe.shape[1:], "actions": recipe.action_nvec, "choices": recipe.choices}
+    here = {"size": task.size, "actions": task.agent.action_nvec, "choices": choice_names(task)}
+    if changes := differences(there, here):
+        return changes
+    same = recipe.task_fingerprint == fingerprint(task)
+    return () if same else ("the task, its knobs or its rules have changed since, or it had more packs",)
+
+
+TRIES = 8
+"""How often a swap or a selection of packs is drawn again if the rules are inconsistent."""
+
+UNSEEN_RULESETS = 1 << 32
+"""The first number of rulesets that models are tested on. Training takes numbers below it."""
+
+_DRAW = 0x9F1D
+"""The number of the hash by which rulesets are drawn."""
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A ruleset that was drawn. `left_out`: packs; `swapped`: property and two elements; `params`: other chances."""
+
+    number: int
+    left_out: tuple[str, ...] = ()
+    swapped: tuple[tuple[str, str, str], ...] = ()
+    params: tuple[tuple[str, float], ...] = ()
+
+    @property
+    def structure(self) -> tuple[Any, ...]:
+        """The changes that decide the compiled code. Parameters, which are inputs of each world, are not among them."""
+        return self.left_out, self.swapped
+
+
+def check_properties(rules: Ruleset, names: Sequence[str]) -> None:
+    """Raise CompileError (PD301) for a property that rules do not have."""
+    for name in names:
+        if rules.property(name) is None:
+            helps = suggest(name, [prop.name for prop in rules.properties], "properties")
+            raise failure("PD301", f"the rules {rules.name} have no property `{name}`", helps=helps)
+
+
+class RulesetSource:
+    """Draws rulesets around one, which is `rules` as everywhere. The same number gives the same ruleset.
+
+    `palette` has ids that were recorded, as `compiler.load` takes them.
+
+    Raises:
+        CompileError: what loading the rules raises; PD301 for a property that they do not have.
+    """
+
+    def __init__(
+        self,
+        rules: str | Sequence[str],
+        variety: Variety,
+        params: Mapping[str, Any] | None = None,
+        palette: Palette | None = None,
+    ):
+        reporter = Reporter()
+        self.packs, self.ruleset_decl = read([rules] if isinstance(rules, str) else rules, reporter)
+        reporter.raise_if_errors()
+        self.variety, self.params, self.palette = variety, params or {}, palette
+        self.base = self._checked(self.packs)
+        self._models = {Drawn(0).structure: self.base}
+        self.palette = palette or self.base.palette  # ids stay where they are when packs are left out
+        check_properties(self.base, variety.swaps)
+
+    def draw(self, number: int) -> Drawn:
+        """Ruleset `number`, 0 or more. Inconsistent rulesets are drawn again."""
+        draws = _draws(number)
+        for _ in range(TRIES):
+            left_out = self._left_out(draws)
+            drawn = Drawn(number, left_out, self._swapped(draws, left_out))
+            try:
+                model = self.model(drawn)
+            except CompileError:
+                continue
+            return replace(drawn, params=self._chances(draws, model))
+        return Drawn(number, params=self._chances(draws, self.base))
+
+    def model(self, drawn: Drawn) -> Ruleset:
+        """The checked model of a ruleset, with the base's parameters. Raises CompileError for inconsistent rules."""
+        if drawn.structure not in self._models:
+            packs = [pack for pack in self.packs if pack.name.text not in drawn.left_out]
+            for prop, first, second in drawn.swapped:
+                packs = _exchanged(packs, prop, first, second)
+            self._models[drawn.structure] = self._checked(packs)
+        return self._models[drawn.structure]
+
+    def _checked(self, packs: Sequence[PackDecl]) -> Ruleset:
+        reporter = Reporter()
+        model = check(list(packs), self.ruleset_decl, reporter, self.palette)
+        left_out = {pack.name.text for pack in self.packs} - {pack.name.text for pack in packs}
+        params = {
+            name: value for name, value in self.params.items() if name.partition(".")[0] not in left_out
+        }
+        model = set_params(model, params, reporter) if params else model
+        reporter.raise_if_errors()
+        return model
+
+    def _left_out(self, draws: Iterator[float]) -> tuple[str, ...]:
+        """The packs that are left out, drawn one at a time; packs that others need stay."""
+        if not self.variety.leave_out:
+            return ()
+        needed = {name.text for pack in with_stand_ins(self.packs).values() for name in pack.needs}
+        loose = [pack.name.text for pack in self.packs if pack.name.text not in needed]
+        return tuple(name for name in loose if next(draws) < self.variety.leave_out)
+
+    def _swapped(self, draws: Iterator[float], left_out: tuple[str, ...]) -> tuple[tuple[str, str, str], ...]:
+        """For each property, two elements with different values."""
+        packs = [pack for pack in self.packs if pack.name.text not in left_out]
+        swapped = []
+        for prop in self.variety.swaps:
+            values = _values(packs, prop)
+            pairs = [pair for pair in combinations(values, 2) if values[pair[0]] != values[pair[1]]]
+            if pairs:
+                swapped.append((prop, *pairs[int(next(draws) * len(pairs))]))
+        return tuple(swapped)
+
+    def _chances(self, draws: Iterator[float], model: Ruleset) -> tuple[tuple[str, float], ...]:
+        """The chances of the model, each multiplied by a factor. All chances of the base draw one."""
+        if self.variety.chances == 1:
+            return ()
+        spread, names = math.log(self.variety.chances), {param.name for param in model.params}
+        chances = []
+        for param in self.base.params:
+            if param.kind.name == "chance":
+                factor = math.exp(spread * (2 * next(draws) - 1))
+                if param.name in names:
+                    chances.append((param.name, min(1.0, float(param.default) * factor)))
+        return tuple(chances)
+
+
+def _draws(number: int) -> Iterator[float]:
+    """Endless numbers from 0 to 1 that depend on `number` alone."""
+    keys = base_keys(torch.tensor([number]), torch.tensor([_DRAW]))
+    key, count = int(mix(keys[0] ^ keys[1])[0]), 0
+    while True:
+        yield int(mix(torch.tensor((key + count * 0x9E3779B1) & MASK))) / 2**32
+        count += 1
+
+
+def _values(packs: Iterable[PackDecl], prop: str) -> dict[str, Any]:
+    """The values of a property as elements declare them, by name."""
+    return {
+        element.name.text: syntax
+        for pack in packs
+        for element in pack.elements
+        for name, syntax in element.values
+        if name.text == prop
+    }
+
+
+def _exchanged(packs: Sequence[PackDecl], prop: str, first: str, second: str) -> list[PackDecl]:
+    """Packs in which two elements have exchanged their values of a property."""
+    values = _values(packs, prop)
+    new = {first: values[second], second: values[first]}
+
+    def exchanged(element: ElementDecl) -> ElementDecl:
+        swapped = tuple(
+            (name, new.get(element.name.text, syntax) if name.text == prop else syntax)
+            for name, syntax in element.values
+        )
+        return replace(element, values=swapped)
+
+    return [replace(pack, elements=tuple(map(exchanged, pack.elements))) for pack in packs]

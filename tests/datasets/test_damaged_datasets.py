@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from powderdsl.datasets import Dataset, Transitions
-from powderdsl.datasets.shards import write_shard
+from powderdsl.datasets.dataset import write_shard
 from powderdsl.diagnostics import CompileError
 from tests.hostile.damage_kinds import npy
 from tests.refusals import refusal

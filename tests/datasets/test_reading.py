@@ -14,10 +14,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from powderdsl.datasets import Dataset
-from powderdsl.datasets.dataset import Batch, drawn
+from powderdsl.datasets.dataset import Batch, drawn, write_shard
 from powderdsl.datasets.flat import flat
 from powderdsl.datasets.manifest import Manifest, Recipe, write_manifest
-from powderdsl.datasets.shards import write_shard
 from powderdsl.diagnostics import CompileError
 from powderdsl.envs import TensorEnv
 from powderdsl.tasks.episodes import TaskProgram

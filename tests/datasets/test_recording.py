@@ -107,7 +107,7 @@ def test_a_full_disk_is_told_with_its_path(
         written += 1
         write_archive(*arguments)
 
-    monkeypatch.setattr("powderdsl.datasets.shards.write_archive", write)
+    monkeypatch.setattr("powderdsl.datasets.dataset.write_archive", write)
     folder = tmp_path / "data"
     with pytest.raises(CompileError, match=rf"PD613.* cannot write {folder}/shard-00000{shards}.npz"):
         record(small, "random", folder, episodes=20, shard=8)

@@ -8,9 +8,8 @@ import pytest
 
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Severity, Source
 from powderdsl.model.check import check
-from powderdsl.model.declarations import PackDecl
+from powderdsl.model.declarations import PackDecl, read_file
 from powderdsl.model.logic.satisfy import Facts, decide, satisfiable
-from powderdsl.model.packs import read_file
 from powderdsl.model.types import FLAG, Expr, integer
 
 HEAD = """pack: yard

@@ -39,7 +39,7 @@ from powderdsl.rl import preset
 from powderdsl.simulation.standalone import standalone_module
 from powderdsl.system.writing import replacing
 from powderdsl.tasks.shipped import load_task, load_task_with_diagnostics
-from powderdsl.testing.properties.refute import refuted
+from powderdsl.testing.properties.search import refuted
 from powderdsl.worldmodel import training
 from powderdsl.worldmodel.config import DataConfig, Machine, TrainConfig
 from powderdsl.worldmodel.networks import custom_network

@@ -17,8 +17,7 @@ from powderdsl.compiler import shipped_rules
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Source
 from powderdsl.diagnostics.diagnostic import diagnostic_data, render_text
 from powderdsl.model.check import check
-from powderdsl.model.declarations import PackDecl, RulesetDecl
-from powderdsl.model.packs import read_file
+from powderdsl.model.declarations import PackDecl, RulesetDecl, read_file
 from powderdsl.model.types import Ruleset
 from powderdsl.syntax.sources import shipped
 from powderdsl.system.reports import as_json

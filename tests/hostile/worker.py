@@ -28,7 +28,7 @@ MODULES = (
     *(f"powderdsl.cli.commands.{name}" for name in COMMANDS),
     "powderdsl.cli.start_worlds",
     "powderdsl.datasets.dataset",
-    "powderdsl.testing.properties.refute",
+    "powderdsl.testing.properties.search",
     "powderdsl.rl.evaluation",
     "powderdsl.experiments.studies.run",
     "powderdsl.tasks.shipped",

@@ -18,8 +18,7 @@ from powderdsl.ir.bits import segments
 from powderdsl.ir.ops import REAL, Node, Program, ordered
 from powderdsl.ir.text import print_program
 from powderdsl.schedule.stages import PLANNERS, plan
-from powderdsl.schedule.text import print_schedule
-from powderdsl.schedule.types import ANSWER, Compute, Guard, Move, Schedule, Sweeps, flat
+from powderdsl.schedule.types import ANSWER, Compute, Guard, Move, Schedule, Sweeps, flat, print_schedule
 
 GOLDEN = Path(__file__).parent / "golden"
 UNREAD = {"powderworld2"}

@@ -17,9 +17,8 @@ from powderdsl.model.text import place_of
 from powderdsl.testing.generators.cases import Start
 from powderdsl.testing.pack_tests.runner import run_examples
 from powderdsl.testing.properties.outcomes import Result
-from powderdsl.testing.properties.refute import refuted
 from powderdsl.testing.properties.running import Runner
-from powderdsl.testing.properties.search import InvariantSearch, SearchPlan
+from powderdsl.testing.properties.search import InvariantSearch, SearchPlan, refuted
 from tests.cli.commands import ROOT, powderdsl
 
 

@@ -10,17 +10,16 @@ import pytest
 import powderdsl
 from powderdsl.analysis.ledger import ledger
 from powderdsl.model.types import Ruleset
-from powderdsl.testing.properties import refute
-from powderdsl.testing.properties.refute import refuted
+from powderdsl.testing.properties import search
 from powderdsl.testing.properties.running import Runner
-from powderdsl.testing.properties.search import InvariantSearch, SearchPlan
+from powderdsl.testing.properties.search import InvariantSearch, SearchPlan, refuted
 from tests.semantics.texts import load_text
 
 
 @pytest.fixture(autouse=True)
 def many_worlds(monkeypatch: pytest.MonkeyPatch) -> None:
     """Try enough worlds that a rule with a small chance is seen to break its invariant."""
-    monkeypatch.setattr(refute, "WORLDS", 1024)
+    monkeypatch.setattr(search, "QUICK_WORLDS", 1024)
 
 
 WISHES = """pack: wishes

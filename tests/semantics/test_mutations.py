@@ -17,7 +17,7 @@ from powderdsl.diagnostics import CompileError, Severity
 from powderdsl.model.text import one_line
 from powderdsl.model.types import Ruleset
 from powderdsl.testing.pack_tests.runner import run_examples
-from powderdsl.testing.properties.refute import quick_results
+from powderdsl.testing.properties.search import quick_results
 
 ROOT = Path(__file__).resolve().parents[2]
 ROWS: list[dict[str, str]] = yaml.load(

@@ -18,7 +18,7 @@ import powderdsl
 from powderdsl.diagnostics import CompileError, Reporter, Source, Span
 from powderdsl.model import reference
 from powderdsl.model.check import check
-from powderdsl.model.packs import PackDecl, read_file
+from powderdsl.model.declarations import PackDecl, read_file
 from powderdsl.model.state import SNAP, slots
 from powderdsl.model.types import Assign, Moment, Move, Swap, Transform
 from powderdsl.simulation.simulator import Simulator, World

@@ -7,8 +7,7 @@ import contextlib
 import powderdsl
 from powderdsl.diagnostics import CompileError, Diagnostic, Reporter, Source
 from powderdsl.model.check import check
-from powderdsl.model.declarations import PackDecl
-from powderdsl.model.packs import read_file
+from powderdsl.model.declarations import PackDecl, read_file
 from powderdsl.model.types import Ruleset
 from tests.compilers import skip_without_compiler
 

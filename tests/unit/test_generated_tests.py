@@ -6,8 +6,7 @@ import pytest
 
 from powderdsl.diagnostics import Source
 from powderdsl.simulation.simulator import compile
-from powderdsl.testing.mutation.judging import Original
-from powderdsl.testing.mutation.written import GeneratedTest, distinguish, with_tests, written_test
+from powderdsl.testing.mutation.judging import GeneratedTest, Original, distinguish, with_tests, written_test
 from powderdsl.testing.pack_tests.runner import run_examples
 from tests.semantics.texts import load_text
 

@@ -12,7 +12,6 @@ import pytest
 from powderdsl import compiler
 from powderdsl.compiler import load_with_diagnostics, lower, parts
 from powderdsl.diagnostics import CompileError
-from powderdsl.model import packs
 from powderdsl.simulation.standalone import standalone_module
 from powderdsl.syntax.sources import shipped
 from powderdsl.system.memo import Memo
@@ -62,8 +61,8 @@ def test_exceptions_are_not_kept() -> None:
 def parse(monkeypatch: pytest.MonkeyPatch) -> Mock:
     """What parses a file, and counts."""
     monkeypatch.setattr(compiler, "persistent", lambda name, inputs, make: make())
-    monkeypatch.setattr(packs, "read_file", Mock(wraps=packs.read_file))
-    return packs.read_file
+    monkeypatch.setattr(compiler, "read_file", Mock(wraps=compiler.read_file))
+    return compiler.read_file
 
 
 @pytest.fixture

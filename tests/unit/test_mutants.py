@@ -9,7 +9,7 @@ import pytest
 
 from powderdsl.compiler import read, shipped_tests, shipped_variants
 from powderdsl.diagnostics import Reporter, Source
-from powderdsl.model.packs import read_file
+from powderdsl.model.declarations import read_file
 from powderdsl.testing.mutation.operators import mutants_of
 from tests.tiers import tiered
 

@@ -16,8 +16,8 @@ from powderdsl.tasks.shipped import load_task
 from powderdsl.worldmodel import Machine, TrainConfig, load_trained, train
 from powderdsl.worldmodel.evaluation import evaluate, evaluate_recording
 from powderdsl.worldmodel.networks import NO_ELEMENT, ActionChannels, without_actions
-from powderdsl.worldmodel.recordings import Recording, open_recording
 from powderdsl.worldmodel.training import finetuned
+from powderdsl.worldmodel.worlds import Recording, open_recording
 from tests.cli.commands import powderdsl as run
 from tests.refusals import refusal
 

@@ -11,7 +11,7 @@ import powderdsl
 from powderdsl.worldmodel import DataConfig, Machine, TrainConfig, evaluate, load_trained, task_worlds, train
 from powderdsl.worldmodel.config import Variety
 from powderdsl.worldmodel.evaluation import unseen_worlds
-from powderdsl.worldmodel.rulesets import UNSEEN_RULESETS, RulesetSource
+from powderdsl.worldmodel.worlds import UNSEEN_RULESETS, RulesetSource
 from tests.refusals import refusal
 
 TASK = """

@@ -136,7 +136,7 @@ def _check(name: str, quick: bool, cost: bool, ledger: bool) -> Checked:
 
 
 def _refuted(ruleset: Ruleset) -> tuple[Diagnostic, ...]:
-    from powderdsl.testing.properties.refute import refuted  # brings numpy
+    from powderdsl.testing.properties.search import refuted  # brings numpy
 
     return refuted(ruleset, _ledger(ruleset))
 

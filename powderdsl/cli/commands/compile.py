@@ -76,7 +76,7 @@ def _schedules(
 ) -> Iterator[str]:
     """The schedule of each pass of a backend after a stage of the planner."""
     from powderdsl.schedule.stages import PLANNERS, steps
-    from powderdsl.schedule.text import print_schedule
+    from powderdsl.schedule.types import print_schedule
 
     stages = PLANNERS.get("wasm" if backend == "auto" else backend)
     if stages is None:

@@ -14,8 +14,7 @@ from powderdsl.cli.exits import BadInput
 from powderdsl.compiler import read, shipped_rules, shipped_words
 from powderdsl.diagnostics import CompileError, Reporter, Severity, Source
 from powderdsl.model.check import check
-from powderdsl.model.declarations import PackDecl
-from powderdsl.model.packs import read_file
+from powderdsl.model.declarations import PackDecl, read_file
 from powderdsl.model.schema import MAX_NAME, NAME
 from powderdsl.system.random import name_number
 from powderdsl.system.writing import write_text

@@ -37,9 +37,8 @@ from powderdsl.testing.properties.running import Runner
 from powderdsl.testing.properties.search import InvariantSearch, SearchPlan, counterexample
 
 if TYPE_CHECKING:
-    from powderdsl.testing.mutation.judging import Verdict
+    from powderdsl.testing.mutation.judging import GeneratedTest, Verdict
     from powderdsl.testing.mutation.operators import Mutant
-    from powderdsl.testing.mutation.written import GeneratedTest
 
 MAX_SECONDS = 24 * 3600
 
@@ -371,7 +370,7 @@ WORDS = {"check": "`check`", "invariant": "invariants", "test": "tests", "genera
 
 
 def _write(judged: Sequence[tuple[Mutant, Verdict]]) -> None:
-    from powderdsl.testing.mutation.written import add_tests
+    from powderdsl.testing.mutation.judging import add_tests
 
     tests: dict[Path, dict[str, GeneratedTest]] = {}
     for mutant, verdict in judged:

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from powderdsl.worldmodel.config import Machine
     from powderdsl.worldmodel.evaluation import Strip, Tested
     from powderdsl.worldmodel.networks import CustomNetwork
-    from powderdsl.worldmodel.recordings import Recording
     from powderdsl.worldmodel.training import Trained, TrainingProgress
+    from powderdsl.worldmodel.worlds import Recording
 
 
 OF_WORLDS = {field.name for field in (*fields(DataConfig), *fields(Variety))} - {"task"}
@@ -280,7 +280,7 @@ def _open_recording(folder: Path, task: str | None) -> Recording:
     from powderdsl.cli.commands.record import require_gymnasium
 
     require_gymnasium()
-    from powderdsl.worldmodel.recordings import open_recording
+    from powderdsl.worldmodel.worlds import open_recording
 
     return open_recording(folder, task)
 

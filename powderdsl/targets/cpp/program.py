@@ -16,11 +16,10 @@ from torch import Tensor
 from powderdsl.ir.ops import Program
 from powderdsl.system import cache
 from powderdsl.system.reading import read_bytes
-from powderdsl.targets.codec import Piece, parameters, pieces
 from powderdsl.targets.cpp.build import build, current, load_library
 from powderdsl.targets.cpp.source import native_source
 from powderdsl.targets.job import Job, Like, OwnedBatch, like_of, shape_of
-from powderdsl.targets.layout import Layout
+from powderdsl.targets.layout import Layout, Piece, parameters, pieces
 
 KEPT_INPUTS = 16
 """The number of mappings of parameters whose inputs a program keeps."""

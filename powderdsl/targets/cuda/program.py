@@ -21,9 +21,9 @@ from torch import Tensor
 
 from powderdsl.ir.ops import Program
 from powderdsl.system import cache as native_cache
-from powderdsl.targets.codec import parameters, pieces
 from powderdsl.targets.cuda.source import KernelSource, cuda_source
 from powderdsl.targets.job import Job, Like, PackedArrays, Runnable, like_of, shape_of, unavailable
+from powderdsl.targets.layout import parameters, pieces
 from powderdsl.targets.tensor_kind import pack
 from powderdsl.targets.torch.program import packed_program
 

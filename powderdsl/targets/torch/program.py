@@ -18,8 +18,8 @@ from powderdsl.ir.bits import segments
 from powderdsl.ir.ops import SNAP, Program, Threshold, kernel_rows
 from powderdsl.system.memo import collection_paused
 from powderdsl.system.random import MASK, base_keys, mix
-from powderdsl.targets.codec import limits, pieces
 from powderdsl.targets.job import Job, Runnable, mixed_program
+from powderdsl.targets.layout import limits, pieces
 from powderdsl.targets.torch.source import load_source, pass_source
 
 PassFunction = Callable[[Any, dict[str, Tensor]], dict[str, Tensor]]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from powderdsl.targets.codec import Piece
-from powderdsl.targets.layout import Layout
+from powderdsl.targets.layout import Layout, Piece
 
 HEADER = 16
 """Bytes of numbers before the contents of planes, fields and batches."""

@@ -16,9 +16,8 @@ from powderdsl.ir.text import structure
 from powderdsl.system.cache import persistent
 from powderdsl.system.memo import Memo
 from powderdsl.targets.array_kind import Array, ArrayKind
-from powderdsl.targets.codec import parameters, pieces
 from powderdsl.targets.job import Job, Like, OwnedBatch, like_of, shape_of
-from powderdsl.targets.layout import layout_of
+from powderdsl.targets.layout import layout_of, parameters, pieces
 from powderdsl.targets.wasm.batches import GROUPS, HEADER, aligned, numbers_of
 from powderdsl.targets.wasm.host import Compiled, this_host
 

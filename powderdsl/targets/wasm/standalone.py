@@ -27,7 +27,7 @@ from functools import partial
 from typing import TypeVar
 
 from powderdsl.ir.ops import SNAP, Threshold
-from powderdsl.targets.codec import Piece
+from powderdsl.targets.layout import Piece
 from powderdsl.targets.wasm.batches import HEADER, aligned, numbers_of
 from powderdsl.targets.wasm.binary import F64, I32, Callee, Local, Value, body, const, load, op
 from powderdsl.targets.wasm.driver import Batches
