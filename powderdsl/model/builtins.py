@@ -110,6 +110,6 @@ ELSEWHERE = {
     "ceil": "`a div b` divides integers and rounds down: `(a + b - 1) div b` rounds up",
     "sqrt": "there are no roots; `length(VEC2)` is the length of a vector",
     "pow": "powers are written out: `x * x`",
-    "distance": "`length(VEC2)` is the length of a vector",
+    "distance": "`count(SET in disc(3)) > 0` asks what is near; `length(VEC2)` is the length of a vector",
 }
 """Words of other languages, and what to write instead."""

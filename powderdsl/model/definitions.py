@@ -337,7 +337,8 @@ def set_params(ruleset: Ruleset, values: Mapping[str, Any], reporter: Reporter) 
     for name, value in values.items():
         if name not in known:
             names = ", ".join(sorted(known)) or "none"
-            helps = suggest(name, known, "parameters") or (f"parameters: {names}",)
+            close = [f"did you mean `{other}`?" for other in known if other.endswith(f".{name}")]
+            helps = close[:1] or suggest(name, known, "parameters") or (f"parameters: {names}",)
             reporter.error("PD309", f"unknown parameter `{name}`", None, helps=helps)
             continue
         kind = known[name].kind

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from powderdsl.diagnostics import Reporter, Source, Span, suggest
 from powderdsl.model.builtins import (
     COORDINATES,
+    DIRECTIONS,
     ELSEWHERE,
     KERNEL_SHAPES,
     KERNELS,
@@ -499,6 +500,9 @@ def call(typer: Typer, syntax: Syntax, scope: Scope) -> Operand:
     if function is None and name not in KERNEL_SHAPES:
         word = Span(syntax.span.source, syntax.span.start, syntax.span.start + len(name))
         meant = ELSEWHERE.get(name.lower())
+        if name in DIRECTIONS:
+            rows, columns = (2 * part for part in DIRECTIONS[name])
+            meant = f"a cell further away is `at(ROWS, COLUMNS)`: here `at({rows}, {columns})`"
         helps = (meant,) if meant else suggest(name, [*FUNCTIONS, *KERNEL_SHAPES], "functions")
         if not helps:
             helps = (f"functions: {', '.join(f'`{known}`' for known in FUNCTIONS)}",)

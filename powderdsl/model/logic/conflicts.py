@@ -34,6 +34,7 @@ from powderdsl.model.logic.satisfy import (
     single_domains,
 )
 from powderdsl.model.operations import OPERATIONS
+from powderdsl.model.text import one_line
 from powderdsl.model.types import (
     FLAG,
     HERE,
@@ -191,14 +192,15 @@ def check_logic(
             fix = "remove it, or name another element after `->`"
             reporter.report("PD509", "this rule changes nothing", span, label, helps=[fix])
         else:
-            _report_silent(span, silent[span], facts.relaxed(), elaborated, reporter)
+            _report_silent(span, silent[span], facts, elaborated, reporter)
     return passes, useful.where(None)
 
 
 def _report_silent(
-    span: Span, copies: list[tuple[Expr, Lets]], relaxed: Facts, elaborated: Elaborator, reporter: Reporter
+    span: Span, copies: list[tuple[Expr, Lets]], facts: Facts, elaborated: Elaborator, reporter: Reporter
 ) -> None:
     """Report a rule that never fires, and why."""
+    relaxed = facts.relaxed()
     if span in elaborated.inactive:
         reason = f"`{elaborated.inactive[span]}` is not loaded"
     elif span in elaborated.empty:
@@ -206,13 +208,43 @@ def _report_silent(
     elif any(decide(relaxed, [(mask, HERE)], lets) for mask, lets in copies):
         reason = "no loaded element has the properties it asks for"
     else:
-        fix = "look for conditions that exclude each other, or that the properties of no element meet"
-        label = "no cell can meet all of its conditions"
-        reporter.report("PD503", "this rule can never fire", span, label, helps=[fix])
+        _report_impossible(span, copies[0], facts, reporter)
         return
     label = "cannot happen with these packs"
     fix = "it becomes active with a pack that brings what it asks for"
     reporter.report("PD506", f"this rule is inactive: {reason}", span, label, helps=[fix])
+
+
+def _report_impossible(span: Span, copy: tuple[Expr, Lets], facts: Facts, reporter: Reporter) -> None:
+    """Report the conditions of a rule that exclude each other, as few as possible."""
+    mask, lets = copy
+    parts = [mask]
+    while any(part.op == "and" for part in parts):
+        parts = [inner for part in parts for inner in (part.args if part.op == "and" else (part,))]
+    for part in [*parts]:
+        others = [other for other in parts if other is not part]
+        if others and decide(facts, [(other, HERE) for other in others], lets) is False:
+            parts = others
+    notes = [
+        f"`{one_line(arg.span)}` lies in {arg.kind.lo:g}..{arg.kind.hi:g}"
+        for part in parts
+        for arg in part.args
+        if part.op in ("lt", "le", "eq")
+        and arg.op != "const"
+        and arg.kind.name in ("int", "real")
+        and arg.span
+    ]
+    places = [part.span for part in parts if part.span is not None]
+    label = "this is never true" if len(parts) == 1 else "not together with the others"
+    reporter.report(
+        "PD503",
+        "this rule can never fire",
+        span,
+        "no cell can meet all of its conditions",
+        secondary=[Label(place, label) for place in places if place != span],
+        notes=notes,
+        helps=["change the conditions that are underlined, or remove the rule"],
+    )
 
 
 def _report_conflicts(
