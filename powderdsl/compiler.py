@@ -23,6 +23,7 @@ from powderdsl.system.cache import persistent
 from powderdsl.system.fingerprint import fingerprint
 from powderdsl.system.memo import Memo, collection_paused
 from powderdsl.system.reading import inside, is_path
+from powderdsl.system.writing import failure
 
 if TYPE_CHECKING:
     from powderdsl.ir.bits import Segment
@@ -211,17 +212,20 @@ def read(names: Sequence[str | Path], reporter: Reporter) -> tuple[list[PackDecl
     return _Reader(reporter).read_all(names)
 
 
-def split_names(name: str | Path) -> tuple[list[str], list[str]]:
+def split_names(name: Any) -> tuple[list[str], list[str]]:
     """Split ``a+b-c`` into names to load and names to leave out.
 
     Existing files are paths, even if their names contain ``+`` or ``-``: the longest run of parts between ``+`` that
     names a file is one path. After ``.yaml``, a ``-`` leaves a pack out, too.
     """
+    if not isinstance(name, str | Path):
+        helps = ["one text each: load('a', 'b'), or load('a+b')"]
+        raise failure("PD304", f"rules are named by texts, found {type(name).__name__}", helps=helps)
     if isinstance(name, Path):
         return [str(name)], []
     plus: list[str] = []
     minus: list[str] = []
-    parts = str(name).split("+")  # callers of the Python API may pass anything
+    parts = name.split("+")
     while parts:
         count = min(len(parts), MAX_PLUSES + 1)
         head, rest = _without("+".join(parts[:count]))

@@ -433,7 +433,7 @@ class Simulator:
         """Set cells of a mask: fresh cells of an element, and values of fields.
 
         Args:
-            where: bool [B, H, W] or [H, W].
+            where: bool [B, H, W] or [H, W]; or an index of cells, such as ``(slice(0, 8), slice(0, 8))``, in all worlds.
             element: the element's name, plain or qualified.
             fields: values by field name; vectors as (rows, columns).
 
@@ -443,6 +443,9 @@ class Simulator:
             ValueError: a wrong shape or value, as in `replace`.
         """
         xp = self.kind.xp
+        if isinstance(where, tuple | slice):  # as arrays are indexed, in all worlds
+            index, where = where, np.zeros(world.shape[1:], dtype=np.bool_)
+            where[index] = True
         mask = self._broadcast(where, "where", world.shape)
         if self.kind.sort(mask) != "bool":
             raise TypeError(f"where must be a bool mask, found {mask.dtype}")

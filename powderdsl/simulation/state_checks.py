@@ -28,6 +28,8 @@ def unknown_name(kind: str, name: str, known: Iterable[str], kinds: str = "") ->
 
 def unknown_slot(ruleset: Ruleset, name: str) -> KeyError:
     """The error for a name that is neither a field nor a property."""
+    if ruleset.element(name) is not None:
+        return KeyError(f"`{name}` is an element, not a field: world.count({name!r}) counts its cells")
     known = [*(slot.name for slot in slots(ruleset)), *(prop.name for prop in ruleset.properties)]
     return KeyError(
         with_suggestion(f"{ruleset.name} has no field or property `{name}`", name, known, "it has")

@@ -50,6 +50,22 @@ def test_elements_and_tags_are_counted(sim: powderdsl.Simulator, garden: powderd
     assert garden.count("fluid")[0] == np.isin(garden.ids[0], fluids).sum()
     with pytest.raises(KeyError, match="did you mean `sand`"):
         garden.count("snad")
+    with pytest.raises(KeyError, match="`sand` is an element"):
+        garden["sand"]
+
+
+def test_an_index_says_where_to_paint(sim: powderdsl.Simulator, garden: powderdsl.World) -> None:
+    mask = np.zeros(garden.shape[1:], dtype=bool)
+    mask[:8, 3:5] = True
+    painted = sim.paint(garden, where=(slice(0, 8), slice(3, 5)), element="lava")
+    assert torch.equal(painted.ids, sim.paint(garden, where=mask, element="lava").ids)
+
+
+def test_rules_are_named_by_texts() -> None:
+    with pytest.raises(CompileError, match=r"one text each"):
+        powderdsl.load(["core", "sand"])
+    with pytest.raises(CompileError, match=r"did you mean `water\.melt`"):
+        powderdsl.load("core+water", params={"melt": "50%"})
 
 
 def test_frames_are_the_start_and_each_stride(sim: powderdsl.Simulator, garden: powderdsl.World) -> None:

@@ -150,8 +150,9 @@ def test_elements_need_only_be_known_where_they_are_drawn():
     few = powderdsl.load("core+sand+water")
     assert load_scene(f"{DESIGNED}#sand-on-water", few).shape == (64, 64)
     errors = refusal(load_scene, f"{DESIGNED}#stone-arches", few)
-    assert {found.code for found in errors} == {"PD604"}
-    assert len(errors) == 6
+    assert [(found.code, found.primary.span.text) for found in errors] == [("PD604", "stone")]
+    (found,) = refusal(load_scene, "fish-tank", powderdsl.load("core+sand"))
+    assert "`fish-tank` is drawn with elements that core+sand lacks: `water`, `wood`, `fish`" in found.message
 
 
 # What can be wrong. Each row: the file, the code, the text under the caret.

@@ -325,11 +325,20 @@ def draw_start(scene: Scene, ruleset: Ruleset, *, size: Size | None = None) -> S
         for paint in scene.paints
     ]
     used = [(paint.element, paint.element_span) for paint in paints if isinstance(paint, Paint)]
+    unknown: dict[str, Span | None] = {}
     for name, span in ((scene.fill, scene.fill_span), *used):
         if name not in ids:
-            helps = suggest(name, {element.name for element in ruleset.elements}, "its elements")
-            label = "not an element of this ruleset"
-            reporter.error("PD604", f"unknown element `{name}`", span, label, helps=helps)
+            unknown.setdefault(name, span)
+    helps = {name: suggest(name, {e.name for e in ruleset.elements}, "its elements") for name in unknown}
+    others = [name for name in unknown if not "".join(helps[name]).startswith("did")]
+    if len(others) > 1:  # not misspelled: drawn for other rules
+        names = ", ".join(f"`{name}`" for name in others)
+        message = f"`{scene.name}` is drawn with elements that {ruleset.name} lacks: {names}"
+        fix = "load rules that have them, or name another scene"
+        reporter.error("PD604", message, unknown[others[0]], "the first of them", helps=[fix])
+    for name in (name for name in unknown if len(others) < 2 or name not in others):
+        label = "not an element of this ruleset"
+        reporter.error("PD604", f"unknown element `{name}`", unknown[name], label, helps=helps[name])
     slot_of = {slot.name: slot for slot in slots(ruleset) if slot.name != "element"}
     settings = [paint for paint in paints if isinstance(paint, Setting)]
     values = {setting: value_of(setting, slot_of, ids, ruleset, reporter) for setting in settings}
