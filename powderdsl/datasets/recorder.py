@@ -26,10 +26,10 @@ from powderdsl.datasets.manifest import (
     write_manifest,
 )
 from powderdsl.diagnostics import CompileError
-from powderdsl.envs.acting import FrameStack, Policy, action_keys, random_policy
-from powderdsl.envs.observations import Observation, observation_of
-from powderdsl.envs.tensor_env import TensorEnv
+from powderdsl.envs.actions import FrameStack, Policy, random_policy
+from powderdsl.envs.tensor_env import Observation, TensorEnv, observation_of
 from powderdsl.experiments.runs import differences, lock_folder
+from powderdsl.system.random import action_keys
 from powderdsl.system.settings import check_count
 from powderdsl.system.writing import failure, not_writable
 from powderdsl.tasks.episodes import TaskProgram
@@ -82,7 +82,7 @@ def record(
     Args:
         task: as in `TensorEnv`.
         policy: ``random``, ``nothing`` or ``expert``, or a function from observations and keys to actions: see
-            `envs.acting.Policy`. Keys follow from the seed, the episode and the action's number; a stochastic policy
+            `envs.actions.Policy`. Keys follow from the seed, the episode and the action's number; a stochastic policy
             draws by them.
         folder: the folder to write, which is made, but not its parent.
         episodes: the number of episodes.

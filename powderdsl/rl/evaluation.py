@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from powderdsl.envs.acting import FrameStack, Policy, action_keys, random_policy
-from powderdsl.envs.observations import observation_of
-from powderdsl.envs.tensor_env import TensorEnv
+from powderdsl.envs.actions import FrameStack, Policy, random_policy
+from powderdsl.envs.tensor_env import TensorEnv, observation_of
 from powderdsl.experiments.runs import Estimate, RunFolder, find_run, mean_and_interval, write_json
 from powderdsl.rl.config import BASELINES, TrainConfig, chosen_policies
 from powderdsl.rl.policies import TrainedPolicy, config_of, load_policy, task_of
 from powderdsl.simulation.draw import OUTLINES, contact_sheet, looks, outline, rgb, scale, shown_fields
 from powderdsl.simulation.simulator import World
+from powderdsl.system.random import action_keys
 from powderdsl.tasks.episodes import Episodes, TaskProgram, compile_task
 from powderdsl.tasks.players import ExpertPlayer
 from powderdsl.tasks.shipped import check_split

@@ -16,7 +16,6 @@ from stable_baselines3.common.type_aliases import Schedule
 from torch import Tensor, nn
 from torch.distributions import Categorical
 
-from powderdsl.envs.acting import uniforms
 from powderdsl.envs.actions import ActionForm, action_form
 from powderdsl.envs.features import paper_policy, patches_of, small_policy
 from powderdsl.envs.tensor_env import TensorEnv
@@ -29,6 +28,7 @@ from powderdsl.experiments.runs import (
     reporting_misfits,
 )
 from powderdsl.rl.config import TrainConfig, from_json
+from powderdsl.system.random import uniforms
 from powderdsl.tasks.episodes import compile_task
 from powderdsl.tasks.shipped import load_task
 from powderdsl.tasks.task import Task
@@ -194,7 +194,7 @@ def policy_of(config: TrainConfig, env: TensorEnv) -> tuple[type[ActorCriticPoli
 
 @dataclass(frozen=True)
 class TrainedPolicy:
-    """The policy of a run: a function as `envs.acting.Policy` says.
+    """The policy of a run: a function as `envs.actions.Policy` says.
 
     `deterministic`: the likeliest action, instead of one drawn. If `frames` is not 1, it takes that many observations,
     stacked by a `FrameStack`.
@@ -246,7 +246,7 @@ def load_policy(run: RunFolder | str | Path, env: TensorEnv, *, deterministic: b
         deterministic: take the likeliest action, instead of drawing one.
 
     Returns:
-        A function from observations [B, …] and keys, int64 [B], to actions, int64 [B, 5]: see `envs.acting.Policy`.
+        A function from observations [B, …] and keys, int64 [B], to actions, int64 [B, 5]: see `envs.actions.Policy`.
 
     Raises:
         CompileError: PD620 if there is no such run or checkpoint; PD623 if the environment does not fit the run.

@@ -29,9 +29,8 @@ from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
 from powderdsl.compiler import whole_palette
 from powderdsl.datasets.dataset import Dataset, Transitions, drawn
 from powderdsl.datasets.recorder import record
-from powderdsl.envs.observations import channels_of
 from powderdsl.envs.sb3 import PowderVecEnv
-from powderdsl.envs.tensor_env import check_cells
+from powderdsl.envs.tensor_env import channels_of, check_cells
 from powderdsl.experiments.runs import (
     Metrics,
     RunFolder,

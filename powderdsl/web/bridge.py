@@ -156,8 +156,7 @@ class Session:
 
     def ledger(self) -> str:
         """The ledger of created, destroyed and conserved elements, as `check --ledger` prints it."""
-        from powderdsl.analysis.account import ledger_text
-        from powderdsl.analysis.ledger import ledger
+        from powderdsl.analysis.ledger import ledger, ledger_text
 
         return ledger_text(ledger(self._rules()))
 

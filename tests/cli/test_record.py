@@ -14,8 +14,8 @@ import torch
 
 from powderdsl.datasets import Dataset, record
 from powderdsl.envs import TensorEnv
-from powderdsl.envs.acting import action_keys
 from powderdsl.rl.policies import load_policy
+from powderdsl.system.random import action_keys
 from powderdsl.tasks.episodes import compile_task
 from tests.cli.commands import command_line, environment_with, powderdsl
 from tests.envs.conftest import SMALL

@@ -16,8 +16,9 @@ from powderdsl.datasets import Dataset, record
 from powderdsl.datasets.manifest import MAX_SHARDS, read_manifest, recipe_of
 from powderdsl.diagnostics import CompileError
 from powderdsl.envs import TensorEnv
-from powderdsl.envs.acting import action_keys, random_policy
+from powderdsl.envs.actions import random_policy
 from powderdsl.system.archives import write_archive
+from powderdsl.system.random import action_keys
 from powderdsl.tasks.episodes import TaskProgram
 from tests.refusals import refusal
 

@@ -21,9 +21,8 @@ import powderdsl.envs  # noqa: F401
 from powderdsl.envs.actions import KINDS as ACTIONS
 from powderdsl.envs.features import Expand, paper_policy
 from powderdsl.envs.gym import GoalEnv, PowderEnv, PowderVectorEnv
-from powderdsl.envs.observations import KINDS
 from powderdsl.envs.sb3 import PowderVecEnv
-from powderdsl.envs.tensor_env import TensorEnv
+from powderdsl.envs.tensor_env import OBSERVATIONS, TensorEnv
 from powderdsl.tasks.episodes import TaskProgram, compile_task
 from powderdsl.tasks.shipped import shipped_tasks
 from tests.tiers import tiered
@@ -38,7 +37,7 @@ def test_both_checkers_pass_without_a_warning(name: str) -> None:
     program = compile_task(name, backend="wasm")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for kind, actions in zip(KINDS, [*ACTIONS, "discrete"], strict=True):
+        for kind, actions in zip(OBSERVATIONS, [*ACTIONS, "discrete"], strict=True):
             env = PowderEnv(program, observation=kind, actions=actions, action_mask=kind == "ids")
             check_gymnasium(env, skip_render_check=True)
             check_sb3(FlattenObservation(env) if kind == "matrix" else env)

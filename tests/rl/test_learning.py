@@ -11,7 +11,7 @@ import torch
 from stable_baselines3.common.vec_env import VecFrameStack
 
 from powderdsl.datasets import Dataset, record
-from powderdsl.envs.acting import FrameStack
+from powderdsl.envs.actions import FrameStack
 from powderdsl.envs.sb3 import PowderVecEnv
 from powderdsl.envs.tensor_env import TensorEnv
 from powderdsl.experiments.runs import read_metrics

@@ -13,14 +13,14 @@ import torch
 from PIL import Image
 
 from powderdsl.diagnostics import CompileError
-from powderdsl.envs.acting import action_keys, random_policy
-from powderdsl.envs.observations import observation_of
-from powderdsl.envs.tensor_env import TensorEnv
+from powderdsl.envs.actions import random_policy
+from powderdsl.envs.tensor_env import TensorEnv, observation_of
 from powderdsl.experiments.runs import RunFolder
 from powderdsl.rl import evaluate, load_policy, train
 from powderdsl.rl.evaluation import HAND, Film, film, play
 from powderdsl.simulation.draw import OUTLINES
 from powderdsl.simulation.simulator import World
+from powderdsl.system.random import action_keys
 from powderdsl.tasks.episodes import TaskProgram, compile_task
 from powderdsl.tasks.shipped import load_task
 from tests.cli.commands import powderdsl

@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from powderdsl.analysis.account import ledger_text
-from powderdsl.analysis.ledger import Ledger, NotProven, Proven, ledger
+from powderdsl.analysis.ledger import Ledger, NotProven, Proven, ledger, ledger_text
 from powderdsl.compiler import load
 from powderdsl.model.state import slots
 from powderdsl.model.types import ELEMENT, Ruleset

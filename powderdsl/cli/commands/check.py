@@ -84,7 +84,7 @@ def command(
         if cost:
             data["cost"] = {result.name: result.cost for result in results if result.cost is not None}
         if ledger:
-            from powderdsl.analysis.account import ledger_data
+            from powderdsl.analysis.ledger import ledger_data
 
             data["ledger"] = {result.name: ledger_data(result.ledger) for result in results if result.ledger}
         print_json(data)
@@ -108,7 +108,7 @@ def _lines(result: Checked, notes: bool) -> Iterator[str]:
     if result.cost is not None:
         yield from ("", *_cost_lines(result.cost))
     if result.ledger is not None:
-        from powderdsl.analysis.account import ledger_text
+        from powderdsl.analysis.ledger import ledger_text
 
         yield from ("", ledger_text(result.ledger))
 
