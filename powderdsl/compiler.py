@@ -219,7 +219,7 @@ def split_names(name: Any) -> tuple[list[str], list[str]]:
     names a file is one path. After ``.yaml``, a ``-`` leaves a pack out, too.
     """
     if not isinstance(name, str | Path):
-        helps = ["one text each: load('a', 'b'), or load('a+b')"]
+        helps = ("one text each: load('a', 'b'), or load('a+b')",)
         raise failure("PD304", f"rules are named by texts, found {type(name).__name__}", helps=helps)
     if isinstance(name, Path):
         return [str(name)], []
