@@ -48,19 +48,6 @@ GROUPS = {
 }
 COMMANDS = {name: summary for group in GROUPS.values() for name, summary in group.items()}
 
-COMPLETE = "_POWDERDSL_COMPLETE"
-ENVIRONMENT = {
-    "NO_COLOR": "No colors, also on a terminal.",
-    "FORCE_COLOR": "Colors, also without a terminal.",
-    "CXX": "C++ compiler of the backend native.",
-    "POWDERDSL_ARCH": "Processor that it compiles for, such as x86-64-v3.  [default: this one]",
-    "XDG_CACHE_HOME": "Folder of the cache of checked and compiled rules.  [default: ~/.cache]",
-    "CI": "`powderdsl test` keeps no counterexamples.",
-    "POWDERDSL_DEBUG": "1: tracebacks of mistakes in powderdsl itself.",
-    COMPLETE: "bash_source: print what completes commands in bash; README.md has other shells.",
-}
-"""Variables that commands read."""
-
 
 _usual = warnings.formatwarning
 
@@ -93,7 +80,7 @@ class GuardedCommand(click.Command):
         if os.environ.pop(LIFELINE, None):
             end_with_stdin()
         # For completion, click writes bytes that a shell reads: names of ours, and nothing from files.
-        completes = COMPLETE in os.environ
+        completes = "_POWDERDSL_COMPLETE" in os.environ
         with nullcontext() if completes else printable_streams(), interruptible():
             try:
                 status = super().main(args, prog_name or self.name, *rest, **options)
@@ -114,14 +101,14 @@ class CommandGroup(GuardedCommand, click.Group):
 
             ctx.fail(with_suggestion(f"no command `{cmd_name}`", cmd_name, COMMANDS, "commands"))
         command: click.Command = import_module(f"powderdsl.cli.commands.{cmd_name}").command
-        if COMPLETE in os.environ:
+        if ctx.resilient_parsing:  # a shell asks
             from powderdsl.cli.completion import add_completion
 
             add_completion(command)
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        for title, rows in {**GROUPS, "Environment variables": ENVIRONMENT}.items():
+        for title, rows in GROUPS.items():
             with formatter.section(title):
                 formatter.write_dl(list(rows.items()))
 
@@ -141,4 +128,6 @@ def main() -> None:
     \b
         powderdsl run RULES --watch
         powderdsl new NAME && powderdsl check core+NAME.yaml
+
+    docs/shell.md lists environment variables, and says how shells complete words.
     """

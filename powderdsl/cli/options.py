@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 Option = Callable[[Any], Any]
 """A decorator that gives a command an option."""
+Presets = Mapping[str, Mapping[str, Any]] | None
 
 MAX_SIDE = 1 << 24
 """Rows or columns of a world; `worlds` limits the number of cells."""
@@ -170,13 +171,7 @@ def several(*options: Option) -> Option:
     return decorate
 
 
-def settings_of(
-    config: type,
-    presets: Mapping[str, Mapping[str, Any]] | None = None,
-    *,
-    only: Sequence[str] = (),
-    **names: str,
-) -> Option:
+def settings_of(config: type, presets: Presets = None, *, only: Sequence[str] = (), **names: str) -> Option:
     """An option for each field of a dataclass that has a help text (`system.settings`). Its default is None.
 
     The settings themselves report values out of range, all mistakes together. `presets`: the settings that each changes,
@@ -186,7 +181,7 @@ def settings_of(
     return several(*(_setting(field, names.get(field.name, ""), presets) for field in chosen))
 
 
-def _setting(field: Field[Any], name: str, presets: Mapping[str, Mapping[str, Any]] | None) -> Option:
+def _setting(field: Field[Any], name: str, presets: Presets) -> Option:
     about = field.metadata.get("about")
     if not about:
         return several()
@@ -213,19 +208,19 @@ def given_options(values: Mapping[str, Any], names: Iterable[str]) -> dict[str, 
     return {name: values[name] for name in names if values.get(name) not in (None, (), {})}
 
 
+def given_settings(values: Mapping[str, Any], config: type, without: Sequence[str] = ()) -> dict[str, Any]:
+    """The settings of a dataclass that were given as options."""
+    return given_options(values, [setting.name for setting in fields(config) if setting.name not in without])
+
+
 rules = click.argument("rules", metavar="RULES")
 """RULES: what `powderdsl.load` takes."""
 
 parameters = pairs(
-    "--set",
-    "PACK.PARAM=VALUE",
-    "Another value for a parameter of the rules, such as 5%. May be repeated.",
-    "settings",
+    "--set", "PACK.PARAM=VALUE", "Another value for a parameter of the rules, such as 5%.", "settings"
 )
 """Names and values are checked later, with the model."""
-world = click.option(
-    "--world", metavar="FILE|NAME", help="A .npz, .png, .txt or .yaml file, or the name of a scene."
-)
+world = option("--world", "FILE|NAME", "A .npz, .png, .txt or .yaml file, or the name of a scene.")
 size = option("--size", SIZE, "Rows and columns, such as 48x64.")
 device = click.option("--device", default="cpu", help="A torch device: cpu, cuda, cuda:1.")
 
@@ -269,9 +264,7 @@ class Command(click.Command):
 def pack_list(name: str, about: str, read: Callable[[str], str] = str, **more: Any) -> Option:
     """An option for packs, joined by commas; it may be repeated."""
 
-    def joined(
-        ctx: click.Context, param: click.Parameter, lists: tuple[tuple[str, ...], ...]
-    ) -> tuple[str, ...]:
+    def joined(ctx: Any, param: Any, lists: Sequence[Sequence[str]]) -> tuple[str, ...]:
         return tuple(read(pack) for packs in lists for pack in packs)
 
     return option(name, NAMES, about, metavar="PACK,PACK", multiple=True, callback=joined, **more)
@@ -283,6 +276,7 @@ def _place(pack: str) -> str:
 
 
 packs = pack_list("--packs", "Packs, by name or file, that are added to the task's rules.", _place)
+task_options = several(knobs("Another value for a knob of a task. May be repeated."), parameters, packs)
 
 
 BACKEND = click.Choice(list(BACKENDS))
@@ -290,6 +284,9 @@ BACKEND = click.Choice(list(BACKENDS))
 
 def backend(default: str | None, about: str = "Backend that runs the rules.") -> Option:
     return click.option("--backend", type=BACKEND, default=default, help=about)
+
+
+machine = several(backend("auto"), device, option("--threads", (1, 1024), "CPU threads.", 1))
 
 
 def load_rules(rules: str, settings: dict[str, str]) -> Ruleset:

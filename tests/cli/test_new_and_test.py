@@ -78,6 +78,23 @@ def test_tests_that_pass(folder):
     assert result.stdout.endswith("all passed\n")
 
 
+def test_what_rules_name_is_reported(folder):
+    """Of other packs, the number of tests that pass, and what is wrong."""
+    (folder / "grit.yaml").write_text(PACK + TESTS)
+    for rules, own, counted in [
+        ("core+water+grit.yaml", "grit", "grit.yaml: 1 of 1 rule happened"),
+        ("water", "water", "rules/water.yaml: "),
+    ]:
+        lines = powderdsl("test", rules, "--examples", 0, exits=0).stdout.splitlines()
+        passed = [line.split()[1] for line in lines if line.startswith("ok ")]
+        assert {*passed} == {f"{own}:", "other"}
+        assert passed[-1] == "other"
+        assert not [line for line in lines if "core:" in line or "core.yaml" in line]
+        assert [line for line in lines if line.startswith(counted) or f"/{counted}" in line]
+    lines = powderdsl("test", "core+water", "--examples", 0, exits=0).stdout.splitlines()
+    assert {"core:", "water:"} == {line.split()[1] for line in lines if line.startswith("ok ")}
+
+
 def test_what_is_not_as_expected_is_shown(folder):
     result = run_tests(TESTS.replace(". x x .", ". x . ."), folder, exits=1)
     place = "grit.yaml:12: row 2, column 2 is `grit`, not `empty` (seed 0, after 3 steps)"

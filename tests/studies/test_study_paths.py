@@ -114,7 +114,7 @@ def test_results_with_a_link_that_leads_out_are_refused(tmp_path):
 def test_every_word_that_stands_for_a_value_is_known():
     """An option with a new kind of value must say what it is before studies may give it."""
     plain = ["N", "A,B", "NAME=N", "PACK.PARAM=VALUE", "PROPERTY", "CHANCE", "MINUTES"]
-    plain += ["SPLIT", "DIR", "DEVICE", "SWAP"]
+    plain += ["SPLIT", "SPLIT,SPLIT", "DIR", "DEVICE", "SWAP"]
     found = commands()
     assert set(found) == set(CALLED)
     for words in CALLED:

@@ -8,7 +8,6 @@ import click
 
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import user_values
-from powderdsl.cli.options import find_played
 from powderdsl.cli.output import print_json
 from powderdsl.system.reports import table
 
@@ -29,9 +28,7 @@ if TYPE_CHECKING:
     "--deterministic/--sampled", default=False, help="Take the likeliest action, or draw one as in training."
 )
 @opt.option("--seed", (0, 2**32 - 1), "Seed of what policies draw.", 0)
-@opt.knobs("For a task: another value for a knob.")
-@opt.parameters
-@opt.packs
+@opt.task_options
 @click.option("--backend", type=opt.BACKEND, help="Backend that runs the rules.  [default: the run's]")
 @click.option("--device", help="A torch device.  [default: the run's]")
 @opt.option("--json", bool, "One JSON object instead of a table.", to="as_json")
@@ -48,7 +45,7 @@ def command(
     The result is also written to evaluation.json in the run's folder. For a TASK,
     policies that need no training are compared.
     """
-    played = find_played(run, knobs, settings, packs)
+    played = opt.find_played(run, knobs, settings, packs)
     from powderdsl.rl.evaluation import evaluate
 
     with user_values():

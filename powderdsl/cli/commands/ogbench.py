@@ -19,9 +19,7 @@ from powderdsl.cli.output import counted, progress
 @opt.option("--episodes", (1, 1 << 30), "Training episodes.  [default: as many as OGBench has]")
 @opt.option("--validation", (1, 1 << 30), "Validation episodes.  [default: a tenth]")
 @opt.option("--seed", (0, (1 << 61) - 1), "Seed of the episodes.", 0)
-@opt.option("--threads", (1, 1024), "CPU threads.", 1)
-@opt.backend("auto")
-@opt.device
+@opt.machine
 def command(level: str, out: Path, threads: int, backend: str, device: str, **how: Any) -> int:
     """Collect the data set of LEVEL, easy, medium or hard: scripted play, in OGBench's files.
 

@@ -33,9 +33,7 @@ if TYPE_CHECKING:
 @opt.option("--observation", ("ids", "compact"), "Record elements only, or the whole state.", "ids")
 @opt.option("--seed", (0, (1 << 61) - 1), "World of the first episode, and seed of the policy.", 0)
 @opt.option("--worlds", (1, (1 << 61) - 1), "How many worlds there are to draw from.", 1_000_000)
-@opt.knobs("Another value for a knob of the task.")
-@opt.parameters
-@opt.packs
+@opt.task_options
 @opt.option("--shard", (1, 1 << 32), "Episodes per file.  [default: 256, or 256 MiB]")
 @opt.option("--compress", bool, "Smaller files, slower to read.")
 @opt.option("--envs", (1, 1 << 20), "Maximum number of episodes played at once.", 256)

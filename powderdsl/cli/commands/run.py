@@ -48,15 +48,13 @@ class Playback:
 @opt.option("--batch", (1, 1 << 20), "Number of worlds.  [default: 1]")
 @opt.option("--steps", (0, 10**9), "Number of steps.", 240)
 @opt.option("--seed", (0, 2**63 - 1), "Seed of all random numbers.  [default: 0]")
-@opt.backend("auto")
-@opt.device
+@opt.machine
 @opt.parameters
 @opt.output("--out", "FILE", "Write a .png, .gif or .mp4, or save the world as .npz.", *SUFFIXES)
 @opt.option("--scale", (1, 64), "Pixels per cell.  [default: about 400 a side]")
 @opt.option("--every", (1, 10**6), "Show every n-th step.", 1)
 @opt.option("--fps", (1, 240), "Frames per second.", 30)
 @opt.option("--watch", bool, "Show the first world in the terminal while it runs.")
-@opt.option("--threads", (1, 1024), "CPU threads.", 1)
 @click.option("-v", "--verbose", is_flag=True, help="Report the speed and the backend.")
 def command(
     rules: str,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Collection, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import monotonic
@@ -115,7 +115,8 @@ def command(
 class _Report:
     """One call of the command: its options, and its results so far.
 
-    `keep`: whether counterexamples are kept. `picture`: where the first one is drawn.
+    `keep`: whether counterexamples are kept. `picture`: where the first one is drawn. `own`: the files that RULES name, if
+    each part names one or some are paths, else all; what others contain is shown only where it is wrong.
     """
 
     backend: str | None
@@ -124,6 +125,7 @@ class _Report:
     picture: Path | None
     as_json: bool
     failed: bool = False
+    own: Collection[str] = ()
     data: dict[str, Any] = field(default_factory=dict)
 
     def say(self, *lines: str) -> None:
@@ -135,24 +137,33 @@ class _Report:
         start = monotonic()
         runner = Runner(ruleset, self.backend)
         tests = run_examples(ruleset, sim=runner.sim, seen=lambda world: runner.note(world.state))
-        for test in tests:
+        parts = name.split("+")
+        files = {span.source.name for span in (*runner.lines, *(test.span for test in ruleset.tests))}
+        named = {file for file in files if file in parts or Path(file).stem in parts}
+        self.own = named & {*parts} or (named if len(named) == len(parts) else files)
+        mine = [test for test in tests if test.example.span.source.name in self.own]
+        for test in (*mine, *(test for test in tests if not (test.passed or test in mine))):
             outcome = "ok  " if test.passed else "FAIL" if test.failed else "differs"
             self.say(f"{outcome}  {test.example.pack}: {test.example.name}")
             if not test.passed:
                 difference = difference_of_test(test, runner)
                 words = [difference.with_packs, *difference_lines(difference)] if difference else []
                 self.say(*(f"      {line}".rstrip() for line in [*words, *_failure_lines(test)]))
+        if passed := sum(test.passed for test in tests if test not in mine):
+            self.say(f"ok    other packs: {counted(passed, 'test')}")
         results = self._properties(name, runner)
-        missed = [span for span in runner.lines if span not in runner.happened]
+        lines = [span for span in runner.lines if span.source.name in self.own]
+        missed = [span for span in lines if span not in runner.happened]
         for span in missed:
             self.say(f"never happened: {place_of(span)}: {one_line(span)}")
+        title = ruleset.name if self.own == files else ", ".join(sorted(self.own))
         self.say(
-            f"{ruleset.name}: {len(runner.lines) - len(missed)} of {counted(len(runner.lines), 'rule')} happened"
+            f"{title}: {len(lines) - len(missed)} of {counted(len(lines), 'rule')} happened"
             f" on {runner.worlds_run:,} worlds in {monotonic() - start:.0f} s"
         )
         declared = [result for result in results if result.prop.owner != "automatic"]
-        parts = [counted(len(tests), "test")]
-        parts += [counted(len(declared), "invariant")] if declared else []
+        found = [counted(len(tests), "test")]
+        found += [counted(len(declared), "invariant")] if declared else []
         counts = {
             "failed": sum(test.failed for test in tests),
             "broken": sum(not result.holds for result in results),
@@ -160,9 +171,9 @@ class _Report:
             + sum(result.status == "differs" for result in results),
         }
         faults = [f"{number} {word}" for word, number in counts.items() if number]
-        self.say(f"{ruleset.name}: {', '.join([*parts, *(faults or ['all passed'])])}")
+        self.say(f"{ruleset.name}: {', '.join([*found, *(faults or ['all passed'])])}")
         self.failed |= bool(counts["failed"] or counts["broken"])
-        self.data[name] = _data(tests, results, runner.lines, missed)
+        self.data[name] = _data(tests, results, lines, missed)
 
     def _properties(self, name: str, runner: Runner) -> list[Result]:
         search = InvariantSearch.of(runner, self.plan)
@@ -174,7 +185,9 @@ class _Report:
         search.try_random()
         results = search.finish()
         for result in results:
-            self._tell(result, runner.ruleset)
+            span = result.prop.span
+            if span is None or span.source.name in self.own or not result.holds or result.difference:
+                self._tell(result, runner.ruleset)
             if result.counterexample is not None and not result.holds and self.keep:
                 path = file_of(name, result.prop)
                 write_example(path, name, result.prop, result.counterexample)

@@ -45,8 +45,6 @@ def command(
     seed: int | None,
     cell: tuple[int, int],
     step: int,
-    of: tuple[str, ...] | None,
-    every_rule: bool,
     as_json: bool,
     backend: str,
     settings: dict[str, str],
@@ -63,7 +61,7 @@ def command(
 
     worlds = start(ruleset, world, size, None, seed, backend=backend, steps=step)
     with user_values():
-        history = trace(worlds, *cell, step, every_rule=every_rule, of=of, **how)
+        history = trace(worlds, *cell, step, **how)
     if as_json:
         print_json(trace_data(history))
     else:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +28,7 @@ from powderdsl.system.reading import read_json
 )
 @opt.path("--init-from", "DATASET", "Dataset whose actions the network learns first (behavior cloning).")
 @opt.settings_of(TrainConfig, PRESETS, checkpoint_minutes="save-every")
-@opt.knobs("Another value for a knob of the task. May be repeated.")
-@opt.parameters
-@opt.packs
+@opt.task_options
 @opt.backend(None, "Backend that runs the rules.  [default: auto]")
 def command(task: str | None, folder: Path | None, resume: Path | None, **values: Any) -> None:
     """Train an agent on TASK with PPO: a shipped task's name, or a task's file.
@@ -69,8 +66,7 @@ def new_config(values: Mapping[str, Any]) -> TrainConfig:
     task = values["task"]
     if task is None:
         raise BadInput("say which TASK, or --resume DIR")
-    names = [setting.name for setting in fields(TrainConfig) if setting.name not in (*WHAT, "task")]
-    settings = opt.given_options(values, names)
+    settings = opt.given_settings(values, TrainConfig, (*WHAT, "task"))
     if "init_from" in settings:
         settings["init_from"] = str(settings["init_from"].absolute())
     name = str(Path(task).absolute()) if Path(task).suffix else task
@@ -86,9 +82,7 @@ def _config_of(folder: Path, values: Mapping[str, Any]) -> TrainConfig:
     from powderdsl.rl.policies import config_of
     from powderdsl.rl.training import ASKED, KIND
 
-    settings = opt.given_options(
-        values, [setting.name for setting in fields(TrainConfig) if setting.name not in WHAT]
-    )
+    settings = opt.given_settings(values, TrainConfig, WHAT)
     if any(name not in HOW for name in settings) or opt.given_options(values, WHAT):
         raise BadInput(f"--resume keeps what is trained; only {', '.join(HOW)} may change")
     run = find_run(folder, KIND)

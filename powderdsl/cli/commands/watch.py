@@ -9,7 +9,6 @@ import click
 
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BadInput, user_values
-from powderdsl.cli.options import check_writable, find_played
 from powderdsl.cli.pictures import MAX_SIDE
 from powderdsl.tasks.task import Task
 
@@ -25,9 +24,7 @@ from powderdsl.tasks.task import Task
 )
 @click.option("--deterministic/--sampled", default=False, help="Take the likeliest action, or draw one.")
 @opt.option("--seed", (0, 2**32 - 1), "Seed of what the policy draws.", 0)
-@opt.knobs("For a task: another value for a knob.")
-@opt.parameters
-@opt.packs
+@opt.task_options
 @opt.output("--out", "FILE", "The film to write.  [default: watch.gif in the run's folder]", ".gif", ".mp4")
 @opt.option("--fps", (1, 240), "Frames per second.", 15)
 @opt.option("--scale", (1, 32), "Pixels per cell.", 4)
@@ -50,7 +47,7 @@ def command(
     Regions are outlined, and so is where the agent acts; below each world stand its return so far and the action. For a
     TASK, actions are random, or nobody acts.
     """
-    played = find_played(run, **changes)
+    played = opt.find_played(run, **changes)
     policy = policy or ("random" if isinstance(played, Task) else "trained")
     if isinstance(played, Task) and policy == "trained":
         raise BadInput("a task has no trained policy: name a run, or choose --policy random")
@@ -61,7 +58,7 @@ def command(
     split = split or ("test" if "test" in names else names[0])
     if out is None:
         out = own.path / "watch.gif" if own else Path("watch.gif")
-        check_writable(out)
+        opt.check_writable(out)
     if max(task.size) * scale * min(worlds, 4) > MAX_SIDE:
         raise BadInput("such a picture is too large: choose a smaller --scale, or fewer --worlds")
     import torch

@@ -38,9 +38,7 @@ _machine_options = opt.several(
         "Your network, which is imported.  [default: the U-net]",
         to="network_name",
     ),
-    opt.option("--threads", (1, 1024), "CPU threads.", 1),
-    opt.device,
-    opt.backend("auto"),
+    opt.machine,
 )
 _test_options = opt.several(
     click.argument("run", metavar="RUN"),
@@ -113,7 +111,9 @@ def train_command(folder: Path | None, ignore_actions: bool, **values: Any) -> N
     recording = _open_recording(values["data"], values["task"])
     recorded = replace(recording.recorded, actions=not ignore_actions)
     with user_values():
-        config = replace(PRESETS[values["preset"]], recorded=recorded, **given_settings(values, TrainConfig))
+        config = replace(
+            PRESETS[values["preset"]], recorded=recorded, **opt.given_settings(values, TrainConfig)
+        )
     name = f"{recording.task.name}-blind" if ignore_actions else recording.task.name
     _run(config, folder or Path("runs") / name, values, recording=recording)
 
@@ -127,16 +127,16 @@ def new_config(values: Mapping[str, Any], rules_of: Callable[..., str]) -> Train
     packs, held_out = values["packs"], values["held_out"]
     if packs and held_out:
         raise BadInput("--packs says what stays, --held-out what goes: give one of them")
-    variety = given_settings(values, Variety)
+    variety = opt.given_settings(values, Variety)
     if (variety or values["first_ruleset"]) and not values["rulesets"]:
         raise BadInput(
             "--chances, --swap, --leave-out and --first-ruleset say which rulesets: --rulesets says how many"
         )
     with user_values():
-        config = replace(PRESETS[values["preset"]], **given_settings(values, TrainConfig))
+        config = replace(PRESETS[values["preset"]], **opt.given_settings(values, TrainConfig))
         rules, task = values["rules"] or "", values["task"] or config.data.task
         changes = {
-            **given_settings(values, DataConfig),
+            **opt.given_settings(values, DataConfig),
             "rules": rules_of(rules, task, packs, held_out) if packs or held_out else rules,
             "knobs": values["knobs"],
             "params": values["settings"],
@@ -164,7 +164,7 @@ def finetune_command(run: str, packs: tuple[str, ...], folder: Path | None, **va
     network = _import_network(values["network_name"])
     trained = load_trained(run, device="cpu", network=network)
     with user_values():
-        config = finetuned(trained, packs, **given_settings(values, TrainConfig))
+        config = finetuned(trained, packs, **opt.given_settings(values, TrainConfig))
     words = "-".join(config.data.only)
     target = folder or trained.run.path.with_name(f"{trained.run.path.name}-{words}")
     note = {"parent": {"path": str(trained.run.path), "iterations": trained.checkpoint.step}}
@@ -249,11 +249,6 @@ def _show(strips: list[Strip], rules: Ruleset, out: Path, scale: int) -> None:
 def tested_on(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the options that choose the worlds of a test."""
     return opt.given_options(values, ("task", "split", "rules", "only", "knobs", "rulesets"))
-
-
-def given_settings(values: Mapping[str, Any], config: type) -> dict[str, Any]:
-    """The settings of a dataclass that were given as options."""
-    return opt.given_options(values, [setting.name for setting in fields(config)])
 
 
 def _machine(values: dict[str, Any]) -> Machine:

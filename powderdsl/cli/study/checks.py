@@ -19,7 +19,7 @@ import click
 
 from powderdsl.cli.commands import train, wm
 from powderdsl.cli.exits import BadInput
-from powderdsl.cli.options import find_played
+from powderdsl.cli.options import find_played, given_settings
 from powderdsl.compiler import load
 from powderdsl.diagnostics import CompileError, Diagnostic, Label, Reporter, suggest
 from powderdsl.experiments.runs import find_run
@@ -194,7 +194,7 @@ class _StudyCheck:
             return None
         if command == ("wm", "finetune"):
             data = with_packs(run.data, run.data.rules or _rules_of(run.data.task), values["packs"])
-            run = replace(run, data=data, **wm.given_settings(values, type(run)))
+            run = replace(run, data=data, **given_settings(values, type(run)))
             self.check_data(run.data)
             return run
         self.check_data(unseen_data(run.data, **wm.tested_on(values)))
