@@ -171,19 +171,7 @@ def _report_more(
                 reader.reporter.add(diagnostic)
 
 
-INDEPENDENT = (
-    "PD108",
-    "PD110",
-    "PD301",
-    "PD401",
-    "PD402",
-    "PD403",
-    "PD405",
-    "PD406",
-    "PD407",
-    "PD409",
-    "PD410",
-)
+INDEPENDENT = "PD108 PD110 PD301 PD311 PD401 PD402 PD403 PD405 PD406 PD407 PD409 PD410".split()
 """Errors in rules and values, which follow from an earlier one only if they name what could not be read."""
 
 
