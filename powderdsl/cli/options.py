@@ -217,7 +217,7 @@ rules = click.argument("rules", metavar="RULES")
 """RULES: what `powderdsl.load` takes."""
 
 parameters = pairs(
-    "--set", "PACK.PARAM=VALUE", "Another value for a parameter of the rules, such as 5%.", "settings"
+    "--set", "PACK.PARAM=VALUE", "Another value of a parameter, such as 5%. May be repeated.", "settings"
 )
 """Names and values are checked later, with the model."""
 world = option("--world", "FILE|NAME", "A .npz, .png, .txt or .yaml file, or the name of a scene.")
