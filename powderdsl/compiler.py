@@ -166,13 +166,13 @@ def _report_more(
     for diagnostic in later.diagnostics:
         span = diagnostic.primary.span
         word = span.text.removesuffix("?") if span else ""
-        if diagnostic.code in INDEPENDENT and word not in lost:
+        if INDEPENDENT.fullmatch(diagnostic.code) and word not in lost:
             with suppress(CompileError):  # more errors than the limit
                 reader.reporter.add(diagnostic)
 
 
-INDEPENDENT = "PD108 PD110 PD301 PD311 PD401 PD402 PD403 PD405 PD406 PD407 PD409 PD410".split()
-"""Errors in rules and values, which follow from an earlier one only if they name what could not be read."""
+INDEPENDENT = re.compile("PD(108|110|301|311|40[12357]|406|409|410)")
+"""The errors in rules and values, which follow from an earlier one only if they name what could not be read."""
 
 
 def whole_palette(*names: str | Path) -> tuple[str | None, ...]:
