@@ -29,7 +29,8 @@ Shape = tuple[int, ...]
 
 
 def __getattr__(name: str) -> Any:
-    raise AttributeError(f"`{name}` is not there without NumPy")
+    message = f"`{name}` is not there without NumPy"
+    raise AttributeError(message) if name.startswith("_") else ModuleNotFoundError(message, name="numpy")
 
 
 def _reduction(call: Callable[[Values], Any], result: Type | None = None) -> Any:

@@ -24,10 +24,8 @@ from random import Random
 from statistics import median
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from powderdsl.analysis.changes import moved_ids
+from powderdsl.arrays import NDArray, np
 from powderdsl.compiler import BACKENDS
 from powderdsl.diagnostics import with_suggestion
 from powderdsl.model.state import check_sides

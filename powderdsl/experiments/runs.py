@@ -217,6 +217,8 @@ class RunFolder:
             if _digest(data) == digest:
                 try:
                     return Checkpoint(step, _decoded(data), path)
+                except ModuleNotFoundError:  # no safetensors
+                    raise
                 except Exception as error:  # a crafted file raises whatever it likes
                     why = (str(error).strip().partition("\n")[0] or type(error).__name__)[:300]
                     raise failure("PD620", f"{path} is not a checkpoint of a run", notes=(why,)) from None

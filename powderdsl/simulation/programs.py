@@ -76,7 +76,7 @@ def find_device(name: str | torch.device) -> torch.device:
     return device
 
 
-_CPU = "install torch, or run on the device `cpu` and the backend `wasm` or `reference`"
+_CPU = "`pip install torch`, or run on the device `cpu` and the backend `wasm` or `reference`"
 _WASMTIME = "`pip install wasmtime`, or run on the backend `torch` or `native`"
 
 

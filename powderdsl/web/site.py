@@ -464,7 +464,7 @@ def _pack_world(ruleset: Ruleset) -> dict[str, Any]:
     """Shapes of all elements, and more shapes of the pack that was added last."""
     pack = ruleset.packs[-1]
     own = [element.id for element in ruleset.elements if element.pack == pack]
-    ids = strew(ruleset, (SIDE, SIDE), 1, 1)[0]
+    ids = strew(ruleset, (SIDE, SIDE), 1, 1)[0].copy()  # without NumPy, views cannot be written to
     edge = ids.copy()
     random = Random(2)
     for number in range(OWN_SHAPES if own else 0):

@@ -1,0 +1,131 @@
+"""Every command without torch, and without NumPy: it works, or says which package it needs and how to install it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+import pytest
+
+from powderdsl.cli.dispatch import COMMANDS
+from tests.cli.commands import environment_with
+
+BLOCKED = {"torch": ["torch"], "NumPy": ["numpy", "torch"]}
+"""Modules that cannot be imported."""
+
+PROGRAM = """
+import io, json, sys
+from contextlib import redirect_stderr, redirect_stdout
+blocked, lines = json.loads(sys.argv[1])
+sys.modules.update(dict.fromkeys(blocked))
+from powderdsl.cli.dispatch import main
+for line in lines:
+    told = io.StringIO()
+    try:
+        with redirect_stdout(io.StringIO()), redirect_stderr(told):
+            main(line.split())
+    except SystemExit as ended:
+        print(json.dumps([line, ended.code, told.getvalue()]))
+"""
+
+STUDY = """\
+study: tiny
+seeds: 1
+vary: {steps: [64]}
+steps:
+  trained: {command: train, on: sand-pushing, steps: $steps}
+  tested: {command: evaluate, on: trained}
+measures:
+  reward: {of: trained, value: mean}
+"""
+
+WORKS = ""
+QUICK = [
+    # a command; the package that it lacks without torch; without NumPy
+    ("run life --steps 1", WORKS, WORKS),
+    ("run life --steps 1 --out x.png", WORKS, WORKS),
+    ("run life --steps 1 --out x.npz", WORKS, WORKS),
+    ("run life --steps 1 --out x.gif", WORKS, "numpy"),
+    ("run life --steps 1 --out x.mp4", WORKS, "numpy"),
+    ("run life --steps 1 --backend torch", "torch", "torch"),
+    ("run life --steps 1 --backend native", "torch", "torch"),
+    ("run life --steps 1 --backend cuda", "torch", "torch"),
+    ("run life --steps 1 --device cuda", "torch", "torch"),
+    ("check life --quick", WORKS, WORKS),
+    ("compile life --emit kernels --backend wasm", WORKS, WORKS),
+    ("show life", WORKS, WORKS),
+    ("test core --mutate --mutants 2 --jobs 1", "torch", "numpy"),
+    ("trace life --at 1,1 --step 1", WORKS, WORKS),
+    ("record sand-pushing --episodes 1 --out ds", "torch", "numpy"),
+    ("record --verify ds", "torch", "numpy"),
+    ("ogbench easy --out og --episodes 1", "torch", "numpy"),
+    ("bench life --seconds 0.01", "torch", "torch"),
+    ("train sand-pushing --steps 10", "torch", "numpy"),
+    ("evaluate sand-pushing --episodes 1", "torch", "numpy"),
+    ("evaluate run", "torch", "numpy"),
+    ("curves run --metric loss --out c.png", WORKS, "numpy"),
+    ("watch sand-pushing --out w.gif", "torch", "numpy"),
+    ("wm train --iterations 1", "torch", "numpy"),
+    ("wm eval run", "torch", "numpy"),
+    ("wm finetune run --packs gas", "torch", "numpy"),
+    ("study", WORKS, WORKS),
+    ("cache list", WORKS, WORKS),
+    ("new thing", WORKS, WORKS),
+    ("render life --out r.png", WORKS, WORKS),
+    ("export life --out l.wasm", WORKS, WORKS),
+    ("explain PD612", WORKS, WORKS),
+]
+SLOW = [
+    ("check sand-pushing", WORKS, WORKS),
+    ("show sand-pushing", WORKS, WORKS),
+    ("test core --examples 4 --no-keep", WORKS, WORKS),
+    ("study study.yaml --dry-run", WORKS, WORKS),
+    ("play life --export page", WORKS, WORKS),
+]
+
+
+def ends(blocked: str, lines: Iterable[str], folder: Path) -> dict[str, tuple[int, str]]:
+    """The exit status and stderr of commands that run one after the other in a process."""
+    (folder / "study.yaml").write_text(STUDY, encoding="utf-8")
+    (folder / "run").mkdir()
+    (folder / "run" / "run.json").write_text('{"kind": "ppo", "config": {}}', encoding="utf-8")
+    (folder / "run" / "metrics.jsonl").write_text('{"step": 1, "loss": 2.0}\n', encoding="utf-8")
+    given = json.dumps([BLOCKED[blocked], [*lines]])
+    ended = subprocess.run(
+        [sys.executable, "-c", PROGRAM, given],
+        cwd=folder, env=environment_with(XDG_CACHE_HOME=str(folder / "cache")), capture_output=True, text=True,
+    )  # fmt: skip
+    assert ended.returncode == 0, ended.stderr
+    return {line: (code, told) for line, code, told in map(json.loads, ended.stdout.splitlines())}
+
+
+@pytest.mark.parametrize("blocked", BLOCKED)
+def test_every_command_has_help(blocked: str, tmp_path: Path) -> None:
+    groups = ("wm train", "wm eval", "wm finetune", "study collect", "cache list", "cache clear")
+    lines = ["--help", *(f"{name} --help" for name in (*COMMANDS, *groups))]
+    assert ends(blocked, lines, tmp_path) == dict.fromkeys(lines, (0, ""))
+
+
+@pytest.mark.parametrize("blocked", BLOCKED)
+@pytest.mark.parametrize("jobs", [QUICK, pytest.param(SLOW, marks=pytest.mark.slow)], ids=["quick", "slow"])
+def test_every_command_works_or_names_what_it_lacks(
+    jobs: list[tuple[str, str, str]], blocked: str, tmp_path: Path
+) -> None:
+    lacking = {line: names[[*BLOCKED].index(blocked)] for line, *names in jobs}
+    found = ends(blocked, lacking, tmp_path)
+    assert found.keys() == lacking.keys()
+    for line, (code, told) in found.items():
+        if lacking[line] == WORKS:
+            assert (code, "error" in told) == (0, False), (line, told)
+        else:
+            assert code == 2, (line, told)
+            assert "error[PD612]" in told or "error[PD701]" in told, (line, told)
+            assert f"{lacking[line]}" in told, (line, told)
+            assert "pip install" in told, (line, told)
+
+
+def test_all_commands_are_in_the_tables() -> None:
+    assert {line.split()[0] for line, *_ in QUICK + SLOW} == {*COMMANDS}
