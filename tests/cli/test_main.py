@@ -112,6 +112,12 @@ def failing(monkeypatch: pytest.MonkeyPatch, error: BaseException, **environment
         (KeyboardInterrupt(), exits.INTERRUPTED, ""),
         (exits.BadInput("no such thing"), exits.BAD_INPUT, "error: no such thing"),
         (OSError(28, "No space left on device", "x.gif"), exits.BAD_INPUT, "error: x.gif: No space left"),
+        (
+            ModuleNotFoundError(name="PIL.Image"),
+            exits.BAD_INPUT,
+            "PIL, which is not installed\n  = help: pip install pillow",
+        ),
+        (ModuleNotFoundError(name="powderdsl.sand"), exits.INTERNAL, "error[PD901]"),
         (MemoryError(), exits.BAD_INPUT, "error: not enough memory"),
         (RuntimeError("you tried to allocate, not enough memory"), exits.BAD_INPUT, "not enough memory"),
         (

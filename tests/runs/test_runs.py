@@ -103,6 +103,16 @@ def test_a_damaged_run_is_refused_with_a_reason(tmp_path: Path, text: str, why: 
     assert why in " ".join(error.notes)
 
 
+def test_a_checkpoint_is_not_called_damaged_for_want_of_a_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = open_run(tmp_path / "run", "toy", {})
+    run.save_checkpoint(1, state_of(1))
+    monkeypatch.setitem(sys.modules, "safetensors.torch", None)
+    with pytest.raises(ModuleNotFoundError, match="safetensors"):
+        run.latest_checkpoint()
+
+
 def test_a_run_is_found_by_its_name(folder: Path) -> None:
     made = open_run("runs/dunes", "toy", {})
     assert find_run("dunes") == made
