@@ -1,4 +1,4 @@
-"""The names of NumPy that this project uses, on arrays in plain Python. Other names raise AttributeError.
+"""The names of NumPy that this project uses, on arrays in plain Python. Other names raise ModuleNotFoundError.
 
 In NumPy a slice is a view, which sees later writes to its array. Here it is a copy that cannot be written to, and using
 it after its array was written to is an error.
