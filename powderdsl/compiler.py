@@ -19,9 +19,8 @@ from powderdsl.diagnostics import CompileError, Diagnostic, Label, Reporter, Sou
 from powderdsl.model.declarations import SHARED, PackDecl, RulesetDecl, read_file
 from powderdsl.model.types import Ruleset
 from powderdsl.syntax.sources import path_beside, read_source, shipped, shipped_names
-from powderdsl.system.cache import persistent
+from powderdsl.system.cache import Memo, collection_paused, persistent
 from powderdsl.system.fingerprint import fingerprint
-from powderdsl.system.memo import Memo, collection_paused
 from powderdsl.system.reading import inside, is_path
 from powderdsl.system.writing import failure
 
@@ -39,7 +38,6 @@ BACKENDS = {
     "reference": "the slow oracle in NumPy that defines what rules mean",
 }
 """All of them give the same worlds, bit for bit."""
-
 
 MAX_BASES = 8
 """Maximum length of a chain of rulesets that extend each other."""

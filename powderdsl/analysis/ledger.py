@@ -37,7 +37,6 @@ Bounds = tuple[float, float]
 BUDGET = 2_000_000
 """Nodes evaluated for each part of a ledger: some seconds. The largest shipped ruleset needs most of it."""
 
-
 TREND_BREAKS: dict[str, Callable[..., Any]] = {"constant": ne, "never rises": gt, "never falls": lt}
 """The trends of a number, each with the comparison of a later value and an earlier one that breaks it."""
 

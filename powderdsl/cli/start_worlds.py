@@ -9,7 +9,7 @@ from powderdsl.cli.exits import BadInput, user_values
 from powderdsl.compiler import segments_of
 from powderdsl.model.state import fitting
 from powderdsl.model.types import Ruleset
-from powderdsl.system.memo import Memo
+from powderdsl.system.cache import Memo
 from powderdsl.system.writing import failure
 from powderdsl.worlds.raster import Size
 from powderdsl.worlds.scene import Start

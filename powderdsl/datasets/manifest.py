@@ -38,7 +38,6 @@ MAX_EPISODES = 1 << 32
 MAX_SHARDS = 1 << 16
 MAX_SIDE = 1 << 20
 
-
 Digest = Annotated[str, Limits(pattern=r"[0-9a-f]{64}", form="64 hexadecimal digits")]
 Seed = Annotated[int, Limits(0, (1 << 61) - 1)]
 Episodes = Annotated[int, Limits(1, MAX_EPISODES)]

@@ -63,7 +63,6 @@ def shaped_kernel(shape: str, radius: int, name: str = "", wrap: bool = False) -
 KERNELS: dict[str, Kernel] = {name: shaped_kernel(name, 1, name) for name in ("box", "ring", "cross", "plus")}
 """Neighborhoods for `count` and `sum`. Cells outside the grid count as nothing."""
 
-
 COORDINATES = ("row", "column", "step")
 """Where and when: integers that are used with `mod`, as in `(row + step) mod 2`."""
 

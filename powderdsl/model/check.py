@@ -69,7 +69,6 @@ from powderdsl.syntax.parse import Syntax
 OF_COMPOSITIONS = ("PD315", "PD316")
 """Warnings about a combination of packs: misspelled optional names, and values that another pack replaces."""
 
-
 MISREAD = ("PD109", "PD302", "PD303", "PD305", "PD306", "PD307", "PD310", "PD311", "PD508")
 """Errors after which rules would only be misread: names that clash, packs and elements that are missing."""
 

@@ -109,7 +109,6 @@ _SHAPES: dict[Any, str] = {
 VALUES = ("word", "number", "flag", "line")
 """Shapes of a single value, which cannot be empty."""
 
-
 _KEYS: dict[type[Record], dict[str, Key]] = {}
 
 

@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING
 
 import gymnasium
 
-from powderdsl.ogbench.levels import find_level, shipped_levels
+from powderdsl.ogbench.levels import find_level, load_dataset, make_env_and_datasets, shipped_levels
 from powderdsl.system.packages import importing
 
 if TYPE_CHECKING:
-    from powderdsl.ogbench.datasets import load_dataset, make_env_and_datasets
     from powderdsl.ogbench.env import PowderworldEnv, PowderworldVectorEnv
 
 __all__ = ["PowderworldEnv", "PowderworldVectorEnv", "load_dataset", "make_env_and_datasets"]
@@ -36,10 +35,4 @@ def _register() -> None:
 
 _register()
 
-__getattr__, __dir__ = importing(
-    "powderdsl.ogbench",
-    {
-        "datasets": "load_dataset make_env_and_datasets",
-        "env": "PowderworldEnv PowderworldVectorEnv",
-    },
-)
+__getattr__, __dir__ = importing("powderdsl.ogbench", {"env": "PowderworldEnv PowderworldVectorEnv"})

@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from powderdsl.experiments.runs import lock_folder
-from powderdsl.ogbench.datasets import FAMILY, VERSION
 from powderdsl.ogbench.episodes import LevelProgram, keyed
-from powderdsl.ogbench.levels import Level
+from powderdsl.ogbench.levels import FAMILY, VERSION, Level
 from powderdsl.system.archives import BadArchive, Parts, open_archive, write_archive
 from powderdsl.system.fingerprint import fingerprint
 from powderdsl.system.reading import read_json

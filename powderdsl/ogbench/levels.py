@@ -1,12 +1,21 @@
-"""Levels: which elements an agent paints, how, and the goals that it is given. They are JSON files, shipped ones in `levels/`."""
+"""Levels: which elements an agent paints, how, and the goals that it is given; and their data sets.
+
+Levels are JSON files, shipped ones in `levels/`.
+"""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
 from powderdsl.diagnostics import with_suggestion
+from powderdsl.system.archives import BadArchive, open_archive
 from powderdsl.system.reading import is_path, parse_json, read_bytes
 from powderdsl.system.settings import Limits, checked_record
 
@@ -149,3 +158,141 @@ def read_task(info: Any) -> GoalTask:
     """The task of ``options["task_info"]``. Raises ValueError."""
     record = checked_record(TaskInfo, info, "task_info")
     return GoalTask(record.task_name, record.tol, record.action_seq)
+
+
+# Data sets: files of flat rows, and the environments that they belong to
+
+DEFAULT_DATASET_DIR = "~/.ogbench/data"
+"""Where OGBench keeps its data sets, and where they are looked for."""
+
+FAMILY, VERSION = "powderworld", "v0"
+
+ROWS = ("observations", "actions", "terminals")
+"""The arrays of a file; rows of all episodes, one after the other."""
+
+Dataset = dict[str, NDArray[Any]]
+
+
+def make_env_and_datasets(
+    dataset_name: str,
+    dataset_dir: str | Path = DEFAULT_DATASET_DIR,
+    dataset_path: str | Path | None = None,
+    compact_dataset: bool = False,
+    env_only: bool = False,
+    dataset_only: bool = False,
+    cur_env: Any = None,
+    add_info: bool = False,
+    **env_kwargs: Any,
+) -> Any:
+    """Make an environment and load a data set, as `ogbench.make_env_and_datasets` does. Nothing is downloaded.
+
+    Args:
+        dataset_name: ``powderworld-easy-play-v0``, also ``medium`` and ``hard``.
+        dataset_dir: the folder of ``NAME.npz`` and ``NAME-val.npz``, which `powderdsl ogbench` writes.
+        dataset_path: path of the first file; the second is expected in the same folder.
+        compact_dataset: False: transitions with ``next_observations``. True: all rows, and ``valids``.
+        env_only: load no data.
+        dataset_only: make no environment; `env_only` takes precedence.
+        cur_env: accepted as by OGBench, and ignored.
+        add_info: accepted as by OGBench, and ignored.
+        env_kwargs: those of `PowderworldEnv`, and `max_episode_steps`.
+
+    Returns:
+        (environment, training data, validation data); or the environment alone, or the data alone, as a pair. Data are
+        arrays by name, see `load_dataset`: observations uint8, actions int32, the others float32.
+
+    Raises:
+        ValueError: an unknown name, or a file that is not such a data set.
+        FileNotFoundError: there is no such file.
+    """
+    levels = shipped_levels()
+    named = re.fullmatch(rf"{FAMILY}-({'|'.join(levels)})-[^-]+-{VERSION}", dataset_name)
+    if named is None:
+        known = [f"{FAMILY}-{name}-play-{VERSION}" for name in levels]
+        message = f"no data set named {dataset_name!r}"
+        raise ValueError(with_suggestion(message, dataset_name, known, "data sets"))
+    level = named[1]
+    env = None
+    if env_only or not dataset_only:
+        spec = gymnasium.spec(f"powderdsl/{FAMILY}-{level}-{VERSION}")
+        env = gymnasium.make(spec, **env_kwargs)
+    if env_only:
+        return env
+    train = Path(dataset_dir).expanduser() / f"{dataset_name}.npz"
+    if dataset_path is not None:
+        train = Path(dataset_path).expanduser()
+    datasets = []
+    for path in (train, train.with_name(f"{train.stem}-val.npz")):
+        if not path.is_file():
+            raise FileNotFoundError(
+                f"{path} does not exist, and nothing is downloaded. To collect it: "
+                f"powderdsl ogbench {level} --out {path.parent}"
+            )
+        datasets.append(load_dataset(path, np.uint8, np.int32, compact_dataset=compact_dataset))
+    return (datasets[0], datasets[1]) if dataset_only else (env, datasets[0], datasets[1])
+
+
+def load_dataset(
+    dataset_path: str | Path,
+    ob_dtype: Any = np.float32,
+    action_dtype: Any = np.float32,
+    compact_dataset: bool = False,
+    add_info: bool = False,
+) -> Dataset:
+    """Load a file of successive episodes, whose last rows are marked in `terminals`, as arrays by name.
+
+    Args:
+        dataset_path: path of the file, .npz.
+        ob_dtype: dtype of observations.
+        action_dtype: dtype of actions.
+        compact_dataset: False: the last row of each episode, whose action leads nowhere, is only the last row of
+            ``next_observations``; ``terminals`` is 1 on the last transition of each. True: all rows stay; ``valids`` is 0
+            on the last rows, and ``terminals`` is 1 there and on the rows before.
+        add_info: accepted as by OGBench, and ignored.
+
+    Returns:
+        ``observations`` and, unless compact, ``next_observations``, of `ob_dtype` [N, H, W, C]; ``actions``, of
+        `action_dtype` [N]; ``terminals`` and, if compact, ``valids``, float32 [N].
+
+    Raises:
+        ValueError: the file is not such a data set; the text says why.
+        OSError: it cannot be read.
+    """
+    path = Path(dataset_path)
+    try:
+        with open_archive(path) as archive:
+            shapes = []
+            for name in ROWS:
+                head = archive.headers.get(name)
+                if head is None or head.dtype == "str" or not head.shape:
+                    raise BadArchive(f"`{name}` must be an array of numbers")
+                shapes.append(head.shape[0])
+            if len(set(shapes)) > 1:
+                raise BadArchive(f"its arrays have different numbers of rows: {shapes}")
+        # NumPy reads into memory that may be written to, as learners expect; what it reads has been checked above.
+        with np.load(path, allow_pickle=False) as file:
+            observations, actions, ends = (file[name] for name in ROWS)
+    except BadArchive as error:
+        raise ValueError(f"{path} is not a data set of OGBench's: {error}") from None
+    last = ends.astype(bool)
+    if not len(last) or not last[-1] or last[0] or (last[1:] & last[:-1]).any():
+        raise ValueError(
+            f"{path} is not a data set of OGBench's: `terminals` does not end episodes of at least two rows"
+        )
+    before = np.append(last[1:], False)
+    observations = observations.astype(ob_dtype, copy=False)
+    actions = actions.astype(action_dtype, copy=False)
+    if compact_dataset:
+        return {
+            "observations": observations,
+            "actions": actions,
+            "terminals": (last | before).astype(np.float32),
+            "valids": (~last).astype(np.float32),
+        }
+    rows = np.flatnonzero(~last)
+    return {
+        "observations": observations[rows],
+        "actions": actions[rows],
+        "terminals": before[rows].astype(np.float32),
+        "next_observations": observations[rows + 1],
+    }

@@ -1,4 +1,4 @@
-"""Memory of variables: when they are released, what is written in place, numbered buffers, and insert_barriers between threads."""
+"""Memory of variables: when they are released, what is written in place, numbered buffers, and barriers between threads."""
 
 from __future__ import annotations
 

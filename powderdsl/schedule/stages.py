@@ -73,7 +73,6 @@ CPU = tuple(stage for stage in _STAGES if stage.only != "cuda")
 CUDA = tuple(stage for stage in _STAGES if stage.only != "cpu")
 """For blocks of threads, each of which holds some worlds in shared memory."""
 
-
 PLANNERS = {"native": CPU, "wasm": CPU, "cuda": CUDA}
 """The stages of each backend that prints schedules."""
 

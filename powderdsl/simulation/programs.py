@@ -14,7 +14,7 @@ from powderdsl.diagnostics import CompileError
 from powderdsl.ir.ops import Program
 from powderdsl.model import reference
 from powderdsl.model.types import Ruleset
-from powderdsl.system.memo import Memo, collection_paused
+from powderdsl.system.cache import Memo, collection_paused
 from powderdsl.system.writing import failure
 from powderdsl.targets.array_kind import Array, ArrayKind
 from powderdsl.targets.job import Job, Runnable, mixed_program, unavailable

@@ -35,7 +35,7 @@ from powderdsl.simulation.state_checks import (
     unknown_name,
     unknown_slot,
 )
-from powderdsl.system.memo import Memo
+from powderdsl.system.cache import Memo
 from powderdsl.system.packages import require
 from powderdsl.targets.array_kind import Array
 from powderdsl.targets.job import Clock, Job, PassClock, shape_of

@@ -19,7 +19,7 @@ from powderdsl.model.state import (
     stored_range,
 )
 from powderdsl.model.types import Param, Ruleset
-from powderdsl.system.memo import Memo
+from powderdsl.system.cache import Memo
 from powderdsl.system.writing import failure
 from powderdsl.targets.layout import Piece, pieces
 from powderdsl.targets.wasm.source import wasm_module

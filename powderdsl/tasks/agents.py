@@ -27,7 +27,6 @@ from powderdsl.worlds.scene.statements import amounts_of, constants
 ACTS = {"blow": BLOW, "nothing": NO_CHANGE}
 """Words of `may:` that are not elements."""
 
-
 MAX_ACTIONS, MAX_STEPS, MAX_PLANS, MAX_MOVES = 1_000_000, 100_000, 10_000, 256
 """The most actions of an episode, steps after one, plans of a search, and moves of an expert."""
 

@@ -14,5 +14,4 @@ if TYPE_CHECKING:
 
 __all__ = ["worlds"]
 
-
 __getattr__, __dir__ = importing("powderdsl.testing", {"generators.strategies": "worlds"})

@@ -29,7 +29,7 @@ from powderdsl.model.types import Ruleset
 from powderdsl.simulation.standalone import standalone_module
 from powderdsl.syntax.parse import reserved_words
 from powderdsl.syntax.sources import shipped
-from powderdsl.system.memo import Memo
+from powderdsl.system.cache import Memo
 
 MAX_FILES = 64
 MAX_TEXT = 1 << 20

@@ -32,8 +32,7 @@ from powderdsl.model.state import fits
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.standalone import standalone_module
 from powderdsl.syntax.sources import shipped
-from powderdsl.system.cache import code_hash, persistent
-from powderdsl.system.memo import Memo
+from powderdsl.system.cache import Memo, code_hash, persistent
 from powderdsl.system.writing import replacing
 from powderdsl.targets.array_kind import ArrayKind
 from powderdsl.tasks.shipped import load_task, shipped_tasks

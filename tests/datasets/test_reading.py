@@ -14,8 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from powderdsl.datasets import Dataset
-from powderdsl.datasets.dataset import Batch, drawn, write_shard
-from powderdsl.datasets.flat import flat
+from powderdsl.datasets.dataset import Batch, drawn, flat, write_shard
 from powderdsl.datasets.manifest import Manifest, Recipe, write_manifest
 from powderdsl.diagnostics import CompileError
 from powderdsl.envs import TensorEnv

@@ -11,7 +11,7 @@ from powderdsl.syntax.parse import Syntax, parse_text
 from powderdsl.syntax.yaml_tree import parse_yaml
 from powderdsl.testing.generators.cases import Start
 from powderdsl.testing.properties.outcomes import Tree, to_tree, write_yaml
-from powderdsl.testing.properties.shrink import smallest
+from powderdsl.testing.properties.search import smallest
 from tests.fuzz.cases import Case
 
 PLAIN = ("yes", "no", "0", "1", "here", "0.5")

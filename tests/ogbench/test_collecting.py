@@ -13,10 +13,9 @@ import pytest
 
 from powderdsl.ogbench import collect as collecting
 from powderdsl.ogbench.collect import collect, play
-from powderdsl.ogbench.datasets import load_dataset, make_env_and_datasets
 from powderdsl.ogbench.env import PowderworldEnv
 from powderdsl.ogbench.episodes import LevelProgram
-from powderdsl.ogbench.levels import find_level
+from powderdsl.ogbench.levels import find_level, load_dataset, make_env_and_datasets
 from tests.cli.commands import powderdsl
 
 ROWS = 20

@@ -14,7 +14,7 @@ from powderdsl.compiler import load_with_diagnostics, lower, parts
 from powderdsl.diagnostics import CompileError
 from powderdsl.simulation.standalone import standalone_module
 from powderdsl.syntax.sources import shipped
-from powderdsl.system.memo import Memo
+from powderdsl.system.cache import Memo
 from powderdsl.targets.wasm import source
 from powderdsl.targets.wasm.source import wasm_module
 

@@ -14,7 +14,7 @@ import wasmtime
 import powderdsl
 from powderdsl.compiler import lower
 from powderdsl.ir.bits import segments
-from powderdsl.system.memo import Memo
+from powderdsl.system.cache import Memo
 from powderdsl.targets.tensor_kind import Tensors
 from powderdsl.targets.wasm import program, source
 from powderdsl.targets.wasm.binary import Module

@@ -15,7 +15,7 @@ from powderdsl.compiler import load_with_diagnostics  # noqa: E402
 from powderdsl.simulation.simulator import Simulator  # noqa: E402
 from powderdsl.syntax.parse import parser  # noqa: E402
 from powderdsl.syntax.sources import shipped  # noqa: E402
-from powderdsl.system.memo import Memo  # noqa: E402
+from powderdsl.system.cache import Memo  # noqa: E402
 
 REPEATS = 5
 EDITS = {

@@ -12,7 +12,7 @@ from powderdsl.cli.dispatch import main
 from powderdsl.compiler import load, lower, parts
 from powderdsl.simulation.simulator import Simulator
 from powderdsl.syntax.sources import shipped
-from powderdsl.system.memo import Memo
+from powderdsl.system.cache import Memo
 from powderdsl.targets.array_kind import ArrayKind
 from powderdsl.targets.wasm.source import wasm_module
 from powderdsl.tasks.shipped import load_task

@@ -296,7 +296,6 @@ def _end(processes: Iterable[subprocess.Popen[bytes]]) -> None:
 
 atexit.register(_end, _running)
 
-
 _TYPES = {"p": ctypes.c_void_p, "i": ctypes.c_int, "l": ctypes.c_int64, "f": ctypes.c_float, "-": None}
 
 SIGNATURES = {

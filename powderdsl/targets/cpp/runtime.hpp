@@ -169,3 +169,9 @@ static double thread_seconds() {
 }
 #define START double tick = c.seconds ? thread_seconds() : 0
 #define TICK(i) if (c.seconds) { const double now = thread_seconds(); c.seconds[i] += now - tick; tick = now; }
+
+// Rows of the tables of a program: slots that a step resets, planes that follow from places and from the step.
+struct ResetPlane { int slot; bool value; };
+struct ResetReal { int slot; float value; };
+struct FixedPlane { int kind, a, b; };
+struct StepPlane { u64 a; int b; };

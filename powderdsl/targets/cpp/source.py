@@ -9,7 +9,7 @@ from typing import NamedTuple
 from powderdsl.ir.ops import SNAP, Program
 from powderdsl.schedule.presence import tested_ids
 from powderdsl.schedule.stages import CPU, plan
-from powderdsl.system.memo import collection_paused
+from powderdsl.system.cache import collection_paused
 from powderdsl.targets.cpp.text import pass_text
 from powderdsl.targets.layout import NativeLayout, braced, literal, native_layout
 
@@ -91,13 +91,6 @@ def _header(name: str) -> str:
     return (files("powderdsl.targets.cpp") / f"{name}.hpp").read_text(encoding="utf-8")
 
 
-STRUCTS = """\
-struct ResetPlane { int slot; bool value; };
-struct ResetReal { int slot; float value; };
-struct FixedPlane { int kind, a, b; };
-struct StepPlane { u64 a; int b; };"""
-
-
 def _tables(program: Program, layout: NativeLayout, tested: int) -> Iterator[str]:
     """Tables of the slots that a step resets, of planes and of streams; the ids whose presence passes test."""
     planes, reals, idents, elements = [], [], [], []
@@ -110,7 +103,6 @@ def _tables(program: Program, layout: NativeLayout, tested: int) -> Iterator[str
             reals.append((layout.reals[slot.name], literal(float(slot.default))))
     for _, ident, _ in program.streams:
         idents.append(f"{ident}u")
-    yield STRUCTS
     yield f"static const std::vector<ResetPlane> RESET_PLANES = {braced(map(braced, planes))};"
     yield f"static const std::vector<ResetReal> RESET_REALS = {braced(map(braced, reals))};"
     yield f"static const std::vector<FixedPlane> FIXED = {braced(map(braced, layout.fixed))};"

@@ -8,7 +8,7 @@ from importlib.resources import files
 from powderdsl.ir.ops import SNAP, Program
 from powderdsl.schedule.lifetimes import Pending, Pool, assign_buffers, insert_barriers
 from powderdsl.schedule.stages import CUDA, plan
-from powderdsl.system.memo import collection_paused
+from powderdsl.system.cache import collection_paused
 from powderdsl.targets.cuda.text import pass_text
 from powderdsl.targets.layout import Layout, layout_of, literal
 
@@ -22,7 +22,6 @@ SMALL = 64
 
 HELD = 4
 """The number of rounds of a loop over words up to which a thread keeps its results in registers before storing."""
-
 
 RESERVED = 1024
 """Bytes of shared memory that the system reserves in each block."""

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from powderdsl.ir.bits import segments
 from powderdsl.ir.ops import SNAP, Program, Threshold, kernel_rows
-from powderdsl.system.memo import collection_paused
+from powderdsl.system.cache import collection_paused
 from powderdsl.system.random import MASK, base_keys, mix
 from powderdsl.targets.job import Job, Runnable, mixed_program
 from powderdsl.targets.layout import limits, pieces

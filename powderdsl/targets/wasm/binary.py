@@ -249,7 +249,6 @@ F64: TypeAlias = Local
 V128: TypeAlias = Local
 """Parameters of functions, by type (`Module.define`)."""
 
-
 Writer: TypeAlias = "Callable[..., Value | int | None]"
 """Writes a function, given its parameters, and returns the result, if it has one."""
 

@@ -13,8 +13,7 @@ from threading import RLock
 
 from powderdsl.ir.ops import Program
 from powderdsl.ir.text import structure
-from powderdsl.system.cache import persistent
-from powderdsl.system.memo import Memo
+from powderdsl.system.cache import Memo, persistent
 from powderdsl.targets.array_kind import Array, ArrayKind
 from powderdsl.targets.job import Job, Like, OwnedBatch, like_of, shape_of
 from powderdsl.targets.layout import layout_of, parameters, pieces

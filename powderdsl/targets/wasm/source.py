@@ -27,7 +27,7 @@ from powderdsl.schedule.types import (
     alternatives,
 )
 from powderdsl.schedule.words import difference, movement_loop, only_clears, target_loop
-from powderdsl.system.memo import Memo, collection_paused
+from powderdsl.system.cache import Memo, collection_paused
 from powderdsl.targets.layout import layout_of
 from powderdsl.targets.printing import Printer
 from powderdsl.targets.wasm.binary import Local, Module, Value, body, const, op

@@ -48,8 +48,7 @@ from powderdsl.testing.mutation.operators import Mutant, mutants_of
 from powderdsl.testing.pack_tests.runner import ANYTHING, SEEDS, field_rows, run_examples
 from powderdsl.testing.properties.outcomes import Property, Result
 from powderdsl.testing.properties.running import Runner, State, first_difference, random_samples, run_sample
-from powderdsl.testing.properties.search import STEPS, InvariantSearch, SearchPlan
-from powderdsl.testing.properties.shrink import Work, shrink_while
+from powderdsl.testing.properties.search import STEPS, InvariantSearch, SearchPlan, Work, shrink_while
 
 Settings = tuple[tuple[str, str], ...]
 """Parameters and their values as text."""
@@ -554,7 +553,7 @@ TRIED_SEEDS = 16
 """With how many seeds a smaller world is tried."""
 
 WORK = 1_000_000_000
-"""Work for making a world smaller, see `testing.properties.shrink`."""
+"""Work for making a world smaller, see `testing.properties.search`."""
 
 
 @dataclass(frozen=True)
