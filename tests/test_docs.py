@@ -111,14 +111,17 @@ def run_yaml(block: Block) -> None:
         load_start(f"{scene[1]}.yaml", load(block.expected("with")))
         return
     if not re.search(r"^(pack|ruleset):", text, re.MULTILINE):
-        text = f"pack: example\n{text}"
+        given = load(block.expected("with")).packs if block.expected("with") else ()
+        needs = (
+            "" if not given or re.search("^needs:", text, re.MULTILINE) else f"needs: [{', '.join(given)}]\n"
+        )
+        text = f"pack: example\n{needs}{text}"
     name = re.search(r"^(?:pack|ruleset): *(\w+)", text, re.MULTILINE)
     assert name, "the block names no pack"
     if block.expected("file"):
         whole = (ROOT / block.expected("file")).read_text(encoding="utf-8")
         assert text.partition("\n")[2] == re.split(r"^(?:invariants|tests):", whole, flags=re.MULTILINE)[0]
-    needs = re.search(r"^needs: *\[?([^\]\n]*)", text, re.MULTILINE)
-    packs = block.expected("with") or "+".join(needs[1].split(", ") if needs else [])
+    packs = block.expected("with")
     path = Path(f"{name[1]}.yaml")
     path.write_text(text, encoding="utf-8")
     ruleset, found = diagnosed(*filter(None, [packs]), path)

@@ -84,7 +84,6 @@ _ROWS = (
     ("PD501", "movement-conflict"),
     ("PD502", "write-conflict"),
     ("PD503", "rule-never-fires", _WARNING),
-    ("PD504", "element-never-appears", _NOTE),
     ("PD505", "empty-set", _NOTE),
     ("PD506", "rule-asleep", _NOTE),
     ("PD507", "unused-definition", _WARNING),

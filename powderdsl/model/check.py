@@ -40,7 +40,6 @@ from powderdsl.model.expressions.typer import Typer
 from powderdsl.model.logic.conflicts import check_logic
 from powderdsl.model.logic.needless import (
     overridden_ids,
-    produced_ids,
     report_needless,
     report_undecided,
     report_undrawn,
@@ -127,7 +126,7 @@ def check(
     check_assigned(examples, composition, reporter)
     added = None if alone else AddedPacks(composition, check_alone)
     passes, undecided = check_logic(passes, facts, elaborated, reporter, added)
-    report_unused(composition, typer, produced_ids(passes, facts))
+    report_unused(composition, typer)
     order, matrix = lay_out(composition, passes, reporter)
     reporter.raise_if_errors()
     undecided += report_needless(passes, composition.fields, facts, reporter)

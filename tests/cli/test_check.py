@@ -48,11 +48,11 @@ def test_warnings_are_errors_only_on_request(pack):
 
 
 def test_notes_are_shown_on_request(pack):
-    rules = pack()
+    rules = pack("grit -> empty", "grit -> lava?")
     quiet, loud = powderdsl("check", rules), powderdsl("check", rules, "--notes")
     assert "note[" not in quiet.stdout
     assert "(--notes shows them)" in quiet.stdout
-    assert "note[PD504]" in loud.stdout
+    assert "note[PD506]" in loud.stdout
     assert "(--notes shows them)" not in loud.stdout
     assert quiet.exit_code == loud.exit_code == 0
 

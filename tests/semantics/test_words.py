@@ -214,7 +214,7 @@ HEAD = """pack: {pack}
   air: {{id: 0, color: "#F8F9FA", glyph: "."}}
   ball: {{id: 1, color: "#264653"{tags}}}
 {elements}fields:
-  score: {{type: 0..60, at: place}}
+  score: {{type: 0..58, at: place}}
 {sections}passes:
 {passes}"""
 
@@ -227,7 +227,7 @@ def pack(words: list[str], name: str = "words", **parts: Callable[[int, str], st
 
 
 def score(where: str, at: int) -> str:
-    return f"  p{at}:\n    do: score := (score + {at + 1}) mod 61 where {where}\n"
+    return f"  p{at}:\n    do: score := (score + {at + 1}) mod 59 where {where}\n"
 
 
 def named(kind: str, words: list[str]) -> str:
@@ -248,7 +248,7 @@ def named(kind: str, words: list[str]) -> str:
                 passes=lambda at, word: score(f"{word} > 1 and left is air", at),
             )
             return text.replace(
-                "  score: {type: 0..60, at: place}\n", "  score: {type: 0..60, at: place}\nproperties:\n"
+                "  score: {type: 0..58, at: place}\n", "  score: {type: 0..58, at: place}\nproperties:\n"
             )
         case "parameter":
             text = pack(

@@ -330,7 +330,7 @@ def report_undecided(spans: Iterable[Span], reporter: Reporter) -> None:
 # Definitions that nothing uses
 
 
-def report_unused(composition: Composition, typer: Typer, produced: frozenset[int]) -> None:
+def report_unused(composition: Composition, typer: Typer) -> None:
     """Report definitions that no rule uses (warnings), and what the loaded packs lack (notes)."""
     reporter = typer.reporter
     values = [str(value) for prop in typer.symbols.properties.values() for value in prop.values]
@@ -349,10 +349,6 @@ def report_unused(composition: Composition, typer: Typer, produced: frozenset[in
         if name not in typer.used:
             _unused("kernel", name, kernel.span, reporter)
     _report_unwritten(composition, reporter)
-    for element in composition.elements.values():
-        if element.id not in produced:
-            label = "it only comes from the start world, or by painting"
-            reporter.report("PD504", f"no rule produces `{element.name}`", element.span, label)
 
 
 def _unused(what: str, name: str, span: Span, reporter: Reporter) -> None:
@@ -418,14 +414,3 @@ def without_dead_overrides(passes: tuple[Pass, ...], dead: frozenset[str]) -> tu
         return replace(moment, rules=tuple(rules))
 
     return tuple(replace(pass_, moments=tuple(map(alive, pass_.moments))) for pass_ in passes)
-
-
-def produced_ids(passes: tuple[Pass, ...], facts: Facts) -> frozenset[int]:
-    """The ids that some rule may bring about."""
-    ids: set[int] = set()
-    for _, moment in substeps(passes):
-        for rule in moment.rules:
-            match rule:
-                case Transform(target=target) | Move(leaving=Expr() as target):
-                    ids |= {target.value} if target.op == "const" else set(facts.ids)
-    return frozenset(ids)
