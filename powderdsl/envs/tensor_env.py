@@ -384,9 +384,7 @@ class TensorEnv:
             last |= {name: info[name] for name in ("success", "episode_return", "episode_length")}
             masked = info["_episode_return"]
             info["final_info"] = last | {f"_{name}": masked for name in last}
-            info["final_obs"] = (
-                observed[places] if len(places) else observed.new_empty(0, *observed.shape[1:])
-            )
+            info["final_obs"] = observed[places]
             info["_final_obs"] = info["_final_info"] = masked
         if not len(places):
             return

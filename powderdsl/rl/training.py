@@ -192,9 +192,8 @@ class _Learner:
             ],
             "successes": [bool(success) for success in model.ep_success_buffer or ()],
             "updates": model._n_updates,
-            "logged": _numbers(
-                model.logger.name_to_value
-            ),  # of the update that is shown after the next rollout
+            # Of the update that is shown after the next rollout.
+            "logged": _numbers(model.logger.name_to_value),
             "steps": self.step,
             "random": _random_state(),
         }

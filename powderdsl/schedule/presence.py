@@ -50,9 +50,8 @@ def check_presence(schedule: Schedule) -> Schedule:
         return replace(schedule, body=(*schedule.body, Forget())) if writes else schedule
     body: list[Statement] = []
     needs = _Needs(schedule, bits, _times(schedule, bits))
-    for statement, after in zip(
-        schedule.body, (*schedule.body[1:], None), strict=False
-    ):  # a body may be empty
+    followers = (*schedule.body[1:], None)  # one too many if the body is empty
+    for statement, after in zip(schedule.body, followers, strict=False):
         if isinstance(statement, Guard):
             swaps = _preserves_counts(statement, bits)
             body.append(statement if swaps else replace(statement, body=(Forget(), *statement.body)))

@@ -16,12 +16,13 @@ if TYPE_CHECKING:
     from powderdsl.worldmodel.networks import UNet, custom_network
     from powderdsl.worldmodel.scores import score
     from powderdsl.worldmodel.training import Replay, finetuned, load_trained, train
-    from powderdsl.worldmodel.worlds import open_recording, pairs_of, task_worlds, unseen_seeds
+    from powderdsl.worldmodel.worlds import TaskWorlds, open_recording, pairs_of, unseen_seeds
 
 __all__ = [
     "DataConfig",
     "Machine",
     "Replay",
+    "TaskWorlds",
     "TrainConfig",
     "UNet",
     "custom_network",
@@ -32,7 +33,6 @@ __all__ = [
     "open_recording",
     "pairs_of",
     "score",
-    "task_worlds",
     "train",
     "unseen_seeds",
 ]
@@ -45,6 +45,6 @@ __getattr__, __dir__ = importing(
         "networks": "UNet custom_network",
         "scores": "score",
         "training": "Replay finetuned load_trained train",
-        "worlds": "open_recording pairs_of task_worlds unseen_seeds",
+        "worlds": "TaskWorlds open_recording pairs_of unseen_seeds",
     },
 )

@@ -143,7 +143,7 @@ class Machine(Checked):
 
     @property
     def simulation(self) -> dict[str, Any]:
-        """The settings that `task_worlds` takes."""
+        """The settings that `TaskWorlds` takes."""
         return {"device": self.device, "threads": self.threads, "backend": self.backend}
 
 

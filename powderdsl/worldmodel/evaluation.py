@@ -26,7 +26,6 @@ from powderdsl.worldmodel.worlds import (
     Recording,
     TaskWorlds,
     pairs_of,
-    task_worlds,
     unseen_seeds,
 )
 
@@ -97,7 +96,7 @@ def evaluate(
     unseen = unseen_worlds(trained, machine=machine, **tested_on)
     data, names, slots = trained.config.data, unseen.names, len(trained.palette)
     seeds = torch.arange(min(FIT_WORLDS, data.states), device=machine.device)
-    trained_on = task_worlds(data, **machine.simulation, palette=trained.palette)
+    trained_on = TaskWorlds(data, **machine.simulation, palette=trained.palette)
     fit = pairs_of(trained_on, seeds, data.steps, data.pairs)
     predictors: dict[str, Network] = {MODEL: trained.network, **_baselines(fit, unseen.rules, slots)}
     count = worlds or (4 if len(names) > 1 else 32)
@@ -167,14 +166,14 @@ def unseen_worlds(trained: Trained, *, machine: Machine = HERE, **tested_on: Any
         tested_on: see `unseen_data`.
 
     Raises:
-        CompileError: as `task_worlds`; PD623 if the rules have elements that the network has no slots for, or the network
+        CompileError: as `TaskWorlds`; PD623 if the rules have elements that the network has no slots for, or the network
             learned from a dataset.
     """
     if trained.config.recorded is not None:
         raise misfit(trained.run.path, "it predicts recorded transitions, with actions")
     data = unseen_data(trained.config.data, **tested_on)
     check_slots(trained.run.path, trained.palette, load_rules_of(data, trained.palette))
-    return task_worlds(data, **machine.simulation, partly=True, palette=trained.palette)
+    return TaskWorlds(data, **machine.simulation, partly=True, palette=trained.palette)
 
 
 def unseen_data(

@@ -45,7 +45,7 @@ from powderdsl.tasks.shipped import load_task
 from powderdsl.worldmodel.config import HERE, DataConfig, Machine, TrainConfig
 from powderdsl.worldmodel.networks import CustomNetwork, encoder_of, fit_weights, network_of
 from powderdsl.worldmodel.scores import score
-from powderdsl.worldmodel.worlds import Pairs, Worlds, pairs_of, task_worlds, validation_pairs
+from powderdsl.worldmodel.worlds import Pairs, TaskWorlds, Worlds, pairs_of, validation_pairs
 
 if TYPE_CHECKING:
     from powderdsl.worldmodel.worlds import Recording
@@ -221,7 +221,7 @@ def train(
             (`validation_pairs`); 0: never. It decides nothing about the weights, so it may change when a run continues.
 
     Raises:
-        CompileError: from `task_worlds` and `open_run`; PD622 if another process trains there; PD623 if weights do not
+        CompileError: from `TaskWorlds` and `open_run`; PD622 if another process trains there; PD623 if weights do not
             fit the network, or the network that the run was begun with is not given; PD624 if the loss is no longer
             finite; PD625 for a `CustomNetwork` that cannot be trained.
         ValueError: your own network gives logits of another shape.
@@ -241,7 +241,7 @@ def train(
     palette = _palette_for(config, path, worlds)
     identity: dict[str, Any] = {}
     if recording is None and worlds is None:
-        worlds = own_worlds = task_worlds(config.data, **machine.simulation, palette=palette)
+        worlds = own_worlds = TaskWorlds(config.data, **machine.simulation, palette=palette)
         identity["worlds"] = own_worlds.fingerprint
     source: Any = recording or worlds
     check_slots(path, palette, source.rules)

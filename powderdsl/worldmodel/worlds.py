@@ -150,9 +150,8 @@ class TaskWorlds:
             return
         numbers = range(config.first_ruleset, config.first_ruleset + config.rulesets)
         self.rulesets = [source.draw(number) for number in numbers]
-        if (
-            machine.get("backend", "auto") == "auto"
-        ):  # compiling many rulesets would take longer than running them
+        # Compiling many rulesets would take longer than running them.
+        if machine.get("backend", "auto") == "auto":
             self._machine = {**machine, "backend": starting_backend(str(self.device))}
 
     def start(self, seeds: Tensor) -> MixedWorld:
@@ -192,10 +191,6 @@ class TaskWorlds:
 
     def _compiled(self, task: Task) -> TaskProgram:
         return compile_task(task, split=self.config.split, **self._machine)
-
-
-task_worlds = TaskWorlds
-"""The function that makes them."""
 
 
 def check_data(config: DataConfig, task: Task, rules: Ruleset) -> None:

@@ -10,13 +10,12 @@ from torch import Tensor
 
 from powderdsl.simulation.simulator import compile as compile_rules
 from powderdsl.tasks.episodes import compile_task
-from powderdsl.worldmodel import DataConfig, Replay, task_worlds, unseen_seeds
+from powderdsl.worldmodel import DataConfig, Replay, TaskWorlds, unseen_seeds
 from powderdsl.worldmodel.config import TEST_SEEDS
-from powderdsl.worldmodel.worlds import TaskWorlds
 
 
 def worlds_of(config: DataConfig) -> TaskWorlds:
-    return task_worlds(config, backend="torch")
+    return TaskWorlds(config, backend="torch")
 
 
 def by_hand(task: str, seed: int, config: DataConfig) -> list[tuple[Tensor, Tensor]]:

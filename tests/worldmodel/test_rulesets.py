@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import powderdsl
-from powderdsl.worldmodel import DataConfig, Machine, TrainConfig, evaluate, load_trained, task_worlds, train
+from powderdsl.worldmodel import DataConfig, Machine, TaskWorlds, TrainConfig, evaluate, load_trained, train
 from powderdsl.worldmodel.config import Variety
 from powderdsl.worldmodel.evaluation import unseen_worlds
 from powderdsl.worldmodel.worlds import UNSEEN_RULESETS, RulesetSource
@@ -94,7 +94,7 @@ def test_packs_that_others_need_stay() -> None:
 @pytest.mark.slow
 def test_every_world_runs_under_its_own_ruleset(task) -> None:  # type: ignore[no-untyped-def]
     source = RulesetSource(RULES, MANY)
-    worlds = task_worlds(DataConfig(task, rulesets=3, variety=MANY), backend="torch")
+    worlds = TaskWorlds(DataConfig(task, rulesets=3, variety=MANY), backend="torch")
     seeds = torch.tensor([5, 0, 1, 3, 2, 4])
     start = worlds.start(seeds)
     end = worlds.later(worlds.later(start, 8), 8)
@@ -120,7 +120,7 @@ def test_training_and_tests_draw_different_rulesets(dunes: str, tmp_path: Path) 
     run = train(config, tmp_path / "run", machine=machine)
     trained = load_trained(run)
     assert trained.config == config  # variety and all, through run.json
-    worlds = task_worlds(data, backend="torch")
+    worlds = TaskWorlds(data, backend="torch")
     assert [one.number for one in worlds.rulesets] == [0, 1, 2]
     unseen = unseen_worlds(trained, split="train", rulesets=5, machine=machine)
     assert [one.number for one in unseen.rulesets] == [UNSEEN_RULESETS + number for number in range(5)]
@@ -143,7 +143,7 @@ def test_unknown_properties_and_bad_numbers_are_refused() -> None:
 
 def test_seeds_may_have_rulesets_of_their_own(task) -> None:  # type: ignore[no-untyped-def]
     data = [DataConfig(task, rulesets=2, first_ruleset=number, variety=MANY) for number in (0, 1)]
-    first, other = (task_worlds(one, backend="torch").rulesets for one in data)
+    first, other = (TaskWorlds(one, backend="torch").rulesets for one in data)
     assert [one.number for one in other] == [1, 2]
     assert other[0] == first[1]
     assert other[1] not in first

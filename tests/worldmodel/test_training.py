@@ -17,12 +17,12 @@ from powderdsl.experiments.runs import RunFolder
 from powderdsl.worldmodel import (
     DataConfig,
     Machine,
+    TaskWorlds,
     TrainConfig,
     evaluate,
     finetuned,
     load_trained,
     pairs_of,
-    task_worlds,
     train,
 )
 from powderdsl.worldmodel.config import TEST_SEEDS
@@ -69,7 +69,7 @@ def test_a_network_learns_what_baselines_cannot_know(garden: str, tmp_path: Path
 
 def test_validation_worlds_are_held_out(dunes: str) -> None:
     data = tiny(dunes).data
-    worlds = task_worlds(data, backend="torch")
+    worlds = TaskWorlds(data, backend="torch")
     with mock.patch.object(worlds, "start", wraps=worlds.start) as start:
         pairs = validation_pairs(worlds, data)
     seeds = [seed for call in start.call_args_list for seed in call.args[0].tolist()]

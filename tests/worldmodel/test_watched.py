@@ -7,7 +7,7 @@ import torch
 
 import powderdsl
 from powderdsl.tasks.episodes import compile_task
-from powderdsl.worldmodel import DataConfig, task_worlds
+from powderdsl.worldmodel import DataConfig, TaskWorlds
 from powderdsl.worldmodel.training import add, keep, leave_out, palette_of
 from tests.refusals import refusal, refused_codes
 
@@ -16,13 +16,13 @@ PAPER = ("empty", "sand", "water", "wall", "plant", "fire", "wood", "ice", "lava
 
 def ids_in(config: DataConfig, seeds: int = 60) -> set[str]:
     """Names of the elements that start worlds hold."""
-    worlds = task_worlds(config, backend="reference")
+    worlds = TaskWorlds(config, backend="reference")
     found = worlds.start(torch.arange(seeds)).ids.unique().tolist()
     return {element.name for element in worlds.rules.elements if element.id in found}
 
 
 def test_under_its_own_rules_a_task_is_as_it_was() -> None:
-    worlds = task_worlds(DataConfig(), backend="reference")
+    worlds = TaskWorlds(DataConfig(), backend="reference")
     seeds = torch.arange(20)
     same = compile_task("world-model", backend="reference").start(seeds)
     assert torch.equal(worlds.start(seeds).ids, same.world.ids)
@@ -47,7 +47,7 @@ def test_only_some_packs_are_drawn() -> None:
 
 def test_stands_that_rules_cannot_have_are_left_out_or_refused() -> None:
     config = DataConfig(split="designed", rules="powderworld-gas-stone-acid")
-    found = task_worlds(config, backend="reference", partly=True)
+    found = TaskWorlds(config, backend="reference", partly=True)
     assert found.names == ("sand-on-water", "ice-and-plants", "burning-vines", "water-flowing")
     assert {name: lacking for name, lacking, _ in found.missing} == {
         "stone-arches": ("stone",),
@@ -55,14 +55,14 @@ def test_stands_that_rules_cannot_have_are_left_out_or_refused() -> None:
         "dust-on-lava": ("stone",),
         "gas-flowing": ("gas",),
     }
-    full = task_worlds(DataConfig(split="designed"), backend="reference")
+    full = TaskWorlds(DataConfig(split="designed"), backend="reference")
     kept = [full.names.index(name) for name in found.names]
     assert torch.equal(found.start(torch.arange(4)).ids, full.start(torch.arange(8)).ids[kept])
-    assert refused_codes(task_worlds, config, backend="reference") == ["PD604"] * 4
+    assert refused_codes(TaskWorlds, config, backend="reference") == ["PD604"] * 4
 
 
 def test_a_draw_without_elements_is_refused_at_its_line() -> None:
-    (found,) = refusal(task_worlds, DataConfig(split="held_out", rules="core+sand"), backend="reference")
+    (found,) = refusal(TaskWorlds, DataConfig(split="held_out", rules="core+sand"), backend="reference")
     assert found.code == "PD604"
     assert "(gas, stone, acid)" in found.primary.span.text
     assert found.notes == ("they need gas, stone, acid",)
@@ -72,8 +72,8 @@ def test_ids_follow_names_where_rules_number_them_otherwise(tmp_path, garden: st
     (tmp_path / "other").mkdir()
     other = tmp_path / "other" / "moss.yaml"
     other.write_text((tmp_path / "moss.yaml").read_text().replace("id: 5", "id: 9"))
-    own = task_worlds(DataConfig(task=garden), backend="reference")
-    moved = task_worlds(DataConfig(task=garden, rules=f"core+{other}"), backend="reference")
+    own = TaskWorlds(DataConfig(task=garden), backend="reference")
+    moved = TaskWorlds(DataConfig(task=garden, rules=f"core+{other}"), backend="reference")
     seeds = torch.arange(5)
     before, after = own.start(seeds).ids, moved.start(seeds).ids
     assert (before == 5).any()
@@ -81,7 +81,7 @@ def test_ids_follow_names_where_rules_number_them_otherwise(tmp_path, garden: st
 
 
 def test_an_unknown_pack_is_refused() -> None:
-    (found,) = refusal(task_worlds, DataConfig(only=("gass",)), backend="reference")
+    (found,) = refusal(TaskWorlds, DataConfig(only=("gass",)), backend="reference")
     assert (found.code, found.helps) == ("PD304", ("did you mean `gas`?",))
 
 
