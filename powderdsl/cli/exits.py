@@ -37,10 +37,8 @@ def version() -> str:
     return str(sys.modules["powderdsl"].__version__)  # our own package, so it has been imported
 
 
-PACKAGES = {"PIL": "pillow", "yaml": "pyyaml"}
-"""Packages by the module that they bring, where its name is another one."""
-OURS = {"powderdsl", *sys.stdlib_module_names}
-"""Modules that cannot be installed."""
+PACKAGES = {"PIL": "pillow", "gymnasium": "'powderdsl[rl]'"}
+"""Packages by the module that they bring, where pip knows them by another name."""
 
 
 @contextmanager
@@ -75,13 +73,12 @@ def report_failure(error: BaseException) -> int:
             if len(error.diagnostics) > 1:
                 click.echo(f"\n{counted(len(error.diagnostics), 'error')}", err=True)
             return BAD_INPUT
-        case ModuleNotFoundError(name=str(module)) if module.split(".")[0] not in OURS:
+        case ModuleNotFoundError(name=str(module)) if not module.startswith("powderdsl"):
             from powderdsl.system.writing import failure
 
             name = module.split(".")[0]
-            message = f"this command needs {name}, which is not installed"
-            helps = (f"pip install {PACKAGES.get(name, name)}",)
-            return report_failure(failure("PD612", message, helps=helps))
+            message, fix = f"this command needs {name}, which is not installed", PACKAGES.get(name, name)
+            return report_failure(failure("PD612", message, helps=(f"pip install {fix}",)))
         case OSError():
             file = f"{error.filename}: " if error.filename else ""
             click.echo(f"error: {file}{error.strerror or error}", err=True)

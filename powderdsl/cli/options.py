@@ -42,21 +42,12 @@ class Parsed(click.ParamType):
             self.fail(f"`{value}` {error}", param, ctx)
 
 
-class _Digits(click.ParamType):
-    """Refuses digits of other scripts, which Python reads and rule files do not have."""
+class Integer(click.IntRange):
+    """An integer in a range. Digits of other scripts, which Python reads and rule files do not have, are refused."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        if isinstance(value, str) and not value.isascii():
-            self.fail(f"`{value}` is not a number in digits from 0 to 9", param, ctx)
-        return super().convert(value, param, ctx)
-
-
-class Integer(_Digits, click.IntRange):
-    """An integer in a range."""
-
-
-class Decimal(_Digits, click.types.FloatParamType):
-    """A number."""
+        plain: Any = ascii(value)[1:-1] if isinstance(value, str) else value
+        return super().convert(plain, param, ctx)
 
 
 def _count(text: str) -> int:
@@ -199,7 +190,7 @@ def _setting(field: Field[Any], name: str, presets: Presets) -> Option:
     elif isinstance(field.default, int):
         kind = COUNT
     elif isinstance(field.default, float):
-        kind = Decimal()
+        kind = Parsed("FLOAT", lambda text: float(ascii(text)[1:-1]))
     return option(f"--{name}", kind, about, to=field.name, multiple=isinstance(field.default, tuple))
 
 

@@ -61,8 +61,8 @@ def start(
         if drawn is None:
             world = load_world(str(name), sim)
             if world.since + steps > LAST_STEP:
-                fix = f"it can make {LAST_STEP - world.since:,} more: the last step is {LAST_STEP:,}"
-                raise failure("PD602", f"`{name}` cannot make {steps:,} steps", helps=(fix,))
+                more = f"{LAST_STEP - world.since:,} more steps: the last one is {LAST_STEP:,}"
+                raise failure("PD602", f"`{name}` can make {more}")
             return world
         return fresh_world(sim, drawn, seed or 0)
 

@@ -31,7 +31,7 @@ from powderdsl.envs.tensor_env import Observation, TensorEnv, observation_of
 from powderdsl.experiments.runs import differences, lock_folder
 from powderdsl.system.random import action_keys
 from powderdsl.system.settings import check_count
-from powderdsl.system.writing import failure, not_writable
+from powderdsl.system.writing import failure, writing
 from powderdsl.tasks.episodes import TaskProgram
 from powderdsl.tasks.players import ExpertPlayer
 from powderdsl.tasks.task import Task, still_action
@@ -126,10 +126,8 @@ def lock_place(folder: Path) -> Iterator[None]:
     """Make the folder and lock it. A new one without a shard is removed where a CompileError ends the block."""
     check_place(folder)
     is_new = not folder.is_dir()
-    try:
+    with writing(folder):
         folder.mkdir(exist_ok=not is_new)
-    except (OSError, ValueError) as error:
-        raise not_writable(folder, error) from None
     with lock_folder(folder):
         try:
             yield

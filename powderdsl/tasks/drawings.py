@@ -205,9 +205,8 @@ class Drawer:
     def visit(self, span: Span) -> None:
         """Count something that is checked. Raises CompileError for more than MAX_VISITS."""
         if next(self.visits) >= MAX_VISITS:
-            helps = ["a part counts each time that a list has it"]
-            message = f"a task of more than {MAX_VISITS:,} statements"
-            self.reporter.error("PD508", message, span, "over the limit", helps=helps)
+            message = f"a task of more than {MAX_VISITS:,} statements, parts counted each time"
+            self.reporter.error("PD508", message, span, "over the limit")
             self.reporter.raise_if_errors()
 
     def target(self, name: str, items: Sequence[Item]) -> Target:

@@ -37,7 +37,7 @@ def save(world: World, path: str | Path) -> None:
     """Write worlds with their state, seeds, indices and steps as .npz. The file appears whole or not at all.
 
     Raises:
-        CompileError: PD613 if the folder cannot be written, PD602 if the disk is full, PD607 if there are more than
+        CompileError: PD613 if the folder cannot be written or the disk is full, PD607 if there are more than
             MAX_CELLS cells.
         TypeError: `world` is not a World.
     """
@@ -59,14 +59,10 @@ def save(world: World, path: str | Path) -> None:
     to_numpy = world.sim.kind.to_numpy
     arrays = {f"{SLOT}{name}": to_numpy(value) for name, value in world.state.items()}
     clock = {name: to_numpy(getattr(world, name)) for name in CLOCK}
-    with replacing(target, follow=True) as temporary:
-        try:
-            with temporary.open("wb") as file:
-                write_archive(file, {"about": json.dumps(about), **arrays, **clock})
-                file.flush()
-                os.fsync(file.fileno())
-        except OSError as error:
-            raise _unreadable(target, f"cannot be written: {error.strerror}") from None
+    with replacing(target, follow=True) as temporary, temporary.open("wb") as file:
+        write_archive(file, {"about": json.dumps(about), **arrays, **clock})
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def load_world(

@@ -53,7 +53,7 @@ REFUSED = (
     ("run core+grit.yaml --set grit.vanish=200%", "error[PD"),
     ("run core+grit.yaml --set grit.vanish=often", "error[PD"),
     ("run core+grit.yaml --set grit.vanish=٢٠%", "error[PD402]"),
-    ("run core+grit.yaml --steps ٣", "not a number in digits from 0 to 9"),
+    ("run core+grit.yaml --steps ٣", "not a valid integer"),
     ("bench life --seconds ٣", "not a number above 0"),
     ("run core --out none/x.png", "error[PD"),
     ("run core --device cuda:99", "error[PD"),

@@ -158,8 +158,8 @@ SECTIONS: list[tuple[str, str, str, str | None]] = [
     # Kernels and sets
     *DETAILS,
     ("a pack that needs itself", "needs: yard\n", "PD307", "yard"),
-    ("a pack that conflicts with itself", "conflicts: yard\n", "PD307", "yard"),
-    ("a pack that provides itself", "provides: yard\n", "PD307", "yard"),
+    ("a pack that conflicts with itself", "conflicts: yard\n", "PD306", "yard"),
+    ("a pack that provides itself", "provides: yard\n", "PD306", "yard"),
     ("a pack that needs what it provides", "provides: soil\nneeds: soil\n", "PD307", "soil"),
     ("a set of itself", "sets: {s: s}\n", "PD307", "s"),
     ("sets of each other", "sets:\n  s: t\n  t: (s, weed)\n", "PD307", "s"),

@@ -51,7 +51,7 @@ def test_commands_refuse_further_steps_before_they_run(late: Path, tmp_path: Pat
     for words in (("run", "--steps", 3, "--out", out), ("trace", "--step", 3, "--at", "1,1")):
         ended = command(words[0], "powderworld", "--world", late, *words[1:], exits=2)
         assert "error[PD602]" in ended.stderr
-        assert "it can make 2 more" in ended.stderr
+        assert "can make 2 more steps: the last one is" in ended.stderr
     assert not out.exists()
     command("run", "powderworld", "--world", late, "--steps", 2, "--out", out, exits=0)
     command("run", "powderworld", "--world", out, "--steps", 0, exits=0)

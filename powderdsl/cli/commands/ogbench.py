@@ -8,7 +8,6 @@ from typing import Any
 import click
 
 from powderdsl.cli import options as opt
-from powderdsl.cli.commands.record import require_gymnasium
 from powderdsl.cli.exits import OK, user_values
 from powderdsl.cli.output import counted, progress
 
@@ -29,7 +28,6 @@ def command(level: str, out: Path, threads: int, backend: str, device: str, **ho
         powderdsl ogbench easy --out data
         powderdsl ogbench hard --out data --episodes 100
     """
-    require_gymnasium()
     from powderdsl.ogbench.levels import find_level
 
     with user_values():

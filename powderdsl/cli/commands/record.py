@@ -76,7 +76,6 @@ def command(
         raise BadInput(f"{mode} does not go with {', '.join(extra)}")
     if missing := [name for name in needs if name not in arguments]:
         raise BadInput(f"missing {', '.join(missing)}")
-    require_gymnasium()
     from powderdsl.datasets.dataset import Dataset
 
     with user_values():
@@ -149,10 +148,3 @@ def _trained(run: RunFolder, task: Task, how: dict[str, Any]) -> dict[str, Any]:
     env = TensorEnv(task, 1, observation=sees, **where)
     name = f"{run.path.name}, checkpoint {run.checkpoint().path.stem}"
     return {"policy": load_policy(run, env), "policy_name": name, "sees": sees}
-
-
-def require_gymnasium() -> None:
-    """Raises CompileError (PD612) if the environments' package is not installed."""
-    from powderdsl.system.packages import require
-
-    require("gymnasium", "recording", "pip install 'powderdsl[rl]'")

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from functools import partial
 from importlib.util import find_spec
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -90,10 +91,9 @@ SHARD = opt.Parsed("I/N", _shard)
 
 def selected(study: Study, size: str, seeds: int | None, only: Mapping[str, str]) -> list[Point]:
     """The combinations that were asked for. Raises BadInput if there are none."""
-    number = study.number(size, seeds)
-    if number > MAX_POINTS:
-        raise BadInput(f"--seeds: {number:,} combinations; a study has at most {MAX_POINTS:,}")
-    points = every = list(study.points(size, seeds))
+    points = every = list(islice(study.points(size, seeds), MAX_POINTS + 1))
+    if len(every) > MAX_POINTS:
+        raise BadInput(f"--seeds: a study has at most {MAX_POINTS:,} combinations")
     for name, text in only.items():
         known = {point.names[name] for point in every if name in point.names and name != SIZE}
         if not known:

@@ -272,9 +272,6 @@ def _refuse_world_options(values: Mapping[str, Any]) -> None:
 
 def _open_recording(folder: Path, task: str | None) -> Recording:
     """The recording in a dataset's folder."""
-    from powderdsl.cli.commands.record import require_gymnasium
-
-    require_gymnasium()
     from powderdsl.worldmodel.worlds import open_recording
 
     return open_recording(folder, task)

@@ -161,10 +161,6 @@ class Study:
     source: Source
     folder: Path
 
-    def number(self, size: str, seeds: int | None = None) -> int:
-        """The number of combinations, each with every seed."""
-        return (seeds or self.seeds) * math.prod(len(axis.values[size]) for axis in self.axes)
-
     def points(self, size: str, seeds: int | None = None) -> Iterator[Point]:
         """Yield all combinations, each with every seed. Seeds vary slowest, so that early ends leave whole sets."""
         for seed in range(self.seeds if seeds is None else seeds):

@@ -282,16 +282,11 @@ def _check_needs(loaded: Mapping[str, PackDecl], left_out: Collection[str], repo
     stands_in: dict[str, PackDecl] = {}
     missing: dict[str, dict[str, Span]] = {}
     for name, pack in loaded.items():
-        for verb, words in (
-            ("needs", pack.needs),
-            ("conflicts with", pack.conflicts),
-            ("provides", pack.provides),
-        ):
-            for word in words:
-                if word.text == name:
-                    message = f"pack `{name}` {verb} itself"
-                    reporter.error("PD307", message, word.span, "the pack itself", helps=["remove it"])
         for need in pack.needs:
+            if need.text == name:
+                reporter.error(
+                    "PD307", f"pack `{name}` needs itself", need.span, "this pack", helps=["remove it"]
+                )
             if need.text not in loaded:
                 missing.setdefault(need.text, {})[name] = need.span
         for other in (*pack.conflicts, *pack.provides):
@@ -299,7 +294,7 @@ def _check_needs(loaded: Mapping[str, PackDecl], left_out: Collection[str], repo
             if other in pack.provides:
                 rival = rival or stands_in.get(other.text)
                 stands_in.setdefault(other.text, pack)
-            if rival is not None and rival is not pack:
+            if rival is not None:
                 reporter.error(
                     "PD306", f"packs `{name}` and `{rival.name.text}` cannot be loaded together",
                     other.span, "declared here", secondary=[Label(rival.name.span, "loaded too")],
