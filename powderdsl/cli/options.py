@@ -46,8 +46,9 @@ class Integer(click.IntRange):
     """An integer in a range. Digits of other scripts, which Python reads and rule files do not have, are refused."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        plain: Any = ascii(value)[1:-1] if isinstance(value, str) else value
-        return super().convert(plain, param, ctx)
+        if isinstance(value, str) and not value.isascii():
+            self.fail(f"`{value}` is not a valid integer", param, ctx)
+        return super().convert(value, param, ctx)
 
 
 def _count(text: str) -> int:

@@ -179,8 +179,7 @@ class Drawer:
     ruleset: Ruleset
     size: Size
     reporter: Reporter
-    visits: Iterator[int]
-    """The numbers of what is checked: worlds of one task share them."""
+    visits: Iterator[int]  # all worlds of a task share these numbers
     used_parts: set[str] = field(default_factory=set)
     count: int = 0
     cells: int = 0
