@@ -29,7 +29,7 @@ MAP = ROOT / "docs" / "architecture.md"
 MADE_FOLDERS = ("web/made", "web/parts")
 """Folders that `make web` and `make wheel` write, and git ignores."""
 MAX_LINES = 800
-LINE_BUDGET = 52_500
+LINE_BUDGET = 52_300
 """Lines of Python that powderdsl/ may have."""
 
 SLOW_IMPORTS = ("torch", "gymnasium", "stable_baselines3", "matplotlib", "tensorboard")

@@ -94,7 +94,12 @@ def _show(head: dict[str, Any], tables: Tables, as_json: bool) -> None:
     for name, parts in tables.items():
         rows = [dict(_columns(part)) for part in parts]
         cells = [[_text(cell, styled) for cell in row.values()] for row in rows]
-        lines += ["", TITLES.get(name, name.capitalize()), *table([[*rows[0]], *cells] if rows else [])]
+        columns = [column for column in zip(rows[0], *cells, strict=True) if any(column[1:])] if rows else []
+        lines += [
+            "",
+            TITLES.get(name, name.capitalize()),
+            *table([list(row) for row in zip(*columns, strict=True)]),
+        ]
     write_styled(sys.stdout, "\n".join(lines) + "\n")
 
 
@@ -248,7 +253,7 @@ def _of_task(task: Task) -> tuple[dict[str, Any], Tables]:
 
 
 def _agent_text(task: Task) -> Iterator[str]:
-    from powderdsl.tasks.task import BLOW
+    from powderdsl.tasks.task import BLOW, NO_CHANGE
 
     agent, brush, bins = task.agent, task.agent.brush, task.agent.bins
     names = {element.id: element.name for element in task.ruleset.elements}
@@ -258,7 +263,9 @@ def _agent_text(task: Task) -> Iterator[str]:
         acts.append("places " + ("any element" if len(placed) == len(names) else ", ".join(placed)))
     if BLOW in agent.choices:
         acts.append(f"blows with {agent.speed:g} ({agent.speed_field})")
-    yield " or ".join(acts) or "does nothing"
+    if NO_CHANGE in agent.choices:
+        acts.append("does nothing")
+    yield " or ".join(acts)
     yield f"{agent.actions} actions of {agent.steps_per_action} steps"
     if agent.free_steps:
         yield f"then {agent.free_steps} steps"
