@@ -30,9 +30,9 @@ WITHOUT_TORCH = ("wasm", "reference")
 
 @cache
 def has_torch() -> bool:
-    """True if torch can be imported. It is not imported."""
+    """True if torch can be imported, and NumPy, which its tensors are made of. They are not imported."""
     try:
-        return find_spec("torch") is not None
+        return all(find_spec(name) for name in ("torch", "numpy"))
     except ImportError:
         return False
 
@@ -55,9 +55,11 @@ def array_kind(backend: str, device: Any, tensors: bool) -> ArrayKind:
 
         return Tensors(find_device(device))
     if backend not in (*WITHOUT_TORCH, "auto"):
-        raise unavailable(backend, "torch is not installed", _CPU)
+        raise unavailable(backend, "torch or NumPy is not installed", _CPU)
     if str(device) != "cpu":
-        raise failure("PD701", f"no device `{device}`", notes=("torch is not installed",), helps=(_CPU,))
+        raise failure(
+            "PD701", f"no device `{device}`", notes=("torch or NumPy is not installed",), helps=(_CPU,)
+        )
     return ArrayKind()
 
 
@@ -76,7 +78,7 @@ def find_device(name: str | torch.device) -> torch.device:
     return device
 
 
-_CPU = "`pip install torch`, or run on the device `cpu` and the backend `wasm` or `reference`"
+_CPU = "`pip install torch numpy`, or run on the device `cpu` and the backend `wasm` or `reference`"
 _WASMTIME = "`pip install wasmtime`, or run on the backend `torch` or `native`"
 
 
