@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -268,10 +269,12 @@ def _play_all(
 
 
 def _starts(program: TaskProgram, worlds: Tensor) -> list[bytes]:
-    """The elements of start worlds."""
-    return [
-        ids.numpy().tobytes() for part in worlds.split(BATCH) for ids in program.start(part).world.ids.cpu()
-    ]
+    """Digests of start worlds, elements and fields."""
+    digests = []
+    for part in worlds.split(BATCH):
+        state = [value.cpu().numpy() for value in program.start(part).world.state.values()]
+        digests += [sha256(b"".join(map(bytes, rows))).digest() for rows in zip(*state, strict=True)]
+    return digests
 
 
 def _score(split: str, policy: str, all_played: Mapping[str, Played], task: Task) -> Score:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import torch
 
 from powderdsl.targets.array_kind import ArrayKind
 from powderdsl.tasks.episodes import compile_task
 from powderdsl.tasks.tensors.generator import StartWorlds
+from tests.cli.commands import powderdsl as run
 from tests.tasks.test_episodes import task_of
 
 HEAD = "task: t\nrules: powderworld\nsize: [8, 8]\nfill: empty\nagent: {may: any, actions: 3}\n"
@@ -74,3 +77,14 @@ splits:
     )
     world = compile_task(task_of(text), split="both", backend="reference").start(torch.arange(4)).world
     assert [len(cells.unique()) for cells in world["clone"]] == [2, 1, 2, 1]
+
+
+def test_worlds_that_differ_in_fields_alone_are_not_those_of_training(folder: Path) -> None:
+    text = (
+        HEAD + "generate:\n  - box cloner rows 0:4\n  - clone := sand in box rows 0:0..4\nreward: {each: 0}\n"
+    )
+    (folder / "task.yaml").write_text(
+        text + "splits:\n  test: {generate: [box cloner rows 0:4, clone := lava]}\n"
+    )
+    told = run("evaluate", "task.yaml", "--episodes", 4, "--backend", "wasm", exits=0)
+    assert "start as a training world does" not in told.output
