@@ -47,6 +47,13 @@ from powderdsl.system.reading import open_regular
 from powderdsl.system.settings import check_choice, check_count
 from powderdsl.system.writing import failure, replacing
 
+Array = NDArray[Any]
+
+MEANING = ("observation", "channels", "shape", "palette", "action_nvec", "choices")
+"""Fields of a recipe that define what the numbers of observations and actions mean."""
+UNITS = ("world", "episode")
+"""What `split` keeps together."""
+
 DTYPES = {
     "observation": "|u1",
     "action": "<i2",
@@ -212,14 +219,6 @@ def check_episodes(arrays: Mapping[str, Array], recipe: Recipe) -> None:
         raise BadArchive("it has actions out of range")
     if (arrays["world"] < 0).any():
         raise BadArchive("it has worlds out of range")
-
-
-Array = NDArray[Any]
-
-MEANING = ("observation", "channels", "shape", "palette", "action_nvec", "choices")
-"""Fields of a recipe that define what the numbers of observations and actions mean."""
-UNITS = ("world", "episode")
-"""What `split` keeps together."""
 
 
 class Batch(NamedTuple):

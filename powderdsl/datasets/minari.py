@@ -15,13 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from powderdsl.datasets.dataset import DTYPES, Dataset, check_episodes, knows_ids, row_shape
-from powderdsl.datasets.manifest import (
-    Recipe,
-    changed_params,
-    damaged,
-    read_recipe,
-    reporting_damage,
-)
+from powderdsl.datasets.manifest import Recipe, changed_params, damaged, read_recipe, reporting_damage
 from powderdsl.datasets.recorder import add_shard, begin_manifest, lock_place
 from powderdsl.diagnostics import CompileError
 from powderdsl.envs import env_id

@@ -217,10 +217,8 @@ class _Recording:
             if name not in ("length", "world")
         }
         worlds, length = (recipe.seed + numbers) % recipe.worlds, np.zeros(count, np.int64)
-        stack, episodes = (
-            FrameStack(getattr(self.policy, "frames", 1)),
-            torch.from_numpy(numbers).to(env.device),
-        )
+        stack = FrameStack(getattr(self.policy, "frames", 1))
+        episodes = torch.from_numpy(numbers).to(env.device)
         observed, _ = env.reset(seed=0, options={"worlds": worlds})
         tape["observation"][:, 0] = observed.cpu().numpy()
         for step in range(recipe.actions):

@@ -10,16 +10,7 @@ from operator import or_
 
 from powderdsl.ir.ops import FLAG, REAL, Node, ordered
 from powderdsl.schedule.floats import match_slot_choices
-from powderdsl.schedule.types import (
-    ANSWER,
-    Compute,
-    Forget,
-    Guard,
-    Schedule,
-    Statement,
-    combined,
-    flat,
-)
+from powderdsl.schedule.types import ANSWER, Compute, Forget, Guard, Schedule, Statement, combined, flat
 
 MAX_PLANES = 6
 """A set of ids is a word of 64 bits."""

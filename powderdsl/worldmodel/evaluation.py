@@ -20,14 +20,7 @@ from powderdsl.worldmodel.config import HERE, DataConfig, Machine
 from powderdsl.worldmodel.networks import without_actions
 from powderdsl.worldmodel.scores import Network, Score, elements_of, frequent, outcomes, score, still
 from powderdsl.worldmodel.training import Trained, check_slots, load_rules_of
-from powderdsl.worldmodel.worlds import (
-    UNSEEN_RULESETS,
-    Pairs,
-    Recording,
-    TaskWorlds,
-    pairs_of,
-    unseen_seeds,
-)
+from powderdsl.worldmodel.worlds import UNSEEN_RULESETS, Pairs, Recording, TaskWorlds, pairs_of, unseen_seeds
 
 FIT_WORLDS = 64
 """The most training worlds that baselines are fitted on."""
