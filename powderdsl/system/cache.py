@@ -34,7 +34,7 @@ LIMIT = 512 << 20
 MOST = 2000
 """Files to keep, as few as that a folder is searched quickly."""
 
-QUICK = 0.01
+QUICK = 0.002
 """Seconds of work whose results are not worth a file."""
 
 UNUSED = 24 * 3600.0

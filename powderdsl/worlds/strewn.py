@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from random import Random
 
-from powderdsl.analysis.changes import moved_ids, unchanging_ids
 from powderdsl.arrays import NDArray, np
 from powderdsl.model.types import Ruleset
 from powderdsl.system.writing import failure
@@ -68,6 +67,8 @@ def random_shape(random: Random, size: Size, reach: int) -> Shape:
 
 def frame_element(ruleset: Ruleset, ground: int) -> int | None:
     """The id of the element that frames random worlds; None if nothing moves or all elements change."""
+    from powderdsl.analysis.changes import moved_ids, unchanging_ids  # only for scattered worlds
+
     if not moved_ids(ruleset):
         return None
     return min(unchanging_ids(ruleset) - {ground}, default=None)

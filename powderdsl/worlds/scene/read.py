@@ -12,7 +12,6 @@ from typing import Any
 
 from powderdsl.arrays import NDArray, np
 from powderdsl.diagnostics import Label, Reporter, Source, Span, suggest
-from powderdsl.model.examples import WordProblem, read_word
 from powderdsl.model.schema import NAME_FORM, Reader, Record, first_line, keyed, read_tree
 from powderdsl.model.state import Slot, slot_name, slots
 from powderdsl.model.types import Ruleset
@@ -385,6 +384,8 @@ def value_of(
     reporter: Reporter,
 ) -> tuple[float, ...]:
     """The components of a setting's value; empty after a report."""
+    from powderdsl.model.examples import WordProblem, read_word  # brings the checker
+
     slot, name = slot_of.get(setting.name), setting.name
     if slot is None:
         if ruleset.property(name) is not None:
