@@ -127,7 +127,7 @@ def main() -> None:
 
     \b
         powderdsl run RULES --watch
-        powderdsl new NAME && powderdsl check core+NAME.yaml
+        powderdsl new NAME && powderdsl check NAME.yaml
 
     docs/shell.md lists environment variables, and says how shells complete words.
     """

@@ -37,9 +37,9 @@ def run_tests(text: str, folder, exits: int):
 
 @pytest.mark.parametrize("name", ["salt", "Salt2", "x", "a_name_of_exactly_forty_characters_xxxxx"])
 def test_a_new_pack_checks_runs_and_passes_its_test(folder, name):
-    assert f"core+{name}.yaml" in powderdsl("new", name, exits=0).stdout
+    assert f"run {name}.yaml" in powderdsl("new", name, exits=0).stdout
     assert [path.name for path in folder.iterdir()] == [f"{name}.yaml"]
-    rules = f"core+{name}.yaml"
+    rules = f"{name}.yaml"
     powderdsl("check", rules, exits=0)
     assert f"ok    {name}: " in powderdsl("test", rules, exits=0).stdout
 

@@ -43,7 +43,7 @@ def command(name: str, folder: Path) -> None:
     for problem in _problems(name, text):
         raise BadInput(f"`{name}` cannot name a pack: {problem}")
     write_text(path, text)
-    click.echo(f"wrote {path}: powderdsl run core+{path} --watch")
+    click.echo(f"wrote {path}: powderdsl run {path} --watch")
 
 
 def _problems(name: str, text: str) -> list[str]:
