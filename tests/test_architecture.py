@@ -8,10 +8,7 @@ from __future__ import annotations
 
 import ast
 import io
-import os
 import re
-import subprocess
-import sys
 import tokenize
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -31,9 +28,6 @@ MADE_FOLDERS = ("web/made", "web/parts")
 MAX_LINES = 800
 LINE_BUDGET = 52_300
 """Lines of Python that powderdsl/ may have."""
-
-SLOW_IMPORTS = ("torch", "gymnasium", "stable_baselines3", "matplotlib", "tensorboard")
-"""What the front end, `powderdsl check` and `powderdsl --help` must do without."""
 
 EMPTY_NAMES = ("utils", "util", "common", "helpers", "helper", "base", "misc")
 """Names that say nothing: such a module has no reason to refuse anything."""
@@ -302,29 +296,12 @@ def test_every_module_keeps(rule: Callable[[str, str], Iterable[str]], sources: 
         (
             layer_faults,
             "model.reference",
-            "import powderdsl.ir.ops",
-            "model.reference:1 may not import powderdsl.ir.ops",
-        ),
-        (
-            layer_faults,
-            "model.reference",
             "from powderdsl import ir",
-            "model.reference:1 may not import powderdsl.ir",
+            "model.reference:1 may not import powder",
         ),
         (layer_faults, "model.check", "from powderdsl.model import reference", "may not import"),
-        (
-            layer_faults,
-            "ir.stages.fuse",
-            "\nfrom powderdsl.model import Rule",
-            "ir.stages.fuse:2 may not import",
-        ),
+        (layer_faults, "ir.stages.fuse", "from powderdsl.model import Rule", "may not import"),
         (layer_faults, "targets.torch.program", "from powderdsl.ir.stages import PIPELINE", "may not import"),
-        (
-            layer_faults,
-            "targets.torch.program",
-            "from powderdsl.syntax.parse import Syntax",
-            "may not import",
-        ),
         (layer_faults, "targets.wasm.program", "from powderdsl.targets.cpp import build", "may not import"),
         (layer_faults, "targets.job", "from powderdsl.targets.cpp import build", "may not import"),
         (layer_faults, "ir.ops", "from powderdsl.model import Rule", "may not import"),
@@ -346,7 +323,7 @@ def test_every_module_keeps(rule: Callable[[str, str], Iterable[str]], sources: 
         (
             third_party_faults,
             "simulation.draw",
-            "try:\n    import torch\nexcept E: pass",
+            "try: import torch\nexcept E: pass",
             "only inside a function",
         ),
         (import_style_faults, "draw", "from .ir import ops", "draw:1 has a relative import"),
@@ -412,7 +389,7 @@ def test_module_names_can_fail() -> None:
     assert list(module_name_faults(["cli.draw", "draw", "tasks.task"])) == []
 
 
-def test_modules_stand_in_folders(sources: dict[str, str]) -> None:
+def test_modules_stand_in_folders() -> None:
     """The package's top is for what everything goes through."""
     loose = {path.stem for path in PACKAGE.glob("*.py")}
     assert loose == {"__init__", "__main__", "compiler"}
@@ -433,12 +410,10 @@ def test_pages_about_the_code_name_paths_that_exist(name: str) -> None:
     assert len(list(path_faults(text, lambda _: False))) >= 10
 
 
-def test_the_map_is_short() -> None:
-    assert len(MAP.read_text(encoding="utf-8").split()) <= 1_500, f"move details out of {MAP.name}"
-
-
-def test_the_map_has_every_folder() -> None:
-    rows = folders_on_map(MAP.read_text(encoding="utf-8"))
+def test_the_map_is_short_and_has_every_folder_and_the_layers_in_order() -> None:
+    text = MAP.read_text(encoding="utf-8")
+    assert len(text.split()) <= 1_500, f"move details out of {MAP.name}"
+    rows = folders_on_map(text)
     files = (path for kind in ("py", "md", "js") for path in PACKAGE.rglob(f"*.{kind}"))
     folders = {path.parent.relative_to(PACKAGE).as_posix() for path in files} - {"."}
     expect_none(
@@ -446,11 +421,6 @@ def test_the_map_has_every_folder() -> None:
         for folder in sorted(folders)
         if not folder.startswith(MADE_FOLDERS) and not on_map(folder, rows)
     )
-
-
-def test_the_map_has_the_layers_in_order() -> None:
-    text = MAP.read_text(encoding="utf-8")
-    rows = folders_on_map(text)
     later = list(later_imports(list(rows)))
     assert later == ["analysis.costs imports ir"], (
         "the map says which module imports from a folder below its own"
@@ -492,8 +462,6 @@ def test_allowed_words_are_names_of_the_rules(shipped_names: set[str]) -> None:
     [
         'if name == "sand": pass',
         "sand_mask = 1",
-        "is_sand = 1",
-        "x.sand",
         "class SandPass: pass",
         "SAND = 2",
         'f"{sand}"',
@@ -501,7 +469,6 @@ def test_allowed_words_are_names_of_the_rules(shipped_names: set[str]) -> None:
         '"falls like sand"',
         '"""A docstring about\n\nsand."""',
         "x = 1  # a sand castle",
-        '"core.sand"',
         '"sand,water"',
         'x["fire"]',
         "fire = 1",
@@ -523,40 +490,3 @@ def test_other_words_are_not(source: str) -> None:
 def test_names_are_read_from_rules() -> None:
     text = "pack: x\nelements:\n  no: {id: 1}\npasses:\n  fall?: {do: a -> b}\nparams: {p: 1%}\n"
     assert names_in_rules(text) == {"no", "fall"}
-
-
-# --- what an import costs
-
-
-def slow_imports_after(statement: str, path: Path = ROOT) -> set[str]:
-    """Those of SLOW_IMPORTS that a fresh interpreter has loaded after a statement."""
-    program = f"{statement}\nimport sys\nprint(*(set({SLOW_IMPORTS!r}) & sys.modules.keys()))"
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(path), str(ROOT)))}
-    command = [sys.executable, "-c", program]
-    run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
-    assert run.returncode == 0, run.stderr
-    return set(run.stdout.split())
-
-
-@pytest.mark.parametrize(
-    "statement",
-    [
-        "import powderdsl; powderdsl.load('powderworld')",
-        "import powderdsl.cli, powderdsl.testing.properties.search",
-        "from powderdsl.compiler import load, lower; from powderdsl.ir.bits import lower_bits; "
-        "from powderdsl.targets.wasm.source import wasm_module; wasm_module(lower_bits(lower(load('life'))), 64)",
-        "from powderdsl.cli.commands.study import commands; "
-        "from powderdsl.cli.study.checks import check_study; "
-        "from powderdsl.experiments.studies.study import load_study; "
-        "load_study('learning', commands(), check_study)",
-    ],
-)
-def test_the_front_end_does_without_torch(statement: str) -> None:
-    assert slow_imports_after(statement) == set()
-
-
-def test_a_slow_import_would_be_seen(tmp_path: Path) -> None:
-    (tmp_path / "torch.py").touch()  # stands in for torch, which takes seconds to import
-    (tmp_path / "front.py").write_text("import powderdsl\ndef load():\n    import torch\n")
-    assert slow_imports_after("import front", tmp_path) == set()
-    assert slow_imports_after("import front; front.load()", tmp_path) == {"torch"}

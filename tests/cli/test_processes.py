@@ -15,6 +15,9 @@ import pytest
 from tests.cli.commands import command_line, environment_with
 from tests.processes import started
 
+SLOW_IMPORTS = {"gymnasium", "stable_baselines3", "matplotlib", "tensorboard"}
+"""What none of these commands needs."""
+
 
 @pytest.mark.parametrize(
     ("arguments", "unwanted"),
@@ -27,13 +30,15 @@ from tests.processes import started
         (["trace", "core", "--at", "1,1", "--step", "1", "--size", "8x8"], {"torch", "rich", "PIL"}),
         (["show", "core"], {"torch", "numpy", "rich", "PIL"}),
         (["compile", "core", "--emit", "ir"], {"torch", "rich", "PIL"}),
+        (["compile", "core", "--emit", "kernels", "--backend", "wasm"], {"torch", "rich", "PIL"}),
+        (["study", "learning", "--dry-run"], {"torch", "PIL"}),
     ],
 )
 def test_commands_import_only_what_they_need(arguments, unwanted):
     program = (
         "import sys\nfrom powderdsl.cli import main\n"
         f"try:\n    main({arguments!r})\nexcept SystemExit as end:\n    assert not end.code, end.code\n"
-        f"print(sorted({unwanted!r} & sys.modules.keys()), file=sys.stderr)"
+        f"print(sorted({unwanted | SLOW_IMPORTS!r} & sys.modules.keys()), file=sys.stderr)"
     )
     run = subprocess.run(
         [sys.executable, "-c", program], env=environment_with(), capture_output=True, text=True, check=True
