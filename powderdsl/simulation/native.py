@@ -24,8 +24,7 @@ from math import prod
 import torch
 
 from powderdsl.diagnostics import CompileError
-from powderdsl.ir.bits import segments
-from powderdsl.ir.ops import Program
+from powderdsl.ir.bits import Segment
 from powderdsl.model.types import Ruleset
 from powderdsl.system.cache import code_hash
 from powderdsl.system.fingerprint import fingerprint
@@ -72,7 +71,7 @@ class ByWidth:
     Code is built with the settings in effect now. `running` and `notes` describe the width stepped last.
 
     Args:
-        lowered: returns the ruleset in IR; the first call does the work.
+        segments: returns the ruleset on planes; the first call does the work.
         first: for `auto`, the backend that starts at once, and a function that returns its program.
         cells: returns the program that runs everything on cells.
 
@@ -83,12 +82,12 @@ class ByWidth:
     def __init__(
         self,
         ruleset: Ruleset,
-        lowered: Callable[[], Program],
+        segments: Callable[[], tuple[Segment, ...]],
         threads: int,
         first: tuple[str, Callable[[], Runnable]] | None,
         cells: Callable[[], Runnable],
     ):
-        self._ruleset, self._lowered, self._threads, self._how = ruleset, lowered, threads, current()
+        self._ruleset, self._segments, self._threads, self._how = ruleset, segments, threads, current()
         self._first, self._cells = first, cells
         self._programs: dict[int, Runnable] = {}
         self._latest: Runnable | None = None
@@ -99,7 +98,7 @@ class ByWidth:
                 raise _refusal(error) from None
             code = None
         if code is None:
-            lowered()  # reports rules that cannot be lowered
+            segments()  # reports rules that cannot be lowered
         if first is not None:
             self._latest = self._of(0 if code is None else code.width)
 
@@ -133,7 +132,7 @@ class ByWidth:
             if (program := self._recall(width)) is not None:
                 return program
             program = mixed_program(
-                segments(self._lowered()),
+                self._segments(),
                 lambda program, planes: NativeProgram(compile_program(program, planes, width), self._threads),
                 lambda cells: TorchProgram(cells, torch.device("cpu")),
             )

@@ -125,13 +125,17 @@ def make_program(
         return BackendProgram(
             "wasm", _plain_program(ruleset, kind, memo), lambda: ReferenceProgram(ruleset, kind)
         )
-    from powderdsl.targets.torch.program import TorchProgram, packed_program
+    from powderdsl.targets.torch.program import TorchProgram
 
     # Made on first use: native code that was compiled before needs none of them.
-    lowered = cache(lambda: lower(ruleset))
+    lowered, segments = cache(lambda: lower(ruleset)), cache(lambda: segments_of(ruleset))
     cells = cache(lambda: TorchProgram(lowered(), device))
     wasm = cache(
-        lambda: packed_program(lowered(), device, lambda program, planes: WasmProgram(program, planes, kind))
+        lambda: mixed_program(
+            segments(),
+            lambda program, planes: WasmProgram(program, planes, kind),
+            lambda program: TorchProgram(program, device),
+        )
     )
     if backend == "wasm":
         return BackendProgram("wasm", wasm(), cells)
@@ -139,7 +143,7 @@ def make_program(
         from powderdsl.simulation.native import ByWidth
 
         first = None if backend == "native" else ("torch", cells) if problem else ("wasm", wasm)
-        return BackendProgram(backend, ByWidth(ruleset, lowered, threads, first, cells), cells)
+        return BackendProgram(backend, ByWidth(ruleset, segments, threads, first, cells), cells)
     if backend == "cuda" or (backend == "auto" and device.type == "cuda"):
         from powderdsl.targets.cuda.program import cuda_program
 
