@@ -24,15 +24,15 @@ splits: {test: {generate: [frame wall]}}
 """
 
 STUDY = """
-study: endless
-about: Two runs that are ended.
-seeds: 2
-vary: {batch: [12]}
+study: tiny
+about: Many small runs.
+seeds: {seeds}
+vary: {{steps: {steps}}}
 steps:
-  trained: {command: train, on: dig.yaml, preset: small, envs: 4, rollout: 3, batch: $batch, backend: torch, steps: 900000000, seed: $seed, save-every: 0}
-  tested: {command: evaluate, on: trained}
+  trained: {{command: train, on: dig.yaml, preset: small, envs: 4, rollout: 3, batch: 12, backend: torch, steps: $steps, seed: $seed, save-every: 0}}
+  tested: {{command: evaluate, on: trained, episodes: 4, policies: "trained,random"}}
 measures:
-  reward: {of: trained, value: splits/test/trained/mean}
+  reward: {{of: trained, value: splits/test/trained/mean, expect: rises}}
 """
 
 COMPILER = """#!/bin/bash
@@ -117,7 +117,7 @@ class Place:
         for name in ("cache", "tmp"):
             (folder / name).mkdir()
         (folder / "dig.yaml").write_text(TASK, encoding="utf-8")
-        (folder / "study.yaml").write_text(STUDY, encoding="utf-8")
+        (folder / "study.yaml").write_text(STUDY.format(seeds=2, steps=[900000000]), encoding="utf-8")
         self.compiler = folder / "compiler"
         self.compiler.write_text(COMPILER.replace("FOLDER", str(folder)), encoding="utf-8")
         self.compiler.chmod(0o755)

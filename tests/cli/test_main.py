@@ -39,12 +39,6 @@ def test_a_page_lists_the_variables_that_commands_read():
     assert "docs/shell.md lists environment variables" in powderdsl("--help").stdout
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_has_help_and_its_name(name):
-    assert powderdsl(name, "--help", exits=0).stdout.startswith(f"Usage: powderdsl {name}")
-    assert main.get_command(click.Context(main), name).name == name
-
-
 @pytest.mark.parametrize("streams", [">&-", "<&- >&- 2>&-"])
 def test_streams_may_be_closed(streams, tmp_path):
     """What goes there is lost; a file that is written does not take its place."""
@@ -68,6 +62,8 @@ def leaves(command: click.Command, *words: str) -> Iterator[tuple[tuple[str, ...
 def test_many_options_are_in_sections():
     for words, command in leaves(main):
         text = powderdsl(*words, "--help", exits=0).stdout
+        assert text.startswith(f"Usage: {' '.join(('powderdsl', *words))} ")
+        assert command.name == words[-1]
         names = [option.opts[-1] for option in command.params if isinstance(option, click.Option)]
         first = re.search(r"^\w[\w ]*:$", text, re.M).start()
         shown = re.findall(r"^  (?:-\w, )?(--[\w-]+)", text[first:], re.M)
@@ -83,14 +79,6 @@ def test_help_has_the_defaults_of_presets():
     help_text = " ".join(powderdsl("wm", "train", "--help").stdout.split())
     assert "Features of the first block. [paper: 32, small: 16]" in help_text
     assert "..." not in powderdsl("wm", "--help").stdout.partition("Commands:")[2]
-
-
-def test_no_command_is_a_usage_error():
-    powderdsl(exits=exits.BAD_INPUT)
-
-
-def test_an_unknown_command_gets_a_suggestion():
-    assert "did you mean `check`?" in powderdsl("chek", "core", exits=exits.BAD_INPUT).stderr
 
 
 def failing(monkeypatch: pytest.MonkeyPatch, error: BaseException, **environment: str):

@@ -73,7 +73,7 @@ def names(rules, ids):
     return {element.name for element in rules.elements if element.id in ids}
 
 
-def test_reactions_know_what_becomes_what():
+def test_reactions_know_what_becomes_what_and_what_stays():
     rules = package.load("powderworld")
     pairs = {
         (before, after)
@@ -88,10 +88,6 @@ def test_reactions_know_what_becomes_what():
     assert ("sand", "water") not in pairs
     assert ("empty", "wall") in pairs
     assert "wall" not in {before for before, _ in pairs}
-
-
-def test_what_moves_and_what_stays():
-    rules = package.load("powderworld")
     assert "wall" not in names(rules, moved_ids(rules))
     assert names(rules, unchanging_ids(rules)) == {"wall"}
     assert moved_ids(package.load("life")) == frozenset()

@@ -65,7 +65,7 @@ def last_step(run: Path) -> int:
 def test_a_killed_study_resumes_at_once(tmp_path: Path) -> None:
     """What it had started saves where it is and ends; the next call waits for that, and continues there."""
     place, command = Place(tmp_path), COMMANDS["study"]
-    trained = [tmp_path / f"out/runs/batch=12,seed={seed}/trained" for seed in (0, 1)]
+    trained = [tmp_path / f"out/runs/steps=900000000,seed={seed}/trained" for seed in (0, 1)]
     with place.begun(command) as running:
         # Either run may be the first to get so far.
         assert waited(lambda: running.poll() is not None or all(last_step(path) > 0 for path in trained))

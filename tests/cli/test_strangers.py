@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.commands import powderdsl
+from tests.cli.commands import ROOT, powderdsl
 from tests.tiers import tiered
 
 ELEMENT = """
@@ -26,6 +26,7 @@ tests:
       after: 20 steps
       always: not wall or below is not slime
 """
+BEETLE = ROOT / "docs" / "examples" / "beetle.yaml"
 FIELD = """
 pack: heat
 about: A field, and no element.
@@ -34,24 +35,6 @@ fields:
   heat: {type: 0..9, at: place}
 passes:
   warm: {do: [heat += 1 where sand, heat -= 1 where empty]}
-"""
-CREATURE = """
-pack: crab
-needs: core
-fields:
-  heading: {type: direction, default: right, at: element, of: crab}
-elements:
-  crab: {color: "#D05030", density: 4, gravity: yes}
-passes:
-  walk:
-    after: flow
-    conflicts: first_wins
-    do:
-      - crab moves right leaving empty if heading is right and right is empty
-      - crab moves left leaving empty if heading is left and left is empty
-    then:
-      - heading := left where crab and heading is right and right is wall
-      - heading := right where crab and heading is left and left is wall
 """
 AUTOMATON = """
 pack: bugs
@@ -82,7 +65,7 @@ MODEL = shlex.split("--width 1 --iterations 2 --batch 2 --worlds 4 --buffer 64 -
 AGENT = shlex.split(
     "--preset small --features 2 --envs 2 --rollout 4 --batch 4 --epochs 1 --steps 8 --backend wasm"
 )
-PACKS = {"slime": ELEMENT, "heat": FIELD, "crab": CREATURE, "bugs": AUTOMATON}
+PACKS = {"slime": ELEMENT, "heat": FIELD, "beetle": BEETLE.read_text("utf-8"), "bugs": AUTOMATON}
 
 
 @pytest.fixture(autouse=True)
@@ -97,7 +80,7 @@ def run(*words: str) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", tiered(PACKS, ["crab"]))
+@pytest.mark.parametrize("name", tiered(PACKS, ["beetle"]))
 def test_a_pack_of_each_kind_goes_through_every_command(name: str) -> None:
     file = f"{name}.yaml"
     run("check", f"powderworld+{file}", "--quick")
@@ -117,7 +100,7 @@ def test_a_pack_of_each_kind_goes_through_every_command(name: str) -> None:
         json.loads(Path(one, "run.json").read_text())["config"]["palette"] for one in ("more", "back")
     ]
     assert palettes[0] == palettes[1]
-    added = {"slime": ["slime.slime"], "heat": [], "crab": ["crab.crab"], "bugs": ["bugs.dot"]}[name]
+    added = {"slime": ["slime.slime"], "heat": [], "beetle": ["beetle.beetle"], "bugs": ["bugs.dot"]}[name]
     assert palettes[0][14:] == added
 
 

@@ -190,20 +190,14 @@ def test_doing_nothing_is_one_action(small: TaskProgram, tmp_path: Path) -> None
         record("destroying", "nothing", tmp_path / "other", episodes=1, backend="torch")
 
 
-def test_another_recipe_is_refused(small: TaskProgram, recorded: Dataset) -> None:
+def test_another_recipe_and_a_second_process_are_refused(small: TaskProgram, recorded: Dataset) -> None:
     (found,) = refusal(
         record, small, "random", recorded.folder, episodes=21, seed=4, shard=8, observation="compact"
     )
     assert found.code == "PD631"
     names = "seed episodes observation channels shape"
     assert {note.split("`")[1] for note in found.notes} == set(names.split())
-
-
-def test_one_process_at_a_time(small: TaskProgram, recorded: Dataset) -> None:
-    with (
-        FileLock(recorded.folder / ".lock"),
-        pytest.raises(CompileError, match="PD622"),
-    ):
+    with FileLock(recorded.folder / ".lock"), pytest.raises(CompileError, match="PD622"):
         record(small, "random", recorded.folder, episodes=20, seed=3, shard=8)
 
 

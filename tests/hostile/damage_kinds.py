@@ -25,6 +25,9 @@ from powderdsl.cli.commands.study import commands
 from powderdsl.experiments.runs import STATE
 from powderdsl.experiments.studies.run import StudyRun
 from powderdsl.experiments.studies.study import load_study
+from tests.cli.commands import PACK
+from tests.cli.test_new_and_test import TESTS
+from tests.studies.test_parts import STUDY
 
 TEXTS = (
     "\x1b]0;owned\x07",
@@ -371,7 +374,7 @@ def make_valid(folder: Path, run: Callable[..., None]) -> None:
     (folder / "world.txt").write_text("....\n.##.\n....\n")
     (folder / "scene.yaml").write_text(SCENE)
     (folder / "dig.yaml").write_text(TASK)
-    (folder / "study.yaml").write_text(STUDY)
+    (folder / "study.yaml").write_text(STUDY.replace("sand-pushing", "dig.yaml"))
     _results(folder)
     run("run", "core+sand", "--size", "8", "--steps", "1", "--backend", "reference", "--out", "world.npz")
     run("render", "core+sand", "--world", "scene.yaml", "--scale", "1", "--out", "world.png")
@@ -385,32 +388,14 @@ def make_valid(folder: Path, run: Callable[..., None]) -> None:
         about.write_text(about.read_text().replace(str(folder) + "/", ""))
 
 
-GRIT = """\
-pack: grit
-about: A powder for tests.
-needs: core
-params: {vanish: 20%}
+GRIT = (
+    PACK.replace("200", "20")
+    + TESTS
+    + """\
 fields: {heat: {type: 0..9, at: place}}
-elements:
-  grit: {id: 20, density: 4, gravity: yes, color: "#123456", glyph: G, tags: powder, about: falls}
-passes:
-  grit:
-    after: flow
-    let: {near: count(grit) > 1}
-    do:
-      - grit -> empty if near and interact < vanish
-      - heat := 3 where grit and heat < 3
-tests:
-  - grit falls:
-      given: |
-        G
-        .
-      after: 1 step
-      expect: |
-        .
-        G
 invariants: [count(wall) never changes]
 """
+)
 SCENE = """\
 scene: yard
 about: A heap in a frame.
@@ -428,24 +413,12 @@ about: Take sand away.
 rules: core+sand
 size: [8, 8]
 fill: sand
-knobs: {side: {default: 2, range: 1..3, about: half the side}}
+knobs: {lines: {default: 1, range: 0..9, about: half the side}}
 regions: {middle: box rows 2:6 columns 2:6}
 generate:
-  - square sand at (4, 4) half side
+  - square sand at (4, 4) half lines + 1
   - scatter wall chance 10%
 agent: {may: [empty], brush: 2, bins: 4, actions: 3}
 reward: {final: count(empty) / 10}
 splits: {test: {about: framed, generate: [frame wall]}}
-"""
-STUDY = """\
-study: patience
-about: Longer training, more reward.
-seeds: 2
-vary:
-  steps: {about: interactions, small: [100, 200], paper: [1000, 2000]}
-steps:
-  trained: {command: train, on: dig.yaml, steps: $steps, seed: $seed}
-  tested: {command: evaluate, on: trained, episodes: 4}
-measures:
-  reward: {of: trained, value: splits/test/trained/mean, about: mean reward, expect: rises}
 """

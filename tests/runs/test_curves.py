@@ -59,6 +59,13 @@ def test_the_command(runs: list[RunFolder], tmp_path: Path) -> None:
     picture = tmp_path / "curves.png"
     powderdsl(*command, "--out", picture, exits=0)
     assert picture.read_bytes()[:4] == b"\x89PNG"
+    lines = tmp_path / "b0" / "metrics.jsonl"
+    lines.write_text(lines.read_text() + '{"step": 30, "held_out/return": "x", "rollout/other": null}\n')
+    table = powderdsl("curves", lines.parent, "--metric", "held_out/return,rollout/other", exits=0).output
+    assert "| held_out/return | 1 | 10 |" in table
+    assert "| rollout/other | 1 | 10 |" in table
     missing = powderdsl(*command, "--metric", "loss", exits=2)
     assert "no run has the metric loss; there are held_out/return, rollout/other" in missing.stderr
+    lines.unlink()
+    assert "nothing has been written yet" in powderdsl("curves", lines.parent, exits=2).output
     assert json.loads((tmp_path / "a0" / "run.json").read_text())["config"]["task"] == "dig"

@@ -24,6 +24,7 @@ from powderdsl.experiments.studies.run import StudyRun
 from powderdsl.experiments.studies.study import Study, read_study
 from powderdsl.system.writing import MARK
 from tests.cli.commands import command_line, environment_with, powderdsl
+from tests.cli.endless import STUDY
 from tests.cli.endless import TASK as DIG
 from tests.processes import started, waited
 from tests.studies.ray_nodes import Nodes, cluster
@@ -32,17 +33,6 @@ needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="needs Ray: pip 
 needs_proc = pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="finds processes in /proc")
 
 RESULTS = ("results.md", "results.json", "figure.png")
-STUDY = """
-study: tiny
-about: Many small runs.
-seeds: {seeds}
-vary: {{steps: {steps}}}
-steps:
-  trained: {{command: train, on: dig.yaml, preset: small, envs: 4, rollout: 3, batch: 12, backend: torch, steps: $steps, seed: $seed, save-every: 0}}
-  tested: {{command: evaluate, on: trained, episodes: 4, policies: "trained,random"}}
-measures:
-  reward: {{of: trained, value: splits/test/trained/mean, expect: rises}}
-"""
 
 
 def written(folder: Path, seeds: int, steps: list[int]) -> None:

@@ -21,7 +21,8 @@ def begin(task: str, folder: Path, *more: object) -> tuple[object, ...]:
 
 def test_train_eval_finetune_and_show(dunes: str, tmp_path: Path) -> None:
     folder, tuned = tmp_path / "run", tmp_path / "tuned"
-    words = begin(dunes, folder, "--held-out", "stone", "--iterations", 5, "--knob", "squares=2")
+    more = ("--held-out", "stone", "--iterations", 5, "--knob", "squares=2", "--validate-every", 5)
+    words = begin(dunes, folder, *more)
     advice = run(*words, exits=0).output.splitlines()[-1]
     about = json.loads((folder / "run.json").read_text())
     assert load(about["config"]["data"]["rules"]).packs == ("core", "sand", "water")
@@ -29,6 +30,7 @@ def test_train_eval_finetune_and_show(dunes: str, tmp_path: Path) -> None:
     assert about["config"]["palette"][9] == "stone.stone"
     assert about["versions"]["torch"]
     assert (folder / "metrics.jsonl").read_text().count("loss/train") == 1
+    assert (folder / "metrics.jsonl").read_text().count("loss/validation") == 1
 
     told = run("wm", "eval", folder, "--split", "two", "--worlds", 1, "--backend", "torch", exits=0)
     assert "falling" in told.stdout
@@ -56,24 +58,6 @@ def test_train_eval_finetune_and_show(dunes: str, tmp_path: Path) -> None:
     assert [line.split(":")[0] for line in shown.stdout.splitlines()] == ["1  falling", "2  lying"]
     # Two strips of four pictures of 14×18 cells, two pixels a cell, four between and around.
     assert np.asarray(Image.open(out)).shape == (2 * 32 + 4, 4 * 40 + 4, 3)
-
-
-@pytest.mark.slow
-def test_the_curve_of_a_training(dunes: str, tmp_path: Path) -> None:
-    folder, out = tmp_path / "run", tmp_path / "curve.png"
-    run(*begin(dunes, folder, "--iterations", 20, "--validate-every", 5), exits=0)
-    losses = ("curves", folder, "--metric", "loss/train,loss/validation")
-    lines = folder / "metrics.jsonl"
-    lines.write_text(
-        lines.read_text() + '{"step": 30, "loss/train": "x", "loss/validation": null}\n', encoding="utf-8"
-    )
-    run(*losses, "--out", out, exits=0)
-    assert np.asarray(Image.open(out)).shape[:2] == (630, 975)
-    table = run(*losses, exits=0).output
-    assert "| loss/train | 1 | 10 |" in table
-    assert "| loss/validation | 1 | 5 |" in table
-    lines.unlink()
-    assert "nothing has been written yet" in run(*losses, exits=2).output
 
 
 def test_preset_and_options_make_the_configuration(tmp_path: Path, dunes: str) -> None:
