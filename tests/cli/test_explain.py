@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from powderdsl.diagnostics import CODES
-from powderdsl.diagnostics.codes import find_code, similar
 from tests.cli.commands import powderdsl
 
 
@@ -16,7 +15,6 @@ def test_without_a_code_all_are_listed():
 
 @pytest.mark.parametrize("word", ["PD301", "pd301", "301", "unknown-name", "Unknown_Name", "[PD301]"])
 def test_codes_and_slugs_are_accepted(word):
-    assert find_code(word) is CODES["PD301"]
     result = powderdsl("explain", word, exits=0)
     assert "PD301" in result.stdout
     assert "\x1b" not in result.stdout
@@ -27,7 +25,6 @@ def test_codes_and_slugs_are_accepted(word):
     [("unknown-nam", "unknown-name"), ("PD399", "PD301"), ("pass-cicle", "pass-cycle"), ("PD3", "PD301")],
 )
 def test_unknown_codes_get_a_suggestion(word, meant):
-    assert meant in similar(word)
     result = powderdsl("explain", word, exits=2)
     assert meant in result.stderr
     assert result.stdout == ""

@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import signal
-import subprocess
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -16,10 +11,8 @@ from powderdsl.datasets import Dataset, record
 from powderdsl.envs import TensorEnv
 from powderdsl.rl.policies import load_policy
 from powderdsl.system.random import action_keys
-from powderdsl.tasks.episodes import compile_task
-from tests.cli.commands import command_line, environment_with, powderdsl
+from tests.cli.commands import powderdsl
 from tests.envs.conftest import SMALL
-from tests.processes import started, waited
 
 
 @pytest.fixture
@@ -52,40 +45,6 @@ def test_a_dataset_is_recorded_and_verified(task: Path, tmp_path: Path) -> None:
         assert line in refused.stderr
     (out / "shard-000001.npz").write_bytes(b"no shard")
     assert "shard-000001.npz is damaged" in powderdsl("record", "--verify", out, exits=2).stderr
-
-
-EPISODES = 240
-
-
-@contextmanager
-def recording(task: Path, out: Path) -> Iterator[subprocess.Popen[str]]:
-    """A process that has just written a shard and has many before it."""
-    given = ("--episodes", EPISODES, "--shard", 3, "--envs", 8, "--backend", "wasm")
-    command = command_line("record", task, "--out", out, *given)
-    seen = len(list(out.glob("shard-*")))
-    with started(command, env=environment_with(), stderr=subprocess.PIPE) as running:
-        assert waited(lambda: len(list(out.glob("shard-*"))) > seen)
-        yield running
-
-
-@pytest.mark.slow
-def test_killed_and_interrupted_recordings_go_on(task: Path, tmp_path: Path) -> None:
-    """Ctrl-C, SIGKILL at several substeps, then what is left: the same bytes as without any of it."""
-    out, other = tmp_path / "data", tmp_path / "other"
-    with recording(task, out) as running:
-        running.send_signal(signal.SIGINT)
-        _, said = running.communicate(timeout=240)
-    assert running.returncode == 130
-    assert f"the same command continues in {out}" in said
-    for delay in (0.0, 0.013, 0.037):
-        with recording(task, out):
-            time.sleep(delay)
-    program = compile_task(str(task), backend="wasm")
-    for folder in (out, other):
-        record(program, "random", folder, episodes=EPISODES, shard=3)
-    names = sorted(path.name for path in out.glob("shard-*"))
-    assert len(names) == 80
-    assert [(out / name).read_bytes() for name in names] == [(other / name).read_bytes() for name in names]
 
 
 def test_a_trained_agent_is_recorded(task: Path, tmp_path: Path) -> None:

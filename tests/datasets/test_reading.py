@@ -12,6 +12,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from powderdsl.datasets import Dataset
 from powderdsl.datasets.dataset import Batch, drawn, flat, write_shard
@@ -22,13 +23,21 @@ from powderdsl.tasks.episodes import TaskProgram
 from tests.refusals import refusal
 
 
-def numbered(folder: Path, recipe: Recipe, lengths: list[int], shard: int, *, compress: bool) -> Dataset:
-    """A dataset whose observations are (episode, number of the observation)."""
+def numbered(
+    folder: Path,
+    recipe: Recipe,
+    lengths: list[int],
+    shard: int,
+    *,
+    compress: bool,
+    observation: NDArray[np.uint8] | None = None,
+) -> Dataset:
+    """A dataset whose observations are (episode, number of the observation), or of one episode with the given ones."""
     recipe = replace(
         recipe,
         episodes=len(lengths),
         shard=shard,
-        shape=(1, 1, 2),
+        shape=(1, 1, 2) if observation is None else observation.shape[1:],
         actions=max(lengths),
         compress=compress,
     )
@@ -40,7 +49,9 @@ def numbered(folder: Path, recipe: Recipe, lengths: list[int], shard: int, *, co
             ended = np.arange(length) == length - 1
             parts.append(
                 {
-                    "observation": np.array([[[[episode, t]]] for t in range(length + 1)]),
+                    "observation": np.array([[[[episode, t]]] for t in range(length + 1)])
+                    if observation is None
+                    else observation,
                     "action": np.array([[episode % 4, t % 4, 0, 0, 0] for t in range(length)]),
                     "reward": np.arange(length) + 100 * episode,
                     "terminated": ended & (episode % 2 == 0),

@@ -19,6 +19,7 @@ from powderdsl.envs import TensorEnv
 from powderdsl.envs.actions import random_policy
 from powderdsl.system.archives import write_archive
 from powderdsl.system.random import action_keys
+from powderdsl.system.writing import MARK
 from powderdsl.tasks.episodes import TaskProgram
 from tests.refusals import refusal
 
@@ -127,6 +128,7 @@ def test_damaged_shards_are_recorded_anew(small: TaskProgram, recorded: Dataset,
     damaged = bytearray((folder / "shard-000002.npz").read_bytes())
     damaged[-500] ^= 1
     (folder / "shard-000002.npz").write_bytes(damaged)
+    (folder / f".shard-000000{MARK}killed.npz").write_bytes(damaged[:100])  # of a process that was killed
     record(small, "random", folder, episodes=20, seed=3, shard=8)
     assert files(folder) == files(recorded.folder)
 

@@ -11,7 +11,7 @@ import pytest
 from powderdsl.cli.commands.study import CALLED, NOT_FOR_STUDIES, commands
 from powderdsl.experiments.studies.study import READ, RULES, RUN_OR_TASK, TASK, confined, load_study
 from tests.cli.commands import powderdsl
-from tests.refusals import refused_codes
+from tests.refusals import refusal, refused_codes
 
 STUDY = """
 study: odd
@@ -75,10 +75,19 @@ def test_a_path_made_of_values_is_checked_too(tmp_path):
     assert errors(tmp_path / "s.yaml", text.replace("sand-pushing", "$to")) == ["PD112"]
 
 
-@pytest.mark.parametrize("option", ["run", "resume"])
-def test_a_study_cannot_choose_folders(option, tmp_path):
-    text = STUDY.replace("steps: $steps}", f"steps: $steps, {option}: elsewhere}}")
-    assert errors(tmp_path / "s.yaml", text) == ["PD806"]
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [
+        *(("train", option) for option in ("run", "resume")),
+        *((command, "network") for command in ("wm train", "wm finetune", "wm eval")),
+    ],
+)
+def test_a_study_cannot_choose_folders_or_code(command, option, tmp_path):
+    text = STUDY.replace(", steps: $steps}", f", seed: $steps, {option}: elsewhere}}")
+    text = text.replace("command: train, on: sand-pushing", f"command: {command}, on: world-model")
+    (tmp_path / "s.yaml").write_text(text, encoding="utf-8")
+    found = [one.message for one in refusal(load_study, str(tmp_path / "s.yaml"), commands())]
+    assert any(f"`{command}` has no option `{option}`" in message for message in found)
 
 
 def test_good_paths_become_paths_of_the_study(tmp_path):

@@ -7,6 +7,8 @@ from dataclasses import replace
 import pytest
 
 from powderdsl.diagnostics import Reporter, Source
+from powderdsl.envs.tensor_env import observation_of
+from powderdsl.simulation.simulator import compile as compile_rules
 from powderdsl.tasks.episodes import compile_task
 from powderdsl.tasks.file import read_task
 
@@ -30,11 +32,12 @@ reward: {each: painted + count(sand) + 100 * placed}
         ("[24, 70]", "count(sand) + 100 * placed + 10 * blown + left"),
     ],
 )
-def test_packed_worlds_are_acted_on_and_restarted_alike(torch, size, each):
+def test_packed_worlds_are_acted_on_observed_and_restarted_alike(torch, size, each):
     """Few worlds are cut into strips in native code, many are not; 70 columns are more than one word."""
     text = TASK.replace("SIZE", size).replace("painted + count(sand) + 100 * placed", each)
     task = read_task(Source("packed.yaml", text), Reporter())
     native, plain = (compile_task(task, backend=backend) for backend in ("native", "wasm"))
+    observations = [observation_of(kind, native.simulator, task.size) for kind in ("ids", "compact")]
     for batch, reuse in ((1, True), (3, False), (20, True), (20, False)):
         one, other = native.start(torch.arange(batch)), plain.start(torch.arange(batch))
         random = torch.Generator().manual_seed(batch)
@@ -55,6 +58,8 @@ def test_packed_worlds_are_acted_on_and_restarted_alike(torch, size, each):
                 other = plain.restart(other, mask, seeds)
                 assert reuse or torch.equal(native.simulator.step(acted.world, 0).ids, kept)
             assert one.world.step.tolist() == other.world.step.tolist()
+            for observation in observations:
+                assert torch.equal(observation.of(one.world), observation.of(other.world))
             for name, value in other.world.state.items():
                 assert torch.equal(one.world.state[name], value), name
             for name, value in before.items():
@@ -111,3 +116,14 @@ def test_packed_worlds_are_measured_alike(torch, size, each, on_planes):
             unpacked = program.simulator.step(episodes.world, steps).state
             program.measured(replace(episodes, world=replace(world, state=unpacked)))
             assert any(unpacked.has(name) for name in unpacked) is not on_planes
+
+
+def test_spent_worlds_are_refused(torch):
+    native = compile_rules("core+sand", "native")
+    ids = torch.zeros(2, 16, 16, dtype=torch.uint8)
+    world = native.step(native.world(ids), 1)
+    after = native.step(world, 1, reuse=True)
+    assert torch.equal(after.ids, ids)
+    for read in (lambda: world.ids, lambda: native.step(world), world.rgb):
+        with pytest.raises(RuntimeError, match="reuse"):
+            read()

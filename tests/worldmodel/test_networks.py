@@ -217,24 +217,6 @@ def test_a_run_of_the_u_net_has_no_name_and_hostile_names_are_text(dunes: str) -
             assert "Traceback" not in output
 
 
-def test_a_study_cannot_name_a_network() -> None:
-    text = """
-study: mine
-seeds: 1
-vary: {elements: [1, 4]}
-steps:
-  trained: {command: wm train, elements: $elements, network: "nets:Wide"}
-  tuned: {command: wm finetune, on: trained, network: "nets:Wide"}
-  tested: {command: wm eval, on: trained, network: "nets:Wide"}
-measures:
-  loss: {of: trained, value: mean/model/loss}
-"""
-    Path("study.yaml").write_text(text, encoding="utf-8")
-    code, output, imported = was_imported("study", "study.yaml", "--dry-run")
-    assert (code, imported) == (2, False), output
-    assert output.count("has no option `network`") == 3
-
-
 def test_names_of_networks() -> None:
     assert is_network_name("nets:Wide")
     assert is_network_name("some.nets:Outer.Inner")

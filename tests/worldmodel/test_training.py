@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import sys
-import time
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
@@ -28,9 +26,7 @@ from powderdsl.worldmodel import (
 from powderdsl.worldmodel.config import TEST_SEEDS
 from powderdsl.worldmodel.evaluation import unseen_worlds
 from powderdsl.worldmodel.worlds import VALIDATION_SEEDS, VALIDATION_WORLDS, validation_pairs
-from tests.processes import started, waited
 from tests.refusals import refusal, refused_codes
-from tests.states import logged, same
 
 HERE = Machine(backend="torch")
 
@@ -80,33 +76,6 @@ def test_validation_worlds_are_held_out(dunes: str) -> None:
     for moment, (starts, ends) in enumerate(pairs):
         assert torch.equal(starts, whole[moment][0][moment::4])
         assert torch.equal(ends, whole[moment][1][moment::4])
-
-
-CHILD = """
-import json, sys, time, torch
-from powderdsl.worldmodel import Machine, TrainConfig, train
-torch.set_num_threads(1)
-config = TrainConfig.of(json.loads(sys.argv[1]))
-train(config, sys.argv[2], machine=Machine(backend="torch"), save_seconds=0.1, tell=lambda now: time.sleep(0.01))
-"""
-
-
-@pytest.mark.slow
-def test_a_killed_run_ends_with_the_same_weights(dunes: str, tmp_path: Path) -> None:
-    config = tiny(dunes, iterations=100)
-    folder = tmp_path / "killed"
-    for kill in range(3):
-        command = [sys.executable, "-c", CHILD, json.dumps(asdict(config)), str(folder)]
-        before = {path.name for path in (folder / "checkpoints").glob("*.safetensors")}
-        with started(command) as process:
-            made = (folder / "checkpoints").glob
-            assert waited(lambda: {path.name for path in made("*.safetensors")} - before)  # noqa: B023
-            time.sleep(0.037 * kill)
-            assert process.poll() is None, "it ended before it could be killed"
-    run = train(config, folder, machine=HERE)
-    whole = train(config, tmp_path / "whole", machine=HERE)
-    assert same(weights(run), weights(whole))
-    assert logged(run) == logged(whole)
 
 
 def test_another_configuration_or_task_file_is_another_run(dunes: str, tmp_path: Path) -> None:
