@@ -44,21 +44,18 @@ def test_the_workflow_runs_all_checks_on_main_and_on_pull_requests() -> None:
     assert job["steps"][-1].keys() == {"name", "run"}, "no condition and no `continue-on-error`"
 
 
-def test_pre_commit_runs_the_ruff_of_make_lint() -> None:
-    (repo,) = _read(".pre-commit-config.yaml")["repos"]
+def test_pre_commit_runs_the_ruff_of_make_lint_and_checks_messages() -> None:
+    config = _read(".pre-commit-config.yaml")
+    (repo,) = config["repos"]
     assert repo["repo"] == "local", "a remote hook would have a version of its own"
     lint = re.search(r"^lint:.*\n((?:\t.*\n)+)", _text("Makefile"), re.MULTILINE)
     assert lint
     of_make = re.findall(r"\$\(BIN\)/(ruff .+) \.$", lint[1], re.MULTILINE)
     hooks = [hook["entry"].replace(" --force-exclude", "") for hook in repo["hooks"] if "types_or" in hook]
     assert hooks == [f".venv/bin/{command}" for command in of_make]
-
-
-def test_pre_commit_checks_messages() -> None:
-    config = _read(".pre-commit-config.yaml")
     assert config["default_install_hook_types"] == ["pre-commit", "commit-msg"]
     assert config["default_stages"] == ["pre-commit"], "ruff does not read messages"
-    (hook,) = (hook for hook in config["repos"][0]["hooks"] if "stages" in hook)
+    (hook,) = (hook for hook in repo["hooks"] if "stages" in hook)
     assert hook["stages"] == ["commit-msg"]
     assert os.access(ROOT / hook["entry"], os.X_OK)
 

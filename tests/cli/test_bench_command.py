@@ -72,6 +72,9 @@ def test_a_program_is_measured_beside_a_backend(tmp_path):
     assert mine["beside"] == {"mine": 1.0}
     assert torch["beside"]["mine"] > 1
     assert len(mine["round_seconds"]) == 2
+    (tmp_path / "mine.py").rename("torch.py")
+    result = powderdsl(*TORCH, "--beside", "torch.py", exits=exits.BAD_INPUT)
+    assert "`torch` is the name of another program or of a backend" in result.stderr
 
 
 @pytest.mark.parametrize(
@@ -91,9 +94,3 @@ def test_a_program_is_measured_beside_a_backend(tmp_path):
 def test_a_program_with_a_mistake_is_named_with_its_line(tmp_path, text, words):
     (tmp_path / "bad.py").write_text(text)
     assert words in powderdsl(*TORCH, "--beside", "bad.py", exits=exits.BAD_INPUT).stderr
-
-
-def test_a_program_cannot_be_named_as_a_backend(tmp_path):
-    (tmp_path / "torch.py").write_text(PROGRAM)
-    result = powderdsl(*TORCH, "--beside", "torch.py", exits=exits.BAD_INPUT)
-    assert "`torch` is the name of another program or of a backend" in result.stderr

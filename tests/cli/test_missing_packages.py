@@ -12,6 +12,7 @@ import pytest
 
 from powderdsl.cli.dispatch import COMMANDS
 from tests.cli.commands import environment_with
+from tests.studies.test_study_paths import STUDY
 
 BLOCKED = {"torch": ["torch"], "NumPy": ["numpy", "torch"], "only NumPy": ["numpy"]}
 """Modules that cannot be imported."""
@@ -29,17 +30,6 @@ for line in lines:
             main(line.split())
     except SystemExit as ended:
         print(json.dumps([line, ended.code, told.getvalue()]))
-"""
-
-STUDY = """\
-study: tiny
-seeds: 1
-vary: {steps: [64]}
-steps:
-  trained: {command: train, on: sand-pushing, steps: $steps}
-  tested: {command: evaluate, on: trained}
-measures:
-  reward: {of: trained, value: mean}
 """
 
 WORKS = ""

@@ -164,6 +164,10 @@ def test_a_task_file_takes_splits_knobs_and_parameters(task_file: Path) -> None:
     for how in ({"split": "tset"}, {"params": {"water.mlet": 1}}, {"knobs": {"disk": 1}}):
         with pytest.raises(CompileError):
             TensorEnv(task_file, **how)  # type: ignore[arg-type]
+    program = compile_task(load_task(task_file), backend="torch")
+    assert TensorEnv(program).program is TensorEnv(program, 2).program is program
+    with pytest.raises(ValueError, match="load_task"):
+        TensorEnv(program.task, knobs={"disks": 1})
 
 
 BAD_ACTIONS = [
@@ -277,13 +281,6 @@ def test_it_renders(small: TaskProgram) -> None:
     text.reset(seed=0)
     assert text.render().splitlines()[0] == "#" * 16
     assert PowderEnv(small).render() is None
-
-
-def test_programs_are_shared(task_file: Path) -> None:
-    program = compile_task(load_task(task_file), backend="torch")
-    assert TensorEnv(program).program is TensorEnv(program, 2).program is program
-    with pytest.raises(ValueError, match="load_task"):
-        TensorEnv(program.task, knobs={"disks": 1})
 
 
 @pytest.mark.parametrize("mode", MODES)

@@ -12,8 +12,6 @@ from powderdsl.diagnostics import Reporter, Source
 from powderdsl.simulation.simulator import compile as compile_rules
 from powderdsl.tasks.episodes import TaskProgram, check_actions, compile_task
 from powderdsl.tasks.file import read_task
-from powderdsl.tasks.shipped import load_task
-from tests.refusals import refusal, refused_codes
 
 HEAD = "task: test\nrules: powderworld\nsize: [64, 64]\nfill: empty\n"
 NOISE = "generate:\n" + "".join(
@@ -91,24 +89,6 @@ def test_an_element_fills_the_block_with_fresh_cells(torch, program_of):
     assert reward.tolist() == [
         float(n) + b for n, b in zip(changed, (1000, 1000, 10000, 0, 1000, 1000), strict=True)
     ]
-
-
-@pytest.mark.parametrize("backend", ["wasm", "torch"])
-def test_reused_tensors_give_the_same_episodes(torch, backend):
-    program = compile_task(load_task("path-building", knobs={"complexity": 2}), backend=backend)
-    fresh = reused = program.start(torch.arange(3))
-    random = torch.Generator().manual_seed(3)
-    for turn in range(4):
-        actions = torch.stack([torch.randint(0, n, (3,), generator=random) for n in program.action_nvec], 1)
-        fresh, reward, *_ = program.act(fresh, actions)
-        reused, other, *_ = program.act(reused, actions, reuse=True)
-        assert torch.equal(reward, other)
-        mask = torch.tensor([False, turn == 1, False])
-        fresh = program.restart(fresh, mask, torch.arange(3) + 50)
-        reused = program.restart(reused, mask, torch.arange(3) + 50, reuse=True)
-        for name, value in fresh.world.state.items():
-            assert torch.equal(value, reused.world.state[name]), name
-    assert fresh.acted.tolist() == [4, 2, 4]
 
 
 def test_invalid_actions_are_refused(torch, program_of):
@@ -304,14 +284,6 @@ def test_a_start_is_what_the_simulator_makes_of_its_ids(torch):
         assert value.dtype == episodes.world.state[name].dtype
     for name in ("seed", "index", "step"):
         assert torch.equal(getattr(world, name), getattr(episodes.world, name))
-
-
-def test_unknown_names(torch):
-    for wrong, code in (("sand-pulling", "PD801"), ("gone.yaml", "PD101")):
-        assert refused_codes(compile_task, wrong) == [code]
-    assert refusal(compile_task, "destroying", split="tset")[0].helps == ("did you mean `test`?",)
-    errors = refusal(load_task, "destroying", knobs={"lnies": 3, "disks": 65})
-    assert [one.code for one in errors] == ["PD803", "PD803"]
 
 
 def test_without_actions_every_step_is_reported(torch, program_of):

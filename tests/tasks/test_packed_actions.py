@@ -25,18 +25,19 @@ reward: {each: painted + count(sand) + 100 * placed}
 
 
 @pytest.mark.parametrize(
-    ("size", "each"),
+    ("backend", "size", "each"),
     [
-        ("[64, 64]", "painted + count(sand) + 100 * placed"),
-        ("[20, 70]", "painted + count(sand)"),
-        ("[24, 70]", "count(sand) + 100 * placed + 10 * blown + left"),
+        ("native", "[64, 64]", "painted + count(sand) + 100 * placed"),
+        ("native", "[20, 70]", "painted + count(sand)"),
+        ("native", "[24, 70]", "count(sand) + 100 * placed + 10 * blown + left"),
+        ("torch", "[20, 20]", "painted + count(sand)"),  # which reuses tensors
     ],
 )
-def test_packed_worlds_are_acted_on_observed_and_restarted_alike(torch, size, each):
+def test_packed_worlds_are_acted_on_observed_and_restarted_alike(torch, backend, size, each):
     """Few worlds are cut into strips in native code, many are not; 70 columns are more than one word."""
     text = TASK.replace("SIZE", size).replace("painted + count(sand) + 100 * placed", each)
     task = read_task(Source("packed.yaml", text), Reporter())
-    native, plain = (compile_task(task, backend=backend) for backend in ("native", "wasm"))
+    native, plain = (compile_task(task, backend=name) for name in (backend, "wasm"))
     observations = [observation_of(kind, native.simulator, task.size) for kind in ("ids", "compact")]
     for batch, reuse in ((1, True), (3, False), (20, True), (20, False)):
         one, other = native.start(torch.arange(batch)), plain.start(torch.arange(batch))

@@ -7,20 +7,14 @@ const here = dirname(fileURLToPath(import.meta.url));
 const modules = join(here, "node_modules");
 const parts = join(here, "..", "..", "powderdsl", "web", "parts");
 const PYODIDE = ["pyodide.mjs", "pyodide.asm.mjs", "pyodide.asm.wasm", "python_stdlib.zip", "pyodide-lock.json"];
+const DISTRIBUTED = [
+  ...["autocomplete", "commands", "lang-yaml", "language", "lint", "search", "state", "view", "streamparser"].map(
+    (name) => `@codemirror/${name}`,
+  ),
+  ...["common", "highlight", "lr", "yaml"].map((name) => `@lezer/${name}`),
+];
 const EDITOR = {
-  "@codemirror/autocomplete": "dist/index.js",
-  "@codemirror/commands": "dist/index.js",
-  "@codemirror/lang-yaml": "dist/index.js",
-  "@codemirror/language": "dist/index.js",
-  "@codemirror/lint": "dist/index.js",
-  "@codemirror/search": "dist/index.js",
-  "@codemirror/state": "dist/index.js",
-  "@codemirror/view": "dist/index.js",
-  "@codemirror/streamparser": "dist/index.js",
-  "@lezer/common": "dist/index.js",
-  "@lezer/highlight": "dist/index.js",
-  "@lezer/lr": "dist/index.js",
-  "@lezer/yaml": "dist/index.js",
+  ...Object.fromEntries(DISTRIBUTED.map((name) => [name, "dist/index.js"])),
   "@marijn/find-cluster-break": "src/index.js",
   crelt: "index.js",
   "style-mod": "src/style-mod.js",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -122,6 +123,12 @@ def test_training_and_tests_draw_different_rulesets(dunes: str, tmp_path: Path) 
     assert trained.config == config  # variety and all, through run.json
     worlds = TaskWorlds(data, backend="torch")
     assert [one.number for one in worlds.rulesets] == [0, 1, 2]
+    later = TaskWorlds(
+        replace(data, first_ruleset=1), backend="torch"
+    ).rulesets  # seeds may have rulesets of their own
+    assert [one.number for one in later] == [1, 2, 3]
+    assert later[:2] == worlds.rulesets[1:]
+    assert later[2] not in worlds.rulesets
     unseen = unseen_worlds(trained, split="train", rulesets=5, machine=machine)
     assert [one.number for one in unseen.rulesets] == [UNSEEN_RULESETS + number for number in range(5)]
     found = evaluate(trained, split="train", worlds=5, rulesets=5, machine=machine)
@@ -139,11 +146,3 @@ def test_unknown_properties_and_bad_numbers_are_refused() -> None:
             Variety(**wrong)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="`rulesets` must be an integer from 0 to 1,024, found 1025"):
         DataConfig(rulesets=1025)
-
-
-def test_seeds_may_have_rulesets_of_their_own(task) -> None:  # type: ignore[no-untyped-def]
-    data = [DataConfig(task, rulesets=2, first_ruleset=number, variety=MANY) for number in (0, 1)]
-    first, other = (TaskWorlds(one, backend="torch").rulesets for one in data)
-    assert [one.number for one in other] == [1, 2]
-    assert other[0] == first[1]
-    assert other[1] not in first
