@@ -471,6 +471,8 @@ def _file_beside(
 def _report_unknown(word: str, span: Span | None, reporter: Reporter) -> None:
     close = get_close_matches(word, shipped_rules(), n=1)
     helps = [f"did you mean `{close[0]}`?"] if close else ["shipped: " + ", ".join(shipped_rules())]
+    if "," in word:
+        helps = [f"packs are joined by `+`: `{word.replace(',', '+')}`"]
     if span is None and _is_there(f"{word}.yaml"):
         helps = [f"did you mean the file `{word}.yaml`?"]
     label = "not shipped, and no file" if span else ""

@@ -112,7 +112,7 @@ def check(
     check_alone = partial(_check_some, Declared(tuple(packs), None), alone=True)
     invariants = check_invariants(composition, typer, check_alone)
     ramps = element_ramps(typer)
-    report_unknown_names(typer)
+    report_unknown_names(typer, elsewhere)
     reporter.raise_if_errors()
     report_misspelled(packs, composition.ruleset, elsewhere, reporter)
 

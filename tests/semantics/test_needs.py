@@ -80,3 +80,10 @@ def test_a_name_of_a_pack_that_is_not_needed_is_a_warning(packs: Path, rule: str
     warnings = [remark for remark in remarks if remark.code == "PD319"]
     assert [warning.primary.span.text for warning in warnings] == warned
     assert all("add `" in warning.helps[0] and "?`" in warning.helps[0] for warning in warnings)
+
+
+def test_packs_joined_by_commas_and_names_of_shipped_packs_have_a_fix() -> None:
+    assert "packs are joined by `+`: `core+sand`" in run("check", "core,sand", exits=2).stdout
+    Path("oil.yaml").write_text(LOAM + "passes:\n  burn:\n    do: loam -> empty if count(fire) > 0\n")
+    told = run("check", "oil.yaml", exits=2).stdout
+    assert "the pack `fire` defines it: add it to `needs`, or write `fire?`" in told

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
@@ -145,14 +145,19 @@ def clamp_number(value: float | Fraction, kind: Kind) -> float:
 # Unknown names
 
 
-def report_unknown_names(typer: Typer) -> None:
-    """Report every name that was looked up and not found, once with all its places, then forget them."""
+def report_unknown_names(typer: Typer, elsewhere: Callable[[], Mapping[str, str]] = dict) -> None:
+    """Report every name that was looked up and not found, once with all its places, then forget them.
+
+    `elsewhere` gives the packs of words that are not loaded.
+    """
     for (name, after_dot), places in typer.unknown.items():
         first, *others = sorted(places, key=lambda span: (span.source.name, span.start))
         label = "no loaded pack has such a field or property" if after_dot else "no loaded pack defines it"
         more = [Label(span, "and here") for span in others[:MAX_PLACES]]
         notes = [f"and in {len(others) - MAX_PLACES} more places"] if len(others) > MAX_PLACES else []
         fix = _fix(name, places[first], after_dot, typer.symbols)
+        if fix.startswith("load") and (pack := elsewhere().get(name)):
+            fix = f"the pack `{pack}` defines it: add it to `needs`, or write `{name}?`"
         typer.reporter.error(
             "PD301", f"unknown name `{name}`", first, label, secondary=more, notes=notes, helps=[fix]
         )
