@@ -65,13 +65,6 @@ def test_json_is_one_list(pack):
     assert found[0]["primary"]["span"]["start"] == {"line": 4, "column": 18}
 
 
-def test_several_rulesets_are_checked_one_by_one(pack):
-    result = powderdsl("check", "powderworld", pack(), "nope", exits=2)
-    assert "powderworld: 14 elements" in result.stdout
-    assert "core+grit: 3 elements" in result.stdout
-    assert "nope: 1 error" in result.stdout
-
-
 def test_files_that_are_not_there(tmp_path):
     assert "PD101" in powderdsl("check", tmp_path / "none.yaml").stdout
     powderdsl("check", tmp_path, exits=2)

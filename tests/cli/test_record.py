@@ -77,9 +77,5 @@ def test_a_dataset_goes_to_minari_and_back(
     assert f"me/small-v0: 3 episodes of small (train, random), {data.steps} transitions" in written.stderr
     powderdsl("record", "--out", again, "--from-minari", "me/small-v0", exits=0)
     assert (again / "shard-000000.npz").read_bytes() == (out / "shard-000000.npz").read_bytes()
-    for words, says in (
-        (("--out", out, "--to-minari", "me/small-v0"), "there is a Minari dataset me/small-v0"),
-        (("--out", out, "--to-minari", "small"), "a Minari dataset is named namespace/name-v0"),
-        (("--out", tmp_path / "no", "--from-minari", "me/none-v0"), "cannot be imported"),
-    ):
-        assert says in powderdsl("record", *words, exits=2).stderr
+    refused = powderdsl("record", "--out", out, "--to-minari", "small", exits=2)
+    assert "a Minari dataset is named namespace/name-v0" in refused.stderr

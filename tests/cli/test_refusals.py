@@ -129,6 +129,7 @@ REFUSED = (
     *((f"test life --replay {name}.yaml", "PD602") for name in ("empty", "case", "world")),
     ("test --replay case.yaml", "--replay"),
     ("test life --picture rock.gif", "--picture"),
+    ("study start-stats", "did you mean `start-states`?"),
     ("ogbench eazy --out d", "did you mean `easy`"),
     ("record --to-minari me/small-v1", "missing --out"),
     (

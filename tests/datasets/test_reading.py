@@ -135,15 +135,11 @@ def test_minibatches_follow_from_seed_and_number(recorded: Dataset) -> None:
     assert not torch.equal(four[0].observation, four[1].observation)
 
 
-def test_what_was_read_can_be_written_to(recorded: Dataset) -> None:
+def test_what_was_read_can_be_written_to_and_workers_get_the_folder(recorded: Dataset) -> None:
     before = recorded.episode(0).observation.clone()
     recorded.episode(0).observation.zero_()
     next(recorded.transitions(500)).observation.zero_()
     assert torch.equal(recorded.episode(0).observation, before)
-
-
-def test_workers_get_the_folder(recorded: Dataset) -> None:
-    next(recorded.transitions(4))
     text = pickle.dumps(recorded)
     assert len(text) < 1000
     again = pickle.loads(text)

@@ -183,7 +183,9 @@ def test_no_world_is_in_two_parts(replayed: Dataset, recorded: Dataset) -> None:
         assert torch.equal(read, part[:].reward)
 
 
-def test_a_split_depends_on_the_world_and_the_seed_alone(replayed: Dataset, recorded: Dataset) -> None:
+def test_a_split_depends_on_the_world_or_episode_and_the_seed_alone(
+    replayed: Dataset, recorded: Dataset
+) -> None:
     alone = split(Transitions(replayed), (0.6, 0.4))
     torch.manual_seed(99)
     np.random.seed(99)
@@ -200,10 +202,8 @@ def test_a_split_depends_on_the_world_and_the_seed_alone(replayed: Dataset, reco
         with pytest.raises(ValueError, match="seed"):
             split(Transitions(replayed), (0.6, 0.4), seed=seed)
 
-
-def test_a_split_by_episode_keeps_episodes_whole(replayed: Dataset) -> None:
     rows = Transitions(replayed)
-    parts = split(rows, (0.5, 0.5), by="episode")
+    parts = split(rows, (0.5, 0.5), by="episode")  # which keeps episodes whole
     numbers = [episodes_of(part) for part in parts]
     assert not numbers[0] & numbers[1]
     assert numbers[0] | numbers[1] == episodes_of(rows)

@@ -129,10 +129,6 @@ def test_a_mistake_is_reported_at_its_place(old: str, new: str, code: str, caret
     assert (code, caret) in found
 
 
-def test_an_unknown_study_gets_a_suggestion() -> None:
-    assert refusal(load_study, "start-stats", KNOWN)[0].helps == ("did you mean `start-states`?",)
-
-
 def test_an_interval_is_that_of_student() -> None:
     found = interval([1.0, 2.0, 3.0, 4.0])
     half = 3.182 * math.sqrt(5 / 3) / 2

@@ -58,14 +58,11 @@ def test_files_have_their_types(server: SiteServer) -> None:
     assert data == standalone_module(Entry("life", ("life",)).ruleset, (64, 64))
 
 
-def test_only_files_of_the_site_are_served(server: SiteServer) -> None:
+def test_only_files_of_the_site_are_served_and_only_to_itself(server: SiteServer) -> None:
     for path in ("/../site.py", "/%2e%2e/site.py", "/..%2fsite.py", "//etc/passwd"):
         assert ask(server, path)[0] == 404
     for path in ("/page/app.js", "/rules/", "/rules/x.json"):
         assert ask(server, path)[0] == 404
-
-
-def test_other_pages_reach_nothing(server: SiteServer) -> None:
     assert ask(server, "/app.js", Host="evil.example")[0] == 403
     assert ask(server, "/app.js", Origin="http://evil.example")[0] == 403
     assert ask(server, "/app.js", Origin=f"http://127.0.0.1:{server.server_port}")[0] == 200

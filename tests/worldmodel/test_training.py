@@ -81,9 +81,7 @@ def test_validation_worlds_are_held_out(dunes: str) -> None:
 def test_another_configuration_or_task_file_is_another_run(dunes: str, tmp_path: Path) -> None:
     config = tiny(dunes, iterations=1)
     train(config, tmp_path / "run", machine=HERE)
-    (found,) = refusal(train, replace(config, seed=4, width=5), tmp_path / "run", machine=HERE)
-    assert found.code == "PD621"
-    assert found.notes == ("`seed` is 3 there, 4 here", "`width` is 4 there, 5 here")
+    assert refused_codes(train, replace(config, width=5), tmp_path / "run", machine=HERE) == ["PD621"]
     path = Path(dunes)
     path.write_text(path.read_text(encoding="utf-8").replace("half 1..4", "half 1..5"), encoding="utf-8")
     (found,) = refusal(train, config, tmp_path / "run", machine=HERE)

@@ -61,11 +61,13 @@ def test_stands_that_rules_cannot_have_are_left_out_or_refused() -> None:
     assert refused_codes(TaskWorlds, config, backend="reference") == ["PD604"] * 4
 
 
-def test_a_draw_without_elements_is_refused_at_its_line() -> None:
+def test_a_draw_without_elements_and_an_unknown_pack_are_refused() -> None:
     (found,) = refusal(TaskWorlds, DataConfig(split="held_out", rules="core+sand"), backend="reference")
     assert found.code == "PD604"
     assert "(gas, stone, acid)" in found.primary.span.text
     assert found.notes == ("they need gas, stone, acid",)
+    (found,) = refusal(TaskWorlds, DataConfig(only=("gass",)), backend="reference")
+    assert (found.code, found.helps) == ("PD304", ("did you mean `gas`?",))
 
 
 def test_ids_follow_names_where_rules_number_them_otherwise(tmp_path, garden: str) -> None:  # type: ignore[no-untyped-def]
@@ -78,11 +80,6 @@ def test_ids_follow_names_where_rules_number_them_otherwise(tmp_path, garden: st
     before, after = own.start(seeds).ids, moved.start(seeds).ids
     assert (before == 5).any()
     assert torch.equal(torch.where(before == 5, 9, before), after)
-
-
-def test_an_unknown_pack_is_refused() -> None:
-    (found,) = refusal(TaskWorlds, DataConfig(only=("gass",)), backend="reference")
-    assert (found.code, found.helps) == ("PD304", ("did you mean `gas`?",))
 
 
 @pytest.mark.parametrize(

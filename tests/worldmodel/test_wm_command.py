@@ -83,7 +83,6 @@ def test_preset_and_options_make_the_configuration(tmp_path: Path, dunes: str) -
         (("train", "--first-ruleset", "3"), "--rulesets says how many"),
         (("train", "--rulesets", "2", "--swap", "densty"), "did you mean `density`?"),
         (("train", "--device", "cuda:77"), "PD701"),
-        (("finetune", "nowhere", "--packs", "sand"), "PD620"),
         (("finetune", "nowhere"), "Missing option '--packs'"),
         (("eval", "nowhere"), "PD620"),
         (("show", "nowhere", "--out", "x.gif"), "must end in .png"),
