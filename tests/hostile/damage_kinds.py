@@ -26,6 +26,7 @@ from powderdsl.experiments.runs import STATE
 from powderdsl.experiments.studies.run import StudyRun
 from powderdsl.experiments.studies.study import load_study
 from tests.cli.commands import PACK
+from tests.cli.endless import TASK as DIG
 from tests.cli.test_new_and_test import TESTS
 from tests.studies.test_parts import STUDY
 
@@ -407,18 +408,13 @@ draw:
   - line wall from (0, 0) to (15, 15) width 1
   - frame wall
 """
-TASK = """\
-task: dig
-about: Take sand away.
-rules: core+sand
-size: [8, 8]
-fill: sand
+TASK = (
+    DIG
+    + """\
 knobs: {lines: {default: 1, range: 0..9, about: half the side}}
 regions: {middle: box rows 2:6 columns 2:6}
 generate:
   - square sand at (4, 4) half lines + 1
   - scatter wall chance 10%
-agent: {may: [empty], brush: 2, bins: 4, actions: 3}
-reward: {final: count(empty) / 10}
-splits: {test: {about: framed, generate: [frame wall]}}
 """
+)

@@ -19,6 +19,7 @@ from powderdsl.tasks.file import read_task
 from powderdsl.tasks.players import ExpertPlayer, best_plans
 from powderdsl.tasks.shipped import load_task
 from powderdsl.tasks.task import Task
+from tests.tasks.test_episodes import task_of
 
 YARD = """task: yard
 rules: powderworld
@@ -34,15 +35,8 @@ reward: {each: count(water) / 10}
 """
 
 
-def task_of(expert: str) -> Task:
-    reporter = Reporter()
-    task = read_task(Source("yard.yaml", f"{YARD}expert:\n{expert}"), reporter)
-    assert not [one for one in reporter.diagnostics if one.severity is Severity.ERROR]
-    return task
-
-
 def program_of(expert: str) -> TaskProgram:
-    return compile_task(task_of(expert), backend="torch")
+    return compile_task(task_of(f"{YARD}expert:\n{expert}"), backend="torch")
 
 
 def fullest(cells: np.ndarray, task: Task) -> tuple[int, int, int]:
@@ -146,7 +140,7 @@ def test_shipped_experts_beat_doing_nothing(name: str, least: float) -> None:
 
 def test_scores_on_the_experts_scale() -> None:
     """Random actions lie between, with the interval of paired worlds; worlds without a difference are counted."""
-    task = task_of("  - {choose: water, at: most(sand)}\n")
+    task = task_of(f"{YARD}expert:\n  - {{choose: water, at: most(sand)}}\n")
     found = evaluate(task, episodes=24, backend="torch")
     scores = {one.policy: one for one in found.scores}
     assert list(scores) == ["expert", "random", "nothing"]

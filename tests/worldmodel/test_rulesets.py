@@ -15,25 +15,8 @@ from powderdsl.worldmodel.evaluation import unseen_worlds
 from powderdsl.worldmodel.worlds import UNSEEN_RULESETS, RulesetSource
 from tests.refusals import refusal
 
-TASK = """
-task: mixed
-rules: core+sand+water+lava+fire
-size: [12, 16]
-fill: empty
-generate:
-  - repeat 6:
-      - square any at (0..11, 0..15) half 1..4
-agent: {may: nothing, actions: 16, steps_per_action: 8}
-"""
 RULES = "core+sand+water+lava+fire"
 MANY = Variety(chances=4.0, swaps=("density",), leave_out=0.3)
-
-
-@pytest.fixture(name="task")
-def _task(tmp_path: Path):  # type: ignore[no-untyped-def]
-    path = tmp_path / "mixed.yaml"
-    path.write_text(TASK, encoding="utf-8")
-    return str(path)
 
 
 def test_a_number_decides_a_ruleset() -> None:
@@ -93,13 +76,13 @@ def test_packs_that_others_need_stay() -> None:
 
 
 @pytest.mark.slow
-def test_every_world_runs_under_its_own_ruleset(task) -> None:  # type: ignore[no-untyped-def]
-    source = RulesetSource(RULES, MANY)
-    worlds = TaskWorlds(DataConfig(task, rulesets=3, variety=MANY), backend="torch")
+def test_every_world_runs_under_its_own_ruleset(dunes: str) -> None:
+    worlds = TaskWorlds(DataConfig(dunes, rulesets=3, variety=MANY), backend="torch")
+    source = RulesetSource("core+sand+water+stone", MANY)
     seeds = torch.tensor([5, 0, 1, 3, 2, 4])
     start = worlds.start(seeds)
     end = worlds.later(worlds.later(start, 8), 8)
-    assert start.ids.shape == (6, 12, 16)
+    assert start.ids.shape == (6, 14, 18)
     for place, seed in enumerate(seeds.tolist()):
         drawn = worlds.rulesets[seed % 3]
         model = source.model(drawn)
