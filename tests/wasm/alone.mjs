@@ -1,16 +1,14 @@
-// Runs modules that stand alone, and hashes what they hold. In Node.js: node alone.mjs JOBS.json, a list of
-// {module, cells, fields, clock, params, steps} with bytes in base64. In a page: `runJobs(jobs)`.
+// Runs modules that stand alone in Node.js, and hashes what they hold: node alone.mjs JOBS.json, a list of
+// {module, cells, fields, clock, params, steps} with bytes in base64.
 
-export function fnv(bytes) {
-  let hash = 0x811c9dc5;
-  for (const byte of bytes) hash = Math.imul(hash ^ byte, 0x01000193);
-  return hash >>> 0;
-}
+import { createHash } from "node:crypto";
+import { readFileSync } from "node:fs";
 
-const bytesOf = (text) => Uint8Array.from(atob(text), (char) => char.charCodeAt(0));
+const bytesOf = (text) => Buffer.from(text, "base64");
+const hashOf = (bytes) => createHash("sha256").update(bytes).digest("hex");
 const SIZES = { uint8: 1, int8: 1, int16: 2, int32: 4, float32: 4 };
 
-export function runJob({ module, cells, fields, clock, params, steps }) {
+function hashesOf({ module, cells, fields, clock, params, steps }) {
   const compiled = new WebAssembly.Module(bytesOf(module));
   const [section] = WebAssembly.Module.customSections(compiled, "powderdsl");
   const about = JSON.parse(new TextDecoder().decode(section));
@@ -27,20 +25,13 @@ export function runJob({ module, cells, fields, clock, params, steps }) {
     bytes(world.field(number), given.length).set(given);
     world.take(number);
   });
-  const began = performance.now();
   world.step(steps);
-  const hashes = { element: fnv(bytes(world.show(), count)) };
-  const microseconds = ((performance.now() - began) * 1000) / steps;
+  const hashes = { element: hashOf(bytes(world.show(), count)) };
   about.fields.forEach((field, number) => {
     const size = count * field.components * SIZES[field.type];
-    hashes[field.name] = fnv(bytes(world.field(number), size));
+    hashes[field.name] = hashOf(bytes(world.field(number), size));
   });
-  return { hashes, microseconds };
+  return hashes;
 }
 
-export const runJobs = (jobs) => jobs.map(runJob);
-
-if (typeof process !== "undefined") {
-  const { readFileSync } = await import("node:fs");
-  console.log(JSON.stringify(runJobs(JSON.parse(readFileSync(process.argv[2], "utf8")))));
-}
+console.log(JSON.stringify(JSON.parse(readFileSync(process.argv[2], "utf8")).map(hashesOf)));

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from powderdsl.model.state import Slot, slots
+from powderdsl.model.state import slots
 from powderdsl.model.types import Ruleset
 from powderdsl.simulation.standalone import standalone_module
 from powderdsl.targets.wasm.host import this_host
@@ -70,13 +70,6 @@ def pattern(value: float) -> int:
     return int(struct.unpack("<Q", struct.pack("<d", value))[0])
 
 
-def fnv(data: bytes) -> int:
-    found = 0x811C9DC5
-    for byte in data:
-        found = (found ^ byte) * 0x01000193 & 0xFFFFFFFF
-    return found
-
-
 def job(ruleset: Ruleset, start: Start, steps: int) -> dict[str, Any]:
     """One world for hosts in JavaScript."""
     (ids,), clock = start.ids, np.stack([start.seed, start.index, start.step]).astype(np.int64)
@@ -84,7 +77,9 @@ def job(ruleset: Ruleset, start: Start, steps: int) -> dict[str, Any]:
         "module": text(standalone_module(ruleset, ids.shape)),
         "cells": text(ids.tobytes()),
         "fields": {
-            slot.name: text(_stored(slot, start)) for slot in slots(ruleset)[1:] if slot.name in start.fields
+            slot.name: text(start.fields[slot.name][0].astype(slot.dtype).tobytes())
+            for slot in slots(ruleset)[1:]
+            if slot.name in start.fields
         },
         "clock": text(clock.tobytes()),
         "params": [float(start.params[one.name][0]) for one in ruleset.params if start.params],
@@ -92,47 +87,31 @@ def job(ruleset: Ruleset, start: Start, steps: int) -> dict[str, Any]:
     }
 
 
-def _stored(slot: Slot, start: Start) -> bytes:
-    return np.ascontiguousarray(start.fields[slot.name][0].astype(slot.dtype)).tobytes()
-
-
 def text(data: bytes) -> str:
     return base64.b64encode(data).decode()
 
 
-def node() -> str | None:
-    return shutil.which("node")
+NODE = shutil.which("node")
+CHROMIUM = next(
+    filter(None, map(shutil.which, ("chromium-headless-shell", "chromium", "google-chrome"))), None
+)
 
 
-def chromium() -> str | None:
-    return next(
-        filter(None, map(shutil.which, ("chromium-headless-shell", "chromium", "google-chrome"))), None
-    )
-
-
-def in_node(jobs: list[dict[str, Any]], folder: Path) -> list[dict[str, Any]]:
+def in_node(jobs: list[dict[str, Any]], folder: Path) -> Any:
+    """The hashes of each job's world at its end."""
     file = folder / "jobs.json"
     file.write_text(json.dumps(jobs))
-    command = [str(node()), str(JOBS), str(file)]
-    found: list[dict[str, Any]] = json.loads(
-        subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    )
-    return found
-
-
-class _Quiet(SimpleHTTPRequestHandler):
-    def log_message(self, *_: object) -> None:
-        pass
+    return json.loads(subprocess.check_output([str(NODE), str(JOBS), str(file)]))
 
 
 def screenshot(folder: Path, size: tuple[int, int]) -> Image.Image:
     """What Chromium shows of a folder's page after ten seconds of its own time."""
-    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(folder)))
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(SimpleHTTPRequestHandler, directory=str(folder)))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     file = folder / "page.png"
     options = ["--no-sandbox", "--disable-gpu", "--hide-scrollbars", f"--screenshot={file}"]
     options += [f"--window-size={size[1]},{size[0]}", "--virtual-time-budget=10000"]
-    command = [str(chromium()), *options, f"http://127.0.0.1:{server.server_port}/index.html"]
+    command = [str(CHROMIUM), *options, f"http://127.0.0.1:{server.server_port}/index.html"]
     try:
         subprocess.run(command, capture_output=True, check=True, timeout=120)
     finally:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from contextlib import suppress
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -25,15 +26,7 @@ from tests.fuzz.rulemaker import random_ruleset
 from tests.semantics.test_mixed import spread
 from tests.semantics.texts import load_text
 from tests.tiers import tiered
-from tests.wasm.standalone_world import (
-    StandaloneWorld,
-    chromium,
-    fnv,
-    in_node,
-    job,
-    node,
-    screenshot,
-)
+from tests.wasm.standalone_world import CHROMIUM, NODE, StandaloneWorld, in_node, job, screenshot
 
 DOCS = Path(__file__).parents[2] / "docs" / "export.md"
 SIZES = [(9, 70), (16, 64)]
@@ -156,7 +149,7 @@ def test_fields_hold_only_what_rules_allow() -> None:
         compare(alone, world)
 
 
-needs_node = pytest.mark.skipif(node() is None, reason="no Node.js")
+needs_node = pytest.mark.skipif(NODE is None, reason="no Node.js")
 
 
 def same_in_v8(cases: list[tuple[Ruleset, Start]], steps: int, folder: Path, backend: str) -> None:
@@ -166,8 +159,10 @@ def same_in_v8(cases: list[tuple[Ruleset, Start]], steps: int, folder: Path, bac
         jobs.append(job(ruleset, start, steps))
         sim = compile_ruleset(ruleset, backend=backend)
         later = sim.step(start.world(sim), steps, params=dict(start.params) or None)
-        expected.append({slot: fnv(value[0].numpy().tobytes()) for slot, value in later.state.items()})
-    assert [one["hashes"] for one in in_node(jobs, folder)] == expected
+        expected.append(
+            {slot: sha256(value[0].numpy().tobytes()).hexdigest() for slot, value in later.state.items()}
+        )
+    assert in_node(jobs, folder) == expected
 
 
 @pytest.mark.slow
@@ -193,7 +188,7 @@ def test_random_rulesets_in_v8(seeds: range, tmp_path: Path) -> None:
     same_in_v8(cases, 5, tmp_path, "torch")
 
 
-@pytest.mark.skipif(chromium() is None, reason="no Chromium")
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
 def test_the_page_of_the_documentation_shows_falling_sand(tmp_path: Path) -> None:
     page = DOCS.read_text(encoding="utf-8")
     html = page.partition("```html\n")[2].partition("```")[0]
