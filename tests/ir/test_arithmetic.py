@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import product
-from operator import and_, not_, or_, xor
 
 import numpy as np
 import pytest
@@ -13,36 +12,22 @@ import pytest
 from powderdsl.ir import single
 from powderdsl.ir.bits import Bits, Gates
 from powderdsl.ir.ops import FLAG, OPS, Node, integer
+from tests.schedule.interpreter import World, evaluate
 
 RANGES = [(0, 1), (0, 5), (-3, 3), (-8, 7), (-2, 9), (3, 12)]
 
 
-def value_of(node: Node, inputs: dict[str, bool], known: dict[int, bool] | None = None) -> bool:
-    known = {} if known is None else known
-    if id(node) not in known:
-        known[id(node)] = evaluate(node, [value_of(arg, inputs, known) for arg in node.args], inputs)
-    return known[id(node)]
+def values_of(planes: Sequence[Node], inputs: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+    """The value of each node for each assignment of the inputs."""
+    (count,) = {len(values) for values in inputs.values()}
+    slots = {name: values[None] for name, values in inputs.items()}
+    found = evaluate(planes, World((1, count), slots, {}, {}), {})
+    return [found[id(plane)][0] for plane in planes]
 
 
-def evaluate(node: Node, args: list[bool], inputs: dict[str, bool]) -> bool:
-    if node.op in ("input", "const"):
-        return inputs[node.attr] if node.op == "input" else bool(node.attr)
-    return bool(MEANING[node.op](*args))
-
-
-MEANING: dict[str, Callable[..., bool]] = {
-    "not": not_,
-    "and": and_,
-    "or": or_,
-    "xor": xor,
-    "select": lambda condition, yes, no: yes if condition else no,
-}
-
-
-def number_of(bits: Bits, inputs: dict[str, bool]) -> int:
-    known: dict[int, bool] = {}
-    total = sum(value_of(plane, inputs, known) << i for i, plane in enumerate(bits))
-    return total - (value_of(bits[-1], inputs, known) << len(bits))
+def numbers_of(bits: Bits, inputs: Mapping[str, np.ndarray]) -> np.ndarray:
+    *low, sign = (value.astype(int) for value in values_of(bits, inputs))
+    return np.sum([plane << i for i, plane in enumerate(low)], axis=0) - (sign << len(low))
 
 
 def variable(name: str, lo: int, hi: int, gates: Gates) -> Bits:
@@ -50,8 +35,13 @@ def variable(name: str, lo: int, hi: int, gates: Gates) -> Bits:
     return gates.fit([gates.input(f"{name}{i}", FLAG) for i in range(type.bits)], type)
 
 
-def assignment(name: str, value: int, bits: Bits) -> dict[str, bool]:
-    return {f"{name}{i}": bool(value >> i & 1) for i in range(len(bits))}
+def assignments(name: str, values: np.ndarray, bits: Bits) -> dict[str, np.ndarray]:
+    return {f"{name}{i}": values >> i & 1 != 0 for i in range(len(bits))}
+
+
+def every_pair(first: Iterable[int], second: Iterable[int]) -> np.ndarray:
+    """Two rows: all numbers of the first range with all of the second."""
+    return np.array([*product(first, second)]).T
 
 
 @pytest.mark.parametrize("first", RANGES)
@@ -61,13 +51,13 @@ def test_arithmetic(first: tuple[int, int], second: tuple[int, int]) -> None:
     a, b = variable("a", *first, gates), variable("b", *second, gates)
     total = gates.add(a, b, integer(first[0] + second[0], first[1] + second[1]))
     difference = gates.sub(a, b, integer(first[0] - second[1], first[1] - second[0]))
-    less, same = gates.lt(a, b), gates.eq(a, b)
-    for x, y in product(range(first[0], first[1] + 1), range(second[0], second[1] + 1)):
-        inputs = assignment("a", x, a) | assignment("b", y, b)
-        assert number_of(total, inputs) == x + y
-        assert number_of(difference, inputs) == x - y
-        assert value_of(less, inputs) == (x < y)
-        assert value_of(same, inputs) == (x == y)
+    x, y = every_pair(range(first[0], first[1] + 1), range(second[0], second[1] + 1))
+    inputs = assignments("a", x, a) | assignments("b", y, b)
+    assert (numbers_of(total, inputs) == x + y).all()
+    assert (numbers_of(difference, inputs) == x - y).all()
+    less, same = values_of([gates.lt(a, b), gates.eq(a, b)], inputs)
+    assert (less == (x < y)).all()
+    assert (same == (x == y)).all()
 
 
 @pytest.mark.parametrize("first", RANGES)
@@ -75,28 +65,25 @@ def test_arithmetic(first: tuple[int, int], second: tuple[int, int]) -> None:
 def test_division(first: tuple[int, int], most: int) -> None:
     gates = Gates()
     a, b = variable("a", *first, gates), variable("b", 0, most, gates)
-    quotient, rest = gates.divide(a, b, most)
-    for x, y in product(range(first[0], first[1] + 1), range(1, most + 1)):
-        inputs = assignment("a", x, a) | assignment("b", y, b)
-        assert (number_of(quotient, inputs), number_of(rest, inputs)) == divmod(x, y)
+    x, y = every_pair(range(first[0], first[1] + 1), range(1, most + 1))
+    inputs = assignments("a", x, a) | assignments("b", y, b)
+    found = [numbers_of(bits, inputs) for bits in gates.divide(a, b, most)]
+    assert np.array_equal(found, np.divmod(x, y))
 
 
 @pytest.mark.parametrize("bounds", RANGES)
 def test_truth_tables(bounds: tuple[int, int]) -> None:
-    lo, hi = bounds
     gates = Gates()
-    a = variable("a", lo, hi, gates)
-    count = len(a)
-    every = 1 << (hi - lo + 1)
+    a = variable("a", *bounds, gates)
+    numbers = np.arange(bounds[0], bounds[1] + 1)
+    places = [int(number) & ((1 << len(a)) - 1) for number in numbers]
+    every = 1 << len(numbers)
     for members in range(0, every, max(1, every // 97)):
-        matters = values = 0
-        for number in range(lo, hi + 1):
-            place = number & ((1 << count) - 1)
-            matters |= 1 << place
-            values |= (members >> (number - lo) & 1) << place
-        node = gates.truth_table(a, matters, values)
-        for number in range(lo, hi + 1):
-            assert value_of(node, assignment("a", number, a)) == bool(members >> (number - lo) & 1)
+        wanted = members >> np.arange(len(numbers)) & 1
+        values = sum(int(holds) << place for holds, place in zip(wanted, places, strict=True))
+        node = gates.truth_table(a, sum(1 << place for place in places), values)
+        (found,) = values_of([node], assignments("a", numbers, a))
+        assert np.array_equal(found, wanted != 0)
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 5, 9])
@@ -104,9 +91,9 @@ def test_sums_of_flags(size: int) -> None:
     gates = Gates()
     flags = [gates.input(f"f{i}", FLAG) for i in range(size)]
     planes = gates.total([(flag, 1) for flag in flags], size.bit_length())
-    for values in product((False, True), repeat=size):
-        inputs = {f"f{i}": v for i, v in enumerate(values)}
-        assert number_of(planes, inputs) == sum(values)
+    values = np.array([*product((False, True), repeat=size)])
+    inputs = {f"f{i}": column for i, column in enumerate(values.T)}
+    assert (numbers_of(planes, inputs) == values.sum(1)).all()
 
 
 def test_gates_fold() -> None:

@@ -18,6 +18,7 @@ from powderdsl.ir.ops import (
     Node,
     PassGraph,
     Program,
+    SlotType,
     SubstepGraph,
     integer,
     nodes_of,
@@ -68,14 +69,9 @@ def program_of(name: str, folder: Path) -> Program:
     path = folder / f"{name}.yaml"
     path.write_text(PACKS[name], encoding="utf-8")
     program = lower_ruleset(load(path))
-
-    def here(node: Node) -> None:
-        """Golden texts do not depend on where the test put its file."""
-        object.__setattr__(node, "places", ())
-
-    for pass_ in program.passes:
+    for pass_ in program.passes:  # golden texts do not depend on where the test put its file
         for node in nodes_of(pass_):
-            here(node)
+            object.__setattr__(node, "places", ())
     passes = tuple(
         replace(p, substeps=tuple(replace(m, place="") for m in p.substeps)) for p in program.passes
     )
@@ -88,6 +84,7 @@ def test_golden_ir(name: str, tmp_path: Path, golden) -> None:  # type: ignore[n
     program = program_of(name, tmp_path)
     planes = lower_bits(run_passes(program))
     verify(planes, "bits")
+    assert {node.type.name for pass_ in planes.passes for node in nodes_of(pass_)} <= {"flag", "real"}
     stages = {"lower": program}
     stages |= {stage.name: run_passes(program, until=stage.name) for stage in PIPELINE}
     stages["bits"] = planes
@@ -99,25 +96,14 @@ def test_golden_ir(name: str, tmp_path: Path, golden) -> None:  # type: ignore[n
     golden(GOLDEN / f"{name}.ir", text)
 
 
-def test_planes_hold_no_whole_numbers(tmp_path: Path) -> None:
-    for name in PACKS:
-        planes = lower_bits(run_passes(program_of(name, tmp_path)))
-        assert {node.type.name for p in planes.passes for node in nodes_of(p)} <= {"flag", "real"}
-
-
-def a_pass(*outputs: tuple[str, Node]) -> PassGraph:
-    return PassGraph("p", "pack", (SubstepGraph("", "", outputs, ()),), outputs)
-
-
 def a_program(*outputs: tuple[str, Node]) -> Program:
-    from powderdsl.ir.ops import SlotType
-
     slots = (
         SlotType("f", FLAG, 0, False),
         SlotType("n", integer(0, 3), 0, False),
         SlotType("r", REAL, 0.0, False),
     )
-    return Program("broken", slots, (("q", "chance"),), (("s", 7, 16),), (a_pass(*outputs),))
+    pass_ = PassGraph("p", "pack", (SubstepGraph("", "", outputs, ()),), outputs)
+    return Program("broken", slots, (("q", "chance"),), (("s", 7, 16),), (pass_,))
 
 
 BUILD = Graph()

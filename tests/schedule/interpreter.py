@@ -52,7 +52,7 @@ def run_graph(pass_: PassGraph, world: World) -> dict[int, Array]:
     roots = [node for _, node in pass_.outputs]
     roots += [node for step in pass_.substeps for _, node in step.writes]
     roots += [guard for step in pass_.substeps for guard in step.guards]
-    return _evaluate(roots, world, {})
+    return evaluate(roots, world, {})
 
 
 def run_schedule(schedule: Schedule, world: World, truth: Mapping[int, Array]) -> dict[str, Array]:
@@ -60,7 +60,7 @@ def run_schedule(schedule: Schedule, world: World, truth: Mapping[int, Array]) -
     state = _State(world, truth, {var.name: world.slots[slot] for slot, var in schedule.inputs})
     state.buffers = dict(schedule.buffers)
     state.block(schedule.body)
-    return {slot: np.array(_evaluate([node], world, state.held)[id(node)]) for slot, node in schedule.outputs}
+    return {slot: np.array(evaluate([node], world, state.held)[id(node)]) for slot, node in schedule.outputs}
 
 
 @dataclass
@@ -123,7 +123,7 @@ class _State:
                         del self.held[name]
 
     def values(self, nodes: Sequence[Node]) -> list[Array]:
-        found = _evaluate(nodes, self.world, self.held)
+        found = evaluate(nodes, self.world, self.held)
         return [found[id(node)] for node in nodes]
 
     def inside(self, statement: Compute, out: Out, value: Array) -> Array:
@@ -166,7 +166,8 @@ def _shift(x: Array, dy: int, dx: int, wraps: bool) -> Array:
     return result
 
 
-def _evaluate(roots: Sequence[Node], world: World, held: Mapping[str, Array]) -> dict[int, Array]:
+def evaluate(roots: Sequence[Node], world: World, held: Mapping[str, Array]) -> dict[int, Array]:
+    """The value of every node that some nodes are made of, by id; `held` has the variables."""
     done: dict[int, Array] = {}
     with np.errstate(all="ignore"):
         for node in ordered(roots):
