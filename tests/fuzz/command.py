@@ -5,96 +5,62 @@ from __future__ import annotations
 import os
 import re
 import time
+from collections import Counter
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from tempfile import gettempdir
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from powderdsl.cli import options as opt
 from powderdsl.cli.dispatch import GuardedCommand
 from powderdsl.cli.exits import FAILED, OK, BadInput
-from powderdsl.cli.output import counted, progress
+from powderdsl.cli.output import Show, counted, progress
 from powderdsl.system.interrupts import Terminated
+from powderdsl.system.writing import failure, scratch_folder
 from tests.fuzz import COMPARED, COMPILED
 
 if TYPE_CHECKING:
     from tests.fuzz.campaign import Tally
     from tests.fuzz.differential import Plan
 
-Item = TypeVar("Item")
-
-NAMES = ("reference", *COMPARED)
 MAX_SEED = 1 << 40
-LEVELS = ("0", "1", "2", "3")
 
 
-class SeedsType(click.ParamType):
-    """`0..1000`: seeds from 0 to 999."""
-
-    name = "FROM..TO"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> range:
-        match = re.fullmatch(r"([0-9]{1,12})\.\.([0-9]{1,12})", str(value))
-        if match is None or int(match[1]) >= int(match[2]):
-            self.fail(f"`{value}` is not a range of seeds: write FROM..TO, such as 0..1000", param, ctx)
-        return range(int(match[1]), int(match[2]))
+def _seeds(text: str) -> range:
+    match = re.fullmatch(r"([0-9]{1,12})\.\.([0-9]{1,12})", text)
+    if match is None or int(match[1]) >= int(match[2]):
+        raise ValueError("is not a range of seeds: write FROM..TO, such as 0..1000")
+    return range(int(match[1]), int(match[2]))
 
 
-class BackendsType(click.ParamType):
-    """`torch,wasm`: what is compared with the reference, each once, joined by commas. The reference may be among them."""
-
-    name = "NAMES"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[str, ...]:
-        if isinstance(value, tuple):
-            return value
-        names = value.replace(" ", "").split(",")
-        for number, name in enumerate(names):
-            if name not in NAMES:
-                self.fail(f"no backend `{name}` to compare: {', '.join(NAMES)}", param, ctx)
-            if name in names[:number]:
-                self.fail(f"`{name}` is named twice: nothing is compared with itself", param, ctx)
-        others = tuple(name for name in names if name != "reference")
-        if not others:
-            self.fail("the reference is not compared with itself: name another backend too", param, ctx)
-        return others
+def _backends(text: str) -> tuple[str, ...]:
+    """What is compared with the reference, each once. The reference may be among the names."""
+    names = dict.fromkeys(text.replace(" ", "").split(","))
+    names.pop("reference", None)
+    if not names or not names.keys() <= {*COMPARED}:
+        raise ValueError(f"is not what can be compared with the reference: {', '.join(COMPARED)}")
+    return tuple(names)
 
 
 @click.command("fuzz", cls=GuardedCommand, context_settings={"help_option_names": ["-h", "--help"]})
-@click.option("--seeds", type=SeedsType(), help="Which rulesets, or damaged files.  [default: 0..200]")
+@opt.option("--seeds", opt.Parsed("FROM..TO", _seeds), "Which rulesets, or damaged files.  [default: 0..200]")
 @opt.option("--seconds", (1, 10_000_000), "Run for this time, with as many seeds as it takes.")
-@click.option(
+@opt.option(
     "--backends",
-    type=BackendsType(),
-    help=f"What is compared: {', '.join(NAMES)}.  [default: all; those that need a C++ compiler if there is one]",
+    opt.Parsed("NAMES", _backends),
+    f"What is compared: {', '.join(COMPARED)}.  [default: all; those that need a C++ compiler if there is one]",
 )
 @opt.option("--worlds", (1, 100), "Worlds of a ruleset.", 4, show_default=True)
 @opt.option("--steps", (1, 10_000), "Steps of a world.", 3, show_default=True)
-@click.option(
-    "--level",
-    type=click.Choice(LEVELS),
-    default="0",
-    show_default=True,
-    help="Optimization of native code. Users' is 2.",
-)
-@click.option(
-    "--save",
-    "folder",
-    type=click.Path(path_type=Path, file_okay=False),
-    default=Path("fuzz"),
-    show_default=True,
-    help="Folder for what failed.",
-)
-@click.option("--front-end", is_flag=True, help="Damage rule files instead, and load them.")
+@opt.option("--level", tuple("0123"), "Optimization of native code. Users' is 2.", "0", show_default=True)
+@opt.path("--save", "FOLDER", "Folder for what failed.", to="folder", default=Path("fuzz"), show_default=True)
+@opt.option("--front-end", bool, "Damage rule files instead, and load them.")
 @opt.option("--jobs", (1, 256), "Processes.  [default: one per processor]")
-@click.option(
-    "--replay",
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE",
-    help="Only run the case of a file again.",
-)
+@opt.path("--replay", "FILE", "Only run the case of a file again.")
 def command(
     seeds: range | None,
     seconds: int | None,
@@ -136,7 +102,6 @@ def command(
 
 def _there(asked: tuple[str, ...] | None) -> tuple[str, ...]:
     """The backends asked for, by default all that are there. Raises CompileError (PD701) if one is not."""
-    from powderdsl.system.writing import failure
     from powderdsl.targets.cpp.build import INSTALL, NoCompiler, find_compiler
 
     wanted = asked or COMPARED
@@ -156,15 +121,11 @@ def _there(asked: tuple[str, ...] | None) -> tuple[str, ...]:
 
 
 def _replay(path: Path, building: Any) -> int:
-    from dataclasses import replace
-    from tempfile import gettempdir
-
-    from powderdsl.system.writing import scratch_folder
     from tests.fuzz.cases import read_case
     from tests.fuzz.differential import check_case
 
     case = read_case(path)
-    if case.backend not in NAMES:
+    if case.backend not in ("reference", *COMPARED):
         raise BadInput(f"{path}: no backend `{case.backend}`")
     if case.backend in COMPILED:
         _there((case.backend,))
@@ -177,6 +138,30 @@ def _replay(path: Path, building: Any) -> int:
     return FAILED
 
 
+@contextmanager
+def _watched(
+    events: Generator[Any, None, None], seconds: int | None, total: int
+) -> Iterator[tuple[Show, list[KeyboardInterrupt]]]:
+    """Shows how many seeds are done while events are heard. An interrupt ends that, and is there for the report."""
+    interrupts: list[KeyboardInterrupt] = []
+    with progress("fuzz" if seconds is None else f"fuzz for {seconds} s", total) as show:
+        try:
+            yield show, interrupts
+        except KeyboardInterrupt as caught:
+            interrupts.append(caught)
+            click.echo("interrupted")
+        finally:
+            events.close()  # its processes end
+
+
+def _exit(interrupts: list[KeyboardInterrupt], found: int) -> int:
+    click.echo(f"{counted(found, 'problem')} found")
+    for interrupt in interrupts:
+        if isinstance(interrupt, Terminated):
+            raise interrupt
+    return FAILED if found else OK
+
+
 def _campaign(plan: Plan, seeds: range | None, seconds: int | None, folder: Path, jobs: int) -> int:
     from tests.fuzz.campaign import Tally, run_campaign
 
@@ -184,32 +169,19 @@ def _campaign(plan: Plan, seeds: range | None, seconds: int | None, folder: Path
     began = time.monotonic()
     until = began + (seconds if seconds is not None else float("inf"))
     events = run_campaign(plan, tally, iter(wanted), jobs, folder, until)
-    interrupt: KeyboardInterrupt | None = None
-    done = 0
-    with progress(_title(seconds), len(wanted)) as show:
-        try:
-            for event in events:
-                if isinstance(event, Path):
-                    click.echo(f"found: {event}", err=True)
-                else:
-                    done += 1
-                    show(done)
-        except KeyboardInterrupt as caught:
-            interrupt = caught
-        finally:
-            events.close()  # its processes end
-    _report(plan, tally, folder, time.monotonic() - began, interrupt is not None)
-    if isinstance(interrupt, Terminated):
-        raise interrupt
-    return FAILED if tally.files else OK
+    with _watched(events, seconds, len(wanted)) as (show, interrupts):
+        for event in events:
+            show(tally.rulesets + tally.refused)
+            if isinstance(event, Path):
+                click.echo(f"found: {event}", err=True)
+    _report(plan, tally, folder, time.monotonic() - began)
+    return _exit(interrupts, len(tally.files))
 
 
-def _report(plan: Plan, tally: Tally, folder: Path, seconds: float, interrupted: bool) -> None:
+def _report(plan: Plan, tally: Tally, folder: Path, seconds: float) -> None:
     from tests.fuzz.exercised import ON_CELLS, missing
 
     names = " and ".join(filter(None, (", ".join(plan.backends[:-1]), plan.backends[-1])))
-    if interrupted:
-        click.echo("interrupted")
     click.echo(
         f"{tally.rulesets:,} rulesets and {tally.worlds:,} worlds, {counted(plan.steps, 'step')} each, in {seconds:.0f} s: "
         f"{names} against the reference"
@@ -221,12 +193,9 @@ def _report(plan: Plan, tally: Tally, folder: Path, seconds: float, interrupted:
     click.echo()
     for name in tally.files:
         click.echo(f"python -m tests.fuzz --replay {folder / name}")
-    click.echo(f"{counted(len(tally.files), 'difference')} found")
 
 
 def _front_end(seeds: range | None, seconds: int | None, folder: Path, jobs: int) -> int:
-    from collections import Counter
-
     from tests.fuzz.damage import run_trials
 
     wanted = seeds or (range(2000) if seconds is None else range(MAX_SEED))
@@ -234,22 +203,15 @@ def _front_end(seeds: range | None, seconds: int | None, folder: Path, jobs: int
     trials = run_trials(iter(wanted), jobs, folder, began + (seconds or float("inf")))
     kinds: Counter[str] = Counter()
     accepted, slowest, largest, found = 0, 0.0, 0.0, []
-    interrupt: KeyboardInterrupt | None = None
-    with progress(_title(seconds), len(wanted)) as show:
-        try:
-            for trial in trials:
-                kinds[trial.kind] += 1
-                show(kinds.total())
-                accepted += trial.accepted
-                slowest, largest = max(slowest, trial.seconds), max(largest, trial.megabytes)
-                if trial.problem is not None:
-                    found.append(trial)
-                    click.echo(f"{folder / trial.file_name}: {trial.problem}", err=True)
-        except KeyboardInterrupt as caught:
-            interrupt = caught
-            click.echo("interrupted")
-        finally:
-            trials.close()  # its processes end
+    with _watched(trials, seconds, len(wanted)) as (show, interrupts):
+        for trial in trials:
+            kinds[trial.kind] += 1
+            show(kinds.total())
+            accepted += trial.accepted
+            slowest, largest = max(slowest, trial.seconds), max(largest, trial.megabytes)
+            if trial.problem is not None:
+                found.append(trial)
+                click.echo(f"{folder / trial.file_name}: {trial.problem}", err=True)
     click.echo(
         f"{kinds.total():,} inputs loaded in {time.monotonic() - began:.0f} s, {accepted:,} of them good rules"
     )
@@ -257,11 +219,4 @@ def _front_end(seeds: range | None, seconds: int | None, folder: Path, jobs: int
     click.echo(f"slowest {slowest:.2f} s of processor time, largest process {largest:.0f} MB")
     for trial in found:
         click.echo(f"powderdsl check {folder / trial.file_name}")
-    click.echo(f"{counted(len(found), 'problem')} found")
-    if isinstance(interrupt, Terminated):
-        raise interrupt
-    return FAILED if found else OK
-
-
-def _title(seconds: int | None) -> str:
-    return "fuzz" if seconds is None else f"fuzz for {seconds} s"
+    return _exit(interrupts, len(found))
