@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import operator
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from itertools import product
 from typing import Any
 
@@ -101,22 +103,15 @@ def compare(call: Callable[..., Any], theirs: tuple[Any, ...], ours: tuple[Any, 
     check_equal(wanted, found)
 
 
+OPERATORS = "add sub mul truediv floordiv mod and_ or_ xor eq ne lt le gt ge"
+
+
+def operated(name: str, np: Any, a: Any, b: Any) -> Any:
+    return getattr(operator, name)(a, b)
+
+
 BINARY: dict[str, Callable[..., Any]] = {
-    "add": lambda np, a, b: a + b,
-    "subtract": lambda np, a, b: a - b,
-    "multiply": lambda np, a, b: a * b,
-    "divide": lambda np, a, b: a / b,
-    "floor": lambda np, a, b: a // b,
-    "mod": lambda np, a, b: a % b,
-    "and": lambda np, a, b: a & b,
-    "or": lambda np, a, b: a | b,
-    "xor": lambda np, a, b: a ^ b,
-    "eq": lambda np, a, b: a == b,
-    "ne": lambda np, a, b: a != b,
-    "lt": lambda np, a, b: a < b,
-    "le": lambda np, a, b: a <= b,
-    "gt": lambda np, a, b: a > b,
-    "ge": lambda np, a, b: a >= b,
+    **{name: partial(operated, name) for name in OPERATORS.split()},
     "minimum": lambda np, a, b: np.minimum(a, b),
     "maximum": lambda np, a, b: np.maximum(a, b),
     "where": lambda np, a, b: np.where(a == b, a, b),

@@ -85,25 +85,6 @@ also:
 """,
         (("wall never changes", 5),),
     ),
-    Added(
-        "kiln",
-        """pack: kiln
-about: Heat is a field; hot sand melts.
-needs: [core, sand]
-tags: {glowing: gives off heat}
-fields:
-  heat: {type: 0..100, at: place}
-elements:
-  glass: {id: 123, density: 5, color: "#BDE0FE"}
-also: {fire?: glowing, lava?: glowing}
-passes:
-  glow:
-    after: flow
-    do: heat += 20 where glowing
-    then: sand -> glass if heat > 80
-""",
-        (("count(sand?) is constant without (acid?, cloner?)", 14),),
-    ),
 )
 
 

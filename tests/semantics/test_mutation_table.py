@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
-import sys
-from functools import cache
+import runpy
 from multiprocessing import active_children
 from pathlib import Path
-from types import ModuleType
+from types import SimpleNamespace
 
 import pytest
 
@@ -26,25 +24,18 @@ from tests.semantics.texts import load_text
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 
-@cache
-def table() -> ModuleType:
-    """docs/mutation_table.py, which is a script beside the pages and no module of a package."""
-    spec = importlib.util.spec_from_file_location("mutation_table", DOCS / "mutation_table.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+TABLE = SimpleNamespace(**runpy.run_path(str(DOCS / "mutation_table.py")))
 
 
 def measured() -> dict[str, dict[str, dict[str, dict[str, int]]]]:
-    path = table().RESULTS
+    path = TABLE.RESULTS
     return json.loads(path.read_text("utf-8")) if path.exists() else {}
 
 
 def test_every_pack_is_in_the_table_and_the_counts_add_up():
-    assert list(measured()) == list(table().compositions())
+    assert list(measured()) == list(TABLE.compositions())
     for rules, entry in measured().items():
-        assert list(entry["packs"]) == table().packs_of(rules)
+        assert list(entry["packs"]) == TABLE.packs_of(rules)
         for counts in entry["packs"].values():
             assert set(counts) == set(COUNTED)
             assert counts["mutants"] == counts["equivalent"] + counts["killed"] + counts["survived"]
@@ -53,10 +44,10 @@ def test_every_pack_is_in_the_table_and_the_counts_add_up():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rules", table().compositions(), ids=lambda rules: rules.rpartition("/")[2])
+@pytest.mark.parametrize("rules", TABLE.compositions(), ids=lambda rules: rules.rpartition("/")[2])
 def test_no_more_mutants_survive_than_the_table_says(rules, monkeypatch):
     monkeypatch.chdir(DOCS.parent)
-    for found in table().count(rules, table().packs_of(rules), os.cpu_count() or 1):
+    for found in TABLE.count(rules, TABLE.packs_of(rules), os.cpu_count() or 1):
         for pack, counts in found.items():
             said = measured().get(rules, {"packs": {}})["packs"].get(pack)
             if said is None:
