@@ -17,7 +17,7 @@ import pytest
 from PIL import Image
 
 from powderdsl.web.site import PARTS
-from tests.wasm.standalone_world import chromium, fnv
+from tests.wasm.standalone_world import CHROMIUM
 from tests.wheels import once, succeed
 
 HERE = Path(__file__).parent
@@ -31,7 +31,7 @@ def needed() -> str:
         return "the page is tested with Node.js and playwright-core: `make web` fetches it with npm"
     if not PARTS.is_dir():
         return "the page needs Pyodide and CodeMirror: `make web` fetches them with npm"
-    return "" if chromium() else "the page is tested in Chromium: apt install chromium-headless-shell"
+    return "" if CHROMIUM else "the page is tested in Chromium: apt install chromium-headless-shell"
 
 
 @contextmanager
@@ -62,6 +62,13 @@ def seen(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     folder = once(tmp_path_factory, "page", use)
     found: dict[str, Any] = json.loads((folder / "seen.json").read_text(encoding="utf-8"))
     return found | {"folder": folder}
+
+
+def fnv(data: bytes) -> int:
+    found = 0x811C9DC5
+    for byte in data:
+        found = (found ^ byte) * 0x01000193 & 0xFFFFFFFF
+    return found
 
 
 def hashes(path: Path) -> dict[str, int]:
