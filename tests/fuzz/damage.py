@@ -103,19 +103,13 @@ def check_printable(diagnostics: tuple[Diagnostic, ...]) -> None:
 # Kinds of damage
 
 
-def damaged_lines(choices: Choices) -> str:
-    """A shipped file after some deletions, repetitions, exchanges and insertions of lines."""
-    return _damaged(choices, choices.pick(list(rule_texts().values())).splitlines(keepends=True))
+def damaged(parts_of: Callable[[Choices], list[str]]) -> Callable[[Choices], str]:
+    """A text after some deletions, repetitions, exchanges and insertions of its parts."""
+    return lambda choices: _damaged(choices, parts_of(choices))
 
 
-def damaged_tokens(choices: Choices) -> str:
-    """The same with words and signs."""
-    return _damaged(choices, TOKEN.findall(choices.pick(list(rule_texts().values()))))
-
-
-def damaged_random_rules(choices: Choices) -> str:
-    """A random ruleset with damage: it uses all of the language."""
-    return _damaged(choices, TOKEN.findall(ruleset_text(choices, Manner())))
+def shipped_text(choices: Choices) -> str:
+    return choices.pick(list(rule_texts().values()))
 
 
 def _damaged(choices: Choices, parts: list[str]) -> str:
@@ -200,9 +194,9 @@ def heavy(choices: Choices) -> str:
 
 
 KINDS: dict[str, tuple[int, Callable[[Choices], str]]] = {
-    "lines": (5, damaged_lines),
-    "tokens": (5, damaged_tokens),
-    "random rules": (4, damaged_random_rules),
+    "lines": (5, damaged(lambda choices: shipped_text(choices).splitlines(keepends=True))),
+    "tokens": (5, damaged(lambda choices: TOKEN.findall(shipped_text(choices)))),
+    "random rules": (4, damaged(lambda choices: TOKEN.findall(ruleset_text(choices, Manner())))),
     "rule": (3, any_rule),
     "expression": (3, any_expression),
     "heavy": (2, heavy),

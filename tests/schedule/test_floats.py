@@ -9,7 +9,7 @@ import pytest
 from powderdsl.compiler import load
 from powderdsl.ir.ops import REAL, InvalidIR
 from powderdsl.schedule.stages import CPU, plan
-from powderdsl.schedule.types import Compute, Move, Sweeps, flat
+from powderdsl.schedule.types import Compute, Move, Statement, Sweeps, flat
 from tests.schedule.test_stages import packed_passes, run_stages
 from tests.schedule.verify import verify
 from tests.semantics.texts import load_text
@@ -44,13 +44,18 @@ passes:
 """
 
 
-@pytest.mark.parametrize("place", ["left", "above.right", "at(-2, 3)"])
-@pytest.mark.parametrize("policy", ["drop_both", "first_wins"])
-def test_fields_are_exchanged_where_planes_are(policy: str, place: str) -> None:
+def planned(policy: str, place: str) -> list[Statement]:
+    """The statements of the pass, every stage of which means the same."""
     rules = load_text(SINKING.replace("POLICY", policy).replace("OFFSET", place), "sinking.yaml")
     run_stages(rules, CPU)
     ((part, fall),) = packed_passes(rules)
-    statements = list(flat(plan(part.planes, fall, CPU).body))
+    return list(flat(plan(part.planes, fall, CPU).body))
+
+
+@pytest.mark.parametrize("place", ["left", "above.right", "at(-2, 3)"])
+@pytest.mark.parametrize("policy", ["drop_both", "first_wins"])
+def test_fields_are_exchanged_where_planes_are(policy: str, place: str) -> None:
+    statements = planned(policy, place)
     moves = [(one.op, one.offset, one.outs[0].var.type) for one in statements if isinstance(one, Move)]
     fields = [(op, offset) for op, offset, type in moves if type == REAL]
     assert fields == [(op, offset) for op, offset, type in moves if type != REAL]
@@ -60,9 +65,5 @@ def test_fields_are_exchanged_where_planes_are(policy: str, place: str) -> None:
 
 
 def test_exchanges_that_share_cells_are_computed() -> None:
-    rules = load_text(SINKING.replace("POLICY", "overwrite").replace("OFFSET", "left"), "sinking.yaml")
-    run_stages(rules, CPU)
-    ((part, fall),) = packed_passes(rules)
-    assert not any(
-        isinstance(one, Move) and one.op == "swap" for one in flat(plan(part.planes, fall, CPU).body)
-    )
+    statements = planned("overwrite", "left")
+    assert not any(isinstance(one, Move) and one.op == "swap" for one in statements)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -11,11 +9,6 @@ from powderdsl.model.reference import Clock, draw
 from powderdsl.simulation.simulator import compile as compile_ruleset
 from powderdsl.system.random import name_number
 from tests.semantics.texts import load_text
-
-Shape = tuple[int, int]
-Planes = Any
-"""A NumPy array; what it holds is said where it is made."""
-
 
 DEVIATIONS = 6.0
 """Standard deviations that a statistic may be off: by chance, 2 in 10^9 are."""
@@ -29,19 +22,19 @@ def draws(
     step: int = 0,
     ident: int = IDENTS[0],
     bits: int = 32,
-    shape: Shape = (128, 160),
-) -> Planes:
+    shape: tuple[int, int] = (128, 160),
+) -> np.ndarray:
     """Draws of one world by the oracle, as integers below 2^bits: uint64 [H, W]."""
     clock = Clock(np.array([seed]), np.array([index]), np.array([step]))
     return (draw(clock, ident, bits, *shape)[0] * 2.0**bits).astype(np.uint64)  # type: ignore[no-any-return]
 
 
-def planes(numbers: Planes, bits: int = 32) -> Planes:
+def planes(numbers: np.ndarray, bits: int = 32) -> np.ndarray:
     """Bit planes as ±1: float64 [bits, cells…]."""
     return np.stack([(numbers >> np.uint64(j)) & np.uint64(1) for j in range(bits)]).astype(float) * 2 - 1
 
 
-def assert_fair(signs: Planes) -> None:
+def assert_fair(signs: np.ndarray) -> None:
     """Each row of ±1 sums up to about nothing."""
     flat = signs.reshape(len(signs), -1)
     deviations = flat.sum(1) / np.sqrt(flat.shape[1])

@@ -12,6 +12,7 @@ instead is checked for itself, in `test_wind_carries_what_a_cell_holds`.
 
 from __future__ import annotations
 
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -61,12 +62,8 @@ def run(simulator: Simulator, state: State, random: dict[str, np.ndarray], passe
 
 def near(mask: Mask, reach: int) -> Mask:
     """Cells [B, H, W] within `reach` rows and columns of a cell of the mask, around the edges too."""
-    shifts = range(-reach, reach + 1)
-    found = np.zeros_like(mask)
-    for down in shifts:
-        for right in shifts:
-            found |= np.roll(mask, (down, right), (-2, -1))
-    return found
+    shifts = product(range(-reach, reach + 1), repeat=2)
+    return np.any([np.roll(mask, shift, (-2, -1)) for shift in shifts], axis=0)
 
 
 def may_be_overrun(before_wind: State) -> Mask:
