@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from powderdsl.cli.dispatch import COMMANDS
+from powderdsl.compiler import BACKENDS
 from tests.cli.commands import environment_with
 from tests.studies.test_study_paths import STUDY
 
@@ -33,6 +34,7 @@ for line in lines:
 """
 
 WORKS = ""
+PRINTED = [name for name in BACKENDS if name not in ("auto", "reference")]
 QUICK = [
     # a command; the package that it lacks without torch; without NumPy
     ("run life --steps 1", WORKS, WORKS),
@@ -45,7 +47,12 @@ QUICK = [
     ("run life --steps 1 --backend cuda", "torch", "torch"),
     ("run life --steps 1 --device cuda", "torch", "torch"),
     ("check life --quick", WORKS, WORKS),
-    ("compile life --emit kernels --backend wasm", WORKS, WORKS),
+    *(
+        (f"compile core+sand+wind --emit {stage}", WORKS, WORKS)
+        for stage in ("tree", "model", "ir", "planes")
+    ),
+    *((f"compile core+sand+wind --emit kernels --backend {name}", WORKS, WORKS) for name in PRINTED),
+    ("compile life --emit schedule --backend native", WORKS, WORKS),
     ("show life", WORKS, WORKS),
     ("test core --mutate --mutants 2 --jobs 1", "torch", "numpy"),
     ("trace life --at 1,1 --step 1", WORKS, WORKS),

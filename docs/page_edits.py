@@ -1,4 +1,4 @@
-"""How long it takes in Pyodide from an edited rule file to the first step of a world. `measure.py` runs it.
+"""How long it takes in Pyodide from an edited rule file to the first step of a world. `page_table.py` runs it.
 
 Seconds are processor time of the thread that does everything, which other programs hardly change, and by the clock.
 """

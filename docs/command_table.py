@@ -1,6 +1,6 @@
 """Processor time and time by the clock of commands, with an empty cache and with a warm one: the table of docs/performance.md.
 
-python -m tests.bench.commands
+.venv/bin/python docs/command_table.py
 """
 
 from __future__ import annotations

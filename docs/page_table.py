@@ -1,4 +1,4 @@
-"""`python -m tests.web.measure`: seconds from an edited rule file to running code, in Pyodide under Node.js."""
+"""`python -m docs.page_table`: seconds from an edited rule file to running code, in Pyodide under Node.js."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from tests.web.packages import PACKAGES, write_packages
 from tests.wheels import build_wheel, succeed
 
 HERE = Path(__file__).parent
+WEB = HERE.parent / "tests" / "web"
 
 
 def main() -> None:
@@ -23,7 +24,7 @@ def main() -> None:
         folder = Path(name)
         wheel = build_wheel(folder)
         write_packages(folder / "packages.zip", PACKAGES)
-        command = (node, HERE / "pyodide.mjs", folder, HERE / "edits.py", wheel, folder / "packages.zip")
+        command = (node, WEB / "pyodide.mjs", folder, HERE / "page_edits.py", wheel, folder / "packages.zip")
         succeed(*command, cwd=folder)
         found: dict[str, dict[str, float]] = json.loads((folder / "seconds.json").read_text())
     phases = list(found["from scratch"])
