@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import atexit
 import ctypes
+import os
 from contextlib import suppress
 from functools import cache
 from hashlib import sha256
-from importlib.metadata import version
 from typing import Any, TypeVar
 from weakref import WeakSet
 
@@ -17,7 +17,9 @@ from wasmtime import _ffi
 from powderdsl.system.cache import persistent
 from powderdsl.targets.wasm.host import TOO_LARGE
 
-WASMTIME = version("wasmtime")
+INSTALLED = os.stat(wasmtime.__file__).st_mtime_ns
+"""When wasmtime was installed: reading its version takes longer than reading what it has compiled."""
+
 MOST_ARGUMENTS = 16
 GROWTH = 16 << 20
 """Address space reserved for growth on machines with little address space."""
@@ -67,7 +69,7 @@ class WasmtimeModule:
 
     def _compile(self) -> None:
         self._engine = self.engine
-        inputs = f"{WASMTIME} {_engine(reserve=True) is self.engine} {sha256(self._code).hexdigest()}"
+        inputs = f"{INSTALLED} {_engine(reserve=True) is self.engine} {sha256(self._code).hexdigest()}"
         machine_code = persistent(
             "machine code", inputs, lambda: bytes(wasmtime.Module(self.engine, self._code).serialize())
         )
