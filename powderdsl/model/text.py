@@ -222,6 +222,7 @@ class _Printer:
         return f"{item.name} {item.kind} at {item.at}{of} default {default}{own}{resets}{tint_text(item)}"
 
     def kernel_lines(self) -> list[str]:
+        """A line for each kernel that was printed: its name, and the weight of each neighbor."""
         lines = []
         for kernel, name in self.kernels.items():
             weights = " ".join(f"({dy},{dx})={weight}" for dy, dx, weight in kernel.weights)

@@ -502,6 +502,7 @@ class Namer:
         self.count = max((int(name[1:]) for name in names), default=0)
 
     def var(self, type: Type, means: Node | None = None) -> Var:
+        """A new variable, named by its type and a number; `means` is the node whose value it holds."""
         self.count += 1
         return Var(f"{_PREFIX[type.name]}{self.count}", type, means)
 

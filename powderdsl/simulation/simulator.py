@@ -550,6 +550,7 @@ class Simulator:
         return {param.name: self.kind.put([float(param.default)] * batch, "float64") for param in params}
 
     def _parameters(self, params: Mapping[str, Any], batch: int) -> Mapping[str, Array]:
+        """As `parameters`, but defaults share memory. Raises KeyError, TypeError, ValueError."""
         values, by_name = self._defaults(batch), {param.name: param for param in self.ruleset.params}
         for name, value in check_mapping("params", params).items():
             if name not in by_name:

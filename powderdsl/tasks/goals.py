@@ -187,6 +187,7 @@ class GoalChecker:
         return Expr("measure", REAL, value=self.measure(name, parts[0]))
 
     def measure(self, how: str, cells: Syntax) -> Measure:
+        """The measure of a call such as ``count(SET in REGION)``. Raises Poisoned after reporting what is wrong with it."""
         if how == "match":
             if cells.kind != "name" or cells.text not in self.targets:
                 raise self._unknown("target", cells, self.targets)

@@ -172,6 +172,7 @@ def splat(number: Value) -> Value:
 
 
 def integers(number: int) -> Value:
+    """A vector of four equal 32-bit integers."""
     return vector((number & MASK).to_bytes(4, "little") * 4)
 
 

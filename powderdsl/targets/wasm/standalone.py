@@ -172,6 +172,7 @@ class Standalone(Batches):
         body.do(self.calls["run"](self.batch, count))
 
     def clock(self) -> Value:
+        """The address of the world's seed, index and step."""
         return self.batch + HEADER
 
     def show(self) -> Value:
