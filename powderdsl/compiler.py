@@ -150,7 +150,7 @@ def load_with_diagnostics(
 def _report_more(
     packs: Sequence[PackDecl], ruleset: RulesetDecl | None, reader: _Reader, palette: Palette | None
 ) -> None:
-    """Report what is also wrong in files with mistakes, except what may follow from these."""
+    """Report further mistakes in files, except those that may follow from the mistakes reported so far."""
     from powderdsl.model.check import check
     from powderdsl.model.composition.names import words_of_tree
     from powderdsl.syntax.yaml_tree import parse_yaml
@@ -205,8 +205,8 @@ def split_names(name: Any) -> tuple[list[str], list[str]]:
     names a file is one path. After ``.yaml``, a ``-`` leaves a pack out, too.
     """
     if not isinstance(name, str | Path):
-        helps = ("one text each: load('a', 'b'), or load('a+b')",)
-        raise failure("PD304", f"rules are named by texts, found {type(name).__name__}", helps=helps)
+        helps = ("write load('a', 'b') or load('a+b')",)
+        raise failure("PD304", f"rules are named by strings, found {type(name).__name__}", helps=helps)
     if isinstance(name, Path):
         return [str(name)], []
     plus: list[str] = []
@@ -446,9 +446,8 @@ def _find_beside(word: str, reporter: Reporter, ruleset: RulesetDecl, span: Span
         message = f"a ruleset names other files without a path: `{word}`"
         reporter.error("PD304", message, span, helps=helps)
         return None
-    reported = len(reporter.diagnostics)
     path = _file_beside(word, reporter, ruleset, span)
-    if path is None and len(reporter.diagnostics) == reported:
+    if path is None and not _is_there(str(Path(ruleset.source.name).parent / f"{word}.yaml")):
         _report_unknown(word, span, reporter)
     return path
 

@@ -44,8 +44,8 @@ def add_completion(command: click.Command) -> None:
         words = re.findall("[A-Z]+", f"{param.metavar} {param.name}".upper())
         if known := [word for word in NAMES if word in words]:
             param.shell_complete = partial(_complete, known)  # type: ignore[method-assign]
-    for one in command.commands.values() if isinstance(command, click.Group) else ():
-        add_completion(one)
+    for subcommand in command.commands.values() if isinstance(command, click.Group) else ():
+        add_completion(subcommand)
 
 
 def _complete(words: Sequence[str], ctx: click.Context, incomplete: str) -> list[CompletionItem]:
@@ -53,6 +53,6 @@ def _complete(words: Sequence[str], ctx: click.Context, incomplete: str) -> list
     for word in words:
         marks, names = NAMES[word]
         head = incomplete[: 1 + max(incomplete.rfind(mark) for mark in marks)]
-        found = (head + name for name in names(ctx.args))
-        items += [CompletionItem(value) for value in found if value.startswith(incomplete)]
+        values = (head + name for name in names(ctx.args))
+        items += [CompletionItem(value) for value in values if value.startswith(incomplete)]
     return items

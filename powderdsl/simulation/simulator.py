@@ -172,7 +172,7 @@ class World:
         Raises KeyError for an unknown name.
         """
         elements = self.sim.ruleset.elements
-        ids = {one.id for one in elements if element in (one.name, one.qualified, *one.tags)}
+        ids = {entry.id for entry in elements if element in (entry.name, entry.qualified, *entry.tags)}
         if not ids:
             raise unknown_name("element", element, self.sim.elements)
         xp = self.sim.kind.xp

@@ -148,9 +148,9 @@ _PHRASES: tuple[tuple[str, str, str], ...] = (
     (
         r"\b(count|sum)\([^()]*[<>=][^()]*‸in$",
         "",
-        r"a condition stands in parentheses: `\1((CONDITION) in ring)`",
+        r"put the condition in parentheses: `\1((CONDITION) in ring)`",
     ),
-    (r"\b(count|sum)\([^()]*\)\s*(in\s.*‸|.*‸of$)", "", r"the neighborhood stands inside: `\1(SET in ring)`"),
+    (r"\b(count|sum)\([^()]*\)\s*(in\s.*‸|.*‸of$)", "", r"put the neighborhood inside: `\1(SET in ring)`"),
     (r"\b(any|all)\b[^()]*\(?[^()]*‸(\)|\w+)$", "", r"write `\1(side is SET for side in sides)`"),
     (r"\b(an?|the)\s*‸\w+$", "", r"leave out `\1`"),
     (r"^\s*(spawn|create|add|make|place)\s*‸(\w+)", "", r"write `empty -> \2 with chance 1%`"),

@@ -1,4 +1,4 @@
-"""The cache of compiled code and results, files that are added atomically and checked before they are loaded; results in memory.
+"""Caches of results: files, added atomically and checked before they are loaded, and memos in memory.
 
 <key>-<digest>-<name>    a library, a GPU kernel, or the result of a stage; modified when it was last used
 <key>.lock               held by the process that compiles
@@ -32,10 +32,10 @@ LIMIT = 512 << 20
 """Bytes of files to keep; beyond that, those used longest ago are removed."""
 
 MOST = 2000
-"""Files to keep, as few as that a folder is searched quickly."""
+"""The most files to keep, so that searching the folder stays quick."""
 
 QUICK = 0.002
-"""Seconds of work whose results are not worth a file."""
+"""Results that took at most this many seconds are not stored."""
 
 UNUSED = 24 * 3600.0
 """Seconds after which other files are removed; until then another process may be at work on them."""

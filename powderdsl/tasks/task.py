@@ -48,7 +48,7 @@ class Knob:
 
 @dataclass(frozen=True)
 class FieldValue:
-    """What a drawing sets instead of elements: a field's value, in cells of `owners`, all elements if None."""
+    """A field, and the value that a drawing gives it in cells of `owners`; None stands for all elements."""
 
     slot: Slot
     parts: tuple[float, ...]

@@ -62,7 +62,7 @@ def test_an_index_says_where_to_paint(sim: powderdsl.Simulator, garden: powderds
 
 
 def test_rules_are_named_by_texts() -> None:
-    with pytest.raises(CompileError, match=r"one text each"):
+    with pytest.raises(CompileError, match=r"write load"):
         powderdsl.load(["core", "sand"])
     with pytest.raises(CompileError, match=r"did you mean `water\.melt`"):
         powderdsl.load("core+water", params={"melt": "50%"})

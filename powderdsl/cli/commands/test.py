@@ -162,8 +162,8 @@ class _Report:
             f" on {runner.worlds_run:,} worlds in {monotonic() - start:.0f} s"
         )
         declared = [result for result in results if result.prop.owner != "automatic"]
-        found = [counted(len(tests), "test")]
-        found += [counted(len(declared), "invariant")] if declared else []
+        totals = [counted(len(tests), "test")]
+        totals += [counted(len(declared), "invariant")] if declared else []
         counts = {
             "failed": sum(test.failed for test in tests),
             "broken": sum(not result.holds for result in results),
@@ -171,7 +171,7 @@ class _Report:
             + sum(result.status == "differs" for result in results),
         }
         faults = [f"{number} {word}" for word, number in counts.items() if number]
-        self.say(f"{ruleset.name}: {', '.join([*found, *(faults or ['all passed'])])}")
+        self.say(f"{ruleset.name}: {', '.join([*totals, *(faults or ['all passed'])])}")
         self.failed |= bool(counts["failed"] or counts["broken"])
         self.data[name] = _data(tests, results, lines, missed)
 

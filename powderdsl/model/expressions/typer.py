@@ -588,7 +588,7 @@ class Typer:
             words = "is not" if test.kind == "is_not" else "is"
             raise self.fail(
                 "PD410",
-                f"`{names[-1]}` is no part of the test of `{place}`",
+                f"`{names[-1]}` is not part of the test of `{place}`",
                 Span(test.span.source, test.span.start, others[-1].span.end),
                 f"as written, `{names[-1]}` tests the cell itself",
                 f"write `{place} {words} ({', '.join(names)})`, or `({test.span.text}) or {' or '.join(names[1:])}`",

@@ -1,4 +1,4 @@
-"""How batches of worlds lie in the memory of a module, for the host that fills and reads them."""
+"""The layout of batches of worlds in the memory of a module, for the host that fills and reads them."""
 
 from __future__ import annotations
 
