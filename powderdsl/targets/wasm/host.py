@@ -22,7 +22,7 @@ class RunningModule(Protocol):
         """
         ...
 
-    def write(self, at: int, data: bytes) -> None:
+    def write(self, at: int, data: Any) -> None:
         """Write bytes to an address of the module's memory."""
         ...
 
@@ -78,7 +78,7 @@ class BrowserInstance:
             raise MemoryError(TOO_LARGE) from None
         return 0 if result is None else int(result) & 0xFFFFFFFF
 
-    def write(self, at: int, data: bytes) -> None:
+    def write(self, at: int, data: Any) -> None:
         self._view(self._memory.buffer, at, len(data)).assign(data)
 
     def read(self, at: int, size: int) -> bytearray:

@@ -147,7 +147,7 @@ class Instance:
         for name, array in state.items():
             value = self.kind.contiguous(array)
             if bool(value.any()):  # a new batch holds zeros
-                data = bytes(self.kind.bytes_of(value))
+                data = self.kind.bytes_of(value)
                 at = self.call("scratch", len(data))
                 self.running.write(at, data)
                 for numbers in self.transfers(name, value.dtype.itemsize, value.shape, at):

@@ -135,7 +135,7 @@ class WasmtimeInstance:
         start = _ffi.wasmtime_memory_data(self._context, self._memory_at)
         return ctypes.addressof(start.contents) + at
 
-    def write(self, at: int, data: bytes) -> None:
+    def write(self, at: int, data: Any) -> None:
         ctypes.memmove(self._address(at), data, len(data))
 
     def read(self, at: int, size: int) -> bytearray:
