@@ -83,6 +83,10 @@ class ArrayKind:
         """The array of cells in C order; it may share their memory."""
         return np.frombuffer(memory, dtype).reshape(shape)
 
+    def holds_any(self, array: Array) -> bool:
+        """True if a cell of a contiguous array is not zero."""
+        return bool(array.any())
+
     def bytes_of(self, array: Array) -> Any:
         """The cells of a contiguous array in C order, as an object that has the buffer protocol."""
         return array.tobytes()

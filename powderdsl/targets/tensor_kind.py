@@ -69,6 +69,11 @@ class Tensors(ArrayKind):
     def from_bytes(self, memory: bytearray, dtype: torch.dtype, shape: tuple[int, ...]) -> Tensor:
         return torch.frombuffer(memory, dtype=dtype).reshape(shape)
 
+    def holds_any(self, array: Tensor) -> bool:
+        if array.numel() > 1:  # a single number may have any stride
+            array = array.view(-1).view(torch.uint8)  # 5 times as fast as floats
+        return bool(array.any())
+
     def bytes_of(self, array: Tensor) -> Any:
         """A view: the tensor must live longer."""
         return (ctypes.c_ubyte * array.nbytes).from_address(array.data_ptr())
