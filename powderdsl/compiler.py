@@ -20,7 +20,6 @@ from powderdsl.model.declarations import SHARED, PackDecl, RulesetDecl, read_fil
 from powderdsl.model.types import Ruleset
 from powderdsl.syntax.sources import path_beside, read_source, shipped, shipped_names
 from powderdsl.system.cache import Memo, collection_paused, persistent
-from powderdsl.system.fingerprint import fingerprint
 from powderdsl.system.reading import inside, is_path
 from powderdsl.system.writing import failure
 
@@ -500,13 +499,8 @@ def lower(ruleset: Ruleset, memo: Memo | None = None) -> Program:
 def segments_of(ruleset: Ruleset, memo: Memo | None = None) -> tuple[Segment, ...]:
     """A ruleset as segments of optimized IR, on bit planes if the planes can represent the passes. `memo` as in `lower`."""
     return persistent(
-        f"{ruleset.name} on planes", text_key(ruleset), lambda: parts(lower(ruleset, memo), memo)
+        f"{ruleset.name} on planes", ruleset.text_key, lambda: parts(lower(ruleset, memo), memo)
     )
-
-
-def text_key(ruleset: Ruleset) -> str:
-    """A text that differs wherever anything of two models differs, places in files included."""
-    return fingerprint(replace(ruleset, declared=None), whole=True)
 
 
 def parts(program: Program, memo: Memo | None = None) -> tuple[Segment, ...]:

@@ -25,10 +25,6 @@ class Slot:
     of: frozenset[int] | None = None
     own: tuple[tuple[int, Any], ...] = ()
 
-    def fresh(self, identity: int) -> Any:
-        """The value of a fresh cell of an element, of a field."""
-        return dict(self.own).get(identity, self.default)
-
     @property
     def is_real(self) -> bool:
         return self.kind.name in ("real", "vec2")
@@ -98,7 +94,10 @@ def fresh_values(ruleset: Ruleset, slot: Slot) -> list[Any]:
     if slot.name == "element":
         return [*range(256)]
     if ruleset.property(slot.name) is None:
-        return [slot.fresh(identity) for identity in range(256)]
+        usual = [slot.default] * 256
+        for identity, value in slot.own:
+            usual[identity] = value
+        return usual
     values = property_values(ruleset, slot.name)
     return values if slot.is_real else [*map(int, values)]
 

@@ -14,7 +14,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from powderdsl.diagnostics import Span
-from powderdsl.system.fingerprint import UNMEANING
+from powderdsl.system.fingerprint import UNMEANING, fingerprint
 
 if TYPE_CHECKING:
     from powderdsl.model.declarations import PackDecl, RulesetDecl
@@ -504,6 +504,11 @@ class Ruleset:
     def element(self, name: str) -> Element | None:
         """The element of a plain or qualified name."""
         return next((e for e in self.elements if name in (e.name, e.qualified)), None)
+
+    @cached_property
+    def text_key(self) -> str:
+        """A text that differs wherever anything of two rulesets differs, places in files included."""
+        return fingerprint(replace(self, declared=None), whole=True)
 
     @property
     def palette(self) -> tuple[str | None, ...]:

@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from itertools import chain
+from math import gcd
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -150,8 +151,13 @@ def _indexed(images: Any, frame: NDArray[np.uint8]) -> Any:
     columns = np.append(True, (cells[:, 1:] != cells[:, :-1]).any(axis=0).any(axis=1))
     packed = cells[:, columns].astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], dtype=np.uint32)
     colors, index = np.unique(packed, return_inverse=True)
-    if len(colors) > 256:
-        return images.fromarray(frame).quantize(256, dither=images.Dither.NONE)
+    if (
+        len(colors) > 256
+    ):  # which ones remain depends on shares of pixels: the same in one pixel of each square
+        down, across = (gcd(len(starts), *np.flatnonzero(starts).tolist()) for starts in (rows, columns))
+        image = images.fromarray(np.ascontiguousarray(frame[::down, ::across]))
+        image = image.quantize(256, dither=images.Dither.NONE)
+        return image.resize((frame.shape[1], frame.shape[0]), images.Resampling.NEAREST)
     index = index.reshape(packed.shape).astype(np.uint8)
     image = images.fromarray(index[np.cumsum(rows) - 1][:, np.cumsum(columns) - 1])
     image.putpalette(b"".join(int(color).to_bytes(3, "big") for color in colors))

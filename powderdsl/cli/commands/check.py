@@ -12,7 +12,7 @@ import click
 from powderdsl.cli import options as opt
 from powderdsl.cli.exits import BAD_INPUT, FAILED, OK
 from powderdsl.cli.output import counted, print_json, write_diagnostics
-from powderdsl.compiler import load_with_diagnostics, lower, text_key
+from powderdsl.compiler import load_with_diagnostics, lower
 from powderdsl.diagnostics import CompileError, Diagnostic, Severity
 from powderdsl.diagnostics.diagnostic import diagnostic_data
 from powderdsl.model.types import Ruleset
@@ -124,8 +124,8 @@ def _check(name: str, quick: bool, cost: bool, ledger: bool) -> Checked:
     except CompileError as error:
         return Checked(name, error.diagnostics)
     if ruleset.invariants and not quick:
-        inputs = text_key(ruleset)
-        broken = persistent(f"invariants of {ruleset.name}", inputs, lambda: _refuted(ruleset))
+        title = f"invariants of {ruleset.name}"
+        broken = persistent(title, ruleset.text_key, lambda: _refuted(ruleset))
         diagnostics = (*diagnostics, *broken)
     expenses = None
     if cost:

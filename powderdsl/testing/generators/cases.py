@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from math import prod
 from random import Random
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -163,16 +162,8 @@ class Start:
 
 def fresh(ruleset: Ruleset, slot: Slot, ids: Array) -> Array:
     """A slot's values in fresh cells of these elements."""
-    if ruleset.property(slot.name) is not None:
-        return np.array(fresh_values(ruleset, slot), slot.dtype)[ids]
-    values = _fresh_values(slot)[ids]
+    values = np.array(fresh_values(ruleset, slot), slot.dtype)[ids]
     return np.moveaxis(values, -1, 1) if slot.planes == 2 else values
-
-
-@lru_cache(maxsize=64)
-def _fresh_values(slot: Slot) -> Array:
-    """A field's values [256] or [256, 2] in fresh cells, by element id."""
-    return np.array([slot.fresh(identity) for identity in range(256)], slot.dtype)
 
 
 def holding(ruleset: Ruleset, slot: Slot, ids: Array) -> Array:
