@@ -231,7 +231,7 @@ _OPS: dict[str, Any] = {
     "coordinate": _coordinate,
     "inside": lambda e, at: np.broadcast_to(inside(at.shape[1:], e.value), at.shape),
     "look": lambda e, at, a: look(a, e.value),
-    "member": lambda e, at, a: np.isin(a, sorted(e.value)),
+    "member": lambda e, at, a: np.asarray([i in e.value for i in range(256)])[a],
     "not": lambda e, at, a: ~a,
     "and": lambda e, at, a, b: a & b,
     "or": lambda e, at, a, b: a | b,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from dataclasses import fields, is_dataclass
 from fractions import Fraction
-from functools import cache
 from types import MappingProxyType
 
 UNMEANING = MappingProxyType({"meaning": False})
@@ -26,24 +25,15 @@ def fingerprint(model: object, *, whole: bool = False) -> str:
     return _digest(model, known, whole)
 
 
-@cache
-def _members(kind: type, whole: bool) -> tuple[tuple[str, object], ...] | None:
-    """The names and defaults of the fields that count; None for what is no dataclass."""
-    if not is_dataclass(kind):
-        return None
-    some = (f for f in fields(kind) if whole or (f.compare and f.metadata.get("meaning", True)))
-    return tuple((field.name, field.default) for field in some)
-
-
 def _digest(value: object, known: dict[int, tuple[object, str]], whole: bool) -> str:
-    members = _members(type(value), whole)
-    if members is not None:
+    if is_dataclass(value):
         if id(value) not in known:
             parts = []
-            for name, default in members:
-                part = getattr(value, name)
-                if part != default:
-                    parts.append(f"{name}={_digest(part, known, whole)}")
+            for field in fields(value):
+                part = getattr(value, field.name)
+                means = field.compare and field.metadata.get("meaning", True)
+                if (means or whole) and part != field.default:
+                    parts.append(f"{field.name}={_digest(part, known, whole)}")
             text = f"{type(value).__name__}({','.join(parts)})"
             # The value is kept: another object could get its id.
             known[id(value)] = value, hashlib.sha256(text.encode()).hexdigest()

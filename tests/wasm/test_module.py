@@ -49,8 +49,10 @@ def packed(world: Any) -> tuple[Instance, int]:
     return state.instance, state.handle
 
 
-def test_the_same_rules_are_compiled_once_for_a_width(monkeypatch: pytest.MonkeyPatch, torch) -> None:  # type: ignore[no-untyped-def]
-    made: list[int] = []
+def test_the_same_rules_are_compiled_once_for_a_width_and_once_for_narrow_grids(
+    monkeypatch: pytest.MonkeyPatch, torch
+) -> None:  # type: ignore[no-untyped-def]
+    made: list[int | None] = []
     original = source.wasm_module
     monkeypatch.setattr(
         source, "wasm_module", lambda *given, **more: made.append(given[1]) or original(*given, **more)
@@ -60,12 +62,12 @@ def test_the_same_rules_are_compiled_once_for_a_width(monkeypatch: pytest.Monkey
     for chance in ("20%", "20%", "30%"):
         ruleset = powderdsl.load("core+sand+water", params={"water.melt": chance})
         sim = powderdsl.compile(ruleset, backend="wasm")
-        for width in (5, 70, 5):
+        for width in (5, 70, 32, 9, 63):
             sim.step(sim.world(torch.zeros((1, 4, width), dtype=torch.int64)))
-    assert made == [5, 70]  # parameters are inputs
+    assert made == [None, 70, 32]  # parameters are inputs
     sim = powderdsl.compile("core+water", backend="wasm")
     sim.step(sim.world(torch.zeros((1, 4, 5), dtype=torch.int64)))
-    assert made == [5, 70, 5]
+    assert made == [None, 70, 32, None]
 
 
 def test_memory_is_used_again(torch) -> None:  # type: ignore[no-untyped-def]
@@ -121,10 +123,10 @@ def test_too_many_worlds_are_refused(torch) -> None:  # type: ignore[no-untyped-
     instance = WasmProgram(*_programs("life"), Tensors()).instance(2, 64, 64)
     for worlds, rows in ((1 << 31, 64), (1 << 25, 64), (2, 1 << 30)):
         with pytest.raises(MemoryError):
-            instance.call("allocate", worlds, rows)
+            instance.call("allocate", worlds, rows, 64)
     with pytest.raises(MemoryError):
         instance.call("scratch", (1 << 32) - 1)
-    batch = instance.call("allocate", 2, 64)  # smaller ones still fit
+    batch = instance.call("allocate", 2, 64, 64)  # smaller ones still fit
     instance.call("run", batch, 3)
 
 

@@ -137,9 +137,9 @@ class CellLoop(Loop):
                     if full:
                         self.somewhere[i].set(1)
                     for w in range(self.memory.words):
-                        columns = (1 << min(WORD, self.memory.width - WORD * w)) - 1
-                        word = load("i64.load", self.outs[i] + self.row, self.memory.base + 16 * w)
-                        word.set(columns if full else 0)
+                        at, everything = self.memory.base + 16 * w, self.library.everything
+                        columns = load("i64.load", everything + self.row, at) if full else 0
+                        load("i64.load", self.outs[i] + self.row, at).set(columns)
             body.jump(self.skip)
 
     def copy(self, place: int, source: Value) -> None:
@@ -191,7 +191,7 @@ class CellLoop(Loop):
                 for i in fields:
                     load("v128.load", lines[i] + (column << 2)).set(values[i])
                     inside = values[i]
-                    if memory.width % CHUNK:
+                    if library.width % CHUNK:
                         inside = inside & load("v128.load", column << 2, self.columns)
                     alive[i] |= inside
                 for i in flags:
@@ -206,22 +206,22 @@ class CellLoop(Loop):
             library.finish_line(lines[i])
 
     @contextmanager
-    def each_word(self) -> Iterator[tuple[Value, Value, Value]]:
+    def each_word(self) -> Iterator[tuple[Value, Value, Value | int]]:
         """The words of a row: bytes from the plane's first word, the first column, the column after the last."""
         memory = self.memory
         if memory.words == 1:
-            yield self.row, ZERO, const("i32", memory.width)
+            yield self.row, ZERO, self.library.width
             return
         at, x = body.let(self.row), body.let(0)
         with body.loop() as again:
             stop = x + WORD
             if not memory.whole:
                 stop = body.let(stop)
-                stop.set(either(stop < memory.width, stop, memory.width))
+                stop.set(either(stop < self.library.width, stop, self.library.width))
             yield at, x, stop
             at += 16
             x += WORD
-            body.jump(again, x < memory.width)
+            body.jump(again, x < self.library.width)
 
     # Chains of choices
 
@@ -254,7 +254,7 @@ class CellLoop(Loop):
                 with body.scope():
                     self.choose(at, x, mask, [chain[level] for chain in chains], running)
         if continued:
-            with body.each(0, memory.width, CHUNK) as self.column, body.scope():
+            with body.each(0, library.width, CHUNK) as self.column, body.scope():
                 values = Chunks(self, {})
                 for chain, line in zip(chains, running, strict=True):
                     values.known[id(chain[-1])] = body.let(load("v128.load", line + (self.column << 2)))

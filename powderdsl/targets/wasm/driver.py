@@ -18,6 +18,7 @@ from powderdsl.targets.wasm.binary import (
     F32,
     I32,
     Callee,
+    Global,
     Local,
     Place,
     Value,
@@ -94,7 +95,7 @@ class Batches:
                 world = body.let(either(strips, number, (number << 1) + lane))
                 top = either(strips, lane * self.library.rows, 0)  # the world's row at which the lane begins
                 with body.when(world < batch[WORLDS]):
-                    yield group, lane, body.let(address + world * apart + top * self.memory.width * size)
+                    yield group, lane, body.let(address + world * apart + top * self.library.width * size)
             number += 1
 
     @contextmanager
@@ -103,7 +104,7 @@ class Batches:
         memory = self.memory
         with body.each(0, self.library.cells, 16) as at:
             last = ((at % memory.row) >> 4).equals(memory.words - 1)
-            yield at, body.let(either(last, memory.width - WORD * (memory.words - 1), WORD))
+            yield at, body.let(either(last, self.library.width - WORD * (memory.words - 1), WORD))
 
     @contextmanager
     def each_sixteen(self, size: Value, x: Local, count: Value) -> Iterator[None]:
@@ -137,18 +138,16 @@ class Driver(Batches):
     def add(self, *, export: bool) -> dict[str, Callee]:
         """Add the functions, and return them by name. `export`: hosts see them, and the passes by number."""
         self.define(self._setup, self._renew, self._load_real, self._store_real)
-        self.define(
-            self.allocate, self.release, self.copy, self.scratch, self.load, self.store, export=export
-        )
-        self.define(self.enter, self.begin, self.run, export=export)
+        self.define(self.allocate, self.release, self.copy, self.spread, self.scratch, export=export)
+        self.define(self.load, self.store, self.enter, self.begin, self.run, export=export)
         for number, pass_ in enumerate(self.passes if export else ()):
             self.library.module.export(pass_, str(number))
         return self.calls
 
     # Batches
 
-    def allocate(self, worlds: I32, rows: I32) -> Value:
-        """A new batch. All worlds of an instance have the same number of rows."""
+    def allocate(self, worlds: I32, rows: I32, columns: I32) -> Value:
+        """A new batch. All worlds of an instance have the same number of rows, and of columns."""
         library, memory = self.library, self.memory
         per_world = sum(self.sizes)
         library.trap_from(worlds, per_world + memory.group)
@@ -157,7 +156,7 @@ class Driver(Batches):
             even = (rows & 1).equals(0)
             reachable = (rows >> 1) >= max(1, memory.extent.around)
             few = worlds.equals(1) | ((rows * memory.row) >= LARGE_PLANE)
-            body.do(self.calls["setup"](rows, even & reachable & few))
+            body.do(self.calls["setup"](rows, columns, even & reachable & few))
             body.otherwise()
             with body.when(op("i32.ne", library.world_rows, rows)):
                 body.trap()
@@ -185,14 +184,23 @@ class Driver(Batches):
 
     def copy(self, old: I32, new: I32) -> None:
         """Copy a batch into a new batch of the same size; planes and fields are shared until they change."""
-        library, present = self.library, self.memory.present
         body.do(op("memory.copy", new + HEADER, old + HEADER, self.part(old, 3) - old - HEADER))
         apart = body.let(new - old)
         with self.each_group(old) as group:
-            for member, _ in self.memory.slots:
-                body.do(library.give((group + apart)[member]))
-                (group + apart)[member] = library.keep(group[member])
-            (group + apart)[present] = group[present]
+            self._share(group, body.let(group + apart))
+
+    def spread(self, one: I32, many: I32) -> None:
+        """Fill a batch with the first group of another, whose lanes are alike."""
+        first = body.let(self.part(one, 3))
+        with self.each_group(many) as group:
+            self._share(first, group)
+
+    def _share(self, old: Local, new: Local) -> None:
+        """Let a group share the planes and fields of another."""
+        for member, _ in self.memory.slots:
+            body.do(self.library.give(new[member]))
+            new[member] = self.library.keep(old[member])
+        new[self.memory.present] = old[self.memory.present]
 
     def scratch(self, size: I32) -> Value:
         """Memory for the host, valid until the next call."""
@@ -280,7 +288,7 @@ class Driver(Batches):
                 target += size
 
     def _load_real(self, batch: I32, slot: I32, address: I32, apart: I32) -> None:
-        library, memory = self.library, self.memory
+        library = self.library
         with self.each_group(batch) as group:
             at = body.let(group + (slot << 2))
             body.do(library.give(word(at)))
@@ -291,7 +299,7 @@ class Driver(Batches):
             field = body.let(word(group + (slot << 2)))
             with self.each_line(lane) as line:
                 start, alive = body.let(library.line_start(field, line)), body.let(0)
-                with body.each(0, 4 * memory.width, 4) as at:
+                with body.each(0, library.width * 4, 4) as at:
                     value = body.let(word(source + at))
                     word(start + at).set(value)
                     alive |= value << 1
@@ -299,17 +307,17 @@ class Driver(Batches):
                 (field + line)[LIVE] = live
                 field[SOME] |= live
                 library.finish_line(start)
-                source += 4 * memory.width
+                source += library.width * 4
 
     def _store_real(self, batch: I32, slot: I32, address: I32, apart: I32) -> None:
-        memory = self.memory
+        library = self.library
         with self.each_lane(batch, address, apart, 4) as (group, lane, target):
             field = body.let(word(group + (slot << 2)))
             with self.each_line(lane) as line:
-                start = body.let(self.library.line(field, line))
-                with body.each(0, 4 * memory.width, 4) as at:
+                start = body.let(library.line(field, line))
+                with body.each(0, library.width * 4, 4) as at:
                     word(target + at).set(word(start + at))
-                target += 4 * memory.width
+                target += library.width * 4
 
     # Steps
 
@@ -378,7 +386,7 @@ class Driver(Batches):
         worlds = [load("v128.load", 0, memory.at("worlds", i)) for i in range(2)]
         bases = [library.mixed(op("i32x4.add", world, clock)) for world in worlds]
         # The four hashes of a vector differ by this: a word of a lane has two, and strips continue each other.
-        strip = splat(either(library.strips, library.rows, 0) * (-(-memory.width // 32) * 32 * GOLDEN))
+        strip = splat(either(library.strips, library.rows, 0) * (((library.width + 31) >> 5) * (32 * GOLDEN)))
         within = vector(struct.pack("<4I", *[0, 32 * GOLDEN & MASK] * 2))
         apart = body.let(
             op("i32x4.add", op("i32x4.mul", strip, vector(struct.pack("<4I", 0, 0, 1, 1))), within)
@@ -414,13 +422,13 @@ class Driver(Batches):
 
     def _constant_field(self, value: F32) -> Value:
         """A new field of equal values."""
-        library, width = self.library, self.memory.width
+        library = self.library
         field = body.let(library.take_field())
         field[SOME] = 1
         with body.each(0, library.lines) as line:
             (field + line)[LIVE] = 1
             start = body.let(library.line_start(field, line))
-            with body.each(0, 4 * width, 4) as at:
+            with body.each(0, library.width * 4, 4) as at:
                 load("f32.load", start + at).set(value)
             library.finish_line(start)
         return field
@@ -445,10 +453,16 @@ class Driver(Batches):
 
     # Sizes, constant planes and tables, which an instance makes once the number of rows is known
 
-    def _setup(self, height: I32, strips: I32) -> None:
-        """Set the rows of a world; `strips` is 1 if the lanes are strips of one world."""
+    def _setup(self, height: I32, columns: I32, strips: I32) -> None:
+        """Set the rows of a world, and the columns unless they are fixed; `strips` is 1 if the lanes are strips of one world."""
         library, memory = self.library, self.memory
         library.world_rows.set(height)
+        if isinstance(library.width, Global):
+            library.width.set(columns)
+            for number, turned in library.turns.items():
+                turned.set((columns * abs(number) + number) % columns)
+        full = memory.at("columns") + 4 * memory.halo
+        body.do(op("memory.fill", const("i32", full), 255, library.width * 4))
         library.strips.set(strips)
         library.rows.set(height >> strips)
         library.lines.set(library.rows << 1)
@@ -498,9 +512,9 @@ class Driver(Batches):
             top = body.let(either(library.strips, library.rows, 0))
             with body.each(0, LANES) as lane, body.each(0, library.rows + 2 * around) as y:
                 row = body.let(y + top * lane - around)
-                with body.each(0, memory.width) as x, body.scope():
+                with body.each(0, library.width) as x, body.scope():
                     if kind == 2:
-                        flag = ((row + a) < library.world_rows) & ((x + b) < memory.width)
+                        flag = ((row + a) < library.world_rows) & ((x + b) < library.width)
                     else:
                         flag = (((x if kind else row) % a) >> b) & 1
                     at = body.let(plane + y * memory.row + ((x >> 6) << 4) + (lane << 3))

@@ -103,13 +103,14 @@ def extent_of(schedules: Sequence[Schedule]) -> Extent:
 
 
 class Memory:
-    """The sizes of rows, and the static addresses, of a program for grids of one width."""
+    """The sizes of rows, and the static addresses, of a program for grids of one width; None: of all below a word."""
 
-    def __init__(self, width: int, extent: Extent, layout: Layout):
+    def __init__(self, width: int | None, extent: Extent, layout: Layout):
         self.width, self.extent, self.layout = width, extent, layout
-        self.words = -(-width // WORD)
+        most = WORD - 1 if width is None else width
+        self.words = -(-most // WORD)
         """The words of a row."""
-        self.whole = width % WORD == 0
+        self.whole = most % WORD == 0
         """True if all words of a row are full."""
         self.row = 8 * LANES * self.words
         """The bytes of a plane's row, both lanes."""
@@ -119,7 +120,7 @@ class Memory:
         """A word of a plane, and the part of a lane, at the plane's address plus the offset from the first word."""
         self.halo = aligned(extent.reach, 4)
         """The columns of padding on each side of a line."""
-        self.stride = aligned(width, 4) + 2 * self.halo + 4
+        self.stride = aligned(most, 4) + 2 * self.halo + 4
         """The floats of a line, with both halos and the overlap of a chunk."""
         self.slots = [(Member("i32.load", 4 * i), False) for i in range(len(layout.planes))]
         """The planes and fields of a group, by number; True for fields."""
@@ -209,6 +210,9 @@ class Library:
         self.memory, self.module = memory, module
         self._more: list[Global] = []
         variable, define = module.variable, module.define
+        self.width = variable("i32") if memory.width is None else memory.width
+        self.turns: dict[int, Global] = {}
+        """Variables with numbers of columns modulo the width, unless that is fixed."""
         self.top = variable("i32", memory.top)
         """The beginning of memory that was never used."""
         self.planes, self.fields = variable("i32"), variable("i32")
@@ -226,7 +230,8 @@ class Library:
         self.row_list = variable("i32")
         """The rows that movers leave or enter."""
         self.scratch, self.scratch_end = variable("i32"), variable("i32")
-        module.data(memory.at("columns") + 4 * memory.halo, b"\xff" * (4 * memory.width))
+        for column in range(-memory.extent.reach, memory.extent.reach):
+            self.turned(column)
         self.bump = define(self._bump)
         self.take = define(partial(self._take, self.planes, self.plane_size, 0), "take")
         self.take_field = define(partial(self._take, self.fields, self.field_size, FIELD), "take_field")
@@ -419,11 +424,11 @@ class Library:
 
     def word_number(self, at: Value, y: Value | None) -> Value:
         """The number of a word in the hash; `at`: bytes from the first word of the plane, `y`: its row."""
-        across = -(-self.memory.width // 32)
+        across = (self.width + 31) >> 5
+        if self.memory.words == 1:
+            return at << across
         if across == 2 * self.memory.words:
             return at << 2
-        if across == 1:
-            return at << 1
         assert y is not None
         return (at << 2) - (y << 5)
 
@@ -491,7 +496,7 @@ class Library:
 
     def _columns(self, *, wraps: bool) -> Callee:
         """64 columns of a row from a column on: address of the row, column."""
-        width = self.memory.width
+        width = self.width
 
         def columns(row: I32, first: I32) -> Value:
             filled, flags = body.let(0), body.let(0, "v128")
@@ -521,16 +526,23 @@ class Library:
 
     def rotated(self, row: Value, dx: int, *, wraps: bool) -> Value:
         """The flags `dx` columns to the right, of rows of one word. Beyond the width they are garbage."""
-        width = self.memory.width
         if not wraps:
             if abs(dx) >= WORD:
                 return const("v128", 0)
             return row >> dx if dx > 0 else row << -dx
-        by = dx % width
+        by = self.turned(dx) if dx else 0
         if not by:
             return row
         row = row if isinstance(row, Local) else body.let(row)
-        return (row >> by) | (row << (width - by))
+        return (row >> by) | (row << (self.width - by))
+
+    def turned(self, columns: int) -> Value | int:
+        """A number of columns modulo the width."""
+        if isinstance(self.width, int):
+            return columns % self.width
+        if columns not in self.turns:
+            self.turns[columns] = self.module.variable("i32")
+        return self.turns[columns]
 
     # Lines of fields
 
@@ -548,8 +560,14 @@ class Library:
 
     def finish_line(self, start: Value) -> None:
         """Fill the halo of a line with the columns around the edge."""
-        width, reach, halo = self.memory.width, self.memory.extent.reach, self.memory.halo
+        reach, halo = self.memory.extent.reach, self.memory.halo
         before = body.let(start - 4 * halo) if reach else start
+
+        def cell(at: Value | int, more: int = 0) -> Place:
+            if isinstance(at, int):
+                return word(before, 4 * (halo + at + more))
+            return word(before + (at << 2), 4 * (halo + more))
+
         for i in range(reach):
-            for at, source in ((width + i, i % width), (-1 - i, (width - 1 - i) % width)):
-                word(before, 4 * (halo + at)).set(word(before, 4 * (halo + source)))
+            cell(self.width, i).set(cell(self.turned(i)))
+            cell(-1 - i).set(cell(self.turned(-1 - i)))

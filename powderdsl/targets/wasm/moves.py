@@ -172,13 +172,13 @@ def exchanger(library: Library, offset: Offset) -> Callee:
                 here, there = (body.let(library.line_start(field, number)) for number in (line, other))
                 for number, start in ((line, here), (other, there)):
                     with body.when(op("i32.eqz", (field + number)[LIVE])):
-                        with body.each(0, 4 * memory.width, 16) as at:
+                        with body.each(0, library.width * 4, 16) as at:
                             load("v128.load", start + at).set(0)
                         (field + number)[LIVE] = 1
                 x = body.let(0)
                 with body.each(row, row + memory.row, 16) as at:
                     left = body.let((movers + at)[memory.half])
-                    _exchange_word(left, x, here, there, dx % memory.width, memory.width)
+                    _exchange_word(left, x, here, there, library.turned(dx), library.width)
                     x += WORD
                 library.finish_line(here)
                 library.finish_line(there)
@@ -187,7 +187,9 @@ def exchanger(library: Library, offset: Offset) -> Callee:
     return library.module.once(f"exchange_{dy}_{dx}", exchange)
 
 
-def _exchange_word(left: Local, x: Local, here: Local, there: Local, by: int, width: int) -> None:
+def _exchange_word(
+    left: Local, x: Local, here: Local, there: Local, by: Value | int, width: Value | int
+) -> None:
     """Exchange cells of the movers `left`, a word from column `x` on, with those `by` columns to the right, around the edge."""
     with body.block() as done, body.loop() as again, body.scope():
         body.jump(done, op("i64.eqz", left))

@@ -28,7 +28,7 @@ _MODULES = Memo(versions=1, things=64)
 
 
 class WasmProgram:
-    """A program as WebAssembly, run on one thread: a module for each width of grids.
+    """A program as WebAssembly, run on one thread: a module for each width of grids; those below a word share one, except 32.
 
     Args:
         program: the numeric program, whose slots are the state's.
@@ -46,19 +46,19 @@ class WasmProgram:
         self._instances: dict[tuple[int, int, bool], Instance] = {}
 
     def module(self, width: int) -> Compiled:
-        """The module for a width."""
+        """The module for a width. Tests and examples are narrow, of many widths, and run too shortly to repay one each."""
+        fixed = width if width == 32 or width >= 64 else None
 
         def code() -> bytes:
             from powderdsl.targets.wasm.source import wasm_module
 
-            return wasm_module(self.planes, width, memo=self._memo).code
+            return wasm_module(self.planes, fixed, memo=self._memo).code
 
         def make() -> Compiled:
-            return self._compile(
-                persistent(f"WebAssembly of width {width}", repr((self._digest, width)), code)
-            )
+            name = f"WebAssembly of width {fixed}" if fixed else "WebAssembly of narrow grids"
+            return self._compile(persistent(name, repr((self._digest, fixed)), code))
 
-        return _MODULES.of((self._digest, width), "", make)
+        return _MODULES.of((self._digest, fixed), "", make)
 
     def instance(self, worlds: int, rows: int, width: int) -> Instance:
         """The instance for new batches of a shape: a new instance when the memory of the last is full."""
@@ -95,7 +95,7 @@ class Instance:
 
     def __init__(self, program: WasmProgram, width: int):
         self.program, self.kind, self.layout = program, program.kind, program.layout
-        self.running = program.module(width)()
+        self.width, self.running = width, program.module(width)()
         self.call = self.running.call
         self.gone: list[tuple[int, int]] = []
         """Batches that nobody uses any more, with their numbers of worlds."""
@@ -131,7 +131,7 @@ class Instance:
     def new(self, worlds: int, rows: int) -> int:
         """A batch of zeros."""
         free = self._free[worlds]
-        return free.pop() if free else self.call("allocate", worlds, rows)
+        return free.pop() if free else self.call("allocate", worlds, rows, self.width)
 
     def copy(self, state: WasmState) -> int:
         """A batch with a copy of a state of this instance."""
@@ -144,6 +144,11 @@ class Instance:
         """A batch with a state."""
         worlds, rows, _ = shape_of(state)
         batch = self.new(worlds, rows)
+        if worlds > 2 and all(map(self.kind.repeats, state.values())):
+            one = self.pack({name: array[:2] for name, array in state.items()})
+            self.call("spread", one, batch)
+            self.gone.append((2, one))
+            return batch
         for name, array in state.items():
             value = self.kind.contiguous(array)
             if self.kind.holds_any(value):  # a new batch holds zeros

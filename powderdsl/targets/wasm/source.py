@@ -46,9 +46,9 @@ PAGES = 1 << 15
 
 @collection_paused()
 def wasm_module(
-    program: Program, width: int, *, face: Face | None = None, memo: Memo | None = None
+    program: Program, width: int | None, *, face: Face | None = None, memo: Memo | None = None
 ) -> Module:
-    """The module of a program on planes, for grids of this width.
+    """The module of a program on planes, for grids of this width; None: of any width below that of a word.
 
     Args:
         face: if given, the module is a world by itself (`standalone`) and exports only its functions.

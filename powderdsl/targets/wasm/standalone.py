@@ -87,7 +87,9 @@ class Standalone(Batches):
         self.face, self.calls = face, calls
         self.batch = library.module.variable("i32")
         self.end = library.memory.top
-        self.count = face.rows * self.memory.width
+        assert self.memory.width is not None
+        self.width = self.memory.width
+        self.count = face.rows * self.width
         self.valid = self._data(bytes(i if i in face.ids else face.ids[0] for i in range(256)))
         self.cells_at = const("i32", self._place(self.count))
         self.parts = {slot.name: list(self._parts(slot)) for slot in face.fields}
@@ -130,7 +132,7 @@ class Standalone(Batches):
 
     def _start(self) -> None:
         """Make a world of the first element, with seed 0."""
-        self.batch.set(self.calls["allocate"](1, self.face.rows))
+        self.batch.set(self.calls["allocate"](1, self.face.rows, self.width))
         for number, knob in enumerate(self.face.knobs):
             body.do(self.calls["parameter"](number, const("f64", knob.default)))
         body.do(op("memory.fill", self.cells_at, self.face.ids[0], self.count))
@@ -229,13 +231,13 @@ class Standalone(Batches):
     @contextmanager
     def _each_cell(self, top: Local, bottom: Local, left: Local, right: Local) -> Iterator[Local]:
         """The cells of a box within the grid; the function returns before, if there are none."""
-        for start, stop, most in ((top, bottom, self.face.rows), (left, right, self.memory.width)):
+        for start, stop, most in ((top, bottom, self.face.rows), (left, right, self.width)):
             stop.set(either(op("i32.gt_s", stop, most), most, stop))
             start.set(either(op("i32.lt_s", start, 0), 0, start))
             with body.when(op("i32.ge_s", start, stop)):
                 body.leave()
         with body.each(top, bottom) as y, body.each(left, right) as x:
-            yield body.let(y * self.memory.width + x)
+            yield body.let(y * self.width + x)
 
     def paint(self, element: I32, top: I32, bottom: I32, left: I32, right: I32) -> None:
         with body.when(element >= 256):

@@ -137,7 +137,7 @@ class WordValues(Values[Value]):
         return value if self.memory.whole or node.op == "load" else value & self.valid()
 
     def valid(self) -> Value:
-        if self.memory.words == 1:
+        if self.memory.words == 1 and self.memory.width is not None:
             return const("v128", (1 << self.memory.width) - 1)
         return (self.library.everything + self.loop.at)[self.memory.flags]
 
