@@ -158,13 +158,13 @@ class World:
             scale: pixels a cell; by default as many as make a side of about 400.
             most: how many worlds are shown.
         """
-        few, rules = self.select(slice(0, most)), self.sim.ruleset
-        columns = math.ceil(math.sqrt(len(few)))
+        ids, rules = self.ids[:most], self.sim.ruleset
+        columns = math.ceil(math.sqrt(len(ids)))
         scale = scale or max(1, min(8, USUAL_SIDE // (max(self.shape[1:]) * columns)))
-        fields = {name: few[name] for name in draw.shown_fields(rules)}
-        image = draw.rgb(few.ids, fields=fields, **draw.looks(rules.elements, rules.fields))
+        fields = {name: self[name][:most] for name in draw.shown_fields(rules)}
+        image = draw.rgb(ids, fields=fields, **draw.looks(rules.elements, rules.fields))
         images = draw.scale(image, scale)
-        return images[0] if len(few) == 1 else draw.contact_sheet(images, columns=columns)
+        return images[0] if len(ids) == 1 else draw.contact_sheet(images, columns=columns)
 
     def count(self, element: str) -> Array:
         """The number of cells of an element, or of elements with a tag, in each world: int64 [B].

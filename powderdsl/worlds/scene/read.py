@@ -269,17 +269,18 @@ def find_scene(path_or_name: str | Path) -> Scene:
 
 def shipped_scene(name: str) -> Scene:
     """A scene that comes with the package. Raises CompileError (PD601) for an unknown name."""
-    scenes = {scene.name: scene for scene in shipped_scenes()}
-    if name not in scenes:
-        helps = suggest(name, scenes) or ("shipped: " + ", ".join(scenes),)
-        raise failure("PD601", f"unknown scene `{name[:80]}`", helps=helps)
-    return scenes[name]
+    for scene in shipped_scenes(f"scene: {name}"):
+        if scene.name == name:
+            return scene
+    scenes = [scene.name for scene in shipped_scenes()]
+    helps = suggest(name, scenes) or ("shipped: " + ", ".join(scenes),)
+    raise failure("PD601", f"unknown scene `{name[:80]}`", helps=helps)
 
 
-def shipped_scenes() -> tuple[Scene, ...]:
-    """The scenes that come with the package, files in alphabetical order."""
+def shipped_scenes(text: str = "") -> tuple[Scene, ...]:
+    """The scenes that come with the package, of files that contain a text; files in alphabetical order."""
     paths = sorted(shipped("tasks/scenes").glob("*.yaml"))
-    return tuple(scene for path in paths for scene in read_file(path))
+    return tuple(scene for path in paths if text in path.read_text("utf-8") for scene in read_file(path))
 
 
 def read_file(path: Path) -> tuple[Scene, ...]:
