@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from powderdsl.testing.pack_tests.runner import ERROR_RATE, OFF, is_unlikely, run_examples, trials_for
+from powderdsl.testing.pack_tests.runner import ERROR_RATE, OFF, RARE, is_unlikely, run_examples, trials_for
 from tests.semantics.texts import load_text, mistakes
 from tests.tiers import tiered
 
@@ -68,6 +68,11 @@ def test_the_error_rate_is_as_stated(chance):
     assert tail_of_rejection(trials, chance, chance) < ERROR_RATE
     for other in (chance + off, chance - off):
         assert 1 - tail_of_rejection(trials, chance, other) < ERROR_RATE
+
+
+def test_an_exception_in_a_thousand_is_noticed():
+    for chance in (0, 1):
+        assert (1 - RARE) ** trials_for(chance) <= ERROR_RATE
 
 
 def tail_of_rejection(trials: int, claimed: float, true: float) -> float:

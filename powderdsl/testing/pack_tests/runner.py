@@ -256,6 +256,9 @@ ERROR_RATE = 1e-6
 OFF = 0.25
 """How far a chance may be off, as a part of itself or of what it lacks to 100 %, before it is sure to be noticed."""
 
+RARE = 0.001
+"""The share of exceptions from 0 % or 100 % that is sure to be noticed."""
+
 MOST_WORK = 1 << 25
 """Cells times steps that a test may cost. A chance that would need more is tested less sharply."""
 
@@ -283,7 +286,7 @@ def trials_for(chance: float) -> int:
     """The number of trials that tell a chance from one that is off by OFF, in either direction, with ERROR_RATE both ways."""
     small = min(chance, 1 - chance)
     if small <= 0:
-        return 1 << 16
+        return ceil(log(1 / ERROR_RATE) / RARE)
     needed = []
     for other in (chance + OFF * small, chance - OFF * small):
         hits, misses = log(chance / other), log((1 - chance) / (1 - other))
