@@ -77,10 +77,6 @@ class ArrayKind:
         """An array of this library, which may share the memory of a writable argument."""
         return array
 
-    def repeats(self, array: Array) -> bool:
-        """True if all worlds are known to share the memory of one."""
-        return 0 in getattr(array, "strides", ())[:1]
-
     # Programs in the memory of this process
 
     def from_bytes(self, memory: bytearray, dtype: Any, shape: tuple[int, ...]) -> Array:

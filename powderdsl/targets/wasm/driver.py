@@ -138,7 +138,7 @@ class Driver(Batches):
     def add(self, *, export: bool) -> dict[str, Callee]:
         """Add the functions, and return them by name. `export`: hosts see them, and the passes by number."""
         self.define(self._setup, self._renew, self._load_real, self._store_real)
-        self.define(self.allocate, self.release, self.copy, self.spread, self.scratch, export=export)
+        self.define(self.allocate, self.release, self.copy, self.scratch, export=export)
         self.define(self.load, self.store, self.enter, self.begin, self.run, export=export)
         for number, pass_ in enumerate(self.passes if export else ()):
             self.library.module.export(pass_, str(number))
@@ -184,23 +184,14 @@ class Driver(Batches):
 
     def copy(self, old: I32, new: I32) -> None:
         """Copy a batch into a new batch of the same size; planes and fields are shared until they change."""
+        library, present = self.library, self.memory.present
         body.do(op("memory.copy", new + HEADER, old + HEADER, self.part(old, 3) - old - HEADER))
         apart = body.let(new - old)
         with self.each_group(old) as group:
-            self._share(group, body.let(group + apart))
-
-    def spread(self, one: I32, many: I32) -> None:
-        """Fill a batch with the first group of another, whose lanes are alike."""
-        first = body.let(self.part(one, 3))
-        with self.each_group(many) as group:
-            self._share(first, group)
-
-    def _share(self, old: Local, new: Local) -> None:
-        """Let a group share the planes and fields of another."""
-        for member, _ in self.memory.slots:
-            body.do(self.library.give(new[member]))
-            new[member] = self.library.keep(old[member])
-        new[self.memory.present] = old[self.memory.present]
+            for member, _ in self.memory.slots:
+                body.do(library.give((group + apart)[member]))
+                (group + apart)[member] = library.keep(group[member])
+            (group + apart)[present] = group[present]
 
     def scratch(self, size: I32) -> Value:
         """Memory for the host, valid until the next call."""

@@ -564,8 +564,6 @@ class Library:
         before = body.let(start - 4 * halo) if reach else start
 
         def cell(at: Value | int, more: int = 0) -> Place:
-            if isinstance(at, int):
-                return word(before, 4 * (halo + at + more))
             return word(before + (at << 2), 4 * (halo + more))
 
         for i in range(reach):

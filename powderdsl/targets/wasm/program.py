@@ -144,11 +144,6 @@ class Instance:
         """A batch with a state."""
         worlds, rows, _ = shape_of(state)
         batch = self.new(worlds, rows)
-        if worlds > 2 and all(map(self.kind.repeats, state.values())):
-            one = self.pack({name: array[:2] for name, array in state.items()})
-            self.call("spread", one, batch)
-            self.gone.append((2, one))
-            return batch
         for name, array in state.items():
             value = self.kind.contiguous(array)
             if self.kind.holds_any(value):  # a new batch holds zeros

@@ -312,12 +312,11 @@ def chance_problem(start: World, steps: int, claims: Sequence[Often], seed: int)
     most = max(1, MOST_WORK // (cells_of_one * max(steps, 1)))
     copies = min(most, max(ceil(trials_for(float(c.chance)) / int(cells.sum())) for c, cells in chosen))
     hits = [0] * len(chosen)
-    chunk, put, spread = max(1, CHUNK // cells_of_one), start.sim.kind.put, start.sim.kind.xp.broadcast_to
+    chunk, put = max(1, CHUNK // cells_of_one), start.sim.kind.put
     for first in range(0, copies, chunk):
         index = [*range(first, min(first + chunk, copies))]  # by which each copy has luck of its own
-        state = {name: spread(one, (len(index), *one.shape[1:])) for name, one in start.state.items()}
-        clock = {"index": index, "seed": [seed] * len(index), "start": [0] * len(index)}
-        world = start.with_state(state, **{name: put(each, "int64") for name, each in clock.items()})
+        world = start.select(put([0] * len(index), "int64"))
+        world = replace(world, index=put(index, "int64"), seed=put([seed] * len(index), "int64"))
         world = world.sim.step(world, steps=steps)
         at = world_context(world, *(claim.after for claim in claims))
         for number, (claim, cells) in enumerate(chosen):
