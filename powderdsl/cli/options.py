@@ -13,8 +13,9 @@ import click
 
 from powderdsl.cli.exits import BadInput
 from powderdsl.cli.output import counted
-from powderdsl.compiler import BACKENDS, load_with_diagnostics
+from powderdsl.compiler import BACKENDS, load_with_diagnostics, shipped_rules
 from powderdsl.diagnostics import Severity
+from powderdsl.system.reading import is_path
 
 if TYPE_CHECKING:
     from powderdsl.experiments.runs import RunFolder
@@ -240,6 +241,17 @@ SECTIONS = {
 
 class Command(click.Command):
     """A command whose help has its options in sections, if there are many; those that would stand alone are last."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        ctx.allow_extra_args = True
+        rest, fix = super().parse_args(ctx, args), f"see `{ctx.command_path} --help`"
+        for word in rest if not ctx.resilient_parsing else ():
+            if "rules" in ctx.params and (word in shipped_rules() or is_path(word)):
+                fix = f"join rules by `+`: {ctx.params['rules']}+{word}"
+            elif "world" in ctx.params:
+                fix = f"name a start world by `--world {word}`"
+            raise BadInput(f"one argument too many, `{word}`: {fix}")
+        return rest
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         options = [option for option in self.get_params(ctx) if isinstance(option, click.Option)]

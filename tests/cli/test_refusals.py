@@ -39,6 +39,9 @@ RECORD = "record sand-pushing --out d --episodes 1"
 REFUSED = (
     *((line, "Usage: powderdsl") for line in USAGE),
     ("chek core", "did you mean `check`?"),
+    ("run core sand", "core+sand"),
+    ("run core garden --out x.png", "--world garden"),
+    ("train sand-pushing none", "powderdsl train --help"),
     (f"{WORLD} gardn", "error[PD601"),
     (f"{WORLD} none.png", "error[PD101"),
     (f"{WORLD} none.npz", "error[PD602"),
