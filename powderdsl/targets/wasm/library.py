@@ -13,6 +13,7 @@ Addresses are bytes. Everything is aligned to 16 bytes. A group is two lanes of 
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from functools import partial, reduce
 from operator import or_
@@ -211,7 +212,7 @@ class Library:
         self._more: list[Global] = []
         variable, define = module.variable, module.define
         self.width = variable("i32") if memory.width is None else memory.width
-        self.turns: dict[int, Global] = {}
+        self.turns = defaultdict[int, Global](partial(variable, "i32"))
         """Variables with numbers of columns modulo the width, unless that is fixed."""
         self.top = variable("i32", memory.top)
         """The beginning of memory that was never used."""
@@ -540,8 +541,6 @@ class Library:
         """A number of columns modulo the width."""
         if isinstance(self.width, int):
             return columns % self.width
-        if columns not in self.turns:
-            self.turns[columns] = self.module.variable("i32")
         return self.turns[columns]
 
     # Lines of fields
@@ -562,10 +561,6 @@ class Library:
         """Fill the halo of a line with the columns around the edge."""
         reach, halo = self.memory.extent.reach, self.memory.halo
         before = body.let(start - 4 * halo) if reach else start
-
-        def cell(at: Value | int, more: int = 0) -> Place:
-            return word(before + (at << 2), 4 * (halo + more))
-
         for i in range(reach):
-            cell(self.width, i).set(cell(self.turned(i)))
-            cell(-1 - i).set(cell(self.turned(-1 - i)))
+            for at, more, source in ((self.width, i, self.turned(i)), (-1 - i, 0, self.turned(-1 - i))):
+                word(before + (at << 2), 4 * (halo + more)).set(word(before + (source << 2), 4 * halo))

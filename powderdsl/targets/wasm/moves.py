@@ -178,7 +178,7 @@ def exchanger(library: Library, offset: Offset) -> Callee:
                 x = body.let(0)
                 with body.each(row, row + memory.row, 16) as at:
                     left = body.let((movers + at)[memory.half])
-                    _exchange_word(left, x, here, there, library.turned(dx), library.width)
+                    _exchange_word(library, dx, left, x, here, there)
                     x += WORD
                 library.finish_line(here)
                 library.finish_line(there)
@@ -187,17 +187,15 @@ def exchanger(library: Library, offset: Offset) -> Callee:
     return library.module.once(f"exchange_{dy}_{dx}", exchange)
 
 
-def _exchange_word(
-    left: Local, x: Local, here: Local, there: Local, by: Value | int, width: Value | int
-) -> None:
-    """Exchange cells of the movers `left`, a word from column `x` on, with those `by` columns to the right, around the edge."""
+def _exchange_word(library: Library, dx: int, left: Local, x: Local, here: Local, there: Local) -> None:
+    """Exchange cells of the movers `left`, a word from column `x` on, with those `dx` columns to the right, around the edge."""
     with body.block() as done, body.loop() as again, body.scope():
         body.jump(done, op("i64.eqz", left))
         column = body.let(x + op("i32.wrap_i64", op("i64.ctz", left)))
         left &= left - 1
-        target = body.let(column + by)
-        if by:
-            target.set(either(target < width, target, target - width))
+        target = body.let(column + library.turned(dx))
+        if dx:
+            target.set(either(target < library.width, target, target - library.width))
         own, other = body.let(here + (column << 2)), body.let(there + (target << 2))
         saved = body.let(word(own))
         word(own).set(word(other))

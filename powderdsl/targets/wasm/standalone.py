@@ -87,8 +87,7 @@ class Standalone(Batches):
         self.face, self.calls = face, calls
         self.batch = library.module.variable("i32")
         self.end = library.memory.top
-        assert self.memory.width is not None
-        self.width = self.memory.width
+        self.width = self.memory.width or 0
         self.count = face.rows * self.width
         self.valid = self._data(bytes(i if i in face.ids else face.ids[0] for i in range(256)))
         self.cells_at = const("i32", self._place(self.count))
