@@ -100,7 +100,7 @@ def draw(clock: Clock, stream: int, bits: int, height: int, width: int) -> Array
 
 def look(value: Array, offset: Offset) -> Array:
     """The array as seen from each cell at its neighbor `offset`; the grid wraps around."""
-    return np.roll(value, (-offset[0], -offset[1]), (-2, -1))
+    return np.roll(value, (-offset[0], -offset[1]), (-2, -1)) if any(offset) else value
 
 
 def back(offset: Offset) -> Offset:
@@ -189,6 +189,12 @@ def _property(expr: Expr, at: Context) -> Array:
     return _of_elements(prop, at.state["element"], at)
 
 
+@functools.cache
+def _members(some: frozenset[int]) -> Array:
+    """bool [256], by id: whether it is one of some elements."""
+    return np.asarray([number in some for number in range(256)])
+
+
 def _of_elements(prop: Property, ids: Array, at: Context) -> Array:
     """The values of a property for cells of these ids."""
     plain = (float(value) if isinstance(value, Fraction) else value for value in prop.values)
@@ -231,7 +237,7 @@ _OPS: dict[str, Any] = {
     "coordinate": _coordinate,
     "inside": lambda e, at: np.broadcast_to(inside(at.shape[1:], e.value), at.shape),
     "look": lambda e, at, a: look(a, e.value),
-    "member": lambda e, at, a: np.asarray([i in e.value for i in range(256)])[a],
+    "member": lambda e, at, a: _members(e.value)[a],
     "not": lambda e, at, a: ~a,
     "and": lambda e, at, a, b: a & b,
     "or": lambda e, at, a, b: a | b,
@@ -378,7 +384,7 @@ def run_moment(moment: Moment, at: Context, table: Mapping[str, Slot]) -> State:
         assign("effect", claim, effect)
     for slot in table.values():
         if slot.of is not None:
-            holders = np.isin(state["element"], sorted(slot.of))
+            holders = _members(slot.of)[state["element"]]
             write(Change("limit", slot), _default(slot, state[slot.name]), ~holders)
     return state
 
